@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a network sees of a pose: the transforms of joints relative to parent and rest pose."""
+
+import numpy as np
+
+FEATURES_PER_JOINT = 12
+
+
+def joint_features(pose_matrices: np.ndarray, rest_matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:
+    """Transform of each joint relative to its parent and to the rest pose, F_j = (B_p^-1 B_j)^-1 P_p^-1 P_j.
+
+    The identity in the rest pose. The parent of a root is mesh-object space itself.
+
+    Args:
+        pose_matrices: (N, J, 4, 4), mesh-object space, metres.
+        rest_matrices: (J, 4, 4), mesh-object space, metres.
+        parents: (J,) parent index, -1 for a root; every parent before its children.
+
+    Returns:
+        (N, J, 12) float32: the upper three rows of F_j, row by row; rotations without unit, translations in metres.
+    """
+    pose = pose_matrices.astype(np.float64)
+    rest = rest_matrices.astype(np.float64)
+    relative = np.linalg.inv(relative_to_parent(rest[None], parents)) @ relative_to_parent(pose, parents)
+    return relative[:, :, :3, :].reshape(*relative.shape[:2], FEATURES_PER_JOINT).astype(np.float32)
+
+
+def relative_to_parent(matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:
+    """(N, J, 4, 4) matrices in mesh-object space to matrices relative to the parent joint; roots stay as they are."""
+    relative = matrices.copy()
+    children = np.flatnonzero(parents >= 0)
+    relative[:, children] = np.linalg.inv(matrices[:, parents[children]]) @ matrices[:, children]
+    return relative

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the trainer says while it works: one JSON object a line on its stdout.
+
+Direction: trainer to add-on. Every training ends with exactly one of `FINISHED`, `CANCELLED` and `FAILED`.
+"""
+
+import enum
+import json
+from dataclasses import dataclass, field
+
+
+class MessageType(enum.Enum):
+    """Types of a message, with the keys that it carries beside `type`."""
+
+    STARTED = "started"
+    """partitions: int, poses: int, vertices: int, device: str."""
+    PROGRESS = "progress"
+    """epoch: int, epochs: int, validation_mm: float (mean error of the validation poses)."""
+    PARTITION_FINISHED = "partition_finished"
+    """joint: str, basis: int, validation_mm: float."""
+    LOG = "log"
+    """text: str."""
+    FINISHED = "finished"
+    """model: str (path), seconds: float, validation_mm: float."""
+    CANCELLED = "cancelled"
+    """No keys. The trainer was asked to stop and wrote no model."""
+    FAILED = "failed"
+    """text: str, the sentence for the user."""
+
+    @property
+    def is_last(self) -> bool:
+        return self in (MessageType.FINISHED, MessageType.CANCELLED, MessageType.FAILED)
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message and the values of its keys."""
+
+    type: MessageType
+    values: dict = field(default_factory=dict)
+
+    def encode(self) -> str:
+        """One line of JSON, without the line's end."""
+        return json.dumps({"type": self.type.value, **self.values})
+
+    @staticmethod
+    def decode(line: str) -> "Message":
+        """Read one line.
+
+        Raises:
+            ValueError: the line is no message.
+        """
+        values = json.loads(line)
+        if not isinstance(values, dict):
+            raise ValueError(f"not a trainer message: {line[:80]!r}")
+        return Message(MessageType(values.pop("type", None)), values)

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Errors between two deformations of one mesh, and their colours."""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+NO_ERROR = 1e-6
+"""Metres. Below this the heat map is green: no error."""
+HEAT_STOPS = ((NO_ERROR, (0.10, 0.25, 0.95)), (0.005, (0.60, 0.10, 0.80)), (0.01, (0.95, 0.05, 0.05)))
+"""Error in metres and sRGB colour: blue just above no error, violet at 0.5 cm, red at 1 cm and above."""
+HEAT_NONE = (0.10, 0.70, 0.20)
+
+
+@dataclass(frozen=True)
+class ErrorStatistics:
+    """Distances over vertices and poses, all in millimetres."""
+
+    mean: float
+    rms: float
+    p99: float
+    p999: float
+    max: float
+
+    def to_json(self) -> dict:
+        return asdict(self)
+
+
+def distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Distance of each vertex: (N, V, 3) and (N, V, 3), metres, to (N, V) float32, metres."""
+    return np.linalg.norm(first - second, axis=-1)
+
+
+def error_statistics(errors: np.ndarray) -> ErrorStatistics:
+    """Sum up errors.
+
+    Args:
+        errors: distances in metres, any shape, at least one.
+    """
+    mm = np.asarray(errors, np.float64).ravel() * 1000
+    p99, p999 = np.percentile(mm, (99, 99.9))
+    return ErrorStatistics(float(mm.mean()), float(np.sqrt((mm**2).mean())), float(p99), float(p999), float(mm.max()))
+
+
+def heat_colors(errors: np.ndarray) -> np.ndarray:
+    """Colours of a heat map of errors.
+
+    Args:
+        errors: (V,) metres.
+
+    Returns:
+        (V, 3) float32 sRGB, 0 to 1: green below 1e-4 cm, then from blue through violet (0.5 cm) to red (1 cm).
+    """
+    stops = [stop for stop, _ in HEAT_STOPS]
+    colors = np.array([color for _, color in HEAT_STOPS])
+    heat = np.stack([np.interp(errors, stops, colors[:, channel]) for channel in range(3)], axis=-1)
+    heat[np.asarray(errors) < NO_ERROR] = HEAT_NONE
+    return heat.astype(np.float32)

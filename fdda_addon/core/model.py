@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The model: one ONNX file that deforms a character. docs/model.md describes the format."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from .errors import ModelError
+from .onnx_file import read_onnx
+from .rig import Fingerprint, Joint, Rig, differences
+
+VERSION = 1
+METADATA_KEY = "fdda"
+POSE_INPUT = "pose_matrices"
+POSITIONS_OUTPUT = "positions"
+TRUST_OUTPUT = "trust"
+MAX_BYTES = 2 << 30
+
+
+@dataclass(frozen=True)
+class ModelPartition:
+    """What a model says of one partition: joint indices, vertex count and number of basis shapes."""
+
+    joint: int
+    influencing: tuple[int, ...]
+    vertices: int
+    basis: int
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """The metadata property `fdda` of a model.
+
+    Attributes:
+        joints: the joints that `pose_matrices` lists, every parent before its children.
+        rest_matrices: (J, 4, 4) float32, mesh-object space, metres.
+        vertex_count: of the mesh.
+        fingerprint: of the rig that was recorded.
+        partitions: in ascending order of their main joints, the order of the output `trust`.
+        feature_low, feature_high: (J, 12) float32, range of the joint features (core.features) in training.
+        held_out_mm: error over the poses that were held out of the training, in mm, by the names of
+            `metrics.ErrorStatistics`.
+        parity_mm: largest difference between ONNX Runtime and PyTorch, in mm.
+        training: settings and seed of the training.
+    """
+
+    joints: tuple[Joint, ...]
+    rest_matrices: np.ndarray
+    vertex_count: int
+    fingerprint: Fingerprint
+    partitions: tuple[ModelPartition, ...]
+    feature_low: np.ndarray
+    feature_high: np.ndarray
+    held_out_mm: dict[str, float] = field(default_factory=dict)
+    parity_mm: float = 0.0
+    training: dict = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        """The text of the metadata property."""
+        value = {
+            "version": VERSION,
+            "joints": [asdict(joint) for joint in self.joints],
+            "rest_matrices": self.rest_matrices.reshape(-1, 16).tolist(),
+            "vertices": self.vertex_count,
+            "fingerprint": asdict(self.fingerprint),
+            "partitions": [asdict(partition) for partition in self.partitions],
+            "training_ranges": {"low": self.feature_low.tolist(), "high": self.feature_high.tolist()},
+            "held_out_mm": self.held_out_mm,
+            "parity_mm": self.parity_mm,
+            "training": self.training,
+        }
+        return json.dumps(value, allow_nan=False)
+
+    @staticmethod
+    def from_json(text: str) -> "ModelInfo":
+        """Read the metadata property.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is damaged.
+        """
+        value = json.loads(text)
+        if value["version"] != VERSION:
+            raise ValueError(f"version {value['version']!r}, this add-on reads version {VERSION}")
+        joints = tuple(Joint(str(j["name"]), int(j["parent"])) for j in value["joints"])
+        partitions = tuple(
+            ModelPartition(int(p["joint"]), tuple(map(int, p["influencing"])), int(p["vertices"]), int(p["basis"]))
+            for p in value["partitions"]
+        )
+        count = len(joints)
+        if not all(-1 <= joint.parent < number for number, joint in enumerate(joints)):
+            raise ValueError("a joint stands before its parent")
+        if not all(0 <= p.joint < count for p in partitions):
+            raise ValueError("a partition's main joint is none of the joints")
+        if sum(p.vertices for p in partitions) != int(value["vertices"]):
+            raise ValueError("the partitions do not add up to the vertices")
+        return ModelInfo(
+            joints,
+            np.array(value["rest_matrices"], np.float32).reshape(count, 4, 4),
+            int(value["vertices"]),
+            Fingerprint(**value["fingerprint"]),
+            partitions,
+            np.array(value["training_ranges"]["low"], np.float32).reshape(count, 12),
+            np.array(value["training_ranges"]["high"], np.float32).reshape(count, 12),
+            dict(value["held_out_mm"]),
+            float(value["parity_mm"]),
+            dict(value["training"]),
+        )
+
+
+def read_model_info(path: Path) -> ModelInfo:
+    """Read and check a model without executing it.
+
+    Raises:
+        ModelError: no file, no ONNX file, not a model of ours, or one that asks for more than a model may: other
+            inputs, custom operators, external data.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ModelError(f"'{path}' is larger than 2 GB and cannot be a model.")
+        contents = read_onnx(path)
+    except OSError as error:
+        raise ModelError(f"The model '{path}' cannot be read: {error.strerror}; train it first.") from error
+    except ValueError as error:
+        raise ModelError(f"'{path}' is not a model: {error}; give an .onnx file that train made.") from error
+    if contents.external_files:
+        raise ModelError(f"'{path}' keeps data in other files, which is refused; give a model that train made.")
+    if contents.custom_operators:
+        names = ", ".join(sorted(contents.custom_operators))
+        raise ModelError(f"'{path}' uses custom operators ({names}), which is refused; give a model that train made.")
+    if METADATA_KEY not in contents.metadata:
+        raise ModelError(f"'{path}' is an ONNX file but not a model of this add-on; give one that train made.")
+    try:
+        info = ModelInfo.from_json(contents.metadata[METADATA_KEY])
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ModelError(f"The model '{path}' is damaged: {error}; train it again.") from error
+    if extra := sorted(set(contents.inputs) - {POSE_INPUT}):
+        raise ModelError(f"'{path}' asks for inputs that no rig gives ({', '.join(extra)}); train it again.")
+    if contents.inputs.get(POSE_INPUT, ())[1:] != (len(info.joints), 4, 4):
+        raise ModelError(
+            f"The input '{POSE_INPUT}' of '{path}' does not fit its {len(info.joints)} joints; train again."
+        )
+    if contents.outputs.get(POSITIONS_OUTPUT, ())[1:] != (info.vertex_count, 3):
+        raise ModelError(
+            f"The output '{POSITIONS_OUTPUT}' of '{path}' does not fit its {info.vertex_count} vertices; train again."
+        )
+    return info
+
+
+def check_rig(path: Path, info: ModelInfo, rig: Rig) -> None:
+    """Fail when a model was trained for another rig.
+
+    Raises:
+        ModelError: says in what they differ.
+    """
+    found = differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
+    if found:
+        raise ModelError(
+            f"The model '{path}' was trained for another rig: {'; '.join(found)}. Record and train this rig."
+        )

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Partitions: the vertices that share a main joint, and the joints that move their residuals."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .rig import Rig
+
+INFLUENCE_TOLERANCE = 1e-4
+"""A joint influences a partition when it moves a local residual by more than this part of the character's size."""
+
+
+@dataclass(frozen=True)
+class Partition:
+    """The vertices that follow one main joint.
+
+    Attributes:
+        joint: index of the main joint.
+        influencing: indices of the joints that move the local residuals, ascending; may be empty.
+        vertices: (Vp,) int32 indices into the mesh, ascending.
+    """
+
+    joint: int
+    influencing: tuple[int, ...]
+    vertices: np.ndarray
+
+
+def main_joints(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
+    """The joint of the largest weight of each vertex, the first on a tie (paper, section 3.1).
+
+    Args:
+        skin_joints: (V, I) int32. skin_weights: (V, I) float32.
+
+    Returns:
+        (V,) int32 joint indices.
+    """
+    slots = np.argmax(skin_weights, axis=1)
+    return np.take_along_axis(skin_joints, slots[:, None], axis=1)[:, 0].astype(np.int32)
+
+
+def make_partitions(rig: Rig, influencing: dict[int, tuple[int, ...]] | None = None) -> tuple[Partition, ...]:
+    """Cut the mesh by main joint, in ascending order of the joints.
+
+    Args:
+        rig: the rig.
+        influencing: influencing joints by main joint; none for all partitions when left out.
+    """
+    main = main_joints(rig.skin_joints, rig.skin_weights)
+    influencing = influencing or {}
+    return tuple(
+        Partition(int(joint), tuple(influencing.get(int(joint), ())), np.flatnonzero(main == joint).astype(np.int32))
+        for joint in np.unique(main)
+    )
+
+
+def residual_changes(partitions: tuple[Partition, ...], moved: np.ndarray, base: np.ndarray) -> np.ndarray:
+    """How far local residuals move between poses, the most in each partition.
+
+    Args:
+        partitions: P partitions.
+        moved, base: (N, V, 3) float32 local residuals, metres.
+
+    Returns:
+        (P,) float64, metres.
+    """
+    distances = np.sqrt(np.einsum("nvc,nvc->nv", moved - base, moved - base)).max(axis=0, initial=0)
+    return np.array([distances[p.vertices].max(initial=0) for p in partitions], np.float64)

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Ranges of motion, and random poses inside them."""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+DEFAULT_RANGE = (-np.pi / 4, np.pi / 4)
+"""Range of a rotation axis that the rig neither limits nor locks, radians."""
+
+DEFAULT_SPREAD = 1.0
+"""Standard deviation of the poses, as a part of half the range."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One number of a pose that may be sampled.
+
+    Attributes:
+        bone: name of the bone.
+        kind: "rotation" (Euler angle, radians) or "location" (metres), relative to the rest pose.
+        axis: 0, 1 or 2.
+        low, high: the range of motion.
+    """
+
+    bone: str
+    kind: str
+    axis: int
+    low: float
+    high: float
+
+    def to_json(self) -> dict:
+        return asdict(self)
+
+
+def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: float = DEFAULT_SPREAD) -> np.ndarray:
+    """Draw one pose: a normal distribution centred on the middle of each range, redrawn until inside.
+
+    The pose depends on seed and index alone, so a recording that is resumed continues with the same poses.
+
+    Args:
+        channels: C channels with their ranges.
+        seed: of the recording.
+        index: of the pose in the recording.
+        spread: standard deviation as a part of half the range; larger is closer to uniform.
+
+    Returns:
+        (C,) float64, radians or metres, as the channels say.
+    """
+    rng = np.random.default_rng([seed, index])
+    low = np.array([c.low for c in channels])
+    high = np.array([c.high for c in channels])
+    middle, deviation = (low + high) / 2, (high - low) / 2 * spread
+    values = rng.normal(middle, deviation)
+    while (outside := (values < low) | (values > high)).any():
+        values[outside] = rng.normal(middle, deviation)[outside]
+    return values

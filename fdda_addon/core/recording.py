@@ -1,0 +1,396 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The recording: a folder of poses and local residuals. docs/recording.md describes the format.
+
+`recording.json` is written last and says how many poses are complete: an array file may be longer than that, and
+what lies behind it is never read.
+"""
+
+import io
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .errors import OutputError, RecordingError
+from .output import write_json
+from .partition import Partition, make_partitions
+from .poses import Channel
+from .rig import Fingerprint, Joint, Rig
+
+FORMAT = "fdda-recording"
+VERSION = 1
+INDEX = "recording.json"
+MAX_INDEX_BYTES = 64 << 20
+CHECK_BYTES = 64 << 20
+"""Recordings are searched for NaN in pieces of this size."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where poses of a recording came from.
+
+    Attributes:
+        kind: "random" or "action".
+        poses: how many.
+        name: of the action; empty for random poses.
+        frames: first frame of the action and the step between poses, (0, 0) for random poses.
+    """
+
+    kind: str
+    poses: int
+    name: str = ""
+    frames: tuple[int, int] = (0, 0)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How the poses were chosen."""
+
+    seed: int
+    spread: float
+    channels: tuple[Channel, ...]
+    sources: tuple[Source, ...]
+
+    def to_json(self) -> dict:
+        return {
+            "seed": self.seed,
+            "spread": self.spread,
+            "limits": [channel.to_json() for channel in self.channels],
+            "sources": [asdict(source) for source in self.sources],
+        }
+
+
+@dataclass(frozen=True)
+class RecordingInfo:
+    """What `recording.json` says beside the arrays."""
+
+    poses: int
+    complete: int
+    rig_file: str
+    object_name: str
+    blender: str
+    sampling: Sampling
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A complete recording, its large arrays mapped from disk.
+
+    Attributes:
+        path: the folder.
+        info: counts and where it came from.
+        rig: the rig it was made of.
+        partitions: with their influencing joints.
+        pose_matrices: (N, J, 4, 4) float32, mesh-object space, metres.
+        residuals: (N, V, 3) float32, local residuals, metres.
+    """
+
+    path: Path
+    info: RecordingInfo
+    rig: Rig
+    partitions: tuple[Partition, ...]
+    pose_matrices: np.ndarray
+    residuals: np.ndarray
+
+
+def array_shapes(poses: int, joints: int, vertices: int, influences: int) -> dict[str, tuple[tuple, type]]:
+    """Shape and dtype of each array of a recording, by name; `influences` is I of the skin weights."""
+    return {
+        "rest_positions": ((vertices, 3), np.float32),
+        "rest_matrices": ((joints, 4, 4), np.float32),
+        "skin_joints": ((vertices, influences), np.int32),
+        "skin_weights": ((vertices, influences), np.float32),
+        "pose_matrices": ((poses, joints, 4, 4), np.float32),
+        "residuals": ((poses, vertices, 3), np.float32),
+    }
+
+
+STREAMED = ("pose_matrices", "residuals")
+"""The arrays that grow with the poses."""
+
+
+class RecordingWriter:
+    """Writes a recording pose by pose; use as a context manager.
+
+    Every `append` first brings the arrays to the disk, then the count of complete poses: an interruption at any
+    moment leaves a recording that resumes and holds no torn pose. Plain writes, not memory maps: a full disk is then
+    an error that can be reported.
+    """
+
+    def __init__(
+        self, path: Path, rig: Rig, partitions: tuple[Partition, ...], info: RecordingInfo, resume: bool = False
+    ):
+        """Start or resume a recording.
+
+        Args:
+            path: the folder; created when missing.
+            rig, partitions: what is recorded.
+            info: `complete` is ignored.
+            resume: continue the recording at `path` where it stopped.
+
+        Raises:
+            RecordingError: there is a recording already and `resume` is not set, or it is of something else.
+            OutputError: the folder cannot be written.
+        """
+        self.path, self.rig, self.partitions, self.info = path, rig, partitions, info
+        self.complete = 0
+        if (path / INDEX).exists():
+            if not resume:
+                raise RecordingError(
+                    f"'{path}' holds a recording already; continue it with --resume or choose another folder."
+                )
+            self.complete = self._check_resumable()
+        elif path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise OutputError(f"Cannot record into '{path}': it is not an empty folder; choose another.")
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            self._files = self._open_arrays()
+            self._write_index()
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def _check_resumable(self) -> int:
+        previous = read_index(self.path)
+        same = {**previous, "complete": 0} == {**self._index(), "complete": 0}
+        if not same:
+            keys = [key for key, value in self._index().items() if key != "complete" and previous.get(key) != value]
+            raise RecordingError(
+                f"Cannot resume '{self.path}': it was recorded with another {', '.join(keys)}; "
+                "record with the same rig and options, or into another folder."
+            )
+        return previous["complete"]
+
+    def _open_arrays(self) -> dict[str, io.BufferedRandom]:
+        shapes = array_shapes(
+            self.info.poses, len(self.rig.joints), self.rig.vertex_count, self.rig.skin_joints.shape[1]
+        )
+        files = {}
+        for name, (shape, dtype) in shapes.items():
+            path = self.path / f"{name}.npy"
+            if name not in STREAMED:
+                if not self.complete:
+                    np.save(path, getattr(self.rig, name).astype(dtype), allow_pickle=False)
+                continue
+            header = io.BytesIO()
+            np.lib.format.write_array_header_1_0(
+                header, {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape}
+            )
+            row = int(np.prod(shape[1:])) * np.dtype(dtype).itemsize
+            file = open(path, "r+b" if self.complete else "w+b")  # noqa: SIM115 - __exit__ closes it
+            file.write(header.getvalue())
+            file.truncate(len(header.getvalue()) + self.complete * row)
+            file.seek(0, os.SEEK_END)
+            # Ask for the whole space at once: a disk that is too small shows now, not an hour later.
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, len(header.getvalue()) + self.info.poses * row)
+            files[name] = file
+        return files
+
+    def _index(self) -> dict:
+        info = self.info
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "poses": info.poses,
+            "complete": self.complete,
+            "vertices": self.rig.vertex_count,
+            "influences": int(self.rig.skin_joints.shape[1]),
+            "units": {"length": "m", "angle": "rad"},
+            "blender": info.blender,
+            "rig": {
+                "file": info.rig_file,
+                "object": info.object_name,
+                "fingerprint": asdict(self.rig.fingerprint),
+            },
+            "joints": [asdict(joint) for joint in self.rig.joints],
+            "controls": [],
+            "partitions": [{"joint": p.joint, "influencing": list(p.influencing)} for p in self.partitions],
+            # Through JSON and back, so that it compares equal with what was read.
+            "sampling": json.loads(json.dumps(info.sampling.to_json())),
+        }
+
+    def _write_index(self) -> None:
+        write_json(self.path / INDEX, self._index())
+
+    def append(self, pose_matrices: np.ndarray, residuals: np.ndarray) -> None:
+        """Add poses.
+
+        Args:
+            pose_matrices: (n, J, 4, 4), mesh-object space, metres.
+            residuals: (n, V, 3), local residuals, metres.
+
+        Raises:
+            OutputError: the disk is full or went away; the poses before stay complete.
+            RecordingError: a value is not finite.
+        """
+        arrays = {"pose_matrices": pose_matrices, "residuals": residuals}
+        for name, array in arrays.items():
+            if not np.isfinite(array).all():
+                bad = int(np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))[0])
+                raise RecordingError(
+                    f"Pose {self.complete + bad} of the rig evaluates to values that are not numbers ({name}); "
+                    "look for a scale of zero or a broken driver."
+                )
+        try:
+            for name, array in arrays.items():
+                self._files[name].write(np.ascontiguousarray(array, np.float32).data)
+                self._files[name].flush()
+                os.fsync(self._files[name].fileno())
+        except OSError as error:
+            raise self._failed(error) from error
+        self.complete += len(pose_matrices)
+        self._write_index()
+
+    def _failed(self, error: OSError) -> OutputError:
+        return OutputError(
+            f"Cannot write the recording '{self.path}': {error.strerror or error}; "
+            f"{self.complete} of {self.info.poses} poses are complete, continue with --resume."
+        )
+
+    def __enter__(self) -> "RecordingWriter":
+        return self
+
+    def __exit__(self, *_) -> None:
+        for file in self._files.values():
+            file.close()
+
+
+def read_index(path: Path) -> dict:
+    """Read `recording.json` of a recording, complete or not, and check the types of its values.
+
+    Raises:
+        RecordingError: it is missing, damaged, or of another version.
+    """
+    index_path = path / INDEX
+    try:
+        if index_path.stat().st_size > MAX_INDEX_BYTES:
+            raise RecordingError(f"'{index_path}' is larger than {MAX_INDEX_BYTES >> 20} MB; it is no recording.")
+        index = json.loads(index_path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise RecordingError(f"'{path}' is not a recording: it has no {INDEX}; make one with record.") from error
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"'{index_path}' cannot be read ({error}); record again.") from error
+    if not isinstance(index, dict) or index.get("format") != FORMAT:
+        raise RecordingError(f"'{index_path}' is not the index of a recording; give a folder that record made.")
+    if index.get("version") != VERSION:
+        raise RecordingError(
+            f"'{path}' is a recording of version {index.get('version')!r} and this add-on reads version {VERSION}; "
+            "record again."
+        )
+    try:
+        _check_index(index)
+    except (KeyError, TypeError, ValueError, AssertionError) as error:
+        raise RecordingError(f"'{index_path}' is damaged ({error!r}); record again.") from error
+    return index
+
+
+def _check_index(index: dict) -> None:
+    for key in ("poses", "complete", "vertices", "influences"):
+        if type(index[key]) is not int or index[key] < 0:
+            raise ValueError(f"{key} is {index[key]!r}")
+    if index["complete"] > index["poses"] or not index["vertices"] or not index["influences"]:
+        raise ValueError("counts")
+    if index["controls"]:
+        raise ValueError("controls are not supported")
+    names = [str(joint["name"]) for joint in index["joints"]]
+    if len(set(names)) != len(names) or not names:
+        raise ValueError("joints")
+    for number, joint in enumerate(index["joints"]):
+        if type(joint["parent"]) is not int or not -1 <= joint["parent"] < number:
+            raise ValueError(f"parent of joint {joint['name']!r}")
+    for partition in index["partitions"]:
+        for joint in (partition["joint"], *partition["influencing"]):
+            if type(joint) is not int or not 0 <= joint < len(names):
+                raise ValueError(f"joint {joint!r} of a partition")
+    Fingerprint(**index["rig"]["fingerprint"])
+    _sampling(index["sampling"])
+
+
+def _sampling(value: dict) -> Sampling:
+    return Sampling(
+        int(value["seed"]),
+        float(value["spread"]),
+        tuple(Channel(**channel) for channel in value["limits"]),
+        tuple(Source(s["kind"], s["poses"], s["name"], tuple(s["frames"])) for s in value["sources"]),
+    )
+
+
+def read_recording(path: Path) -> Recording:
+    """Open a complete recording; the large arrays are memory maps.
+
+    Raises:
+        RecordingError: it is incomplete, truncated, of another version, holds values that are not numbers, or its
+            files contradict each other.
+    """
+    index = read_index(path)
+    if index["complete"] < index["poses"] or not index["poses"]:
+        raise RecordingError(
+            f"The recording '{path}' is incomplete: {index['complete']} of {index['poses']} poses; "
+            "finish it with record --resume."
+        )
+    shapes = array_shapes(index["poses"], len(index["joints"]), index["vertices"], index["influences"])
+    arrays = {name: _open_array(path / f"{name}.npy", *what) for name, what in shapes.items()}
+    joints = tuple(Joint(joint["name"], joint["parent"]) for joint in index["joints"])
+    rig = Rig(
+        joints,
+        *(np.array(arrays[name]) for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights")),
+        Fingerprint(**index["rig"]["fingerprint"]),
+    )
+    _check_skin(path, rig)
+    for name in STREAMED:
+        _check_finite(path, name, arrays[name])
+    partitions = make_partitions(rig, {p["joint"]: tuple(p["influencing"]) for p in index["partitions"]})
+    if [p.joint for p in partitions] != [p["joint"] for p in index["partitions"]]:
+        raise RecordingError(f"The partitions of '{path}' contradict its skin weights; record again.")
+    info = RecordingInfo(
+        index["poses"],
+        index["complete"],
+        str(index["rig"]["file"]),
+        str(index["rig"]["object"]),
+        str(index["blender"]),
+        _sampling(index["sampling"]),
+    )
+    return Recording(path, info, rig, partitions, arrays["pose_matrices"], arrays["residuals"])
+
+
+def _open_array(path: Path, shape: tuple, dtype: type) -> np.ndarray:
+    """Map an array after its size has been checked against what the index says."""
+    try:
+        with open(path, "rb") as file:
+            if np.lib.format.read_magic(file) != (1, 0):
+                raise ValueError("its npy version is not 1.0")
+            found_shape, fortran, found_dtype = np.lib.format.read_array_header_1_0(file)
+            if found_shape != shape or fortran or found_dtype != np.dtype(dtype):
+                raise ValueError(f"it holds {found_shape} {found_dtype}, not {shape} {np.dtype(dtype)}")
+            expected = file.tell() + int(np.prod(shape)) * np.dtype(dtype).itemsize
+        if path.stat().st_size < expected:
+            raise ValueError(f"it is truncated: {path.stat().st_size} of {expected} bytes")
+        return np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"'{path}' cannot be used: {error}; record again.") from error
+
+
+def _check_finite(path: Path, name: str, array: np.ndarray) -> None:
+    step = max(1, CHECK_BYTES // max(1, array[0].nbytes))
+    for start in range(0, len(array), step):
+        if not np.isfinite(array[start : start + step]).all():
+            raise RecordingError(
+                f"The recording '{path}' holds values that are not numbers ({name}, poses {start} to "
+                f"{min(start + step, len(array)) - 1}); record again."
+            )
+
+
+def _check_skin(path: Path, rig: Rig) -> None:
+    good = (
+        np.isfinite(rig.rest_positions).all()
+        and np.isfinite(rig.rest_matrices).all()
+        and (np.abs(np.linalg.det(rig.rest_matrices.astype(np.float64))) > 1e-12).all()
+        and rig.skin_joints.min() >= 0
+        and rig.skin_joints.max() < len(rig.joints)
+        and np.allclose(rig.skin_weights.sum(axis=1), 1, atol=1e-4)
+        and (rig.skin_weights >= 0).all()
+    )
+    if not good:
+        raise RecordingError(f"The rest pose or skin weights of '{path}' are damaged; record again.")

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The rig as arrays: joints, rest pose and skin weights of one mesh."""
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+REST_TOLERANCE = 1e-4
+"""Largest difference of a rest matrix element (metres, or no unit) at which two rest poses count as the same.
+
+Blender's versions compute a bone's matrix a few float32 steps apart, so the comparison cannot be exact."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint: the bone's name and the index of its parent joint, -1 for a root."""
+
+    name: str
+    parent: int
+
+
+@dataclass(frozen=True)
+class Fingerprint:
+    """Hashes that tell two rigs apart and say in what they differ. Equal for equal topology, rest and weights."""
+
+    topology: str
+    rest_positions: str
+    skin_weights: str
+
+    @staticmethod
+    def digest(*arrays: np.ndarray) -> str:
+        """Hash arrays by dtype, shape and bytes; 16 hexadecimal digits."""
+        digest = hashlib.sha256()
+        for array in arrays:
+            array = np.ascontiguousarray(array)
+            digest.update(f"{array.dtype.str}{array.shape}".encode())
+            digest.update(array.tobytes())
+        return digest.hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """One mesh, its joints and its linear skinning.
+
+    Attributes:
+        joints: J joints, every parent before its children.
+        rest_positions: (V, 3) float32, mesh-object space, metres.
+        rest_matrices: (J, 4, 4) float32, rest pose of the joints in mesh-object space, column vectors.
+        skin_joints: (V, I) int32, indices of the joints that a vertex follows; unused places hold 0.
+        skin_weights: (V, I) float32, their weights; each row sums to 1, unused places hold 0.
+        fingerprint: of topology, rest positions and weights.
+    """
+
+    joints: tuple[Joint, ...]
+    rest_positions: np.ndarray
+    rest_matrices: np.ndarray
+    skin_joints: np.ndarray
+    skin_weights: np.ndarray
+    fingerprint: Fingerprint
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return tuple(joint.name for joint in self.joints)
+
+    @property
+    def parents(self) -> np.ndarray:
+        """(J,) int32, the parent index of each joint, -1 for a root."""
+        return np.array([joint.parent for joint in self.joints], np.int32)
+
+    @property
+    def vertex_count(self) -> int:
+        return len(self.rest_positions)
+
+    @property
+    def size(self) -> float:
+        """Diagonal of the bounding box of the rest positions, metres."""
+        return float(np.linalg.norm(np.ptp(self.rest_positions, axis=0)))
+
+
+def differences(
+    joints: tuple[Joint, ...], rest_matrices: np.ndarray, vertex_count: int, fingerprint: Fingerprint, rig: Rig
+) -> list[str]:
+    """Say in what a rig differs from the one that a recording or model was made of.
+
+    Args:
+        joints, rest_matrices, vertex_count, fingerprint: what the file says, as in `Rig`.
+        rig: the rig at hand.
+
+    Returns:
+        One clause a difference ("it has 1443 vertices, the mesh 1450"); empty when the rigs are the same.
+    """
+    found = []
+    if vertex_count != rig.vertex_count:
+        found.append(f"it has {vertex_count} vertices, the mesh has {rig.vertex_count}")
+    theirs, ours = {j.name for j in joints}, set(rig.joint_names)
+    if theirs != ours:
+        if missing := sorted(theirs - ours):
+            found.append(f"the armature lacks {_names(missing)}")
+        if extra := sorted(ours - theirs):
+            found.append(f"it does not know {_names(extra)}")
+    elif joints != rig.joints:
+        found.append("its joints have other parents")
+    elif rest_matrices.shape != rig.rest_matrices.shape or (
+        np.abs(rest_matrices - rig.rest_matrices).max(initial=0) > REST_TOLERANCE
+    ):
+        found.append("the rest pose of the armature differs")
+    if not found:
+        for part, name in (
+            ("topology", "the topology of the mesh"),
+            ("rest_positions", "the rest pose of the mesh"),
+            ("skin_weights", "the skin weights"),
+        ):
+            if getattr(fingerprint, part) != getattr(rig.fingerprint, part):
+                found.append(f"{name} differ" + ("s" if part != "skin_weights" else ""))
+    return found
+
+
+def _names(names: list[str], most: int = 3) -> str:
+    shown = ", ".join(f"'{name}'" for name in names[:most])
+    return f"the {'joint' if len(names) == 1 else 'joints'} {shown}" + (
+        f" and {len(names) - most} more" if len(names) > most else ""
+    )

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Linear layer and local residuals.
+
+Matrices act on column vectors. A skin matrix is S_j = P_j B_j^-1, from the rest pose to the pose, both in
+mesh-object space (Bailey et al. 2018, section 3).
+"""
+
+import numpy as np
+
+from .partition import Partition, make_partitions
+from .rig import Rig
+
+
+def skin_matrices(pose_matrices: np.ndarray, rest_matrices: np.ndarray) -> np.ndarray:
+    """Skin matrices S_j = P_j B_j^-1.
+
+    Args:
+        pose_matrices: (N, J, 4, 4), mesh-object space, metres.
+        rest_matrices: (J, 4, 4), mesh-object space, metres.
+
+    Returns:
+        (N, J, 4, 4) float32.
+    """
+    return (pose_matrices @ np.linalg.inv(rest_matrices.astype(np.float64))).astype(np.float32)
+
+
+class SkinBlock:
+    """The linear skinning of one partition as one constant matrix.
+
+    With S the skin matrices of the joints that skin the partition side by side, `S @ weighted_rest` is the linear
+    layer of all its vertices: one product in place of a gather for each weight.
+
+    Attributes:
+        joints: (Jp,) int32, the joints that skin the partition.
+        weighted_rest: (4 Jp, Vp) float32, w_vj (x_v, 1), metres.
+    """
+
+    def __init__(self, rig: Rig, partition: Partition):
+        skin_joints = rig.skin_joints[partition.vertices]
+        skin_weights = rig.skin_weights[partition.vertices]
+        self.joints = np.unique(skin_joints[skin_weights > 0]).astype(np.int32)
+        dense = np.zeros((len(self.joints), len(partition.vertices)), np.float32)
+        for slot in range(skin_joints.shape[1]):
+            used = np.flatnonzero(skin_weights[:, slot] > 0)
+            dense[np.searchsorted(self.joints, skin_joints[used, slot]), used] += skin_weights[used, slot]
+        rest = np.concatenate(
+            [rig.rest_positions[partition.vertices], np.ones((len(partition.vertices), 1), np.float32)], axis=1
+        )
+        self.weighted_rest = (dense[:, None, :] * rest.T[None]).reshape(-1, len(partition.vertices))
+
+
+class LinearLayer:
+    """Linear blend skinning of a rig, and the local residuals beside it."""
+
+    def __init__(self, rig: Rig, partitions: tuple[Partition, ...] | None = None):
+        self.rig = rig
+        self.partitions = make_partitions(rig) if partitions is None else partitions
+        self._blocks = [SkinBlock(rig, partition) for partition in self.partitions]
+
+    def positions(self, pose_matrices: np.ndarray) -> np.ndarray:
+        """Skin the mesh.
+
+        Args:
+            pose_matrices: (N, J, 4, 4), mesh-object space, metres.
+
+        Returns:
+            (N, V, 3) float32, mesh-object space, metres.
+        """
+        skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
+        out = np.empty((len(skin), self.rig.vertex_count, 3), np.float32)
+        for partition, block in zip(self.partitions, self._blocks, strict=True):
+            rows = skin[:, block.joints].transpose(0, 2, 1, 3).reshape(len(skin), 3, -1)
+            out[:, partition.vertices] = (rows @ block.weighted_rest).transpose(0, 2, 1)
+        return out
+
+    def local_residuals(self, pose_matrices: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """Residuals in the frames of the main joints, l_v = R_m^-1 (complex_v - lin_v).
+
+        Args:
+            pose_matrices: (N, J, 4, 4), mesh-object space, metres.
+            positions: (N, V, 3), what the rig evaluates to, mesh-object space, metres.
+
+        Returns:
+            (N, V, 3) float32, metres.
+
+        Raises:
+            numpy.linalg.LinAlgError: a joint's matrix is singular (a scale of zero).
+        """
+        residuals = positions - self.positions(pose_matrices)
+        skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :3]
+        inverse = np.linalg.inv(skin)
+        for partition in self.partitions:
+            local = residuals[:, partition.vertices] @ inverse[:, partition.joint].transpose(0, 2, 1)
+            residuals[:, partition.vertices] = local
+        return residuals
+
+    def complex_positions(self, pose_matrices: np.ndarray, local_residuals: np.ndarray) -> np.ndarray:
+        """The inverse of `local_residuals`: lin_v + R_m l_v.
+
+        Args and returns as there: (N, J, 4, 4) and (N, V, 3) in, (N, V, 3) float32 in mesh-object space out.
+        """
+        positions = self.positions(pose_matrices)
+        skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :3]
+        for partition in self.partitions:
+            turned = local_residuals[:, partition.vertices] @ skin[:, partition.joint].transpose(0, 2, 1)
+            positions[:, partition.vertices] += turned
+        return positions
