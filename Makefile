@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+# Every target is a line or two that a person could type; `setup/environment` is what they have in common.
+# .venv holds everything on the newer Python that runs, .venv-4.5 and .venv-5.2 one Blender LTS line without the trainer.
+
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+PYTHON_4.5 = 3.11
+PYTHON_5.2 = 3.13
+OTHER_LINE = $$(.venv/bin/python -c 'import sys; print("4.5" if sys.version_info >= (3, 13) else "5.2")')
+
+# Where torch is. Blender's Python, or a line's environment, starts this one for training.
+export FDDA_TRAINER_PYTHON ?= $(CURDIR)/.venv/bin/python
+
+help:  ## show this list
+	@sed -n 's/^\([a-z-]*\):.*  ## /\1\t/p' $(MAKEFILE_LIST) | while IFS='	' read -r name text; do printf '  make %-14s %s\n' "$$name" "$$text"; done
+	@echo '  PYTHON=/path/to/python3.13 or 3.11 names the Python to use; otherwise one that runs is looked for.'
+
+.venv:
+	@setup/environment .venv everything
+
+demo: .venv  ## the arm from rig to playback, into out/demo
+	.venv/bin/python -m fdda_addon.demo out/demo
+
+test: test-core test-trainer test-blender  ## all three tiers of tests, on one Blender LTS line
+
+test-core: .venv  ## the tests that need no Blender and take seconds
+	.venv/bin/python -m pytest tests/core tests/contract
+
+test-trainer: .venv  ## the tests of the training, export and report
+	.venv/bin/python -m pytest tests/trainer
+
+test-blender: .venv  ## the tests that run in Blender
+	.venv/bin/python -m pytest tests/blender
+
+test-all: test  ## as test, and the core and Blender tiers on the other LTS line
+	@$(MAKE) test-line LINE=$(OTHER_LINE)
+
+test-line: .venv-line .venv  ## the core and Blender tiers on LINE=4.5 or LINE=5.2
+	.venv-$(LINE)/bin/python -m pytest tests/core tests/contract
+	.venv-$(LINE)/bin/python -m pytest tests/blender
+
+.venv-line:
+	@setup/environment .venv-$(LINE) blender $(or $(PYTHON_$(LINE)),$(error LINE is 4.5 or 5.2))
+
+fixtures:  ## build the rigs in blend_fixtures again, with the oldest Blender under test
+	@$(MAKE) .venv-line LINE=4.5
+	.venv-4.5/bin/python blend_fixtures/make_fixtures.py
+
+lint: .venv  ## ruff's checks and formatting
+	.venv/bin/ruff check
+	.venv/bin/ruff format --check
+
+extension: .venv  ## dist/fdda-VERSION.zip, to install in Blender (PLATFORM=linux-x64)
+	.venv/bin/python setup/build_extension.py $(PLATFORM)
+
+requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
+	for version in 3.11 3.13; do .venv/bin/uv pip compile --quiet --no-annotate \
+		--python-version $$version --python-platform x86_64-manylinux_2_28 --custom-compile-command 'make requirements' \
+		--group blender --group trainer --group test --group lint --group setup \
+		--output-file requirements/python-$$version.txt || exit; done
+
+clean:  ## remove what was built and the environments
+	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache
+
+.PHONY: help .venv .venv-line demo test test-core test-trainer test-blender test-all test-line fixtures lint extension requirements clean
