@@ -79,7 +79,8 @@ def check_system_libraries() -> None:
         except OSError:
             missing.append(package)
     if missing:
-        raise SetupError(f"Blender needs system libraries that are missing; as root: apt-get install {' '.join(missing)}")
+        packages = " ".join(missing)
+        raise SetupError(f"Blender needs system libraries that are missing; as root: apt-get install {packages}")
 
 
 def uv_environment(python: Path) -> dict[str, str]:
