@@ -17,6 +17,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 STAMP = "fdda-complete"
+SYSTEM_LIBRARIES = ROOT / "setup" / "system-libraries.txt"
 
 # The dependency groups of pyproject.toml that an environment holds, and the imports that prove that it works.
 CONTENTS = {
@@ -63,14 +64,14 @@ def is_current(folder: Path, contents: str, python: str) -> bool:
     return stamp.is_file() and stamp.read_text() == fingerprint(contents)
 
 
-def check_system_libraries() -> None:
+def check_system_libraries(listing: Path = SYSTEM_LIBRARIES) -> None:
     """Ask before hundreds of megabytes are fetched, not after.
 
     Raises:
         SetupError: naming the Debian packages of all the libraries that cannot be loaded.
     """
     missing = []
-    for line in (ROOT / "setup" / "system-libraries.txt").read_text().splitlines():
+    for line in listing.read_text().splitlines():
         if line.startswith("#"):
             continue
         library, package = line.split()

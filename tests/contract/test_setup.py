@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The set-up: which Python it takes, what it says when there is none, and when an environment counts as complete."""
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PINS = {version: (ROOT / f"requirements/python-{version}.txt").read_text() for version in ("3.11", "3.13")}
+
+
+def load(name: str) -> ModuleType:
+    """A script of setup/ as a module."""
+    spec = importlib.util.spec_from_file_location(f"setup_{name}", ROOT / "setup" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+environment = load("environment")
+build_extension = load("build_extension")
+
+
+def script(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return path
+
+
+def set_up(tmp_path: Path, version: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run setup/environment for a Python version that no machine has, unless the test put it into tmp_path."""
+    clean = {"PATH": f"{tmp_path}/bin:/usr/bin:/bin", "HOME": str(tmp_path), "PYENV_ROOT": f"{tmp_path}/pyenv"}
+    command = [ROOT / "setup/environment", tmp_path / "venv", "blender", version]
+    return subprocess.run(command, env=clean | variables, capture_output=True, text=True, check=False)
+
+
+def test_without_a_python_one_sentence_names_the_packages(tmp_path: Path):
+    result = set_up(tmp_path, "3.99")
+    assert result.returncode == 3 and result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert "Python 3.99" in result.stderr and "python3.11-venv" in result.stderr
+
+
+def test_a_python_without_its_venv_module_is_named_with_the_package(tmp_path: Path):
+    script(tmp_path / "bin/python3.99", "exit 3")
+    result = set_up(tmp_path, "3.99")
+    assert result.returncode == 3
+    assert result.stderr.count("\n") == 1
+    assert "apt-get install python3.99-venv libx11-6" in result.stderr
+
+
+def test_a_name_on_path_that_does_not_run_is_passed_over(tmp_path: Path):
+    script(tmp_path / "bin/python3.99", "echo 'this version is not selected' >&2; exit 127")
+    real = script(tmp_path / "real/python", 'echo "set up by the real one: $*"')
+    script(tmp_path / "pyenv/versions/3.99.1/bin/python", f"echo {real}")
+    result = set_up(tmp_path, "3.99")
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == f"set up by the real one: setup/environment.py make {tmp_path}/venv blender\n"
+
+
+def test_a_python_that_is_asked_for_must_fit(tmp_path: Path):
+    wrong = script(tmp_path / "python", "exit 2")
+    command = [ROOT / "setup/environment", tmp_path / "venv", "everything"]
+    result = subprocess.run(command, env=os.environ | {"PYTHON": wrong}, capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert f"PYTHON={wrong} is not a Python 3.13 or 3.11" in result.stderr
+
+
+def test_a_missing_system_library_is_named_with_its_package(tmp_path: Path):
+    listing = tmp_path / "libraries.txt"
+    listing.write_text("# comment\nlibc.so.6 libc6\nlibfdda-missing.so.1 libfdda1\nlibfdda-gone.so.2 libfdda2\n")
+    with pytest.raises(environment.SetupError, match="apt-get install libfdda1 libfdda2"):
+        environment.check_system_libraries(listing)
+
+
+def test_an_environment_counts_only_with_the_stamp_of_these_requirements(tmp_path: Path):
+    python = os.path.realpath(sys.executable)
+    assert not environment.is_current(tmp_path, "blender", "")
+    (tmp_path / environment.STAMP).write_text(environment.fingerprint("blender"))
+    assert environment.is_current(tmp_path, "blender", "")
+    assert environment.is_current(tmp_path, "blender", python)
+    assert not environment.is_current(tmp_path, "blender", "/usr/bin/another-python")
+    assert not environment.is_current(tmp_path, "everything", "")
+
+
+def test_a_set_up_that_fails_leaves_no_stamp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / environment.STAMP).write_text(environment.fingerprint("blender"))
+    monkeypatch.setattr(sys, "executable", script(tmp_path / "python", "exit 1"))
+    monkeypatch.setattr(environment, "check_system_libraries", lambda: None)
+    with pytest.raises(environment.SetupError, match="could not be made a virtual environment"):
+        environment.make(tmp_path, "blender")
+    assert not (tmp_path / environment.STAMP).exists()
+
+
+def test_uv_is_told_what_pip_was_told(monkeypatch: pytest.MonkeyPatch):
+    for name in environment.UV_SETTINGS.values():
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PIP_INDEX_URL", "file:///mirror/simple")
+    monkeypatch.setenv("PIP_EXTRA_INDEX_URL", "file:///a file:///b")
+    monkeypatch.setenv("PIP_FIND_LINKS", "/wheels /more")
+    monkeypatch.setenv("PIP_CERT", "/from/pip.pem")
+    monkeypatch.setenv("SSL_CERT_FILE", "/of/its/own.pem")
+    told = environment.uv_environment(Path(sys.executable))
+    assert told["UV_DEFAULT_INDEX"] == "file:///mirror/simple"
+    assert told["UV_INDEX"] == "file:///a file:///b"
+    assert told["UV_FIND_LINKS"] == "/wheels,/more"
+    assert told["SSL_CERT_FILE"] == "/of/its/own.pem"
+
+
+@pytest.mark.parametrize("version", PINS)
+def test_every_package_is_pinned_and_nothing_else_is_said(version: str):
+    lines = [line for line in PINS[version].splitlines() if not line.startswith("#")]
+    assert len(lines) > 20
+    assert [line for line in lines if not re.fullmatch(r"[a-z0-9.-]+==[a-z0-9.]+", line)] == []
+
+
+@pytest.mark.parametrize("version", PINS)
+def test_the_pins_are_what_the_project_asks_for(version: str):
+    asked = [requirement for group in PROJECT["dependency-groups"].values() for requirement in group]
+    for requirement in asked:
+        package, _, marker = requirement.partition("; ")
+        if marker in ("", f"python_version == '{version}'"):
+            assert re.search(rf"^{re.escape(package)}(==|$)", PINS[version], re.MULTILINE), requirement
+
+
+def test_the_groups_of_an_environment_exist():
+    for groups, _ in environment.CONTENTS.values():
+        assert set(groups) <= set(PROJECT["dependency-groups"])
+
+
+def test_make_alone_prints_a_line_for_each_target():
+    # Without the flags that a make around these tests hands down.
+    outside = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+    shown = subprocess.run(["make"], cwd=ROOT, env=outside, capture_output=True, text=True, check=True).stdout
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert {"demo", "test", "test-all", "lint", "extension"} <= set(targets)
+    assert [target for target in targets if f"  make {target} " not in shown] == []
+
+
+def test_the_extension_is_staged_as_blender_expects_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(build_extension, "STAGE", tmp_path / "stage")
+    wheel = tmp_path / "onnxruntime-1-cp311-cp311-linux.whl"
+    wheel.write_bytes(b"wheel")
+    build_extension.stage(["linux-x64"], [wheel])
+    manifest = tomllib.loads((tmp_path / "stage/blender_manifest.toml").read_text())
+    assert manifest["version"] == PROJECT["project"]["version"]
+    assert manifest["platforms"] == ["linux-x64"]
+    assert [(tmp_path / "stage" / path).read_bytes() for path in manifest["wheels"]] == [b"wheel"]
+    assert manifest["permissions"]["files"]
+    assert "from .fdda_addon import register" in (tmp_path / "stage/__init__.py").read_text()
+    assert (tmp_path / "stage/trainer/__init__.py").is_file()
