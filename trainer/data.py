@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the networks are trained on: features and coefficients of each partition."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
+from fdda_addon.core.recording import Recording
+
+from .basis import Basis, make_basis
+
+LEAST_POSES = 10
+LEAST_SPREAD = 1e-5
+"""A feature that spreads less than this over the training poses counts as constant (no unit, or metres)."""
+
+
+@dataclass(frozen=True)
+class PartitionData:
+    """Features and residuals of one partition, from a recording or from elsewhere.
+
+    Attributes:
+        name: of the main joint.
+        features: (N, F) float32, what the network sees of each pose; F may be 0.
+        read_residuals: gives the (N, Vp, 3) float32 local residuals, metres; called once, so that not all
+            partitions need to be in memory at a time.
+        vertices: Vp.
+    """
+
+    name: str
+    features: np.ndarray
+    read_residuals: Callable[[], np.ndarray]
+    vertices: int
+
+
+@dataclass(frozen=True)
+class Split:
+    """Indices of the poses that train and of those that validate, ascending."""
+
+    training: np.ndarray
+    validation: np.ndarray
+
+
+@dataclass(frozen=True)
+class PreparedPartition:
+    """A partition, ready to train.
+
+    Attributes:
+        name: of the main joint.
+        vertices: Vp.
+        columns: (F',) int32, the features that vary over the training poses and that the network sees.
+        feature_mean, feature_scale: (F',) float32, mean and standard deviation over the training poses.
+        inputs: (N, F') float32, standardised features of all poses.
+        basis: of the residuals of the training poses.
+        coefficients: (N, K) float32, of all poses, metres.
+        residual_rms: rms distance over training poses and vertices before training, about the mean, metres.
+        validation_truncation: (n,) rms distance over the vertices that the basis leaves of each validation pose,
+            metres.
+    """
+
+    name: str
+    vertices: int
+    columns: np.ndarray
+    feature_mean: np.ndarray
+    feature_scale: np.ndarray
+    inputs: np.ndarray
+    basis: Basis
+    coefficients: np.ndarray
+    residual_rms: float
+    validation_truncation: np.ndarray
+
+
+def split_poses(poses: int, validation_fraction: float, seed: int) -> Split:
+    """Choose the validation poses at random.
+
+    Raises:
+        TrainingError: there are too few poses.
+    """
+    if poses < LEAST_POSES:
+        raise TrainingError(f"The recording has {poses} poses and training takes at least {LEAST_POSES}; record more.")
+    order = np.random.default_rng([seed, 1]).permutation(poses)
+    count = max(1, round(poses * validation_fraction))
+    return Split(np.sort(order[count:]), np.sort(order[:count]))
+
+
+def partitions_of(recording: Recording) -> list[PartitionData]:
+    """The partitions of a recording; the features are those of the influencing joints."""
+    rig = recording.rig
+    features = joint_features(recording.pose_matrices, rig.rest_matrices, rig.parents)
+    return [
+        PartitionData(
+            rig.joints[partition.joint].name,
+            features[:, list(partition.influencing)].reshape(len(features), -1),
+            lambda vertices=partition.vertices: recording.residuals[:, vertices],
+            len(partition.vertices),
+        )
+        for partition in recording.partitions
+    ]
+
+
+def feature_columns(influencing: Sequence[int]) -> np.ndarray:
+    """Where the features of a partition stand in the (J * 12) features of all joints, in the same order."""
+    joints = np.asarray(influencing, np.int64)
+    return (joints[:, None] * FEATURES_PER_JOINT + np.arange(FEATURES_PER_JOINT)).ravel()
+
+
+def prepare(partition: PartitionData, split: Split, tolerance_mm: float, seed: int) -> PreparedPartition:
+    """Standardise the features of a partition and turn its residuals into coefficients.
+
+    Everything is measured on the training poses alone. A partition that sees no varying feature gets no shapes: its
+    mean is the best that can be said of it.
+    """
+    features = partition.features
+    training = features[split.training].astype(np.float64)
+    scale = training.std(axis=0)
+    columns = np.flatnonzero(scale > LEAST_SPREAD).astype(np.int32)
+    mean = training[:, columns].mean(axis=0).astype(np.float32)
+    scale = scale[columns].astype(np.float32)
+    residuals = np.asarray(partition.read_residuals(), np.float32).reshape(len(features), -1)
+    tolerance = tolerance_mm / 1000 if len(columns) else np.inf
+    basis = make_basis(residuals[split.training], tolerance, np.random.default_rng([seed, 2]))
+    coefficients = basis.coefficients(residuals)
+    held_out = residuals[split.validation] - basis.residuals(coefficients[split.validation])
+    spread = residuals[split.training].std(axis=0, dtype=np.float64)
+    return PreparedPartition(
+        partition.name,
+        partition.vertices,
+        columns,
+        mean,
+        scale,
+        (features[:, columns] - mean) / scale,
+        basis,
+        coefficients,
+        float(np.sqrt((spread**2).sum() / partition.vertices)),
+        np.sqrt((held_out**2).sum(axis=1) / partition.vertices),
+    )

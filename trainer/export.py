@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Writes the model and compares it with what was trained."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+
+from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.features import joint_features
+from fdda_addon.core.metrics import distances, error_statistics
+from fdda_addon.core.model import METADATA_KEY, POSE_INPUT, POSITIONS_OUTPUT, ModelInfo, ModelPartition, read_model_info
+from fdda_addon.core.output import replacing
+from fdda_addon.core.recording import Recording
+from fdda_addon.core.skinning import LinearLayer
+
+from .graph import Deformation, build_graph, standardisation
+from .model import ACTIVATIONS
+
+MOST_DIFFERENCE = 1e-5
+"""Metres. An export whose positions differ more from the reference fails; scaled up for rigs larger than a metre."""
+BLOCK_FLOATS = 1 << 24
+"""Poses are evaluated in blocks of so many coordinates."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Distances to the recorded positions, in metres, vertices in mesh order.
+
+    Attributes:
+        fdda, linear: (n, V) float32, of the model and of the linear layer alone.
+    """
+
+    fdda: np.ndarray
+    linear: np.ndarray
+
+
+def reference_positions(deformation: Deformation, pose_matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What the model must play, computed by another way: core's features and linear layer, and the networks in PyTorch.
+
+    Args:
+        deformation: what was trained.
+        pose_matrices: (N, J, 4, 4), mesh-object space, metres.
+
+    Returns:
+        (N, V, 3) float32 positions, mesh-object space, metres, and (N, P) float32 trust.
+    """
+    rig, trust_range = deformation.rig, deformation.trust
+    features = joint_features(pose_matrices, rig.rest_matrices, rig.parents)
+    trust = trust_range.trust(features)
+    mean, scale = standardisation(deformation)
+    clamped = np.clip(features, trust_range.low, trust_range.high).reshape(len(features), -1)
+    inputs = ((clamped - mean) / scale).astype(np.float32).reshape(features.shape)
+    local = np.zeros((len(features), rig.vertex_count, 3), np.float32)
+    activation = ACTIVATIONS[deformation.activation]
+    for number, (partition, prepared, network) in enumerate(
+        zip(deformation.partitions, deformation.prepared, deformation.networks, strict=True)
+    ):
+        own = inputs[:, list(partition.influencing)].reshape(len(features), -1)[:, prepared.columns]
+        values = torch.from_numpy(own)
+        for layer, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+            values = torch.addmm(torch.from_numpy(bias), values, torch.from_numpy(weight))
+            if layer < len(network.weights) - 1:
+                values = activation(values)
+        residuals = prepared.basis.residuals(values.numpy()) * trust[:, number, None]
+        local[:, partition.vertices] = residuals.reshape(len(features), -1, 3)
+    return LinearLayer(rig, deformation.partitions).complex_positions(pose_matrices, local), trust
+
+
+def open_session(model: bytes) -> onnxruntime.InferenceSession:
+    """An ONNX Runtime session on the CPU.
+
+    Raises:
+        TrainingError: ONNX Runtime refuses the model.
+    """
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's exceptions share no base but this one
+        raise TrainingError(f"ONNX Runtime {onnxruntime.__version__} refuses the exported model: {error}") from error
+
+
+def measure(
+    session: onnxruntime.InferenceSession, recording: Recording, deformation: Deformation, poses: np.ndarray
+) -> Measured:
+    """Errors of the exported model on poses of the recording, through the whole pipeline."""
+    vertices = recording.rig.vertex_count
+    fdda, linear = (np.empty((len(poses), vertices), np.float32) for _ in range(2))
+    layer = LinearLayer(recording.rig, deformation.partitions)
+    for block in _blocks(len(poses), vertices):
+        matrices = np.array(recording.pose_matrices[poses[block]])
+        residuals = np.array(recording.residuals[poses[block]])
+        truth = layer.complex_positions(matrices, residuals)
+        (positions,) = session.run([POSITIONS_OUTPUT], {POSE_INPUT: matrices})
+        fdda[block] = distances(positions, truth)
+        linear[block] = distances(layer.positions(matrices), truth)
+    return Measured(fdda, linear)
+
+
+def check_parity(
+    session: onnxruntime.InferenceSession, recording: Recording, deformation: Deformation, poses: np.ndarray
+) -> float:
+    """Compare the exported model with `reference_positions`.
+
+    Returns:
+        The largest difference of a position, metres.
+
+    Raises:
+        TrainingError: it is too large, or the model gives values that are not numbers.
+    """
+    largest = 0.0
+    for block in _blocks(len(poses), recording.rig.vertex_count):
+        matrices = np.array(recording.pose_matrices[poses[block]])
+        positions, trust = session.run(None, {POSE_INPUT: matrices})
+        expected, expected_trust = reference_positions(deformation, matrices)
+        difference = max(float(distances(positions, expected).max()), 0.0)
+        if not np.isfinite(positions).all() or not np.isfinite(trust).all():
+            raise TrainingError("The exported model gives values that are not numbers; train with other settings.")
+        if np.abs(trust - expected_trust).max(initial=0) > 1e-3:
+            raise TrainingError("The trust of the exported model differs from PyTorch; this is a defect, report it.")
+        largest = max(largest, difference)
+    allowed = MOST_DIFFERENCE * max(1.0, recording.rig.size)
+    if largest > allowed:
+        raise TrainingError(
+            f"The exported model differs from PyTorch by {largest * 1000:.3g} mm, more than the allowed "
+            f"{allowed * 1000:.3g} mm; train with a larger weight decay or a smaller learning rate."
+        )
+    return largest
+
+
+def model_info(recording: Recording, deformation: Deformation, held_out: np.ndarray, training: dict) -> ModelInfo:
+    """The metadata of a model; the parity is filled in when it has been measured.
+
+    Args:
+        recording, deformation: what was trained, on what.
+        held_out: distances of the validation poses, metres.
+        training: settings, versions and times.
+    """
+    rig = recording.rig
+    return ModelInfo(
+        rig.joints,
+        rig.rest_matrices,
+        rig.vertex_count,
+        rig.fingerprint,
+        tuple(
+            ModelPartition(p.joint, p.influencing, len(p.vertices), len(prepared.basis.shapes))
+            for p, prepared in zip(deformation.partitions, deformation.prepared, strict=True)
+        ),
+        deformation.trust.low,
+        deformation.trust.high,
+        error_statistics(held_out).to_json(),
+        0.0,
+        training,
+    )
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A model that has passed its checks: the bytes of the file, its metadata, and its held-out errors."""
+
+    content: bytes
+    info: ModelInfo
+    held_out: Measured
+    session: onnxruntime.InferenceSession
+
+
+def build_model(recording: Recording, deformation: Deformation, validation: np.ndarray, training: dict) -> Exported:
+    """Build the model, compare it with what was trained, and measure it; nothing is written.
+
+    Args:
+        recording, deformation: what was trained, on what.
+        validation: indices of the held-out poses.
+        training: settings, versions and times for the metadata.
+
+    Raises:
+        TrainingError: the model does not agree with what was trained.
+    """
+    model = build_graph(deformation)
+    onnx.checker.check_model(model)
+    session = open_session(model.SerializeToString())
+    parity = check_parity(session, recording, deformation, validation)
+    measured = measure(session, recording, deformation, validation)
+    info = replace(model_info(recording, deformation, measured.fdda, training), parity_mm=parity * 1000)
+    model.metadata_props.add(key=METADATA_KEY, value=info.to_json())
+    return Exported(model.SerializeToString(), info, measured, session)
+
+
+def write_model(path: Path, content: bytes) -> None:
+    """Write the model, and read it back as the add-on will, before it replaces what is there.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+        read_model_info(temporary)
+
+
+def _blocks(poses: int, vertices: int) -> list[slice]:
+    step = max(1, BLOCK_FLOATS // (3 * vertices))
+    return [slice(start, start + step) for start in range(0, poses, step)]

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The training loop: all partitions at once."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from .config import TrainingConfig
+from .data import PreparedPartition, Split
+from .model import PartitionNetworks
+
+WARM_UP = 0.15
+"""Part of the steps in which the learning rate rises."""
+
+
+class Cancelled(Exception):  # noqa: N818 - no error
+    """The training was asked to stop."""
+
+
+@dataclass(frozen=True)
+class Network:
+    """The trained network of one partition, in numpy.
+
+    Attributes:
+        weights: one (in, out) float32 a layer; standardised features in, coefficients in metres out.
+        biases: one (out,) float32 a layer.
+    """
+
+    weights: tuple[np.ndarray, ...]
+    biases: tuple[np.ndarray, ...]
+
+
+@dataclass
+class Curves:
+    """Errors of one partition by epoch: means over poses of the rms distance over vertices, mm."""
+
+    training_mm: list[float] = field(default_factory=list)
+    validation_mm: list[float] = field(default_factory=list)
+    best_epoch: int = 0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What is known after an epoch: 1 is the first; mean of the validation errors over all vertices, mm."""
+
+    epoch: int
+    epochs: int
+    validation_mm: float
+
+
+@dataclass(frozen=True)
+class Trained:
+    """Result of a training, a network and curves for each partition; a network without outputs for a constant one."""
+
+    networks: tuple[Network, ...]
+    curves: tuple[Curves, ...]
+
+
+def choose_device() -> torch.device:
+    """The GPU when torch sees one."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def train(
+    partitions: Sequence[PreparedPartition],
+    split: Split,
+    config: TrainingConfig,
+    device: torch.device | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Trained:
+    """Train the networks of all partitions together.
+
+    Args:
+        partitions: their inputs and coefficients hold all poses of the split.
+        split: which poses train and which validate.
+        config: the settings; equal settings and data give equal weights on one machine.
+        device: to train on; `choose_device()` when left out.
+        progress: called after every epoch.
+        should_stop: asked before every step.
+
+    Raises:
+        Cancelled: `should_stop` said so.
+    """
+    device = device or choose_device()
+    learning = [number for number, partition in enumerate(partitions) if len(partition.basis.shapes)]
+    curves = tuple(Curves() for _ in partitions)
+    networks = [Network((np.zeros((len(p.columns), 0), np.float32),), (np.zeros(0, np.float32),)) for p in partitions]
+    if learning:
+        loop = _Loop([partitions[number] for number in learning], split, config, device)
+        loop.run([curves[number] for number in learning], progress, should_stop, partitions)
+        for number, network in zip(learning, loop.best_networks(), strict=True):
+            networks[number] = network
+    return Trained(tuple(networks), curves)
+
+
+class _Loop:
+    """State of one training."""
+
+    def __init__(self, partitions: list[PreparedPartition], split: Split, config: TrainingConfig, device: torch.device):
+        self.partitions, self.config, self.device = partitions, config, device
+        # Each partition's coefficients in units of its own residual, so that one loss and one rate suit all.
+        self.scales = [partition.residual_rms * np.sqrt(partition.vertices) for partition in partitions]
+        inputs = [p.inputs for p in partitions]
+        targets = [p.coefficients / scale for p, scale in zip(partitions, self.scales, strict=True)]
+        self.x, self.y = (_padded(arrays, split.training, device) for arrays in (inputs, targets))
+        self.x_held, self.y_held = (_padded(arrays, split.validation, device) for arrays in (inputs, targets))
+        self.to_mm = torch.tensor([p.residual_rms * 1000 for p in partitions], device=device)[:, None]
+        self.truncation_mm = torch.tensor(
+            np.stack([p.validation_truncation for p in partitions]) * 1000, dtype=torch.float32, device=device
+        )
+        self.model = PartitionNetworks(
+            [a.shape[1] for a in inputs],
+            [a.shape[1] for a in targets],
+            config.hidden,
+            config.activation,
+            config.dropout,
+            torch.Generator().manual_seed(config.seed),
+        ).to(device)
+        self.averaged = [parameter.detach().clone() for parameter in self.model.parameters()]
+        self.best = [average.clone() for average in self.averaged]
+        self.best_mm = torch.full((len(partitions),), torch.inf, device=device)
+
+    def run(
+        self,
+        curves: list[Curves],
+        progress: Callable[[Progress], None] | None,
+        should_stop: Callable[[], bool],
+        everything: Sequence[PreparedPartition],
+    ) -> None:
+        config, poses = self.config, self.x.shape[1]
+        steps = -(-poses // config.batch_size)
+        optimizer = torch.optim.AdamW(
+            self.model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
+        )
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimizer, config.learning_rate, total_steps=config.epochs * steps, pct_start=WARM_UP
+        )
+        order_generator = torch.Generator().manual_seed(config.seed + 1)
+        drop_generator = torch.Generator(self.device).manual_seed(config.seed + 2)
+        vertices = np.array([p.vertices for p in everything])
+        constant = [p for p in everything if not len(p.basis.shapes)]
+        constant_mm = sum(float(p.validation_truncation.mean()) * 1000 * p.vertices for p in constant)
+        learning_vertices = np.array([p.vertices for p in self.partitions])
+        for epoch in range(1, config.epochs + 1):
+            order = torch.randperm(poses, generator=order_generator).to(self.device)
+            training_mm = torch.zeros(len(self.partitions), device=self.device)
+            for step in range(steps):
+                if should_stop():
+                    raise Cancelled
+                batch = order[step * config.batch_size : (step + 1) * config.batch_size]
+                errors = self._step(optimizer, batch, drop_generator)
+                schedule.step()
+                self._average((epoch - 1) * steps + step)
+                training_mm += (errors.sqrt() * self.to_mm).sum(dim=1)
+            held_mm = self._validate()
+            self._keep_best(held_mm, epoch, curves)
+            held = held_mm.cpu().numpy()
+            for curve, train_mm, validation_mm in zip(curves, (training_mm / poses).tolist(), held, strict=True):
+                curve.training_mm.append(train_mm)
+                curve.validation_mm.append(float(validation_mm))
+            if progress:
+                mean = (float(held @ learning_vertices) + constant_mm) / vertices.sum()
+                progress(Progress(epoch, config.epochs, mean))
+            if config.patience and epoch - max(curve.best_epoch for curve in curves) >= config.patience:
+                break
+
+    def _step(self, optimizer: torch.optim.Optimizer, batch: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """One step; returns (P, n) squared errors of the poses relative to the partition's residual."""
+        optimizer.zero_grad(set_to_none=True)
+        difference = self.model(self.x[:, batch], generator) - self.y[:, batch]
+        errors = difference.square().sum(dim=2)
+        # Summed over partitions: each network then has the gradient that it would have alone.
+        loss = errors.mean(dim=1).sum()
+        if self.config.l1:
+            loss = loss + self.config.l1 * sum(weight.abs().sum() for weight in self.model.weights)
+        if self.config.l2:
+            loss = loss + self.config.l2 * sum(weight.square().sum() for weight in self.model.weights)
+        loss.backward()
+        optimizer.step()
+        return errors.detach()
+
+    @torch.no_grad()
+    def _average(self, step: int) -> None:
+        """Move the running average of the weights; fast in the first steps, where they change most."""
+        decay = min(self.config.averaging, (1 + step) / (10 + step)) if self.config.averaging else 0.0
+        torch._foreach_lerp_(self.averaged, list(self.model.parameters()), 1 - decay)
+
+    @torch.no_grad()
+    def _validate(self) -> torch.Tensor:
+        """(P,) mean error of the validation poses with the averaged weights, mm."""
+        own = [parameter.data for parameter in self.model.parameters()]
+        for parameter, average in zip(self.model.parameters(), self.averaged, strict=True):
+            parameter.data = average
+        squared = (self.model(self.x_held) - self.y_held).square().sum(dim=2) * self.to_mm.square()
+        for parameter, data in zip(self.model.parameters(), own, strict=True):
+            parameter.data = data
+        return (squared + self.truncation_mm.square()).sqrt().mean(dim=1)
+
+    def _keep_best(self, held_mm: torch.Tensor, epoch: int, curves: list[Curves]) -> None:
+        better = held_mm < self.best_mm
+        self.best_mm = torch.where(better, held_mm, self.best_mm)
+        for best, average in zip(self.best, self.averaged, strict=True):
+            best[better] = average[better]
+        for number in torch.nonzero(better).flatten().tolist():
+            curves[number].best_epoch = epoch
+
+    def best_networks(self) -> list[Network]:
+        """The best weights of each partition without padding, the coefficients in metres again."""
+        layers = len(self.model.weights)
+        weights, biases = ([t.cpu().numpy() for t in self.best[i * layers : (i + 1) * layers]] for i in range(2))
+        networks = []
+        for number, (partition, scale) in enumerate(zip(self.partitions, self.scales, strict=True)):
+            own_weights, own_biases = ([a[number].copy() for a in arrays] for arrays in (weights, biases))
+            outputs = len(partition.basis.shapes)
+            own_weights[0] = own_weights[0][: partition.inputs.shape[1]]
+            own_weights[-1] = own_weights[-1][:, :outputs] * np.float32(scale)
+            own_biases[-1] = own_biases[-1][:, :outputs] * np.float32(scale)
+            networks.append(Network(tuple(own_weights), tuple(bias[0] for bias in own_biases)))
+        return networks
+
+
+def _padded(arrays: list[np.ndarray], poses: np.ndarray, device: torch.device) -> torch.Tensor:
+    """(n, width) arrays of the chosen poses as one (P, n, widest) float32 tensor."""
+    out = np.zeros((len(arrays), len(poses), max(array.shape[1] for array in arrays)), np.float32)
+    for number, array in enumerate(arrays):
+        out[number, :, : array.shape[1]] = array[poses]
+    return torch.from_numpy(out).to(device)

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The report of a training: `report.json` and the page made of it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fdda_addon.core.metrics import error_statistics
+from fdda_addon.core.recording import Recording
+
+from .export import Exported, Measured
+from .graph import Deformation
+from .loop import Curves
+
+FORMAT = "fdda-report"
+VERSION = 1
+HISTOGRAM_EDGES_MM = np.concatenate([[0.0], np.geomspace(1e-4, 1e3, 71)])
+"""Ten bins a decade; the first one holds everything below a ten-thousandth of a millimetre."""
+
+
+def make_report(
+    recording: Recording,
+    deformation: Deformation,
+    exported: Exported,
+    on_training: Measured,
+    curves: Sequence[Curves],
+    model_name: str,
+) -> dict:
+    """What `report.json` holds. docs/training.md describes the keys; errors are in mm.
+
+    Args:
+        recording, deformation, exported, curves: of the training.
+        on_training: errors on a sample of the training poses.
+        model_name: file name of the model.
+    """
+    names = recording.rig.joint_names
+    held_out = exported.held_out
+    partitions = []
+    for partition, prepared, curve in zip(deformation.partitions, deformation.prepared, curves, strict=True):
+        own = partition.vertices
+        partitions.append(
+            {
+                "joint": names[partition.joint],
+                "vertices": len(own),
+                "influencing": [names[joint] for joint in partition.influencing],
+                "features": len(prepared.columns),
+                "basis": len(prepared.basis.shapes),
+                "truncation": prepared.basis.truncation * 1000,
+                "training": error_statistics(on_training.fdda[:, own]).to_json(),
+                "held_out": error_statistics(held_out.fdda[:, own]).to_json(),
+                "linear": error_statistics(held_out.linear[:, own]).to_json(),
+                "histogram": _histogram(held_out.fdda[:, own]),
+                "curve": {
+                    "training": [round(value, 6) for value in curve.training_mm],
+                    "validation": [round(value, 6) for value in curve.validation_mm],
+                    "best_epoch": curve.best_epoch,
+                },
+            }
+        )
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "unit": "mm",
+        "model": model_name,
+        "model_bytes": len(exported.content),
+        "recording": recording.path.name,
+        "object": recording.info.object_name,
+        "vertices": recording.rig.vertex_count,
+        "joints": len(names),
+        "poses": len(recording.pose_matrices),
+        "training": exported.info.training,
+        "parity": exported.info.parity_mm,
+        "fdda": {
+            "training": error_statistics(on_training.fdda).to_json(),
+            "held_out": exported.info.held_out_mm,
+        },
+        "linear": {"held_out": error_statistics(held_out.linear).to_json()},
+        "histogram": {
+            "edges": HISTOGRAM_EDGES_MM.tolist(),
+            "fdda": _histogram(held_out.fdda),
+            "linear": _histogram(held_out.linear),
+        },
+        "partitions": partitions,
+    }
+
+
+def _histogram(errors: np.ndarray) -> list[int]:
+    return np.histogram(np.minimum(errors * 1000, HISTOGRAM_EDGES_MM[-1]), HISTOGRAM_EDGES_MM)[0].tolist()
+
+
+def render_html(report: dict) -> str:
+    return "<!doctype html>"

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Trust: how far a pose lies inside what the training has seen.
+
+The range of a joint is a box around its features in the training poses, with a margin. The excess of a pose is its
+distance from the box in units of a fade width that grows with the range. With e the excess over all joints that count
+for a partition, its trust is max(0, 1 - e^2)^2: exactly 1 inside, 0 from one fade width on, smooth at both ends.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdda_addon.core.partition import Partition
+from fdda_addon.core.rig import Rig
+from fdda_addon.core.skinning import SkinBlock
+
+MARGIN = 0.05
+"""Margin of the box on each side, as a part of the range."""
+FADE = 0.15
+"""Fade width, as a part of the range."""
+LEAST_MARGIN = (0.01, 0.001)
+LEAST_FADE = (0.05, 0.01)
+"""Least margin and fade width: of rotation elements, no unit, and of translations, as a part of the character's size.
+
+A locked axis has no range of its own; these are what it may turn before it counts, and what takes all trust away."""
+LOCKED = 1e-4
+"""A joint whose features spread less than this was locked in the recording (no unit, or metres)."""
+
+
+@dataclass(frozen=True)
+class TrustRange:
+    """What the training has seen of each joint.
+
+    Attributes:
+        low, high: (J, 12) float32, the box with its margin, in the units of `core.features`.
+        width: (J, 12) float32, fade width.
+        counts: (P, J) bool, the joints that count for a partition: those that influence it, and those beside it that
+            were locked, of which nobody knows whether they would.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    width: np.ndarray
+    counts: np.ndarray
+
+    def trust(self, features: np.ndarray) -> np.ndarray:
+        """(N, J, 12) features to (N, P) float32 trust."""
+        excess = (features - np.clip(features, self.low, self.high)) / self.width
+        squared = (excess.astype(np.float64) ** 2).sum(axis=2) @ self.counts.T
+        return (np.maximum(0, 1 - squared) ** 2).astype(np.float32)
+
+
+def make_trust_range(features: np.ndarray, rig: Rig, partitions: tuple[Partition, ...]) -> TrustRange:
+    """Measure the range of the training poses.
+
+    Args:
+        features: (n, J, 12) float32 of the training poses.
+        rig, partitions: of the recording.
+    """
+    low, high = features.min(axis=0), features.max(axis=0)
+    spread = high - low
+    units = np.ones(12, np.float32)
+    units[3::4] = rig.size
+    least_margin, least_fade = (
+        np.where(np.arange(12) % 4 == 3, part[1], part[0]) for part in (LEAST_MARGIN, LEAST_FADE)
+    )
+    margin = np.maximum(MARGIN * spread, least_margin * units)
+    width = np.maximum(FADE * spread, least_fade * units)
+    locked = (spread < LOCKED).all(axis=1)
+    counts = np.zeros((len(partitions), len(rig.joints)), bool)
+    for number, partition in enumerate(partitions):
+        beside = {partition.joint, rig.joints[partition.joint].parent, *SkinBlock(rig, partition).joints.tolist()}
+        beside |= {child for child, joint in enumerate(rig.joints) if joint.parent == partition.joint}
+        counts[number, [joint for joint in beside if joint >= 0 and locked[joint]]] = True
+        counts[number, list(partition.influencing)] = True
+    return TrustRange(*(array.astype(np.float32) for array in (low - margin, high + margin, width)), counts)
