@@ -7,7 +7,15 @@ it and exits with status 1; an operator reports it and is cancelled. Any other e
 
 
 class FDDAError(Exception):
-    """Base of every error whose text is meant for the user."""
+    """Base of every error whose text is meant for the user; `exit_status` is that of the command line."""
+
+    exit_status = 1
+
+
+class WrongUsageError(FDDAError):
+    """Options that make no sense."""
+
+    exit_status = 2
 
 
 class RigError(FDDAError):

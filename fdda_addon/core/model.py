@@ -109,8 +109,12 @@ class ModelInfo:
         )
 
 
-def read_model_info(path: Path) -> ModelInfo:
+def read_model(path: Path) -> tuple[ModelInfo, bytes]:
     """Read and check a model without executing it.
+
+    Returns:
+        What it says of itself, and the bytes that were checked: executing those, and not the file, leaves no moment
+        in which another file could take its place.
 
     Raises:
         ModelError: no file, no ONNX file, not a model of ours, or one that asks for more than a model may: other
@@ -119,7 +123,8 @@ def read_model_info(path: Path) -> ModelInfo:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise ModelError(f"'{path}' is larger than 2 GB and cannot be a model.")
-        contents = read_onnx(path)
+        data = path.read_bytes()
+        contents = read_onnx(data)
     except OSError as error:
         raise ModelError(f"The model '{path}' cannot be read: {error.strerror}; train it first.") from error
     except ValueError as error:
@@ -145,7 +150,12 @@ def read_model_info(path: Path) -> ModelInfo:
         raise ModelError(
             f"The output '{POSITIONS_OUTPUT}' of '{path}' does not fit its {info.vertex_count} vertices; train again."
         )
-    return info
+    return info, data
+
+
+def read_model_info(path: Path) -> ModelInfo:
+    """What a model says of itself; raises as `read_model`."""
+    return read_model(path)[0]
 
 
 def check_rig(path: Path, info: ModelInfo, rig: Rig) -> None:

@@ -8,7 +8,6 @@ model, and the `onnx` package is not at hand inside Blender, so the few protobuf
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 STANDARD_DOMAINS = ("", "ai.onnx")
 MAX_DEPTH = 8
@@ -34,16 +33,15 @@ class OnnxContents:
     has_graph: bool = False
 
 
-def read_onnx(path: Path) -> OnnxContents:
-    """Read what a file declares, without executing it.
+def read_onnx(data: bytes) -> OnnxContents:
+    """Read what the bytes of a file declare, without executing it.
 
     Raises:
-        OSError: the file cannot be read.
-        ValueError: it is not an ONNX file.
+        ValueError: they are not those of an ONNX file.
     """
     contents = OnnxContents()
     try:
-        for number, value in _fields(memoryview(path.read_bytes())):
+        for number, value in _fields(memoryview(data)):
             if number == 7:
                 contents.has_graph = True
                 _read_graph(value, contents, top=True)

@@ -22,6 +22,24 @@ def check_writable(path: Path) -> None:
         raise OutputError(f"Cannot write '{path}': it is a folder; give the name of a file.")
     if not folder.is_dir():
         raise OutputError(f"Cannot write '{path}': the folder '{folder}' does not exist; create it first.")
+    _probe(path, folder)
+
+
+def check_folder_writable(path: Path) -> None:
+    """Fail before the work rather than after it when files could not be written into a folder that may not exist yet.
+
+    Raises:
+        OutputError: the folder, or the nearest one above it that exists, cannot be written, or it is a file.
+    """
+    folder = path
+    while not folder.exists():
+        folder = folder.parent
+    if not folder.is_dir():
+        raise OutputError(f"Cannot write into '{path}': '{folder}' is a file; choose another folder.")
+    _probe(path, folder)
+
+
+def _probe(path: Path, folder: Path) -> None:
     try:
         handle, probe = tempfile.mkstemp(prefix=".fdda-", dir=folder)
     except OSError as error:

@@ -1,0 +1,9 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`python -m fdda_addon VERB …`: the verbs with the bpy module, without Blender's program."""
+
+import sys
+
+from .cli import main
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:], "python -m fdda_addon"))

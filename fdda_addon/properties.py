@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a bound object keeps in the .blend file: `Object.fdda`."""
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+
+def _apply(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
+    from .runtime.binding import apply
+
+    apply(binding.id_data)
+
+
+class FDDA_PG_modifier(bpy.types.PropertyGroup):
+    """A modifier of the rig and how it was shown before a model took its place."""
+
+    uid: IntProperty()
+    show_viewport: BoolProperty()
+    show_render: BoolProperty()
+
+
+class FDDA_PG_binding(bpy.types.PropertyGroup):
+    """A model bound to a mesh object."""
+
+    is_bound: BoolProperty(name="Bound", description="A model is bound to this object")
+    model: StringProperty(name="Model", description="The model, an .onnx file", subtype="FILE_PATH")
+    mode: EnumProperty(
+        name="Mode",
+        description="What deforms the mesh",
+        items=(
+            ("RIG", "Rig", "The modifiers of the rig"),
+            ("LINEAR", "Linear Layer", "Linear skinning alone"),
+            ("FDDA", "FDDA", "The model"),
+        ),
+        default="RIG",
+        update=_apply,
+    )
+    strength: FloatProperty(
+        name="Strength",
+        description="0 is the linear layer, 1 the model",
+        min=0,
+        max=1,
+        default=1,
+        subtype="FACTOR",
+        update=_apply,
+    )
+    use_in_render: BoolProperty(
+        name="Use in Render", description="Final renders use the model as well, not the rig", update=_apply
+    )
+    status: StringProperty(name="Status", description="Why the model was switched off, empty when all is well")
+
+    is_playing: BoolProperty(description="The modifiers of the rig are switched off and `modifiers` says how they were")
+    modifiers: CollectionProperty(type=FDDA_PG_modifier)
+    show_only_shape_key: BoolProperty()
+    active_shape_key_index: IntProperty()
+
+
+CLASSES = (FDDA_PG_modifier, FDDA_PG_binding)
+
+
+def register() -> None:
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.Object.fdda = PointerProperty(type=FDDA_PG_binding)
+
+
+def unregister() -> None:
+    del bpy.types.Object.fdda
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

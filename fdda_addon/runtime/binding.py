@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Ties a model to a mesh object."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import bpy
+
+from ..core.errors import RigError
+from ..core.model import check_rig
+from ..scene.rig import SceneRig, deforming_modifiers, read_rig
+from . import nodes, playback, switch
+
+
+def bind(scene_rig: SceneRig, model: Path, use_in_render: bool = False) -> None:
+    """Bind a model to a rig and play it.
+
+    Args:
+        scene_rig: the rig.
+        model: the model, anywhere; a saved file remembers it relative to itself.
+        use_in_render: let final renders use the model too.
+
+    Raises:
+        ModelError: the file is no model, or was trained for another rig. The scene is as before.
+        RigError: the rig cannot be read.
+    """
+    mesh_object = scene_rig.mesh_object
+    if mesh_object.mode == "EDIT":
+        raise RigError(f"'{mesh_object.name}' is in edit mode; leave it first.")
+    model = model.absolute()
+    network = playback.load_network(model)
+    check_rig(model, network.info, read_rig(scene_rig))
+    if mesh_object.fdda.is_bound:
+        unbind(mesh_object)
+
+    playback.choose(model)
+    deforming = deforming_modifiers(mesh_object)
+    last = max(mesh_object.modifiers.find(modifier.name) for modifier in deforming)
+    nodes.add_modifier(mesh_object, last + 1)
+    binding = mesh_object.fdda
+    binding.model = bpy.path.relpath(str(model)) if bpy.data.filepath else str(model)
+    binding.use_in_render = use_in_render
+    binding.is_bound = True
+    binding.mode = "FDDA"
+    playback.forget()
+
+
+def unbind(mesh_object: bpy.types.Object) -> None:
+    """Give the mesh back to its rig and remove everything that `bind` added."""
+    binding = mesh_object.fdda
+    if not binding.is_bound:
+        return
+    binding.mode = "RIG"
+    modifier = nodes.find_modifier(mesh_object)
+    if modifier is not None:
+        cache = nodes.cache_of(modifier)
+        mesh_object.modifiers.remove(modifier)
+        nodes.remove_cache(cache)
+    for name in ("is_bound", "model", "use_in_render", "status"):
+        binding.property_unset(name)
+    playback.forget()
+
+
+def apply(mesh_object: bpy.types.Object) -> None:
+    """Bring a bound object in line with its properties; the next evaluation shows it."""
+    if mesh_object.fdda.is_bound:
+        switch.switch_modifiers(mesh_object)
+        playback.refresh(mesh_object)
+
+
+@contextmanager
+def true_rig(mesh_object: bpy.types.Object) -> Iterator[None]:
+    """Borrow a bound object for its rig: the rig deforms it inside, the binding is as before afterwards."""
+    mode = mesh_object.fdda.mode
+    if mesh_object.fdda.is_bound:
+        mesh_object.fdda.mode = "RIG"
+    try:
+        yield
+    finally:
+        if mesh_object.fdda.is_bound:
+            mesh_object.fdda.mode = mode

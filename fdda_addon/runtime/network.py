@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Executes a model with ONNX Runtime."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from ..core.errors import ModelError
+from ..core.model import POSE_INPUT, POSITIONS_OUTPUT, read_model
+
+THREADED_VERTICES = 20_000
+"""From this many vertices on a second thread gains more than it costs."""
+MAX_THREADS = 4
+
+
+class Network:
+    """A model that is ready to play.
+
+    Attributes:
+        path: the file.
+        info: what the model says of itself.
+    """
+
+    def __init__(self, path: Path):
+        """Load a model.
+
+        Raises:
+            ModelError: the file is no model or ONNX Runtime refuses it.
+        """
+        self.path = path
+        self.info, data = read_model(path)
+        try:
+            # Imported here so that Blender starts without it.
+            import onnxruntime
+        except ImportError as error:
+            raise ModelError(f"ONNX Runtime cannot be loaded ({error}); install the extension again.") from error
+        onnxruntime.set_default_logger_severity(3)
+        onnxruntime.disable_telemetry_events()
+        options = onnxruntime.SessionOptions()
+        large = self.info.vertex_count >= THREADED_VERTICES
+        options.intra_op_num_threads = min(MAX_THREADS, os.cpu_count() or 1) if large else 1
+        options.inter_op_num_threads = 1
+        # Threads that spin between frames would take the processor from Blender's own.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        try:
+            self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # ONNX Runtime's exceptions have no common base but this.
+            raise ModelError(
+                f"ONNX Runtime refuses the model '{path}' ({_first_line(error)}); train it again."
+            ) from error
+
+    def positions(self, pose_matrices: np.ndarray) -> np.ndarray:
+        """Deform the mesh.
+
+        Args:
+            pose_matrices: (N, J, 4, 4) float32, mesh-object space, metres.
+
+        Returns:
+            (N, V, 3) float32, mesh-object space, metres.
+
+        Raises:
+            ModelError: the model fails or answers in another shape.
+        """
+        try:
+            (positions,) = self._session.run([POSITIONS_OUTPUT], {POSE_INPUT: pose_matrices})
+        except Exception as error:  # As above.
+            raise ModelError(f"The model '{self.path}' failed ({_first_line(error)}); train it again.") from error
+        expected = (len(pose_matrices), self.info.vertex_count, 3)
+        if positions.shape != expected or positions.dtype != np.float32:
+            raise ModelError(f"The model '{self.path}' answers {positions.shape}, not {expected}; train it again.")
+        return positions
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().partition("\n")[0][:200]

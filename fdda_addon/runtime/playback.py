@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The live bindings of the open file, and the moving of their meshes.
+
+Live bindings hold names and session ids, never RNA references: those do not survive an undo or the load of a file.
+They are found anew from the properties of the objects whenever something may have changed.
+"""
+
+import os
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ..core.errors import FDDAError, ModelError, RigError
+from ..core.skinning import LinearLayer
+from ..scene.rig import PoseReader, SceneRig, armature_modifier, read_rig
+from . import nodes
+from .network import Network
+
+_networks: dict[Path, tuple[tuple, Network]] = {}
+_live: dict[int, "LiveBinding"] = {}
+_chosen: set[Path] = set()
+_object_count = -1
+
+
+class LiveBinding:
+    """One bound object, ready to play."""
+
+    def __init__(self, mesh_object: bpy.types.Object):
+        """Args:
+            mesh_object: bound.
+
+        Raises:
+            FDDAError: the model cannot be loaded, or does not fit the object any more.
+        """
+        self.name, self.uid = mesh_object.name, mesh_object.session_uid
+        self.network = load_network(model_path(mesh_object))
+        self.armature_uid = _armature(mesh_object).session_uid
+        self._reader = self._make_reader(mesh_object)
+        self._linear_layer: LinearLayer | None = None
+        self._shown: tuple | None = None
+
+    def _make_reader(self, mesh_object: bpy.types.Object) -> PoseReader:
+        info = self.network.info
+        names = tuple(joint.name for joint in info.joints)
+        armature_object = _armature(mesh_object)
+        if missing := [name for name in names if name not in armature_object.data.bones]:
+            raise ModelError(
+                f"The armature '{armature_object.name}' lacks the joint '{missing[0]}' of the model "
+                f"'{self.network.path.name}'; name it as before, or bind a model of this rig."
+            )
+        return PoseReader(SceneRig(mesh_object, armature_object), names, info.rest_matrices)
+
+    def find(self) -> bpy.types.Object | None:
+        """The object, under whatever name it has now; None when it is gone or no longer bound."""
+        found = bpy.data.objects.get(self.name)
+        if found is None or found.session_uid != self.uid:
+            found = next((o for o in bpy.data.objects if o.session_uid == self.uid), None)
+            if found is None:
+                return None
+            self.name = found.name
+        return found if found.fdda.is_bound else None
+
+    def read_pose(self, mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray | None:
+        """Pose matrices (J, 4, 4), None when the graph does not hold the object.
+
+        Raises:
+            FDDAError: the mesh or the armature no longer fits the model.
+        """
+        armature_object = _armature(mesh_object)
+        if armature_object.session_uid != self.armature_uid:
+            self._reader, self.armature_uid = self._make_reader(mesh_object), armature_object.session_uid
+        evaluated_mesh = mesh_object.evaluated_get(depsgraph)
+        evaluated_armature = armature_object.evaluated_get(depsgraph)
+        if not (evaluated_mesh.is_evaluated and evaluated_armature.is_evaluated):
+            return None
+        count, expected = len(mesh_object.data.vertices), self.network.info.vertex_count
+        if count != expected and mesh_object.mode != "EDIT":
+            raise ModelError(
+                f"'{mesh_object.name}' has {count} vertices and its model was trained for {expected}; "
+                "undo the change, or record and train again."
+            )
+        return self._reader.read(evaluated_mesh, evaluated_armature)
+
+    def is_shown(self, key: tuple) -> bool:
+        """Whether the cache object holds the positions of this pose already; notes it for the next time."""
+        shown, self._shown = self._shown == key, key
+        return shown
+
+    def forget_shown(self) -> None:
+        """The cache object may hold anything."""
+        self._shown = None
+
+    def linear_positions(self, mesh_object: bpy.types.Object, pose_matrices: np.ndarray) -> np.ndarray:
+        """(V, 3) float32 of the linear layer alone, mesh-object space, metres."""
+        if self._linear_layer is None:
+            self._linear_layer = LinearLayer(read_rig(SceneRig(mesh_object, _armature(mesh_object))))
+        return self._linear_layer.positions(pose_matrices[None])[0]
+
+
+def load_network(path: Path) -> Network:
+    """A network by its file, loaded once for all objects that use it and again when the file changes.
+
+    Raises:
+        ModelError: it cannot be loaded.
+    """
+    try:
+        status = os.stat(path)
+    except OSError as error:
+        raise ModelError(f"The model '{path}' cannot be read: {error.strerror}; bind another.") from error
+    stamp = (status.st_mtime_ns, status.st_size)
+    if path not in _networks or _networks[path][0] != stamp:
+        _networks[path] = (stamp, Network(path))
+    return _networks[path][1]
+
+
+def model_path(mesh_object: bpy.types.Object) -> Path:
+    """Where the model of a binding is.
+
+    Raises:
+        ModelError: the path of a saved file leads out of the file's folder.
+    """
+    stored = mesh_object.fdda.model
+    path = Path(bpy.path.abspath(stored, library=mesh_object.library))
+    file = bpy.path.abspath(mesh_object.library.filepath) if mesh_object.library else bpy.data.filepath
+    if path not in _chosen and file and not path.resolve().is_relative_to(Path(file).resolve().parent):
+        raise ModelError(
+            f"The model '{path}' lies outside the folder of '{Path(file).name}' and is not followed; "
+            "move it beside the file and bind it again."
+        )
+    return path
+
+
+def choose(model: Path) -> None:
+    """The user chose this model in this session: it may lie anywhere until the file is loaded again."""
+    _chosen.add(model)
+
+
+def forget() -> None:
+    """Look for bound objects anew at the next evaluation."""
+    global _object_count
+    _live.clear()
+    _object_count = -1
+
+
+def refresh(mesh_object: bpy.types.Object) -> None:
+    """Evaluate a bound object anew, also when its pose has not changed."""
+    global _object_count
+    live = _live.get(mesh_object.session_uid)
+    if live is not None:
+        live.forget_shown()
+    else:
+        _object_count = -1
+    mesh_object.update_tag()
+
+
+def refresh_all() -> None:
+    """Evaluate every bound object that plays a model anew."""
+    for mesh_object in bpy.data.objects:
+        if mesh_object.type == "MESH" and mesh_object.fdda.is_playing:
+            refresh(mesh_object)
+
+
+def evaluate(depsgraph: bpy.types.Depsgraph) -> None:
+    """Move the meshes of all bound objects to the pose that a dependency graph has evaluated.
+
+    Objects that share a model are evaluated in one call. What cannot play is switched back to its rig and says why.
+    """
+    _scan()
+    rendering = depsgraph.mode == "RENDER"
+    jobs: dict[Network, list[tuple[LiveBinding, bpy.types.Object, np.ndarray]]] = {}
+    for uid, live in list(_live.items()):
+        mesh_object = live.find()
+        if mesh_object is None:
+            del _live[uid]
+            continue
+        binding = mesh_object.fdda
+        if binding.mode == "RIG" or (rendering and not binding.use_in_render):
+            continue
+        with _failing(mesh_object):
+            pose = live.read_pose(mesh_object, depsgraph)
+            if pose is not None and not live.is_shown((pose.tobytes(), binding.mode, binding.strength)):
+                jobs.setdefault(live.network, []).append((live, mesh_object, pose))
+    for network, members in jobs.items():
+        _move(network, members)
+
+
+def _move(network: Network, members: list[tuple[LiveBinding, bpy.types.Object, np.ndarray]]) -> None:
+    try:
+        positions = network.positions(np.stack([pose for _, _, pose in members]))
+    except FDDAError as error:
+        for _, mesh_object, _ in members:
+            fail(mesh_object, error)
+        return
+    for (live, mesh_object, pose), moved in zip(members, positions, strict=True):
+        binding = mesh_object.fdda
+        with _failing(mesh_object):
+            strength = binding.strength if binding.mode == "FDDA" else 0.0
+            if strength < 1:
+                linear = live.linear_positions(mesh_object, pose)
+                moved = linear + np.float32(strength) * (moved - linear)
+            _write(mesh_object, moved)
+
+
+def _write(mesh_object: bpy.types.Object, positions: np.ndarray) -> None:
+    modifier = nodes.find_modifier(mesh_object)
+    cache = nodes.cache_of(modifier) if modifier is not None else None
+    if cache is None or len(cache.data.vertices) != len(positions):
+        raise ModelError("The FDDA modifier or its positions were removed; bind the model again.")
+    cache.data.vertices.foreach_set("co", positions.reshape(-1))
+    cache.data.update_tag()
+
+
+class _failing:  # noqa: N801 - reads as a statement
+    """Switches an object back to its rig when the block fails with an error that is meant for the user."""
+
+    def __init__(self, mesh_object: bpy.types.Object):
+        self._mesh_object = mesh_object
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type | None, error: BaseException | None, _trace: object) -> bool:
+        if isinstance(error, FDDAError):
+            fail(self._mesh_object, error)
+            return True
+        return False
+
+
+def fail(mesh_object: bpy.types.Object, error: FDDAError) -> None:
+    """Give a mesh back to its rig because its model cannot play, and say why, once."""
+    mesh_object.fdda.mode = "RIG"
+    mesh_object.fdda.status = str(error)
+    print(f"FDDA is switched off for '{mesh_object.name}': {error}")
+
+
+def _scan() -> None:
+    """Find the bound objects when objects have come or gone."""
+    global _object_count
+    if _object_count == len(bpy.data.objects):
+        return
+    caches = set()
+    for mesh_object in [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]:
+        modifier = nodes.find_modifier(mesh_object)
+        if modifier is not None:
+            cache = nodes.cache_of(modifier)
+            if cache is None or cache.name in caches:
+                # A duplicate still points to the positions of its original.
+                cache = nodes.new_cache(mesh_object)
+                nodes.set_cache(modifier, cache)
+            caches.add(cache.name)
+        if mesh_object.fdda.is_playing and mesh_object.session_uid not in _live:
+            with _failing(mesh_object):
+                _live[mesh_object.session_uid] = LiveBinding(mesh_object)
+    _object_count = len(bpy.data.objects)
+
+
+def _armature(mesh_object: bpy.types.Object) -> bpy.types.Object:
+    modifier = armature_modifier(mesh_object)
+    if modifier is None:
+        raise RigError(f"The armature of '{mesh_object.name}' is gone; give its Armature modifier an armature.")
+    return modifier.object

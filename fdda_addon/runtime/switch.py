@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Switches a bound mesh object between the modifiers of its rig and the one that plays the model."""
+
+import bpy
+
+from ..scene.rig import deforming_modifiers
+from . import nodes
+
+
+def switch_modifiers(mesh_object: bpy.types.Object) -> None:
+    """Bring the modifiers of a bound object in line with its mode.
+
+    While a model plays, the modifiers of the rig are off in the viewport, and in renders when the user asked for it;
+    how they were is kept in the object's properties and comes back with mode RIG.
+    """
+    binding = mesh_object.fdda
+    modifier = nodes.find_modifier(mesh_object)
+    if binding.mode != "RIG" and modifier is None:
+        binding.status = "The FDDA modifier was removed; bind the model again."
+        binding.mode = "RIG"
+        return
+    playing = binding.mode != "RIG"
+    if playing and not binding.is_playing:
+        _store(mesh_object)
+    elif not playing and binding.is_playing:
+        _restore(mesh_object)
+    if modifier is not None:
+        modifier.show_viewport = playing
+        modifier.show_render = playing and binding.use_in_render
+    if playing:
+        binding.status = ""
+        for saved, rig_modifier in _saved_modifiers(mesh_object):
+            rig_modifier.show_viewport = False
+            rig_modifier.show_render = saved.show_render and not binding.use_in_render
+        pin_shape_keys(mesh_object, True)
+
+
+def pin_shape_keys(mesh_object: bpy.types.Object, pinned: bool) -> None:
+    """Show the reference key alone, or what was shown before.
+
+    Blender evaluates shape keys before the first modifier, also when nothing reads the result; a pinned reference key
+    is merely copied.
+    """
+    keys, binding = mesh_object.data.shape_keys, mesh_object.fdda
+    if keys is None:
+        return
+    if pinned:
+        mesh_object.active_shape_key_index = keys.key_blocks.find(keys.reference_key.name)
+        mesh_object.show_only_shape_key = True
+    else:
+        mesh_object.active_shape_key_index = binding.active_shape_key_index
+        mesh_object.show_only_shape_key = binding.show_only_shape_key
+
+
+def _store(mesh_object: bpy.types.Object) -> None:
+    binding = mesh_object.fdda
+    binding.modifiers.clear()
+    for modifier in deforming_modifiers(mesh_object):
+        saved = binding.modifiers.add()
+        saved.uid = modifier.persistent_uid
+        saved.show_viewport, saved.show_render = modifier.show_viewport, modifier.show_render
+    binding.show_only_shape_key = mesh_object.show_only_shape_key
+    binding.active_shape_key_index = mesh_object.active_shape_key_index
+    binding.is_playing = True
+
+
+def _restore(mesh_object: bpy.types.Object) -> None:
+    for saved, modifier in _saved_modifiers(mesh_object):
+        modifier.show_viewport, modifier.show_render = saved.show_viewport, saved.show_render
+    pin_shape_keys(mesh_object, False)
+    mesh_object.fdda.modifiers.clear()
+    mesh_object.fdda.is_playing = False
+
+
+def _saved_modifiers(mesh_object: bpy.types.Object) -> list[tuple]:
+    by_uid = {modifier.persistent_uid: modifier for modifier in mesh_object.modifiers}
+    return [(saved, by_uid[saved.uid]) for saved in mesh_object.fdda.modifiers if saved.uid in by_uid]

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Armatures in and out: joints, pose matrices, ranges of motion, posing."""
+
+import bpy
+import numpy as np
+from mathutils import Euler
+
+from ..core.poses import DEFAULT_RANGE, Channel
+
+LIMITS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
+AXES = "xyz"
+
+
+def rest_matrices(armature: bpy.types.Armature, names: tuple[str, ...]) -> np.ndarray:
+    """Rest matrices of bones, (J, 4, 4) float64, armature space, metres."""
+    return np.array([armature.bones[name].matrix_local for name in names], np.float64).reshape(-1, 4, 4)
+
+
+def pose_matrices(armature_object: bpy.types.Object, order: np.ndarray) -> np.ndarray:
+    """Pose matrices of an evaluated armature object.
+
+    Args:
+        armature_object: evaluated.
+        order: (J,) indices into its pose bones.
+
+    Returns:
+        (J, 4, 4) float32, armature space, metres.
+    """
+    bones = armature_object.pose.bones
+    flat = np.empty(len(bones) * 16, np.float32)
+    bones.foreach_get("matrix", flat)
+    # Blender keeps matrices column by column.
+    return flat.reshape(-1, 4, 4).transpose(0, 2, 1)[order]
+
+
+def bone_order(armature_object: bpy.types.Object, names: tuple[str, ...]) -> np.ndarray:
+    """Indices of bones in the order of `pose.bones`; KeyError for a name that is not there."""
+    index = {bone.name: number for number, bone in enumerate(armature_object.pose.bones)}
+    return np.array([index[name] for name in names], np.int32)
+
+
+def object_matrix(matrix_world: object) -> np.ndarray:
+    """A mathutils matrix as (4, 4) float64."""
+    return np.array(matrix_world, np.float64)
+
+
+def channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Channel, ...]:
+    """What of a pose may be sampled, and its range of motion.
+
+    The range is that of Limit Rotation and Limit Location constraints in local space, else of the bone's IK limits,
+    else the default; locked axes are left out. A bone that another constraint moves is left out: sampling it would
+    change nothing.
+
+    Args:
+        armature_object: the armature object.
+        names: bones that are sampled even when the rig states no range for them.
+    """
+    found = []
+    for bone in armature_object.pose.bones:
+        if any(c.type not in LIMITS and not c.mute and c.influence > 0 for c in bone.constraints):
+            continue
+        rotation, stated = _rotation_range(bone)
+        location = _location_range(bone)
+        if bone.name in names or stated:
+            for axis in range(3):
+                low, high = rotation[axis]
+                if not bone.lock_rotation[axis] and low < high:
+                    found.append(Channel(bone.name, "rotation", axis, low, high))
+        if not bone.bone.use_connect:
+            for axis, (low, high) in location.items():
+                if not bone.lock_location[axis] and low < high:
+                    found.append(Channel(bone.name, "location", axis, low, high))
+    return tuple(found)
+
+
+def _limit(bone: bpy.types.PoseBone, kind: str) -> bpy.types.Constraint | None:
+    for constraint in bone.constraints:
+        if constraint.type == kind and constraint.owner_space == "LOCAL" and not constraint.mute:
+            return constraint
+    return None
+
+
+def _rotation_range(bone: bpy.types.PoseBone) -> tuple[list[tuple[float, float]], bool]:
+    """Range of each rotation axis in radians, and whether the rig states one."""
+    ranges, stated = [DEFAULT_RANGE] * 3, False
+    constraint = _limit(bone, "LIMIT_ROTATION")
+    for axis, letter in enumerate(AXES):
+        if constraint is not None:
+            if getattr(constraint, f"use_limit_{letter}"):
+                ranges[axis] = (getattr(constraint, f"min_{letter}"), getattr(constraint, f"max_{letter}"))
+                stated = True
+        elif getattr(bone, f"lock_ik_{letter}"):
+            ranges[axis] = (0.0, 0.0)
+        elif getattr(bone, f"use_ik_limit_{letter}"):
+            ranges[axis] = (getattr(bone, f"ik_min_{letter}"), getattr(bone, f"ik_max_{letter}"))
+            stated = True
+    return ranges, stated
+
+
+def _location_range(bone: bpy.types.PoseBone) -> dict[int, tuple[float, float]]:
+    constraint = _limit(bone, "LIMIT_LOCATION")
+    if constraint is None:
+        return {}
+    return {
+        axis: (getattr(constraint, f"min_{letter}"), getattr(constraint, f"max_{letter}"))
+        for axis, letter in enumerate(AXES)
+        if getattr(constraint, f"use_min_{letter}") and getattr(constraint, f"use_max_{letter}")
+    }
+
+
+def clear_pose(armature_object: bpy.types.Object) -> None:
+    """Bring every bone to its rest pose."""
+    bones = armature_object.pose.bones
+    count = len(bones)
+    bones.foreach_set("location", np.zeros(count * 3, np.float32))
+    bones.foreach_set("rotation_euler", np.zeros(count * 3, np.float32))
+    bones.foreach_set("rotation_quaternion", np.tile(np.float32([1, 0, 0, 0]), count))
+    bones.foreach_set("rotation_axis_angle", np.tile(np.float32([0, 0, 1, 0]), count))
+    bones.foreach_set("scale", np.ones(count * 3, np.float32))
+    armature_object.update_tag(refresh={"DATA"})
+
+
+class Poser:
+    """Sets poses given as values of channels. Bones must be at rest where no channel reaches (`clear_pose`)."""
+
+    def __init__(self, armature_object: bpy.types.Object, pose_channels: tuple[Channel, ...]):
+        self._armature_object = armature_object
+        self._rotations: dict[str, list[tuple[int, int]]] = {}
+        self._locations: dict[str, list[tuple[int, int]]] = {}
+        for place, channel in enumerate(pose_channels):
+            kind = self._rotations if channel.kind == "rotation" else self._locations
+            kind.setdefault(channel.bone, []).append((place, channel.axis))
+
+    def set(self, values: np.ndarray) -> None:
+        """Pose the armature: (C,) radians or metres, in the order of the channels. The graph is not evaluated."""
+        bones = self._armature_object.pose.bones
+        for name, places in self._rotations.items():
+            angles = [0.0, 0.0, 0.0]
+            for place, axis in places:
+                angles[axis] = values[place]
+            bone = bones[name]
+            if bone.rotation_mode == "QUATERNION":
+                bone.rotation_quaternion = Euler(angles).to_quaternion()
+            elif bone.rotation_mode == "AXIS_ANGLE":
+                axis_vector, angle = Euler(angles).to_quaternion().to_axis_angle()
+                bone.rotation_axis_angle = (angle, *axis_vector)
+            else:
+                bone.rotation_euler = angles
+        for name, places in self._locations.items():
+            bone = bones[name]
+            for place, axis in places:
+                bone.location[axis] = values[place]

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Scene state that is borrowed for a while and given back, whatever happens."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import bpy
+import numpy as np
+
+_POSE = {
+    "location": 3,
+    "rotation_euler": 3,
+    "rotation_quaternion": 4,
+    "rotation_axis_angle": 4,
+    "scale": 3,
+}
+
+
+@contextmanager
+def borrowed_pose(armature_object: bpy.types.Object) -> Iterator[None]:
+    """Give back the pose of an armature, its animation and the current frame.
+
+    Inside, the armature has no action and no NLA, so that poses stay as they are set.
+    """
+    scene = bpy.context.scene
+    bones = armature_object.pose.bones
+    frame, subframe = scene.frame_current, scene.frame_subframe
+    pose = {name: np.empty(len(bones) * size, np.float32) for name, size in _POSE.items()}
+    for name, values in pose.items():
+        bones.foreach_get(name, values)
+    animation = armature_object.animation_data
+    if animation is not None:
+        action, use_nla = animation.action, animation.use_nla
+        slot = getattr(animation, "action_slot", None)
+        animation.use_nla = False
+        animation.action = None
+    try:
+        yield
+    finally:
+        if animation is None:
+            if armature_object.animation_data is not None:
+                armature_object.animation_data_clear()
+        else:
+            animation.action = action
+            if slot is not None:
+                animation.action_slot = slot
+            animation.use_nla = use_nla
+        # The frame first: evaluating it sets animated channels, and the borrowed pose may differ from its keys.
+        scene.frame_set(frame, subframe=subframe)
+        for name, values in pose.items():
+            bones.foreach_set(name, values)
+        armature_object.update_tag(refresh={"DATA"})
+        bpy.context.view_layer.update()
+
+
+@contextmanager
+def borrowed_attributes(owner: object, **values: object) -> Iterator[None]:
+    """Set attributes of an RNA struct and give the old values back."""
+    old = {name: getattr(owner, name) for name in values}
+    try:
+        for name, value in values.items():
+            setattr(owner, name, value)
+        yield
+    finally:
+        for name, value in old.items():
+            setattr(owner, name, value)
+
+
+def assign_action(armature_object: bpy.types.Object, action: bpy.types.Action) -> None:
+    """Let an action drive an armature, with the first of its slots that fits (4.4 and later have slots)."""
+    animation = armature_object.animation_data or armature_object.animation_data_create()
+    animation.action = action
+    if hasattr(animation, "action_slot") and animation.action_slot is None and animation.action_suitable_slots:
+        animation.action_slot = animation.action_suitable_slots[0]

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Finds the rig in a scene, says why there is none, and reads it into arrays."""
+
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+
+from ..core.errors import RigError
+from ..core.poses import Channel
+from ..core.rig import Fingerprint, Joint, Rig
+from . import armature as armature_io
+from . import mesh as mesh_io
+
+DEFORMING = {
+    "ARMATURE", "CAST", "CLOTH", "CORRECTIVE_SMOOTH", "CURVE", "DISPLACE", "HOOK", "LAPLACIANDEFORM",
+    "LAPLACIANSMOOTH", "LATTICE", "MESH_CACHE", "MESH_DEFORM", "MESH_SEQUENCE_CACHE", "SHRINKWRAP", "SIMPLE_DEFORM",
+    "SMOOTH", "SOFT_BODY", "SURFACE_DEFORM", "VOLUME_DISPLACE", "WARP", "WAVE",
+}  # fmt: skip
+TOPOLOGY_CHANGING = {
+    "ARRAY", "BEVEL", "BOOLEAN", "BUILD", "DECIMATE", "EDGE_SPLIT", "EXPLODE", "FLUID", "MASK", "MIRROR", "MULTIRES",
+    "OCEAN", "REMESH", "SCREW", "SKIN", "SOLIDIFY", "SUBSURF", "VOLUME_TO_MESH", "WELD", "WIREFRAME",
+}  # fmt: skip
+MODIFIER_NAME = "FDDA"
+"""Name of the Geometry Nodes modifier that plays a model; it is never part of the rig."""
+
+
+@dataclass(frozen=True)
+class SceneRig:
+    """A mesh object and the armature object that deforms it. Holds RNA references: not to be kept."""
+
+    mesh_object: bpy.types.Object
+    armature_object: bpy.types.Object
+
+
+def find_rig(name: str = "") -> SceneRig:
+    """Find the rig of the current scene.
+
+    Args:
+        name: of the mesh object; may be left out when one mesh of the scene has an Armature modifier.
+
+    Raises:
+        RigError: there is none, or more than one.
+    """
+    meshes = [o for o in bpy.context.scene.objects if o.type == "MESH"]
+    if name:
+        named = bpy.context.scene.objects.get(name)
+        if named is None or named.type != "MESH":
+            known = ", ".join(f"'{o.name}'" for o in meshes) or "none"
+            raise RigError(f"The scene has no mesh object '{name}'; its mesh objects: {known}.")
+        meshes = [named]
+    if not meshes:
+        raise RigError("The scene has no mesh; open a file with a character that an armature deforms.")
+    rigged = [o for o in meshes if armature_modifier(o) is not None]
+    if not rigged:
+        what = f"'{name}' has no" if name else f"None of the {len(meshes)} meshes of the scene has an"
+        raise RigError(f"{what} Armature modifier with an armature; add one, or choose another object.")
+    if len(rigged) > 1:
+        names = ", ".join(f"'{o.name}'" for o in rigged)
+        raise RigError(f"{len(rigged)} meshes have an Armature modifier ({names}); choose one with --object.")
+    return SceneRig(rigged[0], armature_modifier(rigged[0]).object)
+
+
+def armature_modifier(mesh_object: bpy.types.Object) -> bpy.types.ArmatureModifier | None:
+    """The first Armature modifier that has an armature, None when there is none."""
+    for modifier in mesh_object.modifiers:
+        if modifier.type == "ARMATURE" and modifier.object is not None:
+            return modifier
+    return None
+
+
+def deforming_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier]:
+    """The modifiers of the rig that move vertices, in their order, switched on or not. Geometry Nodes count too."""
+    return [
+        modifier
+        for modifier in mesh_object.modifiers
+        if modifier.type in DEFORMING or (modifier.type == "NODES" and modifier.name != MODIFIER_NAME)
+    ]
+
+
+def check_evaluable(scene_rig: SceneRig) -> None:
+    """Fail when what the graph evaluates the mesh to could not be compared with the mesh.
+
+    Raises:
+        RigError: edit mode, a hidden object, an Armature modifier that is off, or a modifier that changes the
+            topology.
+    """
+    mesh_object = scene_rig.mesh_object
+    if mesh_object.mode == "EDIT" or scene_rig.armature_object.mode == "EDIT":
+        raise RigError(f"'{mesh_object.name}' or its armature is in edit mode; leave it first.")
+    for modifier in mesh_object.modifiers:
+        if modifier.type in TOPOLOGY_CHANGING and modifier.show_viewport:
+            raise RigError(
+                f"Modifier '{modifier.name}' of '{mesh_object.name}' changes the topology of the mesh, so its vertices "
+                "cannot be followed; switch it off in the viewport while recording, or apply it."
+            )
+    if not armature_modifier(mesh_object).show_viewport:
+        raise RigError(f"The Armature modifier of '{mesh_object.name}' is switched off in the viewport; switch it on.")
+    if scene_rig.armature_object.data.pose_position == "REST":
+        raise RigError(f"The armature '{scene_rig.armature_object.name}' shows its rest position; set it to pose.")
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    if not mesh_object.evaluated_get(depsgraph).is_evaluated:
+        raise RigError(f"'{mesh_object.name}' is hidden, so Blender does not evaluate it; show it in the viewport.")
+    count = len(mesh_object.evaluated_get(depsgraph).data.vertices)
+    if count != len(mesh_object.data.vertices):
+        nodes = [m.name for m in mesh_object.modifiers if m.type not in DEFORMING and m.show_viewport]
+        raise RigError(
+            f"The modifiers of '{mesh_object.name}' turn {len(mesh_object.data.vertices)} vertices into {count}; "
+            f"switch off the one that changes the topology ({', '.join(nodes)})."
+        )
+
+
+def read_rig(scene_rig: SceneRig) -> Rig:
+    """Read a rig.
+
+    Its joints are the deforming bones that hold vertices, the bones that have a range of motion, and the ancestors
+    of both.
+
+    Raises:
+        RigError: a vertex follows no deforming bone.
+    """
+    mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
+    if not len(mesh_object.data.vertices):
+        raise RigError(f"The mesh of '{mesh_object.name}' has no vertices; choose another object.")
+    bones = armature_object.data.bones
+    groups = mesh_io.used_groups(mesh_object)
+    skinning = {bone.name for bone in bones if bone.use_deform and bone.name in groups}
+    wanted = skinning | {channel.bone for channel in armature_io.channels(armature_object, set())}
+    wanted |= {parent.name for name in wanted for parent in bones[name].parent_recursive}
+    ordered = sorted((bone for bone in bones if bone.name in wanted), key=lambda bone: len(bone.parent_recursive))
+    index = {bone.name: number for number, bone in enumerate(ordered)}
+    joints = tuple(Joint(bone.name, index[bone.parent.name] if bone.parent else -1) for bone in ordered)
+    names = tuple(joint.name for joint in joints)
+
+    rest_positions = mesh_io.rest_positions(mesh_object.data)
+    skin_joints, skin_weights = mesh_io.skin_weights(mesh_object, {n: i for n, i in index.items() if n in skinning})
+    to_mesh = mesh_from_armature(mesh_object, armature_object)
+    rest = to_mesh @ armature_io.rest_matrices(armature_object.data, names)
+    fingerprint = Fingerprint(
+        Fingerprint.digest(*mesh_io.topology(mesh_object.data)),
+        Fingerprint.digest(rest_positions),
+        Fingerprint.digest(skin_joints, skin_weights),
+    )
+    return Rig(joints, rest_positions, rest.astype(np.float32), skin_joints, skin_weights, fingerprint)
+
+
+def mesh_from_armature(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
+    """(4, 4) float64, armature space to mesh-object space. Pass evaluated objects for an evaluated answer."""
+    to_world = armature_io.object_matrix(armature_object.matrix_world)
+    return np.linalg.inv(armature_io.object_matrix(mesh_object.matrix_world)) @ to_world
+
+
+def sampled_channels(scene_rig: SceneRig, rig: Rig) -> tuple[Channel, ...]:
+    """The channels of a random pose.
+
+    Raises:
+        RigError: nothing may be sampled.
+    """
+    found = armature_io.channels(scene_rig.armature_object, set(rig.joint_names))
+    if not found:
+        raise RigError(
+            f"No bone of '{scene_rig.armature_object.name}' may be sampled: all {len(rig.joints)} are locked or moved "
+            "by constraints; unlock an axis, give it a Limit Rotation, or record an action with --action and --poses 0."
+        )
+    return found
+
+
+class PoseReader:
+    """Reads the pose of a rig as a recording and a model want it.
+
+    A pose matrix is P_j = S_j B_j with S_j the skin matrix as Blender's Armature modifier computes it: the same as
+    the pose matrix in mesh-object space as long as mesh and armature keep the relation of the rest pose, and still
+    right when either object is moved on its own.
+    """
+
+    def __init__(self, scene_rig: SceneRig, names: tuple[str, ...], rest_matrices: np.ndarray):
+        """Args:
+        scene_rig: the rig.
+        names: J joints. KeyError when the armature lacks one.
+        rest_matrices: (J, 4, 4), the joints' rest pose in mesh-object space.
+        """
+        self._order = armature_io.bone_order(scene_rig.armature_object, names)
+        self._rest = rest_matrices.astype(np.float64)
+        self._bone_rest = armature_io.rest_matrices(scene_rig.armature_object.data, names)
+        self._relation: np.ndarray | None = None
+        self._correction = self._bone_rest
+
+    def read(self, mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
+        """Pose matrices of evaluated objects: (J, 4, 4) float32, mesh-object space, metres."""
+        relation = mesh_from_armature(mesh_object, armature_object)
+        if self._relation is None or not np.array_equal(relation, self._relation):
+            self._relation = relation
+            self._correction = np.linalg.inv(relation @ self._bone_rest) @ self._rest
+        pose = armature_io.pose_matrices(armature_object, self._order)
+        # inv(T rest) applied on the right of T pose gives the skin matrix; times the rest pose of the model.
+        return (relation @ pose @ self._correction).astype(np.float32)
+
+
+class PoseEvaluator:
+    """Evaluates the scene as it is posed and reads pose matrices and positions."""
+
+    def __init__(self, scene_rig: SceneRig, rig: Rig):
+        self._scene_rig = scene_rig
+        self._reader = PoseReader(scene_rig, rig.joint_names, rig.rest_matrices)
+
+    def evaluate(self) -> tuple[np.ndarray, np.ndarray]:
+        """Evaluate the pose that is set now.
+
+        Returns:
+            pose_matrices (J, 4, 4) and positions (V, 3), both float32, mesh-object space, metres.
+        """
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        mesh_object = self._scene_rig.mesh_object.evaluated_get(depsgraph)
+        armature_object = self._scene_rig.armature_object.evaluated_get(depsgraph)
+        positions = mesh_io.evaluated_positions(self._scene_rig.mesh_object, depsgraph)
+        return self._reader.read(mesh_object, armature_object), positions

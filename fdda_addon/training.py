@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Starts the trainer in a Python of its own, reads its messages and cancels it.
+
+torch never enters Blender's process: it would bring its own threads and libraries, and Blender's Python has none.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from .core.errors import TrainingError, WrongUsageError
+from .core.messages import Message, MessageType
+
+PYTHON_VARIABLE = "FDDA_TRAINER_PYTHON"
+"""Environment variable: the Python that has torch, when it is not the one that runs this."""
+CANCEL_SECONDS = 20.0
+
+
+def trainer_python() -> str:
+    """The Python that runs the trainer."""
+    return os.environ.get(PYTHON_VARIABLE) or sys.executable
+
+
+def trainer_command(arguments: list[str], python: str | None = None) -> tuple[list[str], dict[str, str]]:
+    """Command line and environment of the trainer, for `subprocess`.
+
+    Args:
+        arguments: of `python -m trainer`.
+        python: the interpreter, `trainer_python()` when left out.
+    """
+    root = Path(__file__).parent.parent
+    paths = [str(root), *filter(None, [os.environ.get("PYTHONPATH")])]
+    # -P: a folder `trainer` in the current folder must not be run in place of ours.
+    command = [python or trainer_python(), "-P", "-m", "trainer", *arguments]
+    return command, {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+
+
+class Training:
+    """A training in a process of its own; use as a context manager: the process is gone when the block ends."""
+
+    def __init__(self, arguments: list[str], python: str | None = None):
+        """Start the trainer.
+
+        Args:
+            arguments: of `python -m trainer`: recording, model and settings.
+            python: the interpreter, `trainer_python()` when left out.
+
+        Raises:
+            TrainingError: the interpreter cannot be started.
+        """
+        command, environment = trainer_command(["--messages", *arguments], python)
+        self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - __exit__ closes it
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                env=environment,
+                text=True,
+                encoding="utf-8",
+            )
+        except OSError as error:
+            self._errors.close()
+            raise TrainingError(
+                f"The trainer's Python '{command[0]}' cannot be started ({error.strerror}); set {PYTHON_VARIABLE} to a "
+                "Python that has torch."
+            ) from error
+
+    def messages(self) -> Iterator[Message]:
+        """What the trainer says, until it is finished or cancelled.
+
+        Raises:
+            WrongUsageError: it does not understand its options.
+            TrainingError: it failed, or died without a last message.
+        """
+        last = None
+        for line in self._process.stdout:
+            try:
+                message = Message.decode(line)
+            except ValueError:
+                # A library that prints; not worth losing a training.
+                continue
+            if message.type is MessageType.FAILED:
+                raise TrainingError(str(message.values.get("text", "The training failed.")))
+            yield message
+            last = message
+        status = self._process.wait()
+        if status == WrongUsageError.exit_status and last is None:
+            raise WrongUsageError(self._error_text().strip())
+        if last is None or not last.type.is_last:
+            raise TrainingError(self._death(status))
+
+    def _death(self, status: int) -> str:
+        text = self._error_text().strip().splitlines()
+        reason = f": {text[-1]}" if text else ""
+        how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
+        return f"The trainer {how} and said nothing{reason}; no model was written."
+
+    def _error_text(self) -> str:
+        self._errors.seek(0)
+        return self._errors.read()
+
+    def __enter__(self) -> "Training":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:
+            self._process.terminate()
+            try:
+                self._process.wait(CANCEL_SECONDS)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        self._process.stdout.close()
+        self._errors.close()
