@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The joints of the arm: names, parents, rest pose and range of motion. No bpy.
+
+A left arm in a T-pose: shoulder at the origin, arm along +X, palm down (-Z), thumb and elbow crease to the front (-Y),
+the forearm half way between pronation and supination. Lengths in metres, angles in degrees.
+
+Every bone runs along its local Y; its local Z points to where it bends (the elbow crease, the palm, the pad of the
+thumb), so that a positive rotation about local X is flexion everywhere.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+# The pose of every bone is three Euler angles in this order.
+ROTATION_MODE = "XYZ"
+ARM_OBJECT = "arm"
+RIG_OBJECT = "arm_rig"
+ACTION = "arm_drive"
+BICEPS_KEY = "biceps"
+# Full flexion: where the biceps key reaches 1.
+ELBOW_FLEXION = 140.0
+
+FINGERS = ("index", "middle", "ring", "pinky")
+
+UPPER_ARM_LENGTH = 0.30
+FOREARM_LENGTH = 0.26
+WRIST_X = UPPER_ARM_LENGTH + FOREARM_LENGTH
+
+LOCKED = (0.0, 0.0)
+Range = tuple[float, float]
+
+
+class Joint(NamedTuple):
+    """One bone in the rest pose.
+
+    head, tail: metres, armature space. bend: unit vector, armature space, the bone's local Z.
+    limits: degrees about local X (flexion), Y (twist), Z (sideways; positive towards the thumb in the hand);
+    `LOCKED` for an axis that does not turn.
+    """
+
+    name: str
+    parent: str | None
+    head: tuple[float, float, float]
+    tail: tuple[float, float, float]
+    bend: tuple[float, float, float]
+    limits: tuple[Range, Range, Range]
+
+
+class Finger(NamedTuple):
+    """Measures of one finger: joint positions in metres, the heading in degrees (positive: towards the thumb).
+
+    bends: the slight flexion that the finger rests in, at its three free joints.
+    tip: how far the flesh reaches beyond the last bone's tail.
+    """
+
+    base: tuple[float, float, float]
+    knuckle: tuple[float, float, float]
+    heading: float
+    lengths: tuple[float, float, float]
+    bends: tuple[float, float, float]
+
+
+# Bone lengths after the usual proportions of a hand of 0.19 m (metacarpal : phalanges as in radiographs).
+HAND: dict[str, Finger] = {
+    "index": Finger((0.588, -0.0140, 0.0000), (0.6515, -0.0295, -0.0005), 5.0, (0.0415, 0.0240, 0.0200), (2, 5, 4)),
+    "middle": Finger((0.590, -0.0035, 0.0020), (0.6550, -0.0080, 0.0020), 0.5, (0.0455, 0.0275, 0.0210), (2, 5, 4)),
+    "ring": Finger((0.588, 0.0070, 0.0015), (0.6490, 0.0125, 0.0010), -4.5, (0.0420, 0.0265, 0.0208), (2, 6, 4)),
+    "pinky": Finger((0.584, 0.0165, -0.0010), (0.6385, 0.0310, -0.0025), -11.0, (0.0335, 0.0195, 0.0190), (2, 6, 4)),
+}
+
+THUMB_BASE = (0.5760, -0.0205, -0.0080)
+THUMB_LENGTHS = (0.0450, 0.0325, 0.0270)
+# Heading and dip of the thumb's metacarpal, degrees; the phalanges turn back towards the fingers a little.
+THUMB_HEADINGS = (43.0, 33.0, 30.0)
+THUMB_DIPS = (24.0, 20.0, 20.0)
+# The thumb's pad faces across the palm: its bend direction is turned this much about its own axis, degrees.
+THUMB_TURN = 62.0
+
+_METACARPAL = ((-20.0, 20.0), (-20.0, 20.0), (-20.0, 20.0))
+_FINGER_LIMITS = (
+    _METACARPAL,
+    ((-20.0, 90.0), LOCKED, (-15.0, 15.0)),
+    ((-5.0, 100.0), LOCKED, (-5.0, 5.0)),
+    ((-10.0, 80.0), LOCKED, (-5.0, 5.0)),
+)
+_THUMB_LIMITS = (
+    ((-20.0, 30.0), (-15.0, 15.0), (-25.0, 25.0)),
+    ((-10.0, 55.0), LOCKED, (-10.0, 10.0)),
+    ((-15.0, 80.0), LOCKED, (-5.0, 5.0)),
+)
+
+
+def heading_vector(heading: float, dip: float) -> np.ndarray:
+    """(3,) unit vector in armature space: +X turned towards the thumb (-Y) and down (-Z), degrees."""
+    a, b = math.radians(heading), math.radians(dip)
+    return np.array([math.cos(a) * math.cos(b), -math.sin(a) * math.cos(b), -math.sin(b)])
+
+
+def across(axis: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """(3,) unit vector at right angles to the unit vector `axis`, as near to `towards` as it can be."""
+    flat = towards - axis * float(np.dot(axis, towards))
+    return flat / np.linalg.norm(flat)
+
+
+def _turned(vector: np.ndarray, axis: np.ndarray, degrees: float) -> np.ndarray:
+    a = math.radians(degrees)
+    return vector * math.cos(a) + np.cross(axis, vector) * math.sin(a)
+
+
+def _joint(name, parent, head, tail, towards, limits) -> Joint:
+    head, tail = np.asarray(head, float), np.asarray(tail, float)
+    axis = (tail - head) / np.linalg.norm(tail - head)
+    bend = across(axis, np.asarray(towards, float))
+    return Joint(name, parent, tuple(head.tolist()), tuple(tail.tolist()), tuple(bend.tolist()), limits)
+
+
+def _finger_joints(name: str, finger: Finger) -> list[Joint]:
+    palm = np.array([0.0, 0.0, -1.0])
+    joints = [_joint(f"{name}_0", "wrist", finger.base, finger.knuckle, palm, _FINGER_LIMITS[0])]
+    head, dip = np.array(finger.knuckle), 0.0
+    for i, (length, bend) in enumerate(zip(finger.lengths, finger.bends), start=1):
+        dip += bend
+        tail = head + heading_vector(finger.heading, dip) * length
+        joints.append(_joint(f"{name}_{i}", f"{name}_{i - 1}", head, tail, palm, _FINGER_LIMITS[i]))
+        head = tail
+    return joints
+
+
+def _thumb_joints() -> list[Joint]:
+    joints = []
+    head, parent = np.array(THUMB_BASE), "wrist"
+    for i, length in enumerate(THUMB_LENGTHS):
+        axis = heading_vector(THUMB_HEADINGS[i], THUMB_DIPS[i])
+        down = across(axis, np.array([0.0, 0.0, -1.0]))
+        tail = head + axis * length
+        name = f"thumb_{i}"
+        joints.append(_joint(name, parent, head, tail, _turned(down, axis, THUMB_TURN), _THUMB_LIMITS[i]))
+        head, parent = tail, name
+    return joints
+
+
+def _arm_joints() -> list[Joint]:
+    crease, palm = (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)
+    elbow, wrist = (UPPER_ARM_LENGTH, 0.0, 0.0), (WRIST_X, 0.0, 0.0)
+    quarter = (-90.0, 90.0)
+    return [
+        _joint("shoulder", None, (0.0, 0.0, 0.0), elbow, crease, (quarter, quarter, quarter)),
+        _joint("elbow", "shoulder", elbow, wrist, crease, ((0.0, ELBOW_FLEXION), LOCKED, LOCKED)),
+        _joint("wrist", "elbow", wrist, (WRIST_X + 0.03, 0.0, 0.0), palm, ((-70.0, 70.0), LOCKED, (-30.0, 20.0))),
+    ]
+
+
+JOINTS: tuple[Joint, ...] = tuple(
+    _arm_joints() + _thumb_joints() + [j for name in FINGERS for j in _finger_joints(name, HAND[name])]
+)
+JOINT_NAMES: tuple[str, ...] = tuple(joint.name for joint in JOINTS)
+JOINT_INDEX: dict[str, int] = {name: i for i, name in enumerate(JOINT_NAMES)}
+
+
+def joint(name: str) -> Joint:
+    """The joint called `name`; KeyError when the arm has none of that name."""
+    return JOINTS[JOINT_INDEX[name]]

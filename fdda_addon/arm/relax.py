@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Draws a grid of quads onto the surface of a field, evenly spread, its rings kept in their planes."""
+
+import numpy as np
+
+from .field import Field
+from .grid import Grid
+
+
+def neighbour_table(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(count, k) int neighbours along edges, rows filled up with the vertex itself, and (count,) how many are real."""
+    edges = np.concatenate([faces[:, [i, (i + 1) % 4]] for i in range(4)])
+    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    both = np.concatenate([edges, edges[:, ::-1]])
+    both = both[np.lexsort((both[:, 1], both[:, 0]))]
+    valence = np.bincount(both[:, 0], minlength=count)
+    table = np.repeat(np.arange(count)[:, None], valence.max(), axis=1)
+    place = np.arange(len(both)) - np.repeat(np.cumsum(valence) - valence, valence)
+    table[both[:, 0], place] = both[:, 1]
+    return table, valence
+
+
+def relax(grid: Grid, field: Field, rounds: int) -> np.ndarray:
+    """(n, 3) float64 points on the field's surface: `rounds` of smoothing along it and stepping back onto it.
+
+    The step is Newton's, inside the vertex's plane as far as the plane holds it, at most 6 mm long.
+    """
+    x = grid.points.copy()
+    table, valence = neighbour_table(grid.faces, len(x))
+    spare = table.shape[1] - valence
+    normal, hold = grid.plane_normal, grid.plane_hold[:, None]
+    outward = np.zeros_like(x)
+    for i in range(rounds):
+        settle = i >= rounds - 3
+        if not settle:
+            mean = (x[table].sum(axis=1) - x * spare[:, None]) / valence[:, None]
+            step = (mean - x) * 0.5
+            step -= outward * np.einsum("ij,ij->i", step, outward)[:, None]
+            x += step
+            away = np.einsum("ij,ij->i", x - grid.plane_point, normal)[:, None]
+            x -= hold * away * normal
+        distance, gradient = field.distance_and_gradient(x)
+        size = np.linalg.norm(gradient, axis=1, keepdims=True)
+        outward = gradient / np.maximum(size, 1e-6)
+        inside = np.einsum("ij,ij->i", gradient, normal)[:, None]
+        slope = gradient - hold * inside * normal
+        steep = np.einsum("ij,ij->i", slope, slope)
+        # Where the plane lies along the surface there is no way inside it: take the plain gradient.
+        slope = np.where((steep < 0.1)[:, None], gradient, slope)
+        steep = np.maximum(np.einsum("ij,ij->i", slope, slope), 1e-6)
+        x -= slope * np.clip(distance / steep, -0.006, 0.006)[:, None]
+    return x

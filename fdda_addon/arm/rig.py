@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The arm in the scene: mesh, armature, range of motion and the three layers of deformation."""
+
+import math
+
+import bpy
+import numpy as np
+
+from .action import assign_drive_action
+from .joints import ARM_OBJECT, BICEPS_KEY, ELBOW_FLEXION, JOINT_NAMES, JOINTS, LOCKED, RIG_OBJECT, ROTATION_MODE
+from .surface import Surface, sculpt_arm
+
+# Corrective Smooth: repeats by density, so that the smoothing reaches about as far on finer quads.
+SMOOTH_ITERATIONS = {1: 10, 2: 20, 3: 30}
+SMOOTH_FACTOR = 0.8
+SKIN_COLOUR = (0.80, 0.56, 0.44, 1.0)
+
+
+def build_arm(density: int = 1) -> tuple[bpy.types.Object, bpy.types.Object]:
+    """Adds the arm and its rig to the current scene: (mesh object, armature object).
+
+    Layers: hard skinning through an Armature modifier, the biceps shape key raised by a driver, Corrective Smooth. The
+    action `arm_drive` is assigned and the scene's range set to it. ValueError for a density other than 1, 2 or 3.
+    """
+    surface = sculpt_arm(density)
+    rig = _armature_object()
+    _limit_motion(rig)
+    arm = _mesh_object(surface)
+    arm.parent = rig
+    _add_skinning(arm, rig, surface.joints)
+    _add_biceps(arm, rig, surface)
+    _add_smoothing(arm, density)
+    assign_drive_action(rig)
+    bpy.context.view_layer.update()
+    return arm, rig
+
+
+def _armature_object() -> bpy.types.Object:
+    armature = bpy.data.armatures.new(RIG_OBJECT)
+    armature.display_type = "STICK"
+    rig = bpy.data.objects.new(RIG_OBJECT, armature)
+    rig.show_in_front = True
+    bpy.context.scene.collection.objects.link(rig)
+    # Bones can only be added in edit mode, which works on the active object.
+    layer = bpy.context.view_layer
+    before = layer.objects.active
+    if before is not None and before.mode != "OBJECT":
+        bpy.ops.object.mode_set(mode="OBJECT")
+    layer.objects.active = rig
+    bpy.ops.object.mode_set(mode="EDIT")
+    try:
+        for joint in JOINTS:
+            bone = armature.edit_bones.new(joint.name)
+            bone.head, bone.tail = joint.head, joint.tail
+            bone.align_roll(joint.bend)
+            if joint.parent is not None:
+                parent = armature.edit_bones[joint.parent]
+                bone.parent = parent
+                bone.use_connect = (parent.tail - bone.head).length < 1e-6
+    finally:
+        bpy.ops.object.mode_set(mode="OBJECT")
+        layer.objects.active = before if before is not None else rig
+    return rig
+
+
+def _limit_motion(rig: bpy.types.Object):
+    """Range of motion as IK limits and lock flags: neither clamps posing by hand, so an action may go beyond."""
+    for joint in JOINTS:
+        bone = rig.pose.bones[joint.name]
+        bone.rotation_mode = ROTATION_MODE
+        bone.lock_location = (True, True, True)
+        bone.lock_scale = (True, True, True)
+        bone.lock_rotation = tuple(limits == LOCKED for limits in joint.limits)
+        for axis, (low, high) in zip("xyz", joint.limits):
+            setattr(bone, f"lock_ik_{axis}", (low, high) == LOCKED)
+            setattr(bone, f"use_ik_limit_{axis}", True)
+            setattr(bone, f"ik_min_{axis}", math.radians(low))
+            setattr(bone, f"ik_max_{axis}", math.radians(high))
+
+
+def _mesh_object(surface: Surface) -> bpy.types.Object:
+    mesh = bpy.data.meshes.new(ARM_OBJECT)
+    mesh.from_pydata(surface.points.tolist(), [], surface.faces.tolist())
+    mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), bool))
+    mesh.materials.append(_skin_material())
+    mesh.update()
+    arm = bpy.data.objects.new(ARM_OBJECT, mesh)
+    bpy.context.scene.collection.objects.link(arm)
+    return arm
+
+
+def _skin_material() -> bpy.types.Material:
+    material = bpy.data.materials.new("arm_skin")
+    material.diffuse_color = SKIN_COLOUR
+    material.roughness = 0.55
+    if material.node_tree is None:
+        material.use_nodes = True
+    shader = material.node_tree.nodes["Principled BSDF"]
+    shader.inputs["Base Color"].default_value = SKIN_COLOUR
+    shader.inputs["Roughness"].default_value = 0.5
+    shader.inputs["Subsurface Weight"].default_value = 0.15
+    shader.inputs["Subsurface Scale"].default_value = 0.01
+    return material
+
+
+def _add_skinning(arm: bpy.types.Object, rig: bpy.types.Object, joints: np.ndarray):
+    for index, name in enumerate(JOINT_NAMES):
+        group = arm.vertex_groups.new(name=name)
+        group.add(np.flatnonzero(joints == index).tolist(), 1.0, "REPLACE")
+    modifier = arm.modifiers.new("Armature", "ARMATURE")
+    modifier.object = rig
+    modifier.use_vertex_groups = True
+    modifier.use_bone_envelopes = False
+    modifier.use_deform_preserve_volume = False
+
+
+def _add_biceps(arm: bpy.types.Object, rig: bpy.types.Object, surface: Surface):
+    basis = arm.shape_key_add(name="Basis", from_mix=False)
+    key = arm.shape_key_add(name=BICEPS_KEY, from_mix=False)
+    key.relative_key = basis
+    key.data.foreach_set("co", (surface.points + surface.biceps).astype(np.float32).ravel())
+    driver = key.driver_add("value").driver
+    driver.type = "SCRIPTED"
+    variable = driver.variables.new()
+    variable.name = "elbow"
+    variable.type = "TRANSFORMS"
+    target = variable.targets[0]
+    target.id = rig
+    target.bone_target = "elbow"
+    target.transform_type = "ROT_X"
+    target.transform_space = "LOCAL_SPACE"
+    # A simple expression: Blender works it out itself, also where Python scripts are disabled.
+    driver.expression = f"clamp(elbow / {math.radians(ELBOW_FLEXION):.6f}, 0, 1)"
+
+
+def _add_smoothing(arm: bpy.types.Object, density: int):
+    modifier = arm.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
+    modifier.rest_source = "ORCO"
+    modifier.smooth_type = "SIMPLE"
+    modifier.factor = SMOOTH_FACTOR
+    modifier.iterations = SMOOTH_ITERATIONS[density]

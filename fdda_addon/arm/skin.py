@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which bone each vertex of the arm follows: one, with weight 1.0."""
+
+import numpy as np
+
+from .grid import Grid
+from .joints import FINGERS, JOINT_INDEX, UPPER_ARM_LENGTH, WRIST_X, joint
+
+
+def _beyond(points: np.ndarray, before: str, after: str) -> np.ndarray:
+    """(n,) bool: past the plane that halves the angle between two bones at their common joint."""
+    first, second = joint(before), joint(after)
+    axes = [np.array(bone.tail) - np.array(bone.head) for bone in (first, second)]
+    normal = sum(axis / np.linalg.norm(axis) for axis in axes)
+    return (points - np.array(second.head)) @ normal > 0.0
+
+
+def _from_bone(points: np.ndarray, name: str, start: float = 0.0) -> np.ndarray:
+    """(n,) metres to the bone's segment, of which the first part `start` (0..1) is left out."""
+    head, tail = np.array(joint(name).head), np.array(joint(name).tail)
+    head = head + (tail - head) * start
+    axis = tail - head
+    t = np.clip((points - head) @ axis / (axis @ axis), 0.0, 1.0)
+    return np.linalg.norm(points - head - t[:, None] * axis, axis=1)
+
+
+def main_joints(points: np.ndarray, grid: Grid) -> np.ndarray:
+    """(n,) int32 index into `JOINTS` for the rest points (n, 3), metres.
+
+    Fingers are cut at their joints, by chain: no vertex of a finger follows another one. The palm goes to the metacarpals
+    by column, the ball of the thumb to the thumb's.
+    """
+    result = np.full(len(points), JOINT_INDEX["shoulder"], np.int32)
+    result[points[:, 0] >= UPPER_ARM_LENGTH] = JOINT_INDEX["elbow"]
+    in_hand = (points[:, 0] >= WRIST_X) | (grid.finger >= 0)
+    result[in_hand] = JOINT_INDEX["wrist"]
+    for k, name in enumerate(FINGERS, start=1):
+        chain = in_hand & np.where(grid.finger >= 0, grid.finger == k, grid.column == k)
+        for i in range(4):
+            before = "wrist" if i == 0 else f"{name}_{i - 1}"
+            chain = chain & (_beyond(points, before, f"{name}_{i}") | (i < 2) & (grid.finger == k))
+            result[chain] = JOINT_INDEX[f"{name}_{i}"]
+    thumb = grid.finger == 0
+    ball = in_hand & (grid.finger < 0) & (grid.column <= 2) & (result != JOINT_INDEX["index_1"])
+    to_index = np.minimum(_from_bone(points, "index_0"), _from_bone(points, "middle_0"))
+    ball &= _from_bone(points, "thumb_0", 0.25) < 0.95 * np.minimum(to_index, _from_bone(points, "wrist") + 0.002)
+    result[thumb | ball] = JOINT_INDEX["thumb_0"]
+    for i in (1, 2):
+        thumb = thumb & _beyond(points, f"thumb_{i - 1}", f"thumb_{i}")
+        result[thumb] = JOINT_INDEX[f"thumb_{i}"]
+    return result

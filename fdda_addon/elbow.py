@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A plain elbow: two bones and a few hundred vertices, small enough for every test."""
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import bpy
+
+ELBOW_OBJECT = "elbow"
+RIG_OBJECT = "elbow_rig"
+ACTION = "elbow_wave"
+FRAMES = 30
+
+# Metres along +X: the tube from its start to its end, the joint between the two bones, how far the weights blend.
+START, JOINT, END = 0.0, 0.25, 0.50
+BLEND = 0.06
+_AROUND, _RINGS = 12, 24
+
+# Degrees, local space: the lower bone turns about X only.
+LOWER_RANGE = ((0.0, 120.0), (0.0, 0.0), (0.0, 0.0))
+UPPER_RANGE = ((-45.0, 45.0), (-45.0, 45.0), (-45.0, 45.0))
+
+
+def elbow_surface() -> tuple[np.ndarray, np.ndarray]:
+    """points (v, 3) float64, metres, and faces (f, 4) int32, outward: a tube that is thick above the joint, closed."""
+    along = np.linspace(START, END, _RINGS + 1)
+    radius = np.interp(along, (START, 0.10, 0.22, 0.27, 0.34, END), (0.047, 0.052, 0.041, 0.042, 0.046, 0.030))
+    angle = np.arange(_AROUND) * (2 * np.pi / _AROUND) + np.pi / _AROUND
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    points = [
+        np.column_stack([np.full(_AROUND, x), ring[:, 0] * r * 1.08, ring[:, 1] * r * 0.94])
+        for x, r in zip(along, radius)
+    ]
+    faces = []
+    for i in range(_RINGS):
+        for j in range(_AROUND):
+            k = (j + 1) % _AROUND
+            a, b = i * _AROUND, (i + 1) * _AROUND
+            faces.append((a + j, a + k, b + k, b + j))
+    faces += _cap(0, outward=False) + _cap(_RINGS * _AROUND, outward=True)
+    # The caps are quads across the ring; drawn in a little, the end rings look like cut flesh.
+    points[0][:, 1:] *= 0.8
+    points[-1][:, 1:] *= 0.8
+    return np.concatenate(points), np.array(faces, np.int32)
+
+
+def _cap(first: int, outward: bool) -> list[tuple[int, int, int, int]]:
+    """The ring's vertices sewn across in quads: facing is the ring's own turn when `outward`."""
+    half = _AROUND // 2
+    quads = []
+    for j in range(half - 1):
+        quad = (first + j, first + j + 1, first + _AROUND - 2 - j, first + _AROUND - 1 - j)
+        quads.append(quad if outward else quad[::-1])
+    return quads
+
+
+def lower_weights(points: np.ndarray) -> np.ndarray:
+    """(v,) weight of the lower bone, 0..1: a smooth step across the joint."""
+    t = np.clip((points[:, 0] - JOINT) / BLEND + 0.5, 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def build_elbow() -> "tuple[bpy.types.Object, bpy.types.Object]":
+    """Adds the elbow to the current scene: (mesh object `elbow`, armature object `elbow_rig`).
+
+    Bones `upper` and `lower`, their range of motion in Limit Rotation constraints in local space; smooth weights, an
+    Armature modifier and Corrective Smooth; an action `elbow_wave` of 30 frames inside the range.
+    """
+    import bpy
+
+    points, faces = elbow_surface()
+    armature = bpy.data.armatures.new(RIG_OBJECT)
+    rig = bpy.data.objects.new(RIG_OBJECT, armature)
+    bpy.context.scene.collection.objects.link(rig)
+    _add_bones(rig)
+    for name, ranges in (("upper", UPPER_RANGE), ("lower", LOWER_RANGE)):
+        _limit_rotation(rig.pose.bones[name], ranges)
+
+    mesh = bpy.data.meshes.new(ELBOW_OBJECT)
+    mesh.from_pydata(points.tolist(), [], faces.tolist())
+    mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), bool))
+    mesh.update()
+    elbow = bpy.data.objects.new(ELBOW_OBJECT, mesh)
+    bpy.context.scene.collection.objects.link(elbow)
+    elbow.parent = rig
+    weights = lower_weights(points)
+    for name, values in (("upper", 1.0 - weights), ("lower", weights)):
+        group = elbow.vertex_groups.new(name=name)
+        for index in np.flatnonzero(values > 0.0):
+            group.add([int(index)], float(values[index]), "REPLACE")
+    skin = elbow.modifiers.new("Armature", "ARMATURE")
+    skin.object = rig
+    smooth = elbow.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
+    smooth.rest_source, smooth.factor, smooth.iterations = "ORCO", 0.6, 8
+    _add_wave(rig)
+    bpy.context.view_layer.update()
+    return elbow, rig
+
+
+def _add_bones(rig: "bpy.types.Object"):
+    import bpy
+
+    layer = bpy.context.view_layer
+    before = layer.objects.active
+    if before is not None and before.mode != "OBJECT":
+        bpy.ops.object.mode_set(mode="OBJECT")
+    layer.objects.active = rig
+    bpy.ops.object.mode_set(mode="EDIT")
+    try:
+        bones = rig.data.edit_bones
+        parent = None
+        for name, head, tail in (("upper", START, JOINT), ("lower", JOINT, END)):
+            bone = bones.new(name)
+            bone.head, bone.tail = (head, 0.0, 0.0), (tail, 0.0, 0.0)
+            # Local Z to the front, so that a positive turn about X bends the elbow forwards.
+            bone.align_roll((0.0, -1.0, 0.0))
+            bone.parent, bone.use_connect = parent, parent is not None
+            parent = bone
+    finally:
+        bpy.ops.object.mode_set(mode="OBJECT")
+        layer.objects.active = before if before is not None else rig
+
+
+def _limit_rotation(bone: "bpy.types.PoseBone", ranges):
+    bone.rotation_mode = "XYZ"
+    bone.lock_location = bone.lock_scale = (True, True, True)
+    limit = bone.constraints.new("LIMIT_ROTATION")
+    limit.owner_space = "LOCAL"
+    for axis, (low, high) in zip("xyz", ranges):
+        setattr(limit, f"use_limit_{axis}", True)
+        setattr(limit, f"min_{axis}", math.radians(low))
+        setattr(limit, f"max_{axis}", math.radians(high))
+
+
+def _add_wave(rig: "bpy.types.Object"):
+    import bpy
+
+    rig.animation_data_create().action = bpy.data.actions.new(ACTION)
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = 1, FRAMES
+    wave = {1: (0, 0, 0, 0), 10: (100, 20, 0, -15), 20: (30, -25, 10, 30), FRAMES: (0, 0, 0, 0)}
+    for frame, (bend, *turn) in wave.items():
+        upper, lower = rig.pose.bones["upper"], rig.pose.bones["lower"]
+        upper.rotation_euler = [math.radians(angle) for angle in turn]
+        lower.rotation_euler = (math.radians(bend), 0.0, 0.0)
+        for bone in (upper, lower):
+            bone.keyframe_insert("rotation_euler", frame=frame, group=bone.name)
+    scene.frame_set(1)
