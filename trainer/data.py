@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What the networks are trained on: features and coefficients of each partition."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
 from fdda_addon.core.recording import Recording
 
 from .basis import Basis, make_basis
+from .inputs import InputRows
 
 LEAST_POSES = 10
 LEAST_SPREAD = 1e-5
@@ -85,25 +85,19 @@ def split_poses(poses: int, validation_fraction: float, seed: int) -> Split:
     return Split(np.sort(order[count:]), np.sort(order[:count]))
 
 
-def partitions_of(recording: Recording) -> list[PartitionData]:
-    """The partitions of a recording; the features are those of the influencing joints."""
+def partitions_of(recording: Recording, inputs: InputRows) -> list[PartitionData]:
+    """The partitions of a recording, their features as `inputs` chose them."""
     rig = recording.rig
-    features = joint_features(recording.pose_matrices, rig.rest_matrices, rig.parents)
+    features = inputs.features(recording.pose_matrices, rig.rest_matrices).reshape(len(recording.pose_matrices), -1)
     return [
         PartitionData(
             rig.joints[partition.joint].name,
-            features[:, list(partition.influencing)].reshape(len(features), -1),
+            features[:, inputs.columns(number)],
             lambda vertices=partition.vertices: recording.residuals[:, vertices],
             len(partition.vertices),
         )
-        for partition in recording.partitions
+        for number, partition in enumerate(recording.partitions)
     ]
-
-
-def feature_columns(influencing: Sequence[int]) -> np.ndarray:
-    """Where the features of a partition stand in the (J * 12) features of all joints, in the same order."""
-    joints = np.asarray(influencing, np.int64)
-    return (joints[:, None] * FEATURES_PER_JOINT + np.arange(FEATURES_PER_JOINT)).ravel()
 
 
 def prepare(partition: PartitionData, split: Split, tolerance_mm: float, seed: int) -> PreparedPartition:

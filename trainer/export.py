@@ -10,7 +10,6 @@ import onnxruntime
 import torch
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.features import joint_features
 from fdda_addon.core.metrics import distances, error_statistics
 from fdda_addon.core.model import METADATA_KEY, POSE_INPUT, POSITIONS_OUTPUT, ModelInfo, ModelPartition, read_model_info
 from fdda_addon.core.output import replacing
@@ -49,17 +48,17 @@ def reference_positions(deformation: Deformation, pose_matrices: np.ndarray) -> 
         (N, V, 3) float32 positions, mesh-object space, metres, and (N, P) float32 trust.
     """
     rig, trust_range = deformation.rig, deformation.trust
-    features = joint_features(pose_matrices, rig.rest_matrices, rig.parents)
+    features = deformation.inputs.features(pose_matrices, rig.rest_matrices)
     trust = trust_range.trust(features)
     mean, scale = standardisation(deformation)
     clamped = np.clip(features, trust_range.low, trust_range.high).reshape(len(features), -1)
-    inputs = ((clamped - mean) / scale).astype(np.float32).reshape(features.shape)
+    inputs = ((clamped - mean) / scale).astype(np.float32)
     local = np.zeros((len(features), rig.vertex_count, 3), np.float32)
     activation = ACTIVATIONS[deformation.activation]
     for number, (partition, prepared, network) in enumerate(
         zip(deformation.partitions, deformation.prepared, deformation.networks, strict=True)
     ):
-        own = inputs[:, list(partition.influencing)].reshape(len(features), -1)[:, prepared.columns]
+        own = inputs[:, deformation.inputs.columns(number)[prepared.columns]]
         values = torch.from_numpy(own)
         for layer, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
             values = torch.addmm(torch.from_numpy(bias), values, torch.from_numpy(weight))
@@ -150,8 +149,8 @@ def model_info(recording: Recording, deformation: Deformation, held_out: np.ndar
             ModelPartition(p.joint, p.influencing, len(p.vertices), len(prepared.basis.shapes))
             for p, prepared in zip(deformation.partitions, deformation.prepared, strict=True)
         ),
-        deformation.trust.low,
-        deformation.trust.high,
+        deformation.trust.low[: len(rig.joints)],
+        deformation.trust.high[: len(rig.joints)],
         error_statistics(held_out).to_json(),
         0.0,
         training,

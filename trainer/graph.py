@@ -17,7 +17,8 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import SkinBlock
 
-from .data import PreparedPartition, feature_columns
+from .data import PreparedPartition
+from .inputs import InputRows
 from .loop import Network
 from .trust import TrustRange
 
@@ -35,12 +36,14 @@ class Deformation:
     Attributes:
         rig: with J joints.
         partitions: P of them, with the prepared data and the network of each.
+        inputs: what the networks see.
         trust: range of the training poses.
         activation: of the networks.
     """
 
     rig: Rig
     partitions: tuple[Partition, ...]
+    inputs: InputRows
     prepared: tuple[PreparedPartition, ...]
     networks: tuple[Network, ...]
     trust: TrustRange
@@ -80,7 +83,7 @@ def build_graph(deformation: Deformation) -> onnx.ModelProto:
     """Build the model, without metadata."""
     graph = _Graph()
     joints, vertices = len(deformation.rig.joints), deformation.rig.vertex_count
-    features = _features(graph, deformation.rig)
+    features = _features(graph, deformation.rig, deformation.inputs)
     inputs, trust = _range(graph, features, deformation)
     coefficients = _networks(graph, inputs, deformation)
     _playback(graph, coefficients, trust, deformation)
@@ -95,22 +98,25 @@ def build_graph(deformation: Deformation) -> onnx.ModelProto:
     return model
 
 
-def _features(graph: _Graph, rig: Rig) -> str:
-    """(N, J * 12) joint features F_j = Q_j^-1 P_j, where Q_j = P_p B_p^-1 B_j is the joint carried by its parent."""
-    parents, rest = rig.parents, rig.rest_matrices.astype(np.float64)
+def _features(graph: _Graph, rig: Rig, inputs: InputRows) -> str:
+    """(N, R * 12) features Q^-1 P_j, where Q = P_r B_r^-1 B_j is the joint carried along by its reference."""
+    parents, rest = inputs.references, rig.rest_matrices.astype(np.float64)[inputs.joints]
     carried = np.where(
-        (parents >= 0)[:, None, None], np.linalg.inv(rest[np.maximum(parents, 0)]) @ rest, np.zeros((4, 4))
+        (parents >= 0)[:, None, None],
+        np.linalg.inv(rig.rest_matrices.astype(np.float64)[np.maximum(parents, 0)]) @ rest,
+        np.zeros((4, 4)),
     )
     roots = np.where((parents < 0)[:, None, None], rest, np.zeros((4, 4)))
     count = len(parents)
     above = graph.add("Gather", [POSE_INPUT, graph.integers("parents", np.maximum(parents, 0))], "above", axis=1)
     moved = graph.add("MatMul", [above, graph.floats("rest_to_parent", carried)], "moved")
     carried_by = graph.add("Add", [moved, graph.floats("root_rest", roots)], "carried")
+    posed = graph.add("Gather", [POSE_INPUT, graph.integers("posed_joints", inputs.joints)], "posed", axis=1)
     flat = graph.integers("flat_matrix", [0, count, 16])
     both = graph.add(
         "Concat",
         [
-            graph.add("Reshape", [POSE_INPUT, flat], "pose_flat"),
+            graph.add("Reshape", [posed, flat], "pose_flat"),
             graph.add("Reshape", [carried_by, flat], "carried_flat"),
         ],
         "pose_and_carried",
@@ -162,7 +168,7 @@ def _range(graph: _Graph, features: str, deformation: Deformation) -> tuple[str,
     """Clamp the features to the training range.
 
     Returns:
-        (N, J * 12) standardised features, clamped; (N, P + 1) trust, the last column always 1.
+        (N, R * 12) standardised features, clamped; (N, P + 1) trust, the last column always 1.
     """
     trust = deformation.trust
     joints = len(deformation.rig.joints)
@@ -173,7 +179,11 @@ def _range(graph: _Graph, features: str, deformation: Deformation) -> tuple[str,
     raised = graph.add("Max", [standard, graph.floats("range_low", low)], "raised")
     clamped = graph.add("Min", [raised, graph.floats("range_high", high)], "clamped")
     outside = graph.add("Sub", [standard, clamped], "outside")
-    excess = graph.add("Mul", [outside, graph.floats("per_fade_width", scale / trust.width.ravel())], "excess")
+    own = joints * FEATURES_PER_JOINT
+    if len(scale) > own:
+        bounds = (graph.integers(f"joint_features_{k}", [v]) for k, v in (("start", 0), ("end", own), ("axis", 1)))
+        outside = graph.add("Slice", [outside, *bounds], "joints_outside")
+    excess = graph.add("Mul", [outside, graph.floats("per_fade_width", scale[:own] / trust.width.ravel())], "excess")
     squared = graph.add("Mul", [excess, excess], "excess_squared")
     counts = np.zeros((joints, FEATURES_PER_JOINT, len(deformation.partitions) + 1))
     counts[:, :, :-1] = trust.counts.T[:, None, :]
@@ -192,11 +202,11 @@ def _range(graph: _Graph, features: str, deformation: Deformation) -> tuple[str,
 
 
 def standardisation(deformation: Deformation) -> tuple[np.ndarray, np.ndarray]:
-    """(J * 12,) float64 mean and scale of each feature; 0 and 1 where no partition looks at it."""
-    size = len(deformation.rig.joints) * FEATURES_PER_JOINT
+    """(R * 12,) float64 mean and scale of each feature; 0 and 1 where no partition looks at it."""
+    size = len(deformation.inputs.joints) * FEATURES_PER_JOINT
     mean, scale = np.zeros(size), np.ones(size)
-    for partition, prepared in zip(deformation.partitions, deformation.prepared, strict=True):
-        columns = feature_columns(partition.influencing)[prepared.columns]
+    for number, prepared in enumerate(deformation.prepared):
+        columns = deformation.inputs.columns(number)[prepared.columns]
         mean[columns], scale[columns] = prepared.feature_mean, prepared.feature_scale
     return mean, scale
 
@@ -214,7 +224,7 @@ def _networks(graph: _Graph, inputs: str, deformation: Deformation) -> str:
     biases = [np.zeros((count, 1, b), np.float32) for b in widths]
     biases[-1][:, 0, -1] = 1
     for n in learned:
-        own = feature_columns(deformation.partitions[n].influencing)[deformation.prepared[n].columns]
+        own = deformation.inputs.columns(n)[deformation.prepared[n].columns]
         columns[n, : len(own)] = own
         for layer, (weight, bias) in enumerate(
             zip(deformation.networks[n].weights, deformation.networks[n].biases, strict=True)

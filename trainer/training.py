@@ -9,7 +9,6 @@ import numpy as np
 import onnxruntime
 import torch
 
-from fdda_addon.core.features import joint_features
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.output import check_writable, write_json, write_text
 from fdda_addon.core.recording import Recording, read_recording
@@ -20,6 +19,7 @@ from .config import TrainingConfig
 from .data import PreparedPartition, Split, partitions_of, prepare, split_poses
 from .export import build_model, measure, write_model
 from .graph import Deformation
+from .inputs import InputRows, make_input_rows
 from .loop import Cancelled, Trained, choose_device, train
 from .trust import make_trust_range
 
@@ -61,7 +61,8 @@ def train_model(
         device=str(device),
     )
     split = split_poses(len(recording.pose_matrices), config.validation_fraction, config.seed)
-    prepared = _prepare(recording, split, config, should_stop)
+    inputs = make_input_rows(recording.rig.parents, recording.partitions)
+    prepared = _prepare(recording, inputs, split, config, should_stop)
     trained = train(
         prepared,
         split,
@@ -72,7 +73,7 @@ def train_model(
         ),
         should_stop,
     )
-    deformation = _deformation(recording, split, prepared, trained, config)
+    deformation = _deformation(recording, inputs, split, prepared, trained, config)
     _check_stop(should_stop)
     settings = {
         **config.to_json(),
@@ -110,24 +111,30 @@ def train_model(
 
 
 def _prepare(
-    recording: Recording, split: Split, config: TrainingConfig, should_stop: Callable[[], bool]
+    recording: Recording, inputs: InputRows, split: Split, config: TrainingConfig, should_stop: Callable[[], bool]
 ) -> list[PreparedPartition]:
     prepared = []
-    for partition in partitions_of(recording):
+    for partition in partitions_of(recording, inputs):
         _check_stop(should_stop)
         prepared.append(prepare(partition, split, config.tolerance_mm, config.seed))
     return prepared
 
 
 def _deformation(
-    recording: Recording, split: Split, prepared: list[PreparedPartition], trained: Trained, config: TrainingConfig
+    recording: Recording,
+    inputs: InputRows,
+    split: Split,
+    prepared: list[PreparedPartition],
+    trained: Trained,
+    config: TrainingConfig,
 ) -> Deformation:
     rig = recording.rig
     matrices = np.array(recording.pose_matrices[split.training])
-    features = joint_features(matrices, rig.rest_matrices, rig.parents)
+    features = inputs.features(matrices, rig.rest_matrices)
     return Deformation(
         rig,
         recording.partitions,
+        inputs,
         tuple(prepared),
         trained.networks,
         make_trust_range(features, rig, recording.partitions),

@@ -32,8 +32,9 @@ class TrustRange:
     """What the training has seen of each joint.
 
     Attributes:
-        low, high: (J, 12) float32, the box with its margin, in the units of `core.features`.
-        width: (J, 12) float32, fade width.
+        low, high: (R, 12) float32, the box with its margin around all transforms that the networks see, of which the
+            first J are the joints relative to their parents (`InputRows`).
+        width: (J, 12) float32, fade width; only the joints count.
         counts: (P, J) bool, the joints that count for a partition: those that influence it, and those beside it that
             were locked, of which nobody knows whether they would.
     """
@@ -44,8 +45,9 @@ class TrustRange:
     counts: np.ndarray
 
     def trust(self, features: np.ndarray) -> np.ndarray:
-        """(N, J, 12) features to (N, P) float32 trust."""
-        excess = (features - np.clip(features, self.low, self.high)) / self.width
+        """(N, R, 12) features to (N, P) float32 trust."""
+        joints = features[:, : len(self.width)]
+        excess = (joints - np.clip(joints, self.low[: len(self.width)], self.high[: len(self.width)])) / self.width
         squared = (excess.astype(np.float64) ** 2).sum(axis=2) @ self.counts.T
         return (np.maximum(0, 1 - squared) ** 2).astype(np.float32)
 
@@ -54,7 +56,7 @@ def make_trust_range(features: np.ndarray, rig: Rig, partitions: tuple[Partition
     """Measure the range of the training poses.
 
     Args:
-        features: (n, J, 12) float32 of the training poses.
+        features: (n, R, 12) float32 of the training poses, the first J the joints relative to their parents.
         rig, partitions: of the recording.
     """
     low, high = features.min(axis=0), features.max(axis=0)
@@ -64,10 +66,11 @@ def make_trust_range(features: np.ndarray, rig: Rig, partitions: tuple[Partition
     least_margin, least_fade = (
         np.where(np.arange(12) % 4 == 3, part[1], part[0]) for part in (LEAST_MARGIN, LEAST_FADE)
     )
+    joints = len(rig.joints)
     margin = np.maximum(MARGIN * spread, least_margin * units)
-    width = np.maximum(FADE * spread, least_fade * units)
-    locked = (spread < LOCKED).all(axis=1)
-    counts = np.zeros((len(partitions), len(rig.joints)), bool)
+    width = np.maximum(FADE * spread, least_fade * units)[:joints]
+    locked = (spread[:joints] < LOCKED).all(axis=1)
+    counts = np.zeros((len(partitions), joints), bool)
     for number, partition in enumerate(partitions):
         beside = {partition.joint, rig.joints[partition.joint].parent, *SkinBlock(rig, partition).joints.tolist()}
         beside |= {child for child, joint in enumerate(rig.joints) if joint.parent == partition.joint}
