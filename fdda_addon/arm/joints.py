@@ -64,17 +64,17 @@ class Finger(NamedTuple):
 
 # Bone lengths after the usual proportions of a hand of 0.19 m (metacarpal : phalanges as in radiographs).
 HAND: dict[str, Finger] = {
-    "index": Finger((0.588, -0.0140, 0.0000), (0.6515, -0.0295, -0.0005), 5.0, (0.0415, 0.0240, 0.0200), (2, 5, 4)),
-    "middle": Finger((0.590, -0.0035, 0.0020), (0.6550, -0.0080, 0.0020), 0.5, (0.0455, 0.0275, 0.0210), (2, 5, 4)),
-    "ring": Finger((0.588, 0.0070, 0.0015), (0.6490, 0.0125, 0.0010), -4.5, (0.0420, 0.0265, 0.0208), (2, 6, 4)),
-    "pinky": Finger((0.584, 0.0165, -0.0010), (0.6385, 0.0310, -0.0025), -11.0, (0.0335, 0.0195, 0.0190), (2, 6, 4)),
+    "index": Finger((0.588, -0.0140, 0.0000), (0.6495, -0.0290, -0.0005), 6.0, (0.0435, 0.0250, 0.0208), (2, 5, 4)),
+    "middle": Finger((0.590, -0.0035, 0.0020), (0.6530, -0.0080, 0.0020), 0.5, (0.0475, 0.0290, 0.0215), (2, 5, 4)),
+    "ring": Finger((0.588, 0.0070, 0.0015), (0.6475, 0.0125, 0.0010), -4.5, (0.0440, 0.0278, 0.0213), (2, 6, 4)),
+    "pinky": Finger((0.584, 0.0165, -0.0010), (0.6365, 0.0318, -0.0025), -13.0, (0.0350, 0.0205, 0.0192), (2, 6, 4)),
 }
 
 THUMB_BASE = (0.5760, -0.0205, -0.0080)
 THUMB_LENGTHS = (0.0450, 0.0325, 0.0270)
 # Heading and dip of the thumb's metacarpal, degrees; the phalanges turn back towards the fingers a little.
 THUMB_HEADINGS = (43.0, 33.0, 30.0)
-THUMB_DIPS = (24.0, 20.0, 20.0)
+THUMB_DIPS = (21.0, 17.0, 17.0)
 # The thumb's pad faces across the palm: its bend direction is turned this much about its own axis, degrees.
 THUMB_TURN = 62.0
 

@@ -4,7 +4,7 @@
 import numpy as np
 
 from .field import Field
-from .grid import Grid
+from .quads import Grid
 
 
 def neighbour_table(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -20,19 +20,34 @@ def neighbour_table(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarr
     return table, valence
 
 
-def relax(grid: Grid, field: Field, rounds: int) -> np.ndarray:
-    """(n, 3) float64 points on the field's surface: `rounds` of smoothing along it and stepping back onto it.
+def draw_out(grid: Grid) -> np.ndarray:
+    """(n, 3) float64: the grid's points, the loose ones moved to the middle of their neighbours, like a soap film.
+
+    From there the surface is reached without folds.
+    """
+    x = grid.points.copy()
+    table, valence = neighbour_table(grid.faces, len(x))
+    loose = np.flatnonzero(grid.loose)
+    near, count = table[loose], valence[loose, None]
+    spare = table.shape[1] - count
+    for _ in range(60):
+        x[loose] = (x[near].sum(axis=1) - x[loose] * spare) / count
+    return x
+
+
+def relax(points: np.ndarray, grid: Grid, field: Field, rounds: int) -> np.ndarray:
+    """(n, 3) float64 on the field's surface, from `points`: `rounds` of smoothing along it and stepping back onto it.
 
     The step is Newton's, inside the vertex's plane as far as the plane holds it, at most 6 mm long.
     """
-    x = grid.points.copy()
+    x = points.copy()
     table, valence = neighbour_table(grid.faces, len(x))
     spare = table.shape[1] - valence
     normal, hold = grid.plane_normal, grid.plane_hold[:, None]
     outward = np.zeros_like(x)
     for i in range(rounds):
-        settle = i >= rounds - 3
-        if not settle:
+        # The last rounds only settle on the surface.
+        if i < rounds - 3:
             mean = (x[table].sum(axis=1) - x * spare[:, None]) / valence[:, None]
             step = (mean - x) * 0.5
             step -= outward * np.einsum("ij,ij->i", step, outward)[:, None]
@@ -42,8 +57,8 @@ def relax(grid: Grid, field: Field, rounds: int) -> np.ndarray:
         distance, gradient = field.distance_and_gradient(x)
         size = np.linalg.norm(gradient, axis=1, keepdims=True)
         outward = gradient / np.maximum(size, 1e-6)
-        inside = np.einsum("ij,ij->i", gradient, normal)[:, None]
-        slope = gradient - hold * inside * normal
+        across = np.einsum("ij,ij->i", gradient, normal)[:, None]
+        slope = gradient - hold * across * normal
         steep = np.einsum("ij,ij->i", slope, slope)
         # Where the plane lies along the surface there is no way inside it: take the plain gradient.
         slope = np.where((steep < 0.1)[:, None], gradient, slope)

@@ -13,7 +13,7 @@ _X, _Z = np.array([1.0, 0, 0]), np.array([0.0, 0, 1.0])
 
 # x, centre y, centre z, half-width to +y (triceps, little finger), -y (biceps, thumb), +z (back), -z (palm)
 _LIMB = [
-    (-0.030, 0.000, -0.002, 0.048, 0.047, 0.046, 0.050),
+    (-0.040, 0.000, -0.002, 0.048, 0.047, 0.046, 0.050),
     (0.020, 0.000, -0.002, 0.047, 0.045, 0.044, 0.050),
     (0.080, 0.000, -0.001, 0.042, 0.038, 0.038, 0.043),
     (0.150, 0.000, 0.000, 0.037, 0.034, 0.036, 0.039),
@@ -28,8 +28,8 @@ _LIMB = [
     (0.556, 0.000, 0.000, 0.0270, 0.0275, 0.0185, 0.0200),
     (0.585, 0.000, 0.000, 0.0300, 0.0290, 0.0175, 0.0185),
     (0.615, 0.000, 0.000, 0.0370, 0.0360, 0.0150, 0.0150),
-    (0.645, 0.001, 0.000, 0.0400, 0.0400, 0.0130, 0.0125),
-    (0.672, 0.001, -0.001, 0.0370, 0.0375, 0.0105, 0.0115),
+    (0.640, 0.000, 0.000, 0.0390, 0.0395, 0.0130, 0.0125),
+    (0.660, -0.006, -0.001, 0.0280, 0.0300, 0.0110, 0.0115),
 ]
 
 
@@ -84,7 +84,7 @@ def _palm() -> list[Stroke]:
     strokes = [
         # Hypothenar along the little finger's side, thenar at the root of the thumb.
         Stroke(_spindle((0.570, 0.020, -0.009), (0.645, 0.033, -0.007), 0.014, 0.013, (0, 0.4, -1)), 0.010),
-        Stroke(_spindle((0.563, -0.012, -0.012), (0.632, -0.034, -0.018), 0.017, 0.0150, (0.2, -0.3, -1)), 0.010),
+        Stroke(_spindle((0.558, -0.008, -0.011), (0.618, -0.045, -0.023), 0.0165, 0.0140, (0.2, -0.1, -1)), 0.010),
         # The first interosseous fills the fork between thumb and index.
         Stroke(_spindle((0.590, -0.022, -0.003), (0.645, -0.039, -0.004), 0.010, 0.012, (0, -1, 0)), 0.012),
     ]
@@ -166,7 +166,7 @@ def _thumb_form() -> list[Stroke]:
 
 def arm_field() -> Field:
     """The whole arm, shoulder to finger tips; a round cut closes the shoulder end."""
-    limb = Loft((0, 0, 0), frame_along(_X, _Z), _LIMB, caps=(0.016, 0.010), power=2.2)
+    limb = Loft((0, 0, 0), frame_along(_X, _Z), _LIMB, caps=(0.030, 0.010), power=2.2)
     strokes = [Stroke(limb, 0.01)] + _upper_arm() + _elbow_and_forearm() + _palm() + _thumb_form()
     for name in FINGERS:
         strokes += _finger_form(name)

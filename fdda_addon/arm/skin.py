@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from .grid import Grid
+from .quads import Grid
 from .joints import FINGERS, JOINT_INDEX, UPPER_ARM_LENGTH, WRIST_X, joint
 
 
@@ -32,16 +32,16 @@ def main_joints(points: np.ndarray, grid: Grid) -> np.ndarray:
     """
     result = np.full(len(points), JOINT_INDEX["shoulder"], np.int32)
     result[points[:, 0] >= UPPER_ARM_LENGTH] = JOINT_INDEX["elbow"]
-    in_hand = (points[:, 0] >= WRIST_X) | (grid.finger >= 0)
+    in_hand = (points[:, 0] >= WRIST_X) | (grid.digit >= 0)
     result[in_hand] = JOINT_INDEX["wrist"]
     for k, name in enumerate(FINGERS, start=1):
-        chain = in_hand & np.where(grid.finger >= 0, grid.finger == k, grid.column == k)
+        chain = in_hand & np.where(grid.digit >= 0, grid.digit == k, grid.column == k)
         for i in range(4):
             before = "wrist" if i == 0 else f"{name}_{i - 1}"
-            chain = chain & (_beyond(points, before, f"{name}_{i}") | (i < 2) & (grid.finger == k))
+            chain = chain & (_beyond(points, before, f"{name}_{i}") | (i < 2) & (grid.digit == k))
             result[chain] = JOINT_INDEX[f"{name}_{i}"]
-    thumb = grid.finger == 0
-    ball = in_hand & (grid.finger < 0) & (grid.column <= 2) & (result != JOINT_INDEX["index_1"])
+    thumb = grid.digit == 0
+    ball = in_hand & (grid.digit < 0) & (grid.column <= 2) & (result != JOINT_INDEX["index_1"])
     to_index = np.minimum(_from_bone(points, "index_0"), _from_bone(points, "middle_0"))
     ball &= _from_bone(points, "thumb_0", 0.25) < 0.95 * np.minimum(to_index, _from_bone(points, "wrist") + 0.002)
     result[thumb | ball] = JOINT_INDEX["thumb_0"]

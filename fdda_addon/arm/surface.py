@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The arm as arrays: rest points, quads, the bone of each vertex, the biceps. No bpy."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .biceps import biceps_offsets
 from .grid import build_grid
-from .relax import relax
+from .quads import seeded_points
+from .relax import draw_out, relax
 from .sculpt import arm_field
 from .skin import main_joints
 
-_ROUNDS = 40
+# Rounds of relaxation: the guide starts far from the skin, finer grids start on it.
+_GUIDE_ROUNDS, _FINE_ROUNDS = 60, 14
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,12 @@ def sculpt_arm(density: int) -> Surface:
     """The arm at density 1, 2 or 3 (about 1,450, 10,000 and 50,000 vertices); ValueError for any other."""
     grid = build_grid(density)
     field = arm_field()
-    points = relax(grid, field, _ROUNDS)
+    guide = build_grid(1)
+    points = relax(draw_out(guide), guide, field, _GUIDE_ROUNDS)
+    if density > 1:
+        seeds = seeded_points(grid, guide, points)
+        # The guide has found where every ring belongs.
+        points = relax(seeds, replace(grid, plane_point=seeds), field, _FINE_ROUNDS)
     _, normals = field.distance_and_gradient(points)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return Surface(points, grid.faces, main_joints(points, grid), biceps_offsets(points, normals))
