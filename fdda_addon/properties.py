@@ -12,6 +12,8 @@ from bpy.props import (
     StringProperty,
 )
 
+from .scene.compatibility import BLEND_RELATIVE_PATH
+
 
 def _apply(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
     from .runtime.binding import apply
@@ -31,7 +33,12 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
     """A model bound to a mesh object."""
 
     is_bound: BoolProperty(name="Bound", description="A model is bound to this object")
-    model: StringProperty(name="Model", description="The model, an .onnx file", subtype="FILE_PATH")
+    model: StringProperty(
+        name="Model",
+        description="The model, an .onnx file",
+        subtype="FILE_PATH",
+        options=BLEND_RELATIVE_PATH,
+    )
     mode: EnumProperty(
         name="Mode",
         description="What deforms the mesh",

@@ -78,7 +78,7 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         RecordingError: there is a recording already, or the one to resume is of something else.
         OutputError: the folder cannot be written.
     """
-    actions = [_find_action(name) for name in settings.actions]
+    actions = [find_action(name) for name in settings.actions]
     check_evaluable(scene_rig)
     rig = read_rig(scene_rig)
     channels = sampled_channels(scene_rig, rig) if settings.poses else ()
@@ -105,7 +105,12 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
                 yield Progress("poses", writer.complete, total)
 
 
-def _find_action(name: str) -> bpy.types.Action:
+def find_action(name: str) -> bpy.types.Action:
+    """An action of the file by its name.
+
+    Raises:
+        RigError: there is none of this name.
+    """
     action = bpy.data.actions.get(name)
     if action is None:
         known = ", ".join(f"'{a.name}'" for a in bpy.data.actions) or "none"

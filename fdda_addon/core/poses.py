@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Ranges of motion, and random poses inside them."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -55,3 +55,12 @@ def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: fl
     while (outside := (values < low) | (values > high)).any():
         values[outside] = rng.normal(middle, deviation)[outside]
     return values
+
+
+def beyond_range(channels: tuple[Channel, ...], factor: float) -> tuple[Channel, ...]:
+    """Channels whose ranges are `factor` times as wide, about the same middle."""
+    widened = []
+    for channel in channels:
+        middle, half = (channel.low + channel.high) / 2, (channel.high - channel.low) / 2 * factor
+        widened.append(replace(channel, low=middle - half, high=middle + half))
+    return tuple(widened)

@@ -55,6 +55,7 @@ def unbind(mesh_object: bpy.types.Object) -> None:
     modifier = nodes.find_modifier(mesh_object)
     if modifier is not None:
         cache = nodes.cache_of(modifier)
+        nodes.set_cache(modifier, None)
         mesh_object.modifiers.remove(modifier)
         nodes.remove_cache(cache)
     for name in ("is_bound", "model", "use_in_render", "status"):

@@ -19,7 +19,9 @@ def _on_evaluated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> No
 @persistent
 def _on_reloaded(*_: object) -> None:
     playback.forget()
-    playback.refresh_all()
+    if playback.playing_objects():
+        # Without a window nothing evaluates a file that was loaded; here it is safe, no evaluation is under way.
+        playback.evaluate(bpy.context.evaluated_depsgraph_get())
 
 
 @persistent
@@ -34,11 +36,12 @@ def _on_render_ended(*_: object) -> None:
     for mesh_object in _playing_outside_renders():
         switch.pin_shape_keys(mesh_object, True)
     # The cache objects hold the last frame of the render.
-    playback.refresh_all()
+    for mesh_object in playback.playing_objects():
+        playback.refresh(mesh_object)
 
 
 def _playing_outside_renders() -> list[bpy.types.Object]:
-    return [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_playing and not o.fdda.use_in_render]
+    return [mesh_object for mesh_object in playback.playing_objects() if not mesh_object.fdda.use_in_render]
 
 
 HANDLERS = {

@@ -6,6 +6,7 @@ They are found anew from the properties of the objects whenever something may ha
 """
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -39,6 +40,7 @@ class LiveBinding:
         self._reader = self._make_reader(mesh_object)
         self._linear_layer: LinearLayer | None = None
         self._shown: tuple | None = None
+        self._cache_name = ""
 
     def _make_reader(self, mesh_object: bpy.types.Object) -> PoseReader:
         info = self.network.info
@@ -82,6 +84,24 @@ class LiveBinding:
             )
         return self._reader.read(evaluated_mesh, evaluated_armature)
 
+    def find_cache(self, mesh_object: bpy.types.Object) -> bpy.types.Object:
+        """The cache object of the mesh object.
+
+        Raises:
+            ModelError: it or the modifier that reads it is gone.
+        """
+        cache = bpy.data.objects.get(self._cache_name)
+        if cache is None:
+            modifier = nodes.find_modifier(mesh_object)
+            cache = nodes.cache_of(modifier) if modifier is not None else None
+            if cache is None or len(cache.data.vertices) != self.network.info.vertex_count:
+                raise ModelError(
+                    f"The modifier of '{mesh_object.name}' that plays the model, or its positions, were removed; "
+                    "bind the model again."
+                )
+            self._cache_name = cache.name
+        return cache
+
     def is_shown(self, key: tuple) -> bool:
         """Whether the cache object holds the positions of this pose already; notes it for the next time."""
         shown, self._shown = self._shown == key, key
@@ -94,7 +114,9 @@ class LiveBinding:
     def linear_positions(self, mesh_object: bpy.types.Object, pose_matrices: np.ndarray) -> np.ndarray:
         """(V, 3) float32 of the linear layer alone, mesh-object space, metres."""
         if self._linear_layer is None:
-            self._linear_layer = LinearLayer(read_rig(SceneRig(mesh_object, _armature(mesh_object))))
+            rig = read_rig(SceneRig(mesh_object, _armature(mesh_object)))
+            # The rest pose of the model: the objects may have moved since, and pose matrices refer to it.
+            self._linear_layer = LinearLayer(replace(rig, rest_matrices=self.network.info.rest_matrices))
         return self._linear_layer.positions(pose_matrices[None])[0]
 
 
@@ -154,11 +176,9 @@ def refresh(mesh_object: bpy.types.Object) -> None:
     mesh_object.update_tag()
 
 
-def refresh_all() -> None:
-    """Evaluate every bound object that plays a model anew."""
-    for mesh_object in bpy.data.objects:
-        if mesh_object.type == "MESH" and mesh_object.fdda.is_playing:
-            refresh(mesh_object)
+def playing_objects() -> list[bpy.types.Object]:
+    """The objects of the file that a model deforms."""
+    return [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_playing]
 
 
 def evaluate(depsgraph: bpy.types.Depsgraph) -> None:
@@ -199,16 +219,7 @@ def _move(network: Network, members: list[tuple[LiveBinding, bpy.types.Object, n
             if strength < 1:
                 linear = live.linear_positions(mesh_object, pose)
                 moved = linear + np.float32(strength) * (moved - linear)
-            _write(mesh_object, moved)
-
-
-def _write(mesh_object: bpy.types.Object, positions: np.ndarray) -> None:
-    modifier = nodes.find_modifier(mesh_object)
-    cache = nodes.cache_of(modifier) if modifier is not None else None
-    if cache is None or len(cache.data.vertices) != len(positions):
-        raise ModelError("The FDDA modifier or its positions were removed; bind the model again.")
-    cache.data.vertices.foreach_set("co", positions.reshape(-1))
-    cache.data.update_tag()
+            nodes.write_cache(live.find_cache(mesh_object), moved)
 
 
 class _failing:  # noqa: N801 - reads as a statement

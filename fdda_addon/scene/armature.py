@@ -39,11 +39,6 @@ def bone_order(armature_object: bpy.types.Object, names: tuple[str, ...]) -> np.
     return np.array([index[name] for name in names], np.int32)
 
 
-def object_matrix(matrix_world: object) -> np.ndarray:
-    """A mathutils matrix as (4, 4) float64."""
-    return np.array(matrix_world, np.float64)
-
-
 def channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Channel, ...]:
     """What of a pose may be sampled, and its range of motion.
 

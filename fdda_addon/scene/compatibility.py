@@ -3,6 +3,9 @@
 
 import bpy
 
+BLEND_RELATIVE_PATH = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
+"""Option of a path property that may begin with `//`; older versions take such paths without being told."""
+
 
 def set_node_input(modifier: bpy.types.NodesModifier, identifier: str, value: object) -> None:
     """Set an input of a Geometry Nodes modifier by the identifier of its socket."""

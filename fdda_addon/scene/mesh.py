@@ -83,5 +83,5 @@ def evaluated_positions(mesh_object: bpy.types.Object, depsgraph: bpy.types.Deps
     """
     mesh = mesh_object.evaluated_get(depsgraph).data
     positions = np.empty((len(mesh.vertices), 3), np.float32)
-    mesh.vertices.foreach_get("co", positions.reshape(-1))
+    mesh.attributes["position"].data.foreach_get("vector", positions.reshape(-1))
     return positions

@@ -146,8 +146,7 @@ def read_rig(scene_rig: SceneRig) -> Rig:
 
 def mesh_from_armature(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
     """(4, 4) float64, armature space to mesh-object space. Pass evaluated objects for an evaluated answer."""
-    to_world = armature_io.object_matrix(armature_object.matrix_world)
-    return np.linalg.inv(armature_io.object_matrix(mesh_object.matrix_world)) @ to_world
+    return np.array(mesh_object.matrix_world.inverted_safe() @ armature_object.matrix_world, np.float64)
 
 
 def sampled_channels(scene_rig: SceneRig, rig: Rig) -> tuple[Channel, ...]:

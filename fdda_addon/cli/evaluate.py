@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`evaluate RIG.blend MODEL.onnx --json OUT.json`: how far the model is from the rig."""
+
+import argparse
+from pathlib import Path
+
+from ..core.errors import WrongUsageError
+from ..core.output import check_writable, write_json
+from ..evaluation import Evaluation, EvaluationSettings, evaluate
+from ..recording import Progress
+from ..runtime.binding import true_rig
+from ..scene.rig import SceneRig
+from .files import add_rig_options, open_rig
+from .progress import ProgressPrinter
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    add_rig_options(parser)
+    parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model")
+    parser.add_argument("--json", metavar="OUT.json", type=Path, required=True, help="where to write the errors")
+    parser.add_argument("--poses", type=int, default=200, help="number of held-out poses (default 200)")
+    parser.add_argument("--seed", type=int, default=1, help="of the held-out poses (default 1)")
+    parser.add_argument("--action", action="append", default=[], metavar="NAME", help="compare its frames as well")
+    parser.add_argument(
+        "--beyond", type=float, action="append", default=[], metavar="X", help="compare at X times the range as well"
+    )
+    parser.add_argument("--heatmap", metavar="OUT.png", type=Path, help="draw rig, linear layer and model as heat maps")
+
+
+def run(options: argparse.Namespace) -> None:
+    if options.poses < 1 or options.seed < 0 or min(options.beyond, default=1) <= 0:
+        raise WrongUsageError("--poses must be 1 or more, --seed 0 or more, and --beyond more than 0.")
+    check_writable(options.json)
+    if options.heatmap:
+        check_writable(options.heatmap)
+    scene_rig = open_rig(options)
+    settings = EvaluationSettings(options.poses, options.seed, tuple(options.action), tuple(options.beyond))
+    evaluation = run_evaluation(scene_rig, options.model, settings)
+    if options.heatmap:
+        from ..pictures import draw_comparison, worst_poses
+
+        draw_comparison(scene_rig, options.model, worst_poses(evaluation.held_out), options.heatmap, heat=True)
+    write_json(options.json, evaluation.to_json())
+    print(table(evaluation))
+
+
+def run_evaluation(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> Evaluation:
+    """Evaluate with progress on stderr."""
+    with ProgressPrinter() as progress, true_rig(scene_rig.mesh_object):
+        for step in evaluate(scene_rig, model, settings):
+            if isinstance(step, Progress):
+                progress.show(step.stage, step.done, step.total)
+    return step
+
+
+def table(evaluation: Evaluation) -> str:
+    """The errors as text, in mm."""
+    head = f"{'error in mm':<24}{'mean':>10}{'rms':>10}{'p99':>10}{'p99.9':>10}{'max':>10}"
+    lines = [head, "-" * len(head)]
+    for errors in (evaluation.held_out, *evaluation.beyond, *evaluation.actions):
+        values = errors.to_json()
+        lines.append(f"{errors.name}, {values['poses']} poses")
+        for key, label in (("linear", "  linear layer"), ("fdda", "  FDDA")):
+            row = values[key]
+            figures = "".join(f"{row[name]:>10.4f}" for name in ("mean", "rms", "p99", "p999", "max"))
+            lines.append(f"{label:<24}{figures}")
+        ratios = "".join(
+            f"{100 * values['fdda'][name] / max(values['linear'][name], 1e-12):>9.1f}%"
+            for name in ("mean", "rms", "p99", "p999", "max")
+        )
+        lines.append(f"{'  FDDA / linear layer':<24}{ratios}")
+    return "\n".join(lines)

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Compares a model and the linear layer with the true rig, on poses that training never saw."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from .core.errors import RigError
+from .core.metrics import ErrorStatistics, distances, error_statistics
+from .core.model import check_rig
+from .core.partition import Partition
+from .core.poses import Channel, beyond_range, sample_pose
+from .core.skinning import LinearLayer
+from .recording import Progress, action_frames, find_action
+from .runtime.network import Network
+from .scene.armature import Poser, clear_pose
+from .scene.borrow import assign_action, borrowed_pose
+from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
+
+HELD_OUT_INDEX = 1 << 33
+"""Held-out poses are drawn from indices that no recording reaches, so that they differ from the poses of any recording
+even when it was made with the same seed."""
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What to compare on.
+
+    Attributes:
+        poses: number of random held-out poses.
+        seed: of the random poses.
+        actions: names of actions whose frames are compared as well.
+        beyond: factors by which the range of motion is widened for further poses, a quarter as many for each.
+    """
+
+    poses: int = 200
+    seed: int = 1
+    actions: tuple[str, ...] = ()
+    beyond: tuple[float, ...] = ()
+
+
+@dataclass
+class PoseErrors:
+    """Errors of one set of poses.
+
+    Attributes:
+        name: what the poses are.
+        pose_matrices: (N, J, 4, 4) float32, mesh-object space, metres.
+        positions: (N, V, 3) float32, the true rig, mesh-object space, metres.
+        fdda, linear: (N, V) float32, distances from the true rig, metres.
+    """
+
+    name: str
+    pose_matrices: np.ndarray
+    positions: np.ndarray
+    fdda: np.ndarray
+    linear: np.ndarray
+
+    def to_json(self) -> dict:
+        return {
+            "name": self.name,
+            "poses": len(self.fdda),
+            "fdda": error_statistics(self.fdda).to_json(),
+            "linear": error_statistics(self.linear).to_json(),
+        }
+
+
+@dataclass
+class Evaluation:
+    """How well a model stands in for its rig.
+
+    Attributes:
+        partitions: of the rig. joints: names by joint index.
+        held_out: errors of the random poses.
+        actions, beyond: errors of the actions, and of the poses beyond the range of motion by factor.
+    """
+
+    partitions: tuple[Partition, ...]
+    joints: tuple[str, ...]
+    held_out: PoseErrors
+    actions: list[PoseErrors] = field(default_factory=list)
+    beyond: list[PoseErrors] = field(default_factory=list)
+
+    @property
+    def fdda(self) -> ErrorStatistics:
+        return error_statistics(self.held_out.fdda)
+
+    @property
+    def linear(self) -> ErrorStatistics:
+        return error_statistics(self.held_out.linear)
+
+    def to_json(self) -> dict:
+        """docs/evaluation.md describes it; lengths in mm."""
+        return {
+            "unit": "mm",
+            "poses": len(self.held_out.fdda),
+            "vertices": self.held_out.fdda.shape[1],
+            "fdda": self.fdda.to_json(),
+            "linear": self.linear.to_json(),
+            "partitions": [
+                {
+                    "joint": self.joints[partition.joint],
+                    "vertices": len(partition.vertices),
+                    "fdda": error_statistics(self.held_out.fdda[:, partition.vertices]).to_json(),
+                    "linear": error_statistics(self.held_out.linear[:, partition.vertices]).to_json(),
+                }
+                for partition in self.partitions
+            ],
+            "actions": [errors.to_json() for errors in self.actions],
+            "beyond": [errors.to_json() for errors in self.beyond],
+        }
+
+
+def evaluate(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> Iterator[Progress | Evaluation]:
+    """Compare a model with its rig; a generator that does the work while it is iterated.
+
+    The scene is as before when the generator ends, is closed, or raises.
+
+    Yields:
+        Progress, and as the last thing the Evaluation.
+
+    Raises:
+        RigError: the rig cannot be evaluated.
+        ModelError: the model cannot be read, or is of another rig.
+    """
+    actions = [find_action(name) for name in settings.actions]
+    network = Network(model)
+    check_evaluable(scene_rig)
+    rig = read_rig(scene_rig)
+    check_rig(model, network.info, rig)
+    layer = LinearLayer(rig)
+    if settings.poses < 1:
+        raise RigError("There is nothing to evaluate: 0 poses; give --poses.")
+    channels = sampled_channels(scene_rig, rig)
+    extra = max(1, settings.poses // 4)
+    total = settings.poses + sum(len(action_frames(a)) for a in actions) + extra * len(settings.beyond)
+    with borrowed_pose(scene_rig.armature_object):
+        clear_pose(scene_rig.armature_object)
+        comparison = _Comparison(PoseEvaluator(scene_rig, rig), network, layer, total)
+        poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses)
+        held_out = yield from comparison.compare("held-out poses", poses)
+        beyond = []
+        for number, factor in enumerate(settings.beyond, 1):
+            first = HELD_OUT_INDEX * (1 + number)
+            poses = _random_poses(scene_rig, beyond_range(channels, factor), settings.seed, first, extra)
+            beyond.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
+        compared_actions = []
+        for action in actions:
+            compared_actions.append((yield from comparison.compare(action.name, _action_poses(scene_rig, action))))
+    yield Evaluation(layer.partitions, rig.joint_names, held_out, compared_actions, beyond)
+
+
+def _random_poses(
+    scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, first: int, count: int
+) -> Iterator[None]:
+    poser = Poser(scene_rig.armature_object, channels)
+    for index in range(first, first + count):
+        poser.set(sample_pose(channels, seed, index))
+        yield
+
+
+def _action_poses(scene_rig: SceneRig, action: bpy.types.Action) -> Iterator[None]:
+    clear_pose(scene_rig.armature_object)
+    assign_action(scene_rig.armature_object, action)
+    for frame in action_frames(action):
+        bpy.context.scene.frame_set(frame)
+        yield
+
+
+class _Comparison:
+    """Evaluates poses three ways and counts them."""
+
+    def __init__(self, evaluator: PoseEvaluator, network: Network, layer: LinearLayer, total: int):
+        self._evaluator, self._network, self._layer = evaluator, network, layer
+        self._done, self._total = 0, total
+
+    def compare(self, name: str, poses: Iterator[None]) -> Iterator[Progress]:
+        """Yields progress, returns PoseErrors."""
+        matrices, positions, fdda, linear = [], [], [], []
+        for _ in poses:
+            pose, true = self._evaluator.evaluate()
+            matrices.append(pose)
+            positions.append(true)
+            fdda.append(distances(self._network.positions(pose[None])[0], true))
+            linear.append(distances(self._layer.positions(pose[None])[0], true))
+            self._done += 1
+            yield Progress("evaluation", self._done, self._total)
+        return PoseErrors(name, np.stack(matrices), np.stack(positions), np.stack(fdda), np.stack(linear))

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The elbow, recorded, trained and bound once for all tests; and what the tests measure with."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+import fdda_addon
+from fdda_addon.cli import main
+from fdda_addon.runtime.network import Network
+from fdda_addon.scene.rig import PoseReader, SceneRig, armature_modifier, find_rig
+
+ELBOW = "elbow"
+ELBOW_RIG = "elbow_rig"
+
+
+@dataclass(frozen=True)
+class ElbowFiles:
+    """The files of the elbow, in one folder: rig, recording, model, bound file."""
+
+    rig: Path
+    recording: Path
+    model: Path
+    bound: Path
+
+
+def run(*arguments: object) -> int:
+    """Run a verb of the command line; returns the exit status."""
+    return main([str(argument) for argument in arguments], "fdda")
+
+
+@pytest.fixture(scope="session")
+def elbow(tmp_path_factory: pytest.TempPathFactory) -> ElbowFiles:
+    from fdda_addon.cli.files import save_copy
+    from fdda_addon.elbow import build_elbow
+
+    folder = tmp_path_factory.mktemp("elbow")
+    files = ElbowFiles(*(folder / name for name in ("elbow.blend", "recording", "elbow.onnx", "bound.blend")))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    build_elbow()
+    save_copy(files.rig)
+    assert run("record", files.rig, files.recording, "--poses", 150) == 0
+    assert run("train", files.recording, files.model, "--epochs", 40) == 0
+    assert run("bind", files.rig, files.model, files.bound) == 0
+    return files
+
+
+@pytest.fixture(autouse=True)
+def _addon() -> Iterator[None]:
+    """The add-on is registered in an empty file; nothing stays for the next test."""
+    fdda_addon.register()
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    fdda_addon.register()
+    yield
+    fdda_addon.unregister()
+
+
+@pytest.fixture
+def rig(elbow: ElbowFiles) -> SceneRig:
+    """The elbow's file, opened."""
+    bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
+    return find_rig()
+
+
+@pytest.fixture
+def bound(elbow: ElbowFiles) -> bpy.types.Object:
+    """The bound elbow's mesh object, its file opened."""
+    bpy.ops.wm.open_mainfile(filepath=str(elbow.bound))
+    return bpy.data.objects[ELBOW]
+
+
+def pose(armature_name: str = ELBOW_RIG, angle: float = 1.0, bone: str = "lower") -> None:
+    """Bend a bone about X and evaluate."""
+    bpy.data.objects[armature_name].pose.bones[bone].rotation_euler[0] = angle
+    bpy.context.view_layer.update()
+
+
+def evaluated(mesh_object: bpy.types.Object) -> np.ndarray:
+    """(V, 3), what Blender shows, as a user's script would read it."""
+    mesh_object = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    mesh = mesh_object.to_mesh()
+    positions = np.array([vertex.co[:] for vertex in mesh.vertices], np.float32)
+    mesh_object.to_mesh_clear()
+    return positions
+
+
+def predicted(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:
+    """(V, 3), what the model says of the pose that Blender has evaluated; nothing of the playback is used."""
+    network = Network(model)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    armature_object = armature_modifier(mesh_object).object
+    names = tuple(joint.name for joint in network.info.joints)
+    reader = PoseReader(SceneRig(mesh_object, armature_object), names, network.info.rest_matrices)
+    matrices = reader.read(mesh_object.evaluated_get(depsgraph), armature_object.evaluated_get(depsgraph))
+    return network.positions(matrices[None])[0]
+
+
+def assert_plays(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:
+    """The evaluated mesh is the model's output within 1e-5 m; returns it."""
+    positions = evaluated(mesh_object)
+    assert not mesh_object.fdda.status
+    assert np.abs(positions - predicted(mesh_object, model)).max() < 1e-5
+    return positions

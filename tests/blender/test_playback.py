@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A bound mesh shows the model's output for the evaluated pose, however the pose came about."""
+
+import bpy
+import numpy as np
+import pytest
+from conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, predicted
+
+from fdda_addon.runtime import nodes
+from fdda_addon.runtime.binding import bind, unbind
+from fdda_addon.scene.rig import find_rig
+
+
+def test_opened_file_plays(bound, elbow):
+    assert_plays(bound, elbow.model)
+
+
+def test_frame_set(bound, elbow):
+    frames = [assert_plays(bound, elbow.model) for f in (5, 12, 25) if not bpy.context.scene.frame_set(f)]
+    assert np.abs(frames[0] - frames[1]).max() > 1e-3
+
+
+def test_posing(bound, elbow):
+    pose(angle=0.4)
+    first = assert_plays(bound, elbow.model)
+    pose(angle=1.6)
+    assert np.abs(assert_plays(bound, elbow.model) - first).max() > 1e-2
+
+
+def test_playing_differs_from_the_rig(bound, elbow):
+    pose(angle=1.9)
+    playing = evaluated(bound)
+    bound.fdda.mode = "RIG"
+    rig = evaluated(bound)
+    bound.fdda.mode = "LINEAR"
+    linear = evaluated(bound)
+    errors = [np.linalg.norm(positions - rig, axis=1).mean() for positions in (playing, linear)]
+    assert 0 < errors[0] < errors[1] / 3
+
+
+def test_modes_give_the_rig_back(bound, elbow):
+    pose(angle=1.2)
+    bound.fdda.mode = "RIG"
+    assert [m.show_viewport for m in bound.modifiers] == [True, True, False]
+    true = evaluated(bound)
+    bound.fdda.mode = "FDDA"
+    assert [m.show_viewport for m in bound.modifiers] == [False, False, True]
+    assert_plays(bound, elbow.model)
+    bound.fdda.mode = "RIG"
+    assert np.array_equal(evaluated(bound), true)
+
+
+def test_linear_layer_is_the_armature_modifier(bound):
+    pose(angle=1.4)
+    bound.fdda.mode = "LINEAR"
+    linear = evaluated(bound)
+    bound.fdda.mode = "RIG"
+    bound.modifiers["CorrectiveSmooth"].show_viewport = False
+    assert np.abs(evaluated(bound) - linear).max() < 1e-5
+
+
+def test_strength_blends(bound, elbow):
+    pose(angle=1.4)
+    playing = assert_plays(bound, elbow.model)
+    bound.fdda.strength = 0
+    linear = evaluated(bound)
+    bound.fdda.strength = 0.25
+    assert np.abs(evaluated(bound) - (0.75 * linear + 0.25 * playing)).max() < 1e-6
+    assert np.abs(playing - linear).max() > 1e-3
+
+
+def test_save_and_reload(bound, elbow):
+    pose(angle=0.9)
+    path = elbow.bound.with_name("saved.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    reloaded = bpy.data.objects[ELBOW]
+    assert_plays(reloaded, elbow.model)
+    pose(angle=1.7)
+    assert_plays(reloaded, elbow.model)
+
+
+def test_undo_and_redo(bound, elbow):
+    bpy.ops.ed.undo_push(message="start")
+    pose(angle=0.5)
+    bpy.ops.ed.undo_push(message="first")
+    first = evaluated(bound)
+    pose(angle=1.8)
+    bpy.ops.ed.undo_push(message="second")
+    second = evaluated(bound)
+    bpy.ops.ed.undo()
+    assert bpy.data.objects[ELBOW_RIG].pose.bones["lower"].rotation_euler[0] == pytest.approx(0.5)
+    assert np.array_equal(assert_plays(bpy.data.objects[ELBOW], elbow.model), first)
+    bpy.ops.ed.redo()
+    assert np.array_equal(assert_plays(bpy.data.objects[ELBOW], elbow.model), second)
+    pose(angle=1.1)
+    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+
+
+def test_undo_of_bind(rig, elbow):
+    bpy.ops.ed.undo_push(message="start")
+    bind(rig, elbow.model)
+    bpy.context.view_layer.update()
+    bpy.ops.ed.undo_push(message="bound")
+    bpy.ops.ed.undo()
+    mesh_object = bpy.data.objects[ELBOW]
+    assert not mesh_object.fdda.is_bound
+    pose(angle=1.0)
+    assert all(m.show_viewport for m in mesh_object.modifiers)
+    bpy.ops.ed.redo()
+    pose(angle=1.2)
+    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+
+
+@pytest.mark.parametrize("linked", [False, True], ids=["own mesh", "shared mesh"])
+def test_two_in_different_poses(bound, elbow, linked):
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    second, second_rig = bound.copy(), armature_object.copy()
+    if not linked:
+        second.data = bound.data.copy()
+    for new in (second, second_rig):
+        bpy.context.scene.collection.objects.link(new)
+    second.modifiers["Armature"].object = second_rig
+    second_rig.animation_data_clear()
+    pose(angle=0.3)
+    pose(second_rig.name, angle=1.9)
+    first_positions, second_positions = assert_plays(bound, elbow.model), assert_plays(second, elbow.model)
+    assert np.abs(first_positions - second_positions).max() > 0.05
+    pose(angle=1.5)
+    assert np.array_equal(assert_plays(second, elbow.model), second_positions)
+    assert np.abs(assert_plays(bound, elbow.model) - first_positions).max() > 0.05
+
+
+def test_objects_with_different_transforms(rig, elbow):
+    """The linear relation of mesh and armature changes after binding; Blender's own skinning is the measure."""
+    bind(rig, elbow.model)
+    rig.mesh_object.location = (0.3, -0.2, 0.1)
+    rig.mesh_object.rotation_euler = (0.2, 0.4, -0.3)
+    rig.armature_object.location = (-0.5, 0.1, 0.9)
+    rig.armature_object.scale = (1.2, 1.2, 1.2)
+    pose(angle=1.3)
+    assert_plays(rig.mesh_object, elbow.model)
+    rig.mesh_object.fdda.mode = "LINEAR"
+    linear = evaluated(rig.mesh_object)
+    unbind(rig.mesh_object)
+    rig.mesh_object.modifiers["CorrectiveSmooth"].show_viewport = False
+    assert np.abs(evaluated(rig.mesh_object) - linear).max() < 1e-5
+
+
+def test_edit_mode(bound, elbow):
+    bpy.context.view_layer.objects.active = bound
+    bpy.ops.object.mode_set(mode="EDIT")
+    pose(angle=1.5)
+    in_edit_mode = evaluated(bound)
+    assert np.abs(in_edit_mode - predicted(bound, elbow.model)).max() < 1e-5
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert np.array_equal(assert_plays(bound, elbow.model), in_edit_mode)
+
+
+def test_edit_mode_that_changes_the_topology(bound, elbow, capsys):
+    bpy.context.view_layer.objects.active = bound
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="SELECT")
+    bpy.ops.mesh.subdivide()
+    bpy.ops.object.mode_set(mode="OBJECT")
+    pose(angle=1.0)
+    pose(angle=1.2)
+    assert bound.fdda.mode == "RIG"
+    assert f"has {len(bound.data.vertices)} vertices and its model was trained for" in bound.fdda.status
+    assert capsys.readouterr().out.count("switched off") == 1
+
+
+def test_renaming(bound, elbow):
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    bound.name, armature_object.name = "other", "other rig"
+    pose("other rig", angle=1.3)
+    assert_plays(bound, elbow.model)
+
+
+def test_deleting_the_mesh(bound):
+    bpy.data.objects.remove(bound)
+    pose(angle=1.3)
+    bpy.context.scene.frame_set(7)
+
+
+def test_deleting_the_armature(bound, capsys):
+    bpy.data.objects.remove(bpy.data.objects[ELBOW_RIG])
+    bpy.context.view_layer.update()
+    bpy.context.scene.frame_set(7)
+    bpy.context.scene.frame_set(8)
+    assert bound.fdda.mode == "RIG"
+    assert "armature of 'elbow' is gone" in bound.fdda.status
+    assert capsys.readouterr().out.count("switched off") == 1
+    assert [m.show_viewport for m in bound.modifiers] == [True, True, False]
+
+
+def test_deleting_the_armature_comes_back_with_undo(bound, elbow):
+    pose(angle=1.0)
+    bpy.ops.ed.undo_push(message="posed")
+    bpy.data.objects.remove(bpy.data.objects[ELBOW_RIG])
+    bpy.context.view_layer.update()
+    bpy.ops.ed.undo_push(message="deleted")
+    bpy.ops.ed.undo()
+    pose(angle=1.4)
+    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+
+
+def test_renamed_bone_is_reported(bound, elbow):
+    bpy.data.objects[ELBOW_RIG].data.bones["lower"].name = "forearm"
+    bound.fdda.mode = "RIG"
+    path = elbow.bound.with_name("renamed.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    bpy.data.objects[ELBOW].fdda.mode = "FDDA"
+    bpy.context.view_layer.update()
+    assert "lacks the joint 'lower'" in bpy.data.objects[ELBOW].fdda.status
+
+
+def test_removed_modifier_is_reported(bound):
+    bound.modifiers.remove(nodes.find_modifier(bound))
+    pose(angle=1.0)
+    bound.fdda.mode = "LINEAR"
+    assert bound.fdda.mode == "RIG"
+    assert "removed; bind the model again" in bound.fdda.status
+
+
+def test_missing_model_is_reported(bound, elbow, tmp_path):
+    path = tmp_path / "alone.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    mesh_object = bpy.data.objects[ELBOW]
+    bpy.context.view_layer.update()
+    assert mesh_object.fdda.mode == "RIG"
+    assert "cannot be read" in mesh_object.fdda.status or "outside the folder" in mesh_object.fdda.status
+
+
+def test_path_out_of_the_folder_is_not_followed(bound, elbow, tmp_path):
+    bound.fdda.model = str(elbow.model)
+    path = tmp_path / "elsewhere.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    from fdda_addon.runtime import playback
+
+    playback._chosen.clear()
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    bpy.context.view_layer.update()
+    assert "outside the folder of 'elsewhere.blend'" in bpy.data.objects[ELBOW].fdda.status
+
+
+def test_unbind_leaves_nothing(rig, elbow):
+    def count():
+        return len(bpy.data.objects), len(bpy.data.meshes), [m.name for m in rig.mesh_object.modifiers]
+
+    before = count()
+    bind(rig, elbow.model)
+    pose(angle=1.0)
+    unbind(rig.mesh_object)
+    assert count() == before
+    assert all(m.show_viewport and m.show_render for m in rig.mesh_object.modifiers)
+
+
+def test_binding_twice(bound, elbow):
+    bind(find_rig(), elbow.model)
+    pose(angle=1.0)
+    assert_plays(bound, elbow.model)
+    assert sum(m.type == "NODES" for m in bound.modifiers) == 1
+
+
+def test_hidden_armature(bound, elbow):
+    bpy.data.objects[ELBOW_RIG].hide_viewport = True
+    pose(angle=0.2)
+    first = assert_plays(bound, elbow.model)
+    pose(angle=1.4)
+    assert np.abs(assert_plays(bound, elbow.model) - first).max() > 0.02
+
+
+def test_modifiers_after_the_rig_stay(bound, elbow):
+    bound.modifiers.new("Subdivision", "SUBSURF")
+    pose(angle=1.0)
+    assert len(evaluated(bound)) > len(bound.data.vertices)
+    bound.modifiers["Subdivision"].show_viewport = False
+    assert_plays(bound, elbow.model)

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Renders show the true rig, or the model where the user asks for it: compared pixel by pixel."""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from conftest import ELBOW_RIG, assert_plays, predicted
+
+FRAME = 22
+"""Of the elbow's action: well bent."""
+
+
+@pytest.fixture
+def camera(bound):
+    scene = bpy.context.scene
+    scene.render.engine = "BLENDER_WORKBENCH"
+    scene.render.resolution_x, scene.render.resolution_y = 160, 120
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.data.type, camera.data.ortho_scale = "ORTHO", 0.9
+    camera.location, camera.rotation_euler = (0.25, -2, 0), (np.pi / 2, 0, 0)
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    scene.frame_set(FRAME)
+    return camera
+
+
+def still(path: Path) -> np.ndarray:
+    bpy.context.scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    return pixels(path)
+
+
+def animation(folder: Path) -> dict[int, np.ndarray]:
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = FRAME - 1, FRAME + 1
+    scene.render.filepath = str(folder / "frame_")
+    bpy.ops.render.render(animation=True)
+    return {f: pixels(folder / f"frame_{f:04}.png") for f in range(scene.frame_start, scene.frame_end + 1)}
+
+
+def pixels(path: Path) -> np.ndarray:
+    image = bpy.data.images.load(str(path))
+    values = np.array(image.pixels[:], np.float32)
+    bpy.data.images.remove(image)
+    return values
+
+
+def render_positions(bound: bpy.types.Object, positions: np.ndarray, path: Path) -> np.ndarray:
+    """Render a plain mesh of these positions in place of the bound object."""
+    mesh = bound.data.copy()
+    mesh.attributes["position"].data.foreach_set("vector", positions.reshape(-1))
+    mesh.update()
+    plain = bpy.data.objects.new("plain", mesh)
+    plain.matrix_world = bound.matrix_world
+    bpy.context.scene.collection.objects.link(plain)
+    bound.hide_render = True
+    try:
+        return still(path)
+    finally:
+        bound.hide_render = False
+        bpy.data.objects.remove(plain)
+
+
+def rig_pixels(bound: bpy.types.Object, tmp_path: Path) -> np.ndarray:
+    bound.fdda.mode = "RIG"
+    rendered = still(tmp_path / "rig.png")
+    bound.fdda.mode = "FDDA"
+    return rendered
+
+
+def test_still_shows_the_rig(bound, camera, tmp_path, elbow):
+    assert np.array_equal(still(tmp_path / "still.png"), rig_pixels(bound, tmp_path))
+    assert_plays(bound, elbow.model)
+
+
+def test_still_shows_the_model_when_asked(bound, camera, tmp_path, elbow):
+    bound.fdda.use_in_render = True
+    model = render_positions(bound, predicted(bound, elbow.model), tmp_path / "plain.png")
+    assert np.array_equal(still(tmp_path / "still.png"), model)
+    assert not np.array_equal(model, rig_pixels(bound, tmp_path))
+
+
+def test_animation_shows_the_rig(bound, camera, tmp_path, elbow):
+    frames = animation(tmp_path)
+    bpy.context.view_layer.update()
+    assert_plays(bound, elbow.model)
+    for frame, rendered in frames.items():
+        bpy.context.scene.frame_set(frame)
+        assert np.array_equal(rendered, rig_pixels(bound, tmp_path)), frame
+
+
+def test_animation_shows_the_model_when_asked(bound, camera, tmp_path, elbow):
+    bound.fdda.use_in_render = True
+    frames = animation(tmp_path)
+    assert bpy.context.scene.frame_current == FRAME
+    bpy.context.view_layer.update()
+    assert_plays(bound, elbow.model)
+    for frame, rendered in frames.items():
+        bpy.context.scene.frame_set(frame)
+        model = render_positions(bound, predicted(bound, elbow.model), tmp_path / "plain.png")
+        assert np.array_equal(rendered, model), frame
+    assert not np.array_equal(frames[FRAME - 1], frames[FRAME + 1])
+
+
+def test_render_of_a_posed_armature_without_action(bound, camera, tmp_path, elbow):
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    armature_object.animation_data_clear()
+    bound.fdda.use_in_render = True
+    armature_object.pose.bones["lower"].rotation_euler[0] = 0.7
+    # No update in between: the render evaluates the pose itself.
+    rendered = still(tmp_path / "still.png")
+    bpy.context.view_layer.update()
+    model = render_positions(bound, predicted(bound, elbow.model), tmp_path / "plain.png")
+    assert np.array_equal(rendered, model)
