@@ -4,7 +4,7 @@
 import numpy as np
 
 # Metres: how high the bulge stands over the relaxed arm, before it is scaled to exactly this.
-PEAK = 0.020
+PEAK = 0.022
 
 
 def _bump(x: np.ndarray, top: float, rise: float, fall: float) -> np.ndarray:

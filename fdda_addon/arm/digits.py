@@ -5,7 +5,7 @@ import numpy as np
 
 from .field import frame_along, smooth_curve
 from .joints import FINGERS, joint
-from .quads import DIVISIONS, Collector, Seat
+from .quads import DIVISIONS, Collector, Grid, Seat
 from .tube import Tube
 
 # Rings of density 1 as parts along the three free bones (1.0 is the second bone's head), close at the joints; the first
@@ -108,9 +108,7 @@ def _box_outline(columns: int, sides: int) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def _grow(
-    quads: Collector, name: str, loop: list[int], shape: tuple[int, int], guide: tuple[int, int], count: int
-):
+def _grow(quads: Collector, name: str, loop: list[int], shape: tuple[int, int], guide: tuple[int, int], count: int):
     """A digit of `count` rings out of `loop`, which runs around it as a box outline of `shape` (columns, sides) does.
 
     guide: that shape at density 1. The tip is closed with a patch of that shape.
@@ -163,3 +161,14 @@ def _close_tip(quads: Collector, name, digit, last, shape, guide, axis):
     rows.append(last[columns + sides : 2 * columns + sides + 1][::-1])
     quads.sheets[f"{name}_tip"] = rows
     quads.patch(rows)
+
+
+def nail_faces(grid: Grid) -> np.ndarray:
+    """(f,) bool: the back of each digit over its last two rings of density 1."""
+    on_nail = np.zeros(len(grid.seats), bool)
+    for i, seat in enumerate(grid.seats):
+        if seat.sheet in ("thumb", *FINGERS):
+            rings = len(_THUMB_RINGS if seat.sheet == "thumb" else _FINGER_RINGS) - 1
+            columns = DIVISIONS[1].side if seat.sheet == "thumb" else DIVISIONS[1].finger
+            on_nail[i] = seat.row > rings - 2.01 and seat.column < columns + 0.01
+    return on_nail[grid.faces].all(axis=1)

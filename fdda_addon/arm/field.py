@@ -71,6 +71,18 @@ class Ellipsoid:
         return k0 * (k0 - 1.0) / np.maximum(k1, 1e-9)
 
 
+class HalfSpace:
+    """Everything on the side of `point` (3,) that `outward` (3,) looks away from."""
+
+    def __init__(self, point, outward):
+        self.centre = np.asarray(point, float)
+        self.outward = np.asarray(outward, float)
+        self.reach = np.inf
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        return (points - self.centre) @ self.outward
+
+
 class Loft:
     """A limb: cross-sections along a straight axis, each with its own centre and four half-widths.
 
@@ -135,23 +147,28 @@ class Field:
         self.strokes = strokes
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """(n,) float64 metres for (n, 3) points; a stroke is looked at only near its form."""
-        result = np.full(len(points), 1.0)
-        for stroke in self.strokes:
-            offset = points - stroke.form.centre
-            limit = stroke.form.reach + stroke.blend + 0.03
-            near = np.flatnonzero(np.einsum("ij,ij->i", offset, offset) < limit * limit)
-            if not len(near):
-                continue
-            there = stroke.form.distance(points[near])
-            here = result[near]
-            result[near] = -_merged(-here, there, stroke.blend) if stroke.carve else _merged(here, there, stroke.blend)
-        return result
+        """(n,) float64 metres for (n, 3) points."""
+        return self._distance(points, self._near(points))
 
     def distance_and_gradient(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(n,) metres and (n, 3) gradient, by differences along the corners of a tetrahedron of 0.1 mm."""
-        step = 1e-4
+        step, near = 1e-4, self._near(points)
         corners = np.array([[1.0, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]])
-        values = [self.distance(points + corner * step) for corner in corners]
-        gradient = sum(value[:, None] * corner for value, corner in zip(values, corners)) / (4 * step)
-        return sum(values) / 4.0, gradient
+        values = np.array([self._distance(points + corner * step, near) for corner in corners])
+        return values.mean(axis=0), values.T @ corners / (4 * step)
+
+    def _near(self, points: np.ndarray) -> list[np.ndarray]:
+        """For each stroke, the points that it may matter to: those near its form."""
+        near = []
+        for stroke in self.strokes:
+            offset = points - stroke.form.centre
+            limit = stroke.form.reach + stroke.blend + 0.03
+            near.append(np.flatnonzero(np.einsum("ij,ij->i", offset, offset) < limit * limit))
+        return near
+
+    def _distance(self, points: np.ndarray, near: list[np.ndarray]) -> np.ndarray:
+        result = np.full(len(points), 1.0)
+        for stroke, index in zip(self.strokes, near, strict=True):
+            here, there = result[index], stroke.form.distance(points[index])
+            result[index] = -_merged(-here, there, stroke.blend) if stroke.carve else _merged(here, there, stroke.blend)
+        return result

@@ -10,10 +10,11 @@ from .action import assign_drive_action
 from .joints import ARM_OBJECT, BICEPS_KEY, ELBOW_FLEXION, JOINT_NAMES, JOINTS, LOCKED, RIG_OBJECT, ROTATION_MODE
 from .surface import Surface, sculpt_arm
 
-# Corrective Smooth: repeats by density, so that the smoothing reaches about as far on finer quads.
-SMOOTH_ITERATIONS = {1: 10, 2: 20, 3: 30}
-SMOOTH_FACTOR = 0.8
-SKIN_COLOUR = (0.80, 0.56, 0.44, 1.0)
+# Corrective Smooth by density: (iterations, factor). On finer quads each iteration reaches less far.
+SMOOTHING = {1: (10, 0.5), 2: (20, 0.8), 3: (30, 1.0)}
+# Linear RGBA and roughness.
+_SKIN = ((0.72, 0.42, 0.31, 1.0), 0.50)
+_NAIL = ((0.80, 0.50, 0.42, 1.0), 0.25)
 
 
 def build_arm(density: int = 1) -> tuple[bpy.types.Object, bpy.types.Object]:
@@ -82,22 +83,24 @@ def _mesh_object(surface: Surface) -> bpy.types.Object:
     mesh = bpy.data.meshes.new(ARM_OBJECT)
     mesh.from_pydata(surface.points.tolist(), [], surface.faces.tolist())
     mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), bool))
-    mesh.materials.append(_skin_material())
+    for name, look in (("arm_skin", _SKIN), ("arm_nail", _NAIL)):
+        mesh.materials.append(_material(name, *look))
+    mesh.polygons.foreach_set("material_index", surface.nails.astype(np.int32))
     mesh.update()
     arm = bpy.data.objects.new(ARM_OBJECT, mesh)
     bpy.context.scene.collection.objects.link(arm)
     return arm
 
 
-def _skin_material() -> bpy.types.Material:
-    material = bpy.data.materials.new("arm_skin")
-    material.diffuse_color = SKIN_COLOUR
-    material.roughness = 0.55
+def _material(name: str, colour: tuple[float, float, float, float], roughness: float) -> bpy.types.Material:
+    material = bpy.data.materials.new(name)
+    material.diffuse_color = colour
+    material.roughness = roughness
     if material.node_tree is None:
         material.use_nodes = True
     shader = material.node_tree.nodes["Principled BSDF"]
-    shader.inputs["Base Color"].default_value = SKIN_COLOUR
-    shader.inputs["Roughness"].default_value = 0.5
+    shader.inputs["Base Color"].default_value = colour
+    shader.inputs["Roughness"].default_value = roughness
     shader.inputs["Subsurface Weight"].default_value = 0.15
     shader.inputs["Subsurface Scale"].default_value = 0.01
     return material
@@ -137,5 +140,4 @@ def _add_smoothing(arm: bpy.types.Object, density: int):
     modifier = arm.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
     modifier.rest_source = "ORCO"
     modifier.smooth_type = "SIMPLE"
-    modifier.factor = SMOOTH_FACTOR
-    modifier.iterations = SMOOTH_ITERATIONS[density]
+    modifier.iterations, modifier.factor = SMOOTHING[density]

@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from .quads import Grid
 from .joints import FINGERS, JOINT_INDEX, UPPER_ARM_LENGTH, WRIST_X, joint
+from .quads import Grid
 
 
 def _beyond(points: np.ndarray, before: str, after: str) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .biceps import biceps_offsets
+from .digits import nail_faces
 from .grid import build_grid
 from .quads import seeded_points
 from .relax import draw_out, relax
@@ -13,18 +14,19 @@ from .sculpt import arm_field
 from .skin import main_joints
 
 # Rounds of relaxation: the guide starts far from the skin, finer grids start on it.
-_GUIDE_ROUNDS, _FINE_ROUNDS = 60, 14
+_GUIDE_ROUNDS, _FINE_ROUNDS = 60, 11
 
 
 @dataclass(frozen=True)
 class Surface:
     """points (v, 3) float64, metres, arm space; faces (f, 4) int32, outward; joints (v,) int32 into `JOINTS`;
-    biceps (v, 3) float64, offsets at full contraction, metres."""
+    biceps (v, 3) float64, offsets at full contraction, metres; nails (f,) bool, the faces of the nails."""
 
     points: np.ndarray
     faces: np.ndarray
     joints: np.ndarray
     biceps: np.ndarray
+    nails: np.ndarray
 
 
 def sculpt_arm(density: int) -> Surface:
@@ -39,4 +41,5 @@ def sculpt_arm(density: int) -> Surface:
         points = relax(seeds, replace(grid, plane_point=seeds), field, _FINE_ROUNDS)
     _, normals = field.distance_and_gradient(points)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return Surface(points, grid.faces, main_joints(points, grid), biceps_offsets(points, normals))
+    joints = main_joints(points, grid)
+    return Surface(points, grid.faces, joints, biceps_offsets(points, normals), nail_faces(grid))

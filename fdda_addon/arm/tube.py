@@ -9,7 +9,7 @@ across the palm and up the thumb's side.
 import numpy as np
 
 from .field import smooth_curve
-from .joints import FINGERS, UPPER_ARM_LENGTH, WRIST_X, joint
+from .joints import FINGERS, HAND, UPPER_ARM_LENGTH, WRIST_X, joint
 from .quads import DIVISIONS, Collector, Divisions, Seat
 
 # x and the spacing of rings wanted there, metres: close at the elbow, the wrist and in the hand.
@@ -29,8 +29,8 @@ _SPACING = np.array(
     ]
 )
 _START_X, _END_X = -0.036, 0.668
-# The ring of density 1 from which the thumb grows.
-_GUIDE_ROOT = 29
+# Rings of density 1: from which the thumb grows, and over the knuckles.
+_GUIDE_ROOT, _GUIDE_KNUCKLES = 29, 34
 
 
 class Tube:
@@ -118,9 +118,17 @@ def _hand_columns(tube: Tube) -> np.ndarray:
     return places
 
 
-def _end_x(y: np.ndarray) -> np.ndarray:
-    """x of the tube's last ring at the side places y: through the webs, falling back to the little finger."""
-    return np.interp(y, (-0.033, -0.020, 0.003, 0.0255, 0.040), (0.664, 0.6680, 0.6680, 0.6580, 0.648))
+def _hand_x(ring: float, x: float, y: np.ndarray) -> np.ndarray:
+    """x of one ring, `ring` in the numbers of density 1, at the side places y: past the wrist the rings bend, so that one
+    runs over the knuckles and the last one through the webs; both fall back to the little finger."""
+    wrist, knuckles, webs = _marks(DIVISIONS[1].rings)[2], _GUIDE_KNUCKLES, _marks(DIVISIONS[1].rings)[3]
+    if ring <= wrist:
+        return np.full(len(y), x)
+    knuckle_x = np.interp(y, *np.array([HAND[name].knuckle[1::-1] for name in FINGERS]).T)
+    web_x = np.interp(y, (-0.033, -0.020, 0.003, 0.0255, 0.040), (0.664, 0.6680, 0.6680, 0.6580, 0.648))
+    if ring <= knuckles:
+        return WRIST_X + (knuckle_x - WRIST_X) * ((ring - wrist) / (knuckles - wrist))
+    return knuckle_x + (web_x - knuckle_x) * ((ring - knuckles) / (webs - knuckles))
 
 
 def _outlines(tube: Tube) -> tuple[np.ndarray, np.ndarray]:
@@ -152,19 +160,20 @@ def lay_tube(quads: Collector, tube: Tube) -> list[list[int]]:
     for number, x in enumerate(_ring_places(tube.guide_ring)):
         in_hand = float(np.clip((x - WRIST_X) / (_END_X - WRIST_X), 0.0, 1.0))
         spread = in_hand * in_hand * (3 - 2 * in_hand)
-        # The hand is left free: there the rings find their own way between wrist, thumb and webs.
-        hold = 1.0 - 0.9 * float(np.clip((x - 0.565) / 0.03, 0.0, 1.0))
         radius = 0.045 if x < 0.4 else 0.03
         place = circle * radius * (1 - spread) + hand * spread
         # Before the second ring of density 1 the end of the arm is rounded off, with no planes to keep to.
         edge = 1.0 - min(float(tube.guide_ring[number]), 1.0)
-        place, hold = place * (1.0 - 0.3 * edge), 0.0 if edge > 0.0 else hold
-        ring_x = x + in_hand * (_end_x(place[:, 0]) - _END_X)
+        place = place * (1.0 - 0.3 * edge)
+        ring_x = _hand_x(float(tube.guide_ring[number]), x, place[:, 0])
         ring = []
         for address in range(tube.around):
             point = np.array([ring_x[address], *place[address]])
             seat = Seat("tube", float(tube.guide_ring[number]), float(tube.guide_column[address]))
             loose = 0.566 < x < 0.650 and point[1] < -0.005
+            # In the hand the rings are left freer: they find their way between wrist, thumb and webs.
+            free = np.clip((x - 0.565) / 0.03, 0.0, 1.0) * (0.95 if point[1] < 0.0 and x < 0.64 else 0.6)
+            hold = 0.0 if edge > 0.0 else 1.0 - float(free)
             ring.append(quads.vertex(point, seat, -1, fingers[address], (point, axis, hold), loose))
         rings.append(ring)
     quads.sheets["tube"] = rings
