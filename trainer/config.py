@@ -38,7 +38,7 @@ class TrainingConfig:
     activation: str = "silu"
     epochs: int = 200
     batch_size: int = 64
-    learning_rate: float = 5e-3
+    learning_rate: float = 1e-2
     weight_decay: float = 0.2
     dropout: float = 0.0
     l1: float = 0.0

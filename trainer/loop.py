@@ -7,12 +7,18 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from fdda_addon.core.errors import TrainingError
+
 from .config import TrainingConfig
 from .data import PreparedPartition, Split
 from .model import PartitionNetworks
 
 WARM_UP = 0.15
 """Part of the steps in which the learning rate rises."""
+
+
+SMOOTHING = 1e-6
+"""Added to squared relative errors: the loss is a distance, without the kink at zero."""
 
 
 class Cancelled(Exception):  # noqa: N818 - no error
@@ -34,7 +40,10 @@ class Network:
 
 @dataclass
 class Curves:
-    """Errors of one partition by epoch: means over poses of the rms distance over vertices, mm."""
+    """Errors of one partition by epoch: means over poses of the rms distance over vertices, mm.
+
+    Those of training are of the weights as they move, those of validation of their running average.
+    """
 
     training_mm: list[float] = field(default_factory=list)
     validation_mm: list[float] = field(default_factory=list)
@@ -83,6 +92,7 @@ def train(
 
     Raises:
         Cancelled: `should_stop` said so.
+        TrainingError: the training diverged.
     """
     device = device or choose_device()
     learning = [number for number, partition in enumerate(partitions) if len(partition.basis.shapes)]
@@ -111,6 +121,7 @@ class _Loop:
         self.truncation_mm = torch.tensor(
             np.stack([p.validation_truncation for p in partitions]) * 1000, dtype=torch.float32, device=device
         )
+        self.left_mm = torch.tensor([p.basis.truncation * 1000 for p in partitions], device=device)[:, None]
         self.model = PartitionNetworks(
             [a.shape[1] for a in inputs],
             [a.shape[1] for a in targets],
@@ -154,10 +165,15 @@ class _Loop:
                 errors = self._step(optimizer, batch, drop_generator)
                 schedule.step()
                 self._average((epoch - 1) * steps + step)
-                training_mm += (errors.sqrt() * self.to_mm).sum(dim=1)
+                training_mm += (errors * self.to_mm.square() + self.left_mm.square()).sqrt().sum(dim=1)
             held_mm = self._validate()
             self._keep_best(held_mm, epoch, curves)
             held = held_mm.cpu().numpy()
+            if not np.isfinite(held).all():
+                raise TrainingError(
+                    f"The training diverged in epoch {epoch}: errors are not numbers; use a smaller learning rate than "
+                    f"{config.learning_rate:g}."
+                )
             for curve, train_mm, validation_mm in zip(curves, (training_mm / poses).tolist(), held, strict=True):
                 curve.training_mm.append(train_mm)
                 curve.validation_mm.append(float(validation_mm))
@@ -172,8 +188,9 @@ class _Loop:
         optimizer.zero_grad(set_to_none=True)
         difference = self.model(self.x[:, batch], generator) - self.y[:, batch]
         errors = difference.square().sum(dim=2)
+        # The mean distance, not its square: it is what the error is measured by, and a few odd poses do not rule it.
         # Summed over partitions: each network then has the gradient that it would have alone.
-        loss = errors.mean(dim=1).sum()
+        loss = (errors + SMOOTHING).sqrt().mean(dim=1).sum()
         if self.config.l1:
             loss = loss + self.config.l1 * sum(weight.abs().sum() for weight in self.model.weights)
         if self.config.l2:

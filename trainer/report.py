@@ -1,16 +1,29 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The report of a training: `report.json` and the page made of it."""
 
+from __future__ import annotations
+
+import argparse
+import json
+import sys
 from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fdda_addon.core.errors import FDDAError, TrainingError
 from fdda_addon.core.metrics import error_statistics
-from fdda_addon.core.recording import Recording
+from fdda_addon.core.output import write_text
 
-from .export import Exported, Measured
-from .graph import Deformation
-from .loop import Curves
+from .page import render_html
+
+if TYPE_CHECKING:  # The page can be written again where torch is not installed.
+    from fdda_addon.core.recording import Recording
+
+    from .export import Exported, Measured
+    from .graph import Deformation
+    from .loop import Curves
 
 FORMAT = "fdda-report"
 VERSION = 1
@@ -88,5 +101,58 @@ def _histogram(errors: np.ndarray) -> list[int]:
     return np.histogram(np.minimum(errors * 1000, HISTOGRAM_EDGES_MM[-1]), HISTOGRAM_EDGES_MM)[0].tolist()
 
 
-def render_html(report: dict) -> str:
-    return "<!doctype html>"
+def write_html(report: dict, path: Path, pictures: Sequence[Path] = (), evaluation: dict | None = None) -> None:
+    """Write the page of a report; again, with pictures and figures that came later.
+
+    Args:
+        report: what `report.json` holds.
+        path: of the page.
+        pictures: PNG or JPEG files to show.
+        evaluation: what `evaluate --json` wrote.
+
+    Raises:
+        OutputError: the page cannot be written.
+    """
+    write_text(path, render_html(report, pictures, evaluation))
+
+
+def read_report(path: Path) -> dict:
+    """Read `report.json`.
+
+    Raises:
+        TrainingError: it is not one.
+    """
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise TrainingError(f"The report '{path}' cannot be read ({error}); train again.") from error
+    if not isinstance(report, dict) or (report.get("format"), report.get("version")) != (FORMAT, VERSION):
+        raise TrainingError(f"'{path}' is not a training report of this version; train again.")
+    return report
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Write the page again: `python -m trainer.report REPORT.json`; returns the exit status."""
+    parser = argparse.ArgumentParser("trainer.report", description="Write the page of a training report again.")
+    parser.add_argument("report", type=Path, help="report.json; the page is written beside it")
+    parser.add_argument("--pictures", type=Path, help="folder of PNG or JPEG files to show, in order of their names")
+    parser.add_argument("--evaluation", type=Path, help="JSON that evaluate wrote")
+    options = parser.parse_args(arguments)
+    try:
+        report = read_report(options.report)
+        pictures = []
+        if options.pictures:
+            pictures = sorted(p for p in options.pictures.glob("*") if p.suffix.lower() in (".png", ".jpg", ".jpeg"))
+        evaluation = json.loads(options.evaluation.read_text(encoding="utf-8")) if options.evaluation else None
+        write_html(report, options.report.with_suffix(".html"), pictures, evaluation)
+    except FDDAError as error:
+        print(error, file=sys.stderr)
+        return 1
+    except (OSError, ValueError) as error:
+        print(f"The evaluation or a picture cannot be read: {error}.", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

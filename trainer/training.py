@@ -21,6 +21,7 @@ from .export import build_model, measure, write_model
 from .graph import Deformation
 from .inputs import InputRows, make_input_rows
 from .loop import Cancelled, Trained, choose_device, train
+from .page import render_html
 from .trust import make_trust_range
 
 REPORT_JSON = "report.json"
@@ -89,7 +90,7 @@ def train_model(
     sample = split.training[:: max(1, len(split.training) // len(split.validation))]
     on_training = measure(exported.session, recording, deformation, sample)
     content = report.make_report(recording, deformation, exported, on_training, trained.curves, model_path.name)
-    page = report.render_html(content)
+    page = render_html(content)
     _check_stop(should_stop)
     # From here on nothing stops: the model and its report belong together.
     write_model(outputs[0], exported.content)

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Basis shapes: their number follows from the tolerance, by either way to the components."""
+
+import numpy as np
+import pytest
+
+from trainer import basis as basis_module
+from trainer.basis import make_basis
+
+
+def residuals(poses: int, vertices: int, rank: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    sizes = 0.01 * 0.5 ** np.arange(rank)
+    shapes = np.linalg.qr(rng.normal(size=(3 * vertices, rank)))[0].T
+    return (rng.normal(size=(poses, rank)) * sizes @ shapes + rng.normal(size=3 * vertices) * 0.01).astype(np.float32)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values.astype(np.float64) ** 2).sum() * 3 / values.size))
+
+
+@pytest.mark.parametrize("poses, vertices", [(60, 50), (200, 20)], ids=["gram", "covariance"])
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-5, 1e-6])
+def test_as_few_shapes_as_the_tolerance_allows(poses, vertices, tolerance):
+    values = residuals(poses, vertices, 12)
+    basis = make_basis(values, tolerance, np.random.default_rng(0))
+    left = rms(values - basis.residuals(basis.coefficients(values)))
+    assert left <= tolerance * 1.01
+    assert basis.truncation == pytest.approx(left, rel=0.02, abs=1e-8)
+    coefficients = basis.coefficients(values)[:, :-1]
+    fewer = coefficients @ basis.shapes[:-1] + basis.mean
+    assert rms(values - fewer) > tolerance
+    assert 0 < len(basis.shapes) <= 12
+
+
+def test_shapes_are_orthonormal_so_coefficients_measure_distance():
+    values = residuals(80, 100, 10)
+    basis = make_basis(values, 1e-6, np.random.default_rng(0))
+    np.testing.assert_allclose(basis.shapes @ basis.shapes.T, np.eye(len(basis.shapes)), atol=1e-5)
+    coefficients = basis.coefficients(values)
+    apart = np.linalg.norm(values[3].astype(np.float64) - values[4])
+    assert np.linalg.norm(coefficients[3] - coefficients[4]) == pytest.approx(apart, rel=1e-3)
+
+
+def test_a_constant_residual_needs_no_shape():
+    values = np.tile(np.float32([[0.01, 0.02, 0.03]]), (20, 5))
+    basis = make_basis(values, 1e-5, np.random.default_rng(0))
+    assert basis.shapes.shape == (0, 15)
+    np.testing.assert_allclose(basis.residuals(basis.coefficients(values)), values, atol=1e-8)
+
+
+def test_a_sample_of_the_poses_finds_the_same_shapes(monkeypatch):
+    monkeypatch.setattr(basis_module, "MOST_POSES", 50)
+    values = residuals(150, 60, 6)
+    basis = make_basis(values, 1e-6, np.random.default_rng(0))
+    assert rms(values - basis.residuals(basis.coefficients(values))) < 3e-6

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The exported model: it plays what was trained, fades outside the training range, and says what it is."""
+
+import json
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from chain import LIMIT, chain_angles, chain_residuals, pose_chain, write_chain
+
+from fdda_addon.core.features import joint_features
+from fdda_addon.core.metrics import distances
+from fdda_addon.core.model import check_rig, read_model_info
+from fdda_addon.core.recording import read_recording
+from fdda_addon.core.rig import Rig
+from fdda_addon.core.skinning import LinearLayer
+from trainer.__main__ import main
+
+
+@pytest.fixture(scope="module")
+def rig(recording) -> Rig:
+    return read_recording(recording).rig
+
+
+@pytest.fixture(scope="module")
+def session(trained) -> onnxruntime.InferenceSession:
+    return onnxruntime.InferenceSession(str(trained / "model.onnx"), providers=["CPUExecutionProvider"])
+
+
+def play(session, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return tuple(session.run(["positions", "trust"], {"pose_matrices": poses}))
+
+
+def test_approximates_unseen_poses(session, rig):
+    angles = chain_angles(50, 3, seed=99)
+    angles[:, 2, 1] = 0
+    poses = pose_chain(rig, angles)
+    layer = LinearLayer(rig)
+    truth = layer.complex_positions(poses, chain_residuals(rig, angles))
+    error, linear = distances(play(session, poses)[0], truth), distances(layer.positions(poses), truth)
+    assert linear.mean() > 2e-3
+    assert error.mean() < 0.08 * linear.mean()
+
+
+def test_number_of_poses_is_free_and_poses_do_not_mix(session, rig):
+    poses = pose_chain(rig, chain_angles(7, 3, seed=5))
+    together, trust = play(session, poses)
+    assert together.shape == (7, rig.vertex_count, 3) and together.dtype == np.float32
+    assert trust.shape == (7, len(read_model_info_partitions(session)))
+    for number in (0, 6):
+        alone = play(session, poses[number : number + 1])[0]
+        np.testing.assert_allclose(alone[0], together[number], atol=2e-6)
+
+
+def read_model_info_partitions(session) -> list:
+    return json.loads(session.get_modelmeta().custom_metadata_map["fdda"])["partitions"]
+
+
+def test_moving_the_character_as_a_whole_moves_the_mesh(session, rig):
+    poses = pose_chain(rig, chain_angles(4, 3, seed=6))
+    shift = np.float32([0.5, -2, 1])
+    moved = poses.copy()
+    # The root's own transform is outside the range, so the chain hangs on a root that only the linear layer knows.
+    moved[:, :, :3, 3] += shift
+    linear = LinearLayer(rig)
+    np.testing.assert_allclose(linear.positions(moved), linear.positions(poses) + shift, atol=1e-5)
+
+
+def test_trust_is_one_inside_the_range_and_the_recorded_poses_are(session, recording):
+    trust = play(session, np.array(read_recording(recording).pose_matrices))[1]
+    assert (trust == 1).all()
+
+
+def test_trust_fades_to_the_linear_layer_outside(session, rig):
+    angles = np.zeros((40, 3, 2))
+    angles[:, 1, 0] = np.linspace(LIMIT, LIMIT * 3, 40)
+    poses = pose_chain(rig, angles)
+    positions, trust = play(session, poses)
+    assert trust[0].min() == 1
+    assert (np.diff(trust, axis=0) <= 1e-6).all(), "trust grows again on the way out"
+    assert trust[-1, :2].max() == 0
+    gone = (trust == 0).all(axis=1)
+    np.testing.assert_allclose(positions[gone], LinearLayer(rig).positions(poses)[gone], atol=2e-6)
+    assert ((trust > 0.02) & (trust < 0.98)).any(), "the fade is a jump"
+
+
+def test_a_locked_axis_that_turns_takes_the_trust_away(session, rig):
+    angles = np.zeros((2, 3, 2))
+    angles[1, 2, 1] = 0.5
+    trust = play(session, pose_chain(rig, angles))[1]
+    assert (trust[0] == 1).all()
+    assert trust[1, 2] == 0, "the last joint never turned about z in the recording"
+
+
+@pytest.mark.parametrize("reach", [1.5, 2.0, 3.0])
+def test_beyond_the_range_it_is_never_worse_than_the_linear_layer(session, rig, reach):
+    angles = chain_angles(100, 3, seed=8, reach=reach)
+    poses, layer = pose_chain(rig, angles), LinearLayer(rig)
+    truth = layer.complex_positions(poses, chain_residuals(rig, angles))
+    positions = play(session, poses)[0]
+    assert distances(positions, truth).mean() <= distances(layer.positions(poses), truth).mean()
+
+
+def test_a_joint_scaled_to_nothing_gives_numbers(session, rig):
+    poses = pose_chain(rig, chain_angles(2, 3, seed=1))
+    poses[1, 1, :3, :3] = 0
+    positions, trust = play(session, poses)
+    assert np.isfinite(positions).all() and np.isfinite(trust).all()
+    assert trust[1].min() == 0
+
+
+def test_metadata_describes_rig_and_training(trained, recording, report):
+    info, source = read_model_info(trained / "model.onnx"), read_recording(recording)
+    check_rig(trained / "model.onnx", info, source.rig)
+    assert info.joints == source.rig.joints and info.fingerprint == source.rig.fingerprint
+    assert [p.joint for p in info.partitions] == [p.joint for p in source.partitions]
+    assert [p.basis for p in info.partitions] == [p["basis"] for p in report["partitions"]]
+    assert info.training["hidden"] == [24, 24] and info.training["seed"] == 0 and info.training["torch"]
+    assert info.held_out_mm == report["fdda"]["held_out"]
+    assert 0 < info.parity_mm < 1e-2
+    features = joint_features(source.pose_matrices, source.rig.rest_matrices, source.rig.parents)
+    assert (info.feature_low <= features.min(axis=0)).mean() > 0.95
+    assert info.feature_low.shape == info.feature_high.shape == (3, 12)
+
+
+def test_graph_uses_standard_operators_of_an_old_runtime(trained):
+    model = onnx.load(trained / "model.onnx")
+    assert model.ir_version <= 9 and [(o.domain, o.version) for o in model.opset_import] == [("", 17)]
+    assert {node.domain for node in model.graph.node} == {""}
+    assert not any(t.external_data for t in model.graph.initializer)
+
+
+def test_report_measures_what_the_model_does(report, trained, recording, session):
+    source = read_recording(recording)
+    assert sum(p["vertices"] for p in report["partitions"]) == source.rig.vertex_count
+    assert report["model_bytes"] == (trained / "model.onnx").stat().st_size
+    held_out, linear = report["fdda"]["held_out"], report["linear"]["held_out"]
+    assert held_out["mean"] < 0.1 * linear["mean"]
+    assert held_out["mean"] <= held_out["rms"] <= held_out["p999"] <= held_out["max"]
+    weights = [p["vertices"] for p in report["partitions"]]
+    by_partition = np.average([p["held_out"]["mean"] for p in report["partitions"]], weights=weights)
+    assert by_partition == pytest.approx(held_out["mean"], rel=1e-4)
+    assert sum(report["histogram"]["fdda"]) == source.rig.vertex_count * report["training"]["validation_poses"]
+    for p in report["partitions"]:
+        assert len(p["curve"]["validation"]) == (40 if p["basis"] else 0)
+
+
+@pytest.mark.parametrize("activation", ["gelu", "tanh", "relu"])
+def test_every_activation_and_any_depth_exports(tmp_path, recording, activation):
+    model = tmp_path / "m.onnx"
+    options = ["--epochs", "2", "--activation", activation, "--hidden", *(["8"] if activation == "tanh" else ["8"] * 3)]
+    assert main([str(recording), str(model), *options]) == 0
+    assert read_model_info(model).parity_mm < 1e-2
+
+
+def test_a_rig_of_one_joint_has_nothing_to_learn_and_plays(tmp_path):
+    rig = write_chain(tmp_path / "one", poses=12, joints=1)
+    model = tmp_path / "m.onnx"
+    assert main([str(tmp_path / "one"), str(model), "--epochs", "1"]) == 0
+    session = onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
+    positions, trust = play(session, rig.rest_matrices[None])
+    np.testing.assert_allclose(positions[0], rig.rest_positions, atol=1e-5)
+    assert trust.tolist() == [[1.0]]

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The command line of the trainer: messages, exit statuses, and what is left behind when it does not finish."""
+
+import json
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from chain import write_chain
+from conftest import QUICK, REPOSITORY, start_trainer
+
+from fdda_addon.core.messages import Message, MessageType
+from trainer.__main__ import main
+
+
+def decode(text: str) -> list[Message]:
+    messages = [Message.decode(line) for line in text.splitlines()]
+    assert [m.type.is_last for m in messages] == [False] * (len(messages) - 1) + [True]
+    return messages
+
+
+def test_messages_from_start_to_finish(recording, tmp_path, capsys):
+    model = tmp_path / "m.onnx"
+    assert main([str(recording), str(model), "--messages", *QUICK]) == 0
+    messages = decode(capsys.readouterr().out)
+    assert messages[0].type is MessageType.STARTED
+    assert messages[0].values == {"partitions": 3, "poses": 120, "vertices": 90, "device": "cpu"}
+    progress = [m.values for m in messages if m.type is MessageType.PROGRESS]
+    assert [p["epoch"] for p in progress] == list(range(1, 41))
+    assert progress[-1]["validation_mm"] < progress[0]["validation_mm"]
+    joints = [m.values["joint"] for m in messages if m.type is MessageType.PARTITION_FINISHED]
+    assert joints == ["bone_0", "bone_1", "bone_2"]
+    assert messages[-1].type is MessageType.FINISHED and messages[-1].values["model"] == str(model)
+
+
+def test_text_for_a_person(recording, tmp_path, capsys):
+    assert main([str(recording), str(tmp_path / "m.onnx"), "--epochs", "20", "--hidden", "8"]) == 0
+    output = capsys.readouterr()
+    lines = output.out.splitlines()
+    assert lines[0] == "Training 3 partitions, 90 vertices, 120 poses, on cpu."
+    assert len([line for line in lines if line.startswith("epoch ")]) == 10
+    assert lines[-1].startswith(f"Wrote '{tmp_path / 'm.onnx'}': validation error ")
+    assert not output.err
+
+
+def test_a_second_training_gives_the_same_model(recording, trained, tmp_path):
+    assert main([str(recording), str(tmp_path / "model.onnx"), *QUICK]) == 0
+    reports = [json.loads((folder / "report.json").read_text()) for folder in (trained, tmp_path)]
+    for report in reports:
+        del report["training"]["seconds"], report["model_bytes"]
+    assert reports[0] == reports[1]
+
+
+def failure(arguments, capsys) -> str:
+    assert main([*map(str, arguments), "--messages", "--epochs", "2"]) == 1
+    output = capsys.readouterr()
+    messages = decode(output.out)
+    assert messages[-1].type is MessageType.FAILED
+    assert output.err.strip() == messages[-1].values["text"]
+    return output.err.strip()
+
+
+def copy(recording, tmp_path):
+    return shutil.copytree(recording, tmp_path / "copy")
+
+
+def test_no_recording(tmp_path, capsys):
+    assert "is not a recording" in failure([tmp_path / "none", tmp_path / "m.onnx"], capsys)
+
+
+def test_incomplete_recording(tmp_path, capsys):
+    write_chain(tmp_path / "half", poses=40, complete=13)
+    text = failure([tmp_path / "half", tmp_path / "m.onnx"], capsys)
+    assert "is incomplete: 13 of 40 poses" in text and "--resume" in text
+    assert not (tmp_path / "m.onnx").exists()
+
+
+def test_truncated_recording(recording, tmp_path, capsys):
+    path = copy(recording, tmp_path)
+    content = (path / "residuals.npy").read_bytes()
+    (path / "residuals.npy").write_bytes(content[:-100])
+    assert "residuals.npy' cannot be used: it is truncated" in failure([path, tmp_path / "m.onnx"], capsys)
+
+
+def test_recording_with_nan(recording, tmp_path, capsys):
+    path = copy(recording, tmp_path)
+    residuals = np.load(path / "residuals.npy")
+    residuals[17, 3, 1] = np.nan
+    np.save(path / "residuals.npy", residuals)
+    assert "holds values that are not numbers (residuals" in failure([path, tmp_path / "m.onnx"], capsys)
+
+
+def test_too_few_poses(tmp_path, capsys):
+    write_chain(tmp_path / "few", poses=5)
+    assert "has 5 poses and training takes at least 10" in failure([tmp_path / "few", tmp_path / "m.onnx"], capsys)
+
+
+def test_output_in_a_folder_that_is_not_there(recording, tmp_path, capsys):
+    text = failure([recording, tmp_path / "no" / "m.onnx"], capsys)
+    assert "does not exist; create it first" in text
+
+
+def test_output_that_is_a_folder(recording, tmp_path, capsys):
+    (tmp_path / "m.onnx").mkdir()
+    assert "it is a folder" in failure([recording, tmp_path / "m.onnx"], capsys)
+
+
+def test_impossible_setting(recording, tmp_path, capsys):
+    text = failure([recording, tmp_path / "m.onnx", "--learning-rate", "-1"], capsys)
+    assert "setting learning_rate cannot be -1.0" in text
+
+
+def test_settings_that_diverge_fail_in_a_sentence(recording, tmp_path, capsys):
+    text = failure([recording, tmp_path / "m.onnx", "--learning-rate", "1e30", "--averaging", "0"], capsys)
+    assert "diverged in epoch 1" in text and "smaller learning rate than 1e+30" in text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_usage_exits_with_two(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(["only-one"])
+    assert exit_.value.code == 2
+
+
+def test_a_full_disk_leaves_nothing(recording, tmp_path):
+    limit = 20_000
+
+    def small_files() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    (tmp_path / "m.onnx").write_text("the old model")
+    process = start_trainer(recording, tmp_path / "m.onnx", "--epochs", "2", "--messages", preexec_fn=small_files)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert decode(out)[-1].type is MessageType.FAILED
+    assert err.startswith(f"Cannot write '{tmp_path / 'm.onnx'}': File too large; nothing was changed.")
+    assert [p.name for p in tmp_path.iterdir()] == ["m.onnx"]
+    assert (tmp_path / "m.onnx").read_text() == "the old model"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_cancels_and_leaves_nothing(recording, tmp_path, number):
+    process = start_trainer(recording, tmp_path / "m.onnx", "--epochs", "100000", "--messages")
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if len(lines) == 5:
+            process.send_signal(number)
+    process.wait(timeout=30)
+    assert process.returncode == 130, process.stderr.read()
+    messages = decode("".join(lines))
+    assert messages[-1] == Message(MessageType.CANCELLED)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_torch_says_what_to_install(recording, tmp_path):
+    code = "import sys; sys.modules['torch'] = None; from trainer.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    process = subprocess.run(
+        [sys.executable, "-c", code, str(recording), str(tmp_path / "m.onnx"), "--messages"],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+    )
+    assert process.returncode == 1
+    text = decode(process.stdout)[-1].values["text"]
+    assert "needs the Python package 'torch'" in text and "install torch" in text
+    assert process.stderr.strip() == text

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Settings: unknown names and impossible values are errors, options reach the training."""
+
+import argparse
+
+import pytest
+
+from fdda_addon.core.errors import TrainingError
+from trainer.config import TrainingConfig, add_options, config_from_arguments
+
+
+def test_an_unknown_setting_is_an_error():
+    with pytest.raises(TrainingError, match=r"Unknown training setting layers; known are .*hidden"):
+        TrainingConfig.from_mapping({"layers": 3})
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("epochs", 0),
+        ("tolerance_mm", 0.0),
+        ("tolerance_mm", float("nan")),
+        ("learning_rate", float("inf")),
+        ("hidden", ()),
+        ("hidden", (0,)),
+        ("activation", "sine"),
+        ("dropout", 1.0),
+        ("validation_fraction", 0.9),
+        ("seed", -1),
+    ],
+)
+def test_an_impossible_value_is_named(name, value):
+    with pytest.raises(TrainingError, match=f"setting {name} cannot be"):
+        TrainingConfig.from_mapping({name: value})
+
+
+def test_every_setting_is_an_option():
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+    given = (
+        "--seed 3 --tolerance-mm 0.2 --hidden 8 9 10 --activation gelu --epochs 7 --batch-size 5 --learning-rate 0.1 "
+        "--weight-decay 0.3 --dropout 0.25 --l1 1e-4 --l2 1e-3 --averaging 0.5 --validation-fraction 0.3 --patience 4"
+    )
+    assert config_from_arguments(parser.parse_args(given.split())) == TrainingConfig(
+        3, 0.2, (8, 9, 10), "gelu", 7, 5, 0.1, 0.3, 0.25, 1e-4, 1e-3, 0.5, 0.3, 4
+    )
+    assert config_from_arguments(parser.parse_args([])) == TrainingConfig()

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Charts of the report as inline SVG; colours come from the page's style sheet."""
+
+import math
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+CURVE_POINTS = 120
+"""A curve with more epochs is thinned out to this many points."""
+
+
+def learning_curves(training: Sequence[float], validation: Sequence[float], low: float, high: float) -> str:
+    """Small chart of one partition: error by epoch, logarithmic between `low` and `high` mm."""
+    width, height, left, bottom = 230, 110, 38, 16
+    if not validation:
+        return (
+            f'<svg viewBox="0 0 {width} {height}"><text class="tick" x="{width / 2}" y="{height / 2}" '
+            'text-anchor="middle">constant: the mean is within the tolerance</text></svg>'
+        )
+    y = _log_axis(low, high, height - bottom, 6)
+    parts = [_grid_lines(low, high, y, left, width - 4)]
+    for name, values in (("training", training), ("validation", validation)):
+        chosen = np.unique(np.linspace(0, len(values) - 1, min(CURVE_POINTS, len(values))).round().astype(int))
+        span = max(1, len(values) - 1)
+        points = " ".join(f"{left + (width - 6 - left) * i / span:.1f},{y(values[i]):.1f}" for i in chosen)
+        parts.append(f'<polyline class="curve {name}" points="{points}"/>')
+    parts.append(f'<text class="tick" x="{left}" y="{height - 3}">1</text>')
+    parts.append(
+        f'<text class="tick" x="{width - 5}" y="{height - 3}" text-anchor="end">{len(validation)} epochs</text>'
+    )
+    return f'<svg viewBox="0 0 {width} {height}" role="img">{"".join(parts)}</svg>'
+
+
+def error_bars(names: Sequence[str], fdda: Sequence[float], linear: Sequence[float], largest: Sequence[float]) -> str:
+    """Mean error of each partition, model against linear layer, and the model's largest error; logarithmic, mm."""
+    row, left, right, top = 20, 130, 16, 24
+    width, height = 880, top + row * len(names) + 8
+    positive = [value for value in (*fdda, *linear, *largest) if value > 0] or [1.0]
+    low, high = _decades(positive)
+    x = _log_axis(low, high, left, width - right)
+    parts = []
+    for value in _powers(low, high):
+        parts.append(f'<line class="grid" x1="{x(value):.1f}" x2="{x(value):.1f}" y1="{top - 6}" y2="{height - 4}"/>')
+        parts.append(f'<text class="tick" x="{x(value):.1f}" y="{top - 11}" text-anchor="middle">{value:g} mm</text>')
+    for number, name in enumerate(names):
+        middle = top + row * number + row / 2
+        parts.append(f'<text class="label" x="{left - 8}" y="{middle + 4}" text-anchor="end">{escape(name)}</text>')
+        for kind, value, thick in (("linear", linear[number], 12), ("fdda", fdda[number], 6)):
+            end = x(value) if value > 0 else left
+            parts.append(
+                f'<rect class="bar {kind}" x="{left}" y="{middle - thick / 2}" height="{thick}" rx="1.5" '
+                f'width="{max(0.0, end - left):.1f}"><title>{escape(name)}: {value:.4f} mm</title></rect>'
+            )
+        if largest[number] > 0:
+            at = x(largest[number])
+            parts.append(
+                f'<line class="most" x1="{at:.1f}" x2="{at:.1f}" y1="{middle - 6}" y2="{middle + 6}">'
+                f"<title>largest: {largest[number]:.3f} mm</title></line>"
+            )
+    return f'<svg viewBox="0 0 {width} {height}" role="img">{"".join(parts)}</svg>'
+
+
+def histogram(edges: Sequence[float], fdda: Sequence[int], linear: Sequence[int]) -> str:
+    """How many vertices have which error: model and linear layer over one logarithmic axis, mm."""
+    width, height, left, bottom, top = 880, 240, 46, 30, 10
+    counts = np.array([fdda, linear], float)
+    used = np.flatnonzero(counts.sum(axis=0))
+    # The first bin starts at zero: it is drawn as wide as the others.
+    bounds = np.log10(np.array([edges[1] ** 2 / edges[2], *edges[1:]]))
+    low, high = math.floor(bounds[used[0]]), math.ceil(bounds[used[-1] + 1])
+    share = counts / counts.sum(axis=1, keepdims=True) * 100
+    most = share.max()
+
+    def x(value: float) -> float:
+        return left + (value - low) / (high - low) * (width - left - 8)
+
+    def y(value: float) -> float:
+        return height - bottom - value / most * (height - bottom - top)
+
+    parts = []
+    for power in range(low, high + 1):
+        parts.append(f'<line class="grid" x1="{x(power):.1f}" x2="{x(power):.1f}" y1="{top}" y2="{height - bottom}"/>')
+        label = (
+            f'<text class="tick" x="{x(power):.1f}" y="{height - 12}" text-anchor="middle">{10.0**power:g} mm</text>'
+        )
+        parts.append(label)
+    for value in (0, most / 2, most):
+        parts.append(f'<text class="tick" x="{left - 6}" y="{y(value) + 4:.1f}" text-anchor="end">{value:.1f} %</text>')
+    for name, values in (("linear", share[1]), ("fdda", share[0])):
+        points = [f"{x(max(low, bounds[used[0]])):.1f},{y(0):.1f}"]
+        for number in range(used[0], used[-1] + 1):
+            for bound in (bounds[number], bounds[number + 1]):
+                points.append(f"{x(max(low, bound)):.1f},{y(values[number]):.1f}")
+        points.append(f"{x(bounds[used[-1] + 1]):.1f},{y(0):.1f}")
+        parts.append(f'<polygon class="area {name}" points="{" ".join(points)}"/>')
+    return f'<svg viewBox="0 0 {width} {height}" role="img">{"".join(parts)}</svg>'
+
+
+def curve_limits(curves: Sequence[Sequence[float]]) -> tuple[float, float]:
+    """Common limits of all learning curves, whole powers of ten, mm."""
+    values = [value for curve in curves for value in curve if value > 0]
+    return _decades(values or [1.0])
+
+
+def _decades(values: Sequence[float]) -> tuple[float, float]:
+    low, high = math.floor(math.log10(min(values))), math.ceil(math.log10(max(values)))
+    return 10.0**low, 10.0 ** max(high, low + 1)
+
+
+def _powers(low: float, high: float) -> list[float]:
+    return [10.0**power for power in range(round(math.log10(low)), round(math.log10(high)) + 1)]
+
+
+def _log_axis(low: float, high: float, start: float, end: float):
+    """A function from a value to its place between `start` (low) and `end` (high)."""
+    span = math.log10(high / low)
+
+    def place(value: float) -> float:
+        part = math.log10(max(value, low) / low) / span
+        return start + min(1.0, part) * (end - start)
+
+    return place
+
+
+def _grid_lines(low: float, high: float, y, left: float, right: float) -> str:
+    return "".join(
+        f'<line class="grid" x1="{left}" x2="{right}" y1="{y(v):.1f}" y2="{y(v):.1f}"/>'
+        f'<text class="tick" x="{left - 4}" y="{y(v) + 3:.1f}" text-anchor="end">{v:g}</text>'
+        for v in _powers(low, high)
+    )
