@@ -32,7 +32,7 @@ def elbow_surface() -> tuple[np.ndarray, np.ndarray]:
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points = [
         np.column_stack([np.full(_AROUND, x), ring[:, 0] * r * 1.08, ring[:, 1] * r * 0.94])
-        for x, r in zip(along, radius)
+        for x, r in zip(along, radius, strict=True)
     ]
     faces = []
     for i in range(_RINGS):
@@ -129,7 +129,7 @@ def _limit_rotation(bone: "bpy.types.PoseBone", ranges):
     bone.lock_location = bone.lock_scale = (True, True, True)
     limit = bone.constraints.new("LIMIT_ROTATION")
     limit.owner_space = "LOCAL"
-    for axis, (low, high) in zip("xyz", ranges):
+    for axis, (low, high) in zip("xyz", ranges, strict=True):
         setattr(limit, f"use_limit_{axis}", True)
         setattr(limit, f"min_{axis}", math.radians(low))
         setattr(limit, f"max_{axis}", math.radians(high))

@@ -26,6 +26,14 @@ even when it was made with the same seed."""
 
 
 @dataclass(frozen=True)
+class NamedPose:
+    """A pose given by hand: Euler angles of bones in radians, in the order of the bone; other bones are at rest."""
+
+    name: str
+    rotations: dict[str, tuple[float, float, float]]
+
+
+@dataclass(frozen=True)
 class EvaluationSettings:
     """What to compare on.
 
@@ -34,12 +42,14 @@ class EvaluationSettings:
         seed: of the random poses.
         actions: names of actions whose frames are compared as well.
         beyond: factors by which the range of motion is widened for further poses, a quarter as many for each.
+        named: poses that are compared as well, each on its own.
     """
 
     poses: int = 200
     seed: int = 1
     actions: tuple[str, ...] = ()
     beyond: tuple[float, ...] = ()
+    named: tuple[NamedPose, ...] = ()
 
 
 @dataclass
@@ -75,7 +85,8 @@ class Evaluation:
     Attributes:
         partitions: of the rig. joints: names by joint index.
         held_out: errors of the random poses.
-        actions, beyond: errors of the actions, and of the poses beyond the range of motion by factor.
+        actions, beyond, named: errors of the actions, of the poses beyond the range of motion by factor, and of the
+            poses given by hand.
     """
 
     partitions: tuple[Partition, ...]
@@ -83,6 +94,7 @@ class Evaluation:
     held_out: PoseErrors
     actions: list[PoseErrors] = field(default_factory=list)
     beyond: list[PoseErrors] = field(default_factory=list)
+    named: list[PoseErrors] = field(default_factory=list)
 
     @property
     def fdda(self) -> ErrorStatistics:
@@ -111,6 +123,7 @@ class Evaluation:
             ],
             "actions": [errors.to_json() for errors in self.actions],
             "beyond": [errors.to_json() for errors in self.beyond],
+            "named": [errors.to_json() for errors in self.named],
         }
 
 
@@ -136,7 +149,8 @@ def evaluate(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> 
         raise RigError("There is nothing to evaluate: 0 poses; give --poses.")
     channels = sampled_channels(scene_rig, rig)
     extra = max(1, settings.poses // 4)
-    total = settings.poses + sum(len(action_frames(a)) for a in actions) + extra * len(settings.beyond)
+    total = settings.poses + extra * len(settings.beyond) + len(settings.named)
+    total += sum(len(action_frames(action)) for action in actions)
     with borrowed_pose(scene_rig.armature_object):
         clear_pose(scene_rig.armature_object)
         comparison = _Comparison(PoseEvaluator(scene_rig, rig), network, layer, total)
@@ -147,10 +161,13 @@ def evaluate(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> 
             first = HELD_OUT_INDEX * (1 + number)
             poses = _random_poses(scene_rig, beyond_range(channels, factor), settings.seed, first, extra)
             beyond.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
+        named = []
+        for pose in settings.named:
+            named.append((yield from comparison.compare(pose.name, _named_pose(scene_rig, pose))))
         compared_actions = []
         for action in actions:
             compared_actions.append((yield from comparison.compare(action.name, _action_poses(scene_rig, action))))
-    yield Evaluation(layer.partitions, rig.joint_names, held_out, compared_actions, beyond)
+    yield Evaluation(layer.partitions, rig.joint_names, held_out, compared_actions, beyond, named)
 
 
 def _random_poses(
@@ -160,6 +177,15 @@ def _random_poses(
     for index in range(first, first + count):
         poser.set(sample_pose(channels, seed, index))
         yield
+
+
+def _named_pose(scene_rig: SceneRig, pose: NamedPose) -> Iterator[None]:
+    clear_pose(scene_rig.armature_object)
+    Poser(
+        scene_rig.armature_object,
+        tuple(Channel(bone, "rotation", axis, 0, 0) for bone in pose.rotations for axis in range(3)),
+    ).set(np.array([angle for angles in pose.rotations.values() for angle in angles]))
+    yield
 
 
 def _action_poses(scene_rig: SceneRig, action: bpy.types.Action) -> Iterator[None]:

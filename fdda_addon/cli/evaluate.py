@@ -57,7 +57,7 @@ def table(evaluation: Evaluation) -> str:
     """The errors as text, in mm."""
     head = f"{'error in mm':<24}{'mean':>10}{'rms':>10}{'p99':>10}{'p99.9':>10}{'max':>10}"
     lines = [head, "-" * len(head)]
-    for errors in (evaluation.held_out, *evaluation.beyond, *evaluation.actions):
+    for errors in (evaluation.held_out, *evaluation.beyond, *evaluation.named, *evaluation.actions):
         values = errors.to_json()
         lines.append(f"{errors.name}, {values['poses']} poses")
         for key, label in (("linear", "  linear layer"), ("fdda", "  FDDA")):

@@ -81,3 +81,23 @@ def true_rig(mesh_object: bpy.types.Object) -> Iterator[None]:
     finally:
         if mesh_object.fdda.is_bound:
             mesh_object.fdda.mode = mode
+
+
+@contextmanager
+def borrowed_binding(scene_rig: SceneRig, model: Path) -> Iterator[None]:
+    """Play a model for a while; the binding that the object has, or none, is there again afterwards.
+
+    Raises:
+        FDDAError: as `bind`.
+    """
+    binding = scene_rig.mesh_object.fdda
+    previous = (playback.model_path(scene_rig.mesh_object), binding.use_in_render) if binding.is_bound else None
+    mode = binding.mode
+    bind(scene_rig, model)
+    try:
+        yield
+    finally:
+        unbind(scene_rig.mesh_object)
+        if previous is not None:
+            bind(scene_rig, *previous)
+            binding.mode = mode

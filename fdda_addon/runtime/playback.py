@@ -6,6 +6,8 @@ They are found anew from the properties of the objects whenever something may ha
 """
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +24,7 @@ _networks: dict[Path, tuple[tuple, Network]] = {}
 _live: dict[int, "LiveBinding"] = {}
 _chosen: set[Path] = set()
 _object_count = -1
+_constants: dict[tuple, np.ndarray] | None = None
 
 
 class LiveBinding:
@@ -205,9 +208,29 @@ def evaluate(depsgraph: bpy.types.Depsgraph) -> None:
         _move(network, members)
 
 
+@contextmanager
+def constant_positions() -> Iterator[None]:
+    """Play without executing models, to measure what the rest of a frame costs: positions stay as they are first."""
+    global _constants
+    _constants = {}
+    try:
+        yield
+    finally:
+        _constants = None
+
+
+def _positions(network: Network, pose_matrices: np.ndarray) -> np.ndarray:
+    if _constants is None:
+        return network.positions(pose_matrices)
+    key = (network, len(pose_matrices))
+    if key not in _constants:
+        _constants[key] = network.positions(pose_matrices)
+    return _constants[key]
+
+
 def _move(network: Network, members: list[tuple[LiveBinding, bpy.types.Object, np.ndarray]]) -> None:
     try:
-        positions = network.positions(np.stack([pose for _, _, pose in members]))
+        positions = _positions(network, np.stack([pose for _, _, pose in members]))
     except FDDAError as error:
         for _, mesh_object, _ in members:
             fail(mesh_object, error)
@@ -222,7 +245,7 @@ def _move(network: Network, members: list[tuple[LiveBinding, bpy.types.Object, n
             nodes.write_cache(live.find_cache(mesh_object), moved)
 
 
-class _failing:  # noqa: N801 - reads as a statement
+class _failing:
     """Switches an object back to its rig when the block fails with an error that is meant for the user."""
 
     def __init__(self, mesh_object: bpy.types.Object):
