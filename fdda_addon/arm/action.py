@@ -22,9 +22,9 @@ def _hand(curl: float, across: float = 0.0, cup: float = 0.0, thumb: tuple[float
         fan = across * (1.0, 0.25, -0.45, -1.0)[i]
         fold = cup * (0.1, 0.2, 0.6, 1.0)[i]
         pose[f"{name}_0"] = (fold, 0.0, fan * 0.15)
-        pose[f"{name}_1"] = (curl * (78 + 2 * i), 0.0, fan)
-        pose[f"{name}_2"] = (max(curl, 0.0) * 95, 0.0, 0.0)
-        pose[f"{name}_3"] = (max(curl, 0.0) * 62, 0.0, 0.0)
+        pose[f"{name}_1"] = (curl * (84 + i), 0.0, fan)
+        pose[f"{name}_2"] = (max(curl, 0.0) * 98, 0.0, 0.0)
+        pose[f"{name}_3"] = (max(curl, 0.0) * 70, 0.0, 0.0)
     pose["thumb_0"] = (thumb[0], 0.0, thumb[1])
     pose["thumb_1"] = (thumb[2] * 0.6, 0.0, 0.0)
     pose["thumb_2"] = (thumb[2], 0.0, 0.0)
@@ -53,13 +53,13 @@ KEYS: dict[int, Pose] = {
     36: _arm((55, -15, 25), 25, (-35, -10)) | _hand(0.05, 7, 0, (-10, 8, 0)),
     52: _arm((70, -25, 45), 5, (10, 8)) | _hand(0.15, 4, 3, (0, 4, 10)),
     # Flex: the elbow all the way, twice.
-    76: _arm((10, 15, 25), 140, (35, 0)) | _hand(0.70, 0, 8, (20, -8, 35)),
+    76: _arm((10, 15, 25), 140, (35, 0)) | _hand(0.70, 0, 8, (15, 8, 40)),
     92: _arm((0, 25, 10), 60, (-10, -12)) | _hand(0.45, 0, 4, (10, 0, 20)),
-    110: _arm((-15, 40, 35), 136, (50, 12)) | _hand(0.85, 0, 10, (25, -10, 45)),
-    # Fist: closed, turned about the wrist, and let go finger by finger.
-    132: _arm((15, 0, 0), 70, (-30, 0)) | _hand(1.0, 0, 12, (28, -12, 50)),
-    146: _arm((20, -30, 10), 75, (45, 15)) | _hand(1.0, 0, 12, (28, -12, 50)),
-    158: _arm((20, -20, 0), 80, (0, -25)) | _hand(1.0, 0, 10, (25, -10, 45)),
+    110: _arm((-15, 40, 35), 136, (50, 12)) | _hand(0.85, 0, 10, (22, 12, 60)),
+    # Fist: closed, turned about the wrist, and let go.
+    132: _arm((15, 0, 0), 70, (-30, 0)) | _hand(1.0, 0, 12, (24, 15, 68)),
+    146: _arm((20, -30, 10), 75, (45, 15)) | _hand(1.0, 0, 12, (24, 15, 68)),
+    158: _arm((20, -20, 0), 80, (0, -25)) | _hand(1.0, 0, 10, (22, 12, 60)),
     172: _arm((10, 0, -10), 60, (-20, 0)) | _hand(0.35, 3, 4, (0, 5, 10)),
     # Spread: fingers fanned and stretched, the metacarpals one against the other.
     190: _arm((-10, -20, -20), 30, (-55, 10)) | _hand(-0.08, 15, -6, (-18, 22, -8)),
@@ -74,7 +74,7 @@ KEYS: dict[int, Pose] = {
 
 @contextmanager
 def _plain_keyframes():
-    """New keys as Bezier with clamped handles: between two keys nothing leaves their range, whatever the user prefers."""
+    """New keys as Bezier with clamped handles, whatever the user prefers: nothing leaves the range of its two keys."""
     edit = bpy.context.preferences.edit
     names = ("keyframe_new_interpolation_type", "keyframe_new_handle_type")
     before = [getattr(edit, name) for name in names]
@@ -82,7 +82,7 @@ def _plain_keyframes():
     try:
         yield
     finally:
-        for name, value in zip(names, before):
+        for name, value in zip(names, before, strict=True):
             setattr(edit, name, value)
 
 

@@ -36,8 +36,8 @@ class Joint(NamedTuple):
     """One bone in the rest pose.
 
     head, tail: metres, armature space. bend: unit vector, armature space, the bone's local Z.
-    limits: degrees about local X (flexion), Y (twist), Z (sideways; positive towards the thumb in the hand);
-    `LOCKED` for an axis that does not turn.
+    limits: degrees about local X (flexion), Y (twist) and Z (sideways: positive towards the thumb, and for the thumb
+    itself away from the back of the hand); `LOCKED` for an axis that does not turn.
     """
 
     name: str
@@ -120,7 +120,7 @@ def _finger_joints(name: str, finger: Finger) -> list[Joint]:
     palm = np.array([0.0, 0.0, -1.0])
     joints = [_joint(f"{name}_0", "wrist", finger.base, finger.knuckle, palm, _FINGER_LIMITS[0])]
     head, dip = np.array(finger.knuckle), 0.0
-    for i, (length, bend) in enumerate(zip(finger.lengths, finger.bends), start=1):
+    for i, (length, bend) in enumerate(zip(finger.lengths, finger.bends, strict=True), start=1):
         dip += bend
         tail = head + heading_vector(finger.heading, dip) * length
         joints.append(_joint(f"{name}_{i}", f"{name}_{i - 1}", head, tail, palm, _FINGER_LIMITS[i]))

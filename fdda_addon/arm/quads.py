@@ -2,6 +2,7 @@
 """Quads in sheets: how a grid is divided, collected, and seeded from a coarser one."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -96,7 +97,7 @@ class Collector:
 
     def patch(self, rows: list[list[int]]):
         """Faces between open rows; seen from outside, the rows run to the right and follow each other downwards."""
-        for a, b in zip(rows, rows[1:], strict=False):
+        for a, b in pairwise(rows):
             for i in range(len(a) - 1):
                 self.faces.append((a[i], b[i], b[i + 1], a[i + 1]))
 

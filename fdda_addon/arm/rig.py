@@ -14,7 +14,7 @@ from .surface import Surface, sculpt_arm
 SMOOTHING = {1: (10, 0.5), 2: (20, 0.8), 3: (30, 1.0)}
 # Linear RGBA and roughness.
 _SKIN = ((0.72, 0.42, 0.31, 1.0), 0.50)
-_NAIL = ((0.80, 0.50, 0.42, 1.0), 0.25)
+_NAIL = ((0.82, 0.50, 0.40, 1.0), 0.35)
 
 
 def build_arm(density: int = 1) -> tuple[bpy.types.Object, bpy.types.Object]:
@@ -72,7 +72,7 @@ def _limit_motion(rig: bpy.types.Object):
         bone.lock_location = (True, True, True)
         bone.lock_scale = (True, True, True)
         bone.lock_rotation = tuple(limits == LOCKED for limits in joint.limits)
-        for axis, (low, high) in zip("xyz", joint.limits):
+        for axis, (low, high) in zip("xyz", joint.limits, strict=True):
             setattr(bone, f"lock_ik_{axis}", (low, high) == LOCKED)
             setattr(bone, f"use_ik_limit_{axis}", True)
             setattr(bone, f"ik_min_{axis}", math.radians(low))

@@ -4,6 +4,8 @@
 Arm space (see `joints`): +X along the arm, +Z the back of the hand, -Y the elbow crease and the thumb.
 """
 
+from itertools import pairwise
+
 import numpy as np
 
 from .field import Ellipsoid, Field, HalfSpace, Loft, Stroke, frame_along
@@ -41,7 +43,7 @@ def _spindle(start, end, width: float, thickness: float, out) -> Ellipsoid:
 
 
 def _belly(start, end, width: float, thickness: float, out, peak: float = 0.45, ends=(0.30, 0.25)) -> Loft:
-    """A muscle from origin `start` to insertion `end`, thickest at the part `peak` of its length, tapering to `ends`."""
+    """A muscle from `start` to `end`, thickest at the part `peak` of its length, thinner by `ends` at its ends."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     length = float(np.linalg.norm(end - start))
     shape = [(0.0, ends[0]), (peak * 0.5, 0.5 * (1 + ends[0])), (peak, 1.0)]
@@ -61,17 +63,17 @@ def _upper_arm() -> list[Stroke]:
         Stroke(_belly((-0.045, 0.000, 0.032), (0.160, 0.000, 0.034), 0.030, 0.028, (0, 0, 1), 0.38), 0.018),
         Stroke(_belly((-0.040, 0.034, 0.020), (0.150, 0.008, 0.034), 0.025, 0.026, (0, 1, 0.8), 0.40), 0.018),
         # Biceps: long head above, short head below, one tendon.
-        Stroke(_belly((0.010, -0.022, 0.010), (0.290, -0.022, 0.000), 0.022, 0.032, (0, -1, 0.12), 0.58), 0.008),
-        Stroke(_belly((0.010, -0.016, -0.018), (0.285, -0.020, -0.006), 0.022, 0.031, (0, -1, -0.30), 0.60), 0.008),
+        Stroke(_belly((0.010, -0.022, 0.010), (0.290, -0.022, 0.000), 0.021, 0.027, (0, -1, 0.12), 0.55), 0.008),
+        Stroke(_belly((0.010, -0.016, -0.018), (0.285, -0.020, -0.006), 0.021, 0.027, (0, -1, -0.30), 0.57), 0.008),
         # Triceps: lateral head above, long head below, medial head near the elbow.
-        Stroke(_belly((0.020, 0.022, 0.012), (0.250, 0.018, 0.016), 0.024, 0.029, (0, 1, 0.55), 0.48), 0.008),
-        Stroke(_belly((0.000, 0.018, -0.018), (0.260, 0.018, -0.014), 0.026, 0.031, (0, 1, -0.55), 0.52), 0.008),
+        Stroke(_belly((0.020, 0.022, 0.012), (0.250, 0.018, 0.016), 0.024, 0.030, (0, 1, 0.55), 0.48), 0.008),
+        Stroke(_belly((0.000, 0.018, -0.018), (0.260, 0.018, -0.014), 0.026, 0.033, (0, 1, -0.55), 0.50), 0.008),
         Stroke(_belly((0.150, 0.016, -0.016), (0.300, 0.014, -0.018), 0.020, 0.023, (0, 0.5, -1), 0.5), 0.010),
         # Brachialis shows on both sides under the biceps.
         Stroke(_belly((0.130, -0.004, 0.020), (0.300, -0.014, 0.014), 0.018, 0.024, (0, -0.35, 1), 0.5), 0.008),
         Stroke(_belly((0.150, -0.006, -0.020), (0.295, -0.014, -0.014), 0.017, 0.023, (0, -0.35, -1), 0.5), 0.008),
         # The furrow below the deltoid's point, between biceps and triceps, inside and outside.
-        Stroke(_spindle((0.050, 0.002, -0.050), (0.230, 0.000, -0.044), 0.006, 0.004, (0, 0, 1)), 0.010, carve=True),
+        Stroke(_spindle((0.050, 0.002, -0.050), (0.230, 0.000, -0.044), 0.006, 0.004, (0, 0, 1)), 0.016, carve=True),
     ]
 
 
@@ -118,7 +120,7 @@ def _palm() -> list[Stroke]:
         pad = knuckle + along[0] * 0.006 - _Z * 0.0060
         strokes.append(Stroke(Ellipsoid(pad, np.array((0.013, 0.0100, 0.0080)) * size, along), 0.007))
     # The skin of the webs, reaching further out on the palm's side.
-    for a, b in zip(FINGERS, FINGERS[1:], strict=False):
+    for a, b in pairwise(FINGERS):
         ends = [np.array(HAND[name].knuckle) for name in (a, b)]
         middle = sum(ends) / 2 + _X * (0.0085 if b != "pinky" else 0.0110) - _Z * 0.0030
         strokes.append(Stroke(Ellipsoid(middle, (0.0085, 0.0080, 0.0070), frame_along((1, 0, -0.25), _Z)), 0.006))

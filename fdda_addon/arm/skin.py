@@ -27,8 +27,8 @@ def _from_bone(points: np.ndarray, name: str, start: float = 0.0) -> np.ndarray:
 def main_joints(points: np.ndarray, grid: Grid) -> np.ndarray:
     """(n,) int32 index into `JOINTS` for the rest points (n, 3), metres.
 
-    Fingers are cut at their joints, by chain: no vertex of a finger follows another one. The palm goes to the metacarpals
-    by column, the ball of the thumb to the thumb's.
+    Fingers are cut at their joints, by chain: no vertex of a finger follows another one. The palm goes to the
+    metacarpals by column, the ball of the thumb to the thumb's.
     """
     result = np.full(len(points), JOINT_INDEX["shoulder"], np.int32)
     result[points[:, 0] >= UPPER_ARM_LENGTH] = JOINT_INDEX["elbow"]
@@ -41,10 +41,14 @@ def main_joints(points: np.ndarray, grid: Grid) -> np.ndarray:
             chain = chain & (_beyond(points, before, f"{name}_{i}") | (i < 2) & (grid.digit == k))
             result[chain] = JOINT_INDEX[f"{name}_{i}"]
     thumb = grid.digit == 0
+    # The ball of the thumb: nearer to its metacarpal than to the others, and not behind the joint that it turns about.
     ball = in_hand & (grid.digit < 0) & (grid.column <= 2) & (result != JOINT_INDEX["index_1"])
     to_index = np.minimum(_from_bone(points, "index_0"), _from_bone(points, "middle_0"))
+    ball &= _beyond(points, "wrist", "thumb_0")
     ball &= _from_bone(points, "thumb_0", 0.25) < 0.95 * np.minimum(to_index, _from_bone(points, "wrist") + 0.002)
     result[thumb | ball] = JOINT_INDEX["thumb_0"]
+    # Its web stays with the metacarpal.
+    thumb &= _from_bone(points, "thumb_1") < _from_bone(points, "index_0") - 0.003
     for i in (1, 2):
         thumb = thumb & _beyond(points, f"thumb_{i - 1}", f"thumb_{i}")
         result[thumb] = JOINT_INDEX[f"thumb_{i}"]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .biceps import biceps_offsets
+from .biceps import PEAK, biceps_offsets
 from .digits import nail_faces
 from .grid import build_grid
 from .quads import seeded_points
@@ -14,7 +14,7 @@ from .sculpt import arm_field
 from .skin import main_joints
 
 # Rounds of relaxation: the guide starts far from the skin, finer grids start on it.
-_GUIDE_ROUNDS, _FINE_ROUNDS = 60, 11
+_GUIDE_ROUNDS, _FINE_ROUNDS = 45, 11
 
 
 @dataclass(frozen=True)
@@ -42,4 +42,4 @@ def sculpt_arm(density: int) -> Surface:
     _, normals = field.distance_and_gradient(points)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     joints = main_joints(points, grid)
-    return Surface(points, grid.faces, joints, biceps_offsets(points, normals), nail_faces(grid))
+    return Surface(points, grid.faces, joints, biceps_offsets(points, normals, PEAK[density]), nail_faces(grid))

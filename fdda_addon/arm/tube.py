@@ -6,6 +6,8 @@ them, and two sides. An address counts them from the thumb's side across the bac
 across the palm and up the thumb's side.
 """
 
+from itertools import pairwise
+
 import numpy as np
 
 from .field import smooth_curve
@@ -119,8 +121,11 @@ def _hand_columns(tube: Tube) -> np.ndarray:
 
 
 def _hand_x(ring: float, x: float, y: np.ndarray) -> np.ndarray:
-    """x of one ring, `ring` in the numbers of density 1, at the side places y: past the wrist the rings bend, so that one
-    runs over the knuckles and the last one through the webs; both fall back to the little finger."""
+    """x of one ring, `ring` in the numbers of density 1, at the side places y.
+
+    Past the wrist the rings bend, so that one runs over the knuckles and the last one through the webs; both fall back
+    to the little finger.
+    """
     wrist, knuckles, webs = _marks(DIVISIONS[1].rings)[2], _GUIDE_KNUCKLES, _marks(DIVISIONS[1].rings)[3]
     if ring <= wrist:
         return np.full(len(y), x)
@@ -178,7 +183,7 @@ def lay_tube(quads: Collector, tube: Tube) -> list[list[int]]:
         rings.append(ring)
     quads.sheets["tube"] = rings
     root = range(tube.root, tube.root + d.thumb_root)
-    for number, (near, far) in enumerate(zip(rings, rings[1:], strict=False)):
+    for number, (near, far) in enumerate(pairwise(rings)):
         quads.band(near, far, skip=range(tube.palm(0), tube.around) if number in root else ())
     _close_shoulder(quads, tube, rings[0])
     return rings
