@@ -73,7 +73,7 @@ def _upper_arm() -> list[Stroke]:
         Stroke(_belly((0.130, -0.004, 0.020), (0.300, -0.014, 0.014), 0.018, 0.024, (0, -0.35, 1), 0.5), 0.008),
         Stroke(_belly((0.150, -0.006, -0.020), (0.295, -0.014, -0.014), 0.017, 0.023, (0, -0.35, -1), 0.5), 0.008),
         # The furrow below the deltoid's point, between biceps and triceps, inside and outside.
-        Stroke(_spindle((0.050, 0.002, -0.050), (0.230, 0.000, -0.044), 0.006, 0.004, (0, 0, 1)), 0.016, carve=True),
+        Stroke(_belly((0.060, 0.002, -0.051), (0.230, 0.000, -0.045), 0.006, 0.005, (0, 0, 1)), 0.012, carve=True),
     ]
 
 
