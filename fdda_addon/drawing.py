@@ -194,6 +194,10 @@ class _Picture:
         scene.render.resolution_y = round(PIXELS_WIDE * self._height / self._width)
         scene.render.engine = "BLENDER_WORKBENCH"
         scene.render.image_settings.file_format = "PNG"
+        scene.render.image_settings.color_mode = "RGB"
+        scene.render.image_settings.compression = 90
+        # Dither is noise, and noise is what does not compress.
+        scene.render.dither_intensity = 0
         scene.render.use_file_extension = False
         scene.render.film_transparent = False
         scene.view_settings.view_transform = "Standard"

@@ -20,7 +20,7 @@ from .scene.borrow import assign_action, borrowed_pose
 from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
 
 BATCH_BYTES = 16 << 20
-BATCH_POSES = 100
+BATCH_POSES = 250
 """Poses go to the disk in batches of at most this size, so that an interruption loses little."""
 
 INFLUENCE_SEED_OFFSET = 1 << 32

@@ -48,13 +48,12 @@ def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: fl
         (C,) float64, radians or metres, as the channels say.
     """
     rng = np.random.default_rng([seed, index])
-    low = np.array([c.low for c in channels])
-    high = np.array([c.high for c in channels])
-    middle, deviation = (low + high) / 2, (high - low) / 2 * spread
-    values = rng.normal(middle, deviation)
-    while (outside := (values < low) | (values > high)).any():
-        values[outside] = rng.normal(middle, deviation)[outside]
-    return values
+    low, high = np.array([(channel.low, channel.high) for channel in channels]).T
+    places = rng.standard_normal(len(channels)) * spread
+    while len(outside := np.flatnonzero(np.abs(places) > 1)):
+        places[outside] = rng.standard_normal(len(outside)) * spread
+    # Rounding must not lead out of the range.
+    return np.clip((low + high) / 2 + (high - low) / 2 * places, low, high)
 
 
 def beyond_range(channels: tuple[Channel, ...], factor: float) -> tuple[Channel, ...]:

@@ -69,8 +69,10 @@ class LinearLayer:
         skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
         out = np.empty((len(skin), self.rig.vertex_count, 3), np.float32)
         for partition, block in zip(self.partitions, self._blocks, strict=True):
-            rows = skin[:, block.joints].transpose(0, 2, 1, 3).reshape(len(skin), 3, -1)
-            out[:, partition.vertices] = (rows @ block.weighted_rest).transpose(0, 2, 1)
+            # All rows of all poses in one product: many small ones cost more than what they compute.
+            rows = skin[:, block.joints].transpose(0, 2, 1, 3).reshape(len(skin) * 3, -1)
+            moved = (rows @ block.weighted_rest).reshape(len(skin), 3, -1)
+            out[:, partition.vertices] = moved.transpose(0, 2, 1)
         return out
 
     def local_residuals(self, pose_matrices: np.ndarray, positions: np.ndarray) -> np.ndarray:

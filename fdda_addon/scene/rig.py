@@ -25,6 +25,10 @@ MODIFIER_NAME = "FDDA"
 """Name of the Geometry Nodes modifier that plays a model; it is never part of the rig."""
 
 
+IDENTITY_TOLERANCE = 1e-6
+"""Mesh and armature count as unmoved, one against the other, when no matrix element differs by more."""
+
+
 @dataclass(frozen=True)
 class SceneRig:
     """A mesh object and the armature object that deforms it. Holds RNA references: not to be kept."""
@@ -182,17 +186,21 @@ class PoseReader:
         self._rest = rest_matrices.astype(np.float64)
         self._bone_rest = armature_io.rest_matrices(scene_rig.armature_object.data, names)
         self._relation: np.ndarray | None = None
-        self._correction = self._bone_rest
+        self._correction: np.ndarray | None = None
 
     def read(self, mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
         """Pose matrices of evaluated objects: (J, 4, 4) float32, mesh-object space, metres."""
         relation = mesh_from_armature(mesh_object, armature_object)
         if self._relation is None or not np.array_equal(relation, self._relation):
             self._relation = relation
-            self._correction = np.linalg.inv(relation @ self._bone_rest) @ self._rest
-        pose = armature_io.pose_matrices(armature_object, self._order)
-        # inv(T rest) applied on the right of T pose gives the skin matrix; times the rest pose of the model.
-        return (relation @ pose @ self._correction).astype(np.float32)
+            # inv(T rest) on the right of T pose gives the skin matrix; times the rest pose that S refers to.
+            correction = np.linalg.inv(relation @ self._bone_rest) @ self._rest
+            is_identity = np.abs(correction - np.eye(4)).max() < IDENTITY_TOLERANCE
+            self._correction = None if is_identity else correction
+        pose = relation @ armature_io.pose_matrices(armature_object, self._order)
+        if self._correction is not None:
+            pose = pose @ self._correction
+        return pose.astype(np.float32)
 
 
 class PoseEvaluator:
