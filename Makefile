@@ -42,6 +42,9 @@ test-line: .venv-line .venv  ## the core and Blender tiers on LINE=4.5 or LINE=5
 .venv-line:
 	@setup/environment .venv-$(LINE) blender $(or $(PYTHON_$(LINE)),$(error LINE is 4.5 or 5.2))
 
+pictures: demo  ## make the README's pictures again, from those of the demo
+	.venv/bin/python docs/pictures/make_pictures.py out/demo/pictures
+
 fixtures:  ## build the rigs in blend_fixtures again, with the oldest Blender under test
 	@$(MAKE) .venv-line LINE=4.5
 	.venv-4.5/bin/python blend_fixtures/make_fixtures.py

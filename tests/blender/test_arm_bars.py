@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the arm must show, from rig to playback: the demo's files, its errors, and the speed of a denser arm."""
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from conftest import assert_plays, run
+
+from fdda_addon import demo
+
+MEAN_BAR, MAX_BAR = 0.08, 0.25
+"""Held-out errors of the model as parts of the linear layer's."""
+SPEED_BAR = 4.0
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the demo."""
+    import fdda_addon
+
+    folder = tmp_path_factory.mktemp("demo")
+    fdda_addon.register()
+    try:
+        assert demo.main(folder) == 0
+    finally:
+        fdda_addon.unregister()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def errors(made: Path) -> dict:
+    return json.loads((made / "evaluation.json").read_text())
+
+
+def test_files(made):
+    assert {path.name for path in made.iterdir()} == {
+        *("arm.blend", "recording", "arm.onnx", "report.json", "report.html"),
+        *("evaluation.json", "arm_bound.blend", "pictures"),
+    }
+
+
+def test_held_out_errors(errors):
+    assert errors["poses"] == 200
+    assert errors["fdda"]["mean"] <= MEAN_BAR * errors["linear"]["mean"]
+    assert errors["fdda"]["max"] <= MAX_BAR * errors["linear"]["max"]
+
+
+def test_beyond_the_range_is_no_worse_than_linear(errors):
+    assert [e["name"] for e in errors["beyond"]] == ["1.5 times the range", "2 times the range", "3 times the range"]
+    for poses in (*errors["beyond"], *errors["named"]):
+        assert poses["fdda"]["mean"] < poses["linear"]["mean"], poses["name"]
+        # Nothing explodes: no vertex is further from the rig than the linear layer leaves it, by more than a trifle.
+        assert poses["fdda"]["max"] < 1.05 * poses["linear"]["max"], poses["name"]
+
+
+def test_every_partition_gains(errors):
+    for partition in errors["partitions"]:
+        assert partition["fdda"]["mean"] < 0.25 * partition["linear"]["mean"], partition["joint"]
+
+
+def test_pictures_show_something(made):
+    pictures = sorted((made / "pictures").iterdir())
+    assert len(pictures) == 5
+    for picture in pictures:
+        image = bpy.data.images.load(str(picture))
+        pixels = np.array(image.pixels[:]).reshape(-1, image.channels)[:, :3]
+        assert len(np.unique(pixels.round(2), axis=0)) > 50, picture.name
+
+
+def test_page_needs_nothing_from_outside(made):
+    page = (made / "report.html").read_text()
+    assert page.count("data:image/png;base64,") >= 5
+    assert 'src="http' not in page and 'href="http' not in page
+
+
+def test_bound_file_plays(made):
+    bpy.ops.wm.open_mainfile(filepath=str(made / "arm_bound.blend"))
+    mesh_object = bpy.data.objects["arm"]
+    for frame in (1, 76, 132, 240):
+        bpy.context.scene.frame_set(frame)
+        assert_plays(mesh_object, made / "arm.onnx")
+
+
+def test_frame_of_the_denser_arm(tmp_path):
+    """A whole frame with the model takes at most a quarter of the rig's."""
+    rig, recording, model = tmp_path / "arm.blend", tmp_path / "recording", tmp_path / "arm.onnx"
+    assert run("build-arm", rig, "--density", 2) == 0
+    # The cost of a frame depends on the size of the model, not on how long it was trained.
+    assert run("record", rig, recording, "--poses", 400) == 0
+    assert run("train", recording, model, "--epochs", 3) == 0
+    assert run("benchmark", rig, model, "--json", tmp_path / "times.json") == 0
+    times = json.loads((tmp_path / "times.json").read_text())
+    assert times["ratio"] >= SPEED_BAR
