@@ -19,31 +19,10 @@ def joint_features(pose_matrices: np.ndarray, rest_matrices: np.ndarray, parents
     Returns:
         (N, J, 12) float32: the upper three rows of F_j, row by row; rotations without unit, translations in metres.
     """
-    return relative_features(pose_matrices, rest_matrices, parents, np.arange(len(parents)))
-
-
-def relative_features(
-    pose_matrices: np.ndarray, rest_matrices: np.ndarray, references: np.ndarray, joints: np.ndarray
-) -> np.ndarray:
-    """Transform of joints relative to other joints and to the rest pose, F = (B_r^-1 B_j)^-1 P_r^-1 P_j.
-
-    Args:
-        pose_matrices, rest_matrices: as for `joint_features`.
-        references: (R,) index of the joint that each feature is relative to, -1 for mesh-object space.
-        joints: (R,) index of the joint itself.
-
-    Returns:
-        (N, R, 12) float32, as `joint_features`.
-    """
-
-    def relative(matrices: np.ndarray) -> np.ndarray:
-        inverse = np.linalg.inv(matrices)[:, references]
-        inverse[:, references < 0] = np.eye(4)
-        return inverse @ matrices[:, joints]
-
-    rest = np.linalg.inv(relative(rest_matrices[None].astype(np.float64)))
-    features = rest @ relative(pose_matrices.astype(np.float64))
-    return features[:, :, :3, :].reshape(*features.shape[:2], FEATURES_PER_JOINT).astype(np.float32)
+    pose = pose_matrices.astype(np.float64)
+    rest = rest_matrices.astype(np.float64)
+    relative = np.linalg.inv(relative_to_parent(rest[None], parents)) @ relative_to_parent(pose, parents)
+    return relative[:, :, :3, :].reshape(*relative.shape[:2], FEATURES_PER_JOINT).astype(np.float32)
 
 
 def relative_to_parent(matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:
