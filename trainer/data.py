@@ -10,7 +10,7 @@ from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.recording import Recording
 
 from .basis import Basis, make_basis
-from .inputs import InputRows
+from .inputs import Inputs
 
 LEAST_POSES = 10
 LEAST_SPREAD = 1e-5
@@ -85,14 +85,14 @@ def split_poses(poses: int, validation_fraction: float, seed: int) -> Split:
     return Split(np.sort(order[count:]), np.sort(order[:count]))
 
 
-def partitions_of(recording: Recording, inputs: InputRows) -> list[PartitionData]:
+def partitions_of(recording: Recording, inputs: Inputs) -> list[PartitionData]:
     """The partitions of a recording, their features as `inputs` chose them."""
     rig = recording.rig
-    features = inputs.features(recording.pose_matrices, rig.rest_matrices).reshape(len(recording.pose_matrices), -1)
+    features = inputs.features(recording.pose_matrices, rig.rest_matrices)
     return [
         PartitionData(
             rig.joints[partition.joint].name,
-            features[:, inputs.columns(number)],
+            features[:, inputs.columns[number]],
             lambda vertices=partition.vertices: recording.residuals[:, vertices],
             len(partition.vertices),
         )

@@ -10,13 +10,15 @@ import onnxruntime
 import torch
 
 from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.features import FEATURES_PER_JOINT
 from fdda_addon.core.metrics import distances, error_statistics
 from fdda_addon.core.model import METADATA_KEY, POSE_INPUT, POSITIONS_OUTPUT, ModelInfo, ModelPartition, read_model_info
 from fdda_addon.core.output import replacing
 from fdda_addon.core.recording import Recording
 from fdda_addon.core.skinning import LinearLayer
 
-from .graph import Deformation, build_graph, standardisation
+from .deformation import Deformation
+from .graph import build_graph
 from .model import ACTIVATIONS
 
 MOST_DIFFERENCE = 1e-5
@@ -50,15 +52,15 @@ def reference_positions(deformation: Deformation, pose_matrices: np.ndarray) -> 
     rig, trust_range = deformation.rig, deformation.trust
     features = deformation.inputs.features(pose_matrices, rig.rest_matrices)
     trust = trust_range.trust(features)
-    mean, scale = standardisation(deformation)
-    clamped = np.clip(features, trust_range.low, trust_range.high).reshape(len(features), -1)
+    mean, scale = deformation.standardisation()
+    clamped = np.clip(features, trust_range.low, trust_range.high)
     inputs = ((clamped - mean) / scale).astype(np.float32)
     local = np.zeros((len(features), rig.vertex_count, 3), np.float32)
     activation = ACTIVATIONS[deformation.activation]
     for number, (partition, prepared, network) in enumerate(
         zip(deformation.partitions, deformation.prepared, deformation.networks, strict=True)
     ):
-        own = inputs[:, deformation.inputs.columns(number)[prepared.columns]]
+        own = inputs[:, deformation.seen_columns(number)]
         values = torch.from_numpy(own)
         for layer, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
             values = torch.addmm(torch.from_numpy(bias), values, torch.from_numpy(weight))
@@ -139,7 +141,7 @@ def model_info(recording: Recording, deformation: Deformation, held_out: np.ndar
         held_out: distances of the validation poses, metres.
         training: settings, versions and times.
     """
-    rig = recording.rig
+    rig, low, high = recording.rig, deformation.trust.low, deformation.trust.high
     return ModelInfo(
         rig.joints,
         rig.rest_matrices,
@@ -149,8 +151,7 @@ def model_info(recording: Recording, deformation: Deformation, held_out: np.ndar
             ModelPartition(p.joint, p.influencing, len(p.vertices), len(prepared.basis.shapes))
             for p, prepared in zip(deformation.partitions, deformation.prepared, strict=True)
         ),
-        deformation.trust.low[: len(rig.joints)],
-        deformation.trust.high[: len(rig.joints)],
+        *(bound[: deformation.inputs.joint_columns].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
         error_statistics(held_out).to_json(),
         0.0,
         training,

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What each network sees: its influencing joints relative to their parents, and relative to the main joint.
+"""What each network sees: its influencing joints relative to their parents, and where its neighbours are.
 
-A smoothed surface is nearly linear in the skin matrices of the joints around it, taken in the frame of the main joint.
-Those are products of the parent-relative transforms along the way from one joint to the other; a network that is given
-them need not learn to multiply. docs/training.md has the errors with and without.
+A smoothed surface depends on where the surface around it is. From the parent-relative transforms a network would have
+to multiply its way to that; so it is also given the middle of the partitions around it, seen from its main joint.
+docs/training.md has the errors with and without.
 """
 
 from collections.abc import Sequence
@@ -11,54 +11,85 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdda_addon.core.features import FEATURES_PER_JOINT, relative_features
+from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
 from fdda_addon.core.partition import Partition
+from fdda_addon.core.rig import Rig
+
+FEATURES_PER_PAIR = 3
 
 
 @dataclass(frozen=True)
-class InputRows:
-    """The transforms that the networks see, twelve numbers each; the first J are the joints relative to their parents.
+class Inputs:
+    """All features that networks see, F = 12 J + 3 Q of them in a row, and which of them each network sees.
+
+    First the J joints relative to their parents (`core.features`); then, for Q pairs of joints a and b, the point of
+    joint b as seen from joint a, P_a^-1 P_b y_b, in metres.
 
     Attributes:
-        references: (R,) int64, index of the joint that a transform is relative to, -1 for mesh-object space.
-        joints: (R,) int64, index of the joint itself.
-        rows: for each partition, the indices of its transforms.
+        parents: (J,) int32, parent of each joint, -1 for a root.
+        points: (J, 3) float32, the point y of each joint in the joint's own frame, metres.
+        pair_references, pair_joints: (Q,) int64, joints a and b of each pair.
+        columns: for each partition, (F_p,) int64 indices of the features that its network is offered.
     """
 
-    references: np.ndarray
-    joints: np.ndarray
-    rows: tuple[np.ndarray, ...]
+    parents: np.ndarray
+    points: np.ndarray
+    pair_references: np.ndarray
+    pair_joints: np.ndarray
+    columns: tuple[np.ndarray, ...]
+
+    @property
+    def joint_columns(self) -> int:
+        """12 J, where the pairs begin."""
+        return len(self.parents) * FEATURES_PER_JOINT
 
     def features(self, pose_matrices: np.ndarray, rest_matrices: np.ndarray) -> np.ndarray:
-        """(N, J, 4, 4) poses to (N, R, 12) float32 features (`core.features.relative_features`)."""
-        return relative_features(pose_matrices, rest_matrices, self.references, self.joints)
+        """(N, J, 4, 4) poses, mesh-object space, metres, to (N, F) float32 features."""
+        joints = joint_features(pose_matrices, rest_matrices, self.parents).reshape(len(pose_matrices), -1)
+        poses = pose_matrices.astype(np.float64)
+        there = np.einsum("njab,jb->nja", poses[:, :, :3, :3], self.points) + poses[:, :, :3, 3]
+        apart = there[:, self.pair_joints] - poses[:, :, :3, 3][:, self.pair_references]
+        seen = np.einsum("nqab,nqb->nqa", np.linalg.inv(poses[:, :, :3, :3])[:, self.pair_references], apart)
+        return np.concatenate([joints, seen.reshape(len(poses), -1).astype(np.float32)], axis=1)
 
-    def columns(self, partition: int) -> np.ndarray:
-        """Where the features of a partition stand among all R * 12, in the order that its network sees."""
-        return (self.rows[partition][:, None] * FEATURES_PER_JOINT + np.arange(FEATURES_PER_JOINT)).ravel()
 
+def make_inputs(parents: np.ndarray, points: np.ndarray, partitions: Sequence[Partition]) -> Inputs:
+    """Choose what the networks see.
 
-def make_input_rows(parents: np.ndarray, partitions: Sequence[Partition]) -> InputRows:
-    """Choose the transforms.
-
-    A joint is seen relative to the main joint when every joint that moves one against the other influences the
-    partition, and when there are at least two of these: one alone is seen relative to its parent already.
+    A joint is seen from the main joint when every joint that moves one against the other influences the partition,
+    and when there are at least two of these: one alone is seen relative to its parent already.
 
     Args:
         parents: (J,) parent index of each joint, -1 for a root.
+        points: (J, 3) one of each joint, in its own frame, metres; `middles` makes them of a rig.
         partitions: with their main and influencing joints.
     """
-    references, joints, rows = list(parents), list(range(len(parents))), []
+    references, joints, columns = [], [], []
     for partition in partitions:
-        own = list(partition.influencing)
+        own = [_columns(0, joint, FEATURES_PER_JOINT) for joint in partition.influencing]
         for joint in range(len(parents)):
             between = _between(parents, partition.joint, joint)
             if len(between) >= 2 and between <= set(partition.influencing):
-                own.append(len(joints))
+                own.append(_columns(len(parents) * FEATURES_PER_JOINT, len(joints), FEATURES_PER_PAIR))
                 references.append(partition.joint)
                 joints.append(joint)
-        rows.append(np.array(own, np.int64))
-    return InputRows(np.array(references, np.int64), np.array(joints, np.int64), tuple(rows))
+        columns.append(np.concatenate([*own, np.zeros(0, np.int64)]))
+    return Inputs(
+        parents, points.astype(np.float32), np.array(references, np.int64), np.array(joints, np.int64), tuple(columns)
+    )
+
+
+def middles(rig: Rig, partitions: Sequence[Partition]) -> np.ndarray:
+    """(J, 3) float64 middle of each joint's partition in the joint's own frame, metres; 0 for one without vertices."""
+    points = np.zeros((len(rig.joints), 3))
+    for partition in partitions:
+        middle = np.append(rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64), 1)
+        points[partition.joint] = (np.linalg.inv(rig.rest_matrices[partition.joint].astype(np.float64)) @ middle)[:3]
+    return points
+
+
+def _columns(start: int, number: int, width: int) -> np.ndarray:
+    return start + number * width + np.arange(width)
 
 
 def _between(parents: np.ndarray, first: int, second: int) -> set[int]:

@@ -21,8 +21,8 @@ from .page import render_html
 if TYPE_CHECKING:  # The page can be written again where torch is not installed.
     from fdda_addon.core.recording import Recording
 
+    from .deformation import Deformation
     from .export import Exported, Measured
-    from .graph import Deformation
     from .loop import Curves
 
 FORMAT = "fdda-report"

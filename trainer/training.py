@@ -17,9 +17,9 @@ from . import report
 from .announcements import Announcer
 from .config import TrainingConfig
 from .data import PreparedPartition, Split, partitions_of, prepare, split_poses
+from .deformation import Deformation
 from .export import build_model, measure, write_model
-from .graph import Deformation
-from .inputs import InputRows, make_input_rows
+from .inputs import Inputs, make_inputs, middles
 from .loop import Cancelled, Trained, choose_device, train
 from .page import render_html
 from .trust import make_trust_range
@@ -62,7 +62,7 @@ def train_model(
         device=str(device),
     )
     split = split_poses(len(recording.pose_matrices), config.validation_fraction, config.seed)
-    inputs = make_input_rows(recording.rig.parents, recording.partitions)
+    inputs = make_inputs(recording.rig.parents, middles(recording.rig, recording.partitions), recording.partitions)
     prepared = _prepare(recording, inputs, split, config, should_stop)
     trained = train(
         prepared,
@@ -112,7 +112,7 @@ def train_model(
 
 
 def _prepare(
-    recording: Recording, inputs: InputRows, split: Split, config: TrainingConfig, should_stop: Callable[[], bool]
+    recording: Recording, inputs: Inputs, split: Split, config: TrainingConfig, should_stop: Callable[[], bool]
 ) -> list[PreparedPartition]:
     prepared = []
     for partition in partitions_of(recording, inputs):
@@ -123,7 +123,7 @@ def _prepare(
 
 def _deformation(
     recording: Recording,
-    inputs: InputRows,
+    inputs: Inputs,
     split: Split,
     prepared: list[PreparedPartition],
     trained: Trained,

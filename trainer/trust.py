@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fdda_addon.core.features import FEATURES_PER_JOINT
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import SkinBlock
@@ -32,9 +33,8 @@ class TrustRange:
     """What the training has seen of each joint.
 
     Attributes:
-        low, high: (R, 12) float32, the box with its margin around all transforms that the networks see, of which the
-            first J are the joints relative to their parents (`InputRows`).
-        width: (J, 12) float32, fade width; only the joints count.
+        low, high: (F,) float32, the box with its margin, around all features that networks see (`Inputs`).
+        width: (12 J,) float32, fade width of the joints' own features; only these count.
         counts: (P, J) bool, the joints that count for a partition: those that influence it, and those beside it that
             were locked, of which nobody knows whether they would.
     """
@@ -45,32 +45,31 @@ class TrustRange:
     counts: np.ndarray
 
     def trust(self, features: np.ndarray) -> np.ndarray:
-        """(N, R, 12) features to (N, P) float32 trust."""
-        joints = features[:, : len(self.width)]
-        excess = (joints - np.clip(joints, self.low[: len(self.width)], self.high[: len(self.width)])) / self.width
-        squared = (excess.astype(np.float64) ** 2).sum(axis=2) @ self.counts.T
-        return (np.maximum(0, 1 - squared) ** 2).astype(np.float32)
+        """(N, F) features to (N, P) float32 trust."""
+        size = len(self.width)
+        own = features[:, :size]
+        excess = (own - np.clip(own, self.low[:size], self.high[:size])) / self.width
+        by_joint = (excess.astype(np.float64) ** 2).reshape(len(own), -1, FEATURES_PER_JOINT).sum(axis=2)
+        return (np.maximum(0, 1 - by_joint @ self.counts.T) ** 2).astype(np.float32)
 
 
 def make_trust_range(features: np.ndarray, rig: Rig, partitions: tuple[Partition, ...]) -> TrustRange:
     """Measure the range of the training poses.
 
     Args:
-        features: (n, R, 12) float32 of the training poses, the first J the joints relative to their parents.
+        features: (n, F) float32 of the training poses, the first 12 J the joints relative to their parents.
         rig, partitions: of the recording.
     """
     low, high = features.min(axis=0), features.max(axis=0)
-    spread = high - low
-    units = np.ones(12, np.float32)
-    units[3::4] = rig.size
+    spread, size = high - low, len(rig.joints) * FEATURES_PER_JOINT
+    translation = (np.arange(len(low)) % 4 == 3) | (np.arange(len(low)) >= size)
     least_margin, least_fade = (
-        np.where(np.arange(12) % 4 == 3, part[1], part[0]) for part in (LEAST_MARGIN, LEAST_FADE)
+        np.where(translation, least[1] * rig.size, least[0]) for least in (LEAST_MARGIN, LEAST_FADE)
     )
-    joints = len(rig.joints)
-    margin = np.maximum(MARGIN * spread, least_margin * units)
-    width = np.maximum(FADE * spread, least_fade * units)[:joints]
-    locked = (spread[:joints] < LOCKED).all(axis=1)
-    counts = np.zeros((len(partitions), joints), bool)
+    margin = np.maximum(MARGIN * spread, least_margin)
+    width = np.maximum(FADE * spread, least_fade)[:size]
+    counts = np.zeros((len(partitions), len(rig.joints)), bool)
+    locked = (spread[:size].reshape(-1, FEATURES_PER_JOINT) < LOCKED).all(axis=1)
     for number, partition in enumerate(partitions):
         beside = {partition.joint, rig.joints[partition.joint].parent, *SkinBlock(rig, partition).joints.tolist()}
         beside |= {child for child, joint in enumerate(rig.joints) if joint.parent == partition.joint}

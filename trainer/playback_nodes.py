@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The part of the graph that plays: networks, and one product with a constant matrix for each partition.
+
+Partitions are evaluated in groups of similar size, padded to the largest of the group.
+"""
+
+import numpy as np
+
+from fdda_addon.core.model import POSE_INPUT, POSITIONS_OUTPUT
+from fdda_addon.core.skinning import SkinBlock
+
+from .deformation import Deformation
+from .nodes import Graph
+
+GROUP_FLOATS = 80_000
+"""A group of its own costs as much time as reading so many constants."""
+MOST_GROUPS = 8
+
+
+def make_groups(deformation: Deformation) -> list[list[int]]:
+    """Cut the partitions, ordered by their number of shapes, into groups such that padding and groups cost least."""
+    shapes = deformation.shape_counts()
+    order = sorted(range(len(shapes)), key=lambda n: (shapes[n], len(deformation.prepared[n].columns), n))
+    vertices = [len(deformation.partitions[n].vertices) for n in order]
+    first = max((network.weights[0].shape[1] for network in deformation.networks), default=0)
+
+    def cost(start: int, end: int) -> float:
+        members = order[start:end]
+        most = max(shapes[n] for n in members) + 1
+        inputs = max(len(deformation.prepared[n].columns) for n in members)
+        last = max(deformation.networks[n].weights[-1].shape[0] for n in members)
+        padded = len(members) * (inputs * first + last * most) + 3 * most * sum(vertices[start:end])
+        return GROUP_FLOATS + padded
+
+    # The cheapest way to cut the first `end` partitions, for every number of groups.
+    best = {(0, 0): (0.0, [])}
+    for groups in range(1, MOST_GROUPS + 1):
+        for end in range(groups, len(order) + 1):
+            ways = [
+                (best[start, groups - 1][0] + cost(start, end), [*best[start, groups - 1][1], (start, end)])
+                for start in range(groups - 1, end)
+                if (start, groups - 1) in best
+            ]
+            best[end, groups] = min(ways, key=lambda way: way[0])
+    cuts = min((way for (end, _), way in best.items() if end == len(order)), key=lambda way: way[0])[1]
+    return [order[start:end] for start, end in cuts]
+
+
+def add_playback(graph: Graph, inputs: str, trust: str, deformation: Deformation, groups: list[list[int]]) -> None:
+    """Add everything from the clamped features to the output `positions`.
+
+    The rows of partition p, of main joint m, are [ P_j of the joints that skin it | t c_k P_m | t P_m ]; its matrix is
+    [ w_vj B_j^-1 (x_v, 1) | shapes and mean, turned by B_m^-1 ]: the inverse rest matrices are in the constants.
+
+    Args:
+        inputs: (N, F) standardised features.
+        trust: (N, P), the partitions in the order of the groups.
+    """
+    rig = deformation.rig
+    order = [number for group in groups for number in group]
+    mains = np.array([deformation.partitions[number].joint for number in order])
+    flat = graph.reshape(POSE_INPUT, [0, 16 * len(rig.joints)], "pose_row")
+    turn = 16 * mains[:, None] + np.array([0, 1, 2, 4, 5, 6, 8, 9, 10])
+    turns = graph.add("Gather", [flat, graph.integers("turn_elements", turn[:, :, None])], "turns", axis=1)
+    wide = graph.reshape(trust, [0, len(order), 1, 1], "trust_wide")
+    trusted = graph.add("Mul", [turns, wide], "trusted_turns")
+    by_partition = graph.add("Transpose", [trusted], "turns_by_partition", perm=[1, 0, 2, 3])
+    names = [f"turns_{number}" for number in range(len(groups))]
+    turns_of = graph.split(by_partition, [len(group) for group in groups], names, axis=0)
+    blocks = []
+    for number, group in enumerate(groups):
+        coefficients = _networks(graph, inputs, deformation, group, f"_{number}")
+        blocks += _products(graph, coefficients, turns_of[number], flat, deformation, group, f"_{number}")
+    joined = graph.add("Concat", blocks, "blocks", axis=3) if len(blocks) > 1 else blocks[0]
+    by_vertex = graph.add("Transpose", [joined], "positions_by_partition", perm=[0, 1, 3, 2])
+    by_vertex = graph.reshape(by_vertex, [-1, rig.vertex_count, 3], "positions_in_a_row")
+    position_of = np.argsort(np.concatenate([deformation.partitions[n].vertices for n in order]))
+    graph.add("Gather", [by_vertex, graph.integers("vertex_order", position_of)], POSITIONS_OUTPUT, axis=1)
+
+
+def _networks(graph: Graph, inputs: str, deformation: Deformation, group: list[int], suffix: str) -> str:
+    """(Pg, N, 1, K + 1) coefficients of a group in metres, padded; the last of each partition is 1, for the mean."""
+    shapes = max(deformation.shape_counts()[n] for n in group)
+    learned = [n for n in group if deformation.shape_counts()[n]]
+    if not learned:
+        layers, widths = 1, [0]
+    else:
+        layers = len(deformation.networks[learned[0]].weights)
+        widths = [len(bias) for bias in deformation.networks[learned[0]].biases]
+    widths[-1] = shapes + 1
+    columns = np.zeros((len(group), max(1, *(len(deformation.prepared[n].columns) for n in group))), np.int64)
+    sizes = [columns.shape[1], *widths]
+    weights = [np.zeros((len(group), sizes[n], sizes[n + 1]), np.float32) for n in range(layers)]
+    biases = [np.zeros((len(group), 1, width), np.float32) for width in widths]
+    biases[-1][:, 0, -1] = 1
+    for place, n in enumerate(group):
+        own = deformation.seen_columns(n)
+        columns[place, : len(own)] = own
+        if n in learned:
+            network = deformation.networks[n]
+            for layer, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+                weights[layer][place, : weight.shape[0], : weight.shape[1]] = weight
+                biases[layer][place, 0, : len(bias)] = bias
+    seen = graph.add("Gather", [inputs, graph.integers(f"seen_columns{suffix}", columns)], f"seen{suffix}", axis=1)
+    values = graph.add("Transpose", [seen], f"inputs{suffix}", perm=[1, 0, 2])
+    for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        name = f"_{layer}{suffix}"
+        values = graph.add("MatMul", [values, graph.floats(f"weights{name}", weight)], f"product{name}")
+        values = graph.add("Add", [values, graph.floats(f"biases{name}", bias)], f"layer{name}")
+        if layer < layers - 1:
+            values = _activation(graph, values, deformation.activation, f"hidden{name}")
+    return graph.add("Unsqueeze", [values, graph.integers(f"row_axis{suffix}", [2])], f"coefficients{suffix}")
+
+
+def _activation(graph: Graph, value: str, activation: str, output: str) -> str:
+    if activation == "silu":
+        return graph.add("Mul", [value, graph.add("Sigmoid", [value], f"{output}_sigmoid")], output)
+    if activation == "gelu":
+        scaled = graph.add("Mul", [value, graph.floats(f"{output}_root", np.sqrt(0.5))], f"{output}_scaled")
+        error = graph.add("Erf", [scaled], f"{output}_erf")
+        raised = graph.add("Add", [error, graph.floats(f"{output}_one", 1.0)], f"{output}_raised")
+        halved = graph.add("Mul", [value, graph.floats(f"{output}_half", 0.5)], f"{output}_halved")
+        return graph.add("Mul", [halved, raised], output)
+    return graph.add({"tanh": "Tanh", "relu": "Relu"}[activation], [value], output)
+
+
+def _products(
+    graph: Graph, coefficients: str, turns: str, flat: str, deformation: Deformation, group: list[int], suffix: str
+) -> list[str]:
+    """(1, N, 3, Vp) positions of each partition of a group.
+
+    Args:
+        coefficients: (Pg, N, 1, K + 1).
+        turns: (Pg, N, 9, 1), the 3x3 of the main joints' poses, times trust.
+        flat: (N, 16 J) poses.
+    """
+    shapes = max(deformation.shape_counts()[n] for n in group) + 1
+    skins = [SkinBlock(deformation.rig, deformation.partitions[n]) for n in group]
+    most_joints = max(len(skin.joints) for skin in skins)
+    turned = graph.add("Mul", [turns, coefficients], f"turned{suffix}")
+    turned = graph.reshape(turned, [0, -1, 3, 3 * shapes], f"residual_rows{suffix}")
+    elements = np.zeros((len(group), 3, 4 * most_joints), np.int64)
+    for place, skin in enumerate(skins):
+        own = (16 * skin.joints[:, None] + np.arange(4)).ravel()
+        elements[place, :, : len(own)] = own + 4 * np.arange(3)[:, None]
+    linear = graph.add("Gather", [flat, graph.integers(f"skin_elements{suffix}", elements)], f"skin{suffix}", axis=1)
+    linear = graph.add("Transpose", [linear], f"linear_rows{suffix}", perm=[1, 0, 2, 3])
+    rows = graph.add("Concat", [linear, turned], f"rows{suffix}", axis=3)
+    names = [f"rows{suffix}_{place}" for place in range(len(group))]
+    parts = graph.split(rows, [1] * len(group), names, axis=0)
+    return [
+        graph.add("MatMul", [part, graph.floats(f"matrix_{n}", matrix)], f"block_{n}")
+        for part, n, matrix in zip(parts, group, _matrices(deformation, group, skins, most_joints, shapes), strict=True)
+    ]
+
+
+def _matrices(
+    deformation: Deformation, group: list[int], skins: list[SkinBlock], most_joints: int, shapes: int
+) -> list[np.ndarray]:
+    """(4 Jg + 3 (K + 1), Vp) constant matrix of each partition, padded as its rows are."""
+    inverse_rest = np.linalg.inv(deformation.rig.rest_matrices.astype(np.float64))
+    matrices = []
+    for n, skin in zip(group, skins, strict=True):
+        partition, basis = deformation.partitions[n], deformation.prepared[n].basis
+        count, own = len(partition.vertices), len(basis.shapes)
+        matrix = np.zeros((4 * most_joints + 3 * shapes, count))
+        weighted = skin.weighted_rest.reshape(len(skin.joints), 4, -1).astype(np.float64)
+        matrix[: 4 * len(skin.joints)] = (inverse_rest[skin.joints] @ weighted).reshape(-1, count)
+        local = np.zeros((shapes, count, 3))
+        local[:own] = basis.shapes.reshape(own, count, 3)
+        local[-1] = basis.mean.reshape(count, 3)
+        turned = np.einsum("ab,kvb->akv", inverse_rest[partition.joint, :3, :3], local)
+        matrix[4 * most_joints :] = turned.reshape(-1, count)
+        matrices.append(matrix)
+    return matrices
