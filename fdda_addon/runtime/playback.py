@@ -230,7 +230,7 @@ def _positions(network: Network, pose_matrices: np.ndarray) -> np.ndarray:
 
 def _move(network: Network, members: list[tuple[LiveBinding, bpy.types.Object, np.ndarray]]) -> None:
     try:
-        positions = _positions(network, np.stack([pose for _, _, pose in members]))
+        positions = _positions(network, np.array([pose for _, _, pose in members]))
     except FDDAError as error:
         for _, mesh_object, _ in members:
             fail(mesh_object, error)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ..core.errors import RigError
 from ..core.poses import Channel
@@ -150,7 +151,11 @@ def read_rig(scene_rig: SceneRig) -> Rig:
 
 def mesh_from_armature(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
     """(4, 4) float64, armature space to mesh-object space. Pass evaluated objects for an evaluated answer."""
-    return np.array(mesh_object.matrix_world.inverted_safe() @ armature_object.matrix_world, np.float64)
+    return np.array(_relation(mesh_object, armature_object), np.float64)
+
+
+def _relation(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> Matrix:
+    return mesh_object.matrix_world.inverted_safe() @ armature_object.matrix_world
 
 
 def sampled_channels(scene_rig: SceneRig, rig: Rig) -> tuple[Channel, ...]:
@@ -185,22 +190,30 @@ class PoseReader:
         self._order = armature_io.bone_order(scene_rig.armature_object, names)
         self._rest = rest_matrices.astype(np.float64)
         self._bone_rest = armature_io.rest_matrices(scene_rig.armature_object.data, names)
-        self._relation: np.ndarray | None = None
-        self._correction: np.ndarray | None = None
+        self._relation: Matrix | None = None
+        self._left: np.ndarray | None = None
+        self._right: np.ndarray | None = None
 
     def read(self, mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
         """Pose matrices of evaluated objects: (J, 4, 4) float32, mesh-object space, metres."""
-        relation = mesh_from_armature(mesh_object, armature_object)
-        if self._relation is None or not np.array_equal(relation, self._relation):
-            self._relation = relation
-            # inv(T rest) on the right of T pose gives the skin matrix; times the rest pose that S refers to.
-            correction = np.linalg.inv(relation @ self._bone_rest) @ self._rest
-            is_identity = np.abs(correction - np.eye(4)).max() < IDENTITY_TOLERANCE
-            self._correction = None if is_identity else correction
-        pose = relation @ armature_io.pose_matrices(armature_object, self._order)
-        if self._correction is not None:
-            pose = pose @ self._correction
-        return pose.astype(np.float32)
+        relation = _relation(mesh_object, armature_object)
+        if relation != self._relation:
+            self._set_relation(relation)
+        pose = armature_io.pose_matrices(armature_object, self._order)
+        if self._left is not None:
+            pose = self._left @ pose
+        if self._right is not None:
+            pose = pose @ self._right
+        return pose.astype(np.float32, copy=False)
+
+    def _set_relation(self, relation: Matrix) -> None:
+        """Prepare P = T pose inv(T bone_rest) rest; a factor that is the identity is None."""
+        self._relation = relation
+        left = np.array(relation, np.float64)
+        right = np.linalg.inv(left @ self._bone_rest) @ self._rest
+        self._left, self._right = (
+            None if np.abs(factor - np.eye(4)).max() < IDENTITY_TOLERANCE else factor for factor in (left, right)
+        )
 
 
 class PoseEvaluator:
