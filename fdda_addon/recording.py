@@ -12,7 +12,8 @@ from .core.errors import RecordingError, RigError
 from .core.output import check_folder_writable
 from .core.partition import INFLUENCE_TOLERANCE, make_partitions, residual_changes
 from .core.poses import DEFAULT_SPREAD, Channel, sample_pose
-from .core.recording import RecordingInfo, RecordingWriter, Sampling, Source
+from .core.recording import RecordingInfo, Sampling, Source
+from .core.recording_writer import RecordingWriter
 from .core.rig import Rig
 from .core.skinning import LinearLayer
 from .scene.armature import Poser, clear_pose

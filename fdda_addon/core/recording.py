@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The recording: a folder of poses and local residuals. docs/recording.md describes the format.
 
-`recording.json` is written last and says how many poses are complete: an array file may be longer than that, and
-what lies behind it is never read.
+`recording.json` says how many poses are complete: an array file may be longer than that, and what lies behind it is
+never read. `recording_writer` writes it.
 """
 
-import io
 import json
-import os
+import math
+import tokenize
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from .errors import OutputError, RecordingError
-from .output import write_json
+from .errors import RecordingError
 from .partition import Partition, make_partitions
 from .poses import Channel
 from .rig import Fingerprint, Joint, Rig
@@ -110,151 +109,8 @@ def array_shapes(poses: int, joints: int, vertices: int, influences: int) -> dic
 STREAMED = ("pose_matrices", "residuals")
 """The arrays that grow with the poses."""
 
-
-class RecordingWriter:
-    """Writes a recording pose by pose; use as a context manager.
-
-    Every `append` first brings the arrays to the disk, then the count of complete poses: an interruption at any
-    moment leaves a recording that resumes and holds no torn pose. Plain writes, not memory maps: a full disk is then
-    an error that can be reported.
-    """
-
-    def __init__(
-        self, path: Path, rig: Rig, partitions: tuple[Partition, ...], info: RecordingInfo, resume: bool = False
-    ):
-        """Start or resume a recording.
-
-        Args:
-            path: the folder; created when missing.
-            rig, partitions: what is recorded.
-            info: `complete` is ignored.
-            resume: continue the recording at `path` where it stopped.
-
-        Raises:
-            RecordingError: there is a recording already and `resume` is not set, or it is of something else.
-            OutputError: the folder cannot be written.
-        """
-        self.path, self.rig, self.partitions, self.info = path, rig, partitions, info
-        self.complete = 0
-        if (path / INDEX).exists():
-            if not resume:
-                raise RecordingError(
-                    f"'{path}' holds a recording already; continue it with --resume or choose another folder."
-                )
-            self.complete = self._check_resumable()
-        elif path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise OutputError(f"Cannot record into '{path}': it is not an empty folder; choose another.")
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            self._files = self._open_arrays()
-            self._write_index()
-        except OSError as error:
-            raise self._failed(error) from error
-
-    def _check_resumable(self) -> int:
-        previous = read_index(self.path)
-        same = {**previous, "complete": 0} == {**self._index(), "complete": 0}
-        if not same:
-            keys = [key for key, value in self._index().items() if key != "complete" and previous.get(key) != value]
-            raise RecordingError(
-                f"Cannot resume '{self.path}': it was recorded with another {', '.join(keys)}; "
-                "record with the same rig and options, or into another folder."
-            )
-        return previous["complete"]
-
-    def _open_arrays(self) -> dict[str, io.BufferedRandom]:
-        shapes = array_shapes(
-            self.info.poses, len(self.rig.joints), self.rig.vertex_count, self.rig.skin_joints.shape[1]
-        )
-        files = {}
-        for name, (shape, dtype) in shapes.items():
-            path = self.path / f"{name}.npy"
-            if name not in STREAMED:
-                if not self.complete:
-                    np.save(path, getattr(self.rig, name).astype(dtype), allow_pickle=False)
-                continue
-            header = io.BytesIO()
-            np.lib.format.write_array_header_1_0(
-                header, {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape}
-            )
-            row = int(np.prod(shape[1:])) * np.dtype(dtype).itemsize
-            file = open(path, "r+b" if self.complete else "w+b")  # noqa: SIM115 - __exit__ closes it
-            file.write(header.getvalue())
-            file.truncate(len(header.getvalue()) + self.complete * row)
-            file.seek(0, os.SEEK_END)
-            # Ask for the whole space at once: a disk that is too small shows now, not an hour later.
-            if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(file.fileno(), 0, len(header.getvalue()) + self.info.poses * row)
-            files[name] = file
-        return files
-
-    def _index(self) -> dict:
-        info = self.info
-        return {
-            "format": FORMAT,
-            "version": VERSION,
-            "poses": info.poses,
-            "complete": self.complete,
-            "vertices": self.rig.vertex_count,
-            "influences": int(self.rig.skin_joints.shape[1]),
-            "units": {"length": "m", "angle": "rad"},
-            "blender": info.blender,
-            "rig": {
-                "file": info.rig_file,
-                "object": info.object_name,
-                "fingerprint": asdict(self.rig.fingerprint),
-            },
-            "joints": [asdict(joint) for joint in self.rig.joints],
-            "controls": [],
-            "partitions": [{"joint": p.joint, "influencing": list(p.influencing)} for p in self.partitions],
-            # Through JSON and back, so that it compares equal with what was read.
-            "sampling": json.loads(json.dumps(info.sampling.to_json())),
-        }
-
-    def _write_index(self) -> None:
-        write_json(self.path / INDEX, self._index())
-
-    def append(self, pose_matrices: np.ndarray, residuals: np.ndarray) -> None:
-        """Add poses.
-
-        Args:
-            pose_matrices: (n, J, 4, 4), mesh-object space, metres.
-            residuals: (n, V, 3), local residuals, metres.
-
-        Raises:
-            OutputError: the disk is full or went away; the poses before stay complete.
-            RecordingError: a value is not finite.
-        """
-        arrays = {"pose_matrices": pose_matrices, "residuals": residuals}
-        for name, array in arrays.items():
-            if not np.isfinite(array).all():
-                bad = int(np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))[0])
-                raise RecordingError(
-                    f"Pose {self.complete + bad} of the rig evaluates to values that are not numbers ({name}); "
-                    "look for a scale of zero or a broken driver."
-                )
-        try:
-            for name, array in arrays.items():
-                self._files[name].write(np.ascontiguousarray(array, np.float32).data)
-                self._files[name].flush()
-                os.fsync(self._files[name].fileno())
-        except OSError as error:
-            raise self._failed(error) from error
-        self.complete += len(pose_matrices)
-        self._write_index()
-
-    def _failed(self, error: OSError) -> OutputError:
-        return OutputError(
-            f"Cannot write the recording '{self.path}': {error.strerror or error}; "
-            f"{self.complete} of {self.info.poses} poses are complete, continue with --resume."
-        )
-
-    def __enter__(self) -> "RecordingWriter":
-        return self
-
-    def __exit__(self, *_) -> None:
-        for file in self._files.values():
-            file.close()
+HEADER_ERRORS = (TypeError, SyntaxError, RecursionError, MemoryError, tokenize.TokenError)
+"""What numpy raises beside ValueError for a damaged header of an array, which is the text of a Python dictionary."""
 
 
 def read_index(path: Path) -> dict:
@@ -270,7 +126,7 @@ def read_index(path: Path) -> dict:
         index = json.loads(index_path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise RecordingError(f"'{path}' is not a recording: it has no {INDEX}; make one with record.") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise RecordingError(f"'{index_path}' cannot be read ({error}); record again.") from error
     if not isinstance(index, dict) or index.get("format") != FORMAT:
         raise RecordingError(f"'{index_path}' is not the index of a recording; give a folder that record made.")
@@ -281,29 +137,34 @@ def read_index(path: Path) -> dict:
         )
     try:
         _check_index(index)
-    except (KeyError, TypeError, ValueError, AssertionError) as error:
-        raise RecordingError(f"'{index_path}' is damaged ({error!r}); record again.") from error
+    except KeyError as error:
+        raise RecordingError(f"'{index_path}' is damaged: it lacks {error}; record again.") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise RecordingError(f"'{index_path}' is damaged: {error}; record again.") from error
     return index
 
 
 def _check_index(index: dict) -> None:
     for key in ("poses", "complete", "vertices", "influences"):
         if type(index[key]) is not int or index[key] < 0:
-            raise ValueError(f"{key} is {index[key]!r}")
+            raise ValueError(f"'{key}' is {index[key]!r}")
     if index["complete"] > index["poses"] or not index["vertices"] or not index["influences"]:
-        raise ValueError("counts")
-    if index["controls"]:
-        raise ValueError("controls are not supported")
+        raise ValueError("its counts contradict each other")
+    if index["controls"] != []:
+        raise ValueError("it has controls, which this version does not know")
+    for text in (index["blender"], index["rig"]["file"], index["rig"]["object"]):
+        if not isinstance(text, str):
+            raise TypeError(f"{text!r} stands where text belongs")
     names = [str(joint["name"]) for joint in index["joints"]]
     if len(set(names)) != len(names) or not names:
-        raise ValueError("joints")
+        raise ValueError("it has no joints, or two of one name")
     for number, joint in enumerate(index["joints"]):
         if type(joint["parent"]) is not int or not -1 <= joint["parent"] < number:
-            raise ValueError(f"parent of joint {joint['name']!r}")
+            raise ValueError(f"the parent of joint {joint['name']!r} is {joint['parent']!r}")
     for partition in index["partitions"]:
         for joint in (partition["joint"], *partition["influencing"]):
             if type(joint) is not int or not 0 <= joint < len(names):
-                raise ValueError(f"joint {joint!r} of a partition")
+                raise ValueError(f"a partition has joint {joint!r} of {len(names)}")
     Fingerprint(**index["rig"]["fingerprint"])
     _sampling(index["sampling"])
 
@@ -347,9 +208,9 @@ def read_recording(path: Path) -> Recording:
     info = RecordingInfo(
         index["poses"],
         index["complete"],
-        str(index["rig"]["file"]),
-        str(index["rig"]["object"]),
-        str(index["blender"]),
+        index["rig"]["file"],
+        index["rig"]["object"],
+        index["blender"],
         _sampling(index["sampling"]),
     )
     return Recording(path, info, rig, partitions, arrays["pose_matrices"], arrays["residuals"])
@@ -364,12 +225,15 @@ def _open_array(path: Path, shape: tuple, dtype: type) -> np.ndarray:
             found_shape, fortran, found_dtype = np.lib.format.read_array_header_1_0(file)
             if found_shape != shape or fortran or found_dtype != np.dtype(dtype):
                 raise ValueError(f"it holds {found_shape} {found_dtype}, not {shape} {np.dtype(dtype)}")
-            expected = file.tell() + int(np.prod(shape)) * np.dtype(dtype).itemsize
+            # math.prod: the counts may be anything, and those of numpy wrap around.
+            expected = file.tell() + math.prod(shape) * np.dtype(dtype).itemsize
         if path.stat().st_size < expected:
             raise ValueError(f"it is truncated: {path.stat().st_size} of {expected} bytes")
         return np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError) as error:
         raise RecordingError(f"'{path}' cannot be used: {error}; record again.") from error
+    except HEADER_ERRORS as error:
+        raise RecordingError(f"'{path}' cannot be used: its header is damaged; record again.") from error
 
 
 def _check_finite(path: Path, name: str, array: np.ndarray) -> None:
