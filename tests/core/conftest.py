@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A complete recording of the limb, and a folder on a disk that is nearly full."""
+
+import ctypes
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from limb import record_limb
+
+SMALL_DISK = 64 << 10
+"""Bytes on the disk of `small_disk`."""
+
+
+@pytest.fixture(scope="session")
+def _recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("limb") / "recording"
+    record_limb(path)
+    return path
+
+
+@pytest.fixture
+def recording(_recorded: Path, tmp_path: Path) -> Path:
+    """Folder of a complete recording of the limb, to be damaged."""
+    return shutil.copytree(_recorded, tmp_path / "recording")
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A folder on a disk of its own, of `SMALL_DISK` bytes."""
+    folder = tmp_path / "small disk"
+    folder.mkdir()
+    libc = ctypes.CDLL(None, use_errno=True)
+    if not hasattr(libc, "mount") or libc.mount(
+        b"tmpfs", os.fsencode(folder), b"tmpfs", 0, f"size={SMALL_DISK}".encode()
+    ):
+        pytest.skip("only root may mount a disk of its own; test_full_disk.py limits the size of files instead")
+    yield folder
+    libc.umount2(os.fsencode(folder), 2)

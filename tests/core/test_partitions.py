@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Partitions by main joint, and the measure of how far a joint moves them."""
+
+import numpy as np
+from limb import INFLUENCING, VERTICES, make_rig, partitions_of
+
+from fdda_addon.core.partition import main_joints, make_partitions, residual_changes
+
+
+def test_main_joint_has_the_largest_weight_and_the_first_wins_a_tie():
+    joints = np.array([[3, 1, 0], [2, 5, 0], [4, 0, 0], [7, 6, 2]], np.int32)
+    weights = np.array([[0.2, 0.8, 0], [0.5, 0.5, 0], [1, 0, 0], [0.3, 0.3, 0.4]], np.float32)
+    found = main_joints(joints, weights)
+    assert found.tolist() == [1, 2, 4, 2] and found.dtype == np.int32
+
+
+def test_partitions_cut_the_mesh():
+    rig = make_rig()
+    partitions = partitions_of(rig)
+    assert [p.joint for p in partitions] == [0, 1, 2, 3]
+    assert sorted(np.concatenate([p.vertices for p in partitions]).tolist()) == list(range(VERTICES))
+    for p in partitions:
+        assert p.vertices.dtype == np.int32 and (np.diff(p.vertices) > 0).all()
+        assert p.influencing == INFLUENCING[p.joint]
+        heaviest = rig.skin_joints[p.vertices, np.argmax(rig.skin_weights[p.vertices], axis=1)]
+        assert (heaviest == p.joint).all()
+
+
+def test_influencing_joints_may_be_left_out():
+    assert all(p.influencing == () for p in make_partitions(make_rig()))
+
+
+def test_residual_changes_are_the_largest_distance_in_each_partition():
+    partitions = partitions_of(make_rig())
+    base = np.random.default_rng(0).normal(size=(2, VERTICES, 3)).astype(np.float32)
+    moved = base.copy()
+    moved[1, partitions[1].vertices[2]] += (0.3, 0, -0.4)
+    moved[0, partitions[1].vertices[0]] += (0.1, 0, 0)
+    moved[0, partitions[3].vertices[-1]] += (0, 0.25, 0)
+    np.testing.assert_allclose(residual_changes(partitions, moved, base), [0, 0.5, 0, 0.25], atol=1e-6)

@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reading a recording that someone or something has damaged: one sentence, never a traceback, never wrong data."""
+
+import json
+import re
+import struct
+
+import numpy as np
+import pytest
+
+from fdda_addon.core.errors import RecordingError
+from fdda_addon.core.recording import read_index, read_recording
+
+
+def refused(path, *words: str) -> None:
+    with pytest.raises(RecordingError) as error:
+        read_recording(path)
+    for word in words:
+        assert word in str(error.value)
+    assert str(error.value).endswith(".") and "\n" not in str(error.value)
+
+
+def edit(path, **changes) -> None:
+    index = json.loads((path / "recording.json").read_text())
+    index.update(changes)
+    (path / "recording.json").write_text(json.dumps(index))
+
+
+def array_file(header: str | bytes, body: bytes = b"", version: bytes = b"\x01\x00") -> bytes:
+    """The bytes of an npy file with any text as its header."""
+    header = header.encode() if isinstance(header, str) else header
+    return b"\x93NUMPY" + version + struct.pack("<H", len(header)) + header + body
+
+
+def test_no_recording(tmp_path):
+    refused(tmp_path, f"'{tmp_path}' is not a recording: it has no recording.json; make one with record.")
+    refused(tmp_path / "none", "is not a recording")
+
+
+def test_a_file_in_place_of_the_folder(tmp_path):
+    (tmp_path / "file").write_text("")
+    refused(tmp_path / "file", "cannot be read")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "cannot be read"),
+        ("{", "cannot be read"),
+        ("\xff", "cannot be read"),
+        ("[" * 100_000, "cannot be read"),
+        ("[]", "is not the index of a recording"),
+        ("null", "is not the index of a recording"),
+        ('{"format": "other", "version": 1}', "is not the index of a recording"),
+    ],
+)
+def test_an_index_that_is_none(recording, text, words):
+    (recording / "recording.json").write_text(text, encoding="latin-1")
+    refused(recording, words)
+
+
+@pytest.mark.parametrize("version", [2, 0, "1", None])
+def test_another_version(recording, version):
+    edit(recording, version=version)
+    refused(recording, f"is a recording of version {version!r} and this add-on reads version 1; record again")
+
+
+KEYS = ("poses", "complete", "vertices", "influences", "rig", "joints", "controls", "partitions", "sampling", "blender")
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_a_key_is_missing(recording, key):
+    index = json.loads((recording / "recording.json").read_text())
+    del index[key]
+    (recording / "recording.json").write_text(json.dumps(index))
+    refused(recording, f"recording.json' is damaged: it lacks '{key}'; record again")
+
+
+@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("value", [None, "x", -1, 1.5, True, [1], {"a": 1}, float("inf")])
+def test_a_key_of_another_type(recording, key, value):
+    if (key, value) == ("blender", "x"):
+        value = None
+    edit(recording, **{key: value})
+    refused(recording, "recording.json' is damaged: ")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"complete": 13}, "its counts contradict each other"),
+        ({"vertices": 0}, "its counts contradict each other"),
+        ({"joints": []}, "no joints"),
+        ({"joints": [{"name": "a", "parent": 0}]}, "the parent of joint 'a' is 0"),
+        ({"joints": [{"name": "a", "parent": -1}, {"name": "a", "parent": 0}]}, "two of one name"),
+        ({"partitions": [{"joint": 4, "influencing": []}]}, "a partition has joint 4 of 4"),
+        ({"partitions": [{"joint": 0, "influencing": [-1]}]}, "a partition has joint -1 of 4"),
+        ({"controls": [{"name": "fist"}]}, "it has controls"),
+    ],
+)
+def test_values_that_contradict_each_other(recording, changes, words):
+    edit(recording, **changes)
+    refused(recording, "recording.json' is damaged: ", words)
+
+
+@pytest.mark.parametrize("seed", [float("inf"), float("nan"), "one", None])
+def test_a_seed_that_is_no_number(recording, seed):
+    index = json.loads((recording / "recording.json").read_text())
+    edit(recording, sampling={**index["sampling"], "seed": seed})
+    refused(recording, "is damaged")
+
+
+@pytest.mark.parametrize("counts", [{"poses": 10**15}, {"poses": 1 << 62}, {"poses": 10**30}, {"vertices": 1 << 61}])
+def test_counts_far_beyond_the_data_allocate_nothing(recording, counts):
+    edit(recording, **counts, **({"complete": counts["poses"]} if "poses" in counts else {}))
+    refused(recording, "cannot be used: it holds")
+
+
+def test_counts_far_beyond_the_data_in_index_and_header(recording):
+    """Both agree, and the number of bytes is a multiple of 2^64: only the size of the file tells."""
+    poses = 1 << 57
+    edit(recording, poses=poses, complete=poses)
+    for name, shape in (("pose_matrices", (poses, 4, 4, 4)), ("residuals", (poses, 40, 3))):
+        header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n"
+        (recording / f"{name}.npy").write_bytes(array_file(header, b"\0" * 4096))
+    refused(recording, "pose_matrices.npy' cannot be used: it is truncated")
+
+
+@pytest.mark.parametrize("name", ["residuals", "pose_matrices", "rest_positions", "skin_joints"])
+def test_truncated(recording, name):
+    path = recording / f"{name}.npy"
+    path.write_bytes(path.read_bytes()[:-1])
+    refused(recording, f"{name}.npy' cannot be used: it is truncated: {path.stat().st_size} of", "record again")
+
+
+def test_missing_array(recording):
+    (recording / "skin_weights.npy").unlink()
+    refused(recording, "skin_weights.npy' cannot be used", "No such file")
+
+
+@pytest.mark.parametrize("name", ["residuals", "pose_matrices"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_values_that_are_no_numbers(recording, name, value):
+    array = np.load(recording / f"{name}.npy")
+    array[11, 3, 1] = value
+    np.save(recording / f"{name}.npy", array)
+    refused(recording, "holds values that are not numbers", f"({name}, poses 0 to 11)", "record again")
+
+
+@pytest.mark.parametrize("value", [np.nan, -0.5, 3.0])
+def test_weights_that_are_none(recording, value):
+    array = np.load(recording / "skin_weights.npy")
+    array[5, 0] = value
+    np.save(recording / "skin_weights.npy", array)
+    refused(recording, "The rest pose or skin weights of", "are damaged; record again")
+
+
+@pytest.mark.parametrize("joint", [-1, 4, 1 << 30])
+def test_weights_on_joints_that_are_none(recording, joint):
+    array = np.load(recording / "skin_joints.npy")
+    array[5, 0] = joint
+    np.save(recording / "skin_joints.npy", array)
+    refused(recording, "The rest pose or skin weights of")
+
+
+def test_a_rest_pose_that_has_no_inverse(recording):
+    array = np.load(recording / "rest_matrices.npy")
+    array[2, :3, 0] = 0
+    np.save(recording / "rest_matrices.npy", array)
+    refused(recording, "The rest pose or skin weights of")
+
+
+def test_partitions_that_contradict_the_weights(recording):
+    edit(recording, partitions=[{"joint": 0, "influencing": [1]}])
+    refused(recording, "The partitions of", "contradict its skin weights; record again")
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.int32, ">f4", np.complex64])
+def test_another_dtype(recording, dtype):
+    array = np.load(recording / "residuals.npy")
+    np.save(recording / "residuals.npy", array.astype(dtype))
+    refused(recording, f"residuals.npy' cannot be used: it holds {array.shape} {np.dtype(dtype)}, not")
+
+
+def test_another_shape_or_order(recording):
+    array = np.load(recording / "residuals.npy")
+    np.save(recording / "residuals.npy", array[:, :, :2])
+    refused(recording, f"it holds {(12, 40, 2)} float32, not {array.shape} float32")
+    np.save(recording / "residuals.npy", np.asfortranarray(array))
+    refused(recording, "residuals.npy' cannot be used")
+
+
+class Trap:
+    """Leaves a trace when someone unpickles it."""
+
+    sprung = False
+
+    def __reduce__(self):
+        return _spring, ()
+
+
+def _spring() -> None:
+    Trap.sprung = True
+
+
+def test_pickled_objects_are_not_loaded(recording):
+    array = np.empty((12, 40, 3), object)
+    array[:] = Trap()
+    np.save(recording / "residuals.npy", array)
+    refused(recording, "residuals.npy' cannot be used: it holds (12, 40, 3) object")
+    assert not Trap.sprung
+
+
+HEADERS = {
+    "empty": "",
+    "no dictionary": "[1, 2]",
+    "unclosed": "{'descr': '<f4', 'fortran_order': False, 'shape': (12, 40, 3",
+    "unclosed string": "{'descr': '<f4",
+    "dedent": "  {\n 1}\n  2",
+    "list as key": "{[]: 1}",
+    "nested": "(" * 9000,
+    "signs": "-" * 9000 + "1",
+    "deep lists": "[" * 150 + "]" * 150,
+    "code": "__import__('os').abort()",
+    "null": b"\0" * 60,
+    "latin": b"\xff\xfe" * 30,
+    "no type": "{'descr': 'nonsense', 'fortran_order': False, 'shape': (12, 40, 3)}",
+    "number as type": "{'descr': 5, 'fortran_order': False, 'shape': (12, 40, 3)}",
+    "numbers as text": "{'descr': '<f4', 'fortran_order': False, 'shape': ('12', 40, 3)}",
+    "negative": "{'descr': '<f4', 'fortran_order': False, 'shape': (-12, 40, 3)}",
+    "structured": "{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (12, 40, 3)}",
+    "recursive type": "{'descr': ('<f4', ("
+    + "('<f4', (" * 60
+    + "2"
+    + ",))" * 60
+    + ",)), 'fortran_order': False, 'shape': ()}",
+    "long": "{'descr': '<f4', 'fortran_order': False, 'shape': (12, 40, 3)}" + " " * 60_000,
+}
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("header", HEADERS.values(), ids=HEADERS.keys())
+def test_absurd_headers(recording, header):
+    (recording / "residuals.npy").write_bytes(array_file(header, b"\0" * 5760))
+    with pytest.raises(RecordingError, match=re.escape("residuals.npy' cannot be used: ")):
+        read_recording(recording)
+
+
+@pytest.mark.parametrize("data", [b"", b"\x93NUMPY", b"PK\x03\x04zip", array_file("{}", version=b"\x02\x00")])
+def test_files_that_are_no_arrays(recording, data):
+    (recording / "residuals.npy").write_bytes(data)
+    refused(recording, "residuals.npy' cannot be used: ")
+
+
+def test_more_data_than_complete_is_not_read(recording):
+    with open(recording / "residuals.npy", "ab") as file:
+        file.write(b"\xff" * 1000)
+    assert read_recording(recording).residuals.shape == (12, 40, 3)
+
+
+def test_the_index_of_an_incomplete_recording_is_read(recording):
+    edit(recording, complete=3)
+    assert read_index(recording)["complete"] == 3
+    refused(recording, "is incomplete: 3 of 12 poses; finish it with record --resume.")
+
+
+def test_a_recording_without_poses(recording):
+    edit(recording, poses=0, complete=0)
+    refused(recording, "is incomplete: 0 of 0 poses")

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Writing a recording: what is written is read back, and an interruption leaves a recording that resumes."""
+
+import json
+
+import numpy as np
+import pytest
+from limb import (
+    INFLUENCING,
+    JOINTS,
+    make_rig,
+    partitions_of,
+    random_poses,
+    random_residuals,
+    record_limb,
+    recording_info,
+)
+
+from fdda_addon.core.errors import FDDAError, OutputError, RecordingError
+from fdda_addon.core.recording import read_index, read_recording
+from fdda_addon.core.recording_writer import RecordingWriter
+
+POSES = 12
+
+
+def files(path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in path.iterdir()}
+
+
+def test_what_is_written_is_read_back(recording):
+    rig, read = make_rig(), read_recording(recording)
+    assert np.array_equal(read.pose_matrices, random_poses(POSES))
+    assert np.array_equal(read.residuals, random_residuals(POSES))
+    assert isinstance(read.residuals, np.memmap) and not read.residuals.flags.writeable
+    for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights"):
+        assert np.array_equal(getattr(read.rig, name), getattr(rig, name))
+        assert getattr(read.rig, name).dtype == getattr(rig, name).dtype
+    assert read.rig.joints == JOINTS and read.rig.fingerprint == rig.fingerprint
+    assert [(p.joint, p.influencing) for p in read.partitions] == list(INFLUENCING.items())
+    assert (read.info.poses, read.info.complete) == (POSES, POSES)
+    assert read.info.sampling == recording_info(POSES).sampling
+
+
+def test_arrays_are_plain_npy_files(recording):
+    residuals = np.load(recording / "residuals.npy", mmap_mode="r", allow_pickle=False)
+    assert residuals.shape == (POSES, 40, 3) and residuals.dtype == np.float32
+    assert sorted(files(recording)) == [
+        "pose_matrices.npy",
+        "recording.json",
+        "residuals.npy",
+        "rest_matrices.npy",
+        "rest_positions.npy",
+        "skin_joints.npy",
+        "skin_weights.npy",
+    ]
+
+
+@pytest.mark.parametrize("complete", [0, 5, 10])
+def test_resuming_continues_bit_for_bit(recording, tmp_path, complete):
+    path = tmp_path / "interrupted"
+    record_limb(path, POSES, complete)
+    assert read_index(path)["complete"] == complete
+    with pytest.raises(RecordingError, match=rf"is incomplete: {complete} of 12 poses; finish it with record --resume"):
+        read_recording(path)
+    record_limb(path, POSES, resume=True)
+    assert files(path) == files(recording)
+
+
+def test_resuming_a_complete_recording_changes_nothing(recording):
+    before = files(recording)
+    record_limb(recording, POSES, resume=True)
+    assert files(recording) == before
+
+
+def test_resume_where_nothing_was_recorded_starts(tmp_path, recording):
+    record_limb(tmp_path / "new", POSES, resume=True)
+    assert files(tmp_path / "new") == files(recording)
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_an_error_between_batches_leaves_what_was_complete(tmp_path, recording, error):
+    path, rig = tmp_path / "interrupted", make_rig()
+    with (
+        pytest.raises(error),
+        RecordingWriter(path, rig, partitions_of(rig), recording_info(POSES)) as writer,
+    ):
+        writer.append(random_poses(POSES)[:5], random_residuals(POSES)[:5])
+        raise error
+    record_limb(path, POSES, resume=True)
+    assert files(path) == files(recording)
+
+
+def test_an_error_before_the_first_pose_leaves_nothing(tmp_path):
+    path, rig = tmp_path / "new" / "deeper", make_rig()
+    with pytest.raises(KeyboardInterrupt), RecordingWriter(path, rig, partitions_of(rig), recording_info(POSES)):
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_before_the_first_pose_leaves_a_folder_that_was_there(tmp_path):
+    rig = make_rig()
+    with pytest.raises(RuntimeError), RecordingWriter(tmp_path, rig, partitions_of(rig), recording_info(POSES)):
+        raise RuntimeError
+    assert tmp_path.is_dir() and list(tmp_path.iterdir()) == []
+
+
+def test_a_torn_write_is_never_read(tmp_path, recording):
+    """What lies behind the complete poses may be anything: a batch was being written when the power went."""
+    path = tmp_path / "torn"
+    record_limb(path, POSES, 5)
+    for name, row in (("pose_matrices", 4 * 4 * 4 * 4), ("residuals", 40 * 3 * 4)):
+        with open(path / f"{name}.npy", "r+b") as file:
+            file.seek(-(POSES - 5) * row, 2)
+            file.write(b"\xff" * 2 * row)
+    record_limb(path, POSES, resume=True)
+    assert files(path) == files(recording)
+
+
+@pytest.mark.parametrize("name", ["residuals.npy", "pose_matrices.npy"])
+@pytest.mark.parametrize("damage", ["shorter", "missing", "other header"])
+def test_resuming_does_not_make_up_poses_that_are_gone(tmp_path, name, damage):
+    record_limb(tmp_path / "r", POSES, 10)
+    path = tmp_path / "r" / name
+    data = path.read_bytes()
+    if damage == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(data[: len(data) // 2] if damage == "shorter" else data.replace(b"<f4", b"<i4"))
+    before = files(tmp_path / "r")
+    with pytest.raises(RecordingError, match=rf"Cannot resume.*'{name}' does not hold the 10 poses"):
+        record_limb(tmp_path / "r", POSES, resume=True)
+    assert files(tmp_path / "r") == before
+
+
+def test_a_recording_is_not_overwritten(recording):
+    before = files(recording)
+    with pytest.raises(RecordingError, match="holds a recording already; continue it with --resume or choose another"):
+        record_limb(recording)
+    assert files(recording) == before
+
+
+def test_another_folder_is_not_recorded_into(tmp_path):
+    (tmp_path / "letter.txt").write_text("dear")
+    with pytest.raises(OutputError, match="it is not an empty folder"):
+        record_limb(tmp_path)
+    with pytest.raises(OutputError, match="it is not an empty folder"):
+        record_limb(tmp_path / "letter.txt")
+    with pytest.raises(OutputError, match=r"letter\.txt/below'.*: Not a directory; make room or choose another folder"):
+        record_limb(tmp_path / "letter.txt" / "below")
+    assert files(tmp_path) == {"letter.txt": b"dear"}
+
+
+def change(index, *keys, value):
+    for key in keys[:-1]:
+        index = index[key]
+    index[keys[-1]] = value
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "named"),
+    [
+        (("sampling", "seed"), 3, "sampling.seed"),
+        (("sampling", "spread"), 0.5, "sampling.spread"),
+        (("sampling", "limits", 0, "high"), 0.1, "sampling.limits"),
+        (("sampling", "sources", 1, "name"), "fist", "sampling.sources"),
+        (("rig", "file"), "other.blend", "rig.file"),
+        (("rig", "fingerprint", "skin_weights"), "0", "rig.fingerprint.skin_weights"),
+        (("joints", 1, "name"), "arm", "joints"),
+        (("partitions", 0, "influencing"), [2], "partitions"),
+        (("poses",), 13, "poses"),
+        (("blender",), "4.5.0", "blender"),
+        (("extra",), 1, "extra"),
+    ],
+)
+def test_resuming_something_else_names_what_differs(tmp_path, keys, value, named):
+    record_limb(tmp_path / "r", POSES, 5)
+    index = tmp_path / "r" / "recording.json"
+    content = json.loads(index.read_text())
+    change(content, *keys, value=value)
+    index.write_text(json.dumps(content))
+    before = files(tmp_path / "r")
+    with pytest.raises(RecordingError, match=rf"it was recorded with another {named}; record with the same rig"):
+        record_limb(tmp_path / "r", POSES, resume=True)
+    assert files(tmp_path / "r") == before
+
+
+@pytest.mark.parametrize("name", ["pose_matrices", "residuals"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_no_numbers_are_refused_and_the_pose_named(tmp_path, name, value):
+    rig, arrays = make_rig(), {"pose_matrices": random_poses(POSES), "residuals": random_residuals(POSES)}
+    arrays[name][7, 1, 2] = value
+    with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSES)) as writer:
+        writer.append(*(array[:5] for array in arrays.values()))
+        with pytest.raises(FDDAError, match=rf"Pose 7 of the rig .* not numbers \({name}\)"):
+            writer.append(*(array[5:10] for array in arrays.values()))
+    assert read_index(tmp_path / "r")["complete"] == 5

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Random poses: inside the range of motion, reproducible pose by pose, as wide as the spread says."""
+
+import numpy as np
+import pytest
+
+from fdda_addon.core.poses import Channel, beyond_range, sample_pose
+
+CHANNELS = (
+    Channel("a", "rotation", 0, -1.0, 3.0),
+    Channel("a", "rotation", 2, 0.25, 0.5),
+    Channel("b", "location", 1, -0.02, 0.0),
+)
+LOW, HIGH = np.array([[c.low, c.high] for c in CHANNELS]).T
+
+
+def draw(count: int, **options) -> np.ndarray:
+    return np.stack([sample_pose(CHANNELS, 0, index, **options) for index in range(count)])
+
+
+@pytest.mark.parametrize("spread", [0.2, 1.0, 5.0])
+def test_poses_stay_inside_the_range(spread):
+    poses = draw(500, spread=spread)
+    assert (poses >= LOW).all() and (poses <= HIGH).all()
+
+
+def test_poses_fill_the_range_around_its_middle():
+    poses = (draw(4000) - LOW) / (HIGH - LOW)
+    np.testing.assert_allclose(poses.mean(axis=0), 0.5, atol=0.02)
+    assert (poses.min(axis=0) < 0.02).all() and (poses.max(axis=0) > 0.98).all()
+    # A normal distribution cut at one standard deviation: its own is 0.5396 of half the range.
+    np.testing.assert_allclose(poses.std(axis=0), 0.5396 / 2, atol=0.01)
+
+
+def test_spread_widens_the_distribution():
+    deviations = [draw(1500, spread=spread).std(axis=0) / (HIGH - LOW) for spread in (0.2, 1.0, 8.0)]
+    # 0.2 is hardly cut; 8 is nearly uniform.
+    np.testing.assert_allclose(deviations[0], 0.1, atol=0.01)
+    np.testing.assert_allclose(deviations[2], 12**-0.5, atol=0.015)
+    assert (deviations[0] < deviations[1]).all() and (deviations[1] < deviations[2]).all()
+
+
+def test_channels_are_independent():
+    correlation = np.corrcoef(draw(3000).T)
+    assert np.abs(correlation - np.eye(3)).max() < 0.06
+
+
+def test_a_pose_depends_on_seed_and_index_alone():
+    first = sample_pose(CHANNELS, 7, 123)
+    sample_pose(CHANNELS, 7, 5)
+    assert np.array_equal(sample_pose(CHANNELS, 7, 123), first)
+    assert not np.array_equal(sample_pose(CHANNELS, 7, 124), first)
+    assert not np.array_equal(sample_pose(CHANNELS, 8, 123), first)
+
+
+def test_poses_do_not_change_between_releases():
+    """A recording must resume, and a seed mean the same poses, with another version of the add-on."""
+    np.testing.assert_allclose(
+        sample_pose(CHANNELS, 0, 0), [1.2514604421867865, 0.35848689208858725, -0.0035957734955671793], rtol=1e-12
+    )
+
+
+def test_a_range_of_one_value_gives_that_value():
+    assert sample_pose((Channel("a", "rotation", 0, 0.3, 0.3),), 0, 0).tolist() == [0.3]
+
+
+def test_beyond_range_widens_about_the_middle():
+    widened = beyond_range(CHANNELS, 2.5)
+    found = [(c.low, c.high) for c in widened]
+    np.testing.assert_allclose(found, [(-4, 6), (0.0625, 0.6875), (-0.035, 0.015)], atol=1e-12)
+    assert [(c.bone, c.kind, c.axis) for c in widened] == [(c.bone, c.kind, c.axis) for c in CHANNELS]
