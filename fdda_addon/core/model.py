@@ -78,35 +78,48 @@ class ModelInfo:
         """Read the metadata property.
 
         Raises:
-            KeyError, TypeError, ValueError: it is damaged.
+            ValueError: it is damaged or of another version; the text is a clause about the model.
         """
-        value = json.loads(text)
-        if value["version"] != VERSION:
-            raise ValueError(f"version {value['version']!r}, this add-on reads version {VERSION}")
-        joints = tuple(Joint(str(j["name"]), int(j["parent"])) for j in value["joints"])
-        partitions = tuple(
-            ModelPartition(int(p["joint"]), tuple(map(int, p["influencing"])), int(p["vertices"]), int(p["basis"]))
-            for p in value["partitions"]
-        )
-        count = len(joints)
-        if not all(-1 <= joint.parent < number for number, joint in enumerate(joints)):
-            raise ValueError("a joint stands before its parent")
-        if not all(0 <= p.joint < count for p in partitions):
-            raise ValueError("a partition's main joint is none of the joints")
-        if sum(p.vertices for p in partitions) != int(value["vertices"]):
-            raise ValueError("the partitions do not add up to the vertices")
-        return ModelInfo(
-            joints,
-            np.array(value["rest_matrices"], np.float32).reshape(count, 4, 4),
-            int(value["vertices"]),
-            Fingerprint(**value["fingerprint"]),
-            partitions,
-            np.array(value["training_ranges"]["low"], np.float32).reshape(count, 12),
-            np.array(value["training_ranges"]["high"], np.float32).reshape(count, 12),
-            dict(value["held_out_mm"]),
-            float(value["parity_mm"]),
-            dict(value["training"]),
-        )
+        try:
+            return _read_info(json.loads(text))
+        except json.JSONDecodeError as error:
+            raise ValueError(f"its metadata is not JSON ({error})") from error
+        except KeyError as error:
+            raise ValueError(f"its metadata lacks {error}") from error
+        except (TypeError, AttributeError, OverflowError, RecursionError) as error:
+            raise ValueError(f"its metadata cannot be read ({error})") from error
+
+
+def _read_info(value: dict) -> ModelInfo:
+    if value["version"] != VERSION:
+        raise ValueError(f"it is of version {value['version']!r} and this add-on reads version {VERSION}")
+    joints = tuple(Joint(str(j["name"]), int(j["parent"])) for j in value["joints"])
+    partitions = tuple(
+        ModelPartition(int(p["joint"]), tuple(map(int, p["influencing"])), int(p["vertices"]), int(p["basis"]))
+        for p in value["partitions"]
+    )
+    count = len(joints)
+    if not all(-1 <= joint.parent < number for number, joint in enumerate(joints)):
+        raise ValueError("a joint stands before its parent")
+    if not all(0 <= joint < count for p in partitions for joint in (p.joint, *p.influencing)):
+        raise ValueError("a partition names a joint that is none of its joints")
+    if sum(p.vertices for p in partitions) != int(value["vertices"]):
+        raise ValueError("the partitions do not add up to the vertices")
+    rest_matrices = np.array(value["rest_matrices"], np.float32).reshape(count, 4, 4)
+    if not np.isfinite(rest_matrices).all():
+        raise ValueError("its rest pose holds values that are not numbers")
+    return ModelInfo(
+        joints,
+        rest_matrices,
+        int(value["vertices"]),
+        Fingerprint(**value["fingerprint"]),
+        partitions,
+        np.array(value["training_ranges"]["low"], np.float32).reshape(count, 12),
+        np.array(value["training_ranges"]["high"], np.float32).reshape(count, 12),
+        dict(value["held_out_mm"]),
+        float(value["parity_mm"]),
+        dict(value["training"]),
+    )
 
 
 def read_model(path: Path) -> tuple[ModelInfo, bytes]:
@@ -123,6 +136,9 @@ def read_model(path: Path) -> tuple[ModelInfo, bytes]:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise ModelError(f"'{path}' is larger than 2 GB and cannot be a model.")
+        if not path.is_file():
+            # A device or a pipe might never end.
+            raise ModelError(f"'{path}' is not a model: it is no file; give an .onnx file that train made.")
         data = path.read_bytes()
         contents = read_onnx(data)
     except OSError as error:
@@ -138,8 +154,8 @@ def read_model(path: Path) -> tuple[ModelInfo, bytes]:
         raise ModelError(f"'{path}' is an ONNX file but not a model of this add-on; give one that train made.")
     try:
         info = ModelInfo.from_json(contents.metadata[METADATA_KEY])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ModelError(f"The model '{path}' is damaged: {error}; train it again.") from error
+    except ValueError as error:
+        raise ModelError(f"The model '{path}' cannot be used: {error}; train it again.") from error
     if extra := sorted(set(contents.inputs) - {POSE_INPUT}):
         raise ModelError(f"'{path}' asks for inputs that no rig gives ({', '.join(extra)}); train it again.")
     if contents.inputs.get(POSE_INPUT, ())[1:] != (len(info.joints), 4, 4):

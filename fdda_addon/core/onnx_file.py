@@ -22,7 +22,7 @@ class OnnxContents:
         inputs, outputs: name to shape; a dimension is an int, or a str where it is dynamic.
         metadata: the metadata properties.
         custom_operators: operators outside the standard domains, "domain::name".
-        external_files: files that tensors refer to.
+        external_files: files that tensors refer to; "" for one that says its data lies outside and not where.
     """
 
     inputs: dict[str, tuple] = field(default_factory=dict)
@@ -50,7 +50,7 @@ def read_onnx(data: bytes) -> OnnxContents:
                 contents.metadata[_text(prop.get(1, b""))] = _text(prop.get(2, b""))
             elif number == 25:
                 contents.custom_operators.add("a function of the file's own")
-    except (IndexError, TypeError, AttributeError, UnicodeDecodeError, RecursionError) as error:
+    except (IndexError, TypeError, UnicodeDecodeError) as error:
         raise ValueError("not an ONNX file") from error
     if not contents.has_graph:
         raise ValueError("not an ONNX file")
@@ -73,7 +73,8 @@ def _fields(data: memoryview) -> Iterator[tuple[int, memoryview | int]]:
             value, position = data[position : position + size], position + size
         else:
             raise ValueError("not an ONNX file")
-        if position > end:
+        # Readers cut a longer key to 32 bits, which would hide a field from this one.
+        if position > end or key >> 32:
             raise ValueError("not an ONNX file")
         yield key >> 3, value
 
@@ -90,7 +91,9 @@ def _varint(data: memoryview, position: int) -> tuple[int, int]:
     raise ValueError("not an ONNX file")
 
 
-def _text(data: memoryview) -> str:
+def _text(data: memoryview | bytes) -> str:
+    if isinstance(data, int):
+        raise TypeError("a number where text belongs")
     return bytes(data).decode("utf-8")
 
 
@@ -129,13 +132,17 @@ def _read_node(data: memoryview, contents: OnnxContents, depth: int) -> None:
 
 
 def _read_tensor(data: memoryview, contents: OnnxContents) -> None:
+    is_external, location = False, ""
     for number, value in _fields(data):
         if number == 13:
+            is_external = True
             entry = dict(_fields(value))
             if _text(entry.get(1, b"")) == "location":
-                contents.external_files.add(_text(entry.get(2, b"")))
-        elif number == 14 and value == 1:
-            contents.external_files.add("")
+                location = _text(entry.get(2, b""))
+        elif number == 14 and value != 0:
+            is_external = True
+    if is_external:
+        contents.external_files.add(location)
 
 
 def _read_sparse_tensor(data: memoryview, contents: OnnxContents) -> None:

@@ -5,7 +5,7 @@ import json
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from .errors import OutputError
@@ -15,12 +15,16 @@ def check_writable(path: Path) -> None:
     """Fail before the work rather than after it when a file could not be written.
 
     Raises:
-        OutputError: the folder does not exist or cannot be written, or the path is a folder.
+        OutputError: the folder does not exist or cannot be written, or the path is a folder or a device.
     """
+    # os.path: the methods of Path raise for a folder that may not be entered.
     folder = path.parent
-    if path.is_dir():
+    if os.path.isdir(path):
         raise OutputError(f"Cannot write '{path}': it is a folder; give the name of a file.")
-    if not folder.is_dir():
+    if os.path.exists(path) and not os.path.isfile(path):
+        # A rename would put a file in the place of /dev/null.
+        raise OutputError(f"Cannot write '{path}': it is no ordinary file; give the name of a file.")
+    if not os.path.isdir(folder):
         raise OutputError(f"Cannot write '{path}': the folder '{folder}' does not exist; create it first.")
     _probe(path, folder)
 
@@ -32,9 +36,9 @@ def check_folder_writable(path: Path) -> None:
         OutputError: the folder, or the nearest one above it that exists, cannot be written, or it is a file.
     """
     folder = path
-    while not folder.exists():
+    while not os.path.exists(folder):
         folder = folder.parent
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise OutputError(f"Cannot write into '{path}': '{folder}' is a file; choose another folder.")
     _probe(path, folder)
 
@@ -64,7 +68,8 @@ def replacing(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise OutputError(f"Cannot write '{path}': {error.strerror or error}; nothing was changed.") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink()
 
 
 def write_text(path: Path, text: str) -> None:

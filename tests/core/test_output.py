@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Files are replaced wholly or not at all, and a path that cannot be written is refused before the work."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fdda_addon.core.errors import OutputError
+from fdda_addon.core.output import check_folder_writable, check_writable, replacing, write_json, write_text
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(file.name for file in folder.iterdir())
+
+
+def test_a_file_is_replaced(tmp_path):
+    path = tmp_path / "a.txt"
+    write_text(path, "old")
+    with replacing(path) as temporary:
+        temporary.write_text("new")
+        assert path.read_text() == "old"
+        assert temporary.parent == tmp_path
+    assert path.read_text() == "new"
+    assert names(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_an_error_leaves_the_old_file(tmp_path, error):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(error), replacing(path) as temporary:
+        temporary.write_text("half")
+        raise error
+    assert path.read_text() == "old" and names(tmp_path) == ["a.txt"]
+
+
+def test_json_without_numbers_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.json"
+    write_json(path, {"é": [1.5, None]})
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(path, {"mean": float("nan")})
+    assert json.loads(path.read_text("utf-8")) == {"é": [1.5, None]}
+    assert names(tmp_path) == ["a.json"]
+
+
+def test_a_new_file_has_the_usual_permissions(tmp_path):
+    write_text(tmp_path / "a", "")
+    (tmp_path / "b").touch()
+    assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
+
+
+def test_replacing_in_a_folder_that_went_away(tmp_path):
+    with pytest.raises(OutputError, match=r"Cannot write '.*': No such file or directory; nothing was changed\."):
+        write_text(tmp_path / "gone" / "a.txt", "")
+
+
+def test_replacing_below_a_file(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="Not a directory; nothing was changed"):
+        write_text(tmp_path / "file" / "a.txt", "")
+
+
+def test_a_name_that_is_too_long(tmp_path):
+    check_folder_writable(tmp_path / ("a" * 300))
+    check_writable(tmp_path / ("a" * 300))
+    with pytest.raises(OutputError, match="File name too long"):
+        write_text(tmp_path / ("a" * 300), "")
+
+
+def test_a_good_path_is_left_as_it_is(tmp_path):
+    (tmp_path / "old.txt").write_text("old")
+    check_writable(tmp_path / "new.txt")
+    check_writable(tmp_path / "old.txt")
+    check_folder_writable(tmp_path / "a" / "b")
+    check_folder_writable(tmp_path)
+    assert names(tmp_path) == ["old.txt"]
+
+
+def test_a_folder_is_no_file(tmp_path):
+    with pytest.raises(OutputError, match="it is a folder; give the name of a file"):
+        check_writable(tmp_path)
+
+
+def test_a_device_is_no_file():
+    with pytest.raises(OutputError, match="'/dev/null': it is no ordinary file"):
+        check_writable(Path(os.devnull))
+
+
+def test_a_missing_folder(tmp_path):
+    with pytest.raises(OutputError, match=r"the folder '.*none' does not exist; create it first"):
+        check_writable(tmp_path / "none" / "a.txt")
+
+
+def test_a_folder_below_a_file(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match=r"the folder .* does not exist"):
+        check_writable(tmp_path / "file" / "a.txt")
+    with pytest.raises(OutputError, match=r"Cannot write into '.*below/deep': '.*/file' is a file; choose another"):
+        check_folder_writable(tmp_path / "file" / "below" / "deep")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_a_folder_that_takes_no_files():
+    """Permissions do not stop root; /proc stops everyone."""
+    for check, path in ((check_writable, Path("/proc/a.json")), (check_folder_writable, Path("/proc/a/b"))):
+        with pytest.raises(OutputError, match=f"Cannot write '{path}': .*; choose a folder that you may write"):
+            check(path)
+
+
+CHECK_AS_NOBODY = """
+import os, sys
+from pathlib import Path
+from fdda_addon.core.errors import OutputError
+from fdda_addon.core.output import check_folder_writable, check_writable
+os.setuid(65534)
+for check, path in ((check_writable, sys.argv[1]), (check_folder_writable, sys.argv[1])):
+    try:
+        check(Path(path))
+    except OutputError as error:
+        print(error)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root may become someone else")
+def test_a_folder_that_may_not_be_entered(tmp_path):
+    """Asking whether something inside it exists is an error of its own in older Pythons."""
+    closed = tmp_path / "closed"
+    (closed / "inside").mkdir(parents=True)
+    closed.chmod(0)
+    command = [sys.executable, "-c", CHECK_AS_NOBODY, str(closed / "inside" / "a.json")]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    lines = result.stdout.splitlines()
+    assert len(lines) == 2 and all(line.startswith("Cannot write") for line in lines), result.stderr
