@@ -72,16 +72,22 @@ class PreparedPartition:
     validation_truncation: np.ndarray
 
 
-def split_poses(poses: int, validation_fraction: float, seed: int) -> Split:
+def split_poses(poses: np.ndarray, validation_fraction: float, seed: int) -> Split:
     """Choose the validation poses at random.
+
+    Args:
+        poses: (n,) indices of the poses that may be used.
+        validation_fraction, seed: as in `TrainingConfig`.
 
     Raises:
         TrainingError: there are too few poses.
     """
-    if poses < LEAST_POSES:
-        raise TrainingError(f"The recording has {poses} poses and training takes at least {LEAST_POSES}; record more.")
+    if len(poses) < LEAST_POSES:
+        raise TrainingError(
+            f"The recording has {len(poses)} poses and training takes at least {LEAST_POSES}; record more."
+        )
     order = np.random.default_rng([seed, 1]).permutation(poses)
-    count = max(1, round(poses * validation_fraction))
+    count = max(1, round(len(poses) * validation_fraction))
     return Split(np.sort(order[count:]), np.sort(order[:count]))
 
 

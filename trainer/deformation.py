@@ -10,7 +10,7 @@ from fdda_addon.core.rig import Rig
 
 from .data import PreparedPartition
 from .inputs import Inputs
-from .loop import Network
+from .model import Network
 from .trust import TrustRange
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import onnx
 import onnxruntime
-import torch
 
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.features import FEATURES_PER_JOINT
@@ -19,7 +18,6 @@ from fdda_addon.core.skinning import LinearLayer
 
 from .deformation import Deformation
 from .graph import build_graph
-from .model import ACTIVATIONS
 
 MOST_DIFFERENCE = 1e-5
 """Metres. An export whose positions differ more from the reference fails; scaled up for rigs larger than a metre."""
@@ -56,17 +54,11 @@ def reference_positions(deformation: Deformation, pose_matrices: np.ndarray) -> 
     clamped = np.clip(features, trust_range.low, trust_range.high)
     inputs = ((clamped - mean) / scale).astype(np.float32)
     local = np.zeros((len(features), rig.vertex_count, 3), np.float32)
-    activation = ACTIVATIONS[deformation.activation]
     for number, (partition, prepared, network) in enumerate(
         zip(deformation.partitions, deformation.prepared, deformation.networks, strict=True)
     ):
-        own = inputs[:, deformation.seen_columns(number)]
-        values = torch.from_numpy(own)
-        for layer, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
-            values = torch.addmm(torch.from_numpy(bias), values, torch.from_numpy(weight))
-            if layer < len(network.weights) - 1:
-                values = activation(values)
-        residuals = prepared.basis.residuals(values.numpy()) * trust[:, number, None]
+        coefficients = network.coefficients(inputs[:, deformation.seen_columns(number)], deformation.activation)
+        residuals = prepared.basis.residuals(coefficients) * trust[:, number, None]
         local[:, partition.vertices] = residuals.reshape(len(features), -1, 3)
     return LinearLayer(rig, deformation.partitions).complex_positions(pose_matrices, local), trust
 

@@ -11,7 +11,7 @@ from fdda_addon.core.errors import TrainingError
 
 from .config import TrainingConfig
 from .data import PreparedPartition, Split
-from .model import PartitionNetworks
+from .model import Network, PartitionNetworks
 
 WARM_UP = 0.15
 """Part of the steps in which the learning rate rises."""
@@ -23,19 +23,6 @@ SMOOTHING = 1e-6
 
 class Cancelled(Exception):  # noqa: N818 - no error
     """The training was asked to stop."""
-
-
-@dataclass(frozen=True)
-class Network:
-    """The trained network of one partition, in numpy.
-
-    Attributes:
-        weights: one (in, out) float32 a layer; standardised features in, coefficients in metres out.
-        biases: one (out,) float32 a layer.
-    """
-
-    weights: tuple[np.ndarray, ...]
-    biases: tuple[np.ndarray, ...]
 
 
 @dataclass

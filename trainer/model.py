@@ -2,8 +2,10 @@
 """The networks of all partitions as one batched network."""
 
 import math
+from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
 import torch
 from torch.nn import functional
 
@@ -13,6 +15,28 @@ ACTIVATIONS = {
     "tanh": torch.tanh,
     "relu": torch.relu,
 }
+
+
+@dataclass(frozen=True)
+class Network:
+    """The trained network of one partition, in numpy.
+
+    Attributes:
+        weights: one (in, out) float32 a layer; standardised features in, coefficients in metres out.
+        biases: one (out,) float32 a layer.
+    """
+
+    weights: tuple[np.ndarray, ...]
+    biases: tuple[np.ndarray, ...]
+
+    def coefficients(self, inputs: np.ndarray, activation: str) -> np.ndarray:
+        """(N, F) float32 standardised features to (N, K) float32 coefficients, metres, in PyTorch."""
+        values = torch.from_numpy(inputs)
+        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            values = torch.addmm(torch.from_numpy(bias), values, torch.from_numpy(weight))
+            if layer < len(self.weights) - 1:
+                values = ACTIVATIONS[activation](values)
+        return values.numpy()
 
 
 class PartitionNetworks(torch.nn.Module):

@@ -61,7 +61,7 @@ def train_model(
         vertices=recording.rig.vertex_count,
         device=str(device),
     )
-    split = split_poses(len(recording.pose_matrices), config.validation_fraction, config.seed)
+    split = split_poses(np.arange(len(recording.pose_matrices)), config.validation_fraction, config.seed)
     inputs = make_inputs(recording.rig.parents, middles(recording.rig, recording.partitions), recording.partitions)
     prepared = _prepare(recording, inputs, split, config, should_stop)
     trained = train(

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The trainer on the reference recordings of a Maya arm, beside the published networks trained on the same poses.
+
+    python -m benchmarks.reference_recordings [DATA] [--json OUT.json] [--choose] [training settings]
+
+Trains on poses 0 to 699 of eight partitions and measures on poses 700 to 1000, which no setting was chosen on: with
+`--choose` it measures on a fifth of the 700 instead, the rest of which it trains on. Errors are in centimetres, as
+published. Exits with 0 and says so where the data is missing.
+"""
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from fdda_addon.core.partition import Partition
+from trainer.config import TrainingConfig, add_options, config_from_arguments
+from trainer.data import PartitionData, PreparedPartition, prepare, split_poses
+from trainer.inputs import Inputs, make_inputs
+from trainer.loop import train
+from trainer.model import Network
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "seed_arm"
+TRAINING_POSES = 700
+CM = 0.01
+SETTINGS = {"hidden": (256, 256), "batch_size": 32, "weight_decay": 1.0, "validation_fraction": 0.05}
+"""What differs from the defaults: networks as large as the largest published, and less trust in few, noisy poses."""
+RELU = {
+    "wrist": (0.0801, 0.4991),
+    "index_1": (0.0594, 0.6329),
+    "middle_2": (0.0188, 0.3216),
+    "ring_0": (0.1040, 0.4937),
+    "thumb_0": (0.0993, 0.4587),
+    "thumb_1": (0.0486, 0.5844),
+    "pinky_1": (0.0408, 0.7063),
+    "thumb_2": (0.0060, 0.1011),
+}
+"""Published 2x128 ReLU networks: mean and largest distance over the held-out poses, cm."""
+
+
+def parent_of(joint: str) -> str | None:
+    """The parent of a joint of that arm, by its name."""
+    if joint in ("elbow", "wrist"):
+        return "elbow" if joint == "wrist" else None
+    finger, number = joint.rsplit("_", 1)
+    return f"{finger}_{int(number) - 1}" if int(number) else "wrist"
+
+
+def read_partition(arrays: dict, name: str, influencing: list[str]) -> PartitionData:
+    """One partition with the features that the trainer makes of a recording.
+
+    The recordings give influencing joints only. The joints between them stay at the identity: their motion is
+    unknown, and the inputs leave out every pair that depends on it.
+    """
+    names = ["elbow"]
+    for joint in [name, *influencing]:
+        chain = []
+        while joint and joint not in names:
+            chain.append(joint)
+            joint = parent_of(joint)
+        names += reversed(chain)
+    local = arrays[f"{name}.local_matrices"]
+    poses = np.tile(np.eye(4), (len(local), len(names), 1, 1))
+    points = np.zeros((len(names), 3))
+    for number, joint in enumerate(influencing):
+        place = names.index(joint)
+        poses[:, place, :3] = local[:, number]
+        poses[:, place, :3, 3] *= CM
+        # Half-way to the joint that it carries is the middle of what it moves.
+        points[names.index(parent_of(joint))] = local[0, number, :, 3] / 2 * CM
+    parents = np.array([names.index(parent_of(joint)) if parent_of(joint) else -1 for joint in names])
+    for place in range(1, len(names)):
+        poses[:, place] = poses[:, parents[place]] @ poses[:, place]
+    own = Partition(names.index(name), tuple(names.index(joint) for joint in influencing), np.zeros(0, np.int32))
+    inputs: Inputs = make_inputs(parents, points, [own])
+    features = inputs.features(poses.astype(np.float32), np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1)))
+    residuals = arrays[f"{name}.residuals"] * np.float32(CM)
+    return PartitionData(name, features[:, inputs.columns[0]], lambda: residuals, residuals.shape[1])
+
+
+def measure(data: PartitionData, prepared: PreparedPartition, network: Network, config, poses: np.ndarray) -> tuple:
+    """Mean and largest distance over poses, and the mean without a network, cm."""
+    coefficients = network.coefficients(prepared.inputs[poses], config.activation)
+    truth = data.read_residuals()[poses]
+    errors = np.linalg.norm(prepared.basis.residuals(coefficients).reshape(truth.shape) - truth, axis=2)
+    return float(errors.mean() / CM), float(errors.max() / CM), float(np.linalg.norm(truth, axis=2).mean() / CM)
+
+
+def run(folder: Path, config: TrainingConfig, choose: bool) -> dict:
+    """Train, measure, and compare; what `--json` writes."""
+    names = json.loads((folder / "recording.json").read_text(encoding="utf-8"))["partitions"]
+    with np.load(folder / "recording.npz", allow_pickle=False) as arrays:
+        arrays = dict(arrays)
+    started = time.perf_counter()
+    every = [read_partition(arrays, entry["partition"], entry["joints"]) for entry in names]
+    poses = len(every[0].features)
+    if choose:
+        order = np.random.default_rng(config.seed + 1000).permutation(TRAINING_POSES)
+        measured, trained_on = np.sort(order[: TRAINING_POSES // 5]), np.sort(order[TRAINING_POSES // 5 :])
+    else:
+        measured, trained_on = np.arange(TRAINING_POSES, poses), np.arange(TRAINING_POSES)
+    split = split_poses(trained_on, config.validation_fraction, config.seed)
+    prepared = [prepare(data, split, config.tolerance_mm, config.seed) for data in every]
+    result = train(prepared, split, config)
+    rows = []
+    for data, ready, network in zip(every, prepared, result.networks, strict=True):
+        mean, largest, linear = measure(data, ready, network, config, measured)
+        published = RELU[data.name]
+        rows.append(
+            {
+                "partition": data.name,
+                "shapes": len(ready.basis.shapes),
+                "linear_mean": linear,
+                "mean": mean,
+                "max": largest,
+                "relu_mean": published[0],
+                "relu_max": published[1],
+            }
+        )
+    totals = {key: float(np.mean([row[key] for row in rows])) for key in ("linear_mean", "mean", "relu_mean")}
+    totals |= {key: max(row[key] for row in rows) for key in ("max", "relu_max")}
+    return {
+        "unit": "cm",
+        "poses": "a fifth of 0-699" if choose else "700-1000",
+        "partitions": rows,
+        "all": totals,
+        "mean_of_relu": totals["mean"] / totals["relu_mean"],
+        "seconds": time.perf_counter() - started,
+        "settings": config.to_json(),
+    }
+
+
+def print_table(result: dict) -> None:
+    print(f"Errors in cm over poses {result['poses']}; relu: the published 2x128 ReLU networks over 700-1000.")
+    print(
+        f"{'partition':10} {'shapes':>6} {'linear':>8} {'mean':>8} {'max':>8} {'relu mean':>10} {'relu max':>9} {'':>6}"
+    )
+    for row in [*result["partitions"], {"partition": "all", "shapes": "", **result["all"]}]:
+        print(
+            f"{row['partition']:10} {row['shapes']:>6} {row['linear_mean']:8.4f} {row['mean']:8.4f} {row['max']:8.4f} "
+            f"{row['relu_mean']:10.4f} {row['relu_max']:9.4f} {100 * row['mean'] / row['relu_mean']:5.1f} %"
+        )
+    print(f"{result['seconds']:.1f} s")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser("reference_recordings", description="The trainer on the reference recordings.")
+    parser.add_argument("data", type=Path, nargs="?", default=DATA, help="folder of recording.npz")
+    parser.add_argument("--json", type=Path, help="write the result here")
+    parser.add_argument("--choose", action="store_true", help="measure on a part of the 700 training poses")
+    add_options(parser)
+    parser.set_defaults(**SETTINGS)
+    options = parser.parse_args()
+    if not (options.data / "recording.npz").exists():
+        print(f"Skipped: the reference recordings are not at '{options.data}'; give their folder as an argument.")
+        return 0
+    assert set(SETTINGS) <= {field.name for field in fields(TrainingConfig)}
+    result = run(options.data, config_from_arguments(options), options.choose)
+    print_table(result)
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
