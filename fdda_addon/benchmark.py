@@ -107,7 +107,7 @@ def benchmark(scene_rig: SceneRig, model: Path, frames: int) -> Iterator[Progres
     animation = scene_rig.armature_object.animation_data
     own_action = animation.action if animation else None
     with (
-        borrowed_pose(scene_rig.armature_object),
+        borrowed_pose(scene_rig.armature_object, [own_action] if own_action else []),
         _playing(scene_rig, own_action) as played,
         borrowed_binding(scene_rig, model),
     ):

@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from .core.errors import RigError
+from .core.errors import FDDAError, RigError
 from .core.metrics import ErrorStatistics, distances, error_statistics
 from .core.model import check_rig
 from .core.partition import Partition
@@ -151,7 +151,7 @@ def evaluate(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> 
     extra = max(1, settings.poses // 4)
     total = settings.poses + extra * len(settings.beyond) + len(settings.named)
     total += sum(len(action_frames(action)) for action in actions)
-    with borrowed_pose(scene_rig.armature_object):
+    with borrowed_pose(scene_rig.armature_object, actions):
         clear_pose(scene_rig.armature_object)
         comparison = _Comparison(PoseEvaluator(scene_rig, rig), network, layer, total)
         poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses)
@@ -208,9 +208,16 @@ class _Comparison:
         matrices, positions, fdda, linear = [], [], [], []
         for _ in poses:
             pose, true = self._evaluator.evaluate()
+            moved = self._network.positions(pose[None])[0]
+            for values, what in ((true, "The rig"), (moved, f"The model '{self._network.path}'")):
+                if not np.isfinite(values).all():
+                    raise FDDAError(
+                        f"{what} gives positions that are not numbers ({name}, pose {len(fdda)}); "
+                        "look for a scale of zero or a broken driver in the rig, else train again."
+                    )
             matrices.append(pose)
             positions.append(true)
-            fdda.append(distances(self._network.positions(pose[None])[0], true))
+            fdda.append(distances(moved, true))
             linear.append(distances(self._layer.positions(pose[None])[0], true))
             self._done += 1
             yield Progress("evaluation", self._done, self._total)

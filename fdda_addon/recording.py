@@ -94,7 +94,7 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         total, 0, Path(bpy.data.filepath).name, scene_rig.mesh_object.name, bpy.app.version_string, sampling
     )
 
-    with borrowed_pose(scene_rig.armature_object):
+    with borrowed_pose(scene_rig.armature_object, actions):
         clear_pose(scene_rig.armature_object)
         evaluator = PoseEvaluator(scene_rig, rig)
         partitions = yield from _detect_influences(scene_rig, rig, channels, evaluator, settings)
@@ -174,14 +174,19 @@ def _batches(
 
 def _append(writer: RecordingWriter, layer: LinearLayer, matrices: list, positions: list) -> None:
     pose_matrices = np.stack(matrices)
+    writer.append(pose_matrices, _local_residuals(layer, pose_matrices, np.stack(positions)))
+
+
+def _local_residuals(layer: LinearLayer, pose_matrices: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """As `LinearLayer.local_residuals`, with a sentence for a joint without extent."""
     try:
-        residuals = layer.local_residuals(pose_matrices, np.stack(positions))
+        return layer.local_residuals(pose_matrices, positions)
     except np.linalg.LinAlgError as error:
-        raise RecordingError(
-            f"A joint of the rig has a scale of zero between pose {writer.complete} and "
-            f"{writer.complete + len(matrices) - 1}; look for a constraint or driver that sets it."
+        flat = np.abs(np.linalg.det(pose_matrices[:, :, :3, :3].astype(np.float64))).min(axis=0)
+        raise RigError(
+            f"Bone '{layer.rig.joint_names[int(flat.argmin())]}' has a scale of zero in some pose; "
+            "look for a constraint or driver that sets it."
         ) from error
-    writer.append(pose_matrices, residuals)
 
 
 def _detect_influences(
@@ -213,7 +218,7 @@ def _detect_influences(
     def local_residuals(values: np.ndarray) -> np.ndarray:
         poser.set(values)
         pose, positions = evaluator.evaluate()
-        return layer.local_residuals(pose[None], positions[None])
+        return _local_residuals(layer, pose[None], positions[None])
 
     def draw(index: int) -> np.ndarray:
         return sample_pose(channels, settings.seed, INFLUENCE_SEED_OFFSET + index, settings.spread)

@@ -27,8 +27,11 @@ def run(options: argparse.Namespace) -> None:
     from .files import open_rig
     from .progress import ProgressPrinter
 
-    if options.poses < 0 or options.seed < 0 or not options.spread > 0:
-        raise WrongUsageError("--poses and --seed must be 0 or more, and --spread more than 0.")
+    if options.poses < 0 or options.seed < 0:
+        raise WrongUsageError("--poses and --seed must be 0 or more.")
+    # Wider is uniform already, and most draws would fall outside and be drawn again.
+    if not 0 < options.spread <= 10:
+        raise WrongUsageError("--spread must be more than 0 and at most 10.")
     scene_rig = open_rig(options)
     settings = RecordingSettings(
         poses=options.poses,

@@ -9,7 +9,7 @@ import bpy
 
 from ..core.errors import RigError
 from ..core.model import check_rig
-from ..scene.rig import SceneRig, deforming_modifiers, read_rig
+from ..scene.rig import SceneRig, check_topology, deforming_modifiers, read_rig
 from . import nodes, playback, switch
 
 
@@ -31,12 +31,14 @@ def bind(scene_rig: SceneRig, model: Path, use_in_render: bool = False) -> None:
     model = model.absolute()
     network = playback.load_network(model)
     check_rig(model, network.info, read_rig(scene_rig))
+    last = max(mesh_object.modifiers.find(modifier.name) for modifier in deforming_modifiers(mesh_object))
+    # Those after the last deforming one stay and work on what the model gives.
+    check_topology(mesh_object, mesh_object.modifiers[:last])
     if mesh_object.fdda.is_bound:
         unbind(mesh_object)
 
     playback.choose(model)
-    deforming = deforming_modifiers(mesh_object)
-    last = max(mesh_object.modifiers.find(modifier.name) for modifier in deforming)
+    last = max(mesh_object.modifiers.find(modifier.name) for modifier in deforming_modifiers(mesh_object))
     nodes.add_modifier(mesh_object, last + 1)
     binding = mesh_object.fdda
     binding.model = bpy.path.relpath(str(model)) if bpy.data.filepath else str(model)

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Scene state that is borrowed for a while and given back, whatever happens."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import bpy
 import numpy as np
+
+from .compatibility import animation_curves
 
 _POSE = {
     "location": 3,
@@ -17,10 +19,15 @@ _POSE = {
 
 
 @contextmanager
-def borrowed_pose(armature_object: bpy.types.Object) -> Iterator[None]:
+def borrowed_pose(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action] = ()) -> Iterator[None]:
     """Give back the pose of an armature, its animation and the current frame.
 
     Inside, the armature has no action and no NLA, so that poses stay as they are set.
+
+    Args:
+        armature_object: not in the NLA's tweak mode, where its action cannot be changed.
+        actions: actions that will drive it; what else they animate, the object itself or a custom property, is given
+            back as well.
     """
     scene = bpy.context.scene
     bones = armature_object.pose.bones
@@ -28,6 +35,7 @@ def borrowed_pose(armature_object: bpy.types.Object) -> Iterator[None]:
     pose = {name: np.empty(len(bones) * size, np.float32) for name, size in _POSE.items()}
     for name, values in pose.items():
         bones.foreach_get(name, values)
+    animated = _animated_values(armature_object, actions)
     animation = armature_object.animation_data
     if animation is not None:
         action, use_nla = animation.action, animation.use_nla
@@ -42,15 +50,40 @@ def borrowed_pose(armature_object: bpy.types.Object) -> Iterator[None]:
                 armature_object.animation_data_clear()
         else:
             animation.action = action
-            if slot is not None:
+            if action is not None and hasattr(animation, "action_slot"):
+                # Also where it was none: Blender chooses one when an action is assigned.
                 animation.action_slot = slot
             animation.use_nla = use_nla
         # The frame first: evaluating it sets animated channels, and the borrowed pose may differ from its keys.
         scene.frame_set(frame, subframe=subframe)
+        for path, value in animated.items():
+            _set_value(armature_object, path, value)
         for name, values in pose.items():
             bones.foreach_set(name, values)
         armature_object.update_tag(refresh={"DATA"})
         bpy.context.view_layer.update()
+
+
+def _animated_values(owner: bpy.types.ID, actions: Iterable[bpy.types.Action]) -> dict[str, object]:
+    """Values by RNA path of all that actions animate in a datablock."""
+    values = {}
+    for path in {curve.data_path for action in actions for curve in animation_curves(action)}:
+        try:
+            value = owner.path_resolve(path)
+        except ValueError:
+            # A curve of something that is not there, or of another datablock's slot.
+            continue
+        values[path] = value[:] if hasattr(value, "__len__") else value
+    return values
+
+
+def _set_value(owner: bpy.types.ID, path: str, value: object) -> None:
+    """Set what `path_resolve` reads."""
+    struct = owner.path_resolve(path, False).data
+    if path.endswith('"]'):
+        struct[bpy.utils.unescape_identifier(path[path.rindex('["') + 2 : -2])] = value
+    else:
+        setattr(struct, path.rpartition(".")[2], value)
 
 
 @contextmanager

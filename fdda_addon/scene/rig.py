@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Finds the rig in a scene, says why there is none, and reads it into arrays."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import bpy
@@ -22,6 +23,8 @@ TOPOLOGY_CHANGING = {
     "ARRAY", "BEVEL", "BOOLEAN", "BUILD", "DECIMATE", "EDGE_SPLIT", "EXPLODE", "FLUID", "MASK", "MIRROR", "MULTIRES",
     "OCEAN", "REMESH", "SCREW", "SKIN", "SOLIDIFY", "SUBSURF", "VOLUME_TO_MESH", "WELD", "WIREFRAME",
 }  # fmt: skip
+SMALLEST_VOLUME = 1e-15
+"""An object whose scales multiply to less is flat: no position could be brought into its space."""
 MODIFIER_NAME = "FDDA"
 """Name of the Geometry Nodes modifier that plays a model; it is never part of the rig."""
 
@@ -87,18 +90,16 @@ def check_evaluable(scene_rig: SceneRig) -> None:
     """Fail when what the graph evaluates the mesh to could not be compared with the mesh.
 
     Raises:
-        RigError: edit mode, a hidden object, an Armature modifier that is off, or a modifier that changes the
-            topology.
+        RigError: edit mode, the NLA's tweak mode, a hidden object, an Armature modifier that is off, or a modifier
+            that changes the topology.
     """
     mesh_object = scene_rig.mesh_object
     if mesh_object.mode == "EDIT" or scene_rig.armature_object.mode == "EDIT":
         raise RigError(f"'{mesh_object.name}' or its armature is in edit mode; leave it first.")
-    for modifier in mesh_object.modifiers:
-        if modifier.type in TOPOLOGY_CHANGING and modifier.show_viewport:
-            raise RigError(
-                f"Modifier '{modifier.name}' of '{mesh_object.name}' changes the topology of the mesh, so its vertices "
-                "cannot be followed; switch it off in the viewport while recording, or apply it."
-            )
+    animation = scene_rig.armature_object.animation_data
+    if animation is not None and animation.use_tweak_mode:
+        raise RigError(f"'{scene_rig.armature_object.name}' is in tweak mode of the NLA editor; leave it first.")
+    check_topology(mesh_object, mesh_object.modifiers)
     if not armature_modifier(mesh_object).show_viewport:
         raise RigError(f"The Armature modifier of '{mesh_object.name}' is switched off in the viewport; switch it on.")
     if scene_rig.armature_object.data.pose_position == "REST":
@@ -115,6 +116,20 @@ def check_evaluable(scene_rig: SceneRig) -> None:
         )
 
 
+def check_topology(mesh_object: bpy.types.Object, modifiers: Iterable[bpy.types.Modifier]) -> None:
+    """Fail when one of these modifiers of a mesh object is on and makes other vertices of those of the mesh.
+
+    Raises:
+        RigError: names it.
+    """
+    for modifier in modifiers:
+        if modifier.type in TOPOLOGY_CHANGING and modifier.show_viewport:
+            raise RigError(
+                f"Modifier '{modifier.name}' of '{mesh_object.name}' changes the topology of the mesh, so its vertices "
+                "cannot be followed; switch it off in the viewport, or apply it."
+            )
+
+
 def read_rig(scene_rig: SceneRig) -> Rig:
     """Read a rig.
 
@@ -122,9 +137,12 @@ def read_rig(scene_rig: SceneRig) -> Rig:
     of both.
 
     Raises:
-        RigError: a vertex follows no deforming bone.
+        RigError: a vertex follows no deforming bone, or an object has a scale of zero.
     """
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
+    for scene_object in (mesh_object, armature_object):
+        if abs(scene_object.matrix_world.to_3x3().determinant()) < SMALLEST_VOLUME:
+            raise RigError(f"'{scene_object.name}' has a scale of zero; give it another.")
     if not len(mesh_object.data.vertices):
         raise RigError(f"The mesh of '{mesh_object.name}' has no vertices; choose another object.")
     bones = armature_object.data.bones

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Everything of a scene that a job may borrow, as values that can be compared; and a fresh elbow to borrow from."""
+
+from collections.abc import Iterator
+
+import bpy
+import numpy as np
+
+from fdda_addon.scene.rig import SceneRig, find_rig
+
+TRANSFORMS = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
+
+
+def fresh_elbow() -> SceneRig:
+    """A new elbow in an empty scene."""
+    from fdda_addon.elbow import build_elbow
+
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    build_elbow()
+    return find_rig()
+
+
+def _properties(owner: object) -> dict:
+    return {key: value for key, value in owner.items() if isinstance(value, int | float | str)}
+
+
+def scene_state(rig: SceneRig) -> dict:
+    """What must be the same before and after: animation, frame, poses, modifiers, selection, datablocks, positions."""
+    scene, armature_object, animation = bpy.context.scene, rig.armature_object, rig.armature_object.animation_data
+    bpy.context.view_layer.update()
+    evaluated = rig.mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    return {
+        "frame": (scene.frame_current, scene.frame_subframe),
+        "animation": animation
+        and (
+            animation.action and animation.action.name,
+            getattr(animation, "action_slot", None) and animation.action_slot.identifier,
+            animation.use_nla,
+            [track.name for track in animation.nla_tracks],
+        ),
+        "pose": {
+            bone.name: (bone.rotation_mode, _properties(bone), *([*getattr(bone, name)] for name in TRANSFORMS))
+            for bone in armature_object.pose.bones
+        },
+        "objects": {
+            o.name: (o.mode, o.hide_viewport, o.select_get(), _properties(o), *([*getattr(o, n)] for n in TRANSFORMS))
+            for o in scene.objects
+        },
+        "active": bpy.context.view_layer.objects.active and bpy.context.view_layer.objects.active.name,
+        "modifiers": [(m.name, m.type, m.show_viewport, m.show_render) for m in rig.mesh_object.modifiers],
+        "binding": (rig.mesh_object.fdda.is_bound, rig.mesh_object.fdda.mode, rig.mesh_object.fdda.status),
+        "datablocks": [len(c) for c in (bpy.data.objects, bpy.data.meshes, bpy.data.actions, bpy.data.scenes)],
+        "positions": [vertex.co[:] for vertex in evaluated.data.vertices],
+    }
+
+
+def disarrange(rig: SceneRig) -> None:
+    """Bring everything that is borrowed into a state that no default would restore."""
+    armature_object = rig.armature_object
+    animation = armature_object.animation_data
+    other = bpy.data.actions.new("other")
+    track = animation.nla_tracks.new()
+    track.name = "below"
+    track.strips.new("wave", 40, bpy.data.actions["elbow_wave"])
+    animation.action = other
+    for frame, angle in ((1, 0.0), (20, 0.4)):
+        armature_object.pose.bones["upper"].rotation_euler[1] = angle
+        armature_object.pose.bones["upper"].keyframe_insert("rotation_euler", index=1, frame=frame)
+    bpy.context.scene.frame_set(7, subframe=0.25)
+    # Not keyed, and other than what the animation says at this frame.
+    upper, lower = (armature_object.pose.bones[name] for name in ("upper", "lower"))
+    upper.rotation_euler = (0.1, 0.2, 0.3)
+    lower.rotation_euler[0] = 1.1
+    lower.location, lower.scale = (0.01, 0, 0), (1, 1.1, 1)
+    lower.rotation_quaternion = (0.5, 0.5, 0.5, 0.5)
+    lower["mood"], armature_object["mood"] = 0.5, 2.0
+    rig.mesh_object.modifiers.new("Off", "CAST").show_viewport = False
+    rig.mesh_object.select_set(True)
+    armature_object.select_set(False)
+    bpy.context.view_layer.objects.active = rig.mesh_object
+
+
+def drain(steps: Iterator, stop_after: int | None = None) -> object:
+    """Iterate to the end, or close after so many steps; returns the last step."""
+    seen = []
+    for step in steps:
+        seen.append(step)
+        if len(seen) == stop_after:
+            steps.close()
+    return seen[-1]
+
+
+def assert_same_state(before: dict, after: dict) -> None:
+    """Compare two states, key by key, so that a failure says what was not given back."""
+    for key in before:
+        if key == "positions":
+            # The graph may sum up in another order; a pose that is off would show far above this.
+            np.testing.assert_allclose(after[key], before[key], atol=1e-6)
+        else:
+            assert after[key] == before[key], key

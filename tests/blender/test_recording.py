@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Recording the elbow: the residuals are those of what Blender shows, from any pose, for any object transform."""
+
+import json
+
+import bpy
+import numpy as np
+import pytest
+from scene_state import drain, fresh_elbow
+
+from fdda_addon.core.errors import RecordingError, RigError
+from fdda_addon.core.poses import sample_pose
+from fdda_addon.core.recording import Recording, read_recording
+from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.recording import BATCH_POSES, Progress, RecordingSettings, record
+from fdda_addon.scene.armature import Poser
+from fdda_addon.scene.mesh import evaluated_positions
+from fdda_addon.scene.rig import PoseReader, SceneRig, read_rig, sampled_channels
+
+
+@pytest.fixture
+def fresh() -> SceneRig:
+    return fresh_elbow()
+
+
+def recorded(rig: SceneRig, path, **settings) -> Recording:
+    drain(record(rig, path, RecordingSettings(**settings)))
+    return read_recording(path)
+
+
+def shown(rig: SceneRig) -> np.ndarray:
+    """(V, 3) what Blender shows now, mesh-object space."""
+    return evaluated_positions(rig.mesh_object, bpy.context.evaluated_depsgraph_get())
+
+
+def assert_reproduces(rig: SceneRig, recording: Recording, poses) -> None:
+    """Recorded pose and residual of each index give what Blender shows when the rig is posed so again."""
+    layer = LinearLayer(recording.rig, recording.partitions)
+    positions = layer.complex_positions(recording.pose_matrices, recording.residuals)
+    for index, set_pose in poses:
+        set_pose()
+        assert np.abs(shown(rig) - positions[index]).max() < 1e-5
+
+
+def random_pose(rig: SceneRig, recording: Recording, index: int):
+    channels = recording.info.sampling.channels
+    values = sample_pose(channels, recording.info.sampling.seed, index)
+    return index, lambda: Poser(rig.armature_object, channels).set(values)
+
+
+def test_residuals_reproduce_what_blender_shows(fresh, tmp_path):
+    recording = recorded(fresh, tmp_path / "r", poses=12, seed=3)
+    fresh.armature_object.animation_data_clear()
+    assert_reproduces(fresh, recording, (random_pose(fresh, recording, index) for index in (0, 5, 11)))
+    assert np.abs(recording.residuals).max() > 2e-3, "the rig differs from its linear layer"
+    assert len({pose.tobytes() for pose in recording.pose_matrices}) == 12
+
+
+def test_linear_layer_is_blender_s_armature_modifier(fresh):
+    layer = LinearLayer(rig := read_rig(fresh))
+    fresh.armature_object.animation_data_clear()
+    fresh.mesh_object.modifiers["CorrectiveSmooth"].show_viewport = False
+    fresh.armature_object.pose.bones["lower"].rotation_euler[0] = 1.5
+    fresh.armature_object.pose.bones["upper"].rotation_euler = (0.3, -0.4, 0.5)
+    positions = shown(fresh)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    reader = PoseReader(fresh, rig.joint_names, rig.rest_matrices)
+    pose = reader.read(fresh.mesh_object.evaluated_get(depsgraph), fresh.armature_object.evaluated_get(depsgraph))
+    assert np.abs(layer.positions(pose[None])[0] - positions).max() < 1e-6
+    assert np.abs(positions - rig.rest_positions).max() > 0.1
+
+
+def test_rig_as_arrays(fresh):
+    rig = read_rig(fresh)
+    assert rig.joint_names == ("upper", "lower") and rig.parents.tolist() == [-1, 0]
+    assert rig.skin_joints.shape == rig.skin_weights.shape == (rig.vertex_count, 4)
+    np.testing.assert_allclose(rig.skin_weights.sum(axis=1), 1, atol=1e-6)
+    for vertex in (0, 150, rig.vertex_count - 1):
+        groups = {
+            fresh.mesh_object.vertex_groups[g.group].name: g.weight
+            for g in fresh.mesh_object.data.vertices[vertex].groups
+        }
+        found = {
+            rig.joint_names[j]: w for j, w in zip(rig.skin_joints[vertex], rig.skin_weights[vertex], strict=True) if w
+        }
+        assert found == pytest.approx({name: w / sum(groups.values()) for name, w in groups.items() if w})
+    bones = fresh.armature_object.data.bones
+    np.testing.assert_allclose(rig.rest_matrices[1], np.array(bones["lower"].matrix_local), atol=1e-6)
+
+
+def test_objects_with_different_transforms(fresh, tmp_path):
+    """The pose matrices are in the space of the mesh object, wherever the two objects stand."""
+    fresh.mesh_object.parent = None
+    fresh.mesh_object.location, fresh.mesh_object.rotation_euler = (0.3, -0.2, 0.1), (0.2, 0.4, -0.3)
+    fresh.armature_object.location, fresh.armature_object.rotation_euler = (-0.5, 0.1, 0.9), (1.0, 0.2, 0)
+    fresh.armature_object.scale = (1.5, 1.5, 1.5)
+    recording = recorded(fresh, tmp_path / "r", poses=6)
+    fresh.armature_object.animation_data_clear()
+    assert_reproduces(fresh, recording, (random_pose(fresh, recording, index) for index in (0, 5)))
+    to_mesh = fresh.mesh_object.matrix_world.inverted() @ fresh.armature_object.matrix_world
+    expected = np.array(to_mesh @ fresh.armature_object.pose.bones["lower"].matrix)
+    np.testing.assert_allclose(recording.pose_matrices[5, 1], expected, atol=1e-5)
+
+
+def test_influences_of_the_elbow(fresh, tmp_path):
+    """The upper half is smoothed by the bend below, and neither sees the shoulder turn."""
+    recording = recorded(fresh, tmp_path / "r", poses=3)
+    assert [(p.joint, p.influencing) for p in recording.partitions] == [(0, (1,)), (1, (1,))]
+
+
+def test_influences_reach_as_far_as_the_rig(fresh, tmp_path):
+    """A shape key that the upper bone drives on the lower half is found, on that half alone."""
+    mesh = fresh.mesh_object.data
+    fresh.mesh_object.shape_key_add(name="Basis")
+    key = fresh.mesh_object.shape_key_add(name="bump")
+    for vertex in mesh.vertices:
+        if vertex.co.x > 0.45:
+            key.data[vertex.index].co.y += 0.02
+    driver = key.driver_add("value").driver
+    variable = driver.variables.new()
+    variable.type = "TRANSFORMS"
+    variable.targets[0].id = fresh.armature_object
+    variable.targets[0].bone_target = "upper"
+    variable.targets[0].transform_type, variable.targets[0].transform_space = "ROT_Z", "LOCAL_SPACE"
+    driver.expression = "var"
+    recording = recorded(fresh, tmp_path / "r", poses=3)
+    assert [(p.joint, p.influencing) for p in recording.partitions] == [(0, (1,)), (1, (0, 1))]
+
+
+def test_an_action_is_recorded_frame_by_frame(fresh, tmp_path):
+    recording = recorded(fresh, tmp_path / "r", poses=4, actions=("elbow_wave",))
+    assert [(s.kind, s.poses, s.name, s.frames) for s in recording.info.sampling.sources] == [
+        ("random", 4, "", (0, 0)),
+        ("action", 30, "elbow_wave", (1, 1)),
+    ]
+    frames = ((4 + frame - 1, lambda frame=frame: bpy.context.scene.frame_set(frame)) for frame in (1, 10, 23, 30))
+    assert_reproduces(fresh, recording, frames)
+
+
+def test_an_action_alone(fresh, tmp_path):
+    """Nobody knows then what moves what: every joint counts for every partition."""
+    recording = recorded(fresh, tmp_path / "r", poses=0, actions=("elbow_wave",))
+    assert recording.pose_matrices.shape[0] == 30
+    assert [p.influencing for p in recording.partitions] == [(0, 1), (0, 1)]
+
+
+def test_an_action_that_moves_the_object_gives_back_what_it_moved(fresh, tmp_path):
+    rig = fresh.armature_object
+    action = rig.animation_data.action = bpy.data.actions.new("walk")
+    rig["mood"] = rig.pose.bones["lower"]['a "b"'] = 0.0
+    for frame in (1, 5):
+        rig.location[0] = rig["mood"] = rig.pose.bones["lower"]['a "b"'] = float(frame)
+        rig.keyframe_insert("location", frame=frame)
+        rig.keyframe_insert('["mood"]', frame=frame)
+        rig.keyframe_insert('pose.bones["lower"]["a \\"b\\""]', frame=frame)
+    rig.animation_data.action = bpy.data.actions["elbow_wave"]
+    rig.location, rig["mood"], rig.pose.bones["lower"]['a "b"'] = (7, 8, 9), 55.0, 3.0
+    recorded(fresh, tmp_path / "r", poses=0, actions=("walk",))
+    assert rig.location[:] == (7, 8, 9) and rig["mood"] == 55 and rig.pose.bones["lower"]['a "b"'] == 3
+    assert action.name == "walk" and rig.animation_data.action.name == "elbow_wave"
+
+
+def test_the_index_says_where_it_came_from(fresh, elbow):
+    index = json.loads((elbow.recording / "recording.json").read_text())
+    assert index["rig"]["file"] == "elbow.blend" and index["rig"]["object"] == "elbow"
+    assert index["blender"] == bpy.app.version_string
+    assert index["units"] == {"length": "m", "angle": "rad"}
+    assert [(c["bone"], c["axis"]) for c in index["sampling"]["limits"]] == [
+        ("upper", 0),
+        ("upper", 1),
+        ("upper", 2),
+        ("lower", 0),
+    ]
+    assert index["joints"] == [{"name": "upper", "parent": -1}, {"name": "lower", "parent": 0}]
+
+
+def test_progress(fresh, tmp_path):
+    poses = BATCH_POSES + 5
+    steps = list(record(fresh, tmp_path / "r", RecordingSettings(poses=poses, influence_poses=4)))
+    assert steps[:4] == [Progress("influences", done, 4) for done in (1, 2, 3, 4)]
+    assert steps[4:] == [Progress("poses", done, poses) for done in (0, BATCH_POSES, poses)]
+
+
+def test_same_seed_same_poses_other_seed_others(fresh, tmp_path):
+    first, second, other = (
+        recorded(fresh, tmp_path / name, poses=3, seed=seed) for name, seed in (("a", 1), ("b", 1), ("c", 2))
+    )
+    assert np.array_equal(first.residuals, second.residuals)
+    assert not np.array_equal(first.pose_matrices, other.pose_matrices)
+
+
+def test_more_poses_begin_with_the_same_ones(fresh, tmp_path):
+    few, many = (recorded(fresh, tmp_path / str(count), poses=count) for count in (3, 8))
+    assert np.array_equal(few.residuals, many.residuals[:3])
+
+
+def test_nothing_to_record(fresh, tmp_path):
+    with pytest.raises(RecordingError, match="0 poses and no action; give --poses or --action"):
+        recorded(fresh, tmp_path / "r", poses=0)
+
+
+def test_unknown_action(fresh, tmp_path):
+    with pytest.raises(RigError, match="has no action 'run'; its actions: 'elbow_wave'"):
+        recorded(fresh, tmp_path / "r", actions=("run",))
+
+
+def test_a_joint_scaled_to_nothing_is_named(fresh, tmp_path):
+    """Blender cannot divide by it either; the recording says so in place of writing infinity."""
+    bone = fresh.armature_object.pose.bones["lower"]
+    limit = bone.constraints.new("LIMIT_SCALE")
+    limit.use_max_x = limit.use_max_y = limit.use_max_z = True
+    limit.owner_space = "LOCAL"
+    with pytest.raises(RigError, match="Bone 'lower' has a scale of zero in some pose"):
+        recorded(fresh, tmp_path / "r", poses=3)
+    assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.parametrize("name", ["elbow", "elbow_rig"])
+def test_an_object_scaled_to_nothing_is_named(fresh, tmp_path, name):
+    bpy.data.objects[name].scale[1] = 0
+    bpy.context.view_layer.update()
+    with pytest.raises(RigError, match=r"'elbow(_rig)?' has a scale of zero; give it another"):
+        recorded(fresh, tmp_path / "r", poses=3)
+
+
+def test_channels_are_what_is_sampled(fresh, tmp_path):
+    recording = recorded(fresh, tmp_path / "r", poses=3)
+    assert recording.info.sampling.channels == sampled_channels(fresh, recording.rig)
