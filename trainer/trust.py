@@ -17,10 +17,13 @@ from fdda_addon.core.skinning import SkinBlock
 
 MARGIN = 0.05
 """Margin of the box on each side, as a part of the range."""
-FADE = 0.15
-"""Fade width, as a part of the range."""
+FADE = 6.0
+"""Fade width, as a part of the range. Wide: the residual at the border of the range stands in well for those outside.
+
+Measured on the arm (docs/training.md): at 3 times the range of motion the mean error is 51 % of the linear layer's,
+with a fade width of 0.15 it was 92 %."""
 LEAST_MARGIN = (0.01, 0.001)
-LEAST_FADE = (0.05, 0.01)
+LEAST_FADE = (4.0, 0.2)
 """Least margin and fade width: of rotation elements, no unit, and of translations, as a part of the character's size.
 
 A locked axis has no range of its own; these are what it may turn before it counts, and what takes all trust away."""

@@ -12,6 +12,7 @@ from chain import LIMIT, chain_angles, chain_residuals, pose_chain, write_chain
 from fdda_addon.core.features import joint_features
 from fdda_addon.core.metrics import distances
 from fdda_addon.core.model import check_rig, read_model_info
+from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording import read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearLayer
@@ -72,25 +73,36 @@ def test_trust_is_one_inside_the_range_and_the_recorded_poses_are(session, recor
     assert (trust == 1).all()
 
 
-def test_trust_fades_to_the_linear_layer_outside(session, rig):
+def test_trust_fades_outside(session, rig):
     angles = np.zeros((40, 3, 2))
     angles[:, 1, 0] = np.linspace(LIMIT, LIMIT * 3, 40)
-    poses = pose_chain(rig, angles)
-    positions, trust = play(session, poses)
+    trust = play(session, pose_chain(rig, angles))[1]
     assert trust[0].min() == 1
     assert (np.diff(trust, axis=0) <= 1e-6).all(), "trust grows again on the way out"
-    assert trust[-1, :2].max() == 0
-    gone = (trust == 0).all(axis=1)
-    np.testing.assert_allclose(positions[gone], LinearLayer(rig).positions(poses)[gone], atol=2e-6)
-    assert ((trust > 0.02) & (trust < 0.98)).any(), "the fade is a jump"
+    assert 0 < trust[-1, :2].max() < 0.99
+    assert np.abs(np.diff(trust, axis=0)).max() < 0.05, "the fade is a jump"
 
 
-def test_a_locked_axis_that_turns_takes_the_trust_away(session, rig):
-    angles = np.zeros((2, 3, 2))
-    angles[1, 2, 1] = 0.5
+def test_far_outside_the_linear_layer_is_left(session, rig):
+    poses = pose_chain(rig, np.zeros((3, 3, 2)))
+    poses[:, 1:, :3, :3] *= np.float32([1, 5, 50])[:, None, None, None]
+    positions, trust = play(session, poses)
+    assert (trust[0] == 1).all() and (np.diff(trust[:, :2], axis=0) <= 0).all()
+    gone = np.flatnonzero(trust[2] == 0)
+    assert len(gone), "a joint fifty times its size is still trusted"
+    partitions = make_partitions(rig)
+    linear = LinearLayer(rig).positions(poses)
+    for number in gone:
+        vertices = partitions[number].vertices
+        np.testing.assert_allclose(positions[2, vertices], linear[2, vertices], atol=1e-4)
+
+
+def test_a_locked_axis_that_turns_lowers_the_trust(session, rig):
+    angles = np.zeros((3, 3, 2))
+    angles[1:, 2, 1] = 0.5, 1.5
     trust = play(session, pose_chain(rig, angles))[1]
     assert (trust[0] == 1).all()
-    assert trust[1, 2] == 0, "the last joint never turned about z in the recording"
+    assert 1 > trust[1, 2] > trust[2, 2], "the last joint never turned about z in the recording"
 
 
 @pytest.mark.parametrize("reach", [1.5, 2.0, 3.0])
@@ -107,7 +119,7 @@ def test_a_joint_scaled_to_nothing_gives_numbers(session, rig):
     poses[1, 1, :3, :3] = 0
     positions, trust = play(session, poses)
     assert np.isfinite(positions).all() and np.isfinite(trust).all()
-    assert trust[1].min() == 0
+    assert trust[1].min() < 1
 
 
 def test_metadata_describes_rig_and_training(trained, recording, report):
