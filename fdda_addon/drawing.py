@@ -26,6 +26,7 @@ TEXT_SIZE = 0.0145
 """Height of a line, as a part of the picture's width."""
 BACKGROUND = (0.13, 0.14, 0.15)
 INK = (0.92, 0.92, 0.92)
+PNG_END = b"IEND\xae\x42\x60\x82"
 
 
 @dataclass(frozen=True)
@@ -220,8 +221,9 @@ class _Picture:
                 bpy.ops.render.render(write_still=True, scene=scene.name)
             except RuntimeError as error:
                 raise OSError(str(error).strip()) from error
-            if not temporary.exists():
-                raise OSError("Blender wrote no picture")
+            # Blender does not look whether all of it reached the disk.
+            if not (temporary.exists() and temporary.read_bytes().endswith(PNG_END)):
+                raise OSError("Blender wrote no picture or only a part of it, the disk may be full")
 
     def remove(self) -> None:
         """Leave nothing of the picture in the file."""

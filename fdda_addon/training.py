@@ -96,9 +96,9 @@ class Training:
 
     def _death(self, status: int) -> str:
         text = self._error_text().strip().splitlines()
-        reason = f": {text[-1]}" if text else ""
+        reason = f" ({text[-1].strip()})" if text else ""
         how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
-        return f"The trainer {how} and said nothing{reason}; no model was written."
+        return f"The trainer {how} before it was done{reason}; no model was written, train again."
 
     def _error_text(self) -> str:
         self._errors.seek(0)

@@ -2,6 +2,7 @@
 """`bind RIG.blend MODEL.onnx OUT.blend`: a file in which the model plays."""
 
 import argparse
+import os
 from pathlib import Path
 
 
@@ -17,7 +18,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     import bpy
 
-    from ..core.output import check_writable
+    from ..core.errors import OutputError
+    from ..core.output import check_writable, replacing
     from ..runtime.binding import bind
     from .files import open_rig, save_copy
 
@@ -28,28 +30,36 @@ def run(options: argparse.Namespace) -> None:
     bpy.context.view_layer.update()
     model = beside(options.model, options.out)
     scene_rig.mesh_object.fdda.model = "//" + model.resolve().relative_to(options.out.resolve().parent).as_posix()
-    save_copy(options.out)
+    copied = not model.exists()
+    if copied:
+        with replacing(model) as temporary:
+            temporary.write_bytes(options.model.read_bytes())
+    try:
+        save_copy(options.out)
+    except OutputError:
+        if copied:
+            model.unlink()
+        raise
+    if copied:
+        print(f"{model}: a copy of {options.model}, beside the file that plays it")
     print(f"{options.out}: '{scene_rig.mesh_object.name}' plays {model.name}")
 
 
 def beside(model: Path, out: Path) -> Path:
-    """A bound file follows no path out of its folder: bring the model there when it is elsewhere.
+    """Where the model of a bound file must be: a bound file follows no path out of its folder.
+
+    Returns:
+        The model itself where it lies in the folder or below, else its name in the folder.
 
     Raises:
         OutputError: another file of that name is there.
     """
     from ..core.errors import OutputError
-    from ..core.output import replacing
 
     if model.resolve().is_relative_to(out.resolve().parent):
         return model
     copy = out.parent / model.name
-    data = model.read_bytes()
-    if not copy.exists():
-        with replacing(copy) as temporary:
-            temporary.write_bytes(data)
-        print(f"{copy}: a copy of {model}, beside the file that plays it")
-    elif copy.read_bytes() != data:
+    if os.path.lexists(copy) and not (copy.is_file() and copy.read_bytes() == model.read_bytes()):
         raise OutputError(
             f"Cannot put the model beside '{out}': there is another '{copy.name}'; remove it or choose another folder."
         )

@@ -14,6 +14,9 @@ from ..core.errors import FDDAError
 from ..core.output import check_writable, replacing
 from ..scene.rig import SceneRig, find_rig
 
+SEEK_TABLE_END = bytes.fromhex("b1ea928f")
+"""Last bytes of a compressed .blend file, which is one of Zstandard's seekable format."""
+
 
 def add_rig_options(parser: argparse.ArgumentParser) -> None:
     """The rig file and its object."""
@@ -43,8 +46,7 @@ def open_file(path: Path) -> None:
         with quiet():
             bpy.ops.wm.open_mainfile(filepath=str(path.absolute()), load_ui=False)
     except RuntimeError as error:
-        reason = str(error).strip().removeprefix("Error: ").partition("\n")[0]
-        raise FDDAError(f"Blender cannot open '{path}' ({reason}); give a .blend file.") from error
+        raise FDDAError(f"Blender cannot open '{path}' ({_reason(error)}); give a .blend file.") from error
 
 
 def save_copy(path: Path) -> None:
@@ -54,13 +56,22 @@ def save_copy(path: Path) -> None:
         OutputError: it cannot be written.
     """
     check_writable(path)
-    with replacing(path) as temporary, quiet():
+    with replacing(path) as temporary:
         try:
-            bpy.ops.wm.save_as_mainfile(
-                filepath=str(temporary.absolute()), copy=True, compress=True, check_existing=False
-            )
+            with quiet():
+                bpy.ops.wm.save_as_mainfile(
+                    filepath=str(temporary.absolute()), copy=True, compress=True, check_existing=False
+                )
         except RuntimeError as error:
-            raise OSError(str(error).strip()) from error
+            raise OSError(_reason(error)) from error
+        # Blender 4.5 saves half a compressed file to a full disk and calls it finished.
+        if temporary.read_bytes()[-len(SEEK_TABLE_END) :] != SEEK_TABLE_END:
+            raise OSError("Blender wrote only a part of it, the disk may be full")
+
+
+def _reason(error: RuntimeError) -> str:
+    """The first of the reports that an operator failed with."""
+    return str(error).strip().removeprefix("Error: ").partition("\n")[0]
 
 
 @contextlib.contextmanager
@@ -71,7 +82,9 @@ def quiet() -> Iterator[None]:
     try:
         with open(os.devnull, "w") as sink:
             os.dup2(sink.fileno(), 1)
-            yield
+            # Blender prints the reports of a failed operator through Python, all else through C.
+            with contextlib.redirect_stdout(sink):
+                yield
     finally:
         os.dup2(saved, 1)
         os.close(saved)

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Bad rigs, recordings and outputs on the command line: one sentence each, and everything is as it was.
+
+Bad models are in test_bad_models.py, bad trainers in test_bad_trainers.py.
+"""
+
+import json
+import shutil
+from itertools import pairwise
+
+import bpy
+import numpy as np
+import pytest
+from refusals import Refusal, files, save_elbow, small_files
+
+
+@pytest.fixture
+def refusal(tmp_path, capfd) -> Refusal:
+    return Refusal(tmp_path, capfd)
+
+
+@pytest.fixture
+def refusal_on_a_full_disk(tmp_path, capsys) -> Refusal:
+    """As `refusal`; what is caught stays in memory, for it could not be written to a file either."""
+    return Refusal(tmp_path, capsys)
+
+
+@pytest.fixture(params=["record", "bind", "evaluate", "benchmark"])
+def verb(request, elbow, tmp_path):
+    """Arguments of each verb that opens a rig, given the rig's file."""
+    after = {
+        "record": [tmp_path / "recording"],
+        "bind": [elbow.model, tmp_path / "bound.blend"],
+        "evaluate": [elbow.model, "--json", tmp_path / "e.json", "--poses", "2"],
+        "benchmark": [elbow.model, "--json", tmp_path / "b.json", "--frames", "5"],
+    }[request.param]
+    return lambda rig, *more: [request.param, rig, *after, *more]
+
+
+def test_no_file(refusal, verb, tmp_path):
+    path = tmp_path / "none.blend"
+    assert refusal(*verb(path)) == f"There is no file '{path}'; give the path of a .blend file."
+    assert "There is no file" in refusal(*verb(tmp_path))
+
+
+def test_a_file_that_is_no_blend(refusal, verb, tmp_path):
+    path = tmp_path / "text.blend"
+    path.write_text("not a blend file\n" * 100)
+    text = refusal(*verb(path))
+    assert text.startswith(f"Blender cannot open '{path}' (") and text.endswith("); give a .blend file.")
+
+
+def test_no_mesh(refusal, verb, tmp_path):
+    path = save_elbow(tmp_path / "rig.blend", lambda rig: bpy.data.objects.remove(rig.mesh_object))
+    assert refusal(*verb(path)).startswith("The scene has no mesh; open a file with a character")
+
+
+def add_second(rig) -> None:
+    second = rig.mesh_object.copy()
+    second.name = "sleeve"
+    bpy.context.scene.collection.objects.link(second)
+
+
+def test_several_candidates(refusal, verb, tmp_path):
+    path = save_elbow(tmp_path / "rig.blend", add_second)
+    assert refusal(*verb(path)) == ("2 meshes have an Armature modifier ('elbow', 'sleeve'); choose one with --object.")
+
+
+def test_an_object_that_is_not_there(refusal, verb, tmp_path):
+    path = save_elbow(tmp_path / "rig.blend", add_second)
+    assert refusal(*verb(path, "--object", "glove")) == (
+        "The scene has no mesh object 'glove'; its mesh objects: 'elbow', 'sleeve'."
+    )
+
+
+def test_no_armature_modifier(refusal, verb, tmp_path):
+    path = save_elbow(
+        tmp_path / "rig.blend", lambda rig: rig.mesh_object.modifiers.remove(rig.mesh_object.modifiers["Armature"])
+    )
+    assert "None of the 1 meshes of the scene has an Armature modifier with an armature" in refusal(*verb(path))
+    assert "'elbow' has no Armature modifier with an armature" in refusal(*verb(path, "--object", "elbow"))
+
+
+@pytest.mark.parametrize("count", [1, 7])
+def test_unweighted_vertices(refusal, verb, tmp_path, count):
+    def unweight(rig):
+        for group in rig.mesh_object.vertex_groups:
+            group.remove(range(20, 20 + count))
+
+    text = refusal(*verb(save_elbow(tmp_path / "rig.blend", unweight)))
+    total = len(bpy.data.objects["elbow"].data.vertices)
+    assert f"{count} of the {total} vertices of 'elbow' have no weight on a deforming bone" in text
+    assert "(vertex 20)" in text if count == 1 else "(vertex 20, 21, 22, 23, 24, …)" in text
+
+
+def test_vertices_of_a_bone_that_does_not_deform(refusal, verb, tmp_path):
+    def switch_off(rig):
+        rig.armature_object.data.bones["lower"].use_deform = False
+
+    assert "have no weight on a deforming bone (vertex " in refusal(
+        *verb(save_elbow(tmp_path / "rig.blend", switch_off))
+    )
+
+
+def lock_all(rig) -> None:
+    for bone in rig.armature_object.pose.bones:
+        bone.lock_rotation = (True, True, True)
+
+
+def test_no_bone_to_sample(refusal, elbow, tmp_path):
+    path = save_elbow(tmp_path / "rig.blend", lock_all)
+    expected = "No bone of 'elbow_rig' may be sampled: all 2 are locked or moved by constraints; unlock an axis"
+    assert refusal("record", path, tmp_path / "r").startswith(expected)
+    assert refusal("evaluate", path, elbow.model, "--json", tmp_path / "e.json").startswith(expected)
+
+
+@pytest.mark.parametrize("kind", ["SUBSURF", "MIRROR", "DECIMATE"])
+@pytest.mark.parametrize("place", [0, 1, 2], ids=["first", "between", "last"])
+def test_a_modifier_that_changes_the_topology(refusal, tmp_path, kind, place):
+    def add(rig):
+        rig.mesh_object.modifiers.new("Changes", kind)
+        rig.mesh_object.modifiers.move(2, place)
+
+    text = refusal("record", save_elbow(tmp_path / "rig.blend", add), tmp_path / "r")
+    assert "Modifier 'Changes' of 'elbow' changes the topology of the mesh" in text
+    assert "switch it off in the viewport, or apply it" in text
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_binding_below_a_modifier_that_changes_the_topology(refusal, elbow, tmp_path, place):
+    def add(rig):
+        rig.mesh_object.modifiers.new("Changes", "SUBSURF")
+        rig.mesh_object.modifiers.move(2, place)
+
+    path = save_elbow(tmp_path / "rig.blend", add)
+    assert "changes the topology" in refusal("bind", path, elbow.model, tmp_path / "b.blend")
+
+
+def add_node_subdivision(rig) -> None:
+    group = bpy.data.node_groups.new("Subdivide", "GeometryNodeTree")
+    for in_out in ("INPUT", "OUTPUT"):
+        group.interface.new_socket("Geometry", in_out=in_out, socket_type="NodeSocketGeometry")
+    nodes = [group.nodes.new(k) for k in ("NodeGroupInput", "GeometryNodeSubdivideMesh", "NodeGroupOutput")]
+    for first, second in pairwise(nodes):
+        group.links.new(first.outputs[0], second.inputs[0])
+    rig.mesh_object.modifiers.new("Subdivide", "NODES").node_group = group
+
+
+def test_geometry_nodes_that_change_the_topology(refusal, tmp_path):
+    text = refusal("record", save_elbow(tmp_path / "rig.blend", add_node_subdivision), tmp_path / "r")
+    count = len(bpy.data.objects["elbow"].data.vertices)
+    assert f"The modifiers of 'elbow' turn {count} vertices into " in text
+    assert "switch off the one that changes the topology (Subdivide)" in text
+
+
+def test_a_mesh_without_vertices(refusal, verb, tmp_path):
+    path = save_elbow(tmp_path / "rig.blend", lambda rig: rig.mesh_object.data.clear_geometry())
+    assert "The mesh of 'elbow' has no vertices" in refusal(*verb(path))
+
+
+def cut_short(path) -> None:
+    (path / "residuals.npy").write_bytes((path / "residuals.npy").read_bytes()[:-50])
+
+
+def put_nan(path) -> None:
+    array = np.load(path / "residuals.npy")
+    array[3, 2, 1] = np.nan
+    np.save(path / "residuals.npy", array)
+
+
+def set_index(**values):
+    def change(path):
+        index = json.loads((path / "recording.json").read_text())
+        (path / "recording.json").write_text(json.dumps({**index, **values}))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (set_index(complete=40), "is incomplete: 40 of 150 poses; finish it with record --resume"),
+        (cut_short, "residuals.npy' cannot be used: it is truncated: "),
+        (set_index(version=2), "is a recording of version 2 and this add-on reads version 1; record again"),
+        (put_nan, "holds values that are not numbers (residuals, poses 0 to 149); record again"),
+    ],
+    ids=["incomplete", "truncated", "other version", "NaN"],
+)
+def test_recordings(refusal, elbow, tmp_path, damage, words):
+    path = shutil.copytree(elbow.recording, tmp_path / "recording")
+    damage(path)
+    assert words in refusal("train", path, tmp_path / "m.onnx")
+
+
+def test_a_recording_that_is_there_already(refusal, elbow, tmp_path):
+    path = shutil.copytree(elbow.recording, tmp_path / "recording")
+    assert "holds a recording already; continue it with --resume" in refusal("record", elbow.rig, path)
+
+
+def test_resuming_with_other_options(refusal, elbow, tmp_path):
+    path = shutil.copytree(elbow.recording, tmp_path / "recording")
+    set_index(complete=40)(path)
+    text = refusal("record", elbow.rig, path, "--poses", 150, "--seed", 1, "--resume")
+    assert "it was recorded with another sampling.seed;" in text
+    text = refusal("record", elbow.rig, path, "--poses", 160, "--resume")
+    assert "it was recorded with another poses, sampling.sources;" in text
+
+
+@pytest.fixture(params=["build-arm", "record", "bind", "evaluate", "heatmap", "benchmark"])
+def writing(request, elbow, tmp_path_factory):
+    """Arguments of each verb that writes, given where to."""
+    return {
+        "build-arm": lambda out: ["build-arm", out],
+        "record": lambda out: ["record", elbow.rig, out, "--poses", 60],
+        "bind": lambda out: ["bind", elbow.rig, elbow.model, out],
+        "evaluate": lambda out: ["evaluate", elbow.rig, elbow.model, "--json", out, "--poses", 2],
+        "heatmap": lambda out: [
+            "evaluate",
+            elbow.rig,
+            elbow.model,
+            "--poses",
+            2,
+            "--json",
+            tmp_path_factory.mktemp("json") / "e.json",
+            "--heatmap",
+            out,
+        ],
+        "benchmark": lambda out: ["benchmark", elbow.rig, elbow.model, "--json", out, "--frames", 5],
+    }[request.param]
+
+
+def test_an_output_below_a_file(refusal, writing, tmp_path):
+    (tmp_path / "file").write_text("old")
+    text = refusal(*writing(tmp_path / "file" / "out"))
+    assert text.startswith("Cannot write")
+
+
+def test_an_output_where_nothing_can_be_written(refusal, writing):
+    assert refusal(*writing("/proc/fdda")).startswith("Cannot write")
+
+
+def test_an_output_in_a_folder_that_is_not_there(refusal, writing, tmp_path):
+    if writing("")[0] == "record":
+        pytest.skip("record makes its folder")
+    text = refusal(*writing(tmp_path / "none" / "out"))
+    assert f"the folder '{tmp_path / 'none'}' does not exist; create it first" in text
+
+
+def test_an_output_that_is_a_folder(refusal, writing, tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "letter.txt").write_text("dear")
+    assert refusal(*writing(tmp_path / "folder")).startswith("Cannot ")
+
+
+def test_a_disk_that_fills_up(refusal_on_a_full_disk, writing, tmp_path):
+    with small_files(100):
+        text = refusal_on_a_full_disk(*writing(tmp_path / "out"))
+    assert text.startswith("Cannot write"), text
+
+
+def test_a_disk_that_fills_up_leaves_the_old_file(refusal_on_a_full_disk, writing, tmp_path):
+    if writing("")[0] == "record":
+        pytest.skip("record replaces nothing")
+    (tmp_path / "out").write_text("old")
+    with small_files(100):
+        refusal_on_a_full_disk(*writing(tmp_path / "out"))
+    assert files(tmp_path) == {"out": b"old"}
+
+
+def test_a_model_that_cannot_be_copied_beside_the_bound_file(refusal, elbow, tmp_path):
+    (tmp_path / elbow.model.name).write_bytes(b"another model")
+    text = refusal("bind", elbow.rig, elbow.model, tmp_path / "b.blend")
+    assert f"there is another '{elbow.model.name}'; remove it or choose another folder" in text

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Models of another rig, and files that are no models, on the command line: one sentence each."""
+
+import json
+
+import bpy
+import numpy as np
+import onnx
+import pytest
+from conftest import run
+from onnx import TensorProto, helper, numpy_helper
+from refusals import Refusal, save_elbow
+
+from fdda_addon.core.errors import FDDAError
+from fdda_addon.runtime.binding import bind
+from fdda_addon.runtime.network import Network
+from fdda_addon.scene.rig import find_rig
+
+
+@pytest.fixture
+def refusal(tmp_path, capfd) -> Refusal:
+    return Refusal(tmp_path, capfd)
+
+
+@pytest.fixture(params=["bind", "evaluate", "benchmark"])
+def verb(request, tmp_path):
+    """Arguments of each verb that takes a model, given rig and model."""
+    after = {
+        "bind": [tmp_path / "bound.blend"],
+        "evaluate": ["--json", tmp_path / "e.json", "--poses", "2"],
+        "benchmark": ["--json", tmp_path / "b.json", "--frames", "5"],
+    }[request.param]
+    return lambda rig, model: [request.param, rig, model, *after]
+
+
+def subdivide(rig) -> None:
+    bpy.context.view_layer.objects.active = rig.mesh_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="SELECT")
+    bpy.ops.mesh.subdivide()
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def edit_bones(change):
+    def edit(rig):
+        bpy.context.view_layer.objects.active = rig.armature_object
+        bpy.ops.object.mode_set(mode="EDIT")
+        change(rig.armature_object.data.edit_bones)
+        bpy.ops.object.mode_set(mode="OBJECT")
+
+    return edit
+
+
+def rename(bones) -> None:
+    bones["lower"].name = "forearm"
+
+
+def move(bones) -> None:
+    bones["lower"].tail.z += 0.1
+
+
+def unparent(bones) -> None:
+    bones["lower"].parent = None
+
+
+def move_vertex(rig) -> None:
+    rig.mesh_object.data.vertices[5].co.x += 0.001
+
+
+def reweight(rig) -> None:
+    rig.mesh_object.vertex_groups["lower"].add([0], 0.2, "REPLACE")
+
+
+def flip(rig) -> None:
+    rig.mesh_object.data.polygons[3].flip()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (subdivide, "it has 300 vertices, the mesh has "),
+        (edit_bones(rename), "the armature lacks the joint 'lower'; it does not know the joint 'forearm'"),
+        (edit_bones(move), "the rest pose of the armature differs"),
+        (edit_bones(unparent), "its joints have other parents"),
+        (move_vertex, "the rest pose of the mesh differs"),
+        (reweight, "the skin weights differ"),
+        (flip, "the topology of the mesh differs"),
+    ],
+    ids=["vertex count", "joints", "rest pose", "parents", "rest positions", "weights", "topology"],
+)
+def test_a_model_of_another_rig(refusal, verb, elbow, tmp_path, change, words):
+    assert len(json.loads((elbow.recording / "recording.json").read_text())["joints"]) == 2
+    text = refusal(*verb(save_elbow(tmp_path / "rig.blend", change), elbow.model))
+    assert text.startswith(f"The model '{elbow.model}' was trained for another rig: {words}")
+    assert text.endswith(". Record and train this rig.")
+
+
+def test_no_model(refusal, verb, elbow, tmp_path):
+    path = tmp_path / "none.onnx"
+    text = refusal(*verb(elbow.rig, path))
+    assert text.startswith(f"The model '{path}' cannot be read: No such file or directory; ")
+
+
+@pytest.mark.parametrize("content", [b"", b"text, not a model\n" * 50, bytes(5000)])
+def test_a_file_that_is_no_model(refusal, verb, elbow, tmp_path, content):
+    path = tmp_path / "m.onnx"
+    path.write_bytes(content)
+    assert refusal(*verb(elbow.rig, path)) == (
+        f"'{path}' is not a model: not an ONNX file; give an .onnx file that train made."
+    )
+
+
+@pytest.mark.parametrize("part", [0.1, 0.5, 0.999])
+def test_a_truncated_model(refusal, verb, elbow, tmp_path, part):
+    path, data = tmp_path / "m.onnx", elbow.model.read_bytes()
+    path.write_bytes(data[: int(len(data) * part)])
+    assert f"'{path}' is not a model" in refusal(*verb(elbow.rig, path))
+
+
+def edited(elbow, tmp_path, change) -> "object":
+    """The elbow's model with something changed."""
+    model = onnx.load(elbow.model)
+    change(model)
+    path = tmp_path / "m.onnx"
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+def add_input(model) -> None:
+    model.graph.input.append(helper.make_tensor_value_info("controls", TensorProto.FLOAT, ["N", 3]))
+
+
+def add_custom_operator(model) -> None:
+    model.graph.node.append(helper.make_node("Run", ["positions"], ["y"], domain="com.example"))
+    model.opset_import.append(helper.make_opsetid("com.example", 1))
+
+
+def add_hidden_operator(model) -> None:
+    value = helper.make_tensor_value_info("inner", TensorProto.FLOAT, None)
+    branch = helper.make_graph([helper.make_node("Run", [], ["inner"], domain="com.example")], "b", [], [value])
+    model.graph.initializer.append(numpy_helper.from_array(np.array(True), "condition"))
+    model.graph.node.append(helper.make_node("If", ["condition"], ["y"], then_branch=branch, else_branch=branch))
+
+
+def keep_data_outside(model) -> None:
+    tensor = next(t for t in model.graph.initializer if t.raw_data)
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value="../../etc/passwd")
+
+
+def remove_metadata(model) -> None:
+    del model.metadata_props[:]
+
+
+def of_version_2(model) -> None:
+    value = json.loads(model.metadata_props[0].value)
+    model.metadata_props[0].value = json.dumps({**value, "version": 2})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (add_input, "asks for inputs that no rig gives (controls); train it again"),
+        (add_custom_operator, "uses custom operators (com.example::Run), which is refused; give a model"),
+        (add_hidden_operator, "uses custom operators (com.example::Run), which is refused; give a model"),
+        (keep_data_outside, "keeps data in other files, which is refused; give a model that train made"),
+        (remove_metadata, "is an ONNX file but not a model of this add-on; give one that train made"),
+        (of_version_2, "cannot be used: it is of version 2 and this add-on reads version 1; train it again"),
+    ],
+)
+def test_onnx_files_that_are_refused_unopened(refusal, verb, elbow, tmp_path, change, words):
+    path = edited(elbow, tmp_path, change)
+    text = refusal(*verb(elbow.rig, path))
+    assert str(path) in text and words in text
+
+
+def of_an_unknown_operator(model) -> None:
+    model.graph.node[0].op_type = "NoSuchOperator"
+
+
+def with_a_loop(model) -> None:
+    model.graph.node[0].input[0] = model.graph.node[-1].output[0]
+
+
+def of_doubles(model) -> None:
+    model.graph.input[0].type.tensor_type.elem_type = TensorProto.DOUBLE
+
+
+@pytest.mark.parametrize("change", [of_an_unknown_operator, with_a_loop, of_doubles])
+def test_what_onnx_runtime_refuses(refusal, verb, elbow, tmp_path, change):
+    path = edited(elbow, tmp_path, change)
+    text = refusal(*verb(elbow.rig, path))
+    assert text.startswith(f"ONNX Runtime refuses the model '{path}' (") and text.endswith("); train it again.")
+
+
+def answer_nan(model) -> None:
+    """The positions are multiplied by NaN on their way out."""
+    last = next(node for node in model.graph.node if "positions" in node.output)
+    last.output[list(last.output).index("positions")] = "good"
+    model.graph.initializer.append(numpy_helper.from_array(np.float32([np.nan]), "nan"))
+    model.graph.node.append(helper.make_node("Mul", ["good", "nan"], ["positions"]))
+
+
+def test_a_model_that_answers_no_numbers(refusal, elbow, tmp_path):
+    path = edited(elbow, tmp_path, answer_nan)
+    text = refusal("evaluate", elbow.rig, path, "--json", tmp_path / "e.json", "--poses", 2)
+    assert f"The model '{path}' gives positions that are not numbers (held-out poses, pose 0)" in text
+
+
+def answer_fewer(model) -> None:
+    last = next(node for node in model.graph.node if "positions" in node.output)
+    last.output[list(last.output).index("positions")] = "all"
+    for name, value in (("from", [0]), ("to", [7]), ("axis", [1])):
+        model.graph.initializer.append(numpy_helper.from_array(np.array(value), name))
+    model.graph.node.append(helper.make_node("Slice", ["all", "from", "to", "axis"], ["positions"]))
+
+
+def test_a_model_that_answers_another_shape(elbow, tmp_path):
+    """ONNX Runtime may refuse it as it loads, or the add-on when it answers."""
+    path = edited(elbow, tmp_path, answer_fewer)
+    with pytest.raises(FDDAError, match=r"refuses the model|answers \(1, 7, 3\), not \(1, 300, 3\)"):
+        network = Network(path)
+        network.positions(network.info.rest_matrices[None])
+
+
+def test_a_refused_model_leaves_a_bound_object_as_it_is(bound, elbow, tmp_path):
+    path = edited(elbow, tmp_path, add_custom_operator)
+    with pytest.raises(FDDAError, match="custom operators"):
+        bind(find_rig(), path)
+    assert bound.fdda.is_bound and bound.fdda.mode == "FDDA"
+    assert [m.show_viewport for m in bound.modifiers] == [False, False, True]
+
+
+def test_the_good_model_is_taken(verb, elbow):
+    """Else all refusals above could have another reason."""
+    assert run(*verb(elbow.rig, elbow.model)) == 0
