@@ -67,13 +67,14 @@ def read_partition(arrays: dict, name: str, influencing: list[str]) -> Partition
         names += reversed(chain)
     local = arrays[f"{name}.local_matrices"]
     poses = np.tile(np.eye(4), (len(local), len(names), 1, 1))
-    points = np.zeros((len(names), 3))
+    # Where the surface is was not recorded: three points around each joint stand for it, a centimetre off.
+    points = np.tile(np.eye(3) * CM, (len(names), 1, 1))
     for number, joint in enumerate(influencing):
         place = names.index(joint)
         poses[:, place, :3] = local[:, number]
         poses[:, place, :3, 3] *= CM
-        # Half-way to the joint that it carries is the middle of what it moves.
-        points[names.index(parent_of(joint))] = local[0, number, :, 3] / 2 * CM
+        # Half-way to the joint that it carries is the middle of what a joint moves.
+        points[names.index(parent_of(joint))] += local[0, number, :, 3] / 2 * CM
     parents = np.array([names.index(parent_of(joint)) if parent_of(joint) else -1 for joint in names])
     for place in range(1, len(names)):
         poses[:, place] = poses[:, parents[place]] @ poses[:, place]

@@ -18,6 +18,9 @@ from .announcements import Announcer, MessageLines, Text
 from .config import add_options, config_from_arguments
 
 INTERRUPTED = 130
+# Threads of OpenMP that wait by spinning make training ten times slower on a machine that is busy with something else,
+# and no faster on one that is not. Read when torch loads.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -72,7 +75,7 @@ def _import_training():
     except ModuleNotFoundError as error:
         raise TrainingError(
             f"Training needs the Python package '{error.name}', which {sys.executable} does not have; install torch, "
-            "onnx, onnxruntime and numpy there, or choose another Python in the preferences."
+            "onnx, onnxruntime and numpy there, or set FDDA_TRAINER_PYTHON to a Python that has them."
         ) from error
     return train_model, Cancelled
 

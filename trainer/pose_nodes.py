@@ -26,7 +26,7 @@ def add_features(graph: Graph, rig: Rig, inputs: Inputs) -> str:
     parent_poses = graph.add("Gather", [POSE_INPUT, graph.integers("parents", above)], "parent_poses", axis=1)
     moved = graph.add("MatMul", [parent_poses, graph.floats("rest_to_parent", to_child)], "moved")
     carried = graph.add("Add", [moved, graph.floats("rest_of_roots", np.where(is_root, rest, 0))], "carried")
-    has_pairs = len(inputs.pair_joints) > 0
+    has_pairs = len(inputs.pair_points) > 0
     # The pairs need the inverses of the poses themselves: one more half of the same stack.
     stack = graph.add("Concat", [carried, POSE_INPUT], "stack", axis=1) if has_pairs else carried
     inverses = _inverses(graph, stack, len(parents) * (2 if has_pairs else 1))
@@ -75,22 +75,27 @@ def _pair_features(graph: Graph, inverses: str, inputs: Inputs) -> str:
         to_points[4 * inner : 4 * inner + 4, 4 * row + inner] = 1
         to_origins[4 * inner + 3, 4 * row + inner] = 1
         sums[4 * row + inner, row] = 1
+    moved = poses
+    if not np.array_equal(inputs.point_joints, np.arange(len(inputs.parents))):
+        moved = graph.add(
+            "Gather", [poses, graph.integers("point_joints", inputs.point_joints)], "moved_points", axis=1
+        )
     scales = np.tile(np.append(inputs.points, np.ones((len(inputs.points), 1)), axis=1), 4)
-    terms = graph.add("Mul", [poses, graph.floats("points", scales)], "point_terms")
+    terms = graph.add("Mul", [moved, graph.floats("points", scales)], "point_terms")
     there = graph.add("MatMul", [terms, graph.floats("to_points", to_points)], "there")
     here = graph.add("MatMul", [poses, graph.floats("to_origins", to_origins)], "here")
-    references, joints = (
+    references, points = (
         graph.integers(name, chosen)
-        for name, chosen in (("pair_references", inputs.pair_references), ("pair_joints", inputs.pair_joints))
+        for name, chosen in (("pair_references", inputs.pair_references), ("pair_points", inputs.pair_points))
     )
     ends = [
-        graph.add("Gather", [there, joints], "pair_there", axis=1),
+        graph.add("Gather", [there, points], "pair_there", axis=1),
         graph.add("Gather", [here, references], "pair_here", axis=1),
     ]
     turned = [graph.add("Gather", [inverses, references], "pair_inverse", axis=1), graph.add("Sub", ends, "apart")]
     products = graph.add("Mul", turned, "pair_products")
     pairs = graph.add("MatMul", [products, graph.floats("pair_sums", sums)], "pairs")
-    return graph.reshape(pairs, [0, len(inputs.pair_joints) * FEATURES_PER_PAIR], "pair_features")
+    return graph.reshape(pairs, [0, len(inputs.pair_points) * FEATURES_PER_PAIR], "pair_features")
 
 
 def add_range(graph: Graph, features: str, deformation: Deformation, order: list[int]) -> tuple[str, str]:

@@ -15,7 +15,7 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import SkinBlock
 
-MARGIN = 0.05
+MARGIN = 0.1
 """Margin of the box on each side, as a part of the range."""
 FADE = 6.0
 """Fade width, as a part of the range. Wide: the residual at the border of the range stands in well for those outside.

@@ -18,8 +18,8 @@ def partition(joint: int, *influencing: int) -> Partition:
 
 
 def pairs(*partitions: Partition) -> list[tuple[int, int]]:
-    inputs = make_inputs(PARENTS, np.zeros((5, 3)), partitions)
-    return list(zip(inputs.pair_references.tolist(), inputs.pair_joints.tolist(), strict=True))
+    inputs = make_inputs(PARENTS, np.zeros((5, 1, 3)), partitions)
+    return list(zip(inputs.pair_references.tolist(), inputs.pair_points.tolist(), strict=True))
 
 
 def test_siblings_and_grandchildren_are_seen_from_the_main_joint():
@@ -32,7 +32,7 @@ def test_a_joint_that_does_not_influence_hides_what_lies_behind_it():
 
 
 def test_a_network_is_offered_its_joints_and_its_pairs():
-    inputs = make_inputs(PARENTS, np.zeros((5, 3)), [partition(2, 2, 3, 4), partition(0, 1, 3), partition(1)])
+    inputs = make_inputs(PARENTS, np.zeros((5, 1, 3)), [partition(2, 2, 3, 4), partition(0, 1, 3), partition(1)])
     assert inputs.columns[0].tolist() == [*range(24, 60), *range(60, 66)]
     assert inputs.columns[1].tolist() == [*range(12, 24), *range(36, 48), *range(66, 69)]
     assert inputs.columns[2].tolist() == []
@@ -42,7 +42,7 @@ def test_a_pair_is_the_middle_of_a_partition_seen_from_a_joint():
     rig = chain_rig(4)
     partitions = make_partitions(rig)
     inputs = make_inputs(rig.parents, middles(rig, partitions), [partition(1, 1, 2, 3)])
-    assert list(zip(inputs.pair_references, inputs.pair_joints, strict=True)) == [(1, 3)]
+    assert list(zip(inputs.pair_references, inputs.pair_points, strict=True)) == [(1, 3)]
     poses = pose_chain(rig, chain_angles(5, 4, 0))
     features = inputs.features(poses, rig.rest_matrices)
     joints = joint_features(poses, rig.rest_matrices, rig.parents)
