@@ -9,6 +9,7 @@ import sys
 from importlib import import_module
 
 from ..core.errors import FDDAError
+from .interruption import interruptible
 
 VERBS = {
     "build-arm": ("build_arm", "build the example rig: an arm with a hand"),
@@ -66,7 +67,8 @@ def _run(verb: object, options: argparse.Namespace) -> int:
     was_registered = is_registered()
     register()
     try:
-        verb.run(options)
+        with interruptible():
+            verb.run(options)
     finally:
         if not was_registered:
             unregister()

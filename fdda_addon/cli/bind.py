@@ -18,7 +18,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     import bpy
 
-    from ..core.errors import OutputError
+    from ..core.errors import ModelError, OutputError
     from ..core.output import check_writable, replacing
     from ..runtime.binding import bind
     from .files import open_rig, save_copy
@@ -28,6 +28,8 @@ def run(options: argparse.Namespace) -> None:
     bind(scene_rig, options.model, options.use_in_render)
     # The file is saved with the positions of its current pose, for a Blender that has no add-on.
     bpy.context.view_layer.update()
+    if scene_rig.mesh_object.fdda.status:
+        raise ModelError(scene_rig.mesh_object.fdda.status)
     model = beside(options.model, options.out)
     scene_rig.mesh_object.fdda.model = "//" + model.resolve().relative_to(options.out.resolve().parent).as_posix()
     copied = not model.exists()

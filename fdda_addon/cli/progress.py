@@ -5,6 +5,8 @@ import sys
 import time
 from typing import TextIO
 
+from .interruption import raise_pending
+
 WIDTH = 30
 PLAIN_PARTS = 10
 """Plain output has a line for each tenth of a stage."""
@@ -19,7 +21,12 @@ class ProgressPrinter:
         self._stage, self._part, self._start, self._open = "", -1, 0.0, False
 
     def show(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Show `done` of `total` steps of a stage."""
+        """Show `done` of `total` steps of a stage.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed where it had to wait.
+        """
+        raise_pending()
         if stage != self._stage:
             self._end_line()
             self._stage, self._part, self._start = stage, -1, time.monotonic()

@@ -148,7 +148,8 @@ def model_path(mesh_object: bpy.types.Object) -> Path:
     stored = mesh_object.fdda.model
     path = Path(bpy.path.abspath(stored, library=mesh_object.library))
     file = bpy.path.abspath(mesh_object.library.filepath) if mesh_object.library else bpy.data.filepath
-    if path not in _chosen and file and not path.resolve().is_relative_to(Path(file).resolve().parent):
+    # Resolved: the way from the open file to the model leads through "..".
+    if path.resolve() not in _chosen and file and not path.resolve().is_relative_to(Path(file).resolve().parent):
         raise ModelError(
             f"The model '{path}' lies outside the folder of '{Path(file).name}' and is not followed; "
             "move it beside the file and bind it again."
@@ -158,7 +159,7 @@ def model_path(mesh_object: bpy.types.Object) -> Path:
 
 def choose(model: Path) -> None:
     """The user chose this model in this session: it may lie anywhere until the file is loaded again."""
-    _chosen.add(model)
+    _chosen.add(model.resolve())
 
 
 def forget() -> None:

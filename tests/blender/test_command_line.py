@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The command line: statuses, options, what each verb prints, and the files that it makes."""
+
+import io
+import shutil
+
+import bpy
+import pytest
+from conftest import assert_plays, evaluated, pose, run
+from refusals import files, save_elbow
+
+import fdda_addon
+from fdda_addon.cli import VERBS
+from fdda_addon.cli.progress import ProgressPrinter
+from fdda_addon.core.recording import read_recording
+from fdda_addon.runtime import playback
+
+
+@pytest.mark.parametrize("arguments", [["--help"], *([verb, "--help"] for verb in VERBS)], ids=" ".join)
+def test_help(arguments, capfd):
+    assert run(*arguments) == 0
+    captured = capfd.readouterr()
+    assert captured.out.startswith("usage: ") and not captured.err
+    if arguments == ["--help"]:
+        assert all(verb in captured.out for verb in VERBS)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["paint"],
+        ["record"],
+        ["record", "a.blend"],
+        ["record", "a.blend", "b", "--poses", "many"],
+        ["record", "a.blend", "b", "--poses", "-1"],
+        ["record", "a.blend", "b", "--seed", "-1"],
+        ["record", "a.blend", "b", "--spread", "0"],
+        ["record", "a.blend", "b", "--spread", "nan"],
+        ["record", "a.blend", "b", "--spread", "inf"],
+        ["record", "a.blend", "b", "--colour"],
+        ["build-arm", "a.blend", "--density", "4"],
+        ["bind", "a.blend", "m.onnx"],
+        ["evaluate", "a.blend", "m.onnx"],
+        ["evaluate", "a.blend", "m.onnx", "--json", "e.json", "--poses", "0"],
+        ["evaluate", "a.blend", "m.onnx", "--json", "e.json", "--beyond", "0"],
+        ["benchmark", "a.blend", "m.onnx", "--json", "b.json", "--frames", "0"],
+        ["train"],
+        ["train", "recording", "m.onnx", "--activation", "step"],
+        ["train", "recording", "m.onnx", "--colour", "red"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_usage(arguments, capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == 2
+    captured = capfd.readouterr()
+    assert captured.err.strip() and not captured.out
+    assert "Traceback" not in captured.err
+    assert files(tmp_path) == {}
+
+
+def test_train_passes_its_options_on(elbow, tmp_path, capfd):
+    model = tmp_path / "m.onnx"
+    options = ["--epochs", 3, "--hidden", 8, 16, "--activation", "tanh", "--seed", 9, "--learning-rate", "0.002"]
+    assert run("train", elbow.recording, model, *options) == 0
+    from fdda_addon.core.model import read_model_info
+
+    training = read_model_info(model).training
+    assert (training["epochs"], training["hidden"], training["activation"], training["seed"]) == (3, [8, 16], "tanh", 9)
+    assert training["learning_rate"] == 0.002
+    captured = capfd.readouterr()
+    assert captured.out.splitlines()[-1].startswith(f"{model}: trained in ")
+    assert "training: 3 of 3, " in captured.err and "validation " in captured.err
+    assert sorted(files(tmp_path)) == ["m.onnx", "report.html", "report.json"]
+
+
+def test_an_impossible_setting_fails(elbow, tmp_path, capfd):
+    assert run("train", elbow.recording, tmp_path / "m.onnx", "--learning-rate", -1) == 1
+    assert "learning_rate cannot be -1.0" in capfd.readouterr().err
+    assert files(tmp_path) == {}
+
+
+def test_record_prints_lines_where_there_is_no_terminal(elbow, tmp_path, capfd):
+    assert run("record", elbow.rig, tmp_path / "r", "--poses", 20, "--seed", 4, "--action", "elbow_wave") == 0
+    captured = capfd.readouterr()
+    assert captured.out.startswith(f"{tmp_path / 'r'}: 50 poses in ") and captured.out.count("\n") == 1
+    lines = captured.err.splitlines()
+    assert lines[0].startswith("influences: 1 of 10, ") and lines[9].startswith("influences: 10 of 10, ")
+    assert lines[10].startswith("poses: 0 of 50, ") and lines[-1].startswith("poses: 50 of 50, ")
+    assert "\r" not in captured.err and "\x1b" not in captured.err
+    recording = read_recording(tmp_path / "r")
+    assert recording.info.sampling.seed == 4
+    assert [(s.kind, s.poses) for s in recording.info.sampling.sources] == [("random", 20), ("action", 30)]
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_bar_on_a_terminal():
+    stream = Terminal()
+    with ProgressPrinter(stream) as progress:
+        for done in range(5):
+            progress.show("poses", done, 4, "fine")
+        progress.say("hello")
+        progress.show("more", 1, 2)
+    lines = stream.getvalue().split("\n")
+    assert lines[0].count("\r") == 5 and "4/4" in lines[0] and "█" * 30 in lines[0] and "fine" in lines[0]
+    assert lines[1] == "hello"
+    assert "1/2" in lines[2] and "█" * 15 + "░" * 15 in lines[2] and lines[3] == ""
+
+
+def test_plain_lines_come_ten_times_a_stage():
+    stream = io.StringIO()
+    with ProgressPrinter(stream) as progress:
+        for done in range(1001):
+            progress.show("poses", done, 1000)
+        progress.show("next", 0, 0)
+    lines = stream.getvalue().splitlines()
+    assert (
+        len(lines) == 12 and lines[0].startswith("poses: 0 of 1000, ") and lines[10].startswith("poses: 1000 of 1000")
+    )
+
+
+def test_a_name_chooses_the_object(elbow, tmp_path):
+    def add_second(rig):
+        second = rig.mesh_object.copy()
+        second.data = second.data.copy()
+        second.name = "sleeve"
+        bpy.context.scene.collection.objects.link(second)
+        rig.mesh_object.vertex_groups.remove(rig.mesh_object.vertex_groups["upper"])
+
+    path = save_elbow(tmp_path / "rig.blend", add_second)
+    assert run("record", path, tmp_path / "r", "--object", "sleeve", "--poses", 3) == 0
+    assert read_recording(tmp_path / "r").info.object_name == "sleeve"
+    assert run("record", path, tmp_path / "other", "--object", "elbow", "--poses", 3) == 1
+
+
+def opened(path) -> bpy.types.Object:
+    """The elbow of a file, opened as a user would who never chose a model in this session."""
+    playback.forget()
+    playback._chosen.clear()
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    return bpy.data.objects["elbow"]
+
+
+def test_a_bound_file_plays_when_it_is_opened(elbow, tmp_path, capfd):
+    """Rig, model and bound file each in a folder of its own: the model is brought beside the bound file."""
+    model, out = tmp_path / "models" / "m.onnx", tmp_path / "out" / "bound.blend"
+    for path in (model, out):
+        path.parent.mkdir()
+    shutil.copy(elbow.model, model)
+    assert run("bind", elbow.rig, model, out) == 0
+    printed = capfd.readouterr().out.splitlines()
+    assert printed == [
+        f"{out.parent / 'm.onnx'}: a copy of {model}, beside the file that plays it",
+        f"{out}: 'elbow' plays m.onnx",
+    ]
+    assert (out.parent / "m.onnx").read_bytes() == elbow.model.read_bytes()
+    shutil.rmtree(model.parent)
+    moved = out.parent.rename(tmp_path / "elsewhere")
+    mesh_object = opened(moved / "bound.blend")
+    assert mesh_object.fdda.model == "//m.onnx" and not mesh_object.fdda.use_in_render
+    pose(angle=0.3)
+    first = assert_plays(mesh_object, elbow.model)
+    pose(angle=1.7)
+    assert abs(assert_plays(mesh_object, elbow.model) - first).max() > 0.01
+
+
+def test_a_model_in_the_folder_or_below_stays_where_it_is(elbow, tmp_path, monkeypatch):
+    (tmp_path / "models").mkdir()
+    shutil.copy(elbow.model, tmp_path / "models" / "m.onnx")
+    monkeypatch.chdir(tmp_path)
+    assert run("bind", elbow.rig, "models/m.onnx", "bound.blend") == 0
+    assert sorted(files(tmp_path)) == ["bound.blend", "models", "models/m.onnx"]
+    mesh_object = opened(tmp_path / "bound.blend")
+    assert mesh_object.fdda.model == "//models/m.onnx"
+    pose(angle=1.0)
+    assert_plays(mesh_object, elbow.model)
+
+
+def test_the_same_model_beside_the_file_is_left_alone(elbow, tmp_path):
+    shutil.copy2(elbow.model, tmp_path / elbow.model.name)
+    before = (tmp_path / elbow.model.name).stat()
+    assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend") == 0
+    after = (tmp_path / elbow.model.name).stat()
+    assert (before.st_mtime_ns, before.st_ino) == (after.st_mtime_ns, after.st_ino)
+
+
+def test_binding_leaves_rig_and_model_alone(elbow, tmp_path):
+    before = elbow.rig.read_bytes(), elbow.model.read_bytes()
+    assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend") == 0
+    assert (elbow.rig.read_bytes(), elbow.model.read_bytes()) == before
+
+
+def test_a_bound_file_in_place_of_the_rig(elbow, tmp_path):
+    rig = shutil.copy(elbow.rig, tmp_path / "rig.blend")
+    assert run("bind", rig, elbow.model, rig) == 0
+    assert_plays(opened(rig), elbow.model)
+
+
+def test_binding_a_bound_file_again(elbow, tmp_path):
+    assert run("bind", elbow.bound, elbow.model, tmp_path / "b.blend") == 0
+    mesh_object = opened(tmp_path / "b.blend")
+    assert sum(m.type == "NODES" for m in mesh_object.modifiers) == 1
+    pose(angle=1.3)
+    assert_plays(mesh_object, elbow.model)
+
+
+def test_use_in_render(elbow, tmp_path):
+    assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend", "--use-in-render") == 0
+    mesh_object = opened(tmp_path / "b.blend")
+    assert mesh_object.fdda.use_in_render
+    assert [m.show_render for m in mesh_object.modifiers] == [False, False, True]
+
+
+def test_a_bound_file_shows_its_pose_without_the_add_on(elbow, tmp_path):
+    assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend") == 0
+    playing = evaluated(opened(tmp_path / "b.blend"))
+    fdda_addon.unregister()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "b.blend"))
+    assert abs(evaluated(bpy.data.objects["elbow"]) - playing).max() < 1e-6
+
+
+def test_recording_a_bound_file_records_the_rig(elbow, tmp_path):
+    assert run("record", elbow.bound, tmp_path / "bound", "--poses", 5) == 0
+    assert run("record", elbow.rig, tmp_path / "rig", "--poses", 5) == 0
+    first, second = (files(tmp_path / name) for name in ("bound", "rig"))
+    assert first["residuals.npy"] == second["residuals.npy"]
+
+
+def test_the_add_on_stays_as_it_was_registered(elbow, tmp_path):
+    assert run("record", elbow.rig, tmp_path / "a", "--poses", 1) == 0
+    assert fdda_addon.is_registered()
+    fdda_addon.unregister()
+    assert run("record", elbow.rig, tmp_path / "b", "--poses", 1) == 0
+    assert not fdda_addon.is_registered() and not hasattr(bpy.types.Object, "fdda")

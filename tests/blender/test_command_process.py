@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`python -m fdda_addon` as a process: exit statuses, Ctrl-C, and a recording that continues after it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import run
+from refusals import files
+
+from fdda_addon.core.errors import RecordingError
+from fdda_addon.core.recording import read_index
+from fdda_addon.recording import BATCH_POSES
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def start(*arguments: object) -> subprocess.Popen:
+    command = [sys.executable, "-m", "fdda_addon", *map(str, arguments)]
+    return subprocess.Popen(
+        command,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+
+
+def finish(*arguments: object) -> tuple[int, str, str]:
+    process = start(*arguments)
+    out, err = process.communicate(timeout=120)
+    return process.returncode, out, err
+
+
+def test_done(elbow, tmp_path):
+    status, out, err = finish("record", elbow.rig, tmp_path / "r", "--poses", 4)
+    assert status == 0, err
+    assert out.startswith(f"{tmp_path / 'r'}: 4 poses in ") and out.count("\n") == 1, "Blender's lines are kept away"
+    assert err.splitlines()[-1].startswith("poses: 4 of 4, ")
+
+
+def test_failed(tmp_path):
+    path = tmp_path / "none.blend"
+    assert finish("record", path, tmp_path / "r") == (
+        1,
+        "",
+        f"Error: There is no file '{path}'; give the path of a .blend file.\n",
+    )
+
+
+def test_wrong_usage():
+    status, out, err = finish("record", "--poses", "many")
+    assert (status, out) == (2, "")
+    assert err.startswith("usage: python -m fdda_addon record")
+
+
+def test_a_blender_file_that_is_none_prints_one_line(tmp_path):
+    (tmp_path / "text.blend").write_text("text")
+    status, out, err = finish("record", tmp_path / "text.blend", tmp_path / "r")
+    assert (status, out) == (1, "") and err.count("\n") == 1 and err.startswith("Error: Blender cannot open '")
+
+
+def wait_for(condition, process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def complete(path: Path) -> int:
+    try:
+        return read_index(path)["complete"]
+    except RecordingError:
+        return -1
+
+
+def test_an_interrupted_recording_resumes(elbow, tmp_path):
+    """Stopped by Ctrl-C in the middle and continued, it is the recording that was never stopped, byte for byte."""
+    poses = 20 * BATCH_POSES
+    options = ["--poses", poses, "--seed", 5]
+    path = tmp_path / "interrupted"
+    process = start("record", elbow.rig, path, *options)
+    wait_for(lambda: complete(path) > 0, process)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert out == "" and err.splitlines()[-1] == "Interrupted." and "Traceback" not in err
+    done = complete(path)
+    assert 0 < done < poses
+    assert run("record", elbow.rig, path, *options, "--resume") == 0
+    assert run("record", elbow.rig, tmp_path / "whole", *options) == 0
+    assert files(path) == files(tmp_path / "whole")
+
+
+def test_a_recording_that_is_killed_resumes(elbow, tmp_path):
+    poses = 20 * BATCH_POSES
+    path = tmp_path / "killed"
+    process = start("record", elbow.rig, path, "--poses", poses)
+    wait_for(lambda: complete(path) > 0, process)
+    process.kill()
+    process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGKILL
+    assert 0 < complete(path) < poses
+    assert run("record", elbow.rig, path, "--poses", poses, "--resume") == 0
+    assert run("record", elbow.rig, tmp_path / "whole", "--poses", poses) == 0
+    assert files(path) == files(tmp_path / "whole")
+
+
+def test_an_interrupted_training_leaves_no_model(elbow, tmp_path):
+    process = start("train", elbow.recording, tmp_path / "m.onnx", "--epochs", 1_000_000)
+    for line in process.stderr:
+        if line.startswith("training: "):
+            break
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "Traceback" not in err and out == ""
+    assert files(tmp_path) == {}
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"]])
+def test_without_a_verb(arguments):
+    status, out, err = finish(*arguments)
+    assert status == (0 if arguments else 2)
+    assert (out or err).startswith("usage: python -m fdda_addon")

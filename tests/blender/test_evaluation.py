@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Evaluation and benchmark: the figures are what a direct computation gives, on poses that no recording has."""
+
+import json
+
+import bpy
+import numpy as np
+import pytest
+from conftest import run
+from scene_state import drain
+
+from fdda_addon.core.metrics import error_statistics
+from fdda_addon.core.model import read_model_info
+from fdda_addon.core.poses import beyond_range, sample_pose
+from fdda_addon.core.recording import read_recording
+from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.evaluation import HELD_OUT_INDEX, Evaluation, EvaluationSettings, NamedPose, evaluate
+from fdda_addon.runtime.network import Network
+from fdda_addon.scene.armature import Poser, clear_pose
+from fdda_addon.scene.mesh import evaluated_positions
+from fdda_addon.scene.rig import read_rig, sampled_channels
+
+STATISTICS = ["mean", "rms", "p99", "p999", "max"]
+
+
+@pytest.fixture(scope="module")
+def report(elbow, tmp_path_factory) -> dict:
+    """What `evaluate --json` writes, with everything it can compare."""
+    path = tmp_path_factory.mktemp("evaluation") / "e.json"
+    options = ["--poses", 12, "--seed", 3, "--action", "elbow_wave", "--beyond", 1.5, "--beyond", 2]
+    assert run("evaluate", elbow.rig, elbow.model, "--json", path, *options) == 0
+    return json.loads(path.read_text())
+
+
+def test_keys(report):
+    assert list(report) == [
+        *("unit", "poses", "vertices", "fdda", "linear", "partitions"),
+        *("actions", "beyond", "named"),
+    ]
+    assert (report["unit"], report["poses"], report["vertices"]) == ("mm", 12, 300)
+    assert list(report["fdda"]) == list(report["linear"]) == STATISTICS
+    for partition in report["partitions"]:
+        assert list(partition) == ["joint", "vertices", "fdda", "linear"]
+        assert list(partition["fdda"]) == list(partition["linear"]) == STATISTICS
+    assert [p["joint"] for p in report["partitions"]] == ["upper", "lower"]
+    assert sum(p["vertices"] for p in report["partitions"]) == 300
+    assert [(e["name"], e["poses"]) for e in report["actions"]] == [("elbow_wave", 30)]
+    assert [(e["name"], e["poses"]) for e in report["beyond"]] == [("1.5 times the range", 3), ("2 times the range", 3)]
+    assert report["named"] == []
+
+
+def test_the_model_is_nearer_than_the_linear_layer(report):
+    assert 0 < report["fdda"]["mean"] < report["linear"]["mean"] / 3
+    for values in (report["fdda"], report["linear"]):
+        assert values["mean"] <= values["rms"] <= values["p999"] <= values["max"]
+        assert values["p99"] <= values["p999"]
+
+
+def by_hand(rig, elbow, channels, seed: int, indices) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (N, V) of model and linear layer, computed without the evaluation: metres."""
+    arrays = read_rig(rig)
+    layer, network = LinearLayer(arrays), Network(elbow.model)
+    bones, errors = rig.armature_object.pose.bones, ([], [])
+    poser = Poser(rig.armature_object, channels)
+    for index in indices:
+        poser.set(sample_pose(channels, seed, index))
+        true = evaluated_positions(rig.mesh_object, bpy.context.evaluated_depsgraph_get())
+        to_mesh = rig.mesh_object.matrix_world.inverted() @ rig.armature_object.matrix_world
+        pose = np.float32([[np.array(to_mesh @ bones[name].matrix) for name in arrays.joint_names]])
+        for found, positions in zip(errors, (network.positions(pose), layer.positions(pose)), strict=True):
+            found.append(np.linalg.norm(positions[0] - true, axis=1))
+    return np.array(errors[0]), np.array(errors[1])
+
+
+def test_figures_are_what_a_direct_computation_gives(report, rig, elbow):
+    rig.armature_object.animation_data_clear()
+    clear_pose(rig.armature_object)
+    channels = sampled_channels(rig, read_rig(rig))
+    fdda, linear = by_hand(rig, elbow, channels, 3, range(HELD_OUT_INDEX, HELD_OUT_INDEX + 12))
+    for errors, name in ((fdda, "fdda"), (linear, "linear")):
+        assert report[name] == pytest.approx(error_statistics(errors).to_json(), abs=2e-4)
+        mm = errors * 1000
+        assert report[name]["mean"] == pytest.approx(mm.mean(), abs=2e-4)
+        assert report[name]["max"] == pytest.approx(mm.max(), abs=2e-4)
+    for partition, found in zip(LinearLayer(read_rig(rig)).partitions, report["partitions"], strict=True):
+        assert found["vertices"] == len(partition.vertices)
+        assert found["fdda"]["mean"] == pytest.approx(1000 * fdda[:, partition.vertices].mean(), abs=2e-4)
+    assert beyond_range(channels, 2)[0].high > channels[0].high
+
+
+def evaluated_with(rig, elbow, **settings) -> Evaluation:
+    return drain(evaluate(rig, elbow.model, EvaluationSettings(**settings)))
+
+
+def test_held_out_poses_are_no_poses_of_the_recording(rig, elbow):
+    """Also with the seed of the recording."""
+    recording = read_recording(elbow.recording)
+    evaluation = evaluated_with(rig, elbow, poses=20, seed=recording.info.sampling.seed)
+    for pose in evaluation.held_out.pose_matrices:
+        assert np.abs(recording.pose_matrices - pose).max(axis=(1, 2, 3)).min() > 1e-3
+    assert read_model_info(elbow.model).fingerprint == recording.rig.fingerprint
+
+
+def test_same_seed_same_figures_other_seed_others(rig, elbow):
+    first, second, other = (evaluated_with(rig, elbow, poses=4, seed=seed) for seed in (1, 1, 2))
+    assert first.to_json() == second.to_json()
+    assert np.abs(first.held_out.pose_matrices - other.held_out.pose_matrices).max() > 1e-2
+
+
+def test_named_poses(rig, elbow):
+    pose = NamedPose("fold", {"lower": (1.5, 0, 0), "upper": (0, 0.2, 0)})
+    (errors,) = evaluated_with(rig, elbow, poses=1, named=(pose,)).named
+    assert errors.name == "fold" and errors.fdda.shape == (1, 300)
+    rig.armature_object.animation_data_clear()
+    clear_pose(rig.armature_object)
+    bones = rig.armature_object.pose.bones
+    bones["lower"].rotation_euler, bones["upper"].rotation_euler = (1.5, 0, 0), (0, 0.2, 0)
+    true = evaluated_positions(rig.mesh_object, bpy.context.evaluated_depsgraph_get())
+    np.testing.assert_allclose(errors.positions[0], true, atol=1e-6)
+
+
+def test_action_frames(rig, elbow):
+    (errors,) = evaluated_with(rig, elbow, poses=1, actions=("elbow_wave",)).actions
+    for frame in (1, 10, 22):
+        bpy.context.scene.frame_set(frame)
+        true = evaluated_positions(rig.mesh_object, bpy.context.evaluated_depsgraph_get())
+        np.testing.assert_allclose(errors.positions[frame - 1], true, atol=1e-6)
+
+
+def test_a_bound_file_is_evaluated_by_its_rig(elbow, tmp_path):
+    for name, file in (("rig", elbow.rig), ("bound", elbow.bound)):
+        assert run("evaluate", file, elbow.model, "--json", tmp_path / name, "--poses", 3) == 0
+    first, second = (json.loads((tmp_path / name).read_text()) for name in ("rig", "bound"))
+    assert first == second and first["linear"]["mean"] > 0.1
+
+
+def test_the_table(elbow, tmp_path, capfd):
+    arguments = ["--json", tmp_path / "e.json", "--poses", 3, "--action", "elbow_wave"]
+    assert run("evaluate", elbow.rig, elbow.model, *arguments) == 0
+    captured = capfd.readouterr()
+    report = json.loads((tmp_path / "e.json").read_text())
+    for values in (report, report["actions"][0]):
+        for way, label in (("linear", "linear layer"), ("fdda", "FDDA")):
+            row = "".join(f"{values[way][name]:>10.4f}" for name in STATISTICS)
+            assert f"  {label:<22}{row}" in captured.out
+    assert "evaluation: 33 of 33, " in captured.err
+
+
+def pixels(path) -> np.ndarray:
+    """(height, width, 4) float32 of a picture."""
+    image = bpy.data.images.load(str(path))
+    values = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(values)
+    return values.reshape(image.size[1], image.size[0], 4)
+
+
+def test_heat_map(elbow, tmp_path):
+    path = tmp_path / "heat.png"
+    arguments = ["--json", tmp_path / "e.json", "--poses", 5, "--heatmap", path]
+    assert run("evaluate", elbow.rig, elbow.model, *arguments) == 0
+    assert path.read_bytes().startswith(b"\x89PNG")
+    picture = pixels(path)[..., :3]
+    assert min(picture.shape[:2]) > 300
+    # Green where there is no error, and colours of the scale that are not: the linear layer is off by millimetres.
+    green = (picture[..., 1] > 1.5 * picture[..., 0]) & (picture[..., 1] > 1.5 * picture[..., 2])
+    blue = picture[..., 2] > 1.3 * picture[..., 1]
+    assert green.mean() > 0.02 and blue.mean() > 0.02
+    assert len(np.unique((picture * 16).astype(int).reshape(-1, 3), axis=0)) > 30
+
+
+def test_benchmark(elbow, tmp_path, capfd):
+    path = tmp_path / "b.json"
+    assert run("benchmark", elbow.rig, elbow.model, "--json", path, "--frames", 12) == 0
+    report = json.loads(path.read_text())
+    ways = ["rig", "linear", "fdda", "floor", "inference"]
+    assert list(report) == ["unit", "vertices", "frames", "blender", "processor", "cores", *ways, "ratio"]
+    assert (report["unit"], report["vertices"], report["frames"]) == ("ms", 300, 15)
+    assert report["blender"] == bpy.app.version_string
+    for way in ways:
+        assert 0 < report[way]["median"] <= report[way]["p90"]
+    assert report["linear"]["median"] < report["rig"]["median"]
+    assert report["ratio"] == pytest.approx(report["rig"]["median"] / report["fdda"]["median"], rel=0.05)
+    out = capfd.readouterr().out
+    assert f"FDDA is {report['ratio']:.2f} times as fast as the rig." in out
+    assert ("It is not worth it here" in out) == (report["ratio"] < 1)
