@@ -82,7 +82,7 @@ def draw_comparison(
     rows = []
     for pose in poses:
         linear = layer.positions(pose.pose_matrices[None])[0]
-        fdda = network.positions(pose.pose_matrices[None])[0]
+        fdda = network.positions(pose.pose_matrices[None])[0].copy()
         cells = [(pose.positions, f"{pose.name}: true rig"), (linear, "linear layer"), (fdda, "FDDA")]
         rows.append([_cell(positions, pose.positions, label, heat) for positions, label in cells])
     title = title or ("Distance from the true rig" if heat else "True rig, linear layer and FDDA")

@@ -12,7 +12,7 @@ from fdda_addon.core.skinning import SkinBlock
 from .deformation import Deformation
 from .nodes import Graph
 
-GROUP_FLOATS = 80_000
+GROUP_FLOATS = 30_000
 """A group of its own costs as much time as reading so many constants."""
 MOST_GROUPS = 8
 
@@ -21,7 +21,6 @@ def make_groups(deformation: Deformation) -> list[list[int]]:
     """Cut the partitions, ordered by their number of shapes, into groups such that padding and groups cost least."""
     shapes = deformation.shape_counts()
     order = sorted(range(len(shapes)), key=lambda n: (shapes[n], len(deformation.prepared[n].columns), n))
-    vertices = [len(deformation.partitions[n].vertices) for n in order]
     first = max((network.weights[0].shape[1] for network in deformation.networks), default=0)
 
     def cost(start: int, end: int) -> float:
@@ -29,7 +28,7 @@ def make_groups(deformation: Deformation) -> list[list[int]]:
         most = max(shapes[n] for n in members) + 1
         inputs = max(len(deformation.prepared[n].columns) for n in members)
         last = max(deformation.networks[n].weights[-1].shape[0] for n in members)
-        padded = len(members) * (inputs * first + last * most) + 3 * most * sum(vertices[start:end])
+        padded = len(members) * (inputs * first + last * most)
         return GROUP_FLOATS + padded
 
     # The cheapest way to cut the first `end` partitions, for every number of groups.
@@ -67,20 +66,23 @@ def add_playback(graph: Graph, inputs: str, trust: str, deformation: Deformation
     by_partition = graph.add("Transpose", [trusted], "turns_by_partition", perm=[1, 0, 2, 3])
     names = [f"turns_{number}" for number in range(len(groups))]
     turns_of = graph.split(by_partition, [len(group) for group in groups], names, axis=0)
-    blocks = []
+    by_row = graph.add("Transpose", [POSE_INPUT], "pose_by_row", perm=[0, 2, 1, 3])
+    by_row = graph.reshape(by_row, [0, 4, 4 * len(rig.joints)], "pose_rows")
+    everything = [graph.slice(by_row, 0, 3, 1, "linear_rows")]
     for number, group in enumerate(groups):
         coefficients = _networks(graph, inputs, deformation, group, f"_{number}")
-        blocks += _products(graph, coefficients, turns_of[number], flat, deformation, group, f"_{number}")
-    joined = graph.add("Concat", blocks, "blocks", axis=3) if len(blocks) > 1 else blocks[0]
-    by_vertex = graph.add("Transpose", [joined], "positions_by_partition", perm=[0, 1, 3, 2])
-    by_vertex = graph.reshape(by_vertex, [-1, rig.vertex_count, 3], "positions_in_a_row")
+        everything.append(_residual_rows(graph, coefficients, turns_of[number], deformation, group, f"_{number}"))
+    joined = graph.add("Concat", everything, "all_rows", axis=2)
+    blocks = _blocks(graph, joined, deformation, groups)
+    joined = graph.add("Concat", blocks, "blocks", axis=2) if len(blocks) > 1 else blocks[0]
+    by_vertex = graph.add("Transpose", [joined], "positions_by_partition", perm=[0, 2, 1])
     position_of = np.argsort(np.concatenate([deformation.partitions[n].vertices for n in order]))
     graph.add("Gather", [by_vertex, graph.integers("vertex_order", position_of)], POSITIONS_OUTPUT, axis=1)
 
 
 def _networks(graph: Graph, inputs: str, deformation: Deformation, group: list[int], suffix: str) -> str:
     """(Pg, N, 1, K + 1) coefficients of a group in metres, padded; the last of each partition is 1, for the mean."""
-    shapes = max(deformation.shape_counts()[n] for n in group)
+    shapes = _most_shapes(deformation, group) - 1
     learned = [n for n in group if deformation.shape_counts()[n]]
     if not learned:
         layers, widths = 1, [0]
@@ -124,52 +126,61 @@ def _activation(graph: Graph, value: str, activation: str, output: str) -> str:
     return graph.add({"tanh": "Tanh", "relu": "Relu"}[activation], [value], output)
 
 
-def _products(
-    graph: Graph, coefficients: str, turns: str, flat: str, deformation: Deformation, group: list[int], suffix: str
-) -> list[str]:
-    """(1, N, 3, Vp) positions of each partition of a group.
+def _residual_rows(
+    graph: Graph, coefficients: str, turns: str, deformation: Deformation, group: list[int], suffix: str
+) -> str:
+    """(N, 3, Pg * 3 * (K + 1)) the rows t c_k P_m and t P_m of all partitions of a group, padded.
 
     Args:
         coefficients: (Pg, N, 1, K + 1).
         turns: (Pg, N, 9, 1), the 3x3 of the main joints' poses, times trust.
-        flat: (N, 16 J) poses.
     """
-    shapes = max(deformation.shape_counts()[n] for n in group) + 1
-    skins = [SkinBlock(deformation.rig, deformation.partitions[n]) for n in group]
-    most_joints = max(len(skin.joints) for skin in skins)
+    shapes = _most_shapes(deformation, group)
     turned = graph.add("Mul", [turns, coefficients], f"turned{suffix}")
-    turned = graph.reshape(turned, [0, -1, 3, 3 * shapes], f"residual_rows{suffix}")
-    elements = np.zeros((len(group), 3, 4 * most_joints), np.int64)
-    for place, skin in enumerate(skins):
-        own = (16 * skin.joints[:, None] + np.arange(4)).ravel()
-        elements[place, :, : len(own)] = own + 4 * np.arange(3)[:, None]
-    linear = graph.add("Gather", [flat, graph.integers(f"skin_elements{suffix}", elements)], f"skin{suffix}", axis=1)
-    linear = graph.add("Transpose", [linear], f"linear_rows{suffix}", perm=[1, 0, 2, 3])
-    rows = graph.add("Concat", [linear, turned], f"rows{suffix}", axis=3)
-    names = [f"rows{suffix}_{place}" for place in range(len(group))]
-    parts = graph.split(rows, [1] * len(group), names, axis=0)
+    turned = graph.reshape(turned, [0, -1, 3, 3 * shapes], f"turned_rows{suffix}")
+    turned = graph.add("Transpose", [turned], f"rows_of_group{suffix}", perm=[1, 2, 0, 3])
+    return graph.reshape(turned, [0, 3, len(group) * 3 * shapes], f"residual_rows{suffix}")
+
+
+def _most_shapes(deformation: Deformation, group: list[int]) -> int:
+    """Shapes of the partitions of a group, padded, and one more for the mean."""
+    return max(deformation.shape_counts()[n] for n in group) + 1
+
+
+def _blocks(graph: Graph, rows: str, deformation: Deformation, groups: list[list[int]]) -> list[str]:
+    """(N, 3, Vp) positions of each partition, in the order of the groups.
+
+    Args:
+        rows: (N, 3, 4 J + all residual rows), the poses and then the groups one after the other. Each partition takes
+            from them exactly what its matrix needs: the matrices are most of what a frame reads, and are not padded.
+    """
+    start = 4 * len(deformation.rig.joints)
+    columns, matrices = [], []
+    for group in groups:
+        shapes = _most_shapes(deformation, group)
+        for n in group:
+            skin, own = SkinBlock(deformation.rig, deformation.partitions[n]), deformation.shape_counts()[n]
+            # Rows of the turned shapes lie as 3 x (K + 1); the mean is the last of the padded ones.
+            kept = np.append(np.arange(own), shapes - 1)
+            residual = start + (np.arange(3)[:, None] * shapes + kept).ravel()
+            columns.append(np.concatenate([(4 * skin.joints[:, None] + np.arange(4)).ravel(), residual]))
+            matrices.append((n, _matrix(deformation, n, skin)))
+            start += 3 * shapes
+    chosen = graph.add("Gather", [rows, graph.integers("row_columns", np.concatenate(columns))], "rows", axis=2)
+    parts = graph.split(chosen, [len(own) for own in columns], [f"rows_{n}" for n, _ in matrices], axis=2)
     return [
         graph.add("MatMul", [part, graph.floats(f"matrix_{n}", matrix)], f"block_{n}")
-        for part, n, matrix in zip(parts, group, _matrices(deformation, group, skins, most_joints, shapes), strict=True)
+        for part, (n, matrix) in zip(parts, matrices, strict=True)
     ]
 
 
-def _matrices(
-    deformation: Deformation, group: list[int], skins: list[SkinBlock], most_joints: int, shapes: int
-) -> list[np.ndarray]:
-    """(4 Jg + 3 (K + 1), Vp) constant matrix of each partition, padded as its rows are."""
+def _matrix(deformation: Deformation, n: int, skin: SkinBlock) -> np.ndarray:
+    """(4 Jp + 3 (K + 1), Vp) float64 constant matrix of a partition."""
     inverse_rest = np.linalg.inv(deformation.rig.rest_matrices.astype(np.float64))
-    matrices = []
-    for n, skin in zip(group, skins, strict=True):
-        partition, basis = deformation.partitions[n], deformation.prepared[n].basis
-        count, own = len(partition.vertices), len(basis.shapes)
-        matrix = np.zeros((4 * most_joints + 3 * shapes, count))
-        weighted = skin.weighted_rest.reshape(len(skin.joints), 4, -1).astype(np.float64)
-        matrix[: 4 * len(skin.joints)] = (inverse_rest[skin.joints] @ weighted).reshape(-1, count)
-        local = np.zeros((shapes, count, 3))
-        local[:own] = basis.shapes.reshape(own, count, 3)
-        local[-1] = basis.mean.reshape(count, 3)
-        turned = np.einsum("ab,kvb->akv", inverse_rest[partition.joint, :3, :3], local)
-        matrix[4 * most_joints :] = turned.reshape(-1, count)
-        matrices.append(matrix)
-    return matrices
+    partition, basis = deformation.partitions[n], deformation.prepared[n].basis
+    count, own = len(partition.vertices), len(basis.shapes)
+    weighted = skin.weighted_rest.reshape(len(skin.joints), 4, -1).astype(np.float64)
+    linear = (inverse_rest[skin.joints] @ weighted).reshape(-1, count)
+    local = np.concatenate([basis.shapes.reshape(own, count, 3), basis.mean.reshape(1, count, 3)])
+    turned = np.einsum("ab,kvb->akv", inverse_rest[partition.joint, :3, :3], local)
+    return np.concatenate([linear, turned.reshape(-1, count)])

@@ -12,6 +12,8 @@ from ..core.model import POSE_INPUT, POSITIONS_OUTPUT, read_model
 THREADED_VERTICES = 20_000
 """From this many vertices on a second thread gains more than it costs."""
 MAX_THREADS = 4
+MAX_BOUND = 4
+"""Numbers of poses for which arrays are kept."""
 
 
 class Network:
@@ -49,6 +51,7 @@ class Network:
             raise ModelError(
                 f"ONNX Runtime refuses the model '{path}' ({_first_line(error)}); train it again."
             ) from error
+        self._bound: dict[int, tuple] = {}
 
     def positions(self, pose_matrices: np.ndarray) -> np.ndarray:
         """Deform the mesh.
@@ -57,19 +60,33 @@ class Network:
             pose_matrices: (N, J, 4, 4) float32, mesh-object space, metres.
 
         Returns:
-            (N, V, 3) float32, mesh-object space, metres.
+            (N, V, 3) float32, mesh-object space, metres. The array is the network's own: the next call with as many
+            poses writes into it, so that a frame needs no new memory.
 
         Raises:
             ModelError: the model fails or answers in another shape.
         """
+        count = len(pose_matrices)
+        if count not in self._bound:
+            if len(self._bound) >= MAX_BOUND:
+                self._bound.clear()
+            self._bound[count] = self._bind(count)
+        binding, poses, positions = self._bound[count]
+        poses[:] = pose_matrices
         try:
-            (positions,) = self._session.run([POSITIONS_OUTPUT], {POSE_INPUT: pose_matrices})
+            self._session.run_with_iobinding(binding)
         except Exception as error:  # As above.
             raise ModelError(f"The model '{self.path}' failed ({_first_line(error)}); train it again.") from error
-        expected = (len(pose_matrices), self.info.vertex_count, 3)
-        if positions.shape != expected or positions.dtype != np.float32:
-            raise ModelError(f"The model '{self.path}' answers {positions.shape}, not {expected}; train it again.")
         return positions
+
+    def _bind(self, count: int) -> tuple[object, np.ndarray, np.ndarray]:
+        """Arrays that the session reads from and writes into, and their binding."""
+        poses = np.zeros((count, len(self.info.joints), 4, 4), np.float32)
+        positions = np.empty((count, self.info.vertex_count, 3), np.float32)
+        binding = self._session.io_binding()
+        binding.bind_input(POSE_INPUT, "cpu", 0, np.float32, poses.shape, poses.ctypes.data)
+        binding.bind_output(POSITIONS_OUTPUT, "cpu", 0, np.float32, positions.shape, positions.ctypes.data)
+        return binding, poses, positions
 
 
 def _first_line(error: Exception) -> str:

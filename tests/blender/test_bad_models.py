@@ -219,7 +219,7 @@ def answer_fewer(model) -> None:
 def test_a_model_that_answers_another_shape(elbow, tmp_path):
     """ONNX Runtime may refuse it as it loads, or the add-on when it answers."""
     path = edited(elbow, tmp_path, answer_fewer)
-    with pytest.raises(FDDAError, match=r"refuses the model|answers \(1, 7, 3\), not \(1, 300, 3\)"):
+    with pytest.raises(FDDAError, match=r"refuses the model|invalid dimensions"):
         network = Network(path)
         network.positions(network.info.rest_matrices[None])
 
