@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The pages on the file formats: their code runs on what the verbs write, and their tables name every key."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import run
+
+from fdda_addon.core.messages import MessageType
+from fdda_addon.core.recording import STREAMED, array_shapes
+from fdda_addon.training import trainer_python
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def page(name: str) -> str:
+    return (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
+
+
+def run_code(name: str, folder: Path, python: str = sys.executable) -> str:
+    """Run the only block of code of a page in a folder; returns what it prints."""
+    (code,) = re.findall(r"```python\n(.*?)```", page(name), re.DOTALL)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run(
+        [python, "-W", "error::RuntimeWarning", "-c", code],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def folder(elbow, tmp_path_factory) -> Path:
+    """The files of the elbow under the names that the pages use."""
+    folder = tmp_path_factory.mktemp("documents")
+    (folder / "recording").symlink_to(elbow.recording)
+    (folder / "model.onnx").write_bytes(elbow.model.read_bytes())
+    for verb, name in (("evaluate", "evaluation.json"), ("benchmark", "benchmark.json")):
+        count = ("--poses", 5) if verb == "evaluate" else ("--frames", 5)
+        assert run(verb, elbow.rig, elbow.model, "--json", folder / name, *count) == 0
+    return folder
+
+
+def test_recording_code(folder):
+    """Mean residual of the recording's first pose, as the core computes it."""
+    from fdda_addon.core.metrics import distances
+    from fdda_addon.core.recording import read_recording
+    from fdda_addon.core.skinning import LinearLayer
+
+    recording = read_recording(folder / "recording")
+    layer, pose = LinearLayer(recording.rig), recording.pose_matrices[:1]
+    expected = distances(layer.complex_positions(pose, recording.residuals[:1]), layer.positions(pose)).mean() * 1000
+    shape, value = re.fullmatch(r"(\(300, 3\)) mean residual (\S+) mm\n", run_code("recording", folder)).groups()
+    assert shape and float(value) == pytest.approx(expected, rel=1e-3)
+
+
+def test_model_code(folder):
+    assert run_code("model", folder).startswith("['upper', 'lower'] (2, 300, 3) [1. ")
+
+
+def test_evaluation_code(folder):
+    lines = run_code("evaluation", folder).splitlines()
+    report = json.loads((folder / "evaluation.json").read_text())
+    assert lines[0].startswith(f"mean {report['fdda']['mean']:.3f} mm, linear layer ")
+    assert lines[1].startswith("largest error: ")
+
+
+def test_messages_code(folder, tmp_path):
+    (tmp_path / "recording").symlink_to(folder / "recording")
+    lines = run_code("messages", tmp_path, trainer_python()).splitlines()
+    assert len(lines) == 3 and lines[1].startswith("2/2: ") and lines[2] == "finished 0"
+
+
+def dotted(value: dict, prefix: str = "") -> set[str]:
+    """Names of all keys, `a.b` for those inside."""
+    found = set()
+    for key, inner in value.items():
+        found |= dotted(inner, f"{prefix}{key}.") if isinstance(inner, dict) else {prefix + key}
+    return found
+
+
+def named(text: str, key: str) -> bool:
+    """Whether a page has a key in code: its whole dotted name, or its first and last part."""
+    parts = key.split(".")
+    text = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    words = set(re.findall(r"[a-z_0-9]+(?:\.[a-z_0-9]+)*", " ".join(re.findall(r"`([^`]+)`", text))))
+    return key in words or ((parts[0] in words or ".".join(parts[:-1]) in words) and parts[-1] in words)
+
+
+def test_recording_page_names_every_key_and_array(folder):
+    text = page("recording")
+    index = json.loads((folder / "recording" / "recording.json").read_text())
+    keys = dotted(index) | {key for name in ("joints", "partitions") for key in index[name][0]}
+    keys |= {key for name in ("limits", "sources") for key in index["sampling"][name][0]}
+    assert [key for key in sorted(keys) if not named(text, key)] == []
+    assert [name for name in array_shapes(1, 1, 1, 1) if f"`{name}.npy`" not in text] == [] and STREAMED
+
+
+def test_model_page_names_every_key(folder):
+    from fdda_addon.core.model import read_model_info
+
+    value = json.loads(read_model_info(folder / "model.onnx").to_json())
+    keys = set(value) | {key for name in ("joints", "partitions") for key in value[name][0]}
+    keys |= set(value["fingerprint"]) | set(value["held_out_mm"]) | set(value["training_ranges"])
+    assert [key for key in sorted(keys) if not named(page("model"), key)] == []
+
+
+@pytest.mark.parametrize("name", ["evaluation", "benchmark"])
+def test_evaluation_page_names_every_key(folder, name):
+    value = json.loads((folder / f"{name}.json").read_text())
+    keys = set(value) | {key for inner in value.values() if isinstance(inner, dict) for key in inner}
+    assert [key for key in sorted(keys) if not named(page("evaluation"), key)] == []
+
+
+def test_messages_page_names_every_type_and_its_keys():
+    text = page("messages")
+    rows = dict(re.findall(r"^\| `(\w+)` \|(.*)$", text, re.MULTILINE))
+    assert rows.pop("type")
+    assert list(rows) == [kind.value for kind in MessageType]
