@@ -29,7 +29,13 @@ from trainer.model import Network
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "seed_arm"
 TRAINING_POSES = 700
 CM = 0.01
-SETTINGS = {"hidden": (256, 256), "batch_size": 32, "weight_decay": 1.0, "validation_fraction": 0.05}
+SETTINGS = {
+    "hidden": (256, 256),
+    "batch_size": 32,
+    "weight_decay": 1.0,
+    "tolerance_mm": 0.05,
+    "validation_fraction": 0.05,
+}
 """What differs from the defaults: networks as large as the largest published, and less trust in few, noisy poses."""
 RELU = {
     "wrist": (0.0801, 0.4991),

@@ -8,6 +8,8 @@ import numpy as np
 MOST_POSES = 1000
 """The components come from at most this many poses; the coefficients from all."""
 MOST_SHAPES = 128
+WORTHWHILE = 0.01
+"""Shapes stop here too, as a part of the rms residual: below it networks err far more than the shapes leave."""
 COLUMN_BLOCK = 1 << 14
 """The Gram matrix is summed up over blocks of this many columns, so that float64 costs little memory."""
 
@@ -66,7 +68,7 @@ def make_basis(residuals: np.ndarray, tolerance: float, rng: np.random.Generator
     values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1]
     # What is left after the first k components, as an rms over poses and vertices.
     left = np.sqrt(np.append(np.cumsum(values[::-1])[::-1], 0) / (count * width / 3))
-    shapes_needed = min(int(np.argmax(left <= tolerance)), MOST_SHAPES)
+    shapes_needed = min(int(np.argmax(left <= max(tolerance, WORTHWHILE * left[0]))), MOST_SHAPES)
     vectors = vectors[:, :shapes_needed]
     if by_pose:
         centre = vectors.sum(axis=0)[:, None] * mean
