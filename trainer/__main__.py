@@ -21,6 +21,8 @@ INTERRUPTED = 130
 # Threads of OpenMP that wait by spinning make training ten times slower on a machine that is busy with something else,
 # and no faster on one that is not. Read when torch loads.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# Half the processors: the networks are small, and a second thread on two busy processors costs far more than it brings.
+os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 2) // 2)))
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from chain import write_chain
 
+from trainer.__main__ import main  # first of all: it says how threads wait, which torch reads when it loads
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 QUICK = ("--epochs", "40", "--hidden", "24", "24", "--batch-size", "16")
 
@@ -38,8 +40,6 @@ def recording(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def trained(recording, tmp_path_factory) -> Path:
     """Folder of a finished training of the chain: model.onnx, report.json, report.html; read only."""
-    from trainer.__main__ import main
-
     folder = tmp_path_factory.mktemp("trained")
     assert main([str(recording), str(folder / "model.onnx"), *QUICK]) == 0
     return folder
