@@ -73,7 +73,7 @@ class LiveBinding:
             FDDAError: the mesh or the armature no longer fits the model.
         """
         armature_object = _armature(mesh_object)
-        if armature_object.session_uid != self.armature_uid:
+        if armature_object.session_uid != self.armature_uid or not self._reader.fits(armature_object):
             self._reader, self.armature_uid = self._make_reader(mesh_object), armature_object.session_uid
         evaluated_mesh = mesh_object.evaluated_get(depsgraph)
         evaluated_armature = armature_object.evaluated_get(depsgraph)
@@ -121,6 +121,10 @@ class LiveBinding:
             # The rest pose of the model: the objects may have moved since, and pose matrices refer to it.
             self._linear_layer = LinearLayer(replace(rig, rest_matrices=self.network.info.rest_matrices))
         return self._linear_layer.positions(pose_matrices[None])[0]
+
+
+_Job = tuple[LiveBinding, bpy.types.Object, np.ndarray, float]
+"""An object to move: its pose matrices and its strength, 0 for the linear layer alone."""
 
 
 def load_network(path: Path) -> Network:
@@ -192,21 +196,23 @@ def evaluate(depsgraph: bpy.types.Depsgraph) -> None:
     """
     _scan()
     rendering = depsgraph.mode == "RENDER"
-    jobs: dict[Network, list[tuple[LiveBinding, bpy.types.Object, np.ndarray]]] = {}
+    jobs: dict[Network, list[_Job]] = {}
     for uid, live in list(_live.items()):
         mesh_object = live.find()
         if mesh_object is None:
             del _live[uid]
             continue
         binding = mesh_object.fdda
-        if binding.mode == "RIG" or (rendering and not binding.use_in_render):
+        mode = binding.mode
+        if mode == "RIG" or (rendering and not binding.use_in_render):
             continue
+        strength = binding.strength if mode == "FDDA" else 0.0
         with _failing(mesh_object):
             pose = live.read_pose(mesh_object, depsgraph)
-            if pose is not None and not live.is_shown((pose.tobytes(), binding.mode, binding.strength)):
-                jobs.setdefault(live.network, []).append((live, mesh_object, pose))
-    for network, members in jobs.items():
-        _move(network, members)
+            if pose is not None and not live.is_shown((pose.tobytes(), strength)):
+                jobs.setdefault(live.network, []).append((live, mesh_object, pose, strength))
+    for network, own in jobs.items():
+        _move(network, own)
 
 
 @contextmanager
@@ -229,17 +235,15 @@ def _positions(network: Network, pose_matrices: np.ndarray) -> np.ndarray:
     return _constants[key]
 
 
-def _move(network: Network, members: list[tuple[LiveBinding, bpy.types.Object, np.ndarray]]) -> None:
+def _move(network: Network, jobs: list[_Job]) -> None:
     try:
-        positions = _positions(network, np.array([pose for _, _, pose in members]))
+        positions = _positions(network, np.array([pose for _, _, pose, _ in jobs]))
     except FDDAError as error:
-        for _, mesh_object, _ in members:
+        for _, mesh_object, _, _ in jobs:
             fail(mesh_object, error)
         return
-    for (live, mesh_object, pose), moved in zip(members, positions, strict=True):
-        binding = mesh_object.fdda
+    for (live, mesh_object, pose, strength), moved in zip(jobs, positions, strict=True):
         with _failing(mesh_object):
-            strength = binding.strength if binding.mode == "FDDA" else 0.0
             if strength < 1:
                 linear = live.linear_positions(mesh_object, pose)
                 moved = linear + np.float32(strength) * (moved - linear)

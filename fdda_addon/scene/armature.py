@@ -16,27 +16,32 @@ def rest_matrices(armature: bpy.types.Armature, names: tuple[str, ...]) -> np.nd
     return np.array([armature.bones[name].matrix_local for name in names], np.float64).reshape(-1, 4, 4)
 
 
-def pose_matrices(armature_object: bpy.types.Object, order: np.ndarray) -> np.ndarray:
-    """Pose matrices of an evaluated armature object.
+class PoseMatrices:
+    """Reads the pose matrices of some bones of an armature, again and again."""
 
-    Args:
-        armature_object: evaluated.
-        order: (J,) indices into its pose bones.
+    def __init__(self, armature_object: bpy.types.Object, names: tuple[str, ...]):
+        """Args:
+        armature_object: whose bones are meant.
+        names: J bones. KeyError for a name that is not there.
+        """
+        index = {bone.name: number for number, bone in enumerate(armature_object.pose.bones)}
+        order = np.array([index[name] for name in names], np.int32)
+        in_a_row = np.array_equal(order, np.arange(len(order)))
+        self._order = slice(0, len(order)) if in_a_row else order
+        self._flat = np.empty(len(index) * 16, np.float32)
 
-    Returns:
-        (J, 4, 4) float32, armature space, metres.
-    """
-    bones = armature_object.pose.bones
-    flat = np.empty(len(bones) * 16, np.float32)
-    bones.foreach_get("matrix", flat)
-    # Blender keeps matrices column by column.
-    return flat.reshape(-1, 4, 4).transpose(0, 2, 1)[order]
+    def fits(self, armature_object: bpy.types.Object) -> bool:
+        """Whether the armature still has as many bones."""
+        return len(armature_object.pose.bones) * 16 == len(self._flat)
 
+    def read(self, armature_object: bpy.types.Object) -> np.ndarray:
+        """Pose matrices of an evaluated armature object, (J, 4, 4) float32, armature space, metres.
 
-def bone_order(armature_object: bpy.types.Object, names: tuple[str, ...]) -> np.ndarray:
-    """Indices of bones in the order of `pose.bones`; KeyError for a name that is not there."""
-    index = {bone.name: number for number, bone in enumerate(armature_object.pose.bones)}
-    return np.array([index[name] for name in names], np.int32)
+        A view of memory that the next call writes into. Bones must not have come or gone (`fits`).
+        """
+        armature_object.pose.bones.foreach_get("matrix", self._flat)
+        # Blender keeps matrices column by column.
+        return self._flat.reshape(-1, 4, 4)[self._order].transpose(0, 2, 1)
 
 
 def channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Channel, ...]:

@@ -205,24 +205,28 @@ class PoseReader:
         names: J joints. KeyError when the armature lacks one.
         rest_matrices: (J, 4, 4), the joints' rest pose in mesh-object space.
         """
-        self._order = armature_io.bone_order(scene_rig.armature_object, names)
+        self._matrices = armature_io.PoseMatrices(scene_rig.armature_object, names)
         self._rest = rest_matrices.astype(np.float64)
         self._bone_rest = armature_io.rest_matrices(scene_rig.armature_object.data, names)
         self._relation: Matrix | None = None
         self._left: np.ndarray | None = None
         self._right: np.ndarray | None = None
 
+    def fits(self, armature_object: bpy.types.Object) -> bool:
+        """Whether the armature still has as many bones as when this reader was made."""
+        return self._matrices.fits(armature_object)
+
     def read(self, mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
         """Pose matrices of evaluated objects: (J, 4, 4) float32, mesh-object space, metres."""
         relation = _relation(mesh_object, armature_object)
         if relation != self._relation:
             self._set_relation(relation)
-        pose = armature_io.pose_matrices(armature_object, self._order)
+        pose = self._matrices.read(armature_object)
         if self._left is not None:
             pose = self._left @ pose
         if self._right is not None:
             pose = pose @ self._right
-        return pose.astype(np.float32, copy=False)
+        return np.array(pose, np.float32, order="C")
 
     def _set_relation(self, relation: Matrix) -> None:
         """Prepare P = T pose inv(T bone_rest) rest; a factor that is the identity is None."""

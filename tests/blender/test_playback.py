@@ -216,6 +216,17 @@ def test_renamed_bone_is_reported(bound, elbow):
     assert "lacks the joint 'lower'" in bpy.data.objects[ELBOW].fdda.status
 
 
+def test_a_bone_that_is_added(bound, elbow):
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    bpy.context.view_layer.objects.active = armature_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    bone = armature_object.data.edit_bones.new("a_prop")
+    bone.tail = (0, 0, 0.1)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    pose(angle=0.8)
+    assert_plays(bound, elbow.model)
+
+
 def test_removed_modifier_is_reported(bound):
     bound.modifiers.remove(nodes.find_modifier(bound))
     pose(angle=1.0)
