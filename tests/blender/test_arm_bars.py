@@ -13,9 +13,11 @@ from fdda_addon import demo
 
 MEAN_BAR, MAX_BAR = 0.08, 0.25
 """Held-out errors of the model as parts of the linear layer's."""
+SPEED_BAR = 4.0
+"""A frame of the denser arm is to be so many times as fast as its rig's."""
 SPEED_FLOOR = 3.0
-"""A frame of the denser arm is at least so many times as fast as its rig's, also on a busy machine. The aim is 4;
-docs/benchmarks.md has what is reached."""
+"""What no version may fall below; docs/benchmarks.md has what is reached."""
+SPEED_RUNS = 3
 
 
 @pytest.fixture(scope="module")
@@ -86,13 +88,26 @@ def test_bound_file_plays(made):
         assert_plays(mesh_object, made / "arm.onnx")
 
 
-def test_frame_of_the_denser_arm(tmp_path):
-    """A whole frame with the model takes a fraction of the rig's."""
-    rig, recording, model = tmp_path / "arm.blend", tmp_path / "recording", tmp_path / "arm.onnx"
+@pytest.fixture(scope="module")
+def speed(tmp_path_factory: pytest.TempPathFactory) -> float:
+    """How many times as fast a frame of the denser arm is with a model: the median of some benchmarks."""
+    folder = tmp_path_factory.mktemp("denser")
+    rig, recording, model, times = (folder / name for name in ("arm.blend", "recording", "arm.onnx", "times.json"))
     assert run("build-arm", rig, "--density", 2) == 0
     # The cost of a frame depends on the size of the model, not on how long it was trained.
     assert run("record", rig, recording, "--poses", 400) == 0
     assert run("train", recording, model, "--epochs", 3) == 0
-    assert run("benchmark", rig, model, "--json", tmp_path / "times.json") == 0
-    times = json.loads((tmp_path / "times.json").read_text())
-    assert times["ratio"] >= SPEED_FLOOR
+    ratios = []
+    for _ in range(SPEED_RUNS):
+        assert run("benchmark", rig, model, "--json", times) == 0
+        ratios.append(json.loads(times.read_text())["ratio"])
+    return float(np.median(ratios))
+
+
+@pytest.mark.xfail(bpy.app.version >= (5, 0), reason="3.8 on 5.2: docs/benchmarks.md, what falls short", strict=False)
+def test_frame_of_the_denser_arm_takes_a_quarter(speed):
+    assert speed >= SPEED_BAR
+
+
+def test_frame_of_the_denser_arm_never_falls_far_behind(speed):
+    assert speed >= SPEED_FLOOR
