@@ -13,10 +13,12 @@ def register() -> None:
         return
     import bpy
 
-    from . import properties
+    from . import operators, panels, properties
     from .runtime import handlers
 
     properties.register()
+    operators.register()
+    panels.register()
     handlers.register()
     _cli_command = bpy.utils.register_cli_command("fdda", _run_command)
     atexit.register(unregister)
@@ -34,13 +36,15 @@ def unregister() -> None:
         return
     import bpy
 
-    from . import properties
+    from . import operators, panels, properties
     from .runtime import handlers
 
     atexit.unregister(unregister)
     bpy.utils.unregister_cli_command(_cli_command)
     _cli_command = None
     handlers.unregister()
+    panels.unregister()
+    operators.unregister()
     properties.unregister()
 
 
