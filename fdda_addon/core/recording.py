@@ -17,6 +17,7 @@ from .errors import RecordingError
 from .partition import Partition, make_partitions
 from .poses import Channel
 from .rig import Fingerprint, Joint, Rig
+from .surface import LEAST_CORNERS, are_faces
 
 FORMAT = "fdda-recording"
 VERSION = 1
@@ -94,8 +95,17 @@ class Recording:
     residuals: np.ndarray
 
 
-def array_shapes(poses: int, joints: int, vertices: int, influences: int) -> dict[str, tuple[tuple, type]]:
-    """Shape and dtype of each array of a recording, by name; `influences` is I of the skin weights."""
+def array_shapes(
+    poses: int, joints: int, vertices: int, influences: int, faces: int = 0, corners: int = 0
+) -> dict[str, tuple[tuple, type]]:
+    """Shape and dtype of each array of a recording, by name.
+
+    Args:
+        poses, joints, vertices: how many.
+        influences: I of the skin weights.
+        faces, corners: how many; without faces there are no arrays of them.
+    """
+    of_faces = {"face_starts": ((faces,), np.int32), "face_vertices": ((corners,), np.int32)}
     return {
         "rest_positions": ((vertices, 3), np.float32),
         "rest_matrices": ((joints, 4, 4), np.float32),
@@ -103,6 +113,7 @@ def array_shapes(poses: int, joints: int, vertices: int, influences: int) -> dic
         "skin_weights": ((vertices, influences), np.float32),
         "pose_matrices": ((poses, joints, 4, 4), np.float32),
         "residuals": ((poses, vertices, 3), np.float32),
+        **(of_faces if faces else {}),
     }
 
 
@@ -150,6 +161,11 @@ def _check_index(index: dict) -> None:
             raise ValueError(f"'{key}' is {index[key]!r}")
     if index["complete"] > index["poses"] or not index["vertices"] or not index["influences"]:
         raise ValueError("its counts contradict each other")
+    for key in ("faces", "corners"):
+        if type(index.get(key, 0)) is not int or index.get(key, 0) < 0:
+            raise ValueError(f"'{key}' is {index[key]!r}")
+    if index.get("corners", 0) < LEAST_CORNERS * index.get("faces", 0):
+        raise ValueError(f"{index['faces']} faces cannot have {index.get('corners', 0)} corners")
     if index["controls"] != []:
         raise ValueError("it has controls, which this version does not know")
     for text in (index["blender"], index["rig"]["file"], index["rig"]["object"]):
@@ -191,15 +207,21 @@ def read_recording(path: Path) -> Recording:
             f"The recording '{path}' is incomplete: {index['complete']} of {index['poses']} poses; "
             "finish it with record --resume."
         )
-    shapes = array_shapes(index["poses"], len(index["joints"]), index["vertices"], index["influences"])
+    shapes = array_shapes(
+        *(index["poses"], len(index["joints"]), index["vertices"], index["influences"]),
+        *(index.get(key, 0) for key in ("faces", "corners")),
+    )
     arrays = {name: _open_array(path / f"{name}.npy", *what) for name, what in shapes.items()}
     joints = tuple(Joint(joint["name"], joint["parent"]) for joint in index["joints"])
     rig = Rig(
         joints,
         *(np.array(arrays[name]) for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights")),
         Fingerprint(**index["rig"]["fingerprint"]),
+        *(np.array(arrays[name]) for name in ("face_starts", "face_vertices") if name in arrays),
     )
     _check_skin(path, rig)
+    if not are_faces(rig.face_starts, rig.face_vertices, rig.vertex_count):
+        raise RecordingError(f"The faces of '{path}' are damaged; record again.")
     for name in STREAMED:
         _check_finite(path, name, arrays[name])
     partitions = make_partitions(rig, {p["joint"]: tuple(p["influencing"]) for p in index["partitions"]})

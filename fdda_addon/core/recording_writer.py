@@ -43,6 +43,7 @@ class RecordingWriter:
         """
         self.path, self.rig, self.partitions, self.info = path, rig, partitions, info
         self.complete = 0
+        self._faces, self._corners = len(rig.face_starts), len(rig.face_vertices)
         self._files: dict[str, io.BufferedRandom] = {}
         self._is_new = not os.path.exists(path / INDEX)
         self._new_folders = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
@@ -68,7 +69,11 @@ class RecordingWriter:
 
     def _check_resumable(self) -> int:
         """How many poses of the recording at `path` are complete, once it is sure that it is one of this rig."""
-        previous, own = read_index(self.path), self._index()
+        previous = read_index(self.path)
+        # A recording of a version that did not write the faces stays without them.
+        if "faces" not in previous:
+            self._faces = self._corners = 0
+        own = self._index()
         if different := [key for key in _different_keys(previous, own) if key != "complete"]:
             raise RecordingError(
                 f"Cannot resume '{self.path}': it was recorded with another {', '.join(different)}; "
@@ -77,8 +82,10 @@ class RecordingWriter:
         return previous["complete"]
 
     def _open_arrays(self) -> None:
+        rig = self.rig
         shapes = array_shapes(
-            self.info.poses, len(self.rig.joints), self.rig.vertex_count, self.rig.skin_joints.shape[1]
+            *(self.info.poses, len(rig.joints), rig.vertex_count, rig.skin_joints.shape[1]),
+            *(self._faces, self._corners),
         )
         for name, (shape, dtype) in shapes.items():
             path = self.path / f"{name}.npy"
@@ -121,6 +128,7 @@ class RecordingWriter:
             "complete": self.complete,
             "vertices": self.rig.vertex_count,
             "influences": int(self.rig.skin_joints.shape[1]),
+            **({"faces": self._faces, "corners": self._corners} if self._faces else {}),
             "units": {"length": "m", "angle": "rad"},
             "blender": info.blender,
             "rig": {
@@ -192,7 +200,7 @@ class RecordingWriter:
         """Remove a new recording without a pose, and the folders that were made for it."""
         if not self._is_new or self.complete:
             return
-        shapes = array_shapes(0, 0, 0, 0)
+        shapes = array_shapes(0, 0, 0, 0, 1, 0)
         for path in (self.path / INDEX, *(self.path / f"{name}.npy" for name in shapes)):
             with contextlib.suppress(OSError):
                 path.unlink()

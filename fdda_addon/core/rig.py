@@ -2,7 +2,7 @@
 """The rig as arrays: joints, rest pose and skin weights of one mesh."""
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -50,6 +50,8 @@ class Rig:
         skin_joints: (V, I) int32, indices of the joints that a vertex follows; unused places hold 0.
         skin_weights: (V, I) float32, their weights; each row sums to 1, unused places hold 0.
         fingerprint: of topology, rest positions and weights.
+        face_starts: (F,) int32, where each face starts in `face_vertices`; empty when the faces are not known.
+        face_vertices: (C,) int32, vertex indices of the corners, face by face.
     """
 
     joints: tuple[Joint, ...]
@@ -58,6 +60,8 @@ class Rig:
     skin_joints: np.ndarray
     skin_weights: np.ndarray
     fingerprint: Fingerprint
+    face_starts: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+    face_vertices: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
 
     @property
     def joint_names(self) -> tuple[str, ...]:

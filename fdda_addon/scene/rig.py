@@ -159,12 +159,13 @@ def read_rig(scene_rig: SceneRig) -> Rig:
     skin_joints, skin_weights = mesh_io.skin_weights(mesh_object, {n: i for n, i in index.items() if n in skinning})
     to_mesh = mesh_from_armature(mesh_object, armature_object)
     rest = to_mesh @ armature_io.rest_matrices(armature_object.data, names)
+    faces = mesh_io.topology(mesh_object.data)
     fingerprint = Fingerprint(
-        Fingerprint.digest(*mesh_io.topology(mesh_object.data)),
+        Fingerprint.digest(*faces),
         Fingerprint.digest(rest_positions),
         Fingerprint.digest(skin_joints, skin_weights),
     )
-    return Rig(joints, rest_positions, rest.astype(np.float32), skin_joints, skin_weights, fingerprint)
+    return Rig(joints, rest_positions, rest.astype(np.float32), skin_joints, skin_weights, fingerprint, *faces)
 
 
 def mesh_from_armature(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:

@@ -48,7 +48,15 @@ def make_rig(seed: int = 0) -> Rig:
     positions = rng.uniform(-0.5, 0.5, (VERTICES, 3)).astype(np.float32)
     fingerprint = Fingerprint("limb", Fingerprint.digest(positions), Fingerprint.digest(skin_joints, skin_weights))
     rest = random_transforms(rng, len(JOINTS)).astype(np.float32)
-    return Rig(JOINTS, positions, rest, skin_joints, skin_weights, fingerprint)
+    return Rig(JOINTS, positions, rest, skin_joints, skin_weights, fingerprint, *make_faces())
+
+
+def make_faces() -> tuple[np.ndarray, np.ndarray]:
+    """Starts and vertices of triangles, quads and pentagons in turn, along the vertices."""
+    corners = np.arange(VERTICES // 4) % 3 + 3
+    starts = np.cumsum(corners) - corners
+    first = np.repeat(np.arange(len(corners)) * 3, corners)
+    return starts.astype(np.int32), (first + np.arange(corners.sum()) - np.repeat(starts, corners)).astype(np.int32)
 
 
 def random_poses(count: int, seed: int = 1) -> np.ndarray:

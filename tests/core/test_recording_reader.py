@@ -3,33 +3,13 @@
 
 import json
 import re
-import struct
 
 import numpy as np
 import pytest
+from damage import array_file, edit, refused
 
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.recording import read_index, read_recording
-
-
-def refused(path, *words: str) -> None:
-    with pytest.raises(RecordingError) as error:
-        read_recording(path)
-    for word in words:
-        assert word in str(error.value)
-    assert str(error.value).endswith(".") and "\n" not in str(error.value)
-
-
-def edit(path, **changes) -> None:
-    index = json.loads((path / "recording.json").read_text())
-    index.update(changes)
-    (path / "recording.json").write_text(json.dumps(index))
-
-
-def array_file(header: str | bytes, body: bytes = b"", version: bytes = b"\x01\x00") -> bytes:
-    """The bytes of an npy file with any text as its header."""
-    header = header.encode() if isinstance(header, str) else header
-    return b"\x93NUMPY" + version + struct.pack("<H", len(header)) + header + body
 
 
 def test_no_recording(tmp_path):
@@ -110,7 +90,13 @@ def test_a_seed_that_is_no_number(recording, seed):
     refused(recording, "is damaged")
 
 
-@pytest.mark.parametrize("counts", [{"poses": 10**15}, {"poses": 1 << 62}, {"poses": 10**30}, {"vertices": 1 << 61}])
+@pytest.mark.parametrize(
+    "counts",
+    [
+        *({"poses": 10**15}, {"poses": 1 << 62}, {"poses": 10**30}, {"vertices": 1 << 61}),
+        *({"corners": 1 << 62}, {"faces": 1 << 60, "corners": 1 << 62}),
+    ],
+)
 def test_counts_far_beyond_the_data_allocate_nothing(recording, counts):
     edit(recording, **counts, **({"complete": counts["poses"]} if "poses" in counts else {}))
     refused(recording, "cannot be used: it holds")
@@ -126,16 +112,19 @@ def test_counts_far_beyond_the_data_in_index_and_header(recording):
     refused(recording, "pose_matrices.npy' cannot be used: it is truncated")
 
 
-@pytest.mark.parametrize("name", ["residuals", "pose_matrices", "rest_positions", "skin_joints"])
+@pytest.mark.parametrize(
+    "name", ["residuals", "pose_matrices", "rest_positions", "skin_joints", "face_starts", "face_vertices"]
+)
 def test_truncated(recording, name):
     path = recording / f"{name}.npy"
     path.write_bytes(path.read_bytes()[:-1])
     refused(recording, f"{name}.npy' cannot be used: it is truncated: {path.stat().st_size} of", "record again")
 
 
-def test_missing_array(recording):
-    (recording / "skin_weights.npy").unlink()
-    refused(recording, "skin_weights.npy' cannot be used", "No such file")
+@pytest.mark.parametrize("name", ["skin_weights", "face_starts", "face_vertices"])
+def test_missing_array(recording, name):
+    (recording / f"{name}.npy").unlink()
+    refused(recording, f"{name}.npy' cannot be used", "No such file")
 
 
 @pytest.mark.parametrize("name", ["residuals", "pose_matrices"])
@@ -239,10 +228,11 @@ HEADERS = {
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["residuals", "face_vertices"])
 @pytest.mark.parametrize("header", HEADERS.values(), ids=HEADERS.keys())
-def test_absurd_headers(recording, header):
-    (recording / "residuals.npy").write_bytes(array_file(header, b"\0" * 5760))
-    with pytest.raises(RecordingError, match=re.escape("residuals.npy' cannot be used: ")):
+def test_absurd_headers(recording, name, header):
+    (recording / f"{name}.npy").write_bytes(array_file(header, b"\0" * 5760))
+    with pytest.raises(RecordingError, match=re.escape(f"{name}.npy' cannot be used: ")):
         read_recording(recording)
 
 

@@ -2,6 +2,7 @@
 """Writing a recording: what is written is read back, and an interruption leaves a recording that resumes."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def test_what_is_written_is_read_back(recording):
     assert np.array_equal(read.pose_matrices, random_poses(POSES))
     assert np.array_equal(read.residuals, random_residuals(POSES))
     assert isinstance(read.residuals, np.memmap) and not read.residuals.flags.writeable
-    for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights"):
+    for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights", "face_starts", "face_vertices"):
         assert np.array_equal(getattr(read.rig, name), getattr(rig, name))
         assert getattr(read.rig, name).dtype == getattr(rig, name).dtype
     assert read.rig.joints == JOINTS and read.rig.fingerprint == rig.fingerprint
@@ -45,6 +46,8 @@ def test_arrays_are_plain_npy_files(recording):
     residuals = np.load(recording / "residuals.npy", mmap_mode="r", allow_pickle=False)
     assert residuals.shape == (POSES, 40, 3) and residuals.dtype == np.float32
     assert sorted(files(recording)) == [
+        "face_starts.npy",
+        "face_vertices.npy",
         "pose_matrices.npy",
         "recording.json",
         "residuals.npy",
@@ -132,6 +135,30 @@ def test_resuming_does_not_make_up_poses_that_are_gone(tmp_path, name, damage):
     assert files(tmp_path / "r") == before
 
 
+def test_a_recording_from_before_there_were_faces_resumes_without_them(tmp_path, recording):
+    path = tmp_path / "old"
+    record_limb(path, POSES, 5)
+    index = json.loads((path / "recording.json").read_text())
+    (path / "recording.json").write_text(json.dumps({k: v for k, v in index.items() if k not in ("faces", "corners")}))
+    for name in ("face_starts", "face_vertices"):
+        (path / f"{name}.npy").unlink()
+    record_limb(path, POSES, resume=True)
+    expected = files(recording)
+    del expected["face_starts.npy"], expected["face_vertices.npy"], expected["recording.json"]
+    assert {name: data for name, data in files(path).items() if name != "recording.json"} == expected
+    assert not {"faces", "corners"} & set(read_index(path))
+    assert len(read_recording(path).rig.face_starts) == 0
+
+
+def test_a_mesh_without_faces(tmp_path):
+    rig = replace(make_rig(), face_starts=np.zeros(0, np.int32), face_vertices=np.zeros(0, np.int32))
+    with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSES)) as writer:
+        writer.append(random_poses(POSES), random_residuals(POSES))
+    assert not {"faces", "corners"} & set(read_index(tmp_path / "r"))
+    assert not list((tmp_path / "r").glob("face*"))
+    assert len(read_recording(tmp_path / "r").rig.face_vertices) == 0
+
+
 def test_a_recording_is_not_overwritten(recording):
     before = files(recording)
     with pytest.raises(RecordingError, match="holds a recording already; continue it with --resume or choose another"):
@@ -170,6 +197,8 @@ def change(index, *keys, value):
         (("poses",), 13, "poses"),
         (("blender",), "4.5.0", "blender"),
         (("extra",), 1, "extra"),
+        (("faces",), 3, "faces"),
+        (("corners",), 60, "corners"),
     ],
 )
 def test_resuming_something_else_names_what_differs(tmp_path, keys, value, named):

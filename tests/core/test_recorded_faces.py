@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Faces of a recording that someone or something has damaged, and recordings without faces."""
+
+import json
+
+import numpy as np
+import pytest
+from damage import edit, refused
+
+from fdda_addon.core.recording import read_recording
+
+
+def test_a_recording_without_faces_is_read(recording):
+    index = json.loads((recording / "recording.json").read_text())
+    del index["faces"], index["corners"]
+    (recording / "recording.json").write_text(json.dumps(index))
+    rig = read_recording(recording).rig
+    assert rig.face_starts.shape == rig.face_vertices.shape == (0,)
+
+
+@pytest.mark.parametrize("key", ["faces", "corners"])
+@pytest.mark.parametrize("value", [None, "x", -1, 1.5, True, [1], {"a": 1}, float("inf")])
+def test_a_number_of_faces_that_is_none(recording, key, value):
+    edit(recording, **{key: value})
+    refused(recording, f"recording.json' is damaged: '{key}' is {value!r}; record again")
+
+
+@pytest.mark.parametrize("counts", [{"faces": 5, "corners": 14}, {"faces": 1 << 62}, {"corners": 0}])
+def test_faces_of_too_few_corners(recording, counts):
+    index = edit(recording, **counts)
+    refused(recording, f"damaged: {index['faces']} faces cannot have {index['corners']} corners; record again")
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "value"),
+    [
+        ("face_starts", 0, 1),
+        ("face_starts", 3, 0),
+        ("face_starts", 3, -(1 << 31)),
+        ("face_starts", -1, 1 << 30),
+        ("face_starts", 3, 9),
+        ("face_vertices", 7, -1),
+        ("face_vertices", 7, 40),
+        ("face_vertices", -1, (1 << 31) - 1),
+    ],
+)
+def test_faces_that_are_none(recording, name, place, value):
+    array = np.load(recording / f"{name}.npy")
+    array[place] = value
+    np.save(recording / f"{name}.npy", array)
+    refused(recording, f"The faces of '{recording}' are damaged; record again.")
+
+
+@pytest.mark.parametrize("name", ["face_starts", "face_vertices"])
+@pytest.mark.parametrize("dtype", [np.int64, np.uint32, ">i4", np.float32])
+def test_faces_of_another_dtype(recording, name, dtype):
+    array = np.load(recording / f"{name}.npy")
+    np.save(recording / f"{name}.npy", array.astype(dtype))
+    refused(recording, f"{name}.npy' cannot be used: it holds {array.shape} {np.dtype(dtype)}, not {array.shape} int32")
