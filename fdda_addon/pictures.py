@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The pictures of an evaluation: partitions in colour; rig, linear layer and model side by side, plain or as heat."""
 
-import colorsys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from .core.metrics import distances, heat_colors
-from .core.partition import make_partitions
+from .core.partition import make_partitions, partition_colors
 from .core.skinning import LinearLayer
 from .drawing import Cell, View, draw
 from .evaluation import PoseErrors
@@ -16,7 +15,6 @@ from .runtime.network import Network
 from .scene.rig import SceneRig, read_rig
 
 PLAIN = (0.78, 0.64, 0.55)
-GOLDEN_RATIO = 0.618034
 
 
 @dataclass(frozen=True)
@@ -47,12 +45,8 @@ def draw_partitions(scene_rig: SceneRig, path: Path, view: View = View()) -> Non
         OutputError: the file cannot be written.
     """
     rig = read_rig(scene_rig)
-    colors = np.zeros((rig.vertex_count, 3), np.float32)
     partitions = make_partitions(rig)
-    for number, partition in enumerate(partitions):
-        # Steps of the golden ratio keep neighbours apart, whatever their number.
-        value = 0.95 if number % 2 else 0.75
-        colors[partition.vertices] = colorsys.hsv_to_rgb(number * GOLDEN_RATIO % 1, 0.62, value)
+    colors = partition_colors(partitions, rig.vertex_count)
     cell = Cell(rig.rest_positions, colors, f"{len(partitions)} partitions, {rig.vertex_count} vertices")
     draw(scene_rig.mesh_object.data, [[cell]], path, "Partitions by main joint", view)
 

@@ -42,16 +42,17 @@ def error_statistics(errors: np.ndarray) -> ErrorStatistics:
     return ErrorStatistics(float(mm.mean()), float(np.sqrt((mm**2).mean())), float(p99), float(p999), float(mm.max()))
 
 
-def heat_colors(errors: np.ndarray) -> np.ndarray:
+def heat_colors(errors: np.ndarray, most: float = HEAT_STOPS[-1][0]) -> np.ndarray:
     """Colours of a heat map of errors.
 
     Args:
         errors: (V,) metres.
+        most: metres, from where on the heat map is red.
 
     Returns:
-        (V, 3) float32 sRGB, 0 to 1: green below 1e-4 cm, then from blue through violet (0.5 cm) to red (1 cm).
+        (V, 3) float32 sRGB, 0 to 1: green below 1e-4 cm, then from blue through violet (half of `most`) to red.
     """
-    stops = [stop for stop, _ in HEAT_STOPS]
+    stops = [stop * most / HEAT_STOPS[-1][0] for stop, _ in HEAT_STOPS]
     colors = np.array([color for _, color in HEAT_STOPS])
     heat = np.stack([np.interp(errors, stops, colors[:, channel]) for channel in range(3)], axis=-1)
     heat[np.asarray(errors) < NO_ERROR] = HEAT_NONE

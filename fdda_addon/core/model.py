@@ -130,8 +130,7 @@ def read_model(path: Path) -> tuple[ModelInfo, bytes]:
         in which another file could take its place.
 
     Raises:
-        ModelError: no file, no ONNX file, not a model of ours, or one that asks for more than a model may: other
-            inputs, custom operators, external data.
+        ModelError: no file, or as `check_model`.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -140,33 +139,48 @@ def read_model(path: Path) -> tuple[ModelInfo, bytes]:
             # A device or a pipe might never end.
             raise ModelError(f"'{path}' is not a model: it is no file; give an .onnx file that train made.")
         data = path.read_bytes()
-        contents = read_onnx(data)
     except OSError as error:
         raise ModelError(f"The model '{path}' cannot be read: {error.strerror}; train it first.") from error
+    return check_model(data, path), data
+
+
+def check_model(data: bytes, name: Path | str) -> ModelInfo:
+    """Check the bytes of a model without executing them.
+
+    Args:
+        data: the bytes.
+        name: what errors call the model.
+
+    Raises:
+        ModelError: no ONNX file, not a model of ours, or one that asks for more than a model may: other inputs,
+            custom operators, external data.
+    """
+    try:
+        contents = read_onnx(data)
     except ValueError as error:
-        raise ModelError(f"'{path}' is not a model: {error}; give an .onnx file that train made.") from error
+        raise ModelError(f"'{name}' is not a model: {error}; give an .onnx file that train made.") from error
     if contents.external_files:
-        raise ModelError(f"'{path}' keeps data in other files, which is refused; give a model that train made.")
+        raise ModelError(f"'{name}' keeps data in other files, which is refused; give a model that train made.")
     if contents.custom_operators:
         names = ", ".join(sorted(contents.custom_operators))
-        raise ModelError(f"'{path}' uses custom operators ({names}), which is refused; give a model that train made.")
+        raise ModelError(f"'{name}' uses custom operators ({names}), which is refused; give a model that train made.")
     if METADATA_KEY not in contents.metadata:
-        raise ModelError(f"'{path}' is an ONNX file but not a model of this add-on; give one that train made.")
+        raise ModelError(f"'{name}' is an ONNX file but not a model of this add-on; give one that train made.")
     try:
         info = ModelInfo.from_json(contents.metadata[METADATA_KEY])
     except ValueError as error:
-        raise ModelError(f"The model '{path}' cannot be used: {error}; train it again.") from error
+        raise ModelError(f"The model '{name}' cannot be used: {error}; train it again.") from error
     if extra := sorted(set(contents.inputs) - {POSE_INPUT}):
-        raise ModelError(f"'{path}' asks for inputs that no rig gives ({', '.join(extra)}); train it again.")
+        raise ModelError(f"'{name}' asks for inputs that no rig gives ({', '.join(extra)}); train it again.")
     if contents.inputs.get(POSE_INPUT, ())[1:] != (len(info.joints), 4, 4):
         raise ModelError(
-            f"The input '{POSE_INPUT}' of '{path}' does not fit its {len(info.joints)} joints; train again."
+            f"The input '{POSE_INPUT}' of '{name}' does not fit its {len(info.joints)} joints; train again."
         )
     if contents.outputs.get(POSITIONS_OUTPUT, ())[1:] != (info.vertex_count, 3):
         raise ModelError(
-            f"The output '{POSITIONS_OUTPUT}' of '{path}' does not fit its {info.vertex_count} vertices; train again."
+            f"The output '{POSITIONS_OUTPUT}' of '{name}' does not fit its {info.vertex_count} vertices; train again."
         )
-    return info, data
+    return info
 
 
 def read_model_info(path: Path) -> ModelInfo:

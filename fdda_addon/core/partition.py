@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Partitions: the vertices that share a main joint, and the joints that move their residuals."""
 
+import colorsys
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from .rig import Rig
 
 INFLUENCE_TOLERANCE = 1e-4
 """A joint influences a partition when it moves a local residual by more than this part of the character's size."""
+GOLDEN_RATIO = 0.618034
 
 
 @dataclass(frozen=True)
@@ -66,3 +68,13 @@ def residual_changes(partitions: tuple[Partition, ...], moved: np.ndarray, base:
     """
     distances = np.sqrt(np.einsum("nvc,nvc->nv", moved - base, moved - base)).max(axis=0, initial=0)
     return np.array([distances[p.vertices].max(initial=0) for p in partitions], np.float64)
+
+
+def partition_colors(partitions: tuple[Partition, ...], vertex_count: int) -> np.ndarray:
+    """A colour for each partition: (V, 3) float32 sRGB, 0 to 1, by vertex."""
+    colors = np.zeros((vertex_count, 3), np.float32)
+    for number, partition in enumerate(partitions):
+        # Steps of the golden ratio keep neighbours apart, whatever their number.
+        value = 0.95 if number % 2 else 0.75
+        colors[partition.vertices] = colorsys.hsv_to_rgb(number * GOLDEN_RATIO % 1, 0.62, value)
+    return colors

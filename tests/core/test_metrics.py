@@ -66,3 +66,8 @@ def test_heat_none_is_green_and_the_other_stops_are_what_they_are_called():
 def test_more_error_is_more_red():
     reds = heat_colors(np.linspace(1e-6, 0.01, 50))[:, 0]
     assert (np.diff(reds) > 0).all()
+
+
+def test_a_narrower_range_moves_the_colours_and_not_what_counts_as_none():
+    np.testing.assert_allclose(heat_colors(np.array([0.0005, 0.001]), 0.001), [VIOLET, RED], atol=1e-5)
+    assert np.array_equal(heat_colors(np.array([0.5e-6]), 0.001)[0], np.float32(HEAT_NONE))

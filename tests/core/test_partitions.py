@@ -4,7 +4,7 @@
 import numpy as np
 from limb import INFLUENCING, VERTICES, make_rig, partitions_of
 
-from fdda_addon.core.partition import main_joints, make_partitions, residual_changes
+from fdda_addon.core.partition import main_joints, make_partitions, partition_colors, residual_changes
 
 
 def test_main_joint_has_the_largest_weight_and_the_first_wins_a_tie():
@@ -38,3 +38,12 @@ def test_residual_changes_are_the_largest_distance_in_each_partition():
     moved[0, partitions[1].vertices[0]] += (0.1, 0, 0)
     moved[0, partitions[3].vertices[-1]] += (0, 0.25, 0)
     np.testing.assert_allclose(residual_changes(partitions, moved, base), [0, 0.5, 0, 0.25], atol=1e-6)
+
+
+def test_every_partition_has_one_colour_of_its_own():
+    partitions = partitions_of(make_rig())
+    colors = partition_colors(partitions, VERTICES)
+    assert colors.shape == (VERTICES, 3) and colors.dtype == np.float32 and colors.max() <= 1
+    found = [np.unique(colors[partition.vertices], axis=0) for partition in partitions]
+    assert all(len(own) == 1 for own in found)
+    assert len(np.unique(np.concatenate(found), axis=0)) == len(partitions)
