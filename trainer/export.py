@@ -11,7 +11,15 @@ import onnxruntime
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.features import FEATURES_PER_JOINT
 from fdda_addon.core.metrics import distances, error_statistics
-from fdda_addon.core.model import METADATA_KEY, POSE_INPUT, POSITIONS_OUTPUT, ModelInfo, ModelPartition, read_model_info
+from fdda_addon.core.model import (
+    LIMITS,
+    METADATA_KEY,
+    POSE_INPUT,
+    POSITIONS_OUTPUT,
+    ModelInfo,
+    ModelPartition,
+    read_model_info,
+)
 from fdda_addon.core.output import replacing
 from fdda_addon.core.recording import Recording
 from fdda_addon.core.skinning import LinearLayer
@@ -146,7 +154,7 @@ def model_info(recording: Recording, deformation: Deformation, held_out: np.ndar
         *(bound[: deformation.inputs.joint_columns].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
         error_statistics(held_out).to_json(),
         0.0,
-        training,
+        {**training, LIMITS: recording.info.sampling.to_json()["limits"]},
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from .errors import ModelError
 from .onnx_file import read_onnx
+from .poses import Channel
 from .rig import Fingerprint, Joint, Rig, differences
 
 VERSION = 1
@@ -16,6 +17,8 @@ METADATA_KEY = "fdda"
 POSE_INPUT = "pose_matrices"
 POSITIONS_OUTPUT = "positions"
 TRUST_OUTPUT = "trust"
+LIMITS = "limits"
+"""Key of `ModelInfo.training`."""
 MAX_BYTES = 2 << 30
 
 
@@ -56,6 +59,11 @@ class ModelInfo:
     held_out_mm: dict[str, float] = field(default_factory=dict)
     parity_mm: float = 0.0
     training: dict = field(default_factory=dict)
+
+    @property
+    def limits(self) -> tuple[Channel, ...]:
+        """The range of motion that random poses were drawn from; empty where there were none, or nobody knows."""
+        return tuple(Channel(**channel) for channel in self.training.get(LIMITS, ()))
 
     def to_json(self) -> str:
         """The text of the metadata property."""
@@ -108,7 +116,7 @@ def _read_info(value: dict) -> ModelInfo:
     rest_matrices = np.array(value["rest_matrices"], np.float32).reshape(count, 4, 4)
     if not np.isfinite(rest_matrices).all():
         raise ValueError("its rest pose holds values that are not numbers")
-    return ModelInfo(
+    info = ModelInfo(
         joints,
         rest_matrices,
         int(value["vertices"]),
@@ -120,6 +128,9 @@ def _read_info(value: dict) -> ModelInfo:
         float(value["parity_mm"]),
         dict(value["training"]),
     )
+    if not all(isinstance(c.bone, str) and np.isfinite([c.low, c.high]).all() for c in info.limits):
+        raise ValueError("its range of motion cannot be read")
+    return info
 
 
 def read_model(path: Path) -> tuple[ModelInfo, bytes]:

@@ -11,6 +11,9 @@ DEFAULT_RANGE = (-np.pi / 4, np.pi / 4)
 DEFAULT_SPREAD = 1.0
 """Standard deviation of the poses, as a part of half the range."""
 
+RANGE_TOLERANCE = 1e-4
+"""Radians or metres. Ranges that differ by less count as the same: Blender keeps them as float32."""
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -63,3 +66,21 @@ def beyond_range(channels: tuple[Channel, ...], factor: float) -> tuple[Channel,
         middle, half = (channel.low + channel.high) / 2, (channel.high - channel.low) / 2 * factor
         widened.append(replace(channel, low=middle - half, high=middle + half))
     return tuple(widened)
+
+
+def range_changes(before: tuple[Channel, ...], after: tuple[Channel, ...]) -> list[str]:
+    """Names of the bones whose range of motion differs, in the order of `after`, those that are gone last."""
+
+    def by_bone(channels: tuple[Channel, ...]) -> dict[str, dict[tuple[str, int], tuple[float, float]]]:
+        found: dict[str, dict] = {}
+        for channel in channels:
+            found.setdefault(channel.bone, {})[channel.kind, channel.axis] = (channel.low, channel.high)
+        return found
+
+    old, new = by_bone(before), by_bone(after)
+    return [
+        bone
+        for bone in {**new, **old}
+        if old.get(bone, {}).keys() != new.get(bone, {}).keys()
+        or any(not np.allclose(own, new[bone][key], atol=RANGE_TOLERANCE) for key, own in old[bone].items())
+    ]

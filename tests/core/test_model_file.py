@@ -14,6 +14,7 @@ from tiny_model import constant, external, in_subgraph, tiny_info, tiny_model
 
 from fdda_addon.core.errors import ModelError
 from fdda_addon.core.model import ModelInfo, ModelPartition, check_rig, read_model, read_model_info
+from fdda_addon.core.poses import Channel
 
 
 def save(tmp_path, model) -> os.PathLike:
@@ -183,3 +184,18 @@ def test_model_of_the_same_rig_and_of_another(tmp_path):
         f"The model '{tmp_path / 'm.onnx'}' was trained for another rig: it has 41 vertices, the mesh has 40; "
         "the armature lacks the joint 'thumb'. Record and train this rig."
     )
+
+
+def test_the_range_of_motion_is_kept_and_may_be_missing():
+    limits = (Channel("a", "rotation", 0, -0.5, 1.25),)
+    info = tiny_info(training={"limits": [channel.to_json() for channel in limits]})
+    assert ModelInfo.from_json(info.to_json()).limits == limits
+    assert ModelInfo.from_json(tiny_info().to_json()).limits == ()
+
+
+@pytest.mark.parametrize(
+    "limits", [3, ["a"], [{"bone": "a"}], [{**Channel("a", "rotation", 0, 0, 1).to_json(), "low": "x"}]]
+)
+def test_a_range_of_motion_that_is_none(tmp_path, limits):
+    training = {"limits": limits}
+    refused(save(tmp_path, tiny_model(metadata(training=training))), "cannot be used: ", "train it again")

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.poses import Channel, beyond_range, sample_pose
+from fdda_addon.core.poses import Channel, beyond_range, range_changes, sample_pose
 
 CHANNELS = (
     Channel("a", "rotation", 0, -1.0, 3.0),
@@ -69,3 +69,14 @@ def test_beyond_range_widens_about_the_middle():
     found = [(c.low, c.high) for c in widened]
     np.testing.assert_allclose(found, [(-4, 6), (0.0625, 0.6875), (-0.035, 0.015)], atol=1e-12)
     assert [(c.bone, c.kind, c.axis) for c in widened] == [(c.bone, c.kind, c.axis) for c in CHANNELS]
+
+
+def test_range_changes_name_the_bones():
+    assert range_changes(CHANNELS, CHANNELS[::-1]) == []
+    nearly = (Channel("a", "rotation", 0, -1.0 + 5e-5, 3.0), *CHANNELS[1:])
+    assert range_changes(CHANNELS, nearly) == []
+    wider = (Channel("a", "rotation", 0, -1.0, 3.1), *CHANNELS[1:])
+    assert range_changes(CHANNELS, wider) == ["a"]
+    assert range_changes(CHANNELS, (CHANNELS[0], CHANNELS[2])) == ["a"]
+    other = (*CHANNELS[:2], Channel("c", "location", 1, -0.02, 0.0))
+    assert range_changes(CHANNELS, other) == ["c", "b"]

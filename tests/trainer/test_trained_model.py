@@ -128,6 +128,7 @@ def test_metadata_describes_rig_and_training(trained, recording, report):
     assert info.joints == source.rig.joints and info.fingerprint == source.rig.fingerprint
     assert [p.joint for p in info.partitions] == [p.joint for p in source.partitions]
     assert [p.basis for p in info.partitions] == [p["basis"] for p in report["partitions"]]
+    assert info.limits == source.info.sampling.channels
     assert info.training["hidden"] == [24, 24] and info.training["seed"] == 0 and info.training["torch"]
     assert info.held_out_mm == report["fdda"]["held_out"]
     assert 0 < info.parity_mm < 1e-2
