@@ -53,8 +53,8 @@ lint: .venv  ## ruff's checks and formatting
 	.venv/bin/ruff check
 	.venv/bin/ruff format --check
 
-extension: .venv  ## dist/fdda-VERSION.zip, to install in Blender (PLATFORM=linux-x64)
-	.venv/bin/python setup/build_extension.py $(PLATFORM)
+package: .venv  ## dist/fdda_addon-VERSION.zip, to install in Blender (PLATFORM=all: one for each)
+	.venv/bin/python setup/package.py $(PLATFORM)
 
 requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
 	for version in 3.11 3.13; do .venv/bin/uv pip compile --quiet --no-annotate \
@@ -65,4 +65,4 @@ requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
 clean:  ## remove what was built and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache
 
-.PHONY: help .venv .venv-line demo test test-core test-trainer test-blender test-all test-line fixtures lint extension requirements clean
+.PHONY: help .venv .venv-line demo test test-core test-trainer test-blender test-all test-line fixtures lint package requirements clean

@@ -26,7 +26,7 @@ def load(name: str) -> ModuleType:
 
 
 environment = load("environment")
-build_extension = load("build_extension")
+package = load("package")
 
 
 def script(path: Path, text: str) -> Path:
@@ -142,19 +142,50 @@ def test_make_alone_prints_a_line_for_each_target():
     outside = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
     shown = subprocess.run(["make"], cwd=ROOT, env=outside, capture_output=True, text=True, check=True).stdout
     targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    assert {"demo", "test", "test-all", "lint", "extension"} <= set(targets)
+    assert {"demo", "test", "test-all", "lint", "package"} <= set(targets)
     assert [target for target in targets if f"  make {target} " not in shown] == []
 
 
 def test_the_extension_is_staged_as_blender_expects_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(build_extension, "STAGE", tmp_path / "stage")
+    monkeypatch.setattr(package, "STAGE", tmp_path / "stage")
     wheel = tmp_path / "onnxruntime-1-cp311-cp311-linux.whl"
     wheel.write_bytes(b"wheel")
-    build_extension.stage(["linux-x64"], [wheel])
+    package.stage("linux-x64", [wheel])
     manifest = tomllib.loads((tmp_path / "stage/blender_manifest.toml").read_text())
     assert manifest["version"] == PROJECT["project"]["version"]
     assert manifest["platforms"] == ["linux-x64"]
     assert [(tmp_path / "stage" / path).read_bytes() for path in manifest["wheels"]] == [b"wheel"]
-    assert manifest["permissions"]["files"]
+    assert set(manifest["permissions"]) == {"files", "network"}
+    # Blender refuses longer reasons, and those that end like a sentence.
+    assert all(0 < len(reason) <= 64 and reason[-1].isalpha() for reason in manifest["permissions"].values())
     assert "from .fdda_addon import register" in (tmp_path / "stage/__init__.py").read_text()
     assert (tmp_path / "stage/trainer/__init__.py").is_file()
+    assert {f"python-{version}.txt" for version in PINS} <= {
+        p.name for p in (tmp_path / "stage/requirements").iterdir()
+    }
+
+
+def test_a_package_is_for_this_platform_or_for_all():
+    assert package.asked_platforms([]) == [package.this_platform()]
+    assert package.asked_platforms(["all"]) == ["linux-x64", "macos-arm64", "windows-x64"]
+    assert package.asked_platforms(["windows-x64"]) == ["windows-x64"]
+
+
+def test_a_platform_without_wheels_is_refused_in_a_sentence():
+    command = [sys.executable, ROOT / "setup/package.py", "macos-x64"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 1 and result.stdout == ""
+    assert result.stderr == (
+        "ONNX Runtime has no wheels for the platform macos-x64; set PLATFORM to all or one of linux-x64, macos-arm64, "
+        "windows-x64.\n"
+    )
+
+
+def test_a_package_that_is_too_large_is_refused(tmp_path: Path):
+    large = tmp_path / "large.zip"
+    with large.open("wb") as file:
+        file.truncate(60_000_000)
+        package.check_size(large)
+        file.truncate(61_000_000)
+    with pytest.raises(package.PackageError, match=r"large\.zip has 61 MB and may have 60; look for"):
+        package.check_size(large)
