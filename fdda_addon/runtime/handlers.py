@@ -1,47 +1,75 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The handlers: when Blender has evaluated a pose, the models play.
 
-All in one table; `register` adds exactly these, `unregister` removes exactly these.
+All in one table; `register` adds exactly these, `unregister` removes exactly these. numpy and the modules that play are
+imported with the first bound object, not when Blender starts.
 """
+
+import sys
+from types import ModuleType
 
 import bpy
 from bpy.app.handlers import persistent
 
-from . import playback, switch
+_PLAYBACK = f"{__package__}.playback"
+_count_without_bound = -1
+
+
+def _playback() -> ModuleType | None:
+    """The module `playback`; None while nothing was ever bound in this session."""
+    global _count_without_bound
+    if _PLAYBACK not in sys.modules:
+        count = len(bpy.data.objects)
+        if count == _count_without_bound:
+            return None
+        if not any(o.type == "MESH" and o.fdda.is_bound for o in bpy.data.objects):
+            _count_without_bound = count
+            return None
+    from . import playback
+
+    return playback
 
 
 @persistent
 def _on_evaluated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     # The graph that is handed in: a render evaluates one of its own.
-    playback.evaluate(depsgraph)
+    if playback := _playback():
+        playback.evaluate(depsgraph)
 
 
 @persistent
 def _on_reloaded(*_: object) -> None:
-    playback.forget()
-    if playback.playing_objects():
-        # Without a window nothing evaluates a file that was loaded; here it is safe, no evaluation is under way.
-        playback.evaluate(bpy.context.evaluated_depsgraph_get())
+    global _count_without_bound
+    _count_without_bound = -1
+    if playback := _playback():
+        playback.forget()
+        if playback.playing_objects():
+            # Without a window nothing evaluates a file that was loaded; here it is safe, no evaluation is under way.
+            playback.evaluate(bpy.context.evaluated_depsgraph_get())
 
 
 @persistent
 def _on_render_begins(*_: object) -> None:
     # A render that shows the rig needs its shape keys; pinning them is not a matter of viewport or render.
-    for mesh_object in _playing_outside_renders():
-        switch.pin_shape_keys(mesh_object, False)
+    if playback := _playback():
+        _pin_outside_renders(playback, False)
 
 
 @persistent
 def _on_render_ended(*_: object) -> None:
-    for mesh_object in _playing_outside_renders():
-        switch.pin_shape_keys(mesh_object, True)
-    # The cache objects hold the last frame of the render.
+    if playback := _playback():
+        _pin_outside_renders(playback, True)
+        # The cache objects hold the last frame of the render.
+        for mesh_object in playback.playing_objects():
+            playback.refresh(mesh_object)
+
+
+def _pin_outside_renders(playback: ModuleType, pinned: bool) -> None:
+    from .switch import pin_shape_keys
+
     for mesh_object in playback.playing_objects():
-        playback.refresh(mesh_object)
-
-
-def _playing_outside_renders() -> list[bpy.types.Object]:
-    return [mesh_object for mesh_object in playback.playing_objects() if not mesh_object.fdda.use_in_render]
+        if not mesh_object.fdda.use_in_render:
+            pin_shape_keys(mesh_object, pinned)
 
 
 HANDLERS = {
@@ -58,6 +86,8 @@ HANDLERS = {
 
 def register() -> None:
     """Add the handlers; a second call adds nothing."""
+    global _count_without_bound
+    _count_without_bound = -1
     for name, handler in HANDLERS.items():
         handlers = getattr(bpy.app.handlers, name)
         if handler not in handlers:
@@ -70,4 +100,5 @@ def unregister() -> None:
         handlers = getattr(bpy.app.handlers, name)
         if handler in handlers:
             handlers.remove(handler)
-    playback.forget()
+    if _PLAYBACK in sys.modules:
+        sys.modules[_PLAYBACK].forget()
