@@ -12,6 +12,7 @@ from bpy.props import (
     StringProperty,
 )
 
+from . import settings
 from .scene.compatibility import BLEND_RELATIVE_PATH
 
 
@@ -69,11 +70,14 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
     show_only_shape_key: BoolProperty()
     active_shape_key_index: IntProperty()
 
+    settings: PointerProperty(type=settings.FDDA_PG_character)
+
 
 CLASSES = (FDDA_PG_modifier, FDDA_PG_binding)
 
 
 def register() -> None:
+    settings.register()
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Object.fdda = PointerProperty(type=FDDA_PG_binding)
@@ -83,3 +87,4 @@ def unregister() -> None:
     del bpy.types.Object.fdda
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)
+    settings.unregister()

@@ -3,7 +3,7 @@
 
 from importlib import import_module
 
-MODULES: tuple[str, ...] = ()
+MODULES: tuple[str, ...] = ("job",)
 """The modules of this package; each lists its classes in `CLASSES`."""
 
 
@@ -11,14 +11,20 @@ def register() -> None:
     """Register the classes of all modules."""
     import bpy
 
+    from . import job_state
+
     for cls in _classes():
         bpy.utils.register_class(cls)
+    job_state.register()
 
 
 def unregister() -> None:
     """Undo `register`."""
     import bpy
 
+    from . import job_state
+
+    job_state.unregister()
     for cls in reversed(_classes()):
         bpy.utils.unregister_class(cls)
 

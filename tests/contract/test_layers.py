@@ -24,7 +24,7 @@ LAYERS = (
     {"core"},
     {"scene"},
     (WORK := set()),
-    {"properties", "preferences", "operators"},
+    {"settings", "properties", "preferences", "operators"},
     {"panels", "cli", "demo", "__main__", "__init__"},
 )
 

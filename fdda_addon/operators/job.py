@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators whose work takes more than a moment.
+
+In a window a job advances a little at each tick of a timer; in the background, or when the operator is executed rather
+than invoked, it runs to its end.
+"""
+
+import time
+from collections.abc import Iterator
+
+import bpy
+
+from ..core.errors import FDDAError
+from .job_state import JobState, Run, current, redraw, request_cancel, state_of, stop
+
+TICK_BUDGET = 0.03
+"""Seconds that a job may work at a tick; a step that is begun is finished, so steps must be short."""
+TICK_SECONDS, IDLE_TICK_SECONDS = 0.01, 0.1
+"""Between the ticks of a job that works in Blender, and of one that waits for another process."""
+BLOCKING_SECONDS = 0.05
+REDRAW_SECONDS = 0.1
+
+LOOKING = {"MOUSEMOVE", "INBETWEEN_MOUSEMOVE", "MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "WINDOW_DEACTIVATE"}
+"""Events that are passed on while a job borrows the scene: looking is allowed, changing is not."""
+
+
+class JobOperator:
+    """Mixin for an operator that runs a job.
+
+    A subclass states `verb` and `title`, and defines `steps`, `finish` and `cancelled`. FDDAErrors of all three are
+    reported, and the operator is cancelled. Invoked in a window the job runs in ticks, otherwise to its end at once.
+    """
+
+    verb = ""
+    title = ""
+    borrows_scene = True
+    """The job changes the scene and gives it back: meanwhile the user may look, but not touch, and ESC cancels."""
+
+    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+        """The work: yields `Progress`, None when there is nothing to do before the next tick, or a result.
+
+        Closing the generator cancels the job. No step may take longer than a tick (`TICK_BUDGET`).
+        """
+        raise NotImplementedError
+
+    def subject(self, context: bpy.types.Context) -> str:
+        """Name of the object that the job is about."""
+        return ""
+
+    def finish(self, context: bpy.types.Context, result: object) -> str:
+        """What remains to do with the last result of `steps`; returns the sentence that is reported."""
+        raise NotImplementedError
+
+    def cancelled(self, context: bpy.types.Context) -> str:
+        """The sentence that is reported when the user has cancelled the job."""
+        return f"{self.title} cancelled."
+
+    @classmethod
+    def is_idle(cls) -> bool:
+        """Whether no job runs; sets the poll message otherwise. For `poll`."""
+        job = current()
+        if job is not None:
+            cls.poll_message_set(f"{job.title} is under way; wait for it or cancel it")
+        return job is None
+
+    @property
+    def state(self) -> JobState:
+        """The state of this operator's job, for its log and curves."""
+        return self._run.state
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        if not self._begin(context):
+            return {"CANCELLED"}
+        while (result := self._advance(context, BLOCKING_SECONDS)) is None:
+            if self._run.is_waiting:
+                time.sleep(BLOCKING_SECONDS)
+        return result
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        if bpy.app.background or context.window is None:
+            return self.execute(context)
+        if not self._begin(context):
+            return {"CANCELLED"}
+        if (result := self._tick(context)) is not None:
+            return result
+        manager = context.window_manager
+        seconds = TICK_SECONDS if self.borrows_scene else IDLE_TICK_SECONDS
+        self._timer = manager.event_timer_add(seconds, window=context.window)
+        manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if not self._run.state.is_running:
+            # Ended by an undo or by another file.
+            self._leave(context)
+            return {"CANCELLED"}
+        if event.type == "ESC" and self.borrows_scene:
+            request_cancel()
+        if event.type == "TIMER" or self._run.state.cancel_requested:
+            result = self._tick(context)
+            if result is not None:
+                return result
+        if event.type == "TIMER" or not self.borrows_scene or _is_harmless(context, event):
+            return {"RUNNING_MODAL", "PASS_THROUGH"}
+        return {"RUNNING_MODAL"}
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Blender ends the operator: its window is closed, or Blender."""
+        if self._run.state.is_running:
+            stop(f"{self.title} ended with its window.")
+        self._leave(context)
+
+    def _begin(self, context: bpy.types.Context) -> bool:
+        if (job := current()) is not None:
+            self.report({"ERROR"}, f"{job.title} is under way; wait for it or cancel it.")
+            return False
+        try:
+            state = JobState(self.verb, self.title, self.subject(context))
+        except FDDAError as error:
+            self.report({"ERROR"}, str(error))
+            return False
+        self._timer, self._shown, self._redrawn = None, None, 0.0
+        self._run = Run(state, self.steps(context), self.borrows_scene)
+        return True
+
+    def _tick(self, context: bpy.types.Context) -> set[str] | None:
+        """Work a little; returns the operator's result once the job has ended."""
+        result = self._advance(context, TICK_BUDGET)
+        if result is not None:
+            self._leave(context)
+            return result
+        state, now = self._run.state, time.monotonic()
+        shown = (state.stage, state.done, len(state.log), state.cancel_requested)
+        if shown != self._shown and now - self._redrawn >= REDRAW_SECONDS:
+            self._shown, self._redrawn = shown, now
+            if self.borrows_scene:
+                context.workspace.status_text_set(
+                    f"{self.title}: {state.done} of {state.total} {state.stage} (ESC: cancel)"
+                )
+            redraw()
+        return None
+
+    def _advance(self, context: bpy.types.Context, seconds: float) -> set[str] | None:
+        run = self._run
+        try:
+            if run.state.cancel_requested:
+                run.close()
+                return self._end(self.cancelled(context), "WARNING")
+            if not run.advance(seconds):
+                return None
+            return self._end(self.finish(context, run.result), "INFO")
+        except FDDAError as error:
+            return self._end(str(error), "ERROR")
+        except ReferenceError:
+            return self._end(f"{self.title} ended: what it worked on was removed.", "ERROR")
+        except BaseException:
+            # Ctrl-C or a bug: it propagates, but what was borrowed is given back and another job may begin.
+            run.close()
+            self._leave(context)
+            run.end(f"{self.title} broke off; the system console says why.", "ERROR")
+            raise
+
+    def _end(self, sentence: str, level: str) -> set[str]:
+        self._run.end(sentence, level)
+        self.report({level}, sentence)
+        return {"FINISHED"} if level == "INFO" else {"CANCELLED"}
+
+    def _leave(self, context: bpy.types.Context) -> None:
+        if self._timer is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._timer = None
+            if context.workspace is not None:
+                context.workspace.status_text_set(None)
+
+
+def _is_harmless(context: bpy.types.Context, event: bpy.types.Event) -> bool:
+    """Whether an event may reach the rest of Blender while the scene is borrowed: to look, and to press Cancel."""
+    if event.type in LOOKING:
+        return True
+    return event.type == "LEFTMOUSE" and any(
+        region.type == "UI"
+        and region.active_panel_category == "FDDA"
+        and 0 <= event.mouse_x - region.x < region.width
+        and 0 <= event.mouse_y - region.y < region.height
+        for area in context.screen.areas
+        if area.type == "VIEW_3D"
+        for region in area.regions
+    )
+
+
+class FDDA_OT_cancel(bpy.types.Operator):
+    bl_idname = "fdda.cancel"
+    bl_label = "Cancel"
+    bl_description = "End the job that is under way; what it has kept stays"
+    bl_options = {"INTERNAL"}
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if current() is None:
+            cls.poll_message_set("Nothing is under way")
+        return current() is not None
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        request_cancel()
+        redraw()
+        return {"FINISHED"}
+
+
+CLASSES = (FDDA_OT_cancel,)
+
+__all__ = ["CLASSES", "JobOperator", "JobState", "current", "redraw", "request_cancel", "state_of", "stop"]

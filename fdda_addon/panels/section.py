@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the sections of the sidebar have in common: where they are, the rig they are about, sentences and jobs."""
+
+import textwrap
+
+import bpy
+
+from ..core.errors import RigError
+from ..operators import job
+from ..scene.active_rig import active_rig
+from ..scene.rig import SceneRig
+
+CHARACTER_WIDTH = 6.4
+"""Mean width of a letter in the sidebar, pixels at a scale of 1."""
+MARGIN = 40
+OUTCOME_ICONS = {"INFO": "CHECKMARK", "WARNING": "INFO", "ERROR": "ERROR"}
+
+
+class Section:
+    """Mixin for a panel of the tab "FDDA". It is there when the active object has a rig, or a job of its own runs."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "FDDA"
+    verbs: tuple[str, ...] = ()
+    """The jobs that this section starts."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        running = job.current()
+        return panel_rig(context)[0] is not None or (running is not None and running.verb in cls.verbs)
+
+
+def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
+    """The rig that the sidebar is about, or None and the sentence that says why there is none."""
+    try:
+        return active_rig(context), ""
+    except RigError as error:
+        return None, str(error)
+
+
+def draw_sentence(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
+    """Draw text in as many lines as the width of the sidebar takes."""
+    scale = context.preferences.system.ui_scale
+    width = (context.region.width if context.region else 300) / scale - MARGIN - (20 if icon != "NONE" else 0)
+    column = layout.column(align=True)
+    column.scale_y = 0.8
+    for number, line in enumerate(textwrap.wrap(text, max(16, int(width / CHARACTER_WIDTH)))):
+        column.label(text=line, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+
+
+def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context, verb: str, unit: str) -> bool:
+    """Draw how far the job of this verb is with a button to cancel it, or how it ended.
+
+    Args:
+        layout, context: as in `draw`.
+        verb: of the job.
+        unit: what it counts, "poses".
+
+    Returns:
+        Whether it runs.
+    """
+    state = job.state_of(verb)
+    if state is None:
+        return False
+    if not state.is_running:
+        draw_sentence(layout, context, state.outcome, OUTCOME_ICONS[state.outcome_level])
+        return False
+    column = layout.column(align=True)
+    column.progress(factor=state.fraction, text=f"{state.done} of {state.total} {unit}" if state.total else "Starting…")
+    row = column.row(align=True)
+    row.enabled = not state.cancel_requested
+    row.operator("fdda.cancel", text="Cancelling…" if state.cancel_requested else "Cancel", icon="X")
+    remaining = state.remaining_seconds
+    if remaining is not None:
+        layout.label(text=f"About {duration(remaining)} left", icon="TIME")
+    return True
+
+
+def duration(seconds: float) -> str:
+    """A time for people: "40 s", "5 min", "2 h 10 min"."""
+    if seconds < 90:
+        return f"{max(1, round(seconds))} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"

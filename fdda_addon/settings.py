@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Settings that users make in the sidebar, and the paths that follow from them.
+
+`Object.fdda.settings` of the mesh describes the character and `Action.fdda` an action; both are saved with the file.
+`WindowManager.fdda` is what the sidebar shows at the moment and is not meant to last.
+"""
+
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+
+from .core.errors import OutputError
+from .scene.compatibility import BLEND_RELATIVE_PATH
+
+
+class FDDA_PG_character(bpy.types.PropertyGroup):
+    """How a character is sampled, recorded and trained; saved with its mesh object."""
+
+    poses: IntProperty(
+        name="Poses", description="Number of random poses to record", default=1000, min=0, soft_max=10000
+    )
+    seed: IntProperty(name="Seed", description="Other seeds give other random poses", min=0)
+    spread: FloatProperty(
+        name="Spread",
+        description="Standard deviation of the random poses as a part of half the range of motion: "
+        "small stays near the middle, large fills the range evenly",
+        default=1.0,
+        min=0.05,
+        max=10.0,
+        step=10,
+    )
+    recording: StringProperty(
+        name="Folder",
+        description="Folder of the recording; empty for one beside the .blend file",
+        subtype="DIR_PATH",
+        options=BLEND_RELATIVE_PATH,
+    )
+    model: StringProperty(
+        name="Model",
+        description="File that the trained model is written to; empty for one beside the .blend file",
+        subtype="FILE_PATH",
+        options=BLEND_RELATIVE_PATH,
+    )
+    tolerance_mm: FloatProperty(
+        name="Tolerance (mm)",
+        description="Error that the shapes of a partition may leave; smaller is more exact and slower",
+        default=0.1,
+        min=0.001,
+        soft_max=1.0,
+        precision=3,
+        step=1,
+    )
+    epochs: IntProperty(
+        name="Epochs",
+        description="Passes over the recorded poses; more is more exact and takes longer",
+        default=200,
+        min=1,
+        soft_max=1000,
+    )
+    training_seed: IntProperty(name="Seed", description="Other seeds start the training elsewhere", min=0)
+
+
+class FDDA_PG_action(bpy.types.PropertyGroup):
+    """What an action is used for; saved with it."""
+
+    record: BoolProperty(name="Record", description="Record the frames of this action after the random poses")
+
+
+class FDDA_PG_session(bpy.types.PropertyGroup):
+    """What the sidebar shows at the moment."""
+
+    pose_number: IntProperty(
+        name="Random Pose", description="Number of the random pose that is shown, as it is recorded", min=0
+    )
+    joint_index: IntProperty(name="Joint")
+    action_index: IntProperty(name="Action")
+    partition_index: IntProperty(name="Partition")
+
+
+CLASSES = (FDDA_PG_character, FDDA_PG_action, FDDA_PG_session)
+
+
+def register() -> None:
+    """Register the groups; `Object.fdda` is made in `properties`."""
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.Action.fdda = PointerProperty(type=FDDA_PG_action)
+    bpy.types.WindowManager.fdda = PointerProperty(type=FDDA_PG_session)
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    del bpy.types.WindowManager.fdda
+    del bpy.types.Action.fdda
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)
+
+
+def recording_folder(mesh_object: bpy.types.Object) -> Path:
+    """Where the character is recorded: the folder that it names, else NAME_recording beside the .blend file.
+
+    Raises:
+        OutputError: it is to lie beside a file that has not been saved.
+    """
+    return _path(mesh_object, mesh_object.fdda.settings.recording, "_recording", "folder for the recording")
+
+
+def model_file(mesh_object: bpy.types.Object) -> Path:
+    """Where the character's model is written: the file that it names, else NAME.onnx beside the .blend file.
+
+    Raises:
+        OutputError: it is to lie beside a file that has not been saved.
+    """
+    return _path(mesh_object, mesh_object.fdda.settings.model, ".onnx", "file for the model")
+
+
+def _path(mesh_object: bpy.types.Object, stated: str, ending: str, what: str) -> Path:
+    if not bpy.data.filepath and (not stated or stated.startswith("//")):
+        raise OutputError(
+            f"The .blend file has not been saved, so there is no place beside it; save it, or name a {what}."
+        )
+    return Path(bpy.path.abspath(stated or f"//{bpy.path.clean_name(mesh_object.name)}{ending}"))

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Jobs without a window: one at a time, ended by a sentence, a cancel or another file, and nothing left behind."""
+
+from collections.abc import Iterator
+
+import bpy
+import pytest
+
+from fdda_addon.core.errors import FDDAError
+from fdda_addon.operators import job
+from fdda_addon.operators.job_state import JobState, Run
+from fdda_addon.recording import Progress
+
+events: list[str] = []
+
+
+class FDDA_OT_count(job.JobOperator, bpy.types.Operator):  # noqa: N801 - Blender wants it
+    """Counts to `upto`, and does at `at` what `what` says."""
+
+    bl_idname = "fdda.count"
+    bl_label = "Count"
+    verb, title = "count", "Counting"
+
+    upto: bpy.props.IntProperty(default=3)
+    at: bpy.props.IntProperty(default=-1)
+    what: bpy.props.StringProperty()
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        return cls.is_idle()
+
+    def steps(self, _context: bpy.types.Context) -> Iterator[object]:
+        try:
+            for number in range(self.upto):
+                if number == self.at:
+                    yield from self._misbehave()
+                yield Progress("numbers", number + 1, self.upto)
+            yield sum(range(self.upto))
+        finally:
+            events.append("given back")
+
+    def _misbehave(self) -> Iterator[None]:
+        if self.what == "fail":
+            raise FDDAError("The number 1 is missing; count again.")
+        if self.what == "cancel":
+            bpy.ops.fdda.cancel()
+        if self.what == "bug":
+            raise ZeroDivisionError("a bug")
+        if self.what == "second":
+            bpy.ops.fdda.count()
+        yield None
+
+    def finish(self, _context: bpy.types.Context, result: object) -> str:
+        events.append(f"finished with {result}")
+        return f"Counted to {result}."
+
+    def cancelled(self, _context: bpy.types.Context) -> str:
+        return f"Counting cancelled at {self.state.done}."
+
+
+@pytest.fixture(autouse=True)
+def _count(_addon: None) -> Iterator[None]:
+    bpy.utils.register_class(FDDA_OT_count)
+    events.clear()
+    yield
+    bpy.utils.unregister_class(FDDA_OT_count)
+
+
+def test_a_job_runs_to_its_end_where_there_is_no_window():
+    assert bpy.ops.fdda.count() == bpy.ops.fdda.count("INVOKE_DEFAULT") == {"FINISHED"}
+    assert events == ["given back", "finished with 3"] * 2
+    state = job.state_of("count")
+    assert (state.done, state.total, state.stage, state.is_running) == (3, 3, "numbers", False)
+    assert (state.outcome, state.outcome_level) == ("Counted to 3.", "INFO")
+    assert job.current() is None
+
+
+def test_an_error_is_reported_and_the_operator_cancelled():
+    with pytest.raises(RuntimeError, match=r"The number 1 is missing; count again\."):
+        bpy.ops.fdda.count(at=1, what="fail")
+    assert events == ["given back"]
+    assert job.state_of("count").outcome_level == "ERROR" and job.current() is None
+    assert bpy.ops.fdda.count() == {"FINISHED"}
+
+
+def test_a_cancelled_job_gives_back_and_says_how_far_it_came():
+    assert bpy.ops.fdda.count(at=2, what="cancel") == {"CANCELLED"}
+    assert events == ["given back"]
+    state = job.state_of("count")
+    assert (state.outcome, state.outcome_level) == ("Counting cancelled at 2.", "WARNING")
+
+
+def test_a_bug_propagates_and_does_not_block_the_next_job():
+    with pytest.raises(RuntimeError, match="ZeroDivisionError"):
+        bpy.ops.fdda.count(at=1, what="bug")
+    assert events == ["given back"] and job.current() is None
+
+
+def test_there_is_one_job_at_a_time():
+    with pytest.raises(RuntimeError, match="Counting is under way; wait for it or cancel it"):
+        bpy.ops.fdda.count(at=1, what="second")
+
+
+def test_cancel_without_a_job_says_so():
+    with pytest.raises(RuntimeError, match="Nothing is under way"):
+        bpy.ops.fdda.cancel()
+
+
+def under_way(borrows_scene: bool) -> JobState:
+    """A job as a window has it between two ticks."""
+
+    def steps() -> Iterator[Progress]:
+        try:
+            yield Progress("numbers", 1, 9)
+            yield Progress("numbers", 2, 9)
+        finally:
+            events.append("given back")
+
+    run = Run(JobState("count", "Counting"), steps(), borrows_scene)
+    assert not run.advance(0)
+    return run.state
+
+
+def test_another_file_ends_a_job(rig):
+    state = under_way(borrows_scene=False)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    assert not state.is_running and state.outcome == "Another file was opened."
+    assert events == ["given back"] and job.current() is None
+
+
+@pytest.mark.parametrize("borrows_scene", [True, False])
+def test_an_undo_ends_a_job_that_borrows_the_scene_and_no_other(rig, borrows_scene):
+    bpy.ops.ed.undo_push()
+    rig.mesh_object.location.x = 1
+    bpy.ops.ed.undo_push()
+    state = under_way(borrows_scene)
+    bpy.ops.ed.undo()
+    assert state.is_running is not borrows_scene
+    job.stop("The test is over.")
+    assert events == ["given back"]
+
+
+def test_disabling_the_addon_ends_a_job():
+    import fdda_addon
+
+    state = under_way(borrows_scene=False)
+    fdda_addon.unregister()
+    assert not state.is_running and events == ["given back"]
+    fdda_addon.register()
+
+
+def test_remaining_time_comes_from_the_speed_of_the_stage(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    state = JobState("record", "Recording")
+    assert state.remaining_seconds is None
+    state.show(Progress("poses", 500, 1000))
+    assert state.remaining_seconds is None, "a resumed recording has not done these now"
+    now[0] += 10
+    state.show(Progress("poses", 600, 1000))
+    assert state.remaining_seconds == pytest.approx(40)
