@@ -14,6 +14,7 @@ from .core.model import check_rig
 from .core.partition import Partition
 from .core.poses import Channel, beyond_range, sample_pose
 from .core.skinning import LinearLayer
+from .core.surface import Surface, SurfaceComparison, SurfaceErrors, surface_errors
 from .recording import Progress, action_frames, find_action
 from .runtime.network import Network
 from .scene.armature import Poser, clear_pose
@@ -61,6 +62,7 @@ class PoseErrors:
         pose_matrices: (N, J, 4, 4) float32, mesh-object space, metres.
         positions: (N, V, 3) float32, the true rig, mesh-object space, metres.
         fdda, linear: (N, V) float32, distances from the true rig, metres.
+        fdda_surface, linear_surface: errors of normals and edges, None for a mesh without faces.
     """
 
     name: str
@@ -68,6 +70,18 @@ class PoseErrors:
     positions: np.ndarray
     fdda: np.ndarray
     linear: np.ndarray
+    fdda_surface: SurfaceErrors | None = None
+    linear_surface: SurfaceErrors | None = None
+
+    def surface_json(self) -> dict:
+        """`normals`, degrees, and `edges`, parts of the rest length, each None for a mesh without faces."""
+        ways = {"fdda": self.fdda_surface, "linear": self.linear_surface}
+        if None in ways.values():
+            return {"normals": None, "edges": None}
+        return {
+            "normals": {way: errors.normals_json() for way, errors in ways.items()},
+            "edges": {way: errors.edges_json() for way, errors in ways.items()},
+        }
 
     def to_json(self) -> dict:
         return {
@@ -75,6 +89,7 @@ class PoseErrors:
             "poses": len(self.fdda),
             "fdda": error_statistics(self.fdda).to_json(),
             "linear": error_statistics(self.linear).to_json(),
+            **self.surface_json(),
         }
 
 
@@ -105,7 +120,7 @@ class Evaluation:
         return error_statistics(self.held_out.linear)
 
     def to_json(self) -> dict:
-        """docs/evaluation.md describes it; lengths in mm."""
+        """docs/evaluation.md describes it; lengths in mm, angles in degrees."""
         return {
             "unit": "mm",
             "poses": len(self.held_out.fdda),
@@ -124,6 +139,7 @@ class Evaluation:
             "actions": [errors.to_json() for errors in self.actions],
             "beyond": [errors.to_json() for errors in self.beyond],
             "named": [errors.to_json() for errors in self.named],
+            **self.held_out.surface_json(),
         }
 
 
@@ -202,10 +218,14 @@ class _Comparison:
     def __init__(self, evaluator: PoseEvaluator, network: Network, layer: LinearLayer, total: int):
         self._evaluator, self._network, self._layer = evaluator, network, layer
         self._done, self._total = 0, total
+        rig, self._surface = layer.rig, None
+        if len(rig.face_starts):
+            surface = Surface(rig.face_starts, rig.face_vertices)
+            self._surface = SurfaceComparison(surface, rig.rest_positions, layer.partitions)
 
     def compare(self, name: str, poses: Iterator[None]) -> Iterator[Progress]:
         """Yields progress, returns PoseErrors."""
-        matrices, positions, fdda, linear = [], [], [], []
+        matrices, positions, fdda, linear, surface = [], [], [], [], []
         for _ in poses:
             pose, true = self._evaluator.evaluate()
             moved = self._network.positions(pose[None])[0]
@@ -218,7 +238,11 @@ class _Comparison:
             matrices.append(pose)
             positions.append(true)
             fdda.append(distances(moved, true))
-            linear.append(distances(self._layer.positions(pose[None])[0], true))
+            skinned = self._layer.positions(pose[None])[0]
+            linear.append(distances(skinned, true))
+            if self._surface:
+                surface.append(self._surface.compare(true, (moved, skinned)))
             self._done += 1
             yield Progress("evaluation", self._done, self._total)
-        return PoseErrors(name, np.stack(matrices), np.stack(positions), np.stack(fdda), np.stack(linear))
+        stacked = (np.stack(arrays) for arrays in (matrices, positions, fdda, linear))
+        return PoseErrors(name, *stacked, *(surface_errors(rows) for rows in zip(*surface, strict=True)))

@@ -69,4 +69,18 @@ def table(evaluation: Evaluation) -> str:
             for name in ("mean", "rms", "p99", "p999", "max")
         )
         lines.append(f"{'  FDDA / linear layer':<24}{ratios}")
+        if values["normals"]:
+            lines += _surface_lines(values["normals"], values["edges"])
     return "\n".join(lines)
+
+
+def _surface_lines(normals: dict, edges: dict) -> list[str]:
+    """What shading shows: a line on normals, one on edges."""
+    angles, lengths = [], []
+    for way, label in (("fdda", "FDDA"), ("linear", "linear layer")):
+        angle, edge = normals[way], edges[way]
+        angles.append(f"{label} {angle['mean']:.3f}, p99 {angle['p99']:.2f}")
+        across, inside = ("-" if edge[part] is None else f"{100 * edge[part]:.3f}" for part in ("across", "inside"))
+        ratio = "-" if edge["ratio"] is None else f"{edge['ratio']:.2f} times"
+        lengths.append(f"{label} {inside}, across borders {across} ({ratio})")
+    return [f"  normals off by degrees: {'; '.join(angles)}", f"  edge lengths off by %: {'; '.join(lengths)}"]

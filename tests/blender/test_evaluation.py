@@ -35,7 +35,7 @@ def report(elbow, tmp_path_factory) -> dict:
 def test_keys(report):
     assert list(report) == [
         *("unit", "poses", "vertices", "fdda", "linear", "partitions"),
-        *("actions", "beyond", "named"),
+        *("actions", "beyond", "named", "normals", "edges"),
     ]
     assert (report["unit"], report["poses"], report["vertices"]) == ("mm", 12, 300)
     assert list(report["fdda"]) == list(report["linear"]) == STATISTICS
