@@ -12,6 +12,7 @@ from .core.errors import RecordingError, RigError
 from .core.output import check_folder_writable
 from .core.partition import INFLUENCE_TOLERANCE, make_partitions, residual_changes
 from .core.poses import DEFAULT_SPREAD, Channel, sample_pose
+from .core.progress import Progress
 from .core.recording import RecordingInfo, Sampling, Source
 from .core.recording_writer import RecordingWriter
 from .core.rig import Rig
@@ -50,15 +51,6 @@ class RecordingSettings:
     influence_poses: int = 10
     influence_tolerance: float = INFLUENCE_TOLERANCE
     resume: bool = False
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far a job is: `done` of `total` steps of the stage."""
-
-    stage: str
-    done: int
-    total: int
 
 
 def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iterator[Progress]:

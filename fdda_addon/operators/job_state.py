@@ -14,7 +14,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..core.errors import FDDAError
-from ..recording import Progress
+from ..core.progress import Progress
 
 LOG_LINES = 2000
 

@@ -8,7 +8,7 @@ import bpy
 from ..core.errors import RigError
 from ..operators import job
 from ..scene.active_rig import active_rig
-from ..scene.rig import SceneRig
+from ..scene.scene_rig import SceneRig
 
 CHARACTER_WIDTH = 6.4
 """Mean width of a letter in the sidebar, pixels at a scale of 1."""

@@ -4,7 +4,7 @@
 import bpy
 
 from ..core.errors import RigError
-from .rig import SceneRig, armature_modifier, find_rig
+from .scene_rig import SceneRig, armature_modifier, find_rig
 
 
 def active_rig(context: bpy.types.Context, name: str = "") -> SceneRig:

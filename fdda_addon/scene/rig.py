@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds the rig in a scene, says why there is none, and reads it into arrays."""
+"""Checks the rig of a scene and reads it into arrays."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import bpy
 import numpy as np
@@ -13,77 +12,16 @@ from ..core.poses import Channel
 from ..core.rig import Fingerprint, Joint, Rig
 from . import armature as armature_io
 from . import mesh as mesh_io
+from .scene_rig import DEFORMING, MODIFIER_NAME, SceneRig, armature_modifier, deforming_modifiers, find_rig
 
-DEFORMING = {
-    "ARMATURE", "CAST", "CLOTH", "CORRECTIVE_SMOOTH", "CURVE", "DISPLACE", "HOOK", "LAPLACIANDEFORM",
-    "LAPLACIANSMOOTH", "LATTICE", "MESH_CACHE", "MESH_DEFORM", "MESH_SEQUENCE_CACHE", "SHRINKWRAP", "SIMPLE_DEFORM",
-    "SMOOTH", "SOFT_BODY", "SURFACE_DEFORM", "VOLUME_DISPLACE", "WARP", "WAVE",
-}  # fmt: skip
 TOPOLOGY_CHANGING = {
     "ARRAY", "BEVEL", "BOOLEAN", "BUILD", "DECIMATE", "EDGE_SPLIT", "EXPLODE", "FLUID", "MASK", "MIRROR", "MULTIRES",
     "OCEAN", "REMESH", "SCREW", "SKIN", "SOLIDIFY", "SUBSURF", "VOLUME_TO_MESH", "WELD", "WIREFRAME",
 }  # fmt: skip
 SMALLEST_VOLUME = 1e-15
 """An object whose scales multiply to less is flat: no position could be brought into its space."""
-MODIFIER_NAME = "FDDA"
-"""Name of the Geometry Nodes modifier that plays a model; it is never part of the rig."""
-
-
 IDENTITY_TOLERANCE = 1e-6
 """Mesh and armature count as unmoved, one against the other, when no matrix element differs by more."""
-
-
-@dataclass(frozen=True)
-class SceneRig:
-    """A mesh object and the armature object that deforms it. Holds RNA references: not to be kept."""
-
-    mesh_object: bpy.types.Object
-    armature_object: bpy.types.Object
-
-
-def find_rig(name: str = "") -> SceneRig:
-    """Find the rig of the current scene.
-
-    Args:
-        name: of the mesh object; may be left out when one mesh of the scene has an Armature modifier.
-
-    Raises:
-        RigError: there is none, or more than one.
-    """
-    meshes = [o for o in bpy.context.scene.objects if o.type == "MESH"]
-    if name:
-        named = bpy.context.scene.objects.get(name)
-        if named is None or named.type != "MESH":
-            known = ", ".join(f"'{o.name}'" for o in meshes) or "none"
-            raise RigError(f"The scene has no mesh object '{name}'; its mesh objects: {known}.")
-        meshes = [named]
-    if not meshes:
-        raise RigError("The scene has no mesh; open a file with a character that an armature deforms.")
-    rigged = [o for o in meshes if armature_modifier(o) is not None]
-    if not rigged:
-        what = f"'{name}' has no" if name else f"None of the {len(meshes)} meshes of the scene has an"
-        raise RigError(f"{what} Armature modifier with an armature; add one, or choose another object.")
-    if len(rigged) > 1:
-        names = ", ".join(f"'{o.name}'" for o in rigged)
-        raise RigError(f"{len(rigged)} meshes have an Armature modifier ({names}); choose one with --object.")
-    return SceneRig(rigged[0], armature_modifier(rigged[0]).object)
-
-
-def armature_modifier(mesh_object: bpy.types.Object) -> bpy.types.ArmatureModifier | None:
-    """The first Armature modifier that has an armature, None when there is none."""
-    for modifier in mesh_object.modifiers:
-        if modifier.type == "ARMATURE" and modifier.object is not None:
-            return modifier
-    return None
-
-
-def deforming_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier]:
-    """The modifiers of the rig that move vertices, in their order, switched on or not. Geometry Nodes count too."""
-    return [
-        modifier
-        for modifier in mesh_object.modifiers
-        if modifier.type in DEFORMING or (modifier.type == "NODES" and modifier.name != MODIFIER_NAME)
-    ]
 
 
 def check_evaluable(scene_rig: SceneRig) -> None:
@@ -257,3 +195,10 @@ class PoseEvaluator:
         armature_object = self._scene_rig.armature_object.evaluated_get(depsgraph)
         positions = mesh_io.evaluated_positions(self._scene_rig.mesh_object, depsgraph)
         return self._reader.read(mesh_object, armature_object), positions
+
+
+__all__ = [
+    "DEFORMING", "MODIFIER_NAME", "TOPOLOGY_CHANGING", "PoseEvaluator", "PoseReader", "SceneRig", "armature_modifier",
+    "check_evaluable", "check_topology", "deforming_modifiers", "find_rig", "mesh_from_armature", "read_rig",
+    "sampled_channels",
+]  # fmt: skip

@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How far a job is: what every generator that works yields."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Progress:
+    """`done` of `total` steps of the stage are done."""
+
+    stage: str
+    done: int
+    total: int
