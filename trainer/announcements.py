@@ -49,7 +49,7 @@ class Text:
         if text:
             print(text.format(**values), flush=True)
 
-    def _progress(self, epoch: int, epochs: int, validation_mm: float) -> None:
+    def _progress(self, epoch: int, epochs: int, validation_mm: float, **_: float) -> None:
         if self.terminal:
             done = round(30 * epoch / epochs)
             bar = "#" * done + "." * (30 - done)

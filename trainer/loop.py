@@ -39,10 +39,11 @@ class Curves:
 
 @dataclass(frozen=True)
 class Progress:
-    """What is known after an epoch: 1 is the first; mean of the validation errors over all vertices, mm."""
+    """What is known after an epoch, 1 is the first: means of the curves over all vertices, mm."""
 
     epoch: int
     epochs: int
+    training_mm: float
     validation_mm: float
 
 
@@ -161,12 +162,16 @@ class _Loop:
                     f"The training diverged in epoch {epoch}: errors are not numbers; use a smaller learning rate than "
                     f"{config.learning_rate:g}."
                 )
-            for curve, train_mm, validation_mm in zip(curves, (training_mm / poses).tolist(), held, strict=True):
+            learned = (training_mm / poses).tolist()
+            for curve, train_mm, validation_mm in zip(curves, learned, held, strict=True):
                 curve.training_mm.append(train_mm)
                 curve.validation_mm.append(float(validation_mm))
             if progress:
-                mean = (float(held @ learning_vertices) + constant_mm) / vertices.sum()
-                progress(Progress(epoch, config.epochs, mean))
+                means = [
+                    (float(errors @ learning_vertices) + constant_mm) / vertices.sum()
+                    for errors in (np.array(learned), held)
+                ]
+                progress(Progress(epoch, config.epochs, *means))
             if config.patience and epoch - max(curve.best_epoch for curve in curves) >= config.patience:
                 break
 

@@ -70,7 +70,11 @@ def train_model(
         config,
         device,
         lambda p: announcer.say(
-            MessageType.PROGRESS, epoch=p.epoch, epochs=p.epochs, validation_mm=round(p.validation_mm, 6)
+            MessageType.PROGRESS,
+            epoch=p.epoch,
+            epochs=p.epochs,
+            training_mm=round(p.training_mm, 6),
+            validation_mm=round(p.validation_mm, 6),
         ),
         should_stop,
     )

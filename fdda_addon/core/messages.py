@@ -15,7 +15,8 @@ class MessageType(enum.Enum):
     STARTED = "started"
     """partitions: int, poses: int, vertices: int, device: str."""
     PROGRESS = "progress"
-    """epoch: int, epochs: int, validation_mm: float (mean error of the validation poses)."""
+    """epoch: int, epochs: int, training_mm: float, validation_mm: float (mean errors of the training and the validation
+    poses)."""
     PARTITION_FINISHED = "partition_finished"
     """joint: str, basis: int, validation_mm: float."""
     LOG = "log"
