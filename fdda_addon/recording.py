@@ -14,6 +14,7 @@ from .core.partition import INFLUENCE_TOLERANCE, make_partitions, residual_chang
 from .core.poses import DEFAULT_SPREAD, Channel, sample_pose
 from .core.progress import Progress
 from .core.recording import RecordingInfo, Sampling, Source
+from .core.recording_extension import RecordingExtension
 from .core.recording_writer import RecordingWriter
 from .core.rig import Rig
 from .core.skinning import LinearLayer
@@ -94,7 +95,7 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         with RecordingWriter(path, rig, partitions, info, settings.resume) as writer:
             poses = _poses(scene_rig, channels, settings, actions, writer.complete)
             yield Progress("poses", writer.complete, total)
-            for _ in _batches(poses, evaluator, layer, writer):
+            for _ in append_poses(poses, evaluator, layer, writer):
                 yield Progress("poses", writer.complete, total)
 
 
@@ -145,8 +146,11 @@ def _poses(
         start += len(action_frames(action))
 
 
-def _batches(
-    poses: Iterator[None], evaluator: PoseEvaluator, layer: LinearLayer, writer: RecordingWriter
+def append_poses(
+    poses: Iterator[None],
+    evaluator: PoseEvaluator,
+    layer: LinearLayer,
+    writer: RecordingWriter | RecordingExtension,
 ) -> Iterator[None]:
     """Evaluate poses and append them to the recording, one batch an iteration."""
     size = max(1, min(BATCH_POSES, BATCH_BYTES // (layer.rig.vertex_count * 12)))
@@ -164,7 +168,7 @@ def _batches(
         yield
 
 
-def _append(writer: RecordingWriter, layer: LinearLayer, matrices: list, positions: list) -> None:
+def _append(writer: RecordingWriter | RecordingExtension, layer: LinearLayer, matrices: list, positions: list) -> None:
     pose_matrices = np.stack(matrices)
     writer.append(pose_matrices, _local_residuals(layer, pose_matrices, np.stack(positions)))
 

@@ -1,9 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`record RIG.blend RECORDING`: random poses and their residuals."""
+"""`record RIG.blend RECORDING`: random poses and their residuals, or more of them where a model is worst."""
 
 import argparse
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ..core.progress import Progress
+    from ..scene.rig import SceneRig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -11,37 +18,49 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
     add_rig_options(parser)
     parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
-    parser.add_argument("--poses", type=int, default=1000, help="number of random poses (default 1000)")
+    parser.add_argument("--poses", type=int, help="number of random poses (default 1000, with --refine 250)")
     parser.add_argument("--seed", type=int, default=0, help="of the random poses (default 0)")
     parser.add_argument(
         "--spread", type=float, default=1.0, help="standard deviation as a part of half the range (default 1.0)"
     )
     parser.add_argument("--action", action="append", default=[], metavar="NAME", help="record its frames as well")
     parser.add_argument("--resume", action="store_true", help="continue a recording that was interrupted")
+    parser.add_argument(
+        "--refine", metavar="MODEL.onnx", type=Path, help="add poses to the recording where this model is worst"
+    )
 
 
 def run(options: argparse.Namespace) -> None:
     from ..core.errors import WrongUsageError
-    from ..recording import RecordingSettings, record
     from ..runtime.binding import true_rig
     from .files import open_rig
     from .progress import ProgressPrinter
 
-    if options.poses < 0 or options.seed < 0:
+    if (options.poses or 0) < 0 or options.seed < 0:
         raise WrongUsageError("--poses and --seed must be 0 or more.")
     # Wider is uniform already, and most draws would fall outside and be drawn again.
     if not 0 < options.spread <= 10:
         raise WrongUsageError("--spread must be more than 0 and at most 10.")
+    if options.refine and (options.action or options.resume or options.poses == 0):
+        raise WrongUsageError("--refine adds random poses to a complete recording; leave --action and --resume out.")
     scene_rig = open_rig(options)
-    settings = RecordingSettings(
-        poses=options.poses,
-        seed=options.seed,
-        spread=options.spread,
-        actions=tuple(options.action),
-        resume=options.resume,
-    )
     start = time.monotonic()
     with ProgressPrinter() as progress, true_rig(scene_rig.mesh_object):
-        for step in record(scene_rig, options.recording, settings):
+        for step in _steps(scene_rig, options):
             progress.show(step.stage, step.done, step.total)
-    print(f"{options.recording}: {step.total} poses in {time.monotonic() - start:.1f} s")
+    added = "added " if options.refine else ""
+    print(f"{options.recording}: {step.total} poses {added}in {time.monotonic() - start:.1f} s")
+
+
+def _steps(scene_rig: "SceneRig", options: argparse.Namespace) -> "Iterator[Progress]":
+    from ..recording import RecordingSettings, record
+    from ..refinement import RefinementSettings, refine
+
+    given = {} if options.poses is None else {"poses": options.poses}
+    if options.refine:
+        settings = RefinementSettings(seed=options.seed, **given)
+        return refine(scene_rig, options.recording, options.refine, settings)
+    settings = RecordingSettings(
+        seed=options.seed, spread=options.spread, actions=tuple(options.action), resume=options.resume, **given
+    )
+    return record(scene_rig, options.recording, settings)

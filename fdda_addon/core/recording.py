@@ -23,6 +23,8 @@ FORMAT = "fdda-recording"
 VERSION = 1
 INDEX = "recording.json"
 MAX_INDEX_BYTES = 64 << 20
+REFINED = "refined"
+"""Kind of the poses that were added where a model was worst: no sample of the range of motion, so never held out."""
 CHECK_BYTES = 64 << 20
 """Recordings are searched for NaN in pieces of this size."""
 
@@ -32,10 +34,10 @@ class Source:
     """Where poses of a recording came from.
 
     Attributes:
-        kind: "random" or "action".
+        kind: "random", "action" or `REFINED`.
         poses: how many.
-        name: of the action; empty for random poses.
-        frames: first frame of the action and the step between poses, (0, 0) for random poses.
+        name: of the action; file name of the model that refined poses were chosen for; empty for random poses.
+        frames: first frame of the action and the step between poses, (0, 0) for other poses.
     """
 
     kind: str
@@ -245,13 +247,15 @@ def _open_array(path: Path, shape: tuple, dtype: type) -> np.ndarray:
             if np.lib.format.read_magic(file) != (1, 0):
                 raise ValueError("its npy version is not 1.0")
             found_shape, fortran, found_dtype = np.lib.format.read_array_header_1_0(file)
-            if found_shape != shape or fortran or found_dtype != np.dtype(dtype):
+            # More poses than the index counts are left by an extension that was interrupted.
+            longer = path.stem in STREAMED and found_shape[:1] > shape[:1] and found_shape[1:] == shape[1:]
+            if not (found_shape == shape or longer) or fortran or found_dtype != np.dtype(dtype):
                 raise ValueError(f"it holds {found_shape} {found_dtype}, not {shape} {np.dtype(dtype)}")
             # math.prod: the counts may be anything, and those of numpy wrap around.
-            expected = file.tell() + math.prod(shape) * np.dtype(dtype).itemsize
+            expected = file.tell() + math.prod(found_shape) * np.dtype(dtype).itemsize
         if path.stat().st_size < expected:
             raise ValueError(f"it is truncated: {path.stat().st_size} of {expected} bytes")
-        return np.load(path, mmap_mode="r", allow_pickle=False)
+        return np.load(path, mmap_mode="r", allow_pickle=False)[: shape[0]]
     except (OSError, ValueError) as error:
         raise RecordingError(f"'{path}' cannot be used: {error}; record again.") from error
     except HEADER_ERRORS as error:

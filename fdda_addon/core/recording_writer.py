@@ -93,7 +93,7 @@ class RecordingWriter:
                 if not self.complete:
                     np.save(path, getattr(self.rig, name).astype(dtype), allow_pickle=False)
                 continue
-            header = _array_header(shape, dtype)
+            header = array_header(shape, dtype)
             row = math.prod(shape[1:]) * np.dtype(dtype).itemsize
             end = len(header) + self.complete * row
             if self.complete:
@@ -158,13 +158,7 @@ class RecordingWriter:
             RecordingError: a value is not finite.
         """
         arrays = {"pose_matrices": pose_matrices, "residuals": residuals}
-        for name, array in arrays.items():
-            if not np.isfinite(array).all():
-                bad = int(np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))[0])
-                raise RecordingError(
-                    f"Pose {self.complete + bad} of the rig evaluates to values that are not numbers ({name}); "
-                    "look for a scale of zero or a broken driver."
-                )
+        check_finite(arrays, self.complete)
         try:
             for name, array in arrays.items():
                 self._files[name].write(np.ascontiguousarray(array, np.float32).data)
@@ -209,7 +203,23 @@ class RecordingWriter:
                 folder.rmdir()
 
 
-def _array_header(shape: tuple, dtype: type) -> bytes:
+def check_finite(arrays: dict[str, np.ndarray], first: int) -> None:
+    """Fail when arrays of poses, by name, hold values that are not numbers; `first` is the number of their first pose.
+
+    Raises:
+        RecordingError: names the pose.
+    """
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            bad = int(np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))[0])
+            raise RecordingError(
+                f"Pose {first + bad} of the rig evaluates to values that are not numbers ({name}); "
+                "look for a scale of zero or a broken driver."
+            )
+
+
+def array_header(shape: tuple, dtype: type) -> bytes:
+    """First bytes of a `.npy` file of version 1.0; as long for any number of rows, so that rows can be added."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape})
     return header.getvalue()

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Appends refined poses to a complete recording, which stays complete at every moment (docs/recording.md)."""
+
+import json
+import math
+import os
+from dataclasses import asdict
+
+import numpy as np
+
+from .errors import OutputError, RecordingError
+from .output import write_json
+from .recording import INDEX, REFINED, STREAMED, Recording, Source, array_shapes, read_index
+from .recording_writer import array_header, check_finite
+
+
+class RecordingExtension:
+    """Appends poses to a recording; use as a context manager.
+
+    Poses are written behind those that the recording has, then the headers of the arrays, which may say more than the
+    index, and the index last: an interruption at any moment leaves a complete recording, with the poses of every
+    `append` that ended.
+    """
+
+    def __init__(self, recording: Recording, name: str):
+        """Args:
+            recording: complete.
+            name: of the model that the poses refine, its file name.
+
+        Raises:
+            OutputError: the files cannot be opened for writing.
+        """
+        self.path = recording.path
+        self.complete = len(recording.pose_matrices)
+        self._start = self.complete
+        self._name = name
+        self._index = read_index(self.path)
+        self._sources = list(self._index["sampling"]["sources"])
+        self._shapes = array_shapes(0, len(self._index["joints"]), self._index["vertices"], self._index["influences"])
+        self._files = {}
+        try:
+            for streamed in STREAMED:
+                self._files[streamed] = open(self.path / f"{streamed}.npy", "r+b")  # noqa: SIM115 - __exit__
+        except OSError as error:
+            self._close()
+            raise self._failed(error) from error
+
+    def append(self, pose_matrices: np.ndarray, residuals: np.ndarray) -> None:
+        """Add poses.
+
+        Args:
+            pose_matrices: (n, J, 4, 4), mesh-object space, metres.
+            residuals: (n, V, 3), local residuals, metres.
+
+        Raises:
+            OutputError: the disk is full or went away; the poses before stay complete.
+            RecordingError: a value is not finite.
+        """
+        arrays = {"pose_matrices": pose_matrices, "residuals": residuals}
+        check_finite(arrays, self.complete)
+        total = self.complete + len(pose_matrices)
+        try:
+            for name, array in arrays.items():
+                self._write(name, array)
+            for name in arrays:
+                self._write_header(name, total)
+            self.complete = total
+            self._write_index()
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def _write(self, name: str, array: np.ndarray) -> None:
+        shape, dtype = self._shapes[name]
+        row = math.prod(shape[1:]) * np.dtype(dtype).itemsize
+        file = self._files[name]
+        file.seek(len(self._header(name, self.complete)) + self.complete * row)
+        file.write(np.ascontiguousarray(array, dtype).data)
+        file.flush()
+        os.fsync(file.fileno())
+
+    def _write_header(self, name: str, poses: int) -> None:
+        header, file = self._header(name, poses), self._files[name]
+        if len(header) != len(self._header(name, self._start)):
+            raise RecordingError(f"'{self.path / name}.npy' has no room for {poses} poses; record again.")
+        file.seek(0)
+        file.write(header)
+        file.flush()
+        os.fsync(file.fileno())
+
+    def _header(self, name: str, poses: int) -> bytes:
+        shape, dtype = self._shapes[name]
+        return array_header((poses, *shape[1:]), dtype)
+
+    def _write_index(self) -> None:
+        source = Source(REFINED, self.complete - self._start, self._name)
+        sources = [*self._sources, json.loads(json.dumps(asdict(source)))]
+        sampling = {**self._index["sampling"], "sources": sources}
+        index = {**self._index, "poses": self.complete, "complete": self.complete, "sampling": sampling}
+        write_json(self.path / INDEX, index)
+
+    def _failed(self, error: OSError) -> OutputError:
+        return OutputError(
+            f"Cannot add poses to the recording '{self.path}': {error.strerror or error}; it holds {self.complete} "
+            "poses and can be trained on as it is."
+        )
+
+    def __enter__(self) -> "RecordingExtension":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        for file in self._files.values():
+            file.close()

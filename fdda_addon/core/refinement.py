@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Chooses the poses that a model should see more of: near those where it errs, and where the recording is thin."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .poses import Channel
+
+THIN_PART = 1 / 3
+"""Part of the choices that go where the recorded poses are few, the others go where the error is large."""
+JITTER = 0.15
+"""Standard deviation around a chosen pose, as a part of half the range of motion."""
+WORST_PART = 0.1
+"""The error that a partition is weighed by is its mean over this part of the probes, the worst."""
+
+
+@dataclass(frozen=True)
+class Probes:
+    """M poses on which a model was compared with its rig.
+
+    Attributes:
+        values: (M, C) float64, of the channels, radians or metres.
+        errors: (M, P) largest error of each partition, metres.
+        distances: (M, P) distance to the nearest recorded pose, of the joints that influence each partition, no unit.
+    """
+
+    values: np.ndarray
+    errors: np.ndarray
+    distances: np.ndarray
+
+
+def nearest_distances(points: np.ndarray, recorded: np.ndarray) -> np.ndarray:
+    """Distance of each point to the nearest recorded one, each feature in units of its spread in the recording.
+
+    Args:
+        points: (M, F). recorded: (N, F).
+
+    Returns:
+        (M,) float64, 0 where no feature varies.
+    """
+    spread = recorded.std(axis=0, dtype=np.float64)
+    used = spread > spread.max(initial=0) * 1e-3
+    if not used.any():
+        return np.zeros(len(points))
+    first, second = (array[:, used] / spread[used] for array in (points, recorded))
+    squared = (first**2).sum(axis=1)[:, None] - 2 * first @ second.T + (second**2).sum(axis=1)
+    return np.sqrt(np.maximum(squared.min(axis=1), 0))
+
+
+def choose_poses(
+    probes: Probes, channels: tuple[Channel, ...], owned: list[np.ndarray], base: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Make poses that help a model most.
+
+    Each pose serves as many partitions as it can: partition after partition, in a random order that prefers those
+    with large errors, sets its channels as in one of its probes, unless another has set one of them; what is left
+    stays as in `base`.
+
+    Args:
+        probes: where the model errs.
+        channels: C channels with their ranges.
+        owned: for each of P partitions, indices of the channels that influence it.
+        base: (n, C) random poses to start from.
+        rng: makes the choices.
+
+    Returns:
+        (n, C) float64, inside the ranges.
+    """
+    low, high = np.array([(channel.low, channel.high) for channel in channels]).T
+    worst = np.sort(probes.errors, axis=0)[-max(1, round(len(probes.errors) * WORST_PART)) :]
+    weights = worst.mean(axis=0)
+    by_error, by_distance = (_shares(scores) for scores in (probes.errors, probes.distances))
+    poses = base.copy()
+    for pose in poses:
+        left = np.ones(len(channels), bool)
+        # Exponential races: the order of a draw without replacement, with these weights.
+        for partition in np.argsort(rng.exponential(size=len(weights)) / np.maximum(weights, 1e-12)):
+            own = owned[partition]
+            if not len(own) or not left[own].all():
+                continue
+            shares = by_distance if rng.random() < THIN_PART else by_error
+            probe = rng.choice(len(probes.values), p=shares[:, partition])
+            noise = rng.standard_normal(len(own)) * JITTER * (high - low)[own] / 2
+            pose[own] = probes.values[probe, own] + noise
+            left[own] = False
+    return np.clip(poses, low, high)
+
+
+def _shares(scores: np.ndarray) -> np.ndarray:
+    """(M, P) scores to probabilities over the M probes: the squares, so that the worst are chosen most."""
+    squared = np.square(scores, dtype=np.float64) + 1e-30
+    return squared / squared.sum(axis=0)

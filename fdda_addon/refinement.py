@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Adds poses to a recording where a model that was trained on it is worst."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .core.errors import RecordingError
+from .core.features import joint_features
+from .core.metrics import distances
+from .core.model import check_rig
+from .core.poses import DEFAULT_SPREAD, Channel, sample_pose
+from .core.progress import Progress
+from .core.recording import Recording, read_recording
+from .core.recording_extension import RecordingExtension
+from .core.refinement import Probes, choose_poses, nearest_distances
+from .core.rig import Rig, differences
+from .core.skinning import LinearLayer
+from .recording import append_poses
+from .runtime.network import Network
+from .scene.armature import Poser, clear_pose
+from .scene.borrow import borrowed_pose
+from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
+
+PROBE_INDEX, BASE_INDEX = 1 << 34, 1 << 35
+"""Poses are drawn from indices that neither a recording nor an evaluation reaches."""
+LEAST_PROBES = 200
+WIDE_SPREAD = 10.0
+"""Every other probe is drawn almost evenly: the corners of the range are rare in a recording, not in an animation."""
+
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """What to add.
+
+    Attributes:
+        poses: how many.
+        seed: of the choices; others with every recording that is longer.
+    """
+
+    poses: int = 250
+    seed: int = 0
+
+
+def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSettings) -> Iterator[Progress]:
+    """Add poses to a complete recording; a generator that does the work while it is iterated.
+
+    The scene is as before when the generator ends, is closed, or raises; the recording is complete at every moment.
+
+    Args:
+        scene_rig: the rig that was recorded.
+        path: folder of the recording.
+        model: trained on it.
+        settings: what to add.
+
+    Yields:
+        Progress of the stages "probes" and "poses".
+
+    Raises:
+        RigError: the rig cannot be recorded.
+        RecordingError: the recording is not complete, or of another rig or range of motion.
+        ModelError: the model cannot be read, or is of another rig.
+        OutputError: the recording cannot be written.
+    """
+    network = Network(model)
+    recording = read_recording(path)
+    check_evaluable(scene_rig)
+    rig = read_rig(scene_rig)
+    check_rig(model, network.info, rig)
+    channels = sampled_channels(scene_rig, rig)
+    _check_recording(recording, rig, channels)
+    first = len(recording.pose_matrices)
+    with borrowed_pose(scene_rig.armature_object):
+        clear_pose(scene_rig.armature_object)
+        evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig.armature_object, channels)
+        count = max(LEAST_PROBES, settings.poses)
+        values = np.stack([_probe(channels, settings.seed, PROBE_INDEX + first + i) for i in range(count)])
+        matrices, errors = [], []
+        for number, pose in enumerate(values):
+            poser.set(pose)
+            pose_matrices, true = evaluator.evaluate()
+            moved = distances(network.positions(pose_matrices[None])[0], true)
+            matrices.append(pose_matrices)
+            errors.append([moved[partition.vertices].max() for partition in recording.partitions])
+            yield Progress("probes", number + 1, count)
+        probes = Probes(values, np.array(errors), _thinness(recording, np.stack(matrices)))
+        base = np.stack([sample_pose(channels, settings.seed, BASE_INDEX + first + i) for i in range(settings.poses)])
+        rng = np.random.default_rng([settings.seed, first])
+        chosen = choose_poses(probes, channels, _owned(recording, channels), base, rng)
+        with RecordingExtension(recording, model.name) as extension:
+            posed = (poser.set(pose) for pose in chosen)
+            for _ in append_poses(posed, evaluator, LinearLayer(rig, recording.partitions), extension):
+                yield Progress("poses", extension.complete - first, settings.poses)
+
+
+def _probe(channels: tuple[Channel, ...], seed: int, index: int) -> np.ndarray:
+    return sample_pose(channels, seed, index, WIDE_SPREAD if index % 2 else DEFAULT_SPREAD)
+
+
+def _check_recording(recording: Recording, rig: Rig, channels: tuple[Channel, ...]) -> None:
+    own = recording.rig
+    found = differences(own.joints, own.rest_matrices, own.vertex_count, own.fingerprint, rig)
+    if found:
+        raise RecordingError(f"'{recording.path}' is a recording of another rig: {'; '.join(found)}. Record this rig.")
+    if not recording.info.sampling.channels:
+        raise RecordingError(
+            f"'{recording.path}' has no random poses, so there is no range of motion to choose from; record with "
+            "--poses."
+        )
+    if recording.info.sampling.channels != channels:
+        raise RecordingError(
+            f"The range of motion of the rig is not that of '{recording.path}' any more; record anew into another "
+            "folder."
+        )
+
+
+def _thinness(recording: Recording, pose_matrices: np.ndarray) -> np.ndarray:
+    """(M, P) how far each pose is from all recorded ones, as the joints that influence each partition go."""
+    rig = recording.rig
+    probes, recorded = (
+        joint_features(matrices, rig.rest_matrices, rig.parents)
+        for matrices in (pose_matrices, np.array(recording.pose_matrices))
+    )
+    return np.stack(
+        [
+            nearest_distances(*(f[:, list(p.influencing)].reshape(len(f), -1) for f in (probes, recorded)))
+            for p in recording.partitions
+        ],
+        axis=1,
+    )
+
+
+def _owned(recording: Recording, channels: tuple[Channel, ...]) -> list[np.ndarray]:
+    """For each partition the channels of the joints that influence it."""
+    names = recording.rig.joint_names
+    influencing = [{names[joint] for joint in partition.influencing} for partition in recording.partitions]
+    return [np.array([i for i, c in enumerate(channels) if c.bone in own], int) for own in influencing]
