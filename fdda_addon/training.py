@@ -5,9 +5,12 @@ torch never enters Blender's process: it would bring its own threads and librari
 """
 
 import os
+import queue
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +20,8 @@ from .core.messages import Message, MessageType
 PYTHON_VARIABLE = "FDDA_TRAINER_PYTHON"
 """Environment variable: the Python that has torch, when it is not the one that runs this."""
 CANCEL_SECONDS = 20.0
+"""A trainer that was asked to stop is killed after so long."""
+READER_SECONDS = 1.0
 
 
 def trainer_python() -> str:
@@ -69,16 +74,44 @@ class Training:
                 f"The trainer's Python '{command[0]}' cannot be started ({error.strerror}); set {PYTHON_VARIABLE} to a "
                 "Python that has torch."
             ) from error
+        self._cancelled_at: float | None = None
+        # A thread of its own: Blender must never wait for a line.
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
 
-    def messages(self) -> Iterator[Message]:
+    def _read(self) -> None:
+        for line in self._process.stdout:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    def cancel(self) -> None:
+        """Ask the trainer to stop; `messages` ends when it has. Does not wait."""
+        if self._cancelled_at is None:
+            self._cancelled_at = time.monotonic()
+            self._process.terminate()
+
+    def messages(self, wait: bool = True) -> Iterator[Message | None]:
         """What the trainer says, until it is finished or cancelled.
+
+        Args:
+            wait: for the next message. Otherwise None is given at once when there is none yet.
 
         Raises:
             WrongUsageError: it does not understand its options.
-            TrainingError: it failed, or died without a last message.
+            TrainingError: it failed, or died without a last message, unless it was cancelled.
         """
         last = None
-        for line in self._process.stdout:
+        while True:
+            try:
+                line = self._lines.get(block=wait)
+            except queue.Empty:
+                if self._cancelled_at is not None and time.monotonic() > self._cancelled_at + CANCEL_SECONDS:
+                    self._process.kill()
+                yield None
+                continue
+            if line is None:
+                break
             try:
                 message = Message.decode(line)
             except ValueError:
@@ -88,7 +121,11 @@ class Training:
                 raise TrainingError(str(message.values.get("text", "The training failed.")))
             yield message
             last = message
+        while not wait and self._process.poll() is None:
+            yield None
         status = self._process.wait()
+        if self._cancelled_at is not None:
+            return
         if status == WrongUsageError.exit_status and last is None:
             raise WrongUsageError(self._error_text().strip())
         if last is None or not last.type.is_last:
@@ -115,5 +152,8 @@ class Training:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
-        self._process.stdout.close()
+        # A process that the trainer has started may hold its output open: then it is left to the thread.
+        self._reader.join(READER_SECONDS)
+        if not self._reader.is_alive():
+            self._process.stdout.close()
         self._errors.close()

@@ -35,6 +35,8 @@ class JobOperator:
     title = ""
     borrows_scene = True
     """The job changes the scene and gives it back: meanwhile the user may look, but not touch, and ESC cancels."""
+    ends_itself = False
+    """`steps` watches `state.cancel_requested` and ends soon: for a process that takes its time to stop."""
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         """The work: yields `Progress`, None when there is nothing to do before the next tick, or a result.
@@ -143,11 +145,13 @@ class JobOperator:
     def _advance(self, context: bpy.types.Context, seconds: float) -> set[str] | None:
         run = self._run
         try:
-            if run.state.cancel_requested:
+            cancelled = run.state.cancel_requested
+            if cancelled and not self.ends_itself:
                 run.close()
-                return self._end(self.cancelled(context), "WARNING")
-            if not run.advance(seconds):
+            elif not run.advance(seconds):
                 return None
+            if cancelled and run.result is None:
+                return self._end(self.cancelled(context), "WARNING")
             return self._end(self.finish(context, run.result), "INFO")
         except FDDAError as error:
             return self._end(str(error), "ERROR")

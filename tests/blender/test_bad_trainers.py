@@ -5,6 +5,8 @@ import os
 import re
 import stat
 import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -127,3 +129,30 @@ def test_a_trainer_that_does_not_stop_is_stopped(elbow, tmp_path, monkeypatch):
         assert next(training.messages()).type is MessageType.STARTED
     with pytest.raises(ProcessLookupError):
         os.kill(int((tmp_path / "pid").read_text()), 0)
+
+
+def test_nobody_waits_for_a_trainer_that_is_silent(tmp_path, monkeypatch):
+    """As a window has it: a poll is answered at once, and a cancelled trainer ends without an error."""
+    from fdda_addon.training import Training
+
+    stand_in(tmp_path, monkeypatch, STARTED, "exec sleep 3600")
+    with Training([]) as training:
+        messages = training.messages(wait=False)
+        seen = first_of(messages)
+        assert seen.type is MessageType.STARTED
+        start = time.monotonic()
+        assert [next(messages) for _ in range(100)] == [None] * 100
+        assert time.monotonic() - start < 0.05
+        training.cancel()
+        assert first_of(messages) is None
+
+
+def first_of(messages: Iterator[Message | None], seconds: float = 20) -> Message | None:
+    """The next message of a training that is polled; None when it has ended."""
+    until = time.monotonic() + seconds
+    for message in messages:
+        if message is not None:
+            return message
+        assert time.monotonic() < until, "neither a message nor an end"
+        time.sleep(0.01)
+    return None
