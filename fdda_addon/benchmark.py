@@ -90,10 +90,15 @@ def _round(value: float) -> float:
     return round(float(value), 4)
 
 
-def benchmark(scene_rig: SceneRig, model: Path, frames: int) -> Iterator[Progress | Benchmark]:
+def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[Progress | Benchmark]:
     """Time a rig and a model in its place; a generator that does the work while it is iterated.
 
     The armature's action is played, or random poses where it has none. The scene is as before afterwards.
+
+    Args:
+        scene_rig: the rig.
+        model: the model, None for the one that is bound.
+        frames: to time, each way.
 
     Yields:
         Progress, and as the last thing the Benchmark.
@@ -119,7 +124,7 @@ def benchmark(scene_rig: SceneRig, model: Path, frames: int) -> Iterator[Progres
                 with prepare(mesh_object):
                     times[way] += _time_frames(played, number * each, each)
             yield Progress("benchmark", number + 1, ROUNDS)
-        network = playback.load_network(model.absolute())
+        network = playback.network_of(mesh_object)
         pose = network.info.rest_matrices[None]
         inference = _time([lambda: network.positions(pose)] * (frames + WARM_UP))[WARM_UP:]
     yield Benchmark(len(mesh_object.data.vertices), each * ROUNDS, **times, inference=inference)

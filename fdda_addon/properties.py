@@ -40,6 +40,9 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
         subtype="FILE_PATH",
         options=BLEND_RELATIVE_PATH,
     )
+    packed: PointerProperty(
+        name="Packed Model", description="The text that holds the model inside this file", type=bpy.types.Text
+    )
     mode: EnumProperty(
         name="Mode",
         description="What deforms the mesh",

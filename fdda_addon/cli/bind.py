@@ -26,7 +26,7 @@ def run(options: argparse.Namespace) -> None:
     check_writable(options.out)
     scene_rig = open_rig(options)
     bind(scene_rig, options.model, options.use_in_render)
-    # The file is saved with the positions of its current pose, for a Blender that has no add-on.
+    # What cannot play says so here and not when the file is opened.
     bpy.context.view_layer.update()
     if scene_rig.mesh_object.fdda.status:
         raise ModelError(scene_rig.mesh_object.fdda.status)

@@ -10,16 +10,19 @@ import bpy
 from ..core.errors import RigError
 from ..core.model import check_rig
 from ..scene.rig import SceneRig, check_topology, deforming_modifiers, read_rig
-from . import nodes, playback, switch
+from . import nodes, packed, playback, switch
 
 
-def bind(scene_rig: SceneRig, model: Path, use_in_render: bool = False) -> None:
+def bind(
+    scene_rig: SceneRig, model: Path, use_in_render: bool = False, packed_model: bpy.types.Text | None = None
+) -> None:
     """Bind a model to a rig and play it.
 
     Args:
         scene_rig: the rig.
         model: the model, anywhere; a saved file remembers it relative to itself.
         use_in_render: let final renders use the model too.
+        packed_model: the text that holds the model (`packed`); `model` is then where it came from.
 
     Raises:
         ModelError: the file is no model, or was trained for another rig. The scene is as before.
@@ -29,7 +32,7 @@ def bind(scene_rig: SceneRig, model: Path, use_in_render: bool = False) -> None:
     if mesh_object.mode == "EDIT":
         raise RigError(f"'{mesh_object.name}' is in edit mode; leave it first.")
     model = model.absolute()
-    network = playback.load_network(model)
+    network = playback.load_network(model) if packed_model is None else packed.load(packed_model)
     check_rig(model, network.info, read_rig(scene_rig))
     last = max(mesh_object.modifiers.find(modifier.name) for modifier in deforming_modifiers(mesh_object))
     # Those after the last deforming one stay and work on what the model gives.
@@ -37,11 +40,13 @@ def bind(scene_rig: SceneRig, model: Path, use_in_render: bool = False) -> None:
     if mesh_object.fdda.is_bound:
         unbind(mesh_object)
 
-    playback.choose(model)
+    if packed_model is None:
+        playback.choose(model)
     last = max(mesh_object.modifiers.find(modifier.name) for modifier in deforming_modifiers(mesh_object))
     nodes.add_modifier(mesh_object, last + 1)
     binding = mesh_object.fdda
     binding.model = bpy.path.relpath(str(model)) if bpy.data.filepath else str(model)
+    binding.packed = packed_model
     binding.use_in_render = use_in_render
     binding.is_bound = True
     binding.mode = "FDDA"
@@ -60,7 +65,7 @@ def unbind(mesh_object: bpy.types.Object) -> None:
         nodes.set_cache(modifier, None)
         mesh_object.modifiers.remove(modifier)
         nodes.remove_cache(cache)
-    for name in ("is_bound", "model", "use_in_render", "status"):
+    for name in ("is_bound", "model", "packed", "use_in_render", "status"):
         binding.property_unset(name)
     playback.forget()
 
@@ -86,15 +91,26 @@ def true_rig(mesh_object: bpy.types.Object) -> Iterator[None]:
 
 
 @contextmanager
-def borrowed_binding(scene_rig: SceneRig, model: Path) -> Iterator[None]:
+def borrowed_binding(scene_rig: SceneRig, model: Path | None) -> Iterator[None]:
     """Play a model for a while; the binding that the object has, or none, is there again afterwards.
+
+    Args:
+        scene_rig: the rig.
+        model: the model, None for the one that is bound.
 
     Raises:
         FDDAError: as `bind`.
     """
     binding = scene_rig.mesh_object.fdda
-    previous = (playback.model_path(scene_rig.mesh_object), binding.use_in_render) if binding.is_bound else None
-    mode = binding.mode
+    if model is None:
+        with true_rig(scene_rig.mesh_object):
+            yield
+        return
+    previous = None
+    if binding.is_bound:
+        path = Path(binding.model) if binding.packed else playback.model_path(scene_rig.mesh_object)
+        previous = (path, binding.use_in_render, binding.packed)
+    mode, stored = binding.mode, binding.model
     bind(scene_rig, model)
     try:
         yield
@@ -102,4 +118,5 @@ def borrowed_binding(scene_rig: SceneRig, model: Path) -> Iterator[None]:
         unbind(scene_rig.mesh_object)
         if previous is not None:
             bind(scene_rig, *previous)
+            binding.model = stored
             binding.mode = mode

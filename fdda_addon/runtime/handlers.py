@@ -42,7 +42,11 @@ def _on_reloaded(*_: object) -> None:
     global _count_without_bound
     _count_without_bound = -1
     if playback := _playback():
+        from .saved_rig import resume
+
         playback.forget()
+        # A file holds the true rig, whatever plays in it.
+        resume()
         if playback.playing_objects():
             # Without a window nothing evaluates a file that was loaded; here it is safe, no evaluation is under way.
             playback.evaluate(bpy.context.evaluated_depsgraph_get())
@@ -64,6 +68,22 @@ def _on_render_ended(*_: object) -> None:
             playback.refresh(mesh_object)
 
 
+@persistent
+def _on_save_begins(*_: object) -> None:
+    if _playback():
+        from .saved_rig import give_back_rigs
+
+        give_back_rigs()
+
+
+@persistent
+def _on_save_ended(*_: object) -> None:
+    if _playback():
+        from .saved_rig import resume
+
+        resume()
+
+
 def _pin_outside_renders(playback: ModuleType, pinned: bool) -> None:
     from .switch import pin_shape_keys
 
@@ -81,6 +101,9 @@ HANDLERS = {
     "render_init": _on_render_begins,
     "render_complete": _on_render_ended,
     "render_cancel": _on_render_ended,
+    "save_pre": _on_save_begins,
+    "save_post": _on_save_ended,
+    "save_post_fail": _on_save_ended,
 }
 
 
@@ -92,13 +115,32 @@ def register() -> None:
         handlers = getattr(bpy.app.handlers, name)
         if handler not in handlers:
             handlers.append(handler)
+    if hasattr(bpy.data, "objects"):
+        _resume_open_file()
+    else:
+        # An add-on that is being enabled does not see the file yet.
+        bpy.app.timers.register(_resume_open_file, first_interval=0)
+
+
+def _resume_open_file() -> None:
+    """Let the models of a file play that was open before the add-on was there."""
+    if _playback():
+        from .saved_rig import resume
+
+        resume()
 
 
 def unregister() -> None:
-    """Remove the handlers and forget all bindings. Left registered they hang the 4.5 module at exit."""
+    """Remove the handlers and forget all bindings; rigs are given back. Left registered they hang the 4.5 module."""
+    if bpy.app.timers.is_registered(_resume_open_file):
+        bpy.app.timers.unregister(_resume_open_file)
     for name, handler in HANDLERS.items():
         handlers = getattr(bpy.app.handlers, name)
         if handler in handlers:
             handlers.remove(handler)
     if _PLAYBACK in sys.modules:
+        from .saved_rig import give_back_rigs
+
+        # Nothing would move their meshes any more.
+        give_back_rigs()
         sys.modules[_PLAYBACK].forget()

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import ModelError
-from ..core.model import POSE_INPUT, POSITIONS_OUTPUT, read_model
+from ..core.model import POSE_INPUT, POSITIONS_OUTPUT, TRUST_OUTPUT, check_model, read_model
 
 THREADED_VERTICES = 20_000
 """From this many vertices on a second thread gains more than it costs."""
@@ -24,14 +24,18 @@ class Network:
         info: what the model says of itself.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, data: bytes | None = None):
         """Load a model.
+
+        Args:
+            path: the file.
+            data: its bytes, where it is no file; `path` is then what errors call it.
 
         Raises:
             ModelError: the file is no model or ONNX Runtime refuses it.
         """
         self.path = path
-        self.info, data = read_model(path)
+        self.info, data = read_model(path) if data is None else (check_model(data, path), data)
         try:
             # Imported here so that Blender starts without it.
             import onnxruntime
@@ -78,6 +82,28 @@ class Network:
         except Exception as error:  # As above.
             raise ModelError(f"The model '{self.path}' failed ({_first_line(error)}); train it again.") from error
         return positions
+
+    def trust(self, pose_matrices: np.ndarray) -> np.ndarray | None:
+        """How far the networks are believed; costs as much as the positions, so not for every frame.
+
+        Args:
+            pose_matrices: (N, J, 4, 4) float32, mesh-object space, metres.
+
+        Returns:
+            (N, P) float32, 0 to 1, in the order of `info.partitions`; None when the model does not say.
+
+        Raises:
+            ModelError: the model fails or answers in another shape.
+        """
+        if TRUST_OUTPUT not in {output.name for output in self._session.get_outputs()}:
+            return None
+        try:
+            (trust,) = self._session.run([TRUST_OUTPUT], {POSE_INPUT: pose_matrices})
+        except Exception as error:  # As above.
+            raise ModelError(f"The model '{self.path}' failed ({_first_line(error)}); train it again.") from error
+        if trust.shape != (len(pose_matrices), len(self.info.partitions)):
+            raise ModelError(f"The model '{self.path}' gives trust of another shape than it says; train it again.")
+        return trust
 
     def _bind(self, count: int) -> tuple[object, np.ndarray, np.ndarray]:
         """Arrays that the session reads from and writes into, and their binding."""

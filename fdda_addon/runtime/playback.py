@@ -17,7 +17,7 @@ import numpy as np
 from ..core.errors import FDDAError, ModelError, RigError
 from ..core.skinning import LinearLayer
 from ..scene.rig import PoseReader, SceneRig, armature_modifier, read_rig
-from . import nodes
+from . import nodes, packed, switch
 from .network import Network
 
 _networks: dict[Path, tuple[tuple, Network]] = {}
@@ -38,7 +38,7 @@ class LiveBinding:
             FDDAError: the model cannot be loaded, or does not fit the object any more.
         """
         self.name, self.uid = mesh_object.name, mesh_object.session_uid
-        self.network = load_network(model_path(mesh_object))
+        self.network = network_of(mesh_object)
         self.armature_uid = _armature(mesh_object).session_uid
         self._reader = self._make_reader(mesh_object)
         self._linear_layer: LinearLayer | None = None
@@ -125,6 +125,16 @@ class LiveBinding:
 
 _Job = tuple[LiveBinding, bpy.types.Object, np.ndarray, float]
 """An object to move: its pose matrices and its strength, 0 for the linear layer alone."""
+
+
+def network_of(mesh_object: bpy.types.Object) -> Network:
+    """The network of a bound object: of the model that is packed into the .blend file, else of its file.
+
+    Raises:
+        ModelError: it cannot be loaded.
+    """
+    binding = mesh_object.fdda
+    return load_network(model_path(mesh_object)) if binding.packed is None else packed.load(binding.packed)
 
 
 def load_network(path: Path) -> Network:
@@ -283,11 +293,15 @@ def _scan() -> None:
         modifier = nodes.find_modifier(mesh_object)
         if modifier is not None:
             cache = nodes.cache_of(modifier)
-            if cache is None or cache.name in caches:
-                # A duplicate still points to the positions of its original.
+            if cache is None or cache.name in caches or cache.library is not None:
+                # A duplicate still points to the positions of its original, a linked object to those of its library,
+                # which Blender does not evaluate anew.
                 cache = nodes.new_cache(mesh_object)
                 nodes.set_cache(modifier, cache)
             caches.add(cache.name)
+        if mesh_object.fdda.mode != "RIG" and not mesh_object.fdda.is_playing:
+            # Linked or appended from a file, which holds the true rig.
+            switch.switch_modifiers(mesh_object)
         if mesh_object.fdda.is_playing and mesh_object.session_uid not in _live:
             with _failing(mesh_object):
                 _live[mesh_object.session_uid] = LiveBinding(mesh_object)

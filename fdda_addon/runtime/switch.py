@@ -35,6 +35,15 @@ def switch_modifiers(mesh_object: bpy.types.Object) -> None:
         pin_shape_keys(mesh_object, True)
 
 
+def give_back(mesh_object: bpy.types.Object) -> None:
+    """Show the modifiers of the rig as if no model played; the mode stays, and `switch_modifiers` follows it again."""
+    if mesh_object.fdda.is_playing:
+        _restore(mesh_object)
+    modifier = nodes.find_modifier(mesh_object)
+    if modifier is not None:
+        modifier.show_viewport = modifier.show_render = False
+
+
 def pin_shape_keys(mesh_object: bpy.types.Object, pinned: bool) -> None:
     """Show the reference key alone, or what was shown before.
 

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A saved file holds the true rig, and its models play as soon as the add-on is there."""
+
+import bpy
+import numpy as np
+import pytest
+from conftest import ELBOW, assert_plays, evaluated, pose
+
+import fdda_addon
+from fdda_addon.runtime import playback
+
+
+@pytest.fixture
+def keyed(bound):
+    """The bound elbow with a shape key, which a playing model pins away."""
+    bound.fdda.mode = "RIG"
+    bound.shape_key_add(name="Basis")
+    key = bound.shape_key_add(name="bulge")
+    key.data[0].co.x += 0.05
+    key.value = 1.0
+    bound.active_shape_key_index = 1
+    bound.fdda.mode = "FDDA"
+    return bound
+
+
+def state(mesh_object):
+    return (
+        {m.name: (m.show_viewport, m.show_render) for m in mesh_object.modifiers},
+        mesh_object.show_only_shape_key,
+        mesh_object.active_shape_key_index,
+    )
+
+
+@pytest.mark.parametrize("use_in_render", [False, True])
+def test_without_the_addon_the_file_shows_and_renders_the_rig(keyed, tmp_path, use_in_render):
+    keyed.fdda.use_in_render = use_in_render
+    pose(angle=1.3)
+    keyed.fdda.mode = "RIG"
+    true = evaluated(keyed)
+    keyed.fdda.mode = "FDDA"
+    playing = evaluated(keyed)
+    assert np.abs(playing - true).max() > 1e-4
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"), copy=True)
+    fdda_addon.unregister()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
+    mesh_object = bpy.data.objects[ELBOW]
+    assert not hasattr(mesh_object, "fdda")
+    shown, pinned, index = state(mesh_object)
+    assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
+    assert (pinned, index) == (False, 1)
+    pose(angle=1.3)
+    assert np.abs(evaluated(mesh_object) - true).max() < 1e-6
+
+
+def test_saving_does_not_stop_the_playback(keyed, elbow):
+    keyed.fdda.use_in_render = True
+    before = state(keyed)
+    pose(angle=0.8)
+    first = assert_plays(keyed, elbow.model)
+    bpy.ops.wm.save_as_mainfile(filepath=str(elbow.bound.with_name("again.blend")), copy=True)
+    assert state(keyed) == before
+    assert np.array_equal(assert_plays(keyed, elbow.model), first)
+    keyed.fdda.mode = "RIG"
+    assert [m.show_viewport for m in keyed.modifiers] == [True, True, False]
+
+
+def test_a_save_that_fails_does_not_stop_the_playback(bound, elbow, tmp_path):
+    folder = tmp_path / "taken.blend"
+    folder.mkdir()
+    with pytest.raises(RuntimeError):
+        bpy.ops.wm.save_as_mainfile(filepath=str(folder), copy=True)
+    pose(angle=1.1)
+    assert_plays(bound, elbow.model)
+    assert bound.fdda.is_playing
+
+
+@pytest.mark.parametrize("mode", ["FDDA", "LINEAR", "RIG"])
+def test_the_mode_comes_back_with_the_file(bound, elbow, mode):
+    bound.fdda.mode = mode
+    pose(angle=1.2)
+    before, shown = evaluated(bound), state(bound)
+    path = elbow.bound.with_name("mode.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    mesh_object = bpy.data.objects[ELBOW]
+    assert mesh_object.fdda.mode == mode and state(mesh_object) == shown
+    pose(angle=1.2)
+    assert np.abs(evaluated(mesh_object) - before).max() < 1e-6
+
+
+def test_disabling_the_addon_gives_the_rig_back_and_enabling_it_plays(bound, elbow):
+    pose(angle=1.0)
+    fdda_addon.unregister()
+    assert state(bound)[0] == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
+    fdda_addon.register()
+    bpy.context.view_layer.update()
+    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+
+
+def test_a_linked_character_plays(elbow):
+    playback.choose(elbow.model)
+    with bpy.data.libraries.load(str(elbow.bound), link=True) as (_, wanted):
+        wanted.objects = [ELBOW, "elbow_rig"]
+    for linked in wanted.objects:
+        bpy.context.scene.collection.objects.link(linked)
+    pose(angle=1.2)
+    assert_plays(wanted.objects[0], elbow.model)
+
+
+def test_undo_across_a_save(bound, elbow):
+    bpy.ops.ed.undo_push(message="start")
+    pose(angle=0.5)
+    bpy.ops.ed.undo_push(message="posed")
+    bpy.ops.wm.save_as_mainfile(filepath=str(elbow.bound.with_name("undone.blend")), copy=True)
+    pose(angle=1.5)
+    bpy.ops.ed.undo_push(message="posed again")
+    bpy.ops.ed.undo()
+    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+    assert bpy.data.objects[ELBOW].fdda.is_playing
