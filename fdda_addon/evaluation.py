@@ -143,7 +143,9 @@ class Evaluation:
         }
 
 
-def evaluate(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> Iterator[Progress | Evaluation]:
+def evaluate(
+    scene_rig: SceneRig, model: Path | Network, settings: EvaluationSettings
+) -> Iterator[Progress | Evaluation]:
     """Compare a model with its rig; a generator that does the work while it is iterated.
 
     The scene is as before when the generator ends, is closed, or raises.
@@ -156,11 +158,8 @@ def evaluate(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> 
         ModelError: the model cannot be read, or is of another rig.
     """
     actions = [find_action(name) for name in settings.actions]
-    network = Network(model)
-    check_evaluable(scene_rig)
-    rig = read_rig(scene_rig)
-    check_rig(model, network.info, rig)
-    layer = LinearLayer(rig)
+    network, layer = _prepare(scene_rig, model)
+    rig = layer.rig
     if settings.poses < 1:
         raise RigError("There is nothing to evaluate: 0 poses; give --poses.")
     channels = sampled_channels(scene_rig, rig)
@@ -184,6 +183,28 @@ def evaluate(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> 
         for action in actions:
             compared_actions.append((yield from comparison.compare(action.name, _action_poses(scene_rig, action))))
     yield Evaluation(layer.partitions, rig.joint_names, held_out, compared_actions, beyond, named)
+
+
+def evaluate_action(scene_rig: SceneRig, model: Path | Network, name: str) -> Iterator[Progress | Evaluation]:
+    """Compare a model with its rig on the frames of one action alone, which stand in the place of held-out poses.
+
+    As `evaluate` in all else.
+    """
+    action = find_action(name)
+    network, layer = _prepare(scene_rig, model)
+    with borrowed_pose(scene_rig.armature_object, [action]):
+        evaluator = PoseEvaluator(scene_rig, layer.rig)
+        comparison = _Comparison(evaluator, network, layer, len(action_frames(action)))
+        errors = yield from comparison.compare(action.name, _action_poses(scene_rig, action))
+    yield Evaluation(layer.partitions, layer.rig.joint_names, errors)
+
+
+def _prepare(scene_rig: SceneRig, model: Path | Network) -> tuple[Network, LinearLayer]:
+    network = model if isinstance(model, Network) else Network(model)
+    check_evaluable(scene_rig)
+    rig = read_rig(scene_rig)
+    check_rig(network.path, network.info, rig)
+    return network, LinearLayer(rig)
 
 
 def _random_poses(

@@ -57,3 +57,24 @@ def heat_colors(errors: np.ndarray, most: float = HEAT_STOPS[-1][0]) -> np.ndarr
     heat = np.stack([np.interp(errors, stops, colors[:, channel]) for channel in range(3)], axis=-1)
     heat[np.asarray(errors) < NO_ERROR] = HEAT_NONE
     return heat.astype(np.float32)
+
+
+def worst_poses(errors: np.ndarray, count: int, apart: int) -> list[int]:
+    """The poses with the largest error of a vertex, the worst first.
+
+    Args:
+        errors: (N, V) metres.
+        count: how many at most.
+        apart: neighbours of a pose that is chosen, nearer than this, are passed over: frames of one movement.
+
+    Returns:
+        Indices of poses; those without any error are left out.
+    """
+    largest = np.asarray(errors).max(axis=1)
+    chosen: list[int] = []
+    for index in np.argsort(-largest, kind="stable"):
+        if len(chosen) == count or largest[index] < NO_ERROR:
+            break
+        if all(abs(int(index) - other) >= apart for other in chosen):
+            chosen.append(int(index))
+    return chosen

@@ -9,12 +9,13 @@ import pytest
 from conftest import run
 from scene_state import drain
 
+from fdda_addon.core.errors import RigError
 from fdda_addon.core.metrics import error_statistics
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.poses import beyond_range, sample_pose
 from fdda_addon.core.recording import read_recording
 from fdda_addon.core.skinning import LinearLayer
-from fdda_addon.evaluation import HELD_OUT_INDEX, Evaluation, EvaluationSettings, NamedPose, evaluate
+from fdda_addon.evaluation import HELD_OUT_INDEX, Evaluation, EvaluationSettings, NamedPose, evaluate, evaluate_action
 from fdda_addon.runtime.network import Network
 from fdda_addon.scene.armature import Poser, clear_pose
 from fdda_addon.scene.mesh import evaluated_positions
@@ -183,3 +184,14 @@ def test_benchmark(elbow, tmp_path, capfd):
     out = capfd.readouterr().out
     assert f"FDDA is {report['ratio']:.2f} times as fast as the rig." in out
     assert ("It is not worth it here" in out) == (report["ratio"] < 1)
+
+
+def test_an_action_alone_is_what_it_is_beside_held_out_poses(rig, elbow):
+    settings = EvaluationSettings(1, actions=("elbow_wave",))
+    beside = drain(evaluate(rig, elbow.model, settings)).actions[0]
+    alone = drain(evaluate_action(rig, Network(elbow.model), "elbow_wave"))
+    assert alone.held_out.name == "elbow_wave"
+    np.testing.assert_allclose(alone.held_out.fdda, beside.fdda, atol=1e-6)
+    assert sum(len(partition.vertices) for partition in alone.partitions) == beside.fdda.shape[1]
+    with pytest.raises(RigError, match="no action 'jump'"):
+        drain(evaluate_action(rig, elbow.model, "jump"))

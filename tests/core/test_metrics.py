@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.metrics import HEAT_NONE, distances, error_statistics, heat_colors
+from fdda_addon.core.metrics import HEAT_NONE, distances, error_statistics, heat_colors, worst_poses
 
 
 def test_distances_are_of_vertices():
@@ -71,3 +71,12 @@ def test_more_error_is_more_red():
 def test_a_narrower_range_moves_the_colours_and_not_what_counts_as_none():
     np.testing.assert_allclose(heat_colors(np.array([0.0005, 0.001]), 0.001), [VIOLET, RED], atol=1e-5)
     assert np.array_equal(heat_colors(np.array([0.5e-6]), 0.001)[0], np.float32(HEAT_NONE))
+
+
+def test_worst_poses_are_apart_and_in_order():
+    errors = np.zeros((12, 3))
+    errors[[2, 3, 7, 11], [0, 1, 2, 0]] = 0.01, 0.03, 0.02, 1e-9
+    assert worst_poses(errors, 5, 2) == [3, 7]
+    assert worst_poses(errors, 5, 1) == [3, 7, 2]
+    assert worst_poses(errors, 1, 1) == [3]
+    assert worst_poses(np.zeros((4, 2)), 3, 1) == []
