@@ -45,7 +45,7 @@ def _train(options: argparse.Namespace, announcer: Announcer, stop: "_StopReques
         config = config_from_arguments(options)
         training, cancelled = _import_training()
         try:
-            training(options.recording, options.model, config, announcer, stop)
+            training(options.recording, options.model, config, announcer, stop, options.warm_start)
         except cancelled:
             announcer.say(MessageType.CANCELLED)
             return INTERRUPTED
@@ -77,7 +77,8 @@ def _import_training():
     except ModuleNotFoundError as error:
         raise TrainingError(
             f"Training needs the Python package '{error.name}', which {sys.executable} does not have; install torch, "
-            "onnx, onnxruntime and numpy there, or set FDDA_TRAINER_PYTHON to a Python that has them."
+            "onnx, onnxruntime, numpy and matplotlib there, create the trainer environment in the preferences of the "
+            "add-on, or set FDDA_TRAINER_PYTHON to a Python that has them."
         ) from error
     return train_model, Cancelled
 
@@ -103,6 +104,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("model", type=Path, help="the .onnx file to write; the report is written beside it")
     parser.add_argument(
         "--messages", action="store_true", help="JSON messages on stdout, for a program, in place of text"
+    )
+    parser.add_argument(
+        "--warm-start", action="store_true", help="start from the last weights of the model, on a recording that grew"
     )
     add_options(parser)
     return parser

@@ -34,5 +34,9 @@ class TrainingError(FDDAError):
     """The training could not start, died, or reported a failure."""
 
 
+class TrainerEnvironmentError(FDDAError):
+    """The Python environment of the trainer cannot be made, removed or used."""
+
+
 class OutputError(FDDAError):
     """An output path cannot be written."""
