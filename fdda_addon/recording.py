@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Turns poses of a rig into a recording."""
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,8 +96,10 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         with RecordingWriter(path, rig, partitions, info, settings.resume) as writer:
             poses = _poses(scene_rig, channels, settings, actions, writer.complete)
             yield Progress("poses", writer.complete, total)
-            for _ in append_poses(poses, evaluator, layer, writer):
-                yield Progress("poses", writer.complete, total)
+            # Closed before the writer: what was evaluated is kept when the recording is broken off.
+            with contextlib.closing(append_poses(poses, evaluator, layer, writer)) as steps:
+                for done in steps:
+                    yield Progress("poses", done, total)
 
 
 def find_action(name: str) -> bpy.types.Action:
@@ -151,21 +154,28 @@ def append_poses(
     evaluator: PoseEvaluator,
     layer: LinearLayer,
     writer: RecordingWriter | RecordingExtension,
-) -> Iterator[None]:
-    """Evaluate poses and append them to the recording, one batch an iteration."""
+) -> Iterator[int]:
+    """Evaluate poses and append them to the recording in batches, one pose an iteration; how many it has is yielded.
+
+    When it is closed, the poses that were evaluated are appended.
+    """
     size = max(1, min(BATCH_POSES, BATCH_BYTES // (layer.rig.vertex_count * 12)))
     matrices, positions = [], []
-    for _ in poses:
-        pose, evaluated = evaluator.evaluate()
-        matrices.append(pose)
-        positions.append(evaluated)
-        if len(matrices) == size:
+    try:
+        for _ in poses:
+            pose, evaluated = evaluator.evaluate()
+            matrices.append(pose)
+            positions.append(evaluated)
+            if len(matrices) == size:
+                _append(writer, layer, matrices, positions)
+                matrices, positions = [], []
+            yield writer.complete + len(matrices)
+    except GeneratorExit:
+        if matrices:
             _append(writer, layer, matrices, positions)
-            matrices, positions = [], []
-            yield
+        raise
     if matrices:
         _append(writer, layer, matrices, positions)
-        yield
 
 
 def _append(writer: RecordingWriter | RecordingExtension, layer: LinearLayer, matrices: list, positions: list) -> None:
@@ -219,16 +229,18 @@ def _detect_influences(
     def draw(index: int) -> np.ndarray:
         return sample_pose(channels, settings.seed, INFLUENCE_SEED_OFFSET + index, settings.spread)
 
+    total = count * (len(moved) + 1)
     # One base pose serves all joints: the rest pose for half of the moves, a random pose each for the others.
     bases = [rest] * (count - count // 2) + [draw(number) for number in range(count // 2)]
     for number, base in enumerate(bases):
         base_residuals = local_residuals(base)
-        for joint, own in moved.items():
+        for step, (joint, own) in enumerate(moved.items(), number * (len(moved) + 1) + 1):
+            yield Progress("influences", step, total)
             values = base.copy()
             values[own] = draw((joint + 1) * count + number)[own]
             changes = residual_changes(partitions, local_residuals(values), base_residuals)
             for partition, change in zip(partitions, changes, strict=True):
                 if change > threshold:
                     influencing[partition.joint].add(joint)
-        yield Progress("influences", number + 1, len(bases))
+        yield Progress("influences", (number + 1) * (len(moved) + 1), total)
     return make_partitions(rig, {joint: tuple(sorted(found)) for joint, found in influencing.items()})

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Adds poses to a recording where a model that was trained on it is worst."""
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,8 +92,10 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         chosen = choose_poses(probes, channels, _owned(recording, channels), base, rng)
         with RecordingExtension(recording, model.name) as extension:
             posed = (poser.set(pose) for pose in chosen)
-            for _ in append_poses(posed, evaluator, LinearLayer(rig, recording.partitions), extension):
-                yield Progress("poses", extension.complete - first, settings.poses)
+            layer = LinearLayer(rig, recording.partitions)
+            with contextlib.closing(append_poses(posed, evaluator, layer, extension)) as steps:
+                for done in steps:
+                    yield Progress("poses", done - first, settings.poses)
 
 
 def _probe(channels: tuple[Channel, ...], seed: int, index: int) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 from .errors import OutputError, RecordingError
 from .output import write_json
 from .recording import INDEX, REFINED, STREAMED, Recording, Source, array_shapes, read_index
+from .recording_lock import RecordingLock
 from .recording_writer import array_header, check_finite
 
 
@@ -28,6 +29,7 @@ class RecordingExtension:
             name: of the model that the poses refine, its file name.
 
         Raises:
+            RecordingError: another process writes the recording.
             OutputError: the files cannot be opened for writing.
         """
         self.path = recording.path
@@ -38,7 +40,9 @@ class RecordingExtension:
         self._sources = list(self._index["sampling"]["sources"])
         self._shapes = array_shapes(0, len(self._index["joints"]), self._index["vertices"], self._index["influences"])
         self._files = {}
+        self._lock = RecordingLock(self.path)
         try:
+            self._lock.acquire()
             for streamed in STREAMED:
                 self._files[streamed] = open(self.path / f"{streamed}.npy", "r+b")  # noqa: SIM115 - __exit__
         except OSError as error:
@@ -113,3 +117,4 @@ class RecordingExtension:
     def _close(self) -> None:
         for file in self._files.values():
             file.close()
+        self._lock.release()

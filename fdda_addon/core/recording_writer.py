@@ -15,6 +15,7 @@ from .errors import OutputError, RecordingError
 from .output import write_json
 from .partition import Partition
 from .recording import FORMAT, INDEX, STREAMED, VERSION, RecordingInfo, array_shapes, read_index
+from .recording_lock import LOCK, RecordingLock
 from .rig import Rig
 
 
@@ -38,7 +39,8 @@ class RecordingWriter:
             resume: continue the recording at `path` where it stopped.
 
         Raises:
-            RecordingError: there is a recording already and `resume` is not set, or it is of something else.
+            RecordingError: there is a recording already and `resume` is not set, it is of something else, or another
+                process writes it.
             OutputError: the folder cannot be written.
         """
         self.path, self.rig, self.partitions, self.info = path, rig, partitions, info
@@ -47,22 +49,25 @@ class RecordingWriter:
         self._files: dict[str, io.BufferedRandom] = {}
         self._is_new = not os.path.exists(path / INDEX)
         self._new_folders = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
-        if not self._is_new:
-            if not resume:
-                raise RecordingError(
-                    f"'{path}' holds a recording already; continue it with --resume or choose another folder."
-                )
-            self.complete = self._check_resumable()
-        elif os.path.exists(path) and (not os.path.isdir(path) or os.listdir(path)):
+        if self._is_new and os.path.exists(path) and (not os.path.isdir(path) or {*os.listdir(path)} - {LOCK}):
             raise OutputError(f"Cannot record into '{path}': it is not an empty folder; choose another.")
+        self._lock = RecordingLock(path)
         try:
             path.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire()
+            if not self._is_new:
+                if not resume:
+                    raise RecordingError(
+                        f"'{path}' holds a recording already; continue it with --resume or choose another folder."
+                    )
+                self.complete = self._check_resumable()
             # The index first: a folder with arrays and no index could be neither resumed nor recorded into.
             self._write_index()
             self._open_arrays()
         except BaseException as error:
             self._close()
             self._remove_if_empty()
+            self._lock.release()
             if isinstance(error, OSError):
                 raise self._failed(error) from error
             raise
@@ -183,6 +188,7 @@ class RecordingWriter:
         self._close()
         if kind is not None:
             self._remove_if_empty()
+        self._lock.release()
 
     def _close(self) -> None:
         for file in self._files.values():
@@ -192,12 +198,13 @@ class RecordingWriter:
 
     def _remove_if_empty(self) -> None:
         """Remove a new recording without a pose, and the folders that were made for it."""
-        if not self._is_new or self.complete:
+        if not self._is_new or self.complete or not self._lock.is_held:
             return
         shapes = array_shapes(0, 0, 0, 0, 1, 0)
         for path in (self.path / INDEX, *(self.path / f"{name}.npy" for name in shapes)):
             with contextlib.suppress(OSError):
                 path.unlink()
+        self._lock.release()
         for folder in self._new_folders:
             with contextlib.suppress(OSError):
                 folder.rmdir()

@@ -86,8 +86,8 @@ def test_record_prints_lines_where_there_is_no_terminal(elbow, tmp_path, capfd):
     captured = capfd.readouterr()
     assert captured.out.startswith(f"{tmp_path / 'r'}: 50 poses in ") and captured.out.count("\n") == 1
     lines = captured.err.splitlines()
-    assert lines[0].startswith("influences: 1 of 10, ") and lines[9].startswith("influences: 10 of 10, ")
-    assert lines[10].startswith("poses: 0 of 50, ") and lines[-1].startswith("poses: 50 of 50, ")
+    assert lines[0].startswith("influences: 1 of 30, ") and lines[10].startswith("influences: 30 of 30, ")
+    assert lines[11].startswith("poses: 0 of 50, ") and lines[-1].startswith("poses: 50 of 50, ")
     assert "\r" not in captured.err and "\x1b" not in captured.err
     recording = read_recording(tmp_path / "r")
     assert recording.info.sampling.seed == 4

@@ -10,7 +10,7 @@ from scene_state import drain, fresh_elbow
 
 from fdda_addon.core.errors import RecordingError, RigError
 from fdda_addon.core.poses import sample_pose
-from fdda_addon.core.recording import Recording, read_recording
+from fdda_addon.core.recording import Recording, read_index, read_recording
 from fdda_addon.core.skinning import LinearLayer
 from fdda_addon.recording import BATCH_POSES, Progress, RecordingSettings, record
 from fdda_addon.scene.armature import Poser
@@ -177,8 +177,24 @@ def test_the_index_says_where_it_came_from(fresh, elbow):
 def test_progress(fresh, tmp_path):
     poses = BATCH_POSES + 5
     steps = list(record(fresh, tmp_path / "r", RecordingSettings(poses=poses, influence_poses=4)))
-    assert steps[:4] == [Progress("influences", done, 4) for done in (1, 2, 3, 4)]
-    assert steps[4:] == [Progress("poses", done, poses) for done in (0, BATCH_POSES, poses)]
+    # 4 times: a base pose, then each of the 2 joints moved.
+    assert steps[:12] == [Progress("influences", done, 12) for done in range(1, 13)]
+    assert steps[12:] == [Progress("poses", done, poses) for done in range(poses + 1)]
+
+
+def test_a_recording_that_is_closed_keeps_its_poses(fresh, tmp_path):
+    settings = RecordingSettings(poses=20, seed=5)
+    whole = recorded(fresh, tmp_path / "whole", poses=20, seed=5)
+    steps = record(fresh, tmp_path / "r", settings)
+    while next(steps) != Progress("poses", 7, 20):
+        pass
+    steps.close()
+    assert read_index(tmp_path / "r")["complete"] == 7
+    resumed = recorded(fresh, tmp_path / "r", poses=20, seed=5, resume=True)
+    assert np.array_equal(resumed.residuals, whole.residuals)
+    assert sorted(path.name for path in (tmp_path / "r").iterdir()) == sorted(
+        path.name for path in (tmp_path / "whole").iterdir()
+    )
 
 
 def test_same_seed_same_poses_other_seed_others(fresh, tmp_path):
