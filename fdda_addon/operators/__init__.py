@@ -3,7 +3,7 @@
 
 from importlib import import_module
 
-MODULES: tuple[str, ...] = ("job",)
+MODULES: tuple[str, ...] = ("job", "trainer_environment")
 """The modules of this package; each lists its classes in `CLASSES`."""
 
 

@@ -117,12 +117,12 @@ class JobOperator:
             self.report({"ERROR"}, f"{job.title} is under way; wait for it or cancel it.")
             return False
         try:
-            state = JobState(self.verb, self.title, self.subject(context))
+            state = JobState(self.verb, self.title, self.subject(context), self.borrows_scene)
         except FDDAError as error:
             self.report({"ERROR"}, str(error))
             return False
         self._timer, self._shown, self._redrawn = None, None, 0.0
-        self._run = Run(state, self.steps(context), self.borrows_scene)
+        self._run = Run(state, self.steps(context))
         return True
 
     def _tick(self, context: bpy.types.Context) -> set[str] | None:

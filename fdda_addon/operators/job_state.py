@@ -27,6 +27,7 @@ class JobState:
         verb: which job, the name in the operator's bl_idname ("record").
         title: what it does, for people ("Recording").
         subject: name of the object that it is about, empty for none.
+        borrows_scene: it changes the scene and gives it back when it ends.
         is_running: under way.
         cancel_requested: the user wants it to end.
         stage, done, total: how far it is; total is 0 as long as nothing is known.
@@ -40,6 +41,7 @@ class JobState:
     verb: str
     title: str
     subject: str = ""
+    borrows_scene: bool = False
     is_running: bool = True
     cancel_requested: bool = False
     stage: str = ""
@@ -111,9 +113,9 @@ def stop(reason: str) -> None:
 class Run:
     """The job under way: its state and its generator."""
 
-    def __init__(self, state: JobState, steps: Iterator, borrows_scene: bool):
+    def __init__(self, state: JobState, steps: Iterator):
         global _running
-        self.state, self.steps, self.borrows_scene = state, steps, borrows_scene
+        self.state, self.steps = state, steps
         self.result: object = None
         self.is_waiting = False
         _states[state.verb] = state
@@ -173,7 +175,7 @@ def _on_load(*_: object) -> None:
 
 @persistent
 def _on_undo(*_: object) -> None:
-    if _running and _running.borrows_scene:
+    if _running and _running.state.borrows_scene:
         stop("An undo ended it.")
 
 

@@ -116,7 +116,7 @@ def under_way(borrows_scene: bool) -> JobState:
         finally:
             events.append("given back")
 
-    run = Run(JobState("count", "Counting"), steps(), borrows_scene)
+    run = Run(JobState("count", "Counting", borrows_scene=borrows_scene), steps())
     assert not run.advance(0)
     return run.state
 

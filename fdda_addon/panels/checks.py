@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Checks of rigs that panels may draw: a check runs when something has changed, in a timer, never while drawing."""
+
+from typing import TYPE_CHECKING
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..core.errors import RigError
+from ..operators import job
+from ..scene.scene_rig import SceneRig, armature_modifier
+
+if TYPE_CHECKING:  # Blender starts without numpy.
+    from ..rig_check import RigCheck
+
+PAUSE_SECONDS = 0.3
+"""While something changes all the time, a rig is checked this often."""
+
+_checks: dict[int, "tuple[RigCheck, tuple]"] = {}
+"""By session_uid of the mesh object: the last check and `_counters` at that time."""
+_wanted: set[int] = set()
+_outdated: set[int] = set()
+"""Meshes whose pose, modifiers or limits may have changed since their check; what `_counters` shows is not in here."""
+_rest_changed: set[str] = set()
+"""Names of meshes and armatures whose data has changed."""
+
+
+def known(scene_rig: SceneRig) -> "RigCheck | None":
+    """The last check of a rig, None before the first. When something has changed since, another is on its way."""
+    uid = scene_rig.mesh_object.session_uid
+    stored = _checks.get(uid)
+    if stored is None or uid in _outdated or stored[1] != _counters(scene_rig) or _is_rest_changed(scene_rig):
+        _wanted.add(uid)
+        if not bpy.app.timers.is_registered(_check_wanted):
+            bpy.app.timers.register(_check_wanted, first_interval=PAUSE_SECONDS if stored else 0.0)
+    return stored[0] if stored else None
+
+
+def check_now(scene_rig: SceneRig) -> "RigCheck":
+    """Check a rig, as far as it has changed."""
+    from ..rig_check import check
+
+    uid, counters = scene_rig.mesh_object.session_uid, _counters(scene_rig)
+    stored = _checks.get(uid)
+    same_rest = stored is not None and stored[1][0] == counters[0] and not _is_rest_changed(scene_rig)
+    result = stored[0].checked_again(scene_rig) if same_rest else check(scene_rig)
+    _outdated.discard(uid)
+    _rest_changed.difference_update({scene_rig.mesh_object.data.name, scene_rig.armature_object.data.name})
+    _checks[uid] = (result, counters)
+    return result
+
+
+def _check_wanted() -> None:
+    running = job.current()
+    before = _shown()
+    meshes = {o.session_uid: o for o in bpy.data.objects if o.type == "MESH"}
+    for uid in list(_wanted):
+        _wanted.discard(uid)
+        mesh_object = meshes.get(uid)
+        modifier = mesh_object and armature_modifier(mesh_object)
+        # While a job borrows the scene, nothing is as the user left it.
+        if modifier and not (running and running.borrows_scene):
+            check_now(SceneRig(mesh_object, modifier.object))
+    if _shown() != before:
+        job.redraw()
+
+
+def _shown() -> dict[int, tuple]:
+    """What panels draw of the checks."""
+    return {uid: (id(check.rig), check.problems, check.channels) for uid, (check, _) in _checks.items()}
+
+
+def _counters(scene_rig: SceneRig) -> tuple:
+    """What is cheap to read and changes when a check may come out differently: (rest pose, the rest)."""
+    mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
+    mesh = mesh_object.data
+    rest = (
+        mesh.name,
+        len(mesh.vertices),
+        len(mesh_object.vertex_groups),
+        armature_object.name,
+        len(armature_object.data.bones),
+        tuple(mesh_object.scale),
+        tuple(armature_object.scale),
+    )
+    modifiers = tuple((m.name, m.type, m.show_viewport) for m in mesh_object.modifiers)
+    state = (mesh_object.mode, armature_object.mode, mesh_object.visible_get(), armature_object.data.pose_position)
+    return rest, modifiers, state, mesh_object.fdda.is_playing
+
+
+def _is_rest_changed(scene_rig: SceneRig) -> bool:
+    mesh_object = scene_rig.mesh_object
+    # Reading a large mesh takes a moment: not at each stroke of a brush.
+    if mesh_object.mode not in {"OBJECT", "POSE"} or not _rest_changed:
+        return False
+    return not _rest_changed.isdisjoint({mesh_object.data.name, scene_rig.armature_object.data.name})
+
+
+@persistent
+def _on_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    if not _checks:
+        return
+    _outdated.update(_checks)
+    for update in depsgraph.updates:
+        if isinstance(update.id, bpy.types.Mesh | bpy.types.Armature):
+            _rest_changed.add(update.id.name)
+
+
+@persistent
+def _on_undone(*_: object) -> None:
+    _outdated.update(_checks)
+    _rest_changed.update(data.name for datas in (bpy.data.meshes, bpy.data.armatures) for data in datas)
+
+
+@persistent
+def _on_loaded(*_: object) -> None:
+    for known_things in (_checks, _wanted, _outdated, _rest_changed):
+        known_things.clear()
+
+
+HANDLERS = {
+    "depsgraph_update_post": _on_changed,
+    "load_post": _on_loaded,
+    "undo_post": _on_undone,
+    "redo_post": _on_undone,
+}
+
+
+def register() -> None:
+    """Watch for changes."""
+    for name, handler in HANDLERS.items():
+        if handler not in getattr(bpy.app.handlers, name):
+            getattr(bpy.app.handlers, name).append(handler)
+
+
+def unregister() -> None:
+    """Undo `register` and forget all checks."""
+    for name, handler in HANDLERS.items():
+        if handler in getattr(bpy.app.handlers, name):
+            getattr(bpy.app.handlers, name).remove(handler)
+    if bpy.app.timers.is_registered(_check_wanted):
+        bpy.app.timers.unregister(_check_wanted)
+    _on_loaded()
