@@ -45,12 +45,21 @@ def bind(
     last = max(mesh_object.modifiers.find(modifier.name) for modifier in deforming_modifiers(mesh_object))
     nodes.add_modifier(mesh_object, last + 1)
     binding = mesh_object.fdda
-    binding.model = bpy.path.relpath(str(model)) if bpy.data.filepath else str(model)
+    binding.model = stored_path(model)
     binding.packed = packed_model
     binding.use_in_render = use_in_render
     binding.is_bound = True
     binding.mode = "FDDA"
     playback.forget()
+
+
+def stored_path(model: Path) -> str:
+    """How the open file remembers where a model is: relative to itself, where that can be said."""
+    try:
+        return bpy.path.relpath(str(model.absolute())) if bpy.data.filepath else str(model.absolute())
+    except ValueError:
+        # On another drive of Windows.
+        return str(model.absolute())
 
 
 def unbind(mesh_object: bpy.types.Object) -> None:

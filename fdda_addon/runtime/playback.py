@@ -159,14 +159,22 @@ def model_path(mesh_object: bpy.types.Object) -> Path:
     Raises:
         ModelError: the path of a saved file leads out of the file's folder.
     """
-    stored = mesh_object.fdda.model
+    return allowed_path(mesh_object, mesh_object.fdda.model)
+
+
+def allowed_path(mesh_object: bpy.types.Object, stored: str) -> Path:
+    """The absolute path of a model that is stored with an object.
+
+    Raises:
+        ModelError: the path of a saved file leads out of the file's folder.
+    """
     path = Path(bpy.path.abspath(stored, library=mesh_object.library))
     file = bpy.path.abspath(mesh_object.library.filepath) if mesh_object.library else bpy.data.filepath
     # Resolved: the way from the open file to the model leads through "..".
     if path.resolve() not in _chosen and file and not path.resolve().is_relative_to(Path(file).resolve().parent):
         raise ModelError(
             f"The model '{path}' lies outside the folder of '{Path(file).name}' and is not followed; "
-            "move it beside the file and bind it again."
+            "move it beside the file and bind it again, or choose it again."
         )
     return path
 
