@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The trainings of `study.py`: parts of a recording, through the trainer's own steps, kept in a folder."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from fdda_addon.core.errors import RecordingError, TrainingError
+from fdda_addon.core.metrics import error_statistics
+from fdda_addon.core.output import write_json
+from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.recording import Recording, read_recording
+from fdda_addon.core.rig import Rig
+from trainer.config import TrainingConfig
+from trainer.data import partitions_of, prepare, split_poses
+from trainer.deformation import Deformation
+from trainer.export import Measured, build_model, measure, write_model
+from trainer.inputs import Inputs, make_inputs, middles
+from trainer.loop import Curves, train
+from trainer.trust import make_trust_range
+
+
+@dataclass(frozen=True)
+class Material:
+    """What every training shares: both recordings, cut down to the partitions, and what their networks see."""
+
+    training: Recording
+    held_out: Recording
+    inputs: Inputs
+
+
+def cut(recording: Recording, names: tuple[str, ...]) -> Recording:
+    """A recording of some partitions alone; their vertices keep their order.
+
+    Raises:
+        RecordingError: it has no such partition.
+    """
+    rig = recording.rig
+    own = {rig.joints[partition.joint].name: partition for partition in recording.partitions}
+    if missing := [name for name in names if name not in own]:
+        raise RecordingError(f"'{recording.path}' has no partition '{missing[0]}'; it has {', '.join(own)}.")
+    chosen = [own[name] for name in names]
+    vertices = np.sort(np.concatenate([partition.vertices for partition in chosen]))
+    small = Rig(
+        rig.joints,
+        rig.rest_positions[vertices],
+        rig.rest_matrices,
+        rig.skin_joints[vertices],
+        rig.skin_weights[vertices],
+        rig.fingerprint,
+    )
+    partitions = make_partitions(small, {partition.joint: partition.influencing for partition in chosen})
+    residuals = np.array(recording.residuals[:, vertices])
+    return Recording(recording.path, recording.info, small, partitions, recording.pose_matrices, residuals)
+
+
+def read_material(training: Path, held_out: Path, names: tuple[str, ...]) -> Material:
+    """Read both recordings.
+
+    Raises:
+        RecordingError: they are of different rigs or of the same poses, or lack a partition.
+    """
+    whole, other = read_recording(training), read_recording(held_out)
+    if whole.rig.fingerprint != other.rig.fingerprint or whole.rig.joints != other.rig.joints:
+        raise RecordingError(f"'{held_out}' is of another rig than '{training}'; record both of the same file.")
+    if whole.info.sampling.seed == other.info.sampling.seed:
+        raise RecordingError(
+            f"'{held_out}' has seed {other.info.sampling.seed}, as '{training}' has: its poses are no held-out ones; "
+            "record it with another --seed."
+        )
+    small = cut(whole, names)
+    # The neighbours' middles are those of the whole mesh: the networks see what they see when all partitions train.
+    inputs = make_inputs(whole.rig.parents, middles(whole.rig, whole.partitions), small.partitions)
+    return Material(small, cut(other, names), inputs)
+
+
+def train_once(material: Material, config: TrainingConfig, model_path: Path) -> dict:
+    """Train, export and measure; writes the model and returns what is known of it, as docs/study.md has it."""
+    recording, inputs = material.training, material.inputs
+    wall, processor = time.perf_counter(), time.process_time()
+    split = split_poses(np.arange(len(recording.pose_matrices)), config.validation_fraction, config.seed)
+    data = partitions_of(recording, inputs)
+    prepared = [prepare(partition, split, config.tolerance_mm, config.seed) for partition in data]
+    trained = train(prepared, split, config, torch.device("cpu"))
+    seconds = {"processor": time.process_time() - processor, "wall": time.perf_counter() - wall}
+    seen = inputs.features(np.array(recording.pose_matrices[split.training]), recording.rig.rest_matrices)
+    trust = make_trust_range(seen, recording.rig, recording.partitions)
+    deformation = Deformation(
+        recording.rig, recording.partitions, inputs, tuple(prepared), trained.networks, trust, config.activation
+    )
+    exported = build_model(recording, deformation, split.validation, config.to_json())
+    held_out = measure(
+        exported.session, material.held_out, deformation, np.arange(len(material.held_out.pose_matrices))
+    )
+    write_model(model_path, exported.content)
+    return {
+        "seconds": {key: round(value, 2) for key, value in seconds.items()},
+        "model_bytes": len(exported.content),
+        "parameters": sum(a.size for network in trained.networks for a in (*network.weights, *network.biases)),
+        "partitions": {
+            prepared[n].name: {
+                "basis_left": {
+                    "validation": float(prepared[n].validation_truncation.mean()) * 1000,
+                    "held_out": _basis_left(deformation, n, material.held_out),
+                },
+                **_partition(deformation, n, exported.held_out, held_out, curves),
+            }
+            for n, curves in enumerate(trained.curves)
+        },
+    }
+
+
+def _partition(deformation: Deformation, number: int, validation: Measured, held_out: Measured, curves: Curves) -> dict:
+    vertices = deformation.partitions[number].vertices
+
+    def errors(distances: np.ndarray) -> dict:
+        return error_statistics(distances[:, vertices]).to_json()
+
+    return {
+        "vertices": len(vertices),
+        "features": len(deformation.prepared[number].columns),
+        "basis": deformation.shape_counts()[number],
+        "validation": errors(validation.fdda),
+        "validation_linear": errors(validation.linear),
+        "held_out": errors(held_out.fdda),
+        "held_out_linear": errors(held_out.linear),
+        "curve": {
+            "training": [round(value, 6) for value in curves.training_mm],
+            "validation": [round(value, 6) for value in curves.validation_mm],
+            "best_epoch": curves.best_epoch,
+        },
+    }
+
+
+def _basis_left(deformation: Deformation, number: int, recording: Recording) -> float:
+    """Mean distance that the basis leaves of residuals whose best coefficients are known, mm: no network is better."""
+    truth = recording.residuals[:, deformation.partitions[number].vertices]
+    basis, flat = deformation.prepared[number].basis, truth.reshape(len(truth), -1)
+    left = basis.residuals(basis.coefficients(flat)) - flat
+    return error_statistics(np.linalg.norm(left.reshape(truth.shape), axis=2)).mean
+
+
+def validation_score(training: dict) -> float:
+    """What a learning rate is chosen by: validation error as a part of the linear layer's, mean over the partitions."""
+    partitions = training["partitions"].values()
+    return float(np.mean([p["validation"]["mean"] / p["validation_linear"]["mean"] for p in partitions]))
+
+
+class Trainings:
+    """The trainings in a folder, each made when it is first asked for.
+
+    Attributes:
+        made: how many were trained, the others were there already.
+    """
+
+    def __init__(self, material: Material, folder: Path, say: Callable[[str], None]):
+        self.material, self.folder, self.say, self.made = material, folder, say, 0
+        folder.mkdir(parents=True, exist_ok=True)
+        self.origin = [
+            {**asdict(r.rig.fingerprint), "poses": r.info.poses, "seed": r.info.sampling.seed}
+            for r in (material.training, material.held_out)
+        ]
+
+    def get(self, config: TrainingConfig) -> dict:
+        """What `train_once` says of a configuration; `model` is the name of the model in the folder."""
+        units, layers = config.hidden[0], len(config.hidden)
+        name = f"{units}x{layers}-{config.activation}-{config.learning_rate:g}-seed{config.seed}"
+        model, notes = self.folder / f"{name}.onnx", self.folder / f"{name}.json"
+        origin = {"settings": config.to_json(), "recordings": self.origin}
+        if model.exists() and notes.exists():
+            known = json.loads(notes.read_text(encoding="utf-8"))
+            # Other poses or epochs under the same name: train again.
+            if known.pop("origin") == origin:
+                return known
+        try:
+            training = train_once(self.material, config, model)
+        except TrainingError as error:
+            raise TrainingError(f"{name}: {error}") from error
+        self.made += 1
+        training |= {"model": model.name}
+        write_json(notes, training | {"origin": origin})
+        self.say(f"{name}: {100 * validation_score(training):.2f} %, {training['seconds']['wall']:.1f} s")
+        return training

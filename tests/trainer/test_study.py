@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The study of network sizes, on the chain: what it writes, that it resumes, and what it refuses."""
+
+import json
+
+import numpy as np
+import pytest
+from chain import write_chain
+
+from benchmarks.study import Plan, main, study
+from benchmarks.study_tables import tables
+from benchmarks.study_trainings import Trainings, cut, read_material
+from fdda_addon.core.errors import RecordingError
+from fdda_addon.core.metrics import error_statistics
+from fdda_addon.core.recording import read_recording
+from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.runtime.network import Network
+from trainer.config import TrainingConfig
+from trainer.inputs import make_inputs, middles
+
+NAMES = ("bone_1", "bone_2")
+PLAN = Plan(
+    units=(8, 24),
+    layers=(2,),
+    activations=("silu", "relu"),
+    beside=(),
+    learning_rates=(0.001, 0.02),
+    seeds=(0, 1),
+    epochs=10,
+)
+TRAININGS = 4 * (2 + 1)
+"""Four configurations: two learning rates with the first seed, the better one with the second."""
+
+
+@pytest.fixture(scope="module")
+def held_out(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recordings") / "held_out"
+    write_chain(path, poses=40, seed=7)
+    return path
+
+
+@pytest.fixture(scope="module")
+def studied(recording, held_out, tmp_path_factory):
+    """Folder of a finished study; what a test changes it must not leave changed."""
+    out = tmp_path_factory.mktemp("study")
+    study(recording, held_out, out, PLAN, NAMES)
+    return out
+
+
+@pytest.fixture
+def result(studied):
+    return json.loads((studied / "study.json").read_text(encoding="utf-8"))
+
+
+def test_every_configuration_is_trained_with_every_seed(result):
+    found = [(c["units"], c["layers"], c["activation"]) for c in result["configurations"]]
+    assert found == [(8, 2, "silu"), (8, 2, "relu"), (24, 2, "silu"), (24, 2, "relu")]
+    for configuration in result["configurations"]:
+        assert len(configuration["trainings"]) == len(configuration["inference_us"]) == 2
+        for training in configuration["trainings"]:
+            assert list(training["partitions"]) == list(NAMES)
+            for partition in training["partitions"].values():
+                assert len(partition["curve"]["validation"]) == PLAN.epochs
+                left, errors, linear = (partition[key] for key in ("basis_left", "held_out", "held_out_linear"))
+                assert left["held_out"] < errors["mean"] < linear["mean"]
+                assert left["validation"] < min(partition["curve"]["validation"])
+    assert result["poses"] == {"training": 120, "held_out": 40}
+
+
+def test_the_learning_rate_is_the_one_of_the_least_validation_error(studied, result):
+    for c in result["configurations"]:
+        errors = {}
+        for rate in PLAN.learning_rates:
+            name = f"{c['units']}x{c['layers']}-{c['activation']}-{rate:g}-seed0.json"
+            partitions = json.loads((studied / "trainings" / name).read_text())["partitions"].values()
+            errors[rate] = sum(p["validation"]["mean"] / p["validation_linear"]["mean"] for p in partitions)
+        assert c["learning_rate"] == min(errors, key=errors.get)
+
+
+def test_the_errors_are_those_of_the_model_on_the_held_out_poses(studied, result, held_out):
+    small = cut(read_recording(held_out), NAMES)
+    truth = LinearLayer(small.rig).complex_positions(small.pose_matrices, small.residuals)
+    training = result["configurations"][0]["trainings"][1]
+    played = Network(studied / "trainings" / training["model"]).positions(small.pose_matrices)
+    for partition, name in zip(small.partitions, NAMES, strict=True):
+        errors = np.linalg.norm(played - truth, axis=2)[:, partition.vertices]
+        assert training["partitions"][name]["held_out"]["mean"] == pytest.approx(
+            error_statistics(errors).mean, rel=1e-3
+        )
+
+
+def test_the_networks_see_what_they_see_when_all_partitions_train(recording, held_out):
+    whole = read_recording(recording)
+    inputs = make_inputs(whole.rig.parents, middles(whole.rig, whole.partitions), whole.partitions)
+    features = inputs.features(whole.pose_matrices, whole.rig.rest_matrices)
+    material = read_material(recording, held_out, NAMES)
+    own = material.inputs.features(material.training.pose_matrices, material.training.rig.rest_matrices)
+    for columns, all_columns in zip(material.inputs.columns, inputs.columns[1:], strict=True):
+        assert np.array_equal(own[:, columns], features[:, all_columns])
+
+
+def test_tables_and_pictures(studied, result):
+    text = (studied / "tables.md").read_text(encoding="utf-8")
+    assert text == tables(result)
+    for configuration in result["configurations"]:
+        hidden = f"{configuration['units']} {configuration['units']}"
+        assert f"| {hidden} | {configuration['activation']} | {configuration['learning_rate']:g} |" in text
+    assert "24 units in place of 8" in text and "relu in place of silu" in text
+    for picture in ("study_curves.png", "study_errors.png"):
+        assert (studied / picture).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_factor_is_the_ratio_of_what_differs_in_it_alone(result):
+    for configuration in result["configurations"]:
+        for seed, training in enumerate(configuration["trainings"]):
+            for partition in training["partitions"].values():
+                partition["held_out"]["mean"] = (2.0 if configuration["units"] == 24 else 4.0) * (1 + seed)
+    (row,) = [line for line in tables(result).splitlines() if line.startswith("| 24 units")]
+    assert row.split(" | ")[1] == "0.5 (0.5 to 0.5), less in 4 of 4"
+
+
+def test_it_goes_on_where_it_was_interrupted(studied, recording, held_out, capsys):
+    before = sorted((studied / "trainings").iterdir())
+    assert len(before) == 2 * TRAININGS
+    gone = studied / "trainings" / "8x2-relu-0.001-seed0.json"
+    errors = json.loads(gone.read_text())["partitions"]
+    gone.unlink()
+    study(recording, held_out, studied, PLAN, NAMES)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("8x2-relu-0.001-seed0: ")
+    assert json.loads(gone.read_text())["partitions"] == errors
+    assert sorted((studied / "trainings").iterdir()) == before
+
+
+def test_other_settings_are_trained_anew(recording, held_out, tmp_path, capsys):
+    material = read_material(recording, held_out, NAMES)
+    for epochs in (2, 3):
+        trainings = Trainings(material, tmp_path, print)
+        training = trainings.get(TrainingConfig(hidden=(8, 8), epochs=epochs))
+        assert trainings.made == 1
+        assert len(training["partitions"]["bone_1"]["curve"]["validation"]) == epochs
+
+
+def test_a_partition_that_is_not_there(recording, held_out, tmp_path):
+    with pytest.raises(RecordingError, match="has no partition 'shoulder'; it has bone_0, bone_1, bone_2"):
+        study(recording, held_out, tmp_path, PLAN, ("shoulder",))
+
+
+def test_held_out_poses_that_are_the_training_poses(recording, tmp_path):
+    with pytest.raises(RecordingError, match=r"has seed 0, as .* its poses are no held-out ones"):
+        study(recording, recording, tmp_path, PLAN, NAMES)
+
+
+def test_recordings_of_two_rigs(recording, tmp_path):
+    write_chain(tmp_path / "other", poses=20, joints=4, seed=3)
+    with pytest.raises(RecordingError, match="is of another rig than"):
+        study(recording, tmp_path / "other", tmp_path, PLAN, NAMES)
+
+
+def test_an_output_that_is_a_file(tmp_path, capsys):
+    (tmp_path / "out").write_text("text")
+    assert main([str(tmp_path / "out")]) == 1
+    assert capsys.readouterr().err == (
+        f"Cannot write into '{tmp_path / 'out'}': '{tmp_path / 'out'}' is a file; choose another folder.\n"
+    )
+
+
+def test_no_seeds(tmp_path, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main([str(tmp_path), "--seeds", "0"])
+    assert exit_.value.code == 2 and "--seeds and --poses must be 1 or more" in capsys.readouterr().err
