@@ -109,20 +109,14 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
     """
     check_evaluable(scene_rig)
     mesh_object = scene_rig.mesh_object
-    animation = scene_rig.armature_object.animation_data
-    own_action = animation.action if animation else None
-    with (
-        borrowed_pose(scene_rig.armature_object, [own_action] if own_action else []),
-        _playing(scene_rig, own_action) as played,
-        borrowed_binding(scene_rig, model),
-    ):
-        ways = {"rig": _rig, "linear": _linear, "fdda": _fdda, "floor": _floor}
+    with playing(scene_rig) as played, borrowed_binding(scene_rig, model):
+        ways = {"rig": _rig, "linear": armature_alone, "fdda": _fdda, "floor": _floor}
         times: dict[str, list[float]] = {way: [] for way in ways}
         each = max(1, -(-frames // ROUNDS))
         for number in range(ROUNDS):
             for way, prepare in ways.items():
                 with prepare(mesh_object):
-                    times[way] += _time_frames(played, number * each, each)
+                    times[way] += time_frames(played, number * each, each)
             yield Progress("benchmark", number + 1, ROUNDS)
         network = playback.network_of(mesh_object)
         pose = network.info.rest_matrices[None]
@@ -131,16 +125,22 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
 
 
 @contextmanager
-def _playing(scene_rig: SceneRig, own_action: bpy.types.Action | None) -> Iterator[range]:
-    """Let an action drive the armature, one of random poses where it has none; gives the frames."""
-    action = own_action or _random_action(scene_rig)
-    assign_action(scene_rig.armature_object, action)
-    try:
-        yield action_frames(action)
-    finally:
-        scene_rig.armature_object.animation_data.action = None
-        if action != own_action:
-            bpy.data.actions.remove(action)
+def playing(scene_rig: SceneRig) -> Iterator[range]:
+    """Let its action drive the armature, one of random poses where it has none; gives the frames.
+
+    Pose and animation are as before afterwards.
+    """
+    animation = scene_rig.armature_object.animation_data
+    own_action = animation.action if animation else None
+    with borrowed_pose(scene_rig.armature_object, [own_action] if own_action else []):
+        action = own_action or _random_action(scene_rig)
+        assign_action(scene_rig.armature_object, action)
+        try:
+            yield action_frames(action)
+        finally:
+            scene_rig.armature_object.animation_data.action = None
+            if action != own_action:
+                bpy.data.actions.remove(action)
 
 
 def _random_action(scene_rig: SceneRig) -> bpy.types.Action:
@@ -157,7 +157,7 @@ def _random_action(scene_rig: SceneRig) -> bpy.types.Action:
     return armature_object.animation_data.action
 
 
-def _time_frames(played: range, first: int, count: int) -> list[float]:
+def time_frames(played: range, first: int, count: int) -> list[float]:
     """Milliseconds of `count` frames from the animation, the first few not counted."""
     scene = bpy.context.scene
 
@@ -184,7 +184,7 @@ def _rig(mesh_object: bpy.types.Object) -> Iterator[None]:
 
 
 @contextmanager
-def _linear(mesh_object: bpy.types.Object) -> Iterator[None]:
+def armature_alone(mesh_object: bpy.types.Object) -> Iterator[None]:
     """Blender's own linear skinning: the Armature modifier alone, shape keys pinned."""
     mesh_object.fdda.mode = "RIG"
     skinning = armature_modifier(mesh_object)
