@@ -4,76 +4,27 @@
 torch never enters Blender's process: it would bring its own threads and libraries, and Blender's Python has none.
 """
 
-import enum
 import os
 import queue
 import subprocess
-import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 from .core.errors import TrainingError, WrongUsageError
 from .core.messages import Message, MessageType
-from .trainer_environment.check import Answer, check
-from .trainer_environment.folder import own_python, python_in
+from .trainer_environment.choice import chosen_python
 
-PYTHON_VARIABLE = "FDDA_TRAINER_PYTHON"
-"""Environment variable: the Python that has torch, when the preferences name none."""
 CANCEL_SECONDS = 20.0
 """A trainer that was asked to stop is killed after so long."""
 READER_SECONDS = 1.0
 
-preferred_python: Callable[[], str] | None = None
-"""What the preferences name, an interpreter or the folder of a virtual environment; `preferences` puts it here."""
-
-
-class Origin(enum.Enum):
-    """Who chose the trainer's Python; the value says what to do when it is the wrong one."""
-
-    PREFERENCES = "choose another Python in the add-on's preferences, or leave that field empty"
-    VARIABLE = f"set {PYTHON_VARIABLE} to a Python that has torch"
-    OWN = "create the trainer environment again, in the add-on's preferences"
-    THIS = (
-        f"create the trainer environment in the add-on's preferences, or set {PYTHON_VARIABLE} to a Python with torch"
-    )
-
-
-class TrainerPython(NamedTuple):
-    """The interpreter that runs the trainer, and who chose it."""
-
-    path: str
-    origin: Origin
-
-
-def chosen_python() -> TrainerPython:
-    """The Python that runs the trainer.
-
-    The first of: what the preferences name, the environment variable, the add-on's own environment, and the Python
-    that runs this. The own environment is Blender's business: where bpy was not imported, nobody made one.
-    """
-    if preferred_python is not None and (preferred := preferred_python()):
-        folder = Path(preferred)
-        return TrainerPython(str(python_in(folder)) if folder.is_dir() else preferred, Origin.PREFERENCES)
-    if named := os.environ.get(PYTHON_VARIABLE):
-        return TrainerPython(named, Origin.VARIABLE)
-    if "bpy" in sys.modules and (own := own_python()):
-        return TrainerPython(own, Origin.OWN)
-    return TrainerPython(sys.executable, Origin.THIS)
-
 
 def trainer_python() -> str:
-    """Path of the Python that runs the trainer."""
+    """Path of the Python that runs the trainer; `trainer_environment.choice` says how it is chosen."""
     return chosen_python().path
-
-
-def ping() -> Answer:
-    """Ask the Python that runs the trainer whether it can train. Takes seconds: never while drawing."""
-    python = chosen_python()
-    return check(python.path, python.origin.value)
 
 
 def trainer_command(arguments: list[str], python: str | None = None) -> tuple[list[str], dict[str, str]]:

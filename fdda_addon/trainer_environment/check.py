@@ -5,13 +5,13 @@ import json
 import os
 import subprocess
 from pathlib import Path
-from typing import NamedTuple
+
+from .answer import Answer
+from .folder import PACKAGES
 
 OLDEST = (3, 11)
 TIMEOUT_SECONDS = 180.0
 """torch takes half a minute to load from a cold or remote disk."""
-PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "matplotlib")
-"""What the trainer imports."""
 
 # Runs in whatever the user named, an ancient Python too. Its last line is the answer; a library may print before it.
 _QUESTION = """
@@ -33,21 +33,6 @@ if answer["packages"].get("torch"):
 print()
 print(json.dumps(answer))
 """
-
-
-class Answer(NamedTuple):
-    """What is known of a Python, or how something ended.
-
-    Attributes:
-        level: 'INFO' all is well, 'WARNING' it works but should be seen to, 'ERROR' it does not work: the levels of an
-            operator's report.
-        message: one sentence; where it is not well, what to do.
-        details: lines for those who want to know more.
-    """
-
-    level: str
-    message: str
-    details: tuple[str, ...] = ()
 
 
 def check(python: str, advice: str) -> Answer:

@@ -15,17 +15,14 @@ from typing import IO
 
 from ..core.errors import TrainerEnvironmentError
 from ..core.progress import Progress
+from .answer import Answer
 from .bases import BasePython, ask, clean_environment, find_bases
-from .check import PACKAGES, Answer, check, hidden
-from .folder import claimed, pins, python_in, remove, write_mark
+from .check import check, hidden
+from .folder import PACKAGES, claimed, pins, python_in, remove, write_mark
 
 NEEDED_GB = 9 if sys.platform.startswith("linux") else 2
 """Free space to begin with: the packages and the downloads, which lie there at the same time. On Linux with CUDA."""
 PIP_WITH_RAW_PROGRESS = (24, 1)
-
-
-class CreationCancelledError(TrainerEnvironmentError):
-    """The user wanted it to end; nothing is left of the environment."""
 
 
 class Creation:
@@ -51,6 +48,15 @@ class Creation:
         Raises:
             TrainerEnvironmentError: it cannot be made, and nothing is left of it. Also when the user cancelled.
         """
+        try:
+            yield from self._steps()
+        except OSError as error:
+            raise TrainerEnvironmentError(
+                f"The trainer environment cannot be written ({error.strerror}: '{error.filename or self.folder}'); "
+                "make room or see to the permissions, and create it again."
+            ) from error
+
+    def _steps(self) -> Iterator[Progress | Answer]:
         with claimed(self.folder), _written(self.log) as log:
             self._check_source()
             yield Progress("looking for a Python", 0, 0)
@@ -208,7 +214,7 @@ class Creation:
 
     def _stop_if_cancelled(self) -> None:
         if self._cancelled:
-            raise CreationCancelledError(
+            raise TrainerEnvironmentError(
                 "The creation of the trainer environment was cancelled; nothing is left of it."
             )
 

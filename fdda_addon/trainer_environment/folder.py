@@ -6,22 +6,25 @@ leaves the folder alone when it updates the extension and removes it when it uni
 """
 
 import enum
-import hashlib
 import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from ..core.errors import TrainerEnvironmentError
-from .check import PACKAGES
 
 EXTENSION = __package__.rpartition(".fdda_addon")[0]
 """The extension's module, "bl_ext.REPOSITORY.fdda"; empty where the add-on was imported and not installed."""
+PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "matplotlib")
+"""What the trainer imports."""
 MARK = "fdda-complete"
 REQUIREMENTS = Path(__file__).parents[2] / "requirements"
 PINS = {(3, 11): "python-3.11.txt", (3, 12): "python-3.11.txt", (3, 13): "python-3.13.txt"}
 """Versions of Python that an environment can be made from, and the file of pinned versions for each."""
+OFFLINE = (
+    "Blender's online access is off: allow it in Preferences > System > Network, choose a folder of wheels, or choose "
+    "an existing Python that has torch"
+)
 
 
 class FolderState(enum.Enum):
@@ -66,6 +69,13 @@ def pins(version: tuple[int, int]) -> Path:
     return REQUIREMENTS / PINS[version]
 
 
+def obstacle(wheels: str) -> str:
+    """Why the environment cannot be created now, empty when it can; `wheels` is the folder to install from, if any."""
+    import bpy
+
+    return "" if wheels or bpy.app.online_access else OFFLINE
+
+
 def folder_state(folder: Path) -> FolderState:
     """The state of the environment in a folder, from its files alone."""
     if not folder.is_dir():
@@ -98,6 +108,8 @@ def remove(folder: Path) -> None:
     Raises:
         TrainerEnvironmentError: something cannot be removed.
     """
+    import shutil
+
     try:
         (folder / MARK).unlink(missing_ok=True)
         if folder.is_dir():
@@ -147,5 +159,7 @@ def _lock(descriptor: int) -> None:
 
 
 def _fingerprint(requirements: Path) -> str:
+    import hashlib
+
     text = requirements.read_text(encoding="utf-8") + repr(PACKAGES)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -10,8 +10,7 @@ from collections.abc import Callable, Generator
 
 from ..core.errors import FDDAError
 from ..core.progress import Progress
-from .check import Answer
-from .creation import CreationCancelledError
+from .answer import Answer
 from .folder import FolderState, folder_state, own_folder
 
 
@@ -22,18 +21,27 @@ class Task:
         title: what it does.
         progress: the last that it yielded.
         outcome: how it ended, None while it runs.
+        keep: takes the outcome.
     """
 
-    def __init__(self, title: str, steps: Generator[Progress | Answer], cancel: Callable[[], None] | None):
+    def __init__(
+        self,
+        title: str,
+        steps: Generator[Progress | Answer],
+        cancel: Callable[[], None] | None,
+        keep: Callable[[Answer], None],
+    ):
         """Start it.
 
         Args:
             title: what it does.
             steps: yields how far it is, and last its outcome.
             cancel: called from another thread, has `steps` end soon; None where that is not possible.
+            keep: takes the outcome, in the main thread.
         """
         self.title, self.progress, self.outcome = title, Progress("starting", 0, 0), None
-        self._steps, self._cancel = steps, cancel
+        self.keep, self._steps, self._cancel = keep, steps, cancel
+        self._cancelled = False
         self._thread = threading.Thread(target=self._work, name=f"FDDA: {title}", daemon=True)
         self._thread.start()
 
@@ -44,6 +52,7 @@ class Task:
     def cancel(self) -> None:
         """Have it end soon."""
         if self._cancel is not None:
+            self._cancelled = True
             self._cancel()
 
     def wait(self, seconds: float) -> None:
@@ -58,10 +67,8 @@ class Task:
                     outcome = step
                 else:
                     self.progress = step
-        except CreationCancelledError as cancelled:
-            outcome = Answer("WARNING", str(cancelled))
         except FDDAError as error:
-            outcome = Answer("ERROR", str(error))
+            outcome = Answer("WARNING" if self._cancelled else "ERROR", str(error))
         finally:
             self.outcome = outcome
 
@@ -84,12 +91,13 @@ def start(new_task: Task) -> None:
 
 
 def end_task() -> Answer | None:
-    """The outcome of the task once it has ended, which ends its being under way; None before."""
+    """Keep the outcome of the task once it has ended, and return it; None before."""
     global task
     if task is None or task.outcome is None:
         return None
-    outcome, task = task.outcome, None
-    return outcome
+    ended, task = task, None
+    ended.keep(ended.outcome)
+    return ended.outcome
 
 
 def remember(new_answer: Answer | None, new_notice: Answer | None = None) -> None:

@@ -14,7 +14,7 @@ from conftest import run
 from refusals import Refusal
 
 from fdda_addon.core.messages import Message, MessageType
-from fdda_addon.training import PYTHON_VARIABLE
+from fdda_addon.trainer_environment.choice import PYTHON_VARIABLE
 
 
 @pytest.fixture
