@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The zip that `make package` builds: installed, enabled, disabled, updated and uninstalled in a Blender of its own."""
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+LIFE = Path(__file__).with_name("extension_life.py")
+VERSION = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["version"]
+PACKAGE = ROOT / "dist" / f"fdda_addon-{VERSION}.zip"
+START_SECONDS = 0.05
+STATE = ("classes", "operators", "properties", "handlers", "keymap_items", "additions", "commands", "preferences")
+
+
+@pytest.fixture(scope="module")
+def package() -> Path:
+    """The zip, if it holds the code that is under test."""
+    if not PACKAGE.is_file():
+        pytest.skip(f"{PACKAGE.name} is not built: make package")
+    with zipfile.ZipFile(PACKAGE) as archive:
+        code = [name for name in archive.namelist() if name.startswith(("fdda_addon/", "trainer/"))]
+        stale = [
+            name for name in code if not (ROOT / name).is_file() or archive.read(name) != (ROOT / name).read_bytes()
+        ]
+    if stale:
+        pytest.skip(f"{PACKAGE.name} was built from other sources ({stale[0]} differs): make package")
+    return PACKAGE
+
+
+def blender(*arguments: object, user: Path) -> subprocess.CompletedProcess[str]:
+    """Run extension_life.py in a Blender with a user folder of its own, and without a network."""
+    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(user), "no_proxy": "", "https_proxy": "http://[::1]:9"}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # Blender compiles an add-on once, not at each start.
+    command = [sys.executable, LIFE, *map(str, arguments)]
+    # Not from the root of the sources: what is tested must come out of the zip.
+    return subprocess.run(command, env=environment, cwd=user, capture_output=True, text=True, check=False, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def story(package: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict]:
+    result = blender("live", package, user=tmp_path_factory.mktemp("user"))
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "Traceback" not in result.stderr
+    return json.loads(result.stdout.splitlines()[-1])
+
+
+def state(moment: dict) -> dict:
+    return {name: moment[name] for name in STATE}
+
+
+def test_it_installs_without_being_enabled(story: dict):
+    assert story["installed"]["result"] == ["FINISHED"]
+    assert state(story["installed"]) == state(story["before"])
+    assert "extensions/user_default/fdda/fdda_addon/__init__.py" in story["installed"]["files"]
+    assert "extensions/user_default/fdda/trainer/__main__.py" in story["installed"]["files"]
+    assert "extensions/user_default/fdda/requirements/python-3.11.txt" in story["installed"]["files"]
+
+
+def test_enabled_it_is_all_there(story: dict):
+    enabled = story["enabled"]
+    assert {"FDDA_PG_binding", "FDDA_AP_preferences", "FDDA_OT_create_trainer_environment"} <= set(enabled["classes"])
+    assert "Object.fdda" in enabled["properties"]
+    assert any(line.startswith("frame_change_post") for line in enabled["handlers"])
+    assert enabled["commands"] and enabled["preferences"]
+
+
+def test_blender_starts_as_fast_with_it(package: Path, tmp_path: Path):
+    """The best of three: the first compiles the modules, and the machine may be busy."""
+    assert blender("install", package, user=tmp_path).returncode == 0
+    starts = [json.loads(blender("start", user=tmp_path).stdout.splitlines()[-1]) for _ in range(3)]
+    assert all(start["modules"] == [] for start in starts)
+    assert min(start["seconds"] for start in starts) < START_SECONDS
+
+
+def test_disabled_it_leaves_nothing_registered(story: dict):
+    assert state(story["disabled"]) == state(story["before"])
+
+
+def test_enabled_again_it_is_as_it_was(story: dict):
+    assert state(story["used"]) == state(story["enabled"])
+    assert "extensions/.local/lib" in story["used"]["onnxruntime"].replace(os.sep, "/")
+
+
+def test_installed_twice_it_is_there_once_and_keeps_the_users_files(story: dict):
+    assert story["updated"]["result"] == ["FINISHED"]
+    assert state(story["updated"]) == state(story["enabled"])
+    assert story["updated"]["files"] == story["used"]["files"] and story["updated"]["kept"]
+
+
+def test_uninstalled_it_leaves_nothing(story: dict):
+    assert story["uninstalled"]["result"] == ["FINISHED"]
+    assert state(story["uninstalled"]) == state(story["before"])
+    assert story["uninstalled"]["files"] == story["before"]["files"] and not story["uninstalled"]["kept"]
+
+
+def test_it_is_small_enough_and_says_what_it_may_do(package: Path):
+    assert package.stat().st_size < 60e6
+    with zipfile.ZipFile(package) as archive:
+        manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
+        names = archive.namelist()
+    assert set(manifest["permissions"]) == {"files", "network"}
+    assert [python for python in ("cp311", "cp313") if any(f"-{python}-" in wheel for wheel in manifest["wheels"])] == [
+        "cp311",
+        "cp313",
+    ]
+    assert not [name for name in names if "__pycache__" in name]
