@@ -79,7 +79,7 @@ class RecordingWriter:
         if "faces" not in previous:
             self._faces = self._corners = 0
         own = self._index()
-        if different := [key for key in _different_keys(previous, own) if key != "complete"]:
+        if different := [key for key in different_keys(previous, own) if key != "complete"]:
             raise RecordingError(
                 f"Cannot resume '{self.path}': it was recorded with another {', '.join(different)}; "
                 "record with the same rig and options, or into another folder."
@@ -232,13 +232,13 @@ def array_header(shape: tuple, dtype: type) -> bytes:
     return header.getvalue()
 
 
-def _different_keys(first: dict, second: dict, prefix: str = "") -> list[str]:
+def different_keys(first: dict, second: dict, prefix: str = "") -> list[str]:
     """Dotted names of the keys whose values differ between two dictionaries."""
     found = []
     for key in sorted(first.keys() | second.keys()):
         values = first.get(key), second.get(key)
         if all(isinstance(value, dict) for value in values):
-            found += _different_keys(*values, f"{prefix}{key}.")
+            found += different_keys(*values, f"{prefix}{key}.")
         elif key not in first or key not in second or values[0] != values[1]:
             found.append(f"{prefix}{key}")
     return found

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import bpy
 
 from ..core.errors import FDDAError
-from .job_state import JobState, Run, current, redraw, request_cancel, state_of, stop
+from .job_state import JobState, Run, current, redraw, register, request_cancel, state_of, stop, unregister
 
 TICK_BUDGET = 0.03
 """Seconds that a job may work at a tick; a step that is begun is finished, so steps must be short."""
@@ -212,4 +212,7 @@ class FDDA_OT_cancel(bpy.types.Operator):
 
 CLASSES = (FDDA_OT_cancel,)
 
-__all__ = ["CLASSES", "JobOperator", "JobState", "current", "redraw", "request_cancel", "state_of", "stop"]
+__all__ = [
+    "CLASSES", "JobOperator", "JobState", "current", "redraw", "register", "request_cancel", "state_of", "stop",
+    "unregister",
+]  # fmt: skip

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 import bpy
 from bpy.app.handlers import persistent
 
-from ..core.errors import RigError
 from ..operators import job
 from ..scene.scene_rig import SceneRig, armature_modifier
 

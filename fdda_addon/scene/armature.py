@@ -5,10 +5,10 @@ import bpy
 import numpy as np
 from mathutils import Euler
 
-from ..core.poses import DEFAULT_RANGE, Channel
+from ..core.poses import Channel
+from .motion_range import DEFAULT, location_ranges, rotation_ranges
 
 LIMITS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
-AXES = "xyz"
 
 
 def rest_matrices(armature: bpy.types.Armature, names: tuple[str, ...]) -> np.ndarray:
@@ -57,55 +57,23 @@ def channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Channe
     """
     found = []
     for bone in armature_object.pose.bones:
-        if any(c.type not in LIMITS and not c.mute and c.influence > 0 for c in bone.constraints):
+        if is_moved_by_constraints(bone):
             continue
-        rotation, stated = _rotation_range(bone)
-        location = _location_range(bone)
-        if bone.name in names or stated:
-            for axis in range(3):
-                low, high = rotation[axis]
-                if not bone.lock_rotation[axis] and low < high:
-                    found.append(Channel(bone.name, "rotation", axis, low, high))
+        ranges = rotation_ranges(bone)
+        if bone.name in names or any(r.source != DEFAULT for r in ranges):
+            for axis, r in enumerate(ranges):
+                if r.moves:
+                    found.append(Channel(bone.name, "rotation", axis, r.low, r.high))
         if not bone.bone.use_connect:
-            for axis, (low, high) in location.items():
+            for axis, (low, high) in location_ranges(bone).items():
                 if not bone.lock_location[axis] and low < high:
                     found.append(Channel(bone.name, "location", axis, low, high))
     return tuple(found)
 
 
-def _limit(bone: bpy.types.PoseBone, kind: str) -> bpy.types.Constraint | None:
-    for constraint in bone.constraints:
-        if constraint.type == kind and constraint.owner_space == "LOCAL" and not constraint.mute:
-            return constraint
-    return None
-
-
-def _rotation_range(bone: bpy.types.PoseBone) -> tuple[list[tuple[float, float]], bool]:
-    """Range of each rotation axis in radians, and whether the rig states one."""
-    ranges, stated = [DEFAULT_RANGE] * 3, False
-    constraint = _limit(bone, "LIMIT_ROTATION")
-    for axis, letter in enumerate(AXES):
-        if constraint is not None:
-            if getattr(constraint, f"use_limit_{letter}"):
-                ranges[axis] = (getattr(constraint, f"min_{letter}"), getattr(constraint, f"max_{letter}"))
-                stated = True
-        elif getattr(bone, f"lock_ik_{letter}"):
-            ranges[axis] = (0.0, 0.0)
-        elif getattr(bone, f"use_ik_limit_{letter}"):
-            ranges[axis] = (getattr(bone, f"ik_min_{letter}"), getattr(bone, f"ik_max_{letter}"))
-            stated = True
-    return ranges, stated
-
-
-def _location_range(bone: bpy.types.PoseBone) -> dict[int, tuple[float, float]]:
-    constraint = _limit(bone, "LIMIT_LOCATION")
-    if constraint is None:
-        return {}
-    return {
-        axis: (getattr(constraint, f"min_{letter}"), getattr(constraint, f"max_{letter}"))
-        for axis, letter in enumerate(AXES)
-        if getattr(constraint, f"use_min_{letter}") and getattr(constraint, f"use_max_{letter}")
-    }
+def is_moved_by_constraints(bone: bpy.types.PoseBone) -> bool:
+    """Whether a constraint other than a limit moves a bone."""
+    return any(c.type not in LIMITS and not c.mute and c.influence > 0 for c in bone.constraints)
 
 
 def clear_pose(armature_object: bpy.types.Object) -> None:

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What is in the folder of a recording: said before anything is recorded, and removed on request."""
+
+import enum
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from .errors import OutputError, RecordingError
+from .recording import INDEX, array_shapes, read_index
+from .recording_lock import LOCK, RecordingLock
+from .recording_writer import different_keys
+from .rig import Fingerprint, Joint, Rig, differences
+
+
+class FolderState(enum.Enum):
+    """What a folder holds."""
+
+    FREE = "free"
+    """Nothing: it can be recorded into."""
+    INCOMPLETE = "incomplete"
+    """A recording of this rig with these settings that was broken off."""
+    COMPLETE = "complete"
+    """A recording of this rig."""
+    OTHER = "other"
+    """A recording of another rig, or an incomplete one with other settings."""
+    FOREIGN = "foreign"
+    """Something else, or a recording that cannot be read."""
+
+
+@dataclass(frozen=True)
+class FolderContent:
+    """What a folder holds: poses of the recording in it, and a sentence where it is not as it should be."""
+
+    state: FolderState
+    complete: int = 0
+    poses: int = 0
+    sentence: str = ""
+
+
+def read_folder(path: Path, rig: Rig | None = None, sampling: dict | None = None) -> FolderContent:
+    """Look into the folder of a recording.
+
+    Args:
+        path: the folder, which need not exist.
+        rig: the rig at hand; None leaves the comparison out.
+        sampling: `Sampling.to_json` of what would be recorded; None leaves the comparison out.
+    """
+    if not os.path.exists(path / INDEX):
+        if os.path.exists(path) and (not os.path.isdir(path) or {*os.listdir(path)} - {LOCK}):
+            return FolderContent(FolderState.FOREIGN, sentence=f"'{path.name}' is not an empty folder; choose another.")
+        return FolderContent(FolderState.FREE)
+    try:
+        index = read_index(path)
+    except RecordingError as error:
+        return FolderContent(FolderState.FOREIGN, sentence=str(error))
+    counts = index["complete"], index["poses"]
+    if rig is not None and (found := _differences(index, rig)):
+        return FolderContent(
+            FolderState.OTHER,
+            *counts,
+            f"'{path.name}' holds a recording of another rig: {'; '.join(found)}. Choose another folder, or remove it.",
+        )
+    if counts[0] == counts[1]:
+        return FolderContent(FolderState.COMPLETE, *counts)
+    if sampling is not None and (found := different_keys(index["sampling"], sampling)):
+        names = sorted({key.partition(".")[0] for key in found})
+        return FolderContent(
+            FolderState.OTHER,
+            *counts,
+            f"'{path.name}' was begun with other settings ({', '.join(names)}) and has {counts[0]} of {counts[1]} "
+            "poses. Set them as they were to resume, choose another folder, or remove it.",
+        )
+    return FolderContent(FolderState.INCOMPLETE, *counts)
+
+
+def _differences(index: dict, rig: Rig) -> list[str]:
+    joints = tuple(Joint(joint["name"], joint["parent"]) for joint in index["joints"])
+    fingerprint = Fingerprint(**index["rig"]["fingerprint"])
+    # The rest pose of the joints is in an array; what differs there is found when the recording is used.
+    return differences(joints, rig.rest_matrices, index["vertices"], fingerprint, rig)
+
+
+def remove_recording(path: Path) -> None:
+    """Remove the files of a recording, and its folder when nothing else is in it.
+
+    Raises:
+        RecordingError: there is no recording, or another process writes it.
+        OutputError: a file cannot be removed.
+    """
+    if not os.path.exists(path / INDEX):
+        raise RecordingError(f"'{path}' holds no recording; there is nothing to remove.")
+    lock = RecordingLock(path)
+    try:
+        lock.acquire()
+        # The index last: what is left of an interruption is still seen to be a recording.
+        for name in (*(f"{array}.npy" for array in array_shapes(0, 0, 0, 0, faces=1)), INDEX):
+            (path / name).unlink(missing_ok=True)
+        lock.release()
+        if not os.listdir(path):
+            path.rmdir()
+    except OSError as error:
+        raise OutputError(f"Cannot remove the recording '{path}': {error.strerror or error}.") from error
+    finally:
+        lock.release()

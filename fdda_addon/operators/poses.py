@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The poses: look at those that are recorded, and state the range of motion."""
+
+import math
+
+import bpy
+
+from ..core.errors import FDDAError, RigError
+from .job import current
+from .on_rig import OnRig
+
+
+class _OnPose(OnRig):
+    """Mixin for an operator that changes the armature of a rig."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        job = current()
+        if job is not None and job.borrows_scene:
+            cls.poll_message_set(f"{job.title} is under way; wait for it or cancel it")
+            return False
+        if context.mode not in {"OBJECT", "POSE"}:
+            cls.poll_message_set("Only in object mode and pose mode")
+            return False
+        return cls.has_rig(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            sentence = self.change(context)
+        except FDDAError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, sentence)
+        return {"FINISHED"}
+
+
+class FDDA_OT_preview_pose(_OnPose, bpy.types.Operator):
+    bl_idname = "fdda.preview_pose"
+    bl_label = "Show Random Pose"
+    bl_description = "Pose the rig as one of the random poses that are recorded"
+    bl_options = {"REGISTER", "UNDO"}
+
+    number: bpy.props.IntProperty(
+        name="Number",
+        description="Of the pose; -1 for the one that was shown last",
+        default=-1,
+        min=-1,
+        options={"SKIP_SAVE"},
+    )
+    step: bpy.props.IntProperty(
+        name="Step", description="Show the pose so many after the number", options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        if properties.step:
+            return f"Show the {'next' if properties.step > 0 else 'previous'} of the random poses that are recorded"
+        return cls.bl_description
+
+    def change(self, context: bpy.types.Context) -> str:
+        from ..core.poses import sample_pose
+        from ..scene.armature import Poser, clear_pose
+        from ..scene.rig import read_rig, sampled_channels
+
+        rig = self.rig(context)
+        settings, session = rig.mesh_object.fdda.settings, context.window_manager.fdda
+        channels = sampled_channels(rig, read_rig(rig))
+        start = self.number if self.number >= 0 else session.pose_number
+        number = max(0, start + self.step)
+        clear_pose(rig.armature_object)
+        Poser(rig.armature_object, channels).set(sample_pose(channels, settings.seed, number, settings.spread))
+        rig.armature_object.update_tag(refresh={"DATA"})
+        session.pose_number = number
+        return f"Random pose {number} of seed {settings.seed}."
+
+
+class FDDA_OT_rest_pose(_OnPose, bpy.types.Operator):
+    bl_idname = "fdda.rest_pose"
+    bl_label = "Rest Pose"
+    bl_description = "Bring every bone back to its rest pose"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def change(self, context: bpy.types.Context) -> str:
+        from ..scene.armature import clear_pose
+
+        armature_object = self.rig(context).armature_object
+        clear_pose(armature_object)
+        return f"'{armature_object.name}' is in its rest pose."
+
+
+class _OnRange(_OnPose):
+    """Mixin for an operator that changes the range of one rotation axis."""
+
+    bone: bpy.props.StringProperty(name="Bone", description="Name of the bone", options={"SKIP_SAVE"})
+    axis: bpy.props.EnumProperty(
+        name="Axis", description="Of the rotation, in the bone's local space", items=[(a, a, "") for a in "XYZ"]
+    )
+
+    def pose_bone(self, context: bpy.types.Context) -> bpy.types.PoseBone:
+        """The bone that is meant.
+
+        Raises:
+            RigError: there is none of this name.
+        """
+        armature_object = self.rig(context).armature_object
+        bone = armature_object.pose.bones.get(self.bone)
+        if bone is None:
+            raise RigError(f"'{armature_object.name}' has no bone '{self.bone}'; give the name of one.")
+        return bone
+
+    @property
+    def axis_index(self) -> int:
+        return "XYZ".index(self.axis)
+
+
+class FDDA_OT_state_range(_OnRange, bpy.types.Operator):
+    bl_idname = "fdda.state_range"
+    bl_label = "State Range"
+    bl_description = (
+        "Write this range of motion to the bone: as IK limits, or into its Limit Rotation constraint where it has one"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    low: bpy.props.FloatProperty(
+        name="Minimum", subtype="ANGLE", default=-math.pi / 4, min=-math.pi, max=math.pi, description="Lowest angle"
+    )
+    high: bpy.props.FloatProperty(
+        name="Maximum", subtype="ANGLE", default=math.pi / 4, min=-math.pi, max=math.pi, description="Highest angle"
+    )
+
+    def change(self, context: bpy.types.Context) -> str:
+        from ..scene.motion_range import state_rotation_range
+
+        bone = self.pose_bone(context)
+        state_rotation_range(bone, self.axis_index, self.low, self.high)
+        low, high = math.degrees(self.low), math.degrees(self.high)
+        return f"'{bone.name}' turns about {self.axis} from {low:.0f}° to {high:.0f}°."
+
+
+class FDDA_OT_unstate_range(_OnRange, bpy.types.Operator):
+    bl_idname = "fdda.unstate_range"
+    bl_label = "Forget Range"
+    bl_description = "Remove this range of motion from the bone; it then has the default of ±45°"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def change(self, context: bpy.types.Context) -> str:
+        from ..scene.motion_range import unstate_rotation_range
+
+        bone = self.pose_bone(context)
+        unstate_rotation_range(bone, self.axis_index)
+        return f"'{bone.name}' states no range about {self.axis} any more."
+
+
+CLASSES = (FDDA_OT_preview_pose, FDDA_OT_rest_pose, FDDA_OT_state_range, FDDA_OT_unstate_range)

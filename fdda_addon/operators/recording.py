@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The recording: evaluate the poses of a character and keep them in a folder."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+
+from ..core.errors import FDDAError
+from ..settings import recording_folder
+from .job import JobOperator, current
+from .on_rig import OnRig
+
+
+class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
+    bl_idname = "fdda.record"
+    bl_label = "Record"
+    bl_description = "Let Blender evaluate random poses and the chosen actions, and keep them in the folder"
+    bl_options = {"REGISTER"}
+    verb, title = "record", "Recording"
+
+    folder: bpy.props.StringProperty(
+        name="Folder",
+        description="Folder of the recording; empty for that of the character",
+        subtype="DIR_PATH",
+        options={"SKIP_SAVE"},
+    )
+    resume: bpy.props.BoolProperty(
+        name="Resume", description="Continue a recording that was broken off", options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        if properties.resume:
+            return "Continue the recording in the folder where it stopped"
+        return cls.bl_description
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.is_idle() and cls.has_rig(context)
+
+    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+        from ..recording import RecordingSettings, record
+        from ..runtime.binding import true_rig
+
+        rig = self.rig(context)
+        settings = rig.mesh_object.fdda.settings
+        self._path = Path(bpy.path.abspath(self.folder)) if self.folder else recording_folder(rig.mesh_object)
+        wanted = RecordingSettings(
+            poses=settings.poses,
+            seed=settings.seed,
+            spread=settings.spread,
+            actions=recorded_actions(rig.armature_object),
+            resume=self.resume,
+        )
+        with true_rig(rig.mesh_object):
+            yield from record(rig, self._path, wanted)
+
+    def finish(self, _context: bpy.types.Context, _result: object) -> str:
+        return f"Recorded {self.state.total:,} poses into '{self._path.name}'."
+
+    def cancelled(self, _context: bpy.types.Context) -> str:
+        if self.state.stage != "poses" or not self.state.done:
+            return "Recording cancelled before the first pose; nothing was kept."
+        return f"Recording cancelled; {self.state.done:,} of {self.state.total:,} poses are kept, resume goes on there."
+
+
+class FDDA_OT_remove_recording(OnRig, bpy.types.Operator):
+    bl_idname = "fdda.remove_recording"
+    bl_label = "Remove Recording"
+    bl_description = (
+        "Remove the recording that is in the folder, so that another can be made there. This cannot be undone"
+    )
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if (job := current()) is not None:
+            cls.poll_message_set(f"{job.title} is under way; wait for it or cancel it")
+            return False
+        return cls.has_rig(context)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if bpy.app.background or context.window is None:
+            return self.execute(context)
+        return context.window_manager.invoke_confirm(self, event)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        from ..core.recording_folder import remove_recording
+
+        try:
+            path = recording_folder(self.rig(context).mesh_object)
+            remove_recording(path)
+        except FDDAError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"Removed the recording '{path.name}'.")
+        return {"FINISHED"}
+
+
+def recorded_actions(armature_object: bpy.types.Object) -> tuple[str, ...]:
+    """Names of the actions that the user has chosen for recording and that move a bone of this armature."""
+    return tuple(action.name for action in bpy.data.actions if action.fdda.record and fits(action, armature_object))
+
+
+def fits(action: bpy.types.Action, armature_object: bpy.types.Object) -> bool:
+    """Whether an action moves a bone of this armature."""
+    from ..scene.compatibility import animation_curves
+
+    bones = armature_object.pose.bones
+    for curve in animation_curves(action):
+        path = curve.data_path
+        if path.startswith('pose.bones["') and path[12 : path.find('"]', 12)] in bones:
+            return True
+    return False
+
+
+CLASSES = (FDDA_OT_record, FDDA_OT_remove_recording)

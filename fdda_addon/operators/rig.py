@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The rig: add the sample arm, measure what a frame costs."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import bpy
+
+from .job import JobOperator
+from .on_rig import OnRig
+
+if TYPE_CHECKING:  # Blender starts without numpy.
+    from ..rig_cost import RigCost
+
+_costs: "dict[int, RigCost]" = {}
+"""What was measured in this session, by session_uid of the mesh object."""
+
+
+def cost_of(mesh_object: bpy.types.Object) -> "RigCost | None":
+    """What a frame of a rig costs, None when that was not measured, or for another number of vertices."""
+    cost = _costs.get(mesh_object.session_uid)
+    return cost if cost is not None and cost.vertices == len(mesh_object.data.vertices) else None
+
+
+class FDDA_OT_add_arm(bpy.types.Operator):
+    bl_idname = "fdda.add_arm"
+    bl_label = "FDDA Sample Arm"
+    bl_description = "Add an arm of 22 joints with a driven biceps, delta mush and an action, to try a first model on"
+    bl_options = {"REGISTER", "UNDO"}
+
+    density: bpy.props.EnumProperty(
+        name="Density",
+        description="How many vertices the arm has",
+        items=(
+            ("1", "1,476 Vertices", "Quick to record and train; so cheap that a model does not pay"),
+            ("2", "9,960 Vertices", "A model is about four times as fast as the rig"),
+            ("3", "50,618 Vertices", "A model is about eleven times as fast as the rig; recording takes a while"),
+        ),
+        default="1",
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if context.mode != "OBJECT":
+            cls.poll_message_set("Objects are added in object mode; switch to it first")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        from ..arm import build_arm
+
+        scene = context.scene
+        frames = (scene.frame_start, scene.frame_end, scene.frame_current)
+        has_animation = len(bpy.data.actions) > 0
+        mesh_object, armature_object = build_arm(int(self.density))
+        if has_animation:
+            # The range is that of the arm's action in an empty scene only.
+            scene.frame_start, scene.frame_end = frames[:2]
+            scene.frame_set(frames[2])
+        for selected in context.selected_objects:
+            selected.select_set(False)
+        mesh_object.select_set(True)
+        context.view_layer.objects.active = mesh_object
+        count = len(mesh_object.data.vertices)
+        self.report({"INFO"}, f"Added '{mesh_object.name}' with {count:,} vertices on '{armature_object.name}'.")
+        return {"FINISHED"}
+
+
+class FDDA_OT_measure(OnRig, JobOperator, bpy.types.Operator):
+    bl_idname = "fdda.measure"
+    bl_label = "Measure"
+    bl_description = "Time some frames of this rig, and estimate what they would cost with a model in its place"
+    bl_options = {"REGISTER"}
+    verb, title = "measure", "Measuring"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.is_idle() and cls.has_rig(context)
+
+    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+        from ..rig_cost import measure
+
+        yield from measure(self.rig(context))
+
+    def finish(self, context: bpy.types.Context, result: "RigCost") -> str:
+        _costs[self.rig(context).mesh_object.session_uid] = result
+        return f"A frame of this rig takes {result.rig:.2f} ms. {result.sentence}"
+
+
+def _draw_add(self: bpy.types.Menu, _context: bpy.types.Context) -> None:
+    self.layout.operator("fdda.add_arm", icon="OUTLINER_OB_ARMATURE")
+
+
+CLASSES = (FDDA_OT_add_arm, FDDA_OT_measure)
+
+
+def register() -> None:
+    """Put the arm into the menu Add > Armature."""
+    bpy.types.VIEW3D_MT_armature_add.append(_draw_add)
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    bpy.types.VIEW3D_MT_armature_add.remove(_draw_add)
+    _costs.clear()

@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""From the sample arm to a model with operators alone, without a window: values, sentences, cancelling and undo."""
+
+import json
+import math
+import os
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from conftest import ELBOW, ELBOW_RIG
+from scene_state import assert_same_state, scene_state
+
+from fdda_addon.core.model import read_model_info
+from fdda_addon.core.poses import sample_pose
+from fdda_addon.core.recording import read_index, read_recording
+from fdda_addon.core.recording_lock import LOCK
+from fdda_addon.operators import job
+from fdda_addon.operators.rig import cost_of
+from fdda_addon.scene.rig import SceneRig, read_rig, sampled_channels
+
+
+@pytest.fixture
+def saved(rig: SceneRig, tmp_path: Path) -> SceneRig:
+    """The elbow, active, in a file of its own."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elbow.blend"))
+    bpy.context.view_layer.objects.active = rig.mesh_object
+    return rig
+
+
+def recorded_folder(tmp_path: Path) -> Path:
+    return tmp_path / "elbow_recording"
+
+
+class TestRig:
+    def test_the_arm_is_added_to_the_scene_that_is_there(self):
+        bpy.ops.mesh.primitive_cube_add()
+        cube = bpy.context.active_object
+        assert bpy.ops.fdda.add_arm() == {"FINISHED"}
+        arm = bpy.context.active_object
+        assert arm.name == "arm" and len(arm.data.vertices) == 1476 and arm.select_get()
+        assert cube.name in bpy.context.scene.objects and not cube.select_get()
+        assert bpy.context.scene.frame_end == 250
+
+    def test_a_second_arm_has_a_rig_of_its_own(self):
+        bpy.ops.fdda.add_arm()
+        bpy.context.scene.frame_end = 77
+        bpy.ops.fdda.add_arm()
+        second = bpy.context.active_object
+        assert second.name == "arm.001" and second.modifiers["Armature"].object.name == "arm_rig.001"
+        driver = second.data.shape_keys.animation_data.drivers[0].driver
+        assert driver.variables[0].targets[0].id.name == "arm_rig.001"
+        assert bpy.context.scene.frame_end == 77, "the range belongs to whoever animates already"
+
+    def test_adding_the_arm_can_be_undone(self):
+        bpy.ops.ed.undo_push()
+        bpy.ops.fdda.add_arm()
+        bpy.ops.ed.undo_push()
+        bpy.ops.ed.undo()
+        assert "arm" not in bpy.data.objects and "arm_rig" not in bpy.data.objects
+
+    def test_not_in_edit_mode(self, saved):
+        bpy.ops.object.mode_set(mode="EDIT")
+        with pytest.raises(RuntimeError, match="Objects are added in object mode; switch to it first"):
+            bpy.ops.fdda.add_arm()
+
+    def test_measuring_gives_back_the_scene_and_keeps_the_cost(self, saved):
+        before = scene_state(saved)
+        assert bpy.ops.fdda.measure() == {"FINISHED"}
+        assert_same_state(before, scene_state(saved))
+        cost = cost_of(saved.mesh_object)
+        assert cost.vertices == len(saved.mesh_object.data.vertices)
+        assert cost.rig > cost.linear > 0 and cost.model > cost.linear
+        assert job.state_of("measure").outcome.endswith("this rig costs less than the playback of a model.")
+
+    def test_what_cannot_be_evaluated_is_not_measured(self, saved):
+        saved.armature_object.data.pose_position = "REST"
+        with pytest.raises(RuntimeError, match="The armature 'elbow_rig' shows its rest position; set it to pose"):
+            bpy.ops.fdda.measure()
+
+
+class TestWhichRig:
+    def test_nothing_active(self):
+        with pytest.raises(RuntimeError, match="Nothing with a rig is active; select the mesh of a character"):
+            bpy.ops.fdda.record()
+
+    def test_a_mesh_without_a_rig_but_another_with_one(self, saved):
+        bpy.ops.mesh.primitive_cube_add()
+        with pytest.raises(RuntimeError, match="'Cube' has no Armature modifier with an armature"):
+            bpy.ops.fdda.measure()
+        assert bpy.ops.fdda.measure(object=ELBOW) == {"FINISHED"}
+
+    def test_a_name_that_is_not_there(self, saved):
+        with pytest.raises(RuntimeError, match="The scene has no mesh object 'none'; its mesh objects: 'elbow'"):
+            bpy.ops.fdda.record(object="none")
+
+    def test_the_armature_stands_for_its_mesh(self, saved):
+        bpy.context.view_layer.objects.active = saved.armature_object
+        assert bpy.ops.fdda.measure() == {"FINISHED"}
+
+    def test_of_two_meshes_the_selected_one_is_meant(self, saved):
+        other = saved.mesh_object.copy()
+        other.data = saved.mesh_object.data.copy()
+        bpy.context.scene.collection.objects.link(other)
+        for mesh_object in (saved.mesh_object, other):
+            mesh_object.select_set(False)
+        bpy.context.view_layer.objects.active = saved.armature_object
+        with pytest.raises(RuntimeError, match=r"2 meshes follow 'elbow_rig' \('elbow', 'elbow.001'\); select the one"):
+            bpy.ops.fdda.measure()
+        other.select_set(True)
+        assert bpy.ops.fdda.measure() == {"FINISHED"}
+        assert job.state_of("measure").subject == "elbow.001"
+
+
+class TestPoses:
+    def test_the_poses_that_are_shown_are_those_that_are_recorded(self, saved):
+        settings = saved.mesh_object.fdda.settings
+        settings.seed, settings.spread = 7, 0.5
+        channels = sampled_channels(saved, read_rig(saved))
+        assert bpy.ops.fdda.preview_pose(number=3) == {"FINISHED"}
+        assert bpy.ops.fdda.preview_pose(step=1) == {"FINISHED"}
+        assert bpy.context.window_manager.fdda.pose_number == 4
+        bones = saved.armature_object.pose.bones
+        shown = [bones[c.bone].rotation_euler[c.axis] for c in channels]
+        np.testing.assert_allclose(shown, sample_pose(channels, 7, 4, 0.5), atol=1e-6)
+        bpy.ops.fdda.preview_pose(number=0, step=-1)
+        assert bpy.context.window_manager.fdda.pose_number == 0
+
+    def test_back_to_rest_and_undone(self, saved):
+        bpy.ops.fdda.preview_pose(number=1)
+        bpy.ops.ed.undo_push()
+        angle = saved.armature_object.pose.bones["lower"].rotation_euler[0]
+        assert angle != 0
+        assert bpy.ops.fdda.rest_pose() == {"FINISHED"}
+        assert saved.armature_object.pose.bones["lower"].rotation_euler[0] == 0
+        bpy.ops.ed.undo_push()
+        bpy.ops.ed.undo()
+        assert bpy.data.objects[ELBOW_RIG].pose.bones["lower"].rotation_euler[0] == pytest.approx(angle)
+
+    def test_nothing_to_pose(self, saved):
+        for bone in saved.armature_object.pose.bones:
+            bone.lock_rotation = (True, True, True)
+        with pytest.raises(RuntimeError, match="No bone of 'elbow_rig' may be sampled"):
+            bpy.ops.fdda.preview_pose()
+
+    def ranges(self, rig: SceneRig) -> dict[str, tuple[float, float]]:
+        return {
+            f"{c.bone} {'XYZ'[c.axis]}": (round(math.degrees(c.low)), round(math.degrees(c.high)))
+            for c in sampled_channels(rig, read_rig(rig))
+        }
+
+    def test_a_range_is_written_where_the_bone_has_it(self, saved):
+        bone = saved.armature_object.pose.bones["upper"]
+        result = bpy.ops.fdda.state_range(bone="upper", axis="Y", low=math.radians(10), high=math.radians(60))
+        assert result == {"FINISHED"} and self.ranges(saved)["upper Y"] == (10, 60)
+        assert math.degrees(bone.constraints[0].min_y) == pytest.approx(10)
+        assert not bone.use_ik_limit_y
+
+    def test_a_bone_without_limits_gets_those_that_leave_posing_free(self, saved):
+        bone = saved.armature_object.pose.bones["upper"]
+        bone.constraints.remove(bone.constraints[0])
+        bone.lock_rotation[2] = True
+        bpy.ops.fdda.state_range(bone="upper", axis="Z", low=-1, high=0.5)
+        assert self.ranges(saved)["upper Z"] == (-57, 29) and self.ranges(saved)["upper X"] == (-45, 45)
+        assert bone.use_ik_limit_z and not bone.constraints
+        with pytest.raises(RuntimeError, match="IK limits, which hold the rest pose; begin at 0 or below"):
+            bpy.ops.fdda.state_range(bone="upper", axis="X", low=0.5, high=1)
+        bpy.ops.fdda.unstate_range(bone="upper", axis="Z")
+        assert self.ranges(saved)["upper Z"] == (-45, 45)
+        bpy.ops.fdda.state_range(bone="upper", axis="X", low=0.5, high=1)
+        assert self.ranges(saved)["upper X"] == (29, 57) and len(bone.constraints) == 1
+
+    def test_an_empty_range_and_an_unknown_bone(self, saved):
+        with pytest.raises(RuntimeError, match="The range of 'upper' about Y is empty; give a larger maximum"):
+            bpy.ops.fdda.state_range(bone="upper", axis="Y", low=1, high=0)
+        with pytest.raises(RuntimeError, match="'elbow_rig' has no bone 'tail'; give the name of one"):
+            bpy.ops.fdda.unstate_range(bone="tail", axis="Y")
+
+
+class TestRecording:
+    def record(self, rig: SceneRig, poses: int = 20, **options) -> set[str]:
+        rig.mesh_object.fdda.settings.poses = poses
+        return bpy.ops.fdda.record(**options)
+
+    def test_what_the_settings_say_is_recorded_beside_the_file(self, saved, tmp_path):
+        settings = saved.mesh_object.fdda.settings
+        settings.seed, settings.spread = 5, 0.75
+        bpy.data.actions["elbow_wave"].fdda.record = True
+        bpy.data.actions.new("of something else").fdda.record = True
+        before = scene_state(saved)
+        assert self.record(saved) == {"FINISHED"}
+        assert_same_state(before, scene_state(saved))
+        sampling = read_recording(recorded_folder(tmp_path)).info.sampling
+        assert (sampling.seed, sampling.spread) == (5, 0.75)
+        assert [(s.kind, s.poses, s.name) for s in sampling.sources] == [
+            ("random", 20, ""),
+            ("action", 30, "elbow_wave"),
+        ]
+        assert job.state_of("record").outcome == "Recorded 50 poses into 'elbow_recording'."
+
+    def test_an_unsaved_file_has_no_place_for_it(self):
+        bpy.ops.fdda.add_arm()
+        with pytest.raises(RuntimeError, match=r"The \.blend file has not been saved, so there is no place beside it"):
+            bpy.ops.fdda.record()
+
+    def test_a_folder_that_is_named(self, saved, tmp_path):
+        saved.mesh_object.fdda.settings.recording = "//deep/down"
+        assert self.record(saved) == {"FINISHED"}
+        assert read_index(tmp_path / "deep" / "down")["complete"] == 20
+        assert self.record(saved, folder=str(tmp_path / "other")) == {"FINISHED"}
+        assert read_index(tmp_path / "other")["complete"] == 20
+
+    def test_cancelled_and_resumed(self, saved, tmp_path, monkeypatch):
+        show = job.JobState.show
+
+        def cancel(state, progress):
+            show(state, progress)
+            if progress.stage == "poses" and progress.done == 8:
+                bpy.ops.fdda.cancel()
+
+        before = scene_state(saved)
+        with monkeypatch.context() as patch:
+            patch.setattr(job.JobState, "show", cancel)
+            assert self.record(saved) == {"CANCELLED"}
+        assert_same_state(before, scene_state(saved))
+        outcome = job.state_of("record").outcome
+        complete = read_index(recorded_folder(tmp_path))["complete"]
+        assert complete >= 8 and f"{complete} of 20 poses are kept" in outcome
+        with pytest.raises(RuntimeError, match="holds a recording already"):
+            self.record(saved)
+        assert self.record(saved, resume=True) == {"FINISHED"}
+        assert len(read_recording(recorded_folder(tmp_path)).residuals) == 20
+
+    def test_another_blender_is_recording_there(self, saved, tmp_path):
+        recorded_folder(tmp_path).mkdir()
+        (recorded_folder(tmp_path) / LOCK).write_text(json.dumps({"pid": os.getppid(), "host": os.uname().nodename}))
+        with pytest.raises(RuntimeError, match=rf"Another Blender \(process {os.getppid()}\) is recording into"):
+            self.record(saved)
+
+    def test_removing_a_recording(self, saved, tmp_path):
+        with pytest.raises(RuntimeError, match="holds no recording; there is nothing to remove"):
+            bpy.ops.fdda.remove_recording()
+        self.record(saved)
+        (recorded_folder(tmp_path) / "notes.txt").write_text("mine")
+        assert bpy.ops.fdda.remove_recording() == {"FINISHED"}
+        assert [path.name for path in recorded_folder(tmp_path).iterdir()] == ["notes.txt"]
+
+    def test_a_bound_rig_is_recorded_as_the_true_rig(self, bound, elbow, tmp_path):
+        bpy.context.view_layer.objects.active = bound
+        assert bound.fdda.is_playing
+        bound.fdda.settings.poses = 5
+        assert bpy.ops.fdda.record(folder=str(tmp_path / "r")) == {"FINISHED"}
+        first, again = (read_recording(path).residuals[:5] for path in (elbow.recording, tmp_path / "r"))
+        np.testing.assert_allclose(again, first, atol=1e-6)
+        assert bound.fdda.is_playing
+
+
+class TestTraining:
+    def train(self, rig: SceneRig, elbow, **options) -> set[str]:
+        settings = rig.mesh_object.fdda.settings
+        settings.epochs, settings.tolerance_mm, settings.training_seed = 6, 0.2, 3
+        return bpy.ops.fdda.train(recording=str(elbow.recording), **options)
+
+    def test_a_model_with_these_settings_and_its_curves(self, saved, elbow, tmp_path):
+        saved.mesh_object.fdda.settings.model = "//models/a.onnx"
+        assert self.train(saved, elbow) == {"FINISHED"}
+        model = tmp_path / "models" / "a.onnx"
+        training = read_model_info(model).training
+        assert (training["epochs"], training["tolerance_mm"], training["seed"]) == (6, 0.2, 3)
+        state = job.state_of("train")
+        assert (state.done, state.total) == (6, 6) and state.outcome.startswith("Trained 'a.onnx' in ")
+        assert [len(state.curves[name]) for name in ("training", "validation")] == [6, 6]
+        assert state.curves["validation"][-1] < state.curves["validation"][0]
+        assert state.log[0].startswith("2 partitions, ")
+
+    def test_cancelled(self, saved, elbow, tmp_path, monkeypatch):
+        show = job.JobState.show
+
+        def cancel(state, progress):
+            show(state, progress)
+            if progress.done == 2:
+                bpy.ops.fdda.cancel()
+
+        monkeypatch.setattr(job.JobState, "show", cancel)
+        saved.mesh_object.fdda.settings.epochs = 10_000
+        options = {"recording": str(elbow.recording), "model": str(tmp_path / "m.onnx")}
+        assert bpy.ops.fdda.train(**options) == {"CANCELLED"}
+        assert job.state_of("train").outcome == "Training cancelled; no model was written."
+        assert not (tmp_path / "m.onnx").exists()
+
+    def test_no_recording_and_one_that_is_not_finished(self, saved, tmp_path):
+        with pytest.raises(RuntimeError, match="is not a recording: it has no recording"):
+            bpy.ops.fdda.train()
+        saved.mesh_object.fdda.settings.poses = 4
+        bpy.ops.fdda.record()
+        index = recorded_folder(tmp_path) / "recording.json"
+        index.write_text(index.read_text().replace('"complete": 4', '"complete": 3'))
+        with pytest.raises(RuntimeError, match="The recording 'elbow_recording' has 3 of 4 poses; resume it first"):
+            bpy.ops.fdda.train()
+
+    def test_a_python_that_is_not_there(self, saved, elbow, tmp_path, monkeypatch):
+        monkeypatch.setenv("FDDA_TRAINER_PYTHON", "/none/python")
+        with pytest.raises(RuntimeError, match="The trainer's Python '/none/python' cannot be started"):
+            self.train(saved, elbow)
+        assert job.current() is None
