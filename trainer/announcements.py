@@ -41,9 +41,9 @@ class Text:
             self.open_line = False
         text = {
             MessageType.STARTED: "Training {partitions} partitions, {vertices} vertices, {poses} poses, on {device}.",
-            MessageType.PARTITION_FINISHED: "  {joint}: {basis} shapes, validation error {validation_mm:.4f} mm",
+            MessageType.PARTITION_FINISHED: "  {joint}: {basis} shapes, held-out error {held_out_mm:.4f} mm",
             MessageType.LOG: "{text}",
-            MessageType.FINISHED: "Wrote '{model}': validation error {validation_mm:.4f} mm, {seconds:.1f} s.",
+            MessageType.FINISHED: "Wrote '{model}': held-out error {held_out_mm:.4f} mm, {seconds:.1f} s.",
             MessageType.CANCELLED: "Cancelled; nothing was written.",
         }.get(kind)
         if text:

@@ -29,6 +29,8 @@ class TrainingConfig:
         averaging: part of the average of the weights that one step replaces is 1 - averaging; 0 takes the weights
             themselves.
         validation_fraction: part of the poses that is kept from the training to choose the best weights.
+        held_out_fraction: part of the poses that is kept from training and choice to measure the error on.
+        target_mm: what 99.9 % of the held-out vertices are to be within, 0 for no target.
         patience: stop when no partition has improved for so many epochs; 0 trains to the end.
     """
 
@@ -44,7 +46,9 @@ class TrainingConfig:
     l1: float = 0.0
     l2: float = 0.0
     averaging: float = 0.99
-    validation_fraction: float = 0.1
+    validation_fraction: float = 0.05
+    held_out_fraction: float = 0.1
+    target_mm: float = 0.0
     patience: int = 0
 
     def __post_init__(self):
@@ -61,7 +65,9 @@ class TrainingConfig:
             "l1": self.l1 >= 0,
             "l2": self.l2 >= 0,
             "averaging": 0 <= self.averaging < 1,
-            "validation_fraction": 0 < self.validation_fraction <= 0.5,
+            "validation_fraction": 0 < self.validation_fraction <= 0.4,
+            "held_out_fraction": 0 < self.held_out_fraction <= 0.4,
+            "target_mm": self.target_mm >= 0,
             "patience": self.patience >= 0,
         }
         for name, good in checks.items():
@@ -104,7 +110,9 @@ HELP = {
     "l1": "factor of the sum of absolute weights in the loss",
     "l2": "factor of the sum of squared weights in the loss",
     "averaging": "how slowly the average of the weights moves, 0 for no average",
-    "validation_fraction": "part of the poses that is kept from the training",
+    "validation_fraction": "part of the poses that is kept from the training to choose the best weights",
+    "held_out_fraction": "part of the poses that is kept from all of it to measure the error on",
+    "target_mm": "what 99.9 %% of the held-out vertices are to be within, in mm; 0 for no target",
     "patience": "stop after so many epochs without improvement, 0 for never",
 }
 

@@ -2,14 +2,15 @@
 """What the networks are trained on: features and coefficients of each partition."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.recording import Recording
+from fdda_addon.core.recording import REFINED, Recording
 
 from .basis import Basis, make_basis
+from .config import TrainingConfig
 from .inputs import Inputs
 
 LEAST_POSES = 10
@@ -37,10 +38,17 @@ class PartitionData:
 
 @dataclass(frozen=True)
 class Split:
-    """Indices of the poses that train and of those that validate, ascending."""
+    """Indices of poses, ascending.
+
+    Attributes:
+        training: those that the basis and the weights are made of.
+        validation: those that choose the best weights.
+        held_out: those that nothing is made of or chosen by, to measure the error on.
+    """
 
     training: np.ndarray
     validation: np.ndarray
+    held_out: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -72,12 +80,12 @@ class PreparedPartition:
     validation_truncation: np.ndarray
 
 
-def split_poses(poses: np.ndarray, validation_fraction: float, seed: int) -> Split:
-    """Choose the validation poses at random.
+def split_poses(poses: np.ndarray, validation_fraction: float, seed: int, held_out_fraction: float = 0.0) -> Split:
+    """Choose the poses that do not train at random.
 
     Args:
         poses: (n,) indices of the poses that may be used.
-        validation_fraction, seed: as in `TrainingConfig`.
+        validation_fraction, held_out_fraction, seed: as in `TrainingConfig`; a fraction of 0 holds nothing out.
 
     Raises:
         TrainingError: there are too few poses.
@@ -87,8 +95,24 @@ def split_poses(poses: np.ndarray, validation_fraction: float, seed: int) -> Spl
             f"The recording has {len(poses)} poses and training takes at least {LEAST_POSES}; record more."
         )
     order = np.random.default_rng([seed, 1]).permutation(poses)
-    count = max(1, round(len(poses) * validation_fraction))
-    return Split(np.sort(order[count:]), np.sort(order[:count]))
+    validation = max(1, round(len(poses) * validation_fraction))
+    held_out = max(1, round(len(poses) * held_out_fraction)) if held_out_fraction else 0
+    parts = np.split(order, [held_out, held_out + validation])
+    return Split(np.sort(parts[2]), np.sort(parts[1]), np.sort(parts[0]))
+
+
+def split_recording(recording: Recording, config: TrainingConfig) -> Split:
+    """Split the poses of a recording.
+
+    Refined poses all train: they are no sample of the range of motion, and an error measured on them would say
+    nothing of it. What is held out stays so when a recording is extended.
+
+    Raises:
+        TrainingError: there are too few poses beside the refined ones.
+    """
+    refined = np.concatenate([np.full(s.poses, s.kind == REFINED) for s in recording.info.sampling.sources])
+    split = split_poses(np.flatnonzero(~refined), config.validation_fraction, config.seed, config.held_out_fraction)
+    return replace(split, training=np.append(split.training, np.flatnonzero(refined)))
 
 
 def partitions_of(recording: Recording, inputs: Inputs) -> list[PartitionData]:

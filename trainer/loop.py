@@ -67,6 +67,7 @@ def train(
     device: torch.device | None = None,
     progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] = lambda: False,
+    initial: Sequence[Network | None] | None = None,
 ) -> Trained:
     """Train the networks of all partitions together.
 
@@ -77,6 +78,7 @@ def train(
         device: to train on; `choose_device()` when left out.
         progress: called after every epoch.
         should_stop: asked before every step.
+        initial: for each partition the network to start from, None for random weights.
 
     Raises:
         Cancelled: `should_stop` said so.
@@ -88,6 +90,8 @@ def train(
     networks = [Network((np.zeros((len(p.columns), 0), np.float32),), (np.zeros(0, np.float32),)) for p in partitions]
     if learning:
         loop = _Loop([partitions[number] for number in learning], split, config, device)
+        if initial is not None:
+            loop.start_from([initial[number] for number in learning])
         loop.run([curves[number] for number in learning], progress, should_stop, partitions)
         for number, network in zip(learning, loop.best_networks(), strict=True):
             networks[number] = network
@@ -121,6 +125,20 @@ class _Loop:
         self.averaged = [parameter.detach().clone() for parameter in self.model.parameters()]
         self.best = [average.clone() for average in self.averaged]
         self.best_mm = torch.full((len(partitions),), torch.inf, device=device)
+
+    @torch.no_grad()
+    def start_from(self, networks: list[Network | None]) -> None:
+        """Take the initial weights from networks, as `best_networks` gives them, where there are any."""
+        for number, (network, scale) in enumerate(zip(networks, self.scales, strict=True)):
+            if network is None:
+                continue
+            last = len(network.weights) - 1
+            for layer, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+                factor = np.float32(1 / scale) if layer == last else np.float32(1)
+                rows, columns = weight.shape
+                self.model.weights[layer][number, :rows, :columns] = torch.from_numpy(weight * factor)
+                self.model.biases[layer][number, 0, :columns] = torch.from_numpy(bias * factor)
+        self.averaged = [parameter.detach().clone() for parameter in self.model.parameters()]
 
     def run(
         self,

@@ -89,7 +89,8 @@ def _head(report: dict) -> str:
     return (
         f"<h1>{escape(report['model'])}</h1><p>{escape(report['object'])}: {report['vertices']:,} vertices, "
         f"{report['joints']} joints. Trained on {training['training_poses']:,} poses of the recording "
-        f"<strong>{escape(report['recording'])}</strong>, measured on {training['validation_poses']:,} others.</p>"
+        f"<strong>{escape(report['recording'])}</strong>, measured on {training['held_out_poses']:,} others "
+        "that neither trained nor chose anything.</p>"
         f'<div class="cards">{shown}</div>'
     )
 

@@ -3,12 +3,14 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
 import torch
 
+from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.output import check_writable, write_json, write_text
 from fdda_addon.core.recording import Recording, read_recording
@@ -16,16 +18,20 @@ from fdda_addon.core.recording import Recording, read_recording
 from . import report
 from .announcements import Announcer
 from .config import TrainingConfig
-from .data import PreparedPartition, Split, partitions_of, prepare, split_poses
+from .data import PreparedPartition, Split, partitions_of, prepare, split_recording
 from .deformation import Deformation
 from .export import build_model, measure, write_model
 from .inputs import Inputs, make_inputs, middles
 from .loop import Cancelled, Trained, choose_device, train
 from .page import render_html
+from .target import Outcome, judge
 from .trust import make_trust_range
+from .weights import LastWeights, initial_networks, read_weights, weights_path, write_weights
 
 REPORT_JSON = "report.json"
 REPORT_HTML = "report.html"
+WARM_EPOCHS, WARM_RATE = 0.5, 0.3
+"""A warm start takes this part of the epochs and of the learning rate: most is learned already."""
 
 
 def train_model(
@@ -34,8 +40,9 @@ def train_model(
     config: TrainingConfig,
     announcer: Announcer,
     should_stop: Callable[[], bool] = lambda: False,
+    warm_start: bool = False,
 ) -> None:
-    """Train a model, and write it with its report beside it.
+    """Train a model, and write it with its report and its last weights beside it.
 
     Args:
         recording_path: folder of a complete recording.
@@ -43,16 +50,18 @@ def train_model(
         config: the settings.
         announcer: told everything from `STARTED` to `FINISHED`; not told of errors.
         should_stop: asked often; nothing has been written when it is heeded.
+        warm_start: start from the last weights of the model, on a recording that may have grown since.
 
     Raises:
         Cancelled: `should_stop` said so.
         FDDAError: the recording, the settings or the output path are no good.
     """
     started = time.perf_counter()
-    outputs = (model_path, model_path.with_name(REPORT_JSON), model_path.with_name(REPORT_HTML))
-    for path in outputs:
+    report_json, report_html = (model_path.with_name(name) for name in (REPORT_JSON, REPORT_HTML))
+    for path in (model_path, report_json, report_html, weights_path(model_path)):
         check_writable(path)
     recording = read_recording(recording_path)
+    last = _last_weights(model_path, recording, config) if warm_start else None
     device = choose_device()
     announcer.say(
         MessageType.STARTED,
@@ -61,13 +70,14 @@ def train_model(
         vertices=recording.rig.vertex_count,
         device=str(device),
     )
-    split = split_poses(np.arange(len(recording.pose_matrices)), config.validation_fraction, config.seed)
+    split = split_recording(recording, config)
     inputs = make_inputs(recording.rig.parents, middles(recording.rig, recording.partitions), recording.partitions)
     prepared = _prepare(recording, inputs, split, config, should_stop)
+    seen = [columns[partition.columns] for columns, partition in zip(inputs.columns, prepared, strict=True)]
     trained = train(
         prepared,
         split,
-        config,
+        _shorter(config) if last else config,
         device,
         lambda p: announcer.say(
             MessageType.PROGRESS,
@@ -77,6 +87,7 @@ def train_model(
             validation_mm=round(p.validation_mm, 6),
         ),
         should_stop,
+        initial_networks(last, prepared, seen) if last else None,
     )
     deformation = _deformation(recording, inputs, split, prepared, trained, config)
     _check_stop(should_stop)
@@ -87,31 +98,78 @@ def train_model(
         "device": str(device),
         "training_poses": len(split.training),
         "validation_poses": len(split.validation),
+        "held_out_poses": len(split.held_out),
+        "warm_start": warm_start,
         "seconds": round(time.perf_counter() - started, 2),
     }
-    exported = build_model(recording, deformation, split.validation, settings)
+    exported = build_model(recording, deformation, split.held_out, settings)
     _check_stop(should_stop)
-    sample = split.training[:: max(1, len(split.training) // len(split.validation))]
+    sample = split.training[:: max(1, len(split.training) // len(split.held_out))]
     on_training = measure(exported.session, recording, deformation, sample)
     content = report.make_report(recording, deformation, exported, on_training, trained.curves, model_path.name)
+    poses, p999 = len(recording.pose_matrices), exported.info.held_out_mm["p999"]
+    history = [*(last.history if last else ()), {"poses": poses, "p999": p999}]
+    outcome = None
+    if config.target_mm:
+        training_p999 = content["fdda"]["training"]["p999"]
+        outcome = judge(config.target_mm, history, training_p999, recording_path, model_path)
+        content["target"] = outcome.to_json()
     page = render_html(content)
     _check_stop(should_stop)
-    # From here on nothing stops: the model and its report belong together.
-    write_model(outputs[0], exported.content)
-    write_json(outputs[1], content)
-    write_text(outputs[2], page)
+    # From here on nothing stops: the model and what lies beside it belong together.
+    write_model(model_path, exported.content)
+    write_weights(weights_path(model_path), deformation, config.hidden, history)
+    write_json(report_json, content)
+    write_text(report_html, page)
+    _announce_end(announcer, model_path, content, outcome, time.perf_counter() - started)
+
+
+def _announce_end(
+    announcer: Announcer, model_path: Path, content: dict, outcome: Outcome | None, seconds: float
+) -> None:
     for partition in content["partitions"]:
         announcer.say(
             MessageType.PARTITION_FINISHED,
             joint=partition["joint"],
             basis=partition["basis"],
-            validation_mm=partition["held_out"]["mean"],
+            held_out_mm=partition["held_out"]["mean"],
         )
+    if outcome:
+        announcer.say(MessageType.LOG, text=outcome.text)
+    held_out = content["fdda"]["held_out"]
     announcer.say(
         MessageType.FINISHED,
         model=str(model_path),
-        seconds=round(time.perf_counter() - started, 2),
-        validation_mm=exported.info.held_out_mm["mean"],
+        seconds=round(seconds, 2),
+        held_out_mm=held_out["mean"],
+        held_out_p999_mm=held_out["p999"],
+        **({"verdict": outcome.verdict.value} if outcome else {}),
+    )
+
+
+def _last_weights(model_path: Path, recording: Recording, config: TrainingConfig) -> LastWeights:
+    """The weights to start from.
+
+    Raises:
+        TrainingError: there are none, or of another rig or other networks.
+    """
+    path = weights_path(model_path)
+    last = read_weights(path)
+    if last.fingerprint != recording.rig.fingerprint:
+        raise TrainingError(f"The last weights '{path}' are of another rig; train without --warm-start.")
+    if (last.hidden, last.activation) != (config.hidden, config.activation):
+        raise TrainingError(
+            f"The last weights '{path}' are of networks --hidden {' '.join(map(str, last.hidden))} --activation "
+            f"{last.activation}; train with the same, or without --warm-start."
+        )
+    return last
+
+
+def _shorter(config: TrainingConfig) -> TrainingConfig:
+    return replace(
+        config,
+        epochs=max(1, round(config.epochs * WARM_EPOCHS)),
+        learning_rate=config.learning_rate * WARM_RATE,
     )
 
 

@@ -9,7 +9,7 @@ import sys
 from importlib import import_module
 
 from ..core.errors import FDDAError
-from .interruption import interruptible
+from .registration import registered
 
 VERBS = {
     "build-arm": ("build_arm", "build the example rig: an arm with a hand"),
@@ -48,7 +48,9 @@ def main(arguments: list[str], program: str) -> int:
 
             return run(arguments[1:])
         options = parser.parse_args(arguments)
-        return _run(import_module(f".{VERBS[verb][0]}", __name__), options)
+        with registered():
+            import_module(f".{VERBS[verb][0]}", __name__).run(options)
+        return 0
     except SystemExit as usage:
         # Blender must not be ended by a wrong option of ours.
         return int(usage.code or 0)
@@ -58,18 +60,3 @@ def main(arguments: list[str], program: str) -> int:
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)
         return INTERRUPTED
-
-
-def _run(verb: object, options: argparse.Namespace) -> int:
-    """Run a verb with the add-on registered; it stays registered where Blender had enabled it."""
-    from .. import is_registered, register, unregister
-
-    was_registered = is_registered()
-    register()
-    try:
-        with interruptible():
-            verb.run(options)
-    finally:
-        if not was_registered:
-            unregister()
-    return 0

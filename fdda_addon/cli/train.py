@@ -1,20 +1,61 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`train RECORDING MODEL.onnx …`: the trainer with its own options, started in the Python that has torch."""
+"""`train RECORDING MODEL.onnx …`: the trainer with its own options, started in the Python that has torch.
 
+With `--refine RIG.blend` it goes on by itself: while the target is missed and more poses help, it adds poses to the
+recording where the model is worst, and trains on.
+"""
+
+import argparse
 import subprocess
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+from ..core.errors import WrongUsageError
 from ..core.messages import MessageType
 from ..training import Training, trainer_command
 from .progress import ProgressPrinter
+from .registration import registered
+
+if TYPE_CHECKING:
+    from ..scene.rig import SceneRig
 
 INTERRUPTED = 130
+MISSED = "missed"
+WARM_START, TARGET = "--warm-start", "--target-mm"
+MOST_ROUNDS = 20
 
 
 def run(arguments: list[str]) -> int:
-    """Train; `arguments` are those of `python -m trainer`. Returns the exit status."""
+    """Train; `arguments` are those of `python -m trainer` and of `_refinement_parser`. Returns the exit status."""
+    parser = _refinement_parser()
     if not arguments or {"-h", "--help"} & set(arguments):
         command, environment = trainer_command(arguments)
-        return subprocess.run(command, env=environment, check=False).returncode
+        status = subprocess.run(command, env=environment, check=False).returncode
+        if arguments:
+            print(f"\n{parser.format_help().partition(chr(10) * 2)[2]}", end="")
+        return status
+    options, own = parser.parse_known_args(arguments)
+    if options.refine is None:
+        if options.object or options.poses is not None:
+            raise WrongUsageError("--object and --poses say how to refine; give --refine RIG.blend with them.")
+        return _train(own)[0]
+    return _train_to_target(own, options)
+
+
+def _refinement_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("train", usage=argparse.SUPPRESS, add_help=False, allow_abbrev=False)
+    group = parser.add_argument_group("until the target is met, with --target-mm")
+    group.add_argument(
+        "--refine", metavar="RIG.blend", type=Path, help="add poses of this rig where the model is worst, and train on"
+    )
+    group.add_argument("--object", default="", metavar="NAME", help="the mesh object, when several have a rig")
+    group.add_argument("--poses", type=int, metavar="N", help="poses to add each time (default 250)")
+    return parser
+
+
+def _train(arguments: list[str]) -> tuple[int, dict]:
+    """One training; its exit status, and what it said last."""
+    values: dict = {}
     with Training(arguments) as training, ProgressPrinter() as progress:
         for message in training.messages():
             values = message.values
@@ -24,6 +65,46 @@ def run(arguments: list[str]) -> int:
             elif message.type is MessageType.LOG:
                 progress.say(values["text"])
             elif message.type is MessageType.CANCELLED:
-                return INTERRUPTED
-    print(f"{values['model']}: trained in {values['seconds']:.1f} s, validation error {values['validation_mm']:.4f} mm")
+                return INTERRUPTED, values
+    print(f"{values['model']}: trained in {values['seconds']:.1f} s, held-out error {values['held_out_mm']:.4f} mm")
+    return 0, values
+
+
+def _train_to_target(arguments: list[str], options: argparse.Namespace) -> int:
+    """Train, and refine the recording, in turn."""
+    if len(arguments) < 2 or any(argument.startswith("-") for argument in arguments[:2]):
+        raise WrongUsageError("With --refine, give RECORDING and MODEL.onnx before the training settings.")
+    if not any(argument.partition("=")[0] == TARGET for argument in arguments):
+        raise WrongUsageError(f"--refine trains until a target is met; say which with {TARGET}.")
+    recording, model = map(Path, arguments[:2])
+    with registered():
+        # Before the first training: a wrong path or object shows at once.
+        _open_rig(options)
+        for number in range(MOST_ROUNDS):
+            warm = [WARM_START] if number and WARM_START not in arguments else []
+            status, values = _train([*arguments, *warm])
+            if status or values.get("verdict") != MISSED:
+                return status
+            _refine(recording, model, options, number)
+    print(f"The target is not met after {MOST_ROUNDS} rounds; run the command again with {WARM_START} to go on.")
     return 0
+
+
+def _open_rig(options: argparse.Namespace) -> "SceneRig":
+    from ..scene.rig import find_rig
+    from .files import open_file
+
+    open_file(options.refine)
+    return find_rig(options.object)
+
+
+def _refine(recording: Path, model: Path, options: argparse.Namespace, number: int) -> None:
+    from ..refinement import RefinementSettings, refine
+    from ..runtime.binding import true_rig
+
+    scene_rig = _open_rig(options)
+    given = {} if options.poses is None else {"poses": options.poses}
+    with ProgressPrinter() as progress, true_rig(scene_rig.mesh_object):
+        for step in refine(scene_rig, recording, model, RefinementSettings(seed=number, **given)):
+            progress.show(step.stage, step.done, step.total)
+    print(f"{recording}: {step.total} poses added where the model is worst")

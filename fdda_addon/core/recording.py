@@ -184,7 +184,9 @@ def _check_index(index: dict) -> None:
             if type(joint) is not int or not 0 <= joint < len(names):
                 raise ValueError(f"a partition has joint {joint!r} of {len(names)}")
     Fingerprint(**index["rig"]["fingerprint"])
-    _sampling(index["sampling"])
+    for source in _sampling(index["sampling"]).sources:
+        if type(source.poses) is not int or source.poses < 0:
+            raise ValueError(f"a source has {source.poses!r} poses")
 
 
 def _sampling(value: dict) -> Sampling:
@@ -229,13 +231,18 @@ def read_recording(path: Path) -> Recording:
     partitions = make_partitions(rig, {p["joint"]: tuple(p["influencing"]) for p in index["partitions"]})
     if [p.joint for p in partitions] != [p["joint"] for p in index["partitions"]]:
         raise RecordingError(f"The partitions of '{path}' contradict its skin weights; record again.")
+    sampling = _sampling(index["sampling"])
+    if sum(source.poses for source in sampling.sources) != index["poses"]:
+        raise RecordingError(
+            f"The index of '{path}' is damaged: its sources do not add up to its {index['poses']} poses; record again."
+        )
     info = RecordingInfo(
         index["poses"],
         index["complete"],
         index["rig"]["file"],
         index["rig"]["object"],
         index["blender"],
-        _sampling(index["sampling"]),
+        sampling,
     )
     return Recording(path, info, rig, partitions, arrays["pose_matrices"], arrays["residuals"])
 

@@ -154,7 +154,7 @@ def test_report_measures_what_the_model_does(report, trained, recording, session
     weights = [p["vertices"] for p in report["partitions"]]
     by_partition = np.average([p["held_out"]["mean"] for p in report["partitions"]], weights=weights)
     assert by_partition == pytest.approx(held_out["mean"], rel=1e-4)
-    assert sum(report["histogram"]["fdda"]) == source.rig.vertex_count * report["training"]["validation_poses"]
+    assert sum(report["histogram"]["fdda"]) == source.rig.vertex_count * report["training"]["held_out_poses"]
     for p in report["partitions"]:
         assert len(p["curve"]["validation"]) == (40 if p["basis"] else 0)
 

@@ -44,7 +44,7 @@ def test_text_for_a_person(recording, tmp_path, capsys):
     lines = output.out.splitlines()
     assert lines[0] == "Training 3 partitions, 90 vertices, 120 poses, on cpu."
     assert len([line for line in lines if line.startswith("epoch ")]) == 10
-    assert lines[-1].startswith(f"Wrote '{tmp_path / 'm.onnx'}': validation error ")
+    assert lines[-1].startswith(f"Wrote '{tmp_path / 'm.onnx'}': held-out error ")
     assert not output.err
 
 

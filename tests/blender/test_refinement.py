@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`record --refine` and `train --target-mm --refine`: more poses where the model is worst, until it is good enough."""
+
+import shutil
+
+import bpy
+import numpy as np
+import pytest
+from conftest import ELBOW_RIG, run
+from mathutils import Matrix
+from scene_state import scene_state
+
+from fdda_addon.core.errors import FDDAError
+from fdda_addon.core.features import joint_features
+from fdda_addon.core.metrics import distances
+from fdda_addon.core.model import read_model_info
+from fdda_addon.core.recording import REFINED, read_recording
+from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.refinement import RefinementSettings, refine
+from fdda_addon.runtime.network import Network
+from fdda_addon.scene.rig import PoseEvaluator, find_rig, read_rig
+
+
+@pytest.fixture
+def recording(elbow, tmp_path):
+    """A copy of the elbow's recording, to be extended."""
+    return shutil.copytree(elbow.recording, tmp_path / "recording")
+
+
+def errors(recording, model, poses: slice) -> np.ndarray:
+    """(n,) largest error of the model in each of these poses, against what was recorded."""
+    layer = LinearLayer(recording.rig, recording.partitions)
+    matrices = np.array(recording.pose_matrices[poses])
+    true = layer.complex_positions(matrices, np.array(recording.residuals[poses]))
+    return distances(Network(model).positions(matrices), true).max(axis=1)
+
+
+def test_poses_are_added_where_the_model_errs(elbow, recording):
+    before = read_recording(recording)
+    assert run("record", elbow.rig, recording, "--refine", elbow.model, "--poses", 60) == 0
+    after = read_recording(recording)
+    assert len(after.pose_matrices) == 210
+    assert after.info.sampling.sources[-1] == type(after.info.sampling.sources[0])(REFINED, 60, "elbow.onnx")
+    assert np.array_equal(after.pose_matrices[:150], before.pose_matrices)
+    assert np.array_equal(after.residuals[:150], before.residuals)
+    # A model that did not see the poses errs more there than on poses like those it was trained on.
+    rest = np.arange(0, 150, 10)
+    assert errors(after, elbow.model, slice(150, 210)).mean() > 1.2 * errors(after, elbow.model, rest).mean()
+
+
+def test_what_is_added_is_what_the_rig_does(elbow, recording):
+    assert run("record", elbow.rig, recording, "--refine", elbow.model, "--poses", 8) == 0
+    read = read_recording(recording)
+    bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
+    scene_rig = find_rig()
+    evaluator = PoseEvaluator(scene_rig, read_rig(scene_rig))
+    features = joint_features(read.pose_matrices[-1:], read.rig.rest_matrices, read.rig.parents)[0]
+    for joint, name in enumerate(read.rig.joint_names):
+        basis = np.vstack([features[joint].reshape(3, 4), [0, 0, 0, 1]])
+        scene_rig.armature_object.pose.bones[name].matrix_basis = Matrix(basis)
+    bpy.context.view_layer.update()
+    pose, positions = evaluator.evaluate()
+    assert np.abs(pose - read.pose_matrices[-1]).max() < 1e-5
+    layer = LinearLayer(read.rig, read.partitions)
+    recorded = layer.complex_positions(read.pose_matrices[-1:], read.residuals[-1:])[0]
+    assert np.abs(recorded - positions).max() < 1e-5
+
+
+def test_every_refinement_chooses_other_poses(elbow, recording):
+    for _ in range(2):
+        assert run("record", elbow.rig, recording, "--refine", elbow.model, "--poses", 5) == 0
+    read = read_recording(recording)
+    assert [(s.kind, s.poses) for s in read.info.sampling.sources] == [("random", 150), (REFINED, 5), (REFINED, 5)]
+    assert np.abs(read.pose_matrices[150:155] - read.pose_matrices[155:160]).max() > 1e-3
+
+
+def test_an_interruption_leaves_a_complete_recording_and_the_scene(elbow, recording, rig):
+    state = scene_state(rig)
+    steps = refine(rig, recording, elbow.model, RefinementSettings(poses=5))
+    for step in steps:
+        if step.done == 3:
+            break
+    steps.close()
+    assert scene_state(rig) == state
+    assert len(read_recording(recording).pose_matrices) == 150
+
+
+def sentence(rig, recording, model) -> str:
+    with pytest.raises(FDDAError) as error:
+        list(refine(rig, recording, model, RefinementSettings(poses=2)))
+    assert str(error.value).endswith(".") and "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_another_range_of_motion_is_refused(elbow, recording, rig):
+    for bone in bpy.data.objects[ELBOW_RIG].pose.bones:
+        bone.lock_rotation[1] = not bone.lock_rotation[1]
+    assert "The range of motion of the rig is not that of" in sentence(rig, recording, elbow.model)
+    assert len(read_recording(recording).pose_matrices) == 150
+
+
+def test_an_action_alone_has_no_range_of_motion(elbow, tmp_path, rig):
+    assert run("record", elbow.rig, tmp_path / "a", "--poses", 0, "--action", "elbow_wave") == 0
+    bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
+    assert "has no random poses" in sentence(find_rig(), tmp_path / "a", elbow.model)
+
+
+def test_another_rig_is_refused(elbow, recording, rig):
+    rig.mesh_object.data.vertices[0].co.x += 0.1
+    if rig.mesh_object.data.shape_keys:
+        rig.mesh_object.data.shape_keys.reference_key.data[0].co.x += 0.1
+    assert "was trained for another rig" in sentence(rig, recording, elbow.model)
+
+
+@pytest.mark.parametrize("option", [["--resume"], ["--action", "elbow_wave"], ["--poses", 0]])
+def test_options_that_contradict(elbow, recording, capfd, option):
+    assert run("record", elbow.rig, recording, "--refine", elbow.model, *option) == 2
+    assert "--refine adds random poses to a complete recording" in capfd.readouterr().err
+
+
+def test_training_until_a_target_is_met(elbow, recording, tmp_path, capfd):
+    model = tmp_path / "m.onnx"
+    quick = ("--epochs", 8, "--hidden", 16, 16)
+    assert run("train", recording, model, *quick) == 0
+    reached = read_model_info(model).held_out_mm["p999"]
+    assert run("train", recording, model, *quick, "--target-mm", reached / 2, "--refine", elbow.rig, "--poses", 40) == 0
+    out = capfd.readouterr()
+    read, info = read_recording(recording), read_model_info(model)
+    added = [s.poses for s in read.info.sampling.sources if s.kind == REFINED]
+    assert added and set(added) == {40}
+    assert f"{recording}: 40 poses added where the model is worst" in out.out
+    assert ("The target is met" in out.err) == (info.held_out_mm["p999"] <= reached / 2)
+    assert info.training["warm_start"] and info.training["training_poses"] == len(read.pose_matrices) - 15 - 8
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--refine", "RIG"], "say which with --target-mm"),
+        (["--object", "elbow"], "give --refine RIG.blend with them"),
+    ],
+)
+def test_options_of_the_target_that_make_no_sense(elbow, recording, tmp_path, capfd, options, words):
+    options = [elbow.rig if option == "RIG" else option for option in options]
+    assert run("train", recording, tmp_path / "m.onnx", *options) == 2
+    assert words in capfd.readouterr().err
+    assert run("train", "--target-mm", 1, recording, tmp_path / "m.onnx", "--refine", elbow.rig) == 2
+    assert "give RECORDING and MODEL.onnx before the training settings" in capfd.readouterr().err
+    assert run("train", recording, tmp_path / "m.onnx", "--target-mm", 1, "--refine", tmp_path / "no.blend") == 1
+    assert "There is no file" in capfd.readouterr().err

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a training says of the error that was asked for."""
+
+from pathlib import Path
+
+import pytest
+
+from trainer.target import Verdict, judge
+
+
+def outcome(*errors: float, target: float = 0.5, training: float = 0.1):
+    history = [{"poses": 500 + 250 * number, "p999": error} for number, error in enumerate(errors)]
+    return judge(target, history, training, Path("recording"), Path("arm.onnx"))
+
+
+@pytest.mark.parametrize(
+    ("errors", "verdict"),
+    [
+        ((0.5,), Verdict.MET),
+        ((0.51,), Verdict.MISSED),
+        ((0.9, 0.8, 0.7), Verdict.MISSED),
+        ((0.9, 0.9), Verdict.MISSED),
+        ((0.9, 0.89, 0.88), Verdict.EXHAUSTED),
+        ((0.9, 0.95, 0.7), Verdict.MISSED),
+        ((0.9, 0.95, 0.4), Verdict.MET),
+    ],
+)
+def test_verdict(errors, verdict):
+    assert outcome(*errors).verdict is verdict
+
+
+def test_a_miss_says_how_to_go_on():
+    text = outcome(0.8).text
+    assert "within 0.8 mm and the target is 0.5 mm" in text
+    assert "record RIG.blend recording --refine arm.onnx" in text and "--warm-start" in text
+
+
+def test_the_end_says_what_limits():
+    assert "500 more poses brought it there from 0.9 mm" in outcome(0.9, 0.89, 0.88).text
+    assert "Narrow the range of motion" in outcome(0.9, 0.89, 0.88).text
+    assert "training poses are at 0.85 mm, so the networks are too small" in outcome(0.9, 0.9, 0.9, training=0.85).text

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A training goes on from the last weights, on a recording that has grown."""
+
+import json
+import shutil
+import zipfile
+
+import numpy as np
+import pytest
+from chain import chain_angles, chain_residuals, pose_chain, write_chain
+from conftest import QUICK
+
+from fdda_addon.core.recording import read_recording
+from fdda_addon.core.recording_extension import RecordingExtension
+from trainer.__main__ import main
+from trainer.config import TrainingConfig
+from trainer.data import partitions_of, prepare, split_recording
+from trainer.inputs import make_inputs, middles
+from trainer.weights import initial_networks, read_weights, weights_path
+
+GROWN = 60
+
+
+@pytest.fixture
+def grown(recording, tmp_path):
+    """The recording with refined poses that reach the end of the range."""
+    folder = tmp_path / "grown"
+    shutil.copytree(recording, folder)
+    read = read_recording(folder)
+    angles = chain_angles(GROWN, 3, seed=5)
+    angles[:, 2, 1] = 0
+    with RecordingExtension(read, "model.onnx") as extension:
+        extension.append(pose_chain(read.rig, angles), chain_residuals(read.rig, angles))
+    return folder
+
+
+@pytest.fixture
+def model(trained, tmp_path):
+    """A model with its last weights, to train on."""
+    for path in (trained / "model.onnx", weights_path(trained / "model.onnx")):
+        shutil.copy(path, tmp_path)
+    return tmp_path / "model.onnx"
+
+
+def prepared_of(path, config):
+    recording = read_recording(path)
+    split = split_recording(recording, config)
+    inputs = make_inputs(recording.rig.parents, middles(recording.rig, recording.partitions), recording.partitions)
+    prepared = [prepare(p, split, config.tolerance_mm, config.seed) for p in partitions_of(recording, inputs)]
+    return split, prepared, [c[p.columns] for c, p in zip(inputs.columns, prepared, strict=True)]
+
+
+def test_networks_start_with_the_answers_they_gave(recording, trained, grown):
+    config = TrainingConfig(tolerance_mm=1e-4)
+    last = read_weights(weights_path(trained / "model.onnx"))
+    _, prepared, columns = prepared_of(grown, config)
+    networks = initial_networks(last, prepared, columns)
+    compared = 0
+    for before, now, network in zip(last.partitions, prepared, networks, strict=True):
+        if network is None:
+            continue
+        features = now.inputs * now.feature_scale + now.feature_mean
+        assert np.array_equal(before.columns, columns[compared]) or len(before.columns) == len(now.columns)
+        old = before.network.coefficients(
+            ((features - before.feature_mean) / before.feature_scale).astype(np.float32), last.activation
+        )
+        expected = old @ before.basis_shapes + before.basis_mean
+        answered = now.basis.residuals(network.coefficients(now.inputs, last.activation))
+        # A millimetre's thousandth: what the finer basis leaves.
+        assert np.abs(answered - expected).max() < 2e-6
+        compared += 1
+    assert compared >= 2
+
+
+def test_training_goes_on_and_does_not_start_again(grown, model, trained):
+    first = json.loads((trained / "report.json").read_text())["fdda"]["held_out"]["mean"]
+    assert main([str(grown), str(model), *QUICK, "--epochs", "12", "--warm-start"]) == 0
+    report = json.loads((model.parent / "report.json").read_text())
+    # Six epochs: from random weights they leave several times the error.
+    assert report["fdda"]["held_out"]["mean"] < 1.2 * first
+    assert main([str(grown), str(model), *QUICK, "--epochs", "6"]) == 0
+    cold = json.loads((model.parent / "report.json").read_text())
+    assert cold["fdda"]["held_out"]["mean"] > 2 * report["fdda"]["held_out"]["mean"]
+    assert main([str(grown), str(model), *QUICK, "--epochs", "12", "--warm-start"]) == 0
+    assert report["training"]["warm_start"] and report["poses"] == 120 + GROWN
+    history = read_weights(weights_path(model)).history
+    assert [entry["poses"] for entry in history] == [120 + GROWN] * 2
+
+
+def test_refined_poses_train_and_what_was_held_out_stays_so(recording, grown):
+    config = TrainingConfig()
+    before, after = split_recording(read_recording(recording), config), split_recording(read_recording(grown), config)
+    assert np.array_equal(before.held_out, after.held_out) and np.array_equal(before.validation, after.validation)
+    assert np.array_equal(after.training, [*before.training, *range(120, 120 + GROWN)])
+    parts = (before.training, before.validation, before.held_out)
+    assert np.array_equal(np.sort(np.concatenate(parts)), np.arange(120)) and [len(p) for p in parts] == [102, 6, 12]
+
+
+def refused(capsys, *arguments) -> str:
+    options = arguments[2:] or QUICK
+    assert main([*map(str, arguments[:2]), *options, "--warm-start"]) == 1
+    return capsys.readouterr().err
+
+
+def test_there_must_be_weights(recording, tmp_path, capsys):
+    assert "There are no last weights" in refused(capsys, recording, tmp_path / "m.onnx")
+
+
+def test_weights_of_other_networks_or_rigs_are_refused(recording, model, tmp_path, capsys):
+    assert "are of networks --hidden 24 24 --activation silu" in refused(capsys, recording, model, "--hidden", "8")
+    write_chain(tmp_path / "other", joints=4)
+    assert "are of another rig" in refused(capsys, tmp_path / "other", model)
+
+
+@pytest.mark.parametrize("damage", ["cut", "text", "packed", "shapes"])
+def test_damaged_weights_are_refused(recording, model, capsys, damage):
+    path = weights_path(model)
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:1000])
+    elif damage == "text":
+        path.write_text("weights")
+    elif damage == "packed":
+        with np.load(path) as arrays:
+            content = dict(arrays)
+        content["1/basis_mean"] = np.zeros(1 << 22, np.float32)
+        np.savez_compressed(path, **content)
+        assert zipfile.is_zipfile(path)
+    else:
+        with np.load(path) as arrays:
+            content = dict(arrays)
+        content["1/weight_1"] = content["1/weight_1"][1:]
+        np.savez(path, **content)
+    before = model.read_bytes()
+    text = refused(capsys, recording, model)
+    assert "cannot be used" in text and "train without --warm-start" in text
+    assert model.read_bytes() == before

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The last weights of a training, kept beside the model, and a start from them on a recording that has grown.
+
+Means, scales and basis shapes are made anew from the poses at hand; the first and the last layer of each network take
+up what changed, so that a network starts with the answers it gave before.
+"""
+
+import json
+import zipfile
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.output import replacing
+from fdda_addon.core.rig import Fingerprint
+
+from .data import PreparedPartition
+from .deformation import Deformation
+from .model import Network
+
+SUFFIX = ".weights.npz"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class LastPartition:
+    """The network of one partition as it was left, with what its numbers mean.
+
+    Attributes:
+        columns: (F',) int64, the features that it saw, among all features of `Inputs`.
+        feature_mean, feature_scale: (F',) float32.
+        basis_mean: (3 Vp,) float32, metres. basis_shapes: (K, 3 Vp) float32, orthonormal rows.
+        network: of standardised features, coefficients in metres.
+    """
+
+    columns: np.ndarray
+    feature_mean: np.ndarray
+    feature_scale: np.ndarray
+    basis_mean: np.ndarray
+    basis_shapes: np.ndarray
+    network: Network
+
+
+@dataclass(frozen=True)
+class LastWeights:
+    """What a training left.
+
+    Attributes:
+        fingerprint: of the rig.
+        hidden, activation: of the networks.
+        history: held-out errors of this training and those before it, oldest first: `{"poses", "p999"}`, in mm.
+        partitions: in the order of the recording.
+    """
+
+    fingerprint: Fingerprint
+    hidden: tuple[int, ...]
+    activation: str
+    history: tuple[dict, ...]
+    partitions: tuple[LastPartition, ...]
+
+
+def weights_path(model_path: Path) -> Path:
+    """Where the last weights of a model are."""
+    return model_path.with_suffix(SUFFIX)
+
+
+def write_weights(path: Path, deformation: Deformation, hidden: tuple[int, ...], history: list[dict]) -> None:
+    """Keep the weights of a training.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    about = {
+        "version": VERSION,
+        "fingerprint": vars(deformation.rig.fingerprint),
+        "hidden": list(hidden),
+        "activation": deformation.activation,
+        "history": history,
+        "partitions": len(deformation.partitions),
+    }
+    arrays = {"about": np.frombuffer(json.dumps(about).encode(), np.uint8)}
+    for number, (prepared, network) in enumerate(zip(deformation.prepared, deformation.networks, strict=True)):
+        own = {
+            "columns": deformation.seen_columns(number),
+            "feature_mean": prepared.feature_mean,
+            "feature_scale": prepared.feature_scale,
+            "basis_mean": prepared.basis.mean,
+            "basis_shapes": prepared.basis.shapes,
+            **{f"weight_{layer}": weight for layer, weight in enumerate(network.weights)},
+            **{f"bias_{layer}": bias for layer, bias in enumerate(network.biases)},
+        }
+        arrays |= {f"{number}/{name}": array for name, array in own.items()}
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **arrays)
+
+
+def read_weights(path: Path) -> LastWeights:
+    """Read the weights that a training left.
+
+    Raises:
+        TrainingError: there are none, or the file is damaged.
+    """
+    try:
+        size = path.stat().st_size
+        with zipfile.ZipFile(path) as archive:
+            # Nothing is allocated that is larger than the file.
+            if any(member.file_size > size for member in archive.infolist()):
+                raise ValueError("it is packed")
+        with np.load(path, allow_pickle=False) as arrays:
+            return _read(arrays)
+    except FileNotFoundError as error:
+        raise TrainingError(
+            f"There are no last weights '{path}' to start from; train without --warm-start first."
+        ) from error
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise TrainingError(
+            f"The last weights '{path}' cannot be used ({error}); train without --warm-start."
+        ) from error
+
+
+def _read(arrays: np.lib.npyio.NpzFile) -> LastWeights:
+    about = json.loads(arrays["about"].tobytes())
+    if about["version"] != VERSION:
+        raise ValueError(f"version {about['version']!r}")
+    hidden = tuple(int(units) for units in about["hidden"])
+    partitions = []
+    for number in range(int(about["partitions"])):
+        own = {name: arrays[f"{number}/{name}"] for name in ("columns", "feature_mean", "feature_scale")}
+        own |= {name: arrays[f"{number}/{name}"] for name in ("basis_mean", "basis_shapes")}
+        layers = range(1 if not len(own["basis_shapes"]) else len(hidden) + 1)
+        weights, biases = (
+            tuple(arrays[f"{number}/{kind}_{layer}"].astype(np.float32) for layer in layers)
+            for kind in ("weight", "bias")
+        )
+        partition = LastPartition(**own, network=Network(weights, biases))
+        _check_shapes(partition, hidden)
+        partitions.append(partition)
+    history = tuple({"poses": int(entry["poses"]), "p999": float(entry["p999"])} for entry in about["history"])
+    return LastWeights(
+        Fingerprint(**about["fingerprint"]), hidden, str(about["activation"]), history, tuple(partitions)
+    )
+
+
+def _check_shapes(partition: LastPartition, hidden: tuple[int, ...]) -> None:
+    features, shapes = len(partition.columns), len(partition.basis_shapes)
+    sizes = (features, *hidden, shapes) if shapes else (features, 0)
+    found = [weight.shape for weight in partition.network.weights]
+    if (
+        found != list(pairwise(sizes))
+        or [bias.shape for bias in partition.network.biases] != [(size,) for size in sizes[1:]]
+        or partition.basis_shapes.shape != (shapes, len(partition.basis_mean))
+        or not (partition.feature_mean.shape == partition.feature_scale.shape == (features,))
+        or not (partition.feature_scale > 0).all()
+    ):
+        raise ValueError("its arrays contradict each other")
+
+
+def initial_networks(
+    last: LastWeights, prepared: list[PreparedPartition], columns: list[np.ndarray]
+) -> list[Network | None]:
+    """Networks to start from that answer as the last ones did.
+
+    Args:
+        last: the same rig, hidden layers and activation.
+        prepared: the partitions as they are now.
+        columns: for each, the features that its network sees now, among all features of `Inputs`.
+
+    Returns:
+        For each partition a network of its features and shapes as they are now; None where there was none or there
+        is nothing to learn.
+
+    Raises:
+        TrainingError: the partitions are not those of the last training.
+    """
+    sizes = [3 * partition.vertices for partition in prepared]
+    if sizes != [len(partition.basis_mean) for partition in last.partitions]:
+        raise TrainingError("The last weights are of other partitions; train without --warm-start.")
+    return [_carried_over(*each) for each in zip(last.partitions, prepared, columns, strict=True)]
+
+
+def _carried_over(last: LastPartition, prepared: PreparedPartition, columns: np.ndarray) -> Network | None:
+    if not len(last.basis_shapes) or not len(prepared.basis.shapes):
+        return None
+    weights, biases = ([array.astype(np.float64) for array in a] for a in (last.network.weights, last.network.biases))
+    # A feature that did not vary before starts without a weight; one that no longer varies stays at its mean.
+    first = np.zeros((len(columns), weights[0].shape[1]))
+    _, now, before = np.intersect1d(columns, last.columns, return_indices=True)
+    own = weights[0][before] / last.feature_scale[before, None]
+    first[now] = own * prepared.feature_scale[now, None]
+    biases[0] = biases[0] + (prepared.feature_mean[now] - last.feature_mean[before]) @ own
+    weights[0] = first
+    shapes = prepared.basis.shapes.T.astype(np.float64)
+    turned = last.basis_shapes @ shapes
+    weights[-1] = weights[-1] @ turned
+    biases[-1] = biases[-1] @ turned + (last.basis_mean - prepared.basis.mean) @ shapes
+    return Network(*(tuple(array.astype(np.float32) for array in arrays) for arrays in (weights, biases)))
