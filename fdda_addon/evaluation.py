@@ -207,6 +207,17 @@ def _prepare(scene_rig: SceneRig, model: Path | Network) -> tuple[Network, Linea
     return network, LinearLayer(rig)
 
 
+def pose_held_out(scene_rig: SceneRig, seed: int, index: int) -> None:
+    """Pose a rig as for one of the random poses that `evaluate` compares.
+
+    Raises:
+        RigError: nothing may be sampled.
+    """
+    channels = sampled_channels(scene_rig, read_rig(scene_rig))
+    clear_pose(scene_rig.armature_object)
+    next(_random_poses(scene_rig, channels, seed, HELD_OUT_INDEX + index, 1))
+
+
 def _random_poses(
     scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, first: int, count: int
 ) -> Iterator[None]:

@@ -12,7 +12,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from . import settings
+from . import evaluation_view, settings
 from .scene.compatibility import BLEND_RELATIVE_PATH
 
 
@@ -28,6 +28,22 @@ class FDDA_PG_modifier(bpy.types.PropertyGroup):
     uid: IntProperty()
     show_viewport: BoolProperty()
     show_render: BoolProperty()
+
+
+class FDDA_PG_model(bpy.types.PropertyGroup):
+    """A model of a mesh: its file, or the text that holds it."""
+
+    name: StringProperty(name="Name", description="What the model is called")
+    path: StringProperty(
+        name="File",
+        description="The model, an .onnx file; where it came from when it is packed",
+        subtype="FILE_PATH",
+        options=BLEND_RELATIVE_PATH,
+    )
+    packed: PointerProperty(
+        name="Packed Model", description="The text that holds the model inside this file", type=bpy.types.Text
+    )
+    packed_bytes: IntProperty(name="Size", description="Size of the packed model in bytes")
 
 
 class FDDA_PG_binding(bpy.types.PropertyGroup):
@@ -73,14 +89,18 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
     show_only_shape_key: BoolProperty()
     active_shape_key_index: IntProperty()
 
+    models: CollectionProperty(type=FDDA_PG_model)
+    model_index: IntProperty(name="Model", description="The model that the buttons below are about")
+
     settings: PointerProperty(type=settings.FDDA_PG_character)
 
 
-CLASSES = (FDDA_PG_modifier, FDDA_PG_binding)
+CLASSES = (FDDA_PG_modifier, FDDA_PG_model, FDDA_PG_binding)
 
 
 def register() -> None:
     settings.register()
+    evaluation_view.register()
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Object.fdda = PointerProperty(type=FDDA_PG_binding)
@@ -90,4 +110,5 @@ def unregister() -> None:
     del bpy.types.Object.fdda
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)
+    evaluation_view.unregister()
     settings.unregister()

@@ -20,6 +20,8 @@ def run(options: argparse.Namespace) -> None:
 
     from ..core.errors import ModelError, OutputError
     from ..core.output import check_writable, replacing
+    from ..model_list import bound_entry
+    from ..models import adopt
     from ..runtime.binding import bind
     from .files import open_rig, save_copy
 
@@ -31,7 +33,11 @@ def run(options: argparse.Namespace) -> None:
     if scene_rig.mesh_object.fdda.status:
         raise ModelError(scene_rig.mesh_object.fdda.status)
     model = beside(options.model, options.out)
-    scene_rig.mesh_object.fdda.model = "//" + model.resolve().relative_to(options.out.resolve().parent).as_posix()
+    binding = scene_rig.mesh_object.fdda
+    adopt(scene_rig.mesh_object)
+    entry = bound_entry(scene_rig.mesh_object)
+    binding.model = "//" + model.resolve().relative_to(options.out.resolve().parent).as_posix()
+    entry.path = binding.model
     copied = not model.exists()
     if copied:
         with replacing(model) as temporary:

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Colours over meshes in the viewport: their errors as a heat map, or their partitions.
+
+They are drawn over what Blender evaluates, so nothing of the file is touched, and they follow the animation. Which
+meshes are painted lasts for the session; without a window nothing is drawn.
+"""
+
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+
+from . import last_evaluation, overlay
+from .core.metrics import heat_colors
+from .core.partition import make_partitions, partition_colors
+from .evaluation_view import redraw_views
+from .scene.rig import SceneRig, read_rig
+
+ERRORS, PARTITIONS = "ERRORS", "PARTITIONS"
+
+
+@dataclass(frozen=True)
+class Paint:
+    """What a mesh is painted with: ERRORS or PARTITIONS, and for those their (V, 3) sRGB colours and number."""
+
+    kind: str
+    colors: np.ndarray | None = None
+    partitions: int = 0
+
+
+_painted: dict[int, Paint] = {}
+
+
+def paint_errors(mesh_object: bpy.types.Object) -> None:
+    """Show the errors of the last evaluation of a mesh."""
+    _paint(mesh_object, Paint(ERRORS))
+
+
+def paint_partitions(scene_rig: SceneRig) -> None:
+    """Show the partitions of a rig.
+
+    Raises:
+        RigError: the rig cannot be read.
+    """
+    rig = read_rig(scene_rig)
+    partitions = make_partitions(rig)
+    colors = partition_colors(partitions, rig.vertex_count)
+    _paint(scene_rig.mesh_object, Paint(PARTITIONS, colors, len(partitions)))
+
+
+def clear(mesh_object: bpy.types.Object) -> None:
+    """Show a mesh as Blender does."""
+    _painted.pop(mesh_object.session_uid, None)
+    if not _painted:
+        overlay.stop()
+    redraw_views()
+
+
+def clear_all() -> None:
+    """Paint nothing any more."""
+    _painted.clear()
+    overlay.stop()
+
+
+def painted(mesh_object: bpy.types.Object) -> str:
+    """ERRORS or PARTITIONS, empty when the mesh is not painted."""
+    paint = _painted.get(mesh_object.session_uid)
+    return paint.kind if paint else ""
+
+
+def colors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
+    """The colours of a painted mesh at the current frame: (V, 3) float32 sRGB, None when there is nothing to show."""
+    paint = _painted.get(mesh_object.session_uid)
+    if paint is None:
+        return None
+    if paint.kind == PARTITIONS:
+        return paint.colors
+    errors = errors_of(mesh_object)
+    return None if errors is None else heat_colors(errors, bpy.context.window_manager.fdda_view.range_mm / 1000)
+
+
+def errors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
+    """The errors that the settings of the view ask for: (V,) metres, None when there are none at this frame."""
+    last, view = last_evaluation.of(mesh_object), bpy.context.window_manager.fdda_view
+    if last is None:
+        return None
+    pose = last.pose_at(bpy.context.scene.frame_current) if last.name else view.pose
+    return last.of_vertices(view.way, view.statistic, pose)
+
+
+def fitting_range_mm(mesh_object: bpy.types.Object) -> float:
+    """A range in which the errors that are shown have colours from blue to red: their 99.5th percentile, mm."""
+    errors = errors_of(mesh_object)
+    return 0.0 if errors is None else float(np.percentile(errors, 99.5)) * 1000
+
+
+def _paint(mesh_object: bpy.types.Object, paint: Paint) -> None:
+    _painted[mesh_object.session_uid] = paint
+    if not bpy.app.background:
+        overlay.start(_sheets, _legend)
+    redraw_views()
+
+
+def _sheets(context: bpy.types.Context) -> list["overlay.Sheet"]:
+    """What the overlay draws, object by object."""
+    alive = {o.session_uid: o for o in bpy.data.objects if o.session_uid in _painted}
+    for uid in _painted.keys() - alive.keys():
+        del _painted[uid]
+    visible = [o for o in alive.values() if o.visible_get(view_layer=context.view_layer)]
+    return [
+        sheet for o in visible if (colors := colors_of(o)) is not None and (sheet := overlay.sheet(context, o, colors))
+    ]
+
+
+def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:
+    """Lines below the colours, and the range of the heat map in mm, None where no errors are shown."""
+    uids = {o.session_uid: o for o in context.view_layer.objects if o.session_uid in _painted}
+    active = context.view_layer.objects.active
+    chosen = uids.get(active.session_uid) if active else None
+    mesh_object = chosen or next(iter(uids.values()), None)
+    if mesh_object is None:
+        return [], None
+    paint = _painted[mesh_object.session_uid]
+    if paint.kind == PARTITIONS:
+        return [f"{mesh_object.name}: {paint.partitions} partitions, a colour for each main joint"], None
+    last, view = last_evaluation.of(mesh_object), context.window_manager.fdda_view
+    if last is None:
+        return [], None
+    errors = errors_of(mesh_object)
+    way = "linear layer" if view.way == "linear" else "FDDA"
+    what = _what(last, view.statistic, context.scene.frame_current, view.pose)
+    if errors is None:
+        return [f"{mesh_object.name}, {way}: {what}"], None
+    numbers = f"mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.2f} mm"
+    return [f"{mesh_object.name}, {way}: {what}", numbers], view.range_mm
+
+
+def _what(last: last_evaluation.LastEvaluation, statistic: str, frame: int, pose: int) -> str:
+    if statistic != "pose":
+        over = f"{last.poses} frames of {last.name}" if last.name else f"{last.poses} random poses"
+        return f"{'mean' if statistic == 'mean' else 'largest'} error over {over}"
+    if not last.name:
+        return f"error in random pose {pose}"
+    return f"error at frame {frame}" if last.pose_at(frame) is not None else f"frame {frame} was not compared"

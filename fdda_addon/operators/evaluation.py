@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators of the section Evaluation: compare, colour the mesh, open the report."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+
+from .. import last_evaluation
+from ..core.errors import ModelError, RigError
+from ..model_list import bound_entry, bound_name
+from .job import JobOperator
+from .playback import OnModel
+
+REPORT = "report.html"
+"""Name of the page that a training writes beside its model."""
+
+
+class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
+    bl_idname = "fdda.evaluate"
+    bl_label = "Evaluate"
+    bl_description = "Compare the bound model with the rig, on the armature's action or on random poses"
+    bl_options = {"REGISTER"}
+    verb, title = "evaluate", "Evaluation"
+
+    source: bpy.props.EnumProperty(
+        name="Compare on",
+        description="The poses on which the model is compared with the rig",
+        items=(
+            ("ACTION", "Action", "The frames of an action"),
+            ("RANDOM", "Random Poses", "Random poses inside the range of motion that no recording has"),
+        ),
+    )
+    action: bpy.props.StringProperty(name="Action", description="Name of the action; empty for the armature's own")
+    poses: bpy.props.IntProperty(name="Poses", description="Number of random poses", default=100, min=1)
+    seed: bpy.props.IntProperty(name="Seed", description="Of the random poses", default=1, min=0)
+
+    execute = JobOperator.execute
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.is_idle() and cls.has_bound(context)
+
+    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+        from ..evaluation import EvaluationSettings, evaluate, evaluate_action
+        from ..runtime.binding import true_rig
+        from ..runtime.playback import network_of
+
+        scene_rig = self.bound_rig(context)
+        self._action = self._action_name(scene_rig.armature_object) if self.source == "ACTION" else ""
+        network = network_of(scene_rig.mesh_object)
+        with true_rig(scene_rig.mesh_object):
+            if self._action:
+                yield from evaluate_action(scene_rig, network, self._action)
+            else:
+                yield from evaluate(scene_rig, network, EvaluationSettings(self.poses, self.seed))
+
+    def finish(self, context: bpy.types.Context, result: object) -> str:
+        from ..evaluation_view import redraw_views
+        from ..recording import action_frames
+
+        mesh_object = self.bound_rig(context).mesh_object
+        first = action_frames(bpy.data.actions[self._action]).start if self._action else 0
+        last = last_evaluation.keep(mesh_object, result, bound_name(mesh_object), self._action, first, self.seed)
+        context.window_manager.fdda_view.pose = -1
+        redraw_views()
+        fdda, linear = last.total["fdda"], last.total["linear"]
+        return (
+            f"FDDA is {fdda.mean:.2f} mm from the rig, at most {fdda.max:.1f} mm; "
+            f"the linear layer {linear.mean:.2f} mm, at most {linear.max:.1f} mm."
+        )
+
+    def _action_name(self, armature_object: bpy.types.Object) -> str:
+        animation = armature_object.animation_data
+        if not self.action and (animation is None or animation.action is None):
+            raise RigError(f"'{armature_object.name}' has no action; give it one, or compare on random poses.")
+        return self.action or animation.action.name
+
+
+class OnEvaluation(OnModel):
+    """Mixin for an operator that shows the last evaluation."""
+
+    @classmethod
+    def has_evaluation(cls, context: bpy.types.Context) -> bool:
+        """Whether a mesh of the scene was evaluated; sets the poll message otherwise. For `poll`."""
+        if not cls.is_free(context):
+            return False
+        if not any(o.type == "MESH" and last_evaluation.of(o) for o in context.scene.objects):
+            cls.poll_message_set("Nothing was evaluated since Blender was started; evaluate first")
+            return False
+        return True
+
+    def last(self, context: bpy.types.Context) -> tuple[object, object]:
+        """The rig and its last evaluation.
+
+        Raises:
+            FDDAError: there is none.
+        """
+        scene_rig = self.rig(context)
+        last = last_evaluation.of(scene_rig.mesh_object)
+        if last is None:
+            raise ModelError(
+                f"'{scene_rig.mesh_object.name}' was not evaluated since Blender was started; evaluate first."
+            )
+        return scene_rig, last
+
+
+class FDDA_OT_paint(OnEvaluation, bpy.types.Operator):
+    bl_idname = "fdda.paint"
+    bl_label = "Colour the Mesh"
+    bl_description = "Show the errors of the last evaluation, or the partitions, as colours in the viewport"
+    bl_options = {"REGISTER"}
+
+    colors: bpy.props.EnumProperty(
+        name="Colours",
+        description="What the colours mean",
+        items=(
+            ("NONE", "None", "Show the mesh as Blender does"),
+            ("ERRORS", "Heat Map", "Show the errors of the last evaluation"),
+            ("PARTITIONS", "Partitions", "Show the partitions, a colour for each main joint"),
+        ),
+        default="ERRORS",
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.is_free(context)
+
+    def work(self, context: bpy.types.Context) -> str:
+        from .. import heat_map
+
+        if self.colors == "ERRORS":
+            scene_rig, _ = self.last(context)
+            heat_map.paint_errors(scene_rig.mesh_object)
+        elif self.colors == "PARTITIONS":
+            scene_rig = self.rig(context)
+            heat_map.paint_partitions(scene_rig)
+        else:
+            scene_rig = self.rig(context)
+            heat_map.clear(scene_rig.mesh_object)
+        shown = {"ERRORS": "its errors", "PARTITIONS": "its partitions", "NONE": "no colours"}[self.colors]
+        return f"'{scene_rig.mesh_object.name}' shows {shown}."
+
+
+class FDDA_OT_fit_range(OnEvaluation, bpy.types.Operator):
+    bl_idname = "fdda.fit_range"
+    bl_label = "Fit Range"
+    bl_description = "Choose the range of the heat map so that the errors shown use all of its colours"
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.has_evaluation(context)
+
+    def work(self, context: bpy.types.Context) -> str:
+        from .. import heat_map
+
+        scene_rig, _ = self.last(context)
+        fitting = heat_map.fitting_range_mm(scene_rig.mesh_object)
+        if not fitting:
+            raise ModelError("No errors are shown that a range could fit; choose another frame, or show the mean.")
+        view = context.window_manager.fdda_view
+        view.range_mm = float(f"{fitting:.2g}")
+        return f"Red begins at {view.range_mm:.3g} mm."
+
+
+class FDDA_OT_open_report(OnModel, bpy.types.Operator):
+    bl_idname = "fdda.open_report"
+    bl_label = "Open Report"
+    bl_description = f"Open the page {REPORT} that the training wrote beside the model, in the web browser"
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.has_bound(context)
+
+    def work(self, context: bpy.types.Context) -> str:
+        path = self._page(self.bound_rig(context).mesh_object)
+        if not path.is_file():
+            raise ModelError(f"There is no report '{path}'; it lies beside the model that was trained, or train again.")
+        try:
+            bpy.ops.wm.url_open(url=path.as_uri())
+        except RuntimeError as error:
+            raise ModelError(f"No web browser could be started; open '{path}' yourself.") from error
+        return f"{path} opens in the web browser."
+
+    def _page(self, mesh_object: bpy.types.Object) -> Path:
+        """Where the report of the bound model is."""
+        from .. import models
+
+        entry = bound_entry(mesh_object)
+        if entry is None:
+            models.adopt(mesh_object)
+            entry = bound_entry(mesh_object)
+        return models.entry_path(mesh_object, entry).resolve().parent / REPORT
+
+
+CLASSES = (
+    FDDA_OT_evaluate,
+    FDDA_OT_paint,
+    FDDA_OT_fit_range,
+    FDDA_OT_open_report,
+)
+
+
+def unregister() -> None:
+    """Paint nothing any more."""
+    heat_map = sys.modules.get(f"{__package__.rpartition('.')[0]}.heat_map")
+    if heat_map is not None:
+        heat_map.clear_all()

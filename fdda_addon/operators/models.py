@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators of the section Models: the list of a mesh, packing into the .blend file, and checking against the rig."""
+
+import bpy
+
+from ..core.errors import ModelError
+from ..model_list import megabytes
+from .playback import ChoosesModel, OnModel
+
+
+class OnEntry(OnModel):
+    """Mixin for an operator on an entry of the list of models."""
+
+    index: bpy.props.IntProperty(
+        name="Index", description="Place in the list, from 0; -1 for the entry that is chosen", default=-1, min=-1
+    )
+
+    @classmethod
+    def has_entry(cls, context: bpy.types.Context) -> bool:
+        """Whether a mesh of the scene has models; sets the poll message otherwise. For `poll`."""
+        if not cls.is_free(context):
+            return False
+        if not any(o.type == "MESH" and (o.fdda.models or o.fdda.is_bound) for o in context.scene.objects):
+            cls.poll_message_set("The list of models is empty; train one, or add a file")
+            return False
+        return True
+
+    def entry(self, context: bpy.types.Context) -> tuple[object, object]:
+        """The rig and the entry that is meant.
+
+        Raises:
+            FDDAError: there is none.
+        """
+        from .. import models
+
+        scene_rig = self.rig(context)
+        mesh_object = scene_rig.mesh_object
+        models.adopt(mesh_object)
+        count = len(mesh_object.fdda.models)
+        if self.index >= count:
+            raise ModelError(f"'{mesh_object.name}' has {count} models and none with index {self.index}.")
+        return scene_rig, models.chosen(mesh_object) if self.index < 0 else mesh_object.fdda.models[self.index]
+
+
+class FDDA_OT_add_model(OnModel, ChoosesModel, bpy.types.Operator):
+    bl_idname = "fdda.add_model"
+    bl_label = "Add Model…"
+    bl_description = "Add a model's file to the list of this mesh; a model of another rig is refused"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.is_free(context)
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        return self.execute(context) if self.filepath else self.choose(context)
+
+    def work(self, context: bpy.types.Context) -> str:
+        from .. import models
+        from ..runtime import playback
+
+        scene_rig = self.rig(context)
+        if not self.filepath:
+            raise ModelError("No file was chosen; give the model's file.")
+        models.check(scene_rig, self.path())
+        models.adopt(scene_rig.mesh_object)
+        playback.choose(self.path())
+        entry = models.remember(scene_rig.mesh_object, self.path())
+        return f"{entry.name} is in the list of '{scene_rig.mesh_object.name}'; bind it to play it."
+
+
+class FDDA_OT_remove_model(OnEntry, bpy.types.Operator):
+    bl_idname = "fdda.remove_model"
+    bl_label = "Remove Model"
+    bl_description = (
+        "Take the model off the list, and unbind it if it is bound; its file stays, a packed model is deleted"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.has_entry(context)
+
+    def work(self, context: bpy.types.Context) -> str:
+        from .. import models
+
+        scene_rig, entry = self.entry(context)
+        mesh_object = scene_rig.mesh_object
+        name = models.forget_entry(mesh_object, list(mesh_object.fdda.models).index(entry))
+        return f"{name} is no longer in the list of '{mesh_object.name}'."
+
+
+class FDDA_OT_pack_model(OnEntry, bpy.types.Operator):
+    bl_idname = "fdda.pack_model"
+    bl_label = "Pack Model"
+    bl_description = "Keep the model inside the .blend file, which then plays without any other file"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.has_entry(context)
+
+    def work(self, context: bpy.types.Context) -> str:
+        from .. import models
+
+        scene_rig, entry = self.entry(context)
+        if entry.packed:
+            raise ModelError(f"{entry.name} is packed already.")
+        size = models.pack_entry(scene_rig.mesh_object, entry)
+        return f"{entry.name} is inside the .blend file, {megabytes(size)}; save the file to keep it."
+
+
+class FDDA_OT_unpack_model(OnEntry, bpy.types.Operator):
+    bl_idname = "fdda.unpack_model"
+    bl_label = "Unpack Model"
+    bl_description = "Write the packed model to a file and remove it from the .blend file"
+    bl_options = {"REGISTER", "UNDO"}
+
+    filepath: bpy.props.StringProperty(
+        name="File", description="Where to write it; empty for NAME.onnx beside the .blend file", subtype="FILE_PATH"
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.has_entry(context)
+
+    def work(self, context: bpy.types.Context) -> str:
+        from pathlib import Path
+
+        from .. import models
+
+        scene_rig, entry = self.entry(context)
+        if not entry.packed:
+            raise ModelError(f"{entry.name} is not packed.")
+        if not self.filepath and not bpy.data.filepath:
+            raise ModelError("The .blend file has not been saved, so there is no place beside it; save it first.")
+        name = bpy.path.clean_name(entry.name) + ".onnx"
+        path = Path(bpy.path.abspath(self.filepath or f"//{name}"))
+        models.unpack_entry(scene_rig.mesh_object, entry, path)
+        return f"{entry.name} is now the file {path}."
+
+
+class FDDA_OT_check_model(OnEntry, bpy.types.Operator):
+    bl_idname = "fdda.check_model"
+    bl_label = "Check Model"
+    bl_description = "Compare the rig with the one that the model was trained for, and say what has changed since"
+    bl_options = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.has_entry(context)
+
+    def work(self, context: bpy.types.Context) -> str:
+        from ..model_changes import changes_since
+
+        scene_rig, entry = self.entry(context)
+        found = changes_since(scene_rig, entry)
+        if found.prevents:
+            raise ModelError(found.sentence)
+        return (
+            found.sentence
+            or f"{entry.name} fits '{scene_rig.mesh_object.name}': nothing has changed since it was trained."
+        )
+
+
+CLASSES = (FDDA_OT_add_model, FDDA_OT_remove_model, FDDA_OT_pack_model, FDDA_OT_unpack_model, FDDA_OT_check_model)

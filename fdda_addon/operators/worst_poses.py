@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators of the section Evaluation for the worst frames: mark them in the timeline, and jump to them."""
+
+import bpy
+
+from .. import markers
+from ..core.errors import ModelError
+from .evaluation import OnEvaluation
+from .playback import OnModel
+
+
+class OnWorst(OnEvaluation):
+    """Mixin for an operator on the poses with the largest errors."""
+
+    def worst(self, context: bpy.types.Context, count: int) -> tuple[object, object, list[tuple[int, float]]]:
+        """The rig, its last evaluation and the worst of its poses: index and largest error in mm.
+
+        Raises:
+            FDDAError: there is no evaluation, or no pose of it has an error.
+        """
+        scene_rig, last = self.last(context)
+        found = last.worst(count)
+        if not found:
+            raise ModelError("The model is exact in every pose that was compared; there is nothing to look at.")
+        return scene_rig, last, found
+
+
+class FDDA_OT_mark_worst(OnWorst, bpy.types.Operator):
+    bl_idname = "fdda.mark_worst"
+    bl_label = "Mark Worst Frames"
+    bl_description = "Put timeline markers at the frames with the largest errors, in place of those put there before"
+    bl_options = {"REGISTER", "UNDO"}
+
+    count: bpy.props.IntProperty(name="Markers", description="How many at most", default=5, min=1, max=50)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.has_evaluation(context)
+
+    def work(self, context: bpy.types.Context) -> str:
+        _, last, found = self.worst(context, self.count)
+        if not last.name:
+            raise ModelError("Random poses have no frames to mark; evaluate the active action.")
+        worst = [(last.first_frame + index, error_mm) for index, error_mm in found]
+        markers.place(context.scene, worst)
+        return f"{len(worst)} frames marked; the worst is {worst[0][0]}, with {worst[0][1]:.2f} mm."
+
+
+class FDDA_OT_remove_markers(OnModel, bpy.types.Operator):
+    bl_idname = "fdda.remove_markers"
+    bl_label = "Remove Markers"
+    bl_description = "Remove the timeline markers at the worst frames; other markers stay"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not markers.find(context.scene):
+            cls.poll_message_set("No frame is marked")
+            return False
+        return True
+
+    def work(self, context: bpy.types.Context) -> str:
+        return f"{markers.remove(context.scene)} markers removed."
+
+
+class FDDA_OT_jump_to_worst(OnWorst, bpy.types.Operator):
+    bl_idname = "fdda.jump_to_worst"
+    bl_label = "Jump to Worst"
+    bl_description = "Go to the frame, or set the random pose, with the largest error"
+    bl_options = {"REGISTER", "UNDO"}
+
+    rank: bpy.props.IntProperty(name="Rank", description="1 is the worst, 2 the next", default=1, min=1, max=50)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.has_evaluation(context)
+
+    def work(self, context: bpy.types.Context) -> str:
+        scene_rig, last, found = self.worst(context, self.rank)
+        index, error_mm = found[-1]
+        if last.name:
+            context.scene.frame_set(last.first_frame + index)
+            return f"Frame {last.first_frame + index}: at most {error_mm:.2f} mm."
+        from ..evaluation import pose_held_out
+
+        pose_held_out(scene_rig, last.seed, index)
+        context.view_layer.update()
+        context.window_manager.fdda_view.pose = index
+        return f"Random pose {index}: at most {error_mm:.2f} mm."
+
+
+CLASSES = (FDDA_OT_mark_worst, FDDA_OT_remove_markers, FDDA_OT_jump_to_worst)

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How far a bound model is believed in the current pose, by partition."""
+
+import bpy
+
+from .core.errors import FDDAError
+from .runtime import playback
+from .scene.rig import PoseReader, SceneRig, armature_modifier
+
+_last: dict[int, tuple[object, bytes, list[tuple[str, float]] | None]] = {}
+
+
+def partition_trust(mesh_object: bpy.types.Object) -> list[tuple[str, float]] | None:
+    """Name of the main joint and trust, 0 to 1, of each partition in the pose that Blender has evaluated.
+
+    The model is executed once for a pose, however often this is asked.
+
+    Returns:
+        The least trusted first; None when the model does not say, or the pose cannot be read.
+    """
+    modifier = armature_modifier(mesh_object)
+    if modifier is None or not mesh_object.fdda.is_bound:
+        return None
+    try:
+        network = playback.network_of(mesh_object)
+        names = tuple(joint.name for joint in network.info.joints)
+        if any(name not in modifier.object.data.bones for name in names):
+            return None
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        evaluated = [o.evaluated_get(depsgraph) for o in (mesh_object, modifier.object)]
+        if not all(o.is_evaluated for o in evaluated):
+            return None
+        pose = PoseReader(SceneRig(mesh_object, modifier.object), names, network.info.rest_matrices).read(*evaluated)
+        kept = _last.get(mesh_object.session_uid)
+        if kept is None or kept[0] is not network or kept[1] != pose.tobytes():
+            trust = network.trust(pose[None])
+            values = None
+            if trust is not None:
+                partitions = zip(network.info.partitions, trust[0].tolist(), strict=True)
+                values = sorted(((names[p.joint], value) for p, value in partitions), key=lambda pair: pair[1])
+            _last.clear()
+            kept = _last[mesh_object.session_uid] = (network, pose.tobytes(), values)
+        return kept[2]
+    except FDDAError:
+        # The playback itself says what is wrong.
+        return None

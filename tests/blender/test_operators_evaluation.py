@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The operators of the section Evaluation: figures, colours and markers are those of the evaluation itself."""
+
+import bpy
+import numpy as np
+import pytest
+from conftest import ELBOW_RIG, pose
+from scene_state import assert_same_state, drain, scene_state
+from test_operators_playback import refused
+
+from fdda_addon import heat_map, last_evaluation, markers
+from fdda_addon.core.metrics import error_statistics, heat_colors
+from fdda_addon.core.partition import make_partitions
+from fdda_addon.evaluation import EvaluationSettings, evaluate, evaluate_action
+from fdda_addon.runtime.binding import true_rig
+from fdda_addon.scene.rig import find_rig, read_rig
+
+
+@pytest.fixture
+def active(bound):
+    bpy.context.view_layer.objects.active = bound
+    return bound
+
+
+@pytest.fixture
+def view():
+    view = bpy.context.window_manager.fdda_view
+    for name in ("way", "statistic", "range_mm", "pose"):
+        view.property_unset(name)
+    return view
+
+
+@pytest.fixture
+def evaluated_action(active):
+    bpy.ops.fdda.evaluate()
+    yield last_evaluation.of(active)
+    heat_map.clear_all()
+
+
+def test_error_on_the_active_action(active, elbow):
+    before = scene_state(find_rig())
+    assert bpy.ops.fdda.evaluate() == {"FINISHED"}
+    assert_same_state(before, scene_state(find_rig()))
+    with true_rig(active):
+        expected = drain(evaluate_action(find_rig(), elbow.model, "elbow_wave"))
+    last = last_evaluation.of(active)
+    np.testing.assert_allclose(last.errors["fdda"], expected.held_out.fdda, atol=1e-6)
+    assert last.total["linear"].max == pytest.approx(error_statistics(expected.held_out.linear).max, rel=1e-3)
+    assert (last.name, last.model, last.poses) == ("elbow_wave", "elbow", len(expected.held_out.fdda))
+    assert sorted(p.joint for p in last.partitions) == ["lower", "upper"]
+    assert sum(p.vertices for p in last.partitions) == last.vertices
+    assert last.partitions[0].fdda.max == pytest.approx(last.total["fdda"].max)
+
+
+def test_error_on_random_poses(active, elbow):
+    assert bpy.ops.fdda.evaluate(source="RANDOM", poses=7, seed=4) == {"FINISHED"}
+    with true_rig(active):
+        expected = drain(evaluate(find_rig(), elbow.model, EvaluationSettings(7, 4)))
+    last = last_evaluation.of(active)
+    np.testing.assert_allclose(last.errors["fdda"], expected.held_out.fdda, atol=1e-6)
+    assert not last.name and last.seed == 4
+
+
+def test_what_cannot_be_evaluated_says_why(active):
+    refused(lambda: bpy.ops.fdda.evaluate(action="jump"), "no action 'jump'")
+    bpy.data.objects[ELBOW_RIG].animation_data.action = None
+    refused(bpy.ops.fdda.evaluate, "'elbow_rig' has no action; give it one, or compare on random poses.")
+    for name in ("fit_range", "mark_worst", "jump_to_worst"):
+        refused(getattr(bpy.ops.fdda, name), "Nothing was evaluated since Blender was started; evaluate first")
+    refused(lambda: bpy.ops.fdda.paint(colors="ERRORS"), "'elbow' was not evaluated since Blender was started")
+    assert last_evaluation.of(active) is None and active.fdda.mode == "FDDA"
+
+
+def test_colours_are_those_of_the_report(active, evaluated_action, view):
+    bpy.ops.fdda.paint()
+    assert heat_map.painted(active) == "ERRORS"
+    errors = evaluated_action.errors
+    np.testing.assert_array_equal(heat_map.colors_of(active), heat_colors(errors["fdda"].mean(axis=0)))
+    view.way, view.statistic, view.range_mm = "linear", "max", 2.0
+    np.testing.assert_array_equal(heat_map.colors_of(active), heat_colors(errors["linear"].max(axis=0), 0.002))
+    assert bpy.ops.fdda.fit_range() == {"FINISHED"}
+    expected = np.percentile(errors["linear"].max(axis=0), 99.5) * 1000
+    assert view.range_mm == pytest.approx(expected, rel=0.06)
+    bpy.ops.fdda.paint(colors="NONE")
+    assert heat_map.colors_of(active) is None and heat_map.painted(active) == ""
+
+
+def test_colours_follow_the_timeline(active, evaluated_action, view):
+    bpy.ops.fdda.paint()
+    view.statistic = "pose"
+    for frame in (evaluated_action.first_frame, 12):
+        bpy.context.scene.frame_set(frame)
+        expected = heat_colors(evaluated_action.errors["fdda"][frame - evaluated_action.first_frame])
+        np.testing.assert_array_equal(heat_map.colors_of(active), expected)
+    bpy.context.scene.frame_set(evaluated_action.first_frame + evaluated_action.poses)
+    assert heat_map.colors_of(active) is None
+    refused(bpy.ops.fdda.fit_range, "choose another frame, or show the mean")
+
+
+def test_partitions_in_colour(active):
+    bpy.ops.fdda.paint(colors="PARTITIONS")
+    colors, partitions = heat_map.colors_of(active), make_partitions(read_rig(find_rig()))
+    assert [len(np.unique(colors[p.vertices], axis=0)) for p in partitions] == [1, 1]
+    assert not np.array_equal(*(colors[p.vertices[0]] for p in partitions))
+    heat_map.clear_all()
+
+
+def test_nothing_of_the_file_is_touched_by_colours(active, evaluated_action):
+    def datablocks():
+        attributes = [attribute.name for attribute in active.data.attributes]
+        return attributes, len(bpy.data.objects), len(bpy.data.materials), [m.name for m in active.modifiers]
+
+    before = datablocks()
+    for colors in ("ERRORS", "PARTITIONS"):
+        bpy.ops.fdda.paint(colors=colors)
+        assert datablocks() == before
+
+
+def test_worst_frames_are_marked_and_jumped_to(active, evaluated_action):
+    scene = bpy.context.scene
+    own = scene.timeline_markers.new("FDDA notes", frame=3)
+    largest = evaluated_action.errors["fdda"].max(axis=1)
+    worst = evaluated_action.first_frame + int(largest.argmax())
+    assert bpy.ops.fdda.mark_worst(count=3) == {"FINISHED"}
+    found = markers.find(scene)
+    assert found[0].frame == worst and found[0].name == f"FDDA 1: {largest.max() * 1000:.2f} mm"
+    frames = sorted(marker.frame for marker in found)
+    assert 1 < len(found) <= 3 and min(np.diff(frames)) >= last_evaluation.FRAMES_APART
+    bpy.ops.fdda.mark_worst(count=1)
+    assert [marker.frame for marker in markers.find(scene)] == [worst]
+    bpy.ops.fdda.jump_to_worst()
+    assert scene.frame_current == worst
+    bpy.ops.fdda.jump_to_worst(rank=2)
+    assert abs(scene.frame_current - worst) >= last_evaluation.FRAMES_APART
+    bpy.ops.fdda.remove_markers()
+    assert [marker.name for marker in scene.timeline_markers] == [own.name]
+    refused(bpy.ops.fdda.remove_markers, "No frame is marked")
+
+
+def test_the_worst_random_pose_is_set(active, view):
+    bpy.ops.fdda.evaluate(source="RANDOM", poses=9)
+    last = last_evaluation.of(active)
+    worst = int(last.errors["fdda"].max(axis=1).argmax())
+    refused(bpy.ops.fdda.mark_worst, "Random poses have no frames to mark")
+    pose(angle=0.0)
+    bpy.data.objects[ELBOW_RIG].animation_data.action = None
+    assert bpy.ops.fdda.jump_to_worst() == {"FINISHED"}
+    with true_rig(active):
+        compared = drain(evaluate(find_rig(), active_model(active), EvaluationSettings(9)))
+    bone = bpy.data.objects[ELBOW_RIG].pose.bones["lower"]
+    index = [joint.name for joint in read_rig(find_rig()).joints].index("lower")
+    np.testing.assert_allclose(np.array(bone.matrix), compared.held_out.pose_matrices[worst][index], atol=1e-5)
+    view.statistic = "pose"
+    assert view.pose == worst
+    np.testing.assert_array_equal(heat_map.errors_of(active), last.errors["fdda"][worst])
+
+
+def active_model(mesh_object):
+    from fdda_addon.runtime.playback import model_path
+
+    return model_path(mesh_object)
+
+
+def test_report_is_opened_beside_the_model(active, elbow, monkeypatch):
+    report = elbow.model.with_name("report.html")
+    assert report.is_file()
+    report.rename(report.with_suffix(".away"))
+    try:
+        refused(bpy.ops.fdda.open_report, f"There is no report '{report}'")
+    finally:
+        report.with_suffix(".away").rename(report)
+
+
+def test_an_evaluation_does_not_outlive_many_others(active):
+    bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
+    assert last_evaluation.of(active) is not None
+    kept = last_evaluation._kept[active.session_uid]
+    for uid in range(-last_evaluation.MOST_KEPT, 0):
+        last_evaluation._kept[uid] = kept
+    bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
+    assert len(last_evaluation._kept) <= last_evaluation.MOST_KEPT and last_evaluation.of(active) is not None
+    for uid in range(-last_evaluation.MOST_KEPT, 0):
+        last_evaluation._kept.pop(uid, None)

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The operators of the section Playback, blocking as without a window: bind, switch, measure, find a file, unbind."""
+
+import shutil
+
+import bpy
+import numpy as np
+import pytest
+from conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
+
+from fdda_addon import frame_times, trust
+from fdda_addon.runtime import nodes
+from fdda_addon.runtime.network import Network
+
+
+def refused(call, *words: str) -> None:
+    """The operator is cancelled with a report that holds the words."""
+    with pytest.raises(RuntimeError) as error:
+        call()
+    for word in words:
+        assert word in str(error.value)
+
+
+def modifiers(mesh_object: bpy.types.Object) -> list[tuple]:
+    return [(m.name, m.type, m.show_viewport, m.show_render) for m in mesh_object.modifiers]
+
+
+def test_bind_plays_and_unbind_restores(rig, elbow):
+    mesh_object = rig.mesh_object
+    mesh_object.modifiers["CorrectiveSmooth"].show_render = False
+    before, datablocks = modifiers(mesh_object), len(bpy.data.objects)
+    assert bpy.ops.fdda.bind(filepath=str(elbow.model)) == {"FINISHED"}
+    pose(angle=1.0)
+    assert_plays(mesh_object, elbow.model)
+    assert [(entry.name, entry.path) for entry in mesh_object.fdda.models] == [("elbow", "//elbow.onnx")]
+    assert bpy.ops.fdda.unbind() == {"FINISHED"}
+    assert modifiers(mesh_object) == before and len(bpy.data.objects) == datablocks
+    assert len(mesh_object.fdda.models) == 1
+
+
+def test_bind_takes_the_model_that_is_chosen_in_the_list(rig, elbow):
+    refused(bpy.ops.fdda.bind, "'elbow' has no model yet; train one, or choose a file.")
+    bpy.ops.fdda.add_model(filepath=str(elbow.model))
+    assert bpy.ops.fdda.bind() == {"FINISHED"}
+    pose(angle=0.7)
+    assert_plays(rig.mesh_object, elbow.model)
+
+
+def test_bind_by_the_name_of_an_object_with_nothing_active(rig, elbow):
+    bpy.context.view_layer.objects.active = None
+    assert bpy.ops.fdda.bind(object=ELBOW, filepath=str(elbow.model)) == {"FINISHED"}
+    assert rig.mesh_object.fdda.is_bound
+    refused(lambda: bpy.ops.fdda.unbind(object="other"), "no mesh object 'other'")
+
+
+def test_bind_with_the_armature_active(rig, elbow):
+    bpy.context.view_layer.objects.active = rig.armature_object
+    bpy.ops.fdda.bind(filepath=str(elbow.model))
+    assert rig.mesh_object.fdda.is_bound
+
+
+def test_what_is_no_model_is_not_put_into_the_list(rig, elbow, tmp_path):
+    path = tmp_path / "text.onnx"
+    path.write_text("no model")
+    refused(lambda: bpy.ops.fdda.bind(filepath=str(path)), "is not a model")
+    refused(lambda: bpy.ops.fdda.bind(filepath=str(tmp_path / "none.onnx")), "cannot be read")
+    assert not rig.mesh_object.fdda.models and not rig.mesh_object.fdda.is_bound
+
+
+def test_a_model_of_another_rig_leaves_the_bound_one(bound, elbow):
+    bpy.context.view_layer.objects.active = bound
+    bound.data.vertices[0].co.x += 0.1
+    refused(lambda: bpy.ops.fdda.bind(filepath=str(elbow.model)), "the rest pose of the mesh differs")
+    assert bound.fdda.is_bound and bound.fdda.mode == "FDDA"
+
+
+def test_undo_of_bind_and_unbind(rig, elbow):
+    before = modifiers(rig.mesh_object)
+    bpy.ops.ed.undo_push(message="start")
+    bpy.ops.fdda.bind(filepath=str(elbow.model))
+    bpy.ops.ed.undo_push(message="bound")
+    bpy.ops.fdda.unbind()
+    bpy.ops.ed.undo_push(message="unbound")
+    bpy.ops.ed.undo()
+    pose(angle=1.2)
+    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+    bpy.ops.ed.undo()
+    assert modifiers(bpy.data.objects[ELBOW]) == before
+
+
+def test_poll_says_why_not(elbow):
+    refused(bpy.ops.fdda.unbind, "Nothing with a rig is active")
+    bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
+    for name in ("unbind", "switch", "measure_model", "relink", "evaluate", "open_report"):
+        refused(getattr(bpy.ops.fdda, name), "No model is bound; bind one first")
+
+
+def test_switch(bound, elbow):
+    bpy.context.view_layer.objects.active = bound
+    pose(angle=1.3)
+    playing = assert_plays(bound, elbow.model)
+    for mode in ("RIG", "LINEAR"):
+        assert bpy.ops.fdda.switch(mode=mode) == {"FINISHED"}
+        assert bound.fdda.mode == mode
+        assert np.abs(evaluated(bound) - playing).max() > 5e-5
+    bpy.ops.fdda.switch(mode="RIG")
+    bpy.ops.fdda.switch()
+    assert bound.fdda.mode == "FDDA"
+    bpy.ops.fdda.switch()
+    assert bound.fdda.mode == "RIG"
+
+
+def test_switch_says_why_a_model_cannot_play(bound):
+    bpy.context.view_layer.objects.active = bound
+    bpy.ops.fdda.switch(mode="RIG")
+    bound.modifiers.remove(nodes.find_modifier(bound))
+    refused(lambda: bpy.ops.fdda.switch(mode="FDDA"), "was removed; bind the model again")
+
+
+def test_measure(bound):
+    bpy.context.view_layer.objects.active = bound
+    bound.fdda.mode = "LINEAR"
+    assert frame_times.of(bound) is None
+    assert bpy.ops.fdda.measure_model(frames=5) == {"FINISHED"}
+    times = frame_times.of(bound)
+    assert min(times.rig, times.linear, times.fdda) > 0
+    worth = times.rig > times.fdda
+    assert times.sentence.startswith("FDDA is" if worth else "Not worth it here")
+    assert bound.fdda.mode == "LINEAR" and bound.fdda.is_bound and bound.fdda.model == "//elbow.onnx"
+    bpy.ops.fdda.unbind()
+    assert frame_times.of(bound) is None
+
+
+def test_a_model_that_was_moved_is_found_again(elbow, tmp_path):
+    for path in (elbow.bound, elbow.model):
+        shutil.copy(path, tmp_path)
+    (tmp_path / "elbow.onnx").rename(tmp_path / "moved.onnx")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "bound.blend"))
+    mesh_object = bpy.data.objects[ELBOW]
+    bpy.context.view_layer.update()
+    assert "cannot be read" in mesh_object.fdda.status and mesh_object.fdda.mode == "RIG"
+    refused(lambda: bpy.ops.fdda.relink(object=ELBOW), "No file was chosen")
+    refused(lambda: bpy.ops.fdda.relink(object=ELBOW, filepath=str(tmp_path / "no.onnx")), "cannot be read")
+    assert bpy.ops.fdda.relink(object=ELBOW, filepath=str(tmp_path / "moved.onnx")) == {"FINISHED"}
+    assert not mesh_object.fdda.status and mesh_object.fdda.mode == "FDDA"
+    assert [entry.path for entry in mesh_object.fdda.models] == ["//moved.onnx"]
+    pose(angle=1.1)
+    assert_plays(mesh_object, tmp_path / "moved.onnx")
+
+
+def test_trust_is_what_the_model_says_and_asked_once_a_pose(bound, elbow, monkeypatch):
+    pose(angle=0.3)
+    inside = trust.partition_trust(bound)
+    assert sorted(name for name, _ in inside) == ["lower", "upper"]
+    assert all(value == pytest.approx(1) for _, value in inside)
+    bone = bpy.data.objects[ELBOW_RIG].pose.bones["lower"]
+    bone.constraints.remove(bone.constraints[0])
+    pose(angle=-2.0)
+    outside = trust.partition_trust(bound)
+    assert outside[0][1] < 0.99 and outside[0][1] <= outside[-1][1]
+    network = Network(elbow.model)
+    calls = []
+    monkeypatch.setattr(
+        Network, "trust", lambda self, poses: calls.append(1) or np.ones((1, len(network.info.partitions)))
+    )
+    assert trust.partition_trust(bound) == outside and not calls
+    pose(angle=2.0)
+    trust.partition_trust(bound)
+    assert trust.partition_trust(bound) and len(calls) == 1
+
+
+def test_trust_of_what_cannot_be_read_is_nothing(bound):
+    bpy.data.objects[ELBOW_RIG].data.bones["lower"].name = "forearm"
+    assert trust.partition_trust(bound) is None
+    bpy.data.objects.remove(bpy.data.objects[ELBOW_RIG])
+    assert trust.partition_trust(bound) is None
