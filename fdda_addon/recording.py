@@ -78,12 +78,10 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
     rig = read_rig(scene_rig)
     channels = sampled_channels(scene_rig, rig) if settings.poses else ()
     check_folder_writable(path)
-    sources = [Source("random", settings.poses)] if settings.poses else []
-    sources += [_action_source(action) for action in actions]
-    total = sum(source.poses for source in sources)
+    sampling = planned_sampling(settings, channels)
+    total = sum(source.poses for source in sampling.sources)
     if total < 1:
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
-    sampling = Sampling(settings.seed, settings.spread, channels, tuple(sources))
     info = RecordingInfo(
         total, 0, Path(bpy.data.filepath).name, scene_rig.mesh_object.name, bpy.app.version_string, sampling
     )
@@ -100,6 +98,17 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
             with contextlib.closing(append_poses(poses, evaluator, layer, writer)) as steps:
                 for done in steps:
                     yield Progress("poses", done, total)
+
+
+def planned_sampling(settings: RecordingSettings, channels: tuple[Channel, ...]) -> Sampling:
+    """How the poses of a recording with these settings are chosen.
+
+    Raises:
+        RigError: there is no action of a name that the settings have.
+    """
+    sources = [Source("random", settings.poses)] if settings.poses else []
+    sources += [_action_source(find_action(name)) for name in settings.actions]
+    return Sampling(settings.seed, settings.spread, channels if settings.poses else (), tuple(sources))
 
 
 def find_action(name: str) -> bpy.types.Action:

@@ -38,7 +38,7 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
     )
     model: StringProperty(
         name="Model",
-        description="File that the trained model is written to; empty for one beside the .blend file",
+        description="File that the trained model is written to; empty for one in a folder beside the .blend file",
         subtype="FILE_PATH",
         options=BLEND_RELATIVE_PATH,
     )
@@ -75,7 +75,7 @@ class FDDA_PG_session(bpy.types.PropertyGroup):
     )
     joint_index: IntProperty(name="Joint")
     action_index: IntProperty(name="Action")
-    partition_index: IntProperty(name="Partition")
+    show_all_partitions: BoolProperty(name="Show All", description="All partitions of the model, not only the worst")
 
 
 CLASSES = (FDDA_PG_character, FDDA_PG_action, FDDA_PG_session)
@@ -103,21 +103,25 @@ def recording_folder(mesh_object: bpy.types.Object) -> Path:
     Raises:
         OutputError: it is to lie beside a file that has not been saved.
     """
-    return _path(mesh_object, mesh_object.fdda.settings.recording, "_recording", "folder for the recording")
+    name = bpy.path.clean_name(mesh_object.name)
+    return _path(mesh_object.fdda.settings.recording, f"{name}_recording", "folder for the recording")
 
 
 def model_file(mesh_object: bpy.types.Object) -> Path:
-    """Where the character's model is written: the file that it names, else NAME.onnx beside the .blend file.
+    """Where the character's model is written: the file that it names, else NAME_model/NAME.onnx beside the .blend file.
+
+    A folder of its own: the trainer writes its report beside the model.
 
     Raises:
         OutputError: it is to lie beside a file that has not been saved.
     """
-    return _path(mesh_object, mesh_object.fdda.settings.model, ".onnx", "file for the model")
+    name = bpy.path.clean_name(mesh_object.name)
+    return _path(mesh_object.fdda.settings.model, f"{name}_model/{name}.onnx", "file for the model")
 
 
-def _path(mesh_object: bpy.types.Object, stated: str, ending: str, what: str) -> Path:
+def _path(stated: str, beside: str, what: str) -> Path:
     if not bpy.data.filepath and (not stated or stated.startswith("//")):
         raise OutputError(
             f"The .blend file has not been saved, so there is no place beside it; save it, or name a {what}."
         )
-    return Path(bpy.path.abspath(stated or f"//{bpy.path.clean_name(mesh_object.name)}{ending}"))
+    return Path(bpy.path.abspath(stated or f"//{beside}"))

@@ -17,7 +17,7 @@ class FDDA_OT_train(OnRig, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.train"
     bl_label = "Train"
     bl_description = "Train a model on the recording, in another process; Blender can be used meanwhile"
-    bl_options = {"REGISTER"}
+    bl_options = {"REGISTER", "UNDO"}
     verb, title = "train", "Training"
     borrows_scene = False
     ends_itself = True
@@ -80,6 +80,12 @@ class FDDA_OT_train(OnRig, JobOperator, bpy.types.Operator):
         return None
 
     def finish(self, _context: bpy.types.Context, result: float) -> str:
+        # By its name: the user may have removed it meanwhile.
+        mesh_object = bpy.data.objects.get(self.state.subject)
+        if mesh_object is not None:
+            from ..models import remember
+
+            remember(mesh_object, self._model)
         return f"Trained '{self._model.name}' in {result:.0f} s."
 
     def cancelled(self, _context: bpy.types.Context) -> str:

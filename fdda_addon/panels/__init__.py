@@ -4,7 +4,7 @@
 from importlib import import_module
 from types import ModuleType
 
-MODULES: tuple[str, ...] = ()
+MODULES: tuple[str, ...] = ("rig", "poses", "recording", "training", "playback", "evaluation", "models")
 """The modules of this package in the order of their sections; each lists its classes in `CLASSES`."""
 
 

@@ -30,6 +30,15 @@ class Section:
         running = job.current()
         return panel_rig(context)[0] is not None or (running is not None and running.verb in cls.verbs)
 
+    @classmethod
+    def is_done(cls, _context: bpy.types.Context) -> bool:
+        """Whether what this section is for has been done; the header has a tick then."""
+        return False
+
+    def draw_header_preset(self, context: bpy.types.Context) -> None:
+        if self.is_done(context):
+            self.layout.label(text="", icon="CHECKMARK")
+
 
 def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
     """The rig that the sidebar is about, or None and the sentence that says why there is none."""
@@ -47,6 +56,13 @@ def draw_sentence(layout: bpy.types.UILayout, context: bpy.types.Context, text: 
     column.scale_y = 0.8
     for number, line in enumerate(textwrap.wrap(text, max(16, int(width / CHARACTER_WIDTH)))):
         column.label(text=line, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+
+
+def draw_path(layout: bpy.types.UILayout, owner: bpy.types.bpy_struct, name: str) -> None:
+    """Draw a path; as a label above, so that the path has the whole width."""
+    column = layout.column(align=True)
+    column.label(text=f"{owner.bl_rna.properties[name].name} (empty: beside the file)")
+    column.prop(owner, name, text="")
 
 
 def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context, verb: str, unit: str) -> bool:

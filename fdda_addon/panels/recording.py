@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Section "Recording": what is in the folder, and the button that comes next."""
+
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import bpy
+
+from ..core.errors import FDDAError
+from ..operators import job
+from ..operators.recording import recorded_actions
+from ..scene.scene_rig import SceneRig
+from ..settings import recording_folder
+from . import checks
+from .section import Section, draw_job, draw_path, draw_sentence, panel_rig
+
+if TYPE_CHECKING:  # Blender starts without numpy.
+    from ..core.recording_folder import FolderContent
+
+_contents: "dict[int, tuple[tuple, FolderContent]]" = {}
+"""What was found in the folder of a character, by session_uid of its mesh object, and for which question."""
+
+
+def content_of(rig: SceneRig, path: Path) -> "FolderContent":
+    """What is in the folder of a recording; it is read again when it, the rig or the settings have changed."""
+    from ..core.recording import INDEX
+    from ..core.recording_folder import read_folder
+    from ..recording import RecordingSettings, planned_sampling
+
+    check, settings = checks.known(rig), rig.mesh_object.fdda.settings
+    actions = recorded_actions(rig.armature_object)
+    try:
+        stamp = os.stat(path / INDEX).st_mtime_ns
+    except OSError:
+        stamp = -1 if path.exists() else 0
+    uid = rig.mesh_object.session_uid
+    question = (path, stamp, id(check), settings.poses, settings.seed, settings.spread, actions)
+    if uid not in _contents or _contents[uid][0] != question:
+        wanted = RecordingSettings(settings.poses, settings.seed, settings.spread, actions)
+        own, sampling = None, None
+        if check is not None and check.rig is not None:
+            own, sampling = check.rig, json.loads(json.dumps(planned_sampling(wanted, check.channels).to_json()))
+        _contents[uid] = (question, read_folder(path, own, sampling))
+    return _contents[uid][1]
+
+
+class FDDA_PT_recording(Section, bpy.types.Panel):
+    bl_idname = "FDDA_PT_recording"
+    bl_label = "Recording"
+    verbs = ("record",)
+
+    @classmethod
+    def is_done(cls, context: bpy.types.Context) -> bool:
+        from ..core.recording_folder import FolderState
+
+        rig = panel_rig(context)[0]
+        running = job.current()
+        if rig is None or (running and running.verb == "record"):
+            return False
+        try:
+            return content_of(rig, recording_folder(rig.mesh_object)).state is FolderState.COMPLETE
+        except FDDAError:
+            return False
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        running = job.current()
+        if running and running.verb == "record":
+            draw_job(layout, context, "record", running.stage)
+            draw_sentence(layout, context, "ESC cancels as well; what is recorded is kept.", "INFO")
+            return
+        rig = panel_rig(context)[0]
+        if rig is None:
+            return
+        _draw_folder(layout, context, rig)
+        draw_job(layout, context, "record", "poses")
+
+
+def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
+    from ..core.recording_folder import FolderState
+
+    draw_path(layout, rig.mesh_object.fdda.settings, "recording")
+    try:
+        path = recording_folder(rig.mesh_object)
+        content = content_of(rig, path)
+    except FDDAError as error:
+        draw_sentence(layout, context, str(error), "ERROR")
+        _draw_record(layout, "Record", False)
+        return
+    check = checks.known(rig)
+    ready = check is not None and not check.problems
+    if check is not None and check.problems:
+        draw_sentence(layout, context, "The rig cannot be recorded yet; see the section Rig.", "ERROR")
+    if content.state is FolderState.FREE:
+        draw_sentence(layout, context, f"{_plan(rig)} will go into '{path.name}'.")
+        _draw_record(layout, "Record", ready)
+    elif content.state is FolderState.INCOMPLETE:
+        text = f"'{path.name}' has {content.complete:,} of {content.poses:,} poses."
+        draw_sentence(layout, context, text, "INFO")
+        _draw_record(layout, "Resume", ready, resume=True)
+    elif content.state is FolderState.COMPLETE:
+        draw_sentence(
+            layout, context, f"'{path.name}' is complete: {content.poses:,} poses. Train on it next.", "CHECKMARK"
+        )
+    else:
+        draw_sentence(layout, context, content.sentence, "ERROR")
+    if content.poses:
+        layout.operator("fdda.remove_recording", text="Remove Recording", icon="TRASH").object = rig.mesh_object.name
+
+
+def _draw_record(layout: bpy.types.UILayout, text: str, enabled: bool, resume: bool = False) -> None:
+    row = layout.row()
+    row.enabled = enabled
+    row.scale_y = 1.3
+    row.operator("fdda.record", text=text, icon="REC").resume = resume
+
+
+def _plan(rig: SceneRig) -> str:
+    from ..recording import action_frames
+
+    settings = rig.mesh_object.fdda.settings
+    frames = [len(action_frames(bpy.data.actions[name])) for name in recorded_actions(rig.armature_object)]
+    parts = [f"{settings.poses:,} random poses"] if settings.poses or not frames else []
+    if frames:
+        parts.append(f"{sum(frames):,} frames of {len(frames)} {'action' if len(frames) == 1 else 'actions'}")
+    return " and ".join(parts)
+
+
+CLASSES = (FDDA_PT_recording,)

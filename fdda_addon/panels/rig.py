@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Section "Rig": which character this is about, whether it can be recorded, and whether a model would pay."""
+
+import bpy
+
+from ..operators import job
+from ..operators.rig import cost_of
+from ..scene.scene_rig import SceneRig, deforming_modifiers
+from . import checks
+from .section import Section, draw_job, draw_sentence, panel_rig
+
+MODIFIER_ICONS = {
+    "ARMATURE": "MOD_ARMATURE", "CORRECTIVE_SMOOTH": "MOD_SMOOTH", "SMOOTH": "MOD_SMOOTH", "LATTICE": "MOD_LATTICE",
+    "NODES": "GEOMETRY_NODES", "SURFACE_DEFORM": "MOD_MESHDEFORM", "MESH_DEFORM": "MOD_MESHDEFORM",
+}  # fmt: skip
+
+
+class FDDA_PT_rig(Section, bpy.types.Panel):
+    bl_idname = "FDDA_PT_rig"
+    bl_label = "Rig"
+    verbs = ("measure",)
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        return True
+
+    @classmethod
+    def is_done(cls, context: bpy.types.Context) -> bool:
+        rig = panel_rig(context)[0]
+        check = checks.known(rig) if rig else None
+        return check is not None and not check.problems
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        rig, sentence = panel_rig(context)
+        if rig is None:
+            draw_sentence(layout, context, sentence, "INFO")
+            layout.operator("fdda.add_arm", text="Add Sample Arm", icon="ADD")
+            return
+        _draw_counts(layout, rig)
+        check = checks.known(rig)
+        for problem in check.problems if check else ():
+            draw_sentence(layout.box(), context, problem, "ERROR")
+        _draw_replaced(layout, context, rig)
+        _draw_cost(layout, context, rig)
+
+
+def _draw_counts(layout: bpy.types.UILayout, rig: SceneRig) -> None:
+    check = checks.known(rig)
+    column = layout.column(align=True)
+    column.label(text=f"{rig.mesh_object.name}: {len(rig.mesh_object.data.vertices):,} vertices", icon="MESH_DATA")
+    bones = len(rig.armature_object.data.bones)
+    joints = f"{len(check.rig.joints)} joints" if check and check.rig else "…"
+    text = f"{rig.armature_object.name}: {joints}"
+    if check and check.rig and len(check.rig.joints) != bones:
+        text += f" of {bones} bones"
+    column.label(text=text, icon="ARMATURE_DATA")
+
+
+def _draw_replaced(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
+    mesh_object = rig.mesh_object
+    column = layout.column(align=True)
+    column.label(text="A model takes the place of:")
+    for modifier in deforming_modifiers(mesh_object):
+        column.label(text=modifier.name, icon=MODIFIER_ICONS.get(modifier.type, "MODIFIER"))
+    if mesh_object.data.shape_keys:
+        count = len(mesh_object.data.shape_keys.key_blocks) - 1
+        column.label(text=f"{count} shape {'key' if count == 1 else 'keys'}", icon="SHAPEKEY_DATA")
+
+
+def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
+    cost = cost_of(rig.mesh_object)
+    state = job.state_of("measure")
+    if state is not None and (state.is_running or state.outcome_level != "INFO"):
+        draw_job(layout, context, "measure", "frames")
+    if cost is not None:
+        column = layout.column(align=True)
+        for name, milliseconds in (
+            ("This rig", f"{cost.rig:.2f} ms a frame"),
+            ("Armature alone", f"{cost.linear:.2f} ms"),
+            ("With a model", f"about {cost.model:.1f} ms (estimate)"),
+        ):
+            row = column.split(factor=0.45)
+            row.label(text=name)
+            row.label(text=milliseconds)
+        draw_sentence(layout, context, cost.sentence, "INFO")
+    if state is None or not state.is_running:
+        layout.operator("fdda.measure", text="Measure Again" if cost else "Measure", icon="TIME")
+
+
+CLASSES = (FDDA_PT_rig,)
+
+
+def register() -> None:
+    """Watch the rigs that are drawn."""
+    checks.register()
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    checks.unregister()
