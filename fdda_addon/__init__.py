@@ -13,10 +13,11 @@ def register() -> None:
         return
     import bpy
 
-    from . import operators, panels, properties
+    from . import operators, panels, preferences, properties
     from .runtime import handlers
 
     properties.register()
+    preferences.register()
     operators.register()
     panels.register()
     handlers.register()
@@ -36,7 +37,7 @@ def unregister() -> None:
         return
     import bpy
 
-    from . import operators, panels, properties
+    from . import operators, panels, preferences, properties
     from .runtime import handlers
 
     atexit.unregister(unregister)
@@ -45,6 +46,7 @@ def unregister() -> None:
     handlers.unregister()
     panels.unregister()
     operators.unregister()
+    preferences.unregister()
     properties.unregister()
 
 
