@@ -8,10 +8,12 @@ import numpy as np
 
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.recording import REFINED, Recording
+from fdda_addon.core.skinning import skin_matrices
 
 from .basis import Basis, make_basis
 from .config import TrainingConfig
 from .inputs import Inputs
+from .linear_fit import LinearFit, Surroundings, make_surroundings
 
 LEAST_POSES = 10
 LEAST_SPREAD = 1e-5
@@ -28,12 +30,14 @@ class PartitionData:
         read_residuals: gives the (N, Vp, 3) float32 local residuals, metres; called once, so that not all
             partitions need to be in memory at a time.
         vertices: Vp.
+        surroundings: what the residuals are fitted to first; None when nothing is known of the joints.
     """
 
     name: str
     features: np.ndarray
     read_residuals: Callable[[], np.ndarray]
     vertices: int
+    surroundings: Surroundings | None = None
 
 
 @dataclass(frozen=True)
@@ -61,9 +65,10 @@ class PreparedPartition:
         columns: (F',) int32, the features that vary over the training poses and that the network sees.
         feature_mean, feature_scale: (F',) float32, mean and standard deviation over the training poses.
         inputs: (N, F') float32, standardised features of all poses.
-        basis: of the residuals of the training poses.
+        fit: the part of the residuals that follows from the joints around.
+        basis: of what the fit leaves of the residuals of the training poses.
         coefficients: (N, K) float32, of all poses, metres.
-        residual_rms: rms distance over training poses and vertices before training, about the mean, metres.
+        residual_rms: rms distance over training poses and vertices that the fit leaves, about the mean, metres.
         validation_truncation: (n,) rms distance over the vertices that the basis leaves of each validation pose,
             metres.
     """
@@ -74,6 +79,7 @@ class PreparedPartition:
     feature_mean: np.ndarray
     feature_scale: np.ndarray
     inputs: np.ndarray
+    fit: LinearFit
     basis: Basis
     coefficients: np.ndarray
     residual_rms: float
@@ -119,12 +125,14 @@ def partitions_of(recording: Recording, inputs: Inputs) -> list[PartitionData]:
     """The partitions of a recording, their features as `inputs` chose them."""
     rig = recording.rig
     features = inputs.features(recording.pose_matrices, rig.rest_matrices)
+    skin = skin_matrices(recording.pose_matrices, rig.rest_matrices)
     return [
         PartitionData(
             rig.joints[partition.joint].name,
             features[:, inputs.columns[number]],
             lambda vertices=partition.vertices: recording.residuals[:, vertices],
             len(partition.vertices),
+            make_surroundings(rig, partition, skin),
         )
         for number, partition in enumerate(recording.partitions)
     ]
@@ -133,8 +141,8 @@ def partitions_of(recording: Recording, inputs: Inputs) -> list[PartitionData]:
 def prepare(partition: PartitionData, split: Split, tolerance_mm: float, seed: int) -> PreparedPartition:
     """Standardise the features of a partition and turn its residuals into coefficients.
 
-    Everything is measured on the training poses alone. A partition that sees no varying feature gets no shapes: its
-    mean is the best that can be said of it.
+    What the joints around say is taken off first. Everything is measured on the training poses alone. A partition that
+    sees no varying feature gets no shapes: its mean is the best that can be said of it.
     """
     features = partition.features
     training = features[split.training].astype(np.float64)
@@ -142,7 +150,12 @@ def prepare(partition: PartitionData, split: Split, tolerance_mm: float, seed: i
     columns = np.flatnonzero(scale > LEAST_SPREAD).astype(np.int32)
     mean = training[:, columns].mean(axis=0).astype(np.float32)
     scale = scale[columns].astype(np.float32)
-    residuals = np.asarray(partition.read_residuals(), np.float32).reshape(len(features), -1)
+    residuals = np.asarray(partition.read_residuals(), np.float32)
+    fit = LinearFit(np.zeros(0, np.int64), np.zeros((0, partition.vertices), np.float32))
+    if partition.surroundings is not None:
+        surroundings = partition.surroundings if len(columns) else partition.surroundings.alone()
+        fit, residuals = surroundings.fit(residuals, split.training)
+    residuals = residuals.reshape(len(features), -1)
     tolerance = tolerance_mm / 1000 if len(columns) else np.inf
     basis = make_basis(residuals[split.training], tolerance, np.random.default_rng([seed, 2]))
     coefficients = basis.coefficients(residuals)
@@ -155,6 +168,7 @@ def prepare(partition: PartitionData, split: Split, tolerance_mm: float, seed: i
         mean,
         scale,
         (features[:, columns] - mean) / scale,
+        fit,
         basis,
         coefficients,
         float(np.sqrt((spread**2).sum() / partition.vertices)),

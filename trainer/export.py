@@ -22,7 +22,7 @@ from fdda_addon.core.model import (
 )
 from fdda_addon.core.output import replacing
 from fdda_addon.core.recording import Recording
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearLayer, skin_matrices
 
 from .deformation import Deformation
 from .graph import build_graph
@@ -61,14 +61,16 @@ def reference_positions(deformation: Deformation, pose_matrices: np.ndarray) -> 
     mean, scale = deformation.standardisation()
     clamped = np.clip(features, trust_range.low, trust_range.high)
     inputs = ((clamped - mean) / scale).astype(np.float32)
-    local = np.zeros((len(features), rig.vertex_count, 3), np.float32)
+    skin = skin_matrices(pose_matrices, rig.rest_matrices)
+    local, offsets = (np.zeros((len(features), rig.vertex_count, 3), np.float32) for _ in range(2))
     for number, (partition, prepared, network) in enumerate(
         zip(deformation.partitions, deformation.prepared, deformation.networks, strict=True)
     ):
         coefficients = network.coefficients(inputs[:, deformation.seen_columns(number)], deformation.activation)
         residuals = prepared.basis.residuals(coefficients) * trust[:, number, None]
         local[:, partition.vertices] = residuals.reshape(len(features), -1, 3)
-    return LinearLayer(rig, deformation.partitions).complex_positions(pose_matrices, local), trust
+        offsets[:, partition.vertices] = prepared.fit.offsets(skin) * trust[:, number, None, None]
+    return LinearLayer(rig, deformation.partitions).complex_positions(pose_matrices, local) + offsets, trust
 
 
 def open_session(model: bytes) -> onnxruntime.InferenceSession:

@@ -72,7 +72,7 @@ def make_inputs(parents: np.ndarray, points: np.ndarray, partitions: Sequence[Pa
     for partition in partitions:
         own = [_columns(0, joint, FEATURES_PER_JOINT) for joint in partition.influencing]
         for joint in range(len(parents)):
-            between = _between(parents, partition.joint, joint)
+            between = joints_between(parents, partition.joint, joint)
             if len(between) >= 2 and between <= set(partition.influencing):
                 for point in range(joint * each, (joint + 1) * each):
                     own.append(_columns(len(parents) * FEATURES_PER_JOINT, len(seen), FEATURES_PER_PAIR))
@@ -102,7 +102,7 @@ def _columns(start: int, number: int, width: int) -> np.ndarray:
     return start + number * width + np.arange(width)
 
 
-def _between(parents: np.ndarray, first: int, second: int) -> set[int]:
+def joints_between(parents: np.ndarray, first: int, second: int) -> set[int]:
     """The joints whose parent-relative transforms make up that of one joint relative to another."""
     return set(_upwards(parents, first)) ^ set(_upwards(parents, second))
 

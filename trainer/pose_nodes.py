@@ -106,7 +106,7 @@ def add_range(graph: Graph, features: str, deformation: Deformation, order: list
         order: in which the rest of the graph wants the partitions.
 
     Returns:
-        (N, F) standardised features, clamped, and (N, P) trust in `order`.
+        (N, F) standardised features, clamped, and (N, P + 1) trust in `order`, after it a 1 for what needs no trust.
     """
     trust, count, own = deformation.trust, len(order), deformation.inputs.joint_columns
     mean, scale = deformation.standardisation()
@@ -120,9 +120,12 @@ def add_range(graph: Graph, features: str, deformation: Deformation, order: list
         outside = graph.slice(outside, 0, own, 1, "joints_outside")
     excess = graph.add("Mul", [outside, graph.floats("per_fade_width", scale[:own] / trust.width)], "excess")
     squared = graph.add("Mul", [excess, excess], "excess_squared")
-    # Every partition twice: as the graph wants them, and as the output lists them.
-    counts = np.repeat(np.concatenate([trust.counts[order], trust.counts]).T, FEATURES_PER_JOINT, axis=0)
+    # Every partition twice: as the graph wants them, and as the output lists them. Between them one that nothing takes
+    # trust from.
+    certain = np.zeros_like(trust.counts[:1])
+    counts = np.concatenate([trust.counts[order], certain, trust.counts])
+    counts = np.repeat(counts.T, FEATURES_PER_JOINT, axis=0)
     summed = graph.add("MatMul", [squared, graph.floats("counts", counts)], "partition_excess")
     root = graph.add("Relu", [graph.add("Sub", [graph.floats("one", 1.0), summed], "trust_left")], "trust_root")
     both = graph.add("Mul", [root, root], "trusts")
-    return clamped, graph.split(both, [count, count], ["partition_trust", TRUST_OUTPUT], axis=1)[0]
+    return clamped, graph.split(both, [count + 1, count], ["partition_trust", TRUST_OUTPUT], axis=1)[0]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The last weights of a training, kept beside the model, and a start from them on a recording that has grown.
 
-Means, scales and basis shapes are made anew from the poses at hand; the first and the last layer of each network take
-up what changed, so that a network starts with the answers it gave before.
+Fit, means, scales and basis shapes are made anew from the poses at hand; the first and the last layer of each network
+take up what changed of the last three, so that a network starts with nearly the answers it gave before.
 """
 
 import json

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The fitted part of the residuals: it finds skinning where there is skinning, and nothing else moves it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from chain import chain_angles, chain_rig, pose_chain, rotation
+
+from fdda_addon.core.partition import Partition, make_partitions
+from fdda_addon.core.rig import Joint, Rig
+from fdda_addon.core.skinning import LinearLayer, skin_matrices
+from trainer.linear_fit import make_surroundings
+
+JOINTS = 4
+INFLUENCING = {joint: tuple(j for j in (joint, joint + 1) if 0 < j < JOINTS) for joint in range(JOINTS)}
+
+
+def hard(rig: Rig) -> Rig:
+    """The same rig, every vertex on one joint."""
+    heaviest = rig.skin_weights == rig.skin_weights.max(axis=1, keepdims=True)
+    heaviest[:, 1] &= ~heaviest[:, 0]
+    return replace(rig, skin_weights=heaviest.astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def smooth() -> Rig:
+    return chain_rig(JOINTS)
+
+
+@pytest.fixture(scope="module")
+def poses(smooth) -> np.ndarray:
+    """(80, J, 4, 4); the chain stands far away from the origin."""
+    there = np.eye(4, dtype=np.float32)
+    there[:3, 3] = 7, -5, 3
+    return there @ pose_chain(smooth, chain_angles(80, JOINTS, seed=4))
+
+
+TRAINING = np.arange(60)
+
+
+@pytest.mark.parametrize("joint", range(JOINTS))
+def test_skinning_to_the_joints_around_is_found(smooth, poses, joint):
+    """The true rig is smoothly skinned, the linear layer hard: nothing is left for a network, on unseen poses too."""
+    rig = hard(smooth)
+    partition = make_partitions(rig, INFLUENCING)[joint]
+    layer = LinearLayer(rig)
+    truth = LinearLayer(smooth).positions(poses)
+    residuals = layer.local_residuals(poses, truth)[:, partition.vertices]
+    skin = skin_matrices(poses, rig.rest_matrices)
+    fit, left = make_surroundings(rig, partition, skin).fit(residuals, TRAINING)
+    assert np.abs(residuals).max() > 5e-3 and np.abs(left).max() < 1e-4
+    fitted = layer.positions(poses)[:, partition.vertices] + fit.offsets(skin)
+    np.testing.assert_allclose(fitted, truth[:, partition.vertices], atol=1e-4)
+
+
+def random_residuals(rig: Rig, partition: Partition, count: int) -> np.ndarray:
+    size = (count, len(partition.vertices), 3)
+    return np.random.default_rng(0).normal(0.01, 0.004, size).astype(np.float32)
+
+
+def test_what_is_left_and_the_offsets_make_up_the_residuals(smooth, poses):
+    partition = make_partitions(smooth, INFLUENCING)[1]
+    skin = skin_matrices(poses, smooth.rest_matrices)
+    residuals = random_residuals(smooth, partition, len(poses))
+    fit, left = make_surroundings(smooth, partition, skin).fit(residuals, TRAINING)
+    inverse = np.linalg.inv(skin[:, partition.joint, :3, :3].astype(np.float64))
+    offsets = np.einsum("nab,nvb->nva", inverse, fit.offsets(skin))
+    np.testing.assert_allclose(offsets + left, residuals, atol=1e-5)
+    assert (left[TRAINING] ** 2).mean() < 0.3 * (residuals[TRAINING] ** 2).mean(), "not even the mean was fitted"
+
+
+def test_moving_the_whole_character_turns_the_offsets_along(smooth, poses):
+    partition = make_partitions(smooth, INFLUENCING)[1]
+    skin = skin_matrices(poses, smooth.rest_matrices)
+    fit, _ = make_surroundings(smooth, partition, skin).fit(random_residuals(smooth, partition, len(poses)), TRAINING)
+    moved = rotation(1, 0.8)
+    moved[:3, 3] = 3, 20, -1
+    expected = fit.offsets(skin) @ moved[:3, :3].T
+    np.testing.assert_allclose(fit.offsets((moved @ skin).astype(np.float32)), expected, atol=1e-4)
+
+
+def test_joints_that_only_influencing_joints_move():
+    parents = (-1, 0, 1, 1, 3)
+    rig = replace(chain_rig(5), joints=tuple(Joint(f"bone_{n}", parent) for n, parent in enumerate(parents)))
+    skin = np.tile(np.eye(4, dtype=np.float32), (2, 5, 1, 1))
+
+    def around(joint: int, *influencing: int) -> list[int]:
+        return make_surroundings(rig, Partition(joint, influencing, np.arange(3)), skin).joints.tolist()
+
+    assert around(2, 2, 3) == [2, 1, 3]
+    assert around(2, 2, 4) == [2, 1], "joint 3 hides joint 4"
+    assert around(1, 1, 2, 3, 4) == [1, 0, 2, 3, 4]
+    assert around(0) == [0]
+
+
+def test_alone_the_main_joint_says_the_mean(smooth, poses):
+    partition = make_partitions(smooth, INFLUENCING)[2]
+    skin = skin_matrices(poses, smooth.rest_matrices)
+    residuals = random_residuals(smooth, partition, len(poses))
+    fit, left = make_surroundings(smooth, partition, skin).alone().fit(residuals, TRAINING)
+    assert fit.joints.tolist() == [2]
+    np.testing.assert_allclose(left, residuals - residuals[TRAINING].mean(axis=0), atol=1e-6)
+
+
+def test_joints_that_never_moved_give_nothing_large(smooth):
+    """All joints say the same then; one of them moves later."""
+    partition = make_partitions(smooth, INFLUENCING)[1]
+    still = pose_chain(smooth, np.zeros((30, JOINTS, 2)))
+    skin = skin_matrices(still, smooth.rest_matrices)
+    residuals = random_residuals(smooth, partition, 30)
+    fit, _ = make_surroundings(smooth, partition, skin).fit(residuals, np.arange(30))
+    assert np.abs(fit.factors).max() < 0.1
+    bent = skin_matrices(pose_chain(smooth, np.full((1, JOINTS, 2), 0.5)), smooth.rest_matrices)
+    assert np.abs(fit.offsets(bent)).max() < 0.1

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the joints around a partition say of its residuals without a network: skinning to them, fitted.
+
+Most of what smoothing does near a joint is that vertices follow the joints on both sides, each by its part. That is
+linear in the poses of these joints, so a least squares fit finds it, and the networks learn what is left: a fraction of
+the residual, and a smooth one. How much of delta mush can be had in this way: Le and Lewis, Direct Delta Mush Skinning
+and Variants, 2019.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdda_addon.core.partition import Partition
+from fdda_addon.core.rig import Rig
+
+from .inputs import joints_between
+
+RIDGE = 1e-6
+"""Added to the mean squares of the rows: joints that say the same share what they say, and nothing grows large."""
+BLOCK_FLOATS = 1 << 22
+"""Residuals are fitted in blocks of so many coordinates."""
+
+
+@dataclass(frozen=True)
+class LinearFit:
+    """The fitted part of the residuals of a partition: vertex v moves by sum_j S_j u_vj, S_j the skin matrices.
+
+    Moving all joints together moves nothing: the last numbers of all u_vj of a vertex sum to zero.
+
+    Attributes:
+        joints: (Jf,) int64, the main joint first; none where nothing is known of the joints.
+        factors: (4 Jf, Vp) float32, u_vj: three metres and a number, joint by joint.
+    """
+
+    joints: np.ndarray
+    factors: np.ndarray
+
+    def offsets(self, skin: np.ndarray) -> np.ndarray:
+        """Skin matrices (N, J, 4, 4) to (N, Vp, 3) offsets from the linear layer, mesh-object space, metres."""
+        rows = skin[:, self.joints, :3].transpose(0, 2, 1, 3).reshape(len(skin), 3, -1)
+        return (rows.astype(np.float64) @ self.factors).transpose(0, 2, 1)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The joints around a partition as its main joint sees them.
+
+    Attributes:
+        joints: (Jf,) int64, the main joint first.
+        centre: (3,) float64, middle of the partition at rest, mesh-object space, metres.
+        rows: (N, 3, 4 Jf) float64, R_m^-1 S_j of each joint; the last column of each says how the centre moves, which
+            keeps the fit well conditioned far away from the origin.
+    """
+
+    joints: np.ndarray
+    centre: np.ndarray
+    rows: np.ndarray
+
+    def alone(self) -> "Surroundings":
+        """The main joint alone, seen from which nothing moves."""
+        return Surroundings(self.joints[:1], self.centre, self.rows[:, :, :4])
+
+    def fit(self, residuals: np.ndarray, training: np.ndarray) -> tuple[LinearFit, np.ndarray]:
+        """Fit local residuals.
+
+        Args:
+            residuals: (N, Vp, 3) float32 local residuals, metres.
+            training: indices of the poses to fit.
+
+        Returns:
+            The fit, and (N, Vp, 3) float32: what it leaves of the residuals of all poses.
+        """
+        width = self.rows.shape[2]
+        products, moments = np.zeros((width, width)), np.zeros((width, residuals.shape[1]))
+        step = max(1, BLOCK_FLOATS // residuals[0].size)
+        for start in range(0, len(training), step):
+            poses = training[start : start + step]
+            rows = self.rows[poses].reshape(-1, width)
+            products += rows.T @ rows
+            moments += rows.T @ residuals[poses].transpose(0, 2, 1).reshape(len(rows), -1)
+        solved = np.linalg.solve(products + RIDGE * len(training) * np.eye(width), moments)
+        left = np.empty_like(residuals)
+        for start in range(0, len(residuals), step):
+            poses = slice(start, start + step)
+            left[poses] = residuals[poses] - (self.rows[poses] @ solved).transpose(0, 2, 1)
+        return LinearFit(self.joints, self._factors(solved.reshape(len(self.joints), 4, -1))), left
+
+    def _factors(self, solved: np.ndarray) -> np.ndarray:
+        """(Jf, 4, Vp) for the rows as they are to (4 Jf, Vp) for skin matrices."""
+        factors, parts = solved.copy(), solved[:, 3]
+        factors[0, 3] = 0
+        factors[1:, :3] += self.centre[:, None] * parts[1:, None]
+        together = parts[1:].sum(axis=0)
+        factors[0, :3] -= self.centre[:, None] * together
+        factors[0, 3] -= together
+        return factors.reshape(-1, solved.shape[2]).astype(np.float32)
+
+
+def make_surroundings(rig: Rig, partition: Partition, skin: np.ndarray) -> Surroundings:
+    """The joints that may move a partition's residuals: those that only influencing joints move against the main one.
+
+    Args:
+        rig, partition: of the recording.
+        skin: (N, J, 4, 4) skin matrices of all poses, metres.
+    """
+    influencing = set(partition.influencing)
+    others = [
+        joint
+        for joint in range(len(rig.joints))
+        if joint != partition.joint and joints_between(rig.parents, partition.joint, joint) <= influencing
+    ]
+    joints = np.array([partition.joint, *others], np.int64)
+    centre = rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
+    apart = skin[:, joints, :3].astype(np.float64)
+    apart[:, :, :, 3] -= skin[:, partition.joint, None, :3, 3]
+    relative = np.linalg.inv(skin[:, partition.joint, None, :3, :3].astype(np.float64)) @ apart
+    relative[:, :, :, 3] += relative[:, :, :, :3] @ centre - centre
+    return Surroundings(joints, centre, relative.transpose(0, 2, 1, 3).reshape(len(skin), 3, -1))
