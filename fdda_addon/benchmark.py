@@ -114,10 +114,10 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
         times: dict[str, list[float]] = {way: [] for way in ways}
         each = max(1, -(-frames // ROUNDS))
         for number in range(ROUNDS):
-            for way, prepare in ways.items():
+            for place, (way, prepare) in enumerate(ways.items(), 1):
                 with prepare(mesh_object):
                     times[way] += time_frames(played, number * each, each)
-            yield Progress("benchmark", number + 1, ROUNDS)
+                yield Progress("benchmark", number * len(ways) + place, ROUNDS * len(ways))
         network = playback.network_of(mesh_object)
         pose = network.info.rest_matrices[None]
         inference = _time([lambda: network.positions(pose)] * (frames + WARM_UP))[WARM_UP:]

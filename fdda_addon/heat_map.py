@@ -29,6 +29,7 @@ class Paint:
 
 
 _painted: dict[int, Paint] = {}
+_hidden: set[int] = set()
 
 
 def paint_errors(mesh_object: bpy.types.Object) -> None:
@@ -68,6 +69,11 @@ def painted(mesh_object: bpy.types.Object) -> str:
     return paint.kind if paint else ""
 
 
+def is_hidden(mesh_object: bpy.types.Object) -> bool:
+    """Whether the colours of a mesh could not be drawn: it is edited, or a modifier changes its topology."""
+    return mesh_object.session_uid in _hidden
+
+
 def colors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
     """The colours of a painted mesh at the current frame: (V, 3) float32 sRGB, None when there is nothing to show."""
     paint = _painted.get(mesh_object.session_uid)
@@ -89,9 +95,9 @@ def errors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
 
 
 def fitting_range_mm(mesh_object: bpy.types.Object) -> float:
-    """A range in which the errors that are shown have colours from blue to red: their 99.5th percentile, mm."""
+    """A range in mm in which the errors that are shown have colours from blue to red: nearly the largest of them."""
     errors = errors_of(mesh_object)
-    return 0.0 if errors is None else float(np.percentile(errors, 99.5)) * 1000
+    return 0.0 if errors is None else float(f"{np.percentile(errors, 99.5) * 1000:.2g}")
 
 
 def _paint(mesh_object: bpy.types.Object, paint: Paint) -> None:
@@ -106,10 +112,21 @@ def _sheets(context: bpy.types.Context) -> list["overlay.Sheet"]:
     alive = {o.session_uid: o for o in bpy.data.objects if o.session_uid in _painted}
     for uid in _painted.keys() - alive.keys():
         del _painted[uid]
-    visible = [o for o in alive.values() if o.visible_get(view_layer=context.view_layer)]
-    return [
-        sheet for o in visible if (colors := colors_of(o)) is not None and (sheet := overlay.sheet(context, o, colors))
-    ]
+    drawn, hidden = [], set()
+    for uid, mesh_object in alive.items():
+        colors = colors_of(mesh_object)
+        if colors is None or not mesh_object.visible_get(view_layer=context.view_layer):
+            continue
+        sheet = overlay.sheet(context, mesh_object, colors)
+        if sheet is None:
+            hidden.add(uid)
+        else:
+            drawn.append(sheet)
+    if hidden != _hidden:
+        _hidden.clear()
+        _hidden.update(hidden)
+        redraw_views()
+    return drawn
 
 
 def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:

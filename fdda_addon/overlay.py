@@ -17,7 +17,7 @@ TOWARDS_VIEWER = 2e-5
 VERTEX = """
 void main()
 {
-  shade = 0.45 + 0.55 * abs(dot(normalize(normal), towards));
+  shade = 0.25 + 0.75 * abs(dot(normalize(normal), towards));
   paint = color;
   gl_Position = transform * vec4(position, 1.0);
   gl_Position.z -= offset * gl_Position.w;
@@ -64,7 +64,9 @@ def start(
 
 
 def stop() -> None:
-    """Draw no more."""
+    """Draw no more, and let go of what the graphics card holds: it must not outlive its context."""
+    global _shader
+    _shader = None
     while _handles:
         bpy.types.SpaceView3D.draw_handler_remove(_handles.pop(), "WINDOW")
     _triangles.clear()

@@ -67,8 +67,8 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
         redraw_views()
         fdda, linear = last.total["fdda"], last.total["linear"]
         return (
-            f"FDDA is {fdda.mean:.2f} mm from the rig, at most {fdda.max:.1f} mm; "
-            f"the linear layer {linear.mean:.2f} mm, at most {linear.max:.1f} mm."
+            f"FDDA is {fdda.mean:.2f} mm from the rig on average and {fdda.max:.1f} mm at most; "
+            f"the linear layer {linear.mean:.2f} and {linear.max:.1f} mm."
         )
 
     def _action_name(self, armature_object: bpy.types.Object) -> str:
@@ -133,6 +133,9 @@ class FDDA_OT_paint(OnEvaluation, bpy.types.Operator):
         if self.colors == "ERRORS":
             scene_rig, _ = self.last(context)
             heat_map.paint_errors(scene_rig.mesh_object)
+            view = context.window_manager.fdda_view
+            if not view.is_property_set("range_mm"):
+                view.range_mm = heat_map.fitting_range_mm(scene_rig.mesh_object) or view.range_mm
         elif self.colors == "PARTITIONS":
             scene_rig = self.rig(context)
             heat_map.paint_partitions(scene_rig)
@@ -161,7 +164,7 @@ class FDDA_OT_fit_range(OnEvaluation, bpy.types.Operator):
         if not fitting:
             raise ModelError("No errors are shown that a range could fit; choose another frame, or show the mean.")
         view = context.window_manager.fdda_view
-        view.range_mm = float(f"{fitting:.2g}")
+        view.range_mm = fitting
         return f"Red begins at {view.range_mm:.3g} mm."
 
 

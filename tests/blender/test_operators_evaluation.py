@@ -75,6 +75,9 @@ def test_colours_are_those_of_the_report(active, evaluated_action, view):
     bpy.ops.fdda.paint()
     assert heat_map.painted(active) == "ERRORS"
     errors = evaluated_action.errors
+    assert view.range_mm == pytest.approx(np.percentile(errors["fdda"].mean(axis=0), 99.5) * 1000, rel=0.06)
+    view.range_mm = 10.0
+    bpy.ops.fdda.paint()
     np.testing.assert_array_equal(heat_map.colors_of(active), heat_colors(errors["fdda"].mean(axis=0)))
     view.way, view.statistic, view.range_mm = "linear", "max", 2.0
     np.testing.assert_array_equal(heat_map.colors_of(active), heat_colors(errors["linear"].max(axis=0), 0.002))
@@ -90,7 +93,8 @@ def test_colours_follow_the_timeline(active, evaluated_action, view):
     view.statistic = "pose"
     for frame in (evaluated_action.first_frame, 12):
         bpy.context.scene.frame_set(frame)
-        expected = heat_colors(evaluated_action.errors["fdda"][frame - evaluated_action.first_frame])
+        errors = evaluated_action.errors["fdda"][frame - evaluated_action.first_frame]
+        expected = heat_colors(errors, view.range_mm / 1000)
         np.testing.assert_array_equal(heat_map.colors_of(active), expected)
     bpy.context.scene.frame_set(evaluated_action.first_frame + evaluated_action.poses)
     assert heat_map.colors_of(active) is None

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The section Evaluation: how far the model is from the rig, in figures, in colours and on the timeline."""
+
+import sys
+
+import bpy
+
+from .. import last_evaluation, markers
+from ..operators import job
+from .section import Section, draw_job, draw_sentence, panel_rig
+
+FEW_PARTITIONS = 5
+FIGURES = (("Mean", "mean"), ("99 %", "p99"), ("Largest", "max"))
+
+
+class FDDA_PT_evaluation(Section, bpy.types.Panel):
+    bl_idname = "FDDA_PT_evaluation"
+    bl_label = "Evaluation"
+    bl_options = {"DEFAULT_CLOSED"}
+    verbs = ("evaluate",)
+
+    @classmethod
+    def is_done(cls, context: bpy.types.Context) -> bool:
+        rig = panel_rig(context)[0]
+        return rig is not None and last_evaluation.of(rig.mesh_object) is not None
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, view = self.layout, context.window_manager.fdda_view
+        scene_rig, reason = panel_rig(context)
+        if scene_rig is None:
+            draw_sentence(layout, context, reason, "INFO")
+            return
+        if not scene_rig.mesh_object.fdda.is_bound:
+            draw_sentence(
+                layout, context, "Bind a model first: what is compared with the rig is the bound model.", "INFO"
+            )
+        else:
+            self._draw_start(context, scene_rig)
+        last = last_evaluation.of(scene_rig.mesh_object)
+        if last is not None:
+            _draw_figures(layout, context, view, last)
+        _draw_colors(layout, context, view, scene_rig.mesh_object, last)
+        if last is not None:
+            _draw_worst(layout, context, view, last)
+        if scene_rig.mesh_object.fdda.is_bound:
+            layout.operator("fdda.open_report", icon="URL")
+
+    def _draw_start(self, context: bpy.types.Context, scene_rig: object) -> None:
+        layout, view = self.layout, context.window_manager.fdda_view
+        state = job.state_of("evaluate")
+        if state is not None and state.is_running:
+            draw_job(layout, context, "evaluate", "poses")
+            return
+        layout.row().prop(view, "source", expand=True)
+        column = layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        animation = scene_rig.armature_object.animation_data
+        action = animation.action if animation else None
+        if view.source == "RANDOM":
+            column.prop(view, "poses")
+            column.prop(view, "seed")
+        elif action is None:
+            draw_sentence(layout, context, f"'{scene_rig.armature_object.name}' has no action.", "ERROR")
+        else:
+            first, last = (round(frame) for frame in action.frame_range)
+            layout.label(text=f"{action.name}, frames {first} to {last}", icon="ACTION")
+        row = layout.row()
+        row.scale_y = 1.4
+        row.enabled = view.source == "RANDOM" or action is not None
+        button = row.operator("fdda.evaluate", icon="PLAY")
+        button.source, button.poses, button.seed = view.source, view.poses, view.seed
+        if state is not None and state.outcome_level != "INFO":
+            draw_job(layout, context, "evaluate", "poses")
+
+
+def _draw_figures(
+    layout: bpy.types.UILayout, context: bpy.types.Context, view: object, last: last_evaluation.LastEvaluation
+) -> None:
+    what = f"{last.poses} frames of {last.name}" if last.name else f"{last.poses} random poses"
+    header, body = layout.panel("fdda_figures", default_closed=False)
+    header.label(text="Distance from the Rig, mm")
+    if body is None:
+        return
+    draw_sentence(body, context, f"{last.model} on {what}")
+    table = body.column(align=True)
+    _row(table, "", [label for label, _ in FIGURES])
+    for label, way in (("FDDA", "fdda"), ("Linear layer", "linear")):
+        _row(table, label, [_millimetres(getattr(last.total[way], name)) for _, name in FIGURES])
+    body.separator()
+    row = body.row()
+    row.label(text="Partitions, worst first")
+    if len(last.partitions) > FEW_PARTITIONS:
+        row.prop(view, "show_partitions", text="All", toggle=True)
+    column = body.column(align=True)
+    for partition in last.partitions[: None if view.show_partitions else FEW_PARTITIONS]:
+        _row(column, partition.joint, [_millimetres(getattr(partition.fdda, name)) for _, name in FIGURES])
+
+
+def _draw_colors(
+    layout: bpy.types.UILayout,
+    context: bpy.types.Context,
+    view: object,
+    mesh_object: bpy.types.Object,
+    last: last_evaluation.LastEvaluation | None,
+) -> None:
+    header, body = layout.panel("fdda_colors", default_closed=False)
+    header.label(text="Colours in the Viewport")
+    if body is None:
+        return
+    heat_map = sys.modules.get(f"{__package__.rpartition('.')[0]}.heat_map")
+    shown = heat_map.painted(mesh_object) if heat_map else ""
+    row = body.row(align=True)
+    for colors, text in (("NONE", "None"), ("ERRORS", "Heat Map"), ("PARTITIONS", "Partitions")):
+        button = row.row(align=True)
+        button.enabled = colors != "ERRORS" or last is not None
+        button.operator("fdda.paint", text=text, depress=shown == ("" if colors == "NONE" else colors)).colors = colors
+    if not shown and last is None:
+        draw_sentence(body, context, "The heat map is there once the model was evaluated.", "INFO")
+    if shown and heat_map.is_hidden(mesh_object):
+        text = "The colours show outside edit mode, while no modifier changes the topology in the viewport."
+        draw_sentence(body, context, text, "ERROR")
+    if shown != "ERRORS" or last is None:
+        return
+    column = body.column()
+    column.use_property_split, column.use_property_decorate = True, False
+    column.row().prop(view, "way", expand=True)
+    column.row().prop(view, "statistic", text="Show", expand=True)
+    if view.statistic == "pose" and not last.name and view.pose < 0:
+        draw_sentence(body, context, "Jump to a pose below to see its errors.", "INFO")
+    elif view.statistic == "pose" and last.name and last.pose_at(context.scene.frame_current) is None:
+        draw_sentence(body, context, f"Frame {context.scene.frame_current} was not compared.", "INFO")
+    row = column.row(align=True)
+    row.prop(view, "range_mm")
+    row.operator("fdda.fit_range", text="", icon="FULLSCREEN_EXIT")
+
+
+def _draw_worst(
+    layout: bpy.types.UILayout, context: bpy.types.Context, view: object, last: last_evaluation.LastEvaluation
+) -> None:
+    header, body = layout.panel("fdda_worst", default_closed=False)
+    header.label(text="Worst Frames" if last.name else "Worst Poses")
+    if body is None:
+        return
+    column = body.column(align=True)
+    for rank, (index, error_mm) in enumerate(_worst(last, view.markers), 1):
+        place = f"Frame {last.first_frame + index}" if last.name else f"Pose {index}"
+        button = column.operator("fdda.jump_to_worst", text=f"{place}: {error_mm:.2f} mm")
+        button.rank = rank
+    if not last.name:
+        return
+    row = body.row(align=True)
+    row.prop(view, "markers")
+    row.operator("fdda.mark_worst", text="Mark", icon="MARKER_HLT").count = view.markers
+    if markers.find(context.scene):
+        row.operator("fdda.remove_markers", text="", icon="X")
+
+
+_worst_of: dict[int, tuple[object, int, list[tuple[int, float]]]] = {}
+
+
+def _worst(last: last_evaluation.LastEvaluation, count: int) -> list[tuple[int, float]]:
+    """The worst poses, found once for an evaluation: drawing computes nothing twice."""
+    if _worst_of.get(0, (None, 0))[:2] != (last, count):
+        _worst_of[0] = (last, count, last.worst(count))
+    return _worst_of[0][2]
+
+
+def _row(layout: bpy.types.UILayout, label: str, figures: list[str]) -> None:
+    row = layout.split(factor=0.4, align=True)
+    row.label(text=label)
+    for figure in figures:
+        cell = row.row(align=True)
+        cell.alignment = "RIGHT"
+        cell.label(text=figure)
+
+
+def _millimetres(value: float) -> str:
+    return f"{value:.2f}" if value < 10 else f"{value:.1f}"
+
+
+CLASSES = (FDDA_PT_evaluation,)
+
+
+def unregister() -> None:
+    """Let go of the last evaluation."""
+    _worst_of.clear()

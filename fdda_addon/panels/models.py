@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The section Models: those of a mesh, which is bound, packing, and what has changed since they were trained."""
+
+import bpy
+
+from ..core.errors import FDDAError
+from ..model_list import chosen_entry, is_bound, megabytes
+from . import checks
+from .section import Section, draw_sentence, panel_rig
+from .watch import Watch
+
+
+def _states(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
+    """What is wrong with the models of a mesh: icon and sentence by path and name; all is well with those left out."""
+    from ..model_changes import changes
+    from ..models import info_of
+    from ..scene.scene_rig import SceneRig, armature_modifier
+
+    modifier = armature_modifier(mesh_object)
+    check = checks.known(SceneRig(mesh_object, modifier.object)) if modifier else None
+    found = {}
+    for entry in mesh_object.fdda.models:
+        try:
+            info = info_of(mesh_object, entry)
+            if check is not None and check.rig is not None:
+                changed = changes(entry.name, info, check.rig, check.channels)
+                if changed.sentence:
+                    found[_key(entry)] = ("ERROR" if changed.prevents else "INFO", changed.sentence)
+        except FDDAError as error:
+            found[_key(entry)] = ("ERROR", str(error))
+    return found
+
+
+def _key(entry: bpy.types.PropertyGroup) -> str:
+    return f"{entry.name}\n{entry.path}\n{entry.packed_bytes}"
+
+
+_models = Watch(_states, 0.5)
+
+
+class FDDA_UL_models(bpy.types.UIList):
+    bl_idname = "FDDA_UL_models"
+
+    def draw_item(self, context, layout, data, item, icon, active_data, active_property, index):
+        mesh_object = data.id_data
+        row = layout.row(align=True)
+        row.prop(item, "name", text="", emboss=False, icon="LINKED" if is_bound(mesh_object, item) else "BLANK1")
+        if item.packed:
+            row.label(text=megabytes(item.packed_bytes), icon="PACKAGE")
+        if (state := (_models.look(mesh_object) or {}).get(_key(item))) is not None:
+            row.label(icon=state[0])
+
+
+class FDDA_PT_models(Section, bpy.types.Panel):
+    bl_idname = "FDDA_PT_models"
+    bl_label = "Models"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        scene_rig, reason = panel_rig(context)
+        if scene_rig is None:
+            draw_sentence(layout, context, reason, "INFO")
+            return
+        mesh_object = scene_rig.mesh_object
+        binding = mesh_object.fdda
+        if not binding.models and not binding.is_bound:
+            draw_sentence(layout, context, "No model yet: train one above, or add a file.", "INFO")
+            layout.operator("fdda.add_model", icon="ADD")
+            return
+        row = layout.row()
+        row.template_list("FDDA_UL_models", "", binding, "models", binding, "model_index", rows=3)
+        column = row.column(align=True)
+        column.operator("fdda.add_model", text="", icon="ADD")
+        column.operator("fdda.remove_model", text="", icon="REMOVE")
+        entry = chosen_entry(mesh_object)
+        if entry is not None:
+            self._draw_entry(context, mesh_object, entry)
+
+    def _draw_entry(
+        self, context: bpy.types.Context, mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup
+    ) -> None:
+        layout = self.layout
+        states = _models.look(mesh_object)
+        state = (states or {}).get(_key(entry))
+        if is_bound(mesh_object, entry):
+            layout.operator("fdda.unbind", icon="UNLINKED")
+        else:
+            row = layout.row()
+            row.scale_y = 1.2
+            row.operator("fdda.bind", text=f"Bind {entry.name}", icon="LINKED").filepath = ""
+        if entry.packed:
+            draw_sentence(layout, context, f"Inside the .blend file, {megabytes(entry.packed_bytes)}.", "PACKAGE")
+            layout.operator("fdda.unpack_model", icon="EXPORT")
+        else:
+            draw_sentence(layout, context, bpy.path.abspath(entry.path), "FILE")
+            layout.operator("fdda.pack_model", text="Pack into the .blend File", icon="PACKAGE")
+        if state is not None:
+            box = layout.box()
+            box.alert = state[0] == "ERROR"
+            draw_sentence(box, context, state[1], state[0])
+        elif states is not None:
+            draw_sentence(layout, context, "It fits the rig: nothing has changed since it was trained.", "CHECKMARK")
+
+
+CLASSES = (FDDA_UL_models, FDDA_PT_models)
+
+
+def unregister() -> None:
+    """Work nothing out any more."""
+    _models.stop()

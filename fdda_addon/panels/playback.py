@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The section Playback: bind a model, choose what deforms the mesh, and see what a frame costs."""
+
+import bpy
+
+from .. import frame_times
+from ..model_list import bound_name, chosen_entry
+from ..operators import job
+from .section import Section, draw_job, draw_sentence, panel_rig
+from .watch import Watch
+
+FULL_TRUST = 0.995
+MOST_SHOWN = 6
+
+
+def _trust(mesh_object: bpy.types.Object) -> object:
+    from ..trust import partition_trust
+
+    return partition_trust(mesh_object) or "This model does not say how far it is believed."
+
+
+_trusts = Watch(_trust, 0.2)
+
+
+class FDDA_PT_playback(Section, bpy.types.Panel):
+    bl_idname = "FDDA_PT_playback"
+    bl_label = "Playback"
+    verbs = ("measure_model",)
+
+    @classmethod
+    def is_done(cls, context: bpy.types.Context) -> bool:
+        rig = panel_rig(context)[0]
+        return rig is not None and rig.mesh_object.fdda.is_bound and not rig.mesh_object.fdda.status
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        scene_rig, reason = panel_rig(context)
+        if scene_rig is None:
+            draw_sentence(layout, context, reason, "INFO")
+            return
+        mesh_object = scene_rig.mesh_object
+        if not mesh_object.fdda.is_bound:
+            self._draw_unbound(context, mesh_object)
+            return
+        self._draw_bound(context, mesh_object)
+        if not mesh_object.fdda.status:
+            self._draw_times(context, mesh_object)
+            self._draw_trust(context, mesh_object)
+        layout.operator("fdda.unbind", icon="UNLINKED")
+
+    def _draw_unbound(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
+        layout, entry = self.layout, chosen_entry(mesh_object)
+        if mesh_object.fdda.status:
+            draw_sentence(layout, context, mesh_object.fdda.status, "ERROR")
+        if entry is None:
+            draw_sentence(layout, context, "No model yet: train one above, or choose a file.", "INFO")
+            layout.operator("fdda.bind", text="Choose Model and Bind…", icon="FILEBROWSER")
+            return
+        column = layout.column()
+        column.scale_y = 1.4
+        column.operator("fdda.bind", text=f"Bind {entry.name}", icon="LINKED").filepath = ""
+
+    def _draw_bound(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
+        layout, binding = self.layout, mesh_object.fdda
+        layout.label(text=f"{bound_name(mesh_object)} is bound", icon="CHECKMARK" if not binding.status else "ERROR")
+        if binding.status:
+            box = layout.box()
+            box.alert = True
+            draw_sentence(box, context, binding.status)
+            row = layout.row(align=True)
+            row.operator("fdda.relink", icon="FILEBROWSER")
+            row.operator("fdda.switch", text="Try Again", icon="FILE_REFRESH").mode = "FDDA"
+            return
+        row = layout.row(align=True)
+        row.scale_y = 1.4
+        row.prop(binding, "mode", expand=True)
+        column = layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        strength = column.row()
+        strength.enabled = binding.mode == "FDDA"
+        strength.prop(binding, "strength", slider=True)
+        column.prop(binding, "use_in_render")
+
+    def _draw_times(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
+        layout = self.layout
+        header, body = layout.panel("fdda_frame_times", default_closed=False)
+        header.label(text="Time a Frame")
+        if body is None:
+            return
+        state = job.state_of("measure_model")
+        if state is not None and (state.is_running or state.outcome_level != "INFO"):
+            draw_job(body, context, "measure_model", "rounds")
+        if state is not None and state.is_running:
+            return
+        times = frame_times.of(mesh_object)
+        if times is not None:
+            grid = body.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
+            for label, value in (("Rig", times.rig), ("Armature alone", times.linear), ("FDDA", times.fdda)):
+                grid.label(text=label)
+                number = grid.row()
+                number.alignment = "RIGHT"
+                number.label(text=f"{value:.2f} ms")
+            draw_sentence(body, context, times.sentence, "INFO" if times.fdda < times.rig else "ERROR")
+        body.operator("fdda.measure_model", text="Measure Again" if times else "Measure", icon="TIME")
+
+    def _draw_trust(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
+        # Closed, nobody looks and the model is not asked.
+        header, body = self.layout.panel("fdda_trust", default_closed=True)
+        header.label(text="Trust in This Pose")
+        if body is None:
+            return
+        trust = _trusts.look(mesh_object)
+        if trust is None or isinstance(trust, str):
+            draw_sentence(body, context, trust or "…")
+            return
+        doubtful = [(name, value) for name, value in trust if value < FULL_TRUST]
+        if not doubtful:
+            draw_sentence(body, context, "This pose lies inside what the model was trained on.", "CHECKMARK")
+            return
+        draw_sentence(body, context, f"{len(doubtful)} of {len(trust)} partitions leave what the model was trained on:")
+        column = body.column(align=True)
+        for name, value in doubtful[:MOST_SHOWN]:
+            row = column.split(factor=0.5, align=True)
+            row.label(text=name)
+            row.progress(factor=value, text=f"{100 * value:.0f} %")
+        if len(doubtful) > MOST_SHOWN:
+            column.label(text=f"and {len(doubtful) - MOST_SHOWN} more")
+
+
+CLASSES = (FDDA_PT_playback,)
+
+
+def unregister() -> None:
+    """Work nothing out any more."""
+    _trusts.stop()
