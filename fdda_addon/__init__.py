@@ -22,7 +22,9 @@ def register() -> None:
     panels.register()
     handlers.register()
     _cli_command = bpy.utils.register_cli_command("fdda", _run_command)
-    atexit.register(unregister)
+    if bpy.app.module:
+        # Blender itself disables its add-ons before it ends; here, at its exit, nothing of it is left.
+        atexit.register(unregister)
 
 
 def is_registered() -> bool:
