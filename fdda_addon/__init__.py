@@ -22,7 +22,7 @@ def register() -> None:
     panels.register()
     handlers.register()
     _cli_command = bpy.utils.register_cli_command("fdda", _run_command)
-    if bpy.app.module:
+    if not bpy.app.binary_path:
         # Blender itself disables its add-ons before it ends; here, at its exit, nothing of it is left.
         atexit.register(unregister)
 
