@@ -14,7 +14,7 @@ from .core.model import check_rig
 from .core.partition import Partition
 from .core.poses import Channel, beyond_range, sample_pose
 from .core.skinning import LinearLayer
-from .core.surface import Surface, SurfaceComparison, SurfaceErrors, surface_errors
+from .core.surface import Surface, SurfaceComparison, SurfaceErrors, surface_errors, surface_json
 from .recording import Progress, action_frames, find_action
 from .runtime.network import Network
 from .scene.armature import Poser, clear_pose
@@ -73,23 +73,13 @@ class PoseErrors:
     fdda_surface: SurfaceErrors | None = None
     linear_surface: SurfaceErrors | None = None
 
-    def surface_json(self) -> dict:
-        """`normals`, degrees, and `edges`, parts of the rest length, each None for a mesh without faces."""
-        ways = {"fdda": self.fdda_surface, "linear": self.linear_surface}
-        if None in ways.values():
-            return {"normals": None, "edges": None}
-        return {
-            "normals": {way: errors.normals_json() for way, errors in ways.items()},
-            "edges": {way: errors.edges_json() for way, errors in ways.items()},
-        }
-
     def to_json(self) -> dict:
         return {
             "name": self.name,
             "poses": len(self.fdda),
             "fdda": error_statistics(self.fdda).to_json(),
             "linear": error_statistics(self.linear).to_json(),
-            **self.surface_json(),
+            **surface_json(self.fdda_surface, self.linear_surface),
         }
 
 
@@ -139,7 +129,7 @@ class Evaluation:
             "actions": [errors.to_json() for errors in self.actions],
             "beyond": [errors.to_json() for errors in self.beyond],
             "named": [errors.to_json() for errors in self.named],
-            **self.held_out.surface_json(),
+            **surface_json(self.held_out.fdda_surface, self.held_out.linear_surface),
         }
 
 

@@ -23,12 +23,15 @@ from fdda_addon.core.model import (
 from fdda_addon.core.output import replacing
 from fdda_addon.core.recording import Recording
 from fdda_addon.core.skinning import LinearLayer, skin_matrices
+from fdda_addon.core.surface import Surface, SurfaceComparison, surface_errors, surface_json
 
 from .deformation import Deformation
 from .graph import build_graph
 
 MOST_DIFFERENCE = 1e-5
 """Metres. An export whose positions differ more from the reference fails; scaled up for rigs larger than a metre."""
+MOST_SURFACES = 50
+"""Normals are compared in so many poses: at 50,000 vertices a pose takes a tenth of a second."""
 BLOCK_FLOATS = 1 << 24
 """Poses are evaluated in blocks of so many coordinates."""
 
@@ -102,6 +105,25 @@ def measure(
         fdda[block] = distances(positions, truth)
         linear[block] = distances(layer.positions(matrices), truth)
     return Measured(fdda, linear)
+
+
+def measure_surface(
+    session: onnxruntime.InferenceSession, recording: Recording, deformation: Deformation, poses: np.ndarray
+) -> dict:
+    """What `surface_json` gives, of the exported model, on at most `MOST_SURFACES` of the poses."""
+    rig, rows = recording.rig, []
+    if not len(rig.face_starts):
+        return surface_json(None, None)
+    layer = LinearLayer(rig, deformation.partitions)
+    comparison = SurfaceComparison(
+        Surface(rig.face_starts, rig.face_vertices), rig.rest_positions, deformation.partitions
+    )
+    for pose in poses[:: -(-len(poses) // MOST_SURFACES)]:
+        matrices = np.array(recording.pose_matrices[pose, None])
+        truth = layer.complex_positions(matrices, np.array(recording.residuals[pose, None]))
+        (positions,) = session.run([POSITIONS_OUTPUT], {POSE_INPUT: matrices})
+        rows.append(comparison.compare(truth[0], (positions[0], layer.positions(matrices)[0])))
+    return surface_json(*(surface_errors(way) for way in zip(*rows, strict=True)))
 
 
 def check_parity(

@@ -54,6 +54,7 @@ def render_html(report: dict, pictures: Sequence[Path] = (), evaluation: dict | 
         _pictures(pictures),
         _evaluation(evaluation),
         _errors(report),
+        _surface(report),
         _curves(report),
         _table(report["partitions"], report["fdda"]["held_out"], report["linear"]["held_out"], report),
         _settings(report),
@@ -141,6 +142,23 @@ def _errors(report: dict) -> str:
         f"{histogram(counts['edges'], counts['fdda'], counts['linear'])}"
         "<h2>Held-out error by partition</h2><p>Bars are means, the tick is the largest error."
         f"{_key('fdda', 'FDDA')}{_key('linear', 'linear layer alone')}</p>{bars}"
+    )
+
+
+def _surface(report: dict) -> str:
+    if not report.get("normals"):
+        return ""
+    rows = ""
+    for way, name in (("fdda", "FDDA"), ("linear", "linear layer")):
+        normals, edges = report["normals"][way], report["edges"][way]
+        cells = [f"{normals[key]:.2f}&deg;" for key in ("mean", "p99", "max")]
+        cells += ["-" if edges[k] is None else f"{100 * edges[k]:.2f} %" for k in ("inside", "beside", "across")]
+        rows += f"<tr><td>{name}</td>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+    heads = ("normals: mean", "99 %", "max", "edges: inside partitions", "beside borders", "across borders")
+    return (
+        "<h2>Surface</h2><p>What shading shows of held-out poses: angles to the true normals, and errors of edge "
+        'lengths as parts of the rest length.</p><div class="scroll"><table><thead><tr><th></th>'
+        f"{''.join(f'<th>{head}</th>' for head in heads)}</tr></thead><tbody>{rows}</tbody></table></div>"
     )
 
 

@@ -36,6 +36,7 @@ def make_report(
     deformation: Deformation,
     exported: Exported,
     on_training: Measured,
+    surface: dict,
     curves: Sequence[Curves],
     model_name: str,
 ) -> dict:
@@ -44,6 +45,7 @@ def make_report(
     Args:
         recording, deformation, exported, curves: of the training.
         on_training: errors on a sample of the training poses.
+        surface: `normals` and `edges` of held-out poses.
         model_name: file name of the model.
     """
     names = recording.rig.joint_names
@@ -88,6 +90,7 @@ def make_report(
             "held_out": exported.info.held_out_mm,
         },
         "linear": {"held_out": error_statistics(held_out.linear).to_json()},
+        **surface,
         "histogram": {
             "edges": HISTOGRAM_EDGES_MM.tolist(),
             "fdda": _histogram(held_out.fdda),

@@ -20,7 +20,7 @@ from .announcements import Announcer
 from .config import TrainingConfig
 from .data import PreparedPartition, Split, partitions_of, prepare, split_recording
 from .deformation import Deformation
-from .export import build_model, measure, write_model
+from .export import build_model, measure, measure_surface, write_model
 from .inputs import Inputs, make_inputs, middles
 from .loop import Cancelled, Trained, choose_device, train
 from .page import render_html
@@ -106,7 +106,10 @@ def train_model(
     _check_stop(should_stop)
     sample = split.training[:: max(1, len(split.training) // len(split.held_out))]
     on_training = measure(exported.session, recording, deformation, sample)
-    content = report.make_report(recording, deformation, exported, on_training, trained.curves, model_path.name)
+    surface = measure_surface(exported.session, recording, deformation, split.held_out)
+    content = report.make_report(
+        recording, deformation, exported, on_training, surface, trained.curves, model_path.name
+    )
     poses, p999 = len(recording.pose_matrices), exported.info.held_out_mm["p999"]
     history = [*(last.history if last else ()), {"poses": poses, "p999": p999}]
     outcome = None

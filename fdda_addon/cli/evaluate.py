@@ -80,7 +80,10 @@ def _surface_lines(normals: dict, edges: dict) -> list[str]:
     for way, label in (("fdda", "FDDA"), ("linear", "linear layer")):
         angle, edge = normals[way], edges[way]
         angles.append(f"{label} {angle['mean']:.3f}, p99 {angle['p99']:.2f}")
-        across, inside = ("-" if edge[part] is None else f"{100 * edge[part]:.3f}" for part in ("across", "inside"))
-        ratio = "-" if edge["ratio"] is None else f"{edge['ratio']:.2f} times"
-        lengths.append(f"{label} {inside}, across borders {across} ({ratio})")
-    return [f"  normals off by degrees: {'; '.join(angles)}", f"  edge lengths off by %: {'; '.join(lengths)}"]
+        parts = ["-" if edge[part] is None else f"{100 * edge[part]:.3f}" for part in ("inside", "beside", "across")]
+        ratio = "" if edge["ratio"] is None else f" ({edge['ratio']:.2f} times)"
+        lengths.append(f"{label} {' / '.join(parts)}{ratio}")
+    return [
+        f"  normals, degrees: {'; '.join(angles)}",
+        f"  edges, % of their length, inside / beside / across borders: {'; '.join(lengths)}",
+    ]

@@ -98,11 +98,13 @@ class SurfaceErrors:
         angles: (N, n) float32, between the normals, degrees.
         across: (N,) float64, mean error of the lengths of the edges between two partitions, each as a part of its
             rest length.
-        inside: (N,) float64, the same of the edges inside partitions.
+        beside: (N,) float64, the same of the edges inside partitions that end at a border.
+        inside: (N,) float64, the same of all edges inside partitions.
     """
 
     angles: np.ndarray
     across: np.ndarray
+    beside: np.ndarray
     inside: np.ndarray
 
     def normals_json(self) -> dict:
@@ -112,10 +114,23 @@ class SurfaceErrors:
 
     def edges_json(self) -> dict:
         """Errors of edge lengths as parts of the rest length; None for what there is no edge of."""
-        across, inside = (
-            float(part.mean()) if np.isfinite(part).all() else None for part in (self.across, self.inside)
-        )
-        return {"across": across, "inside": inside, "ratio": across / inside if across is not None and inside else None}
+        found = {
+            kind: float(errors.mean()) if np.isfinite(errors).all() else None
+            for kind, errors in (("across", self.across), ("beside", self.beside), ("inside", self.inside))
+        }
+        known = found["across"] is not None and found["inside"]
+        return {**found, "ratio": found["across"] / found["inside"] if known else None}
+
+
+def surface_json(fdda: SurfaceErrors | None, linear: SurfaceErrors | None) -> dict:
+    """`normals`, degrees, and `edges`, parts of the rest length, of both ways; None without faces."""
+    if fdda is None or linear is None:
+        return {"normals": None, "edges": None}
+    ways = {"fdda": fdda, "linear": linear}
+    return {
+        "normals": {way: errors.normals_json() for way, errors in ways.items()},
+        "edges": {way: errors.edges_json() for way, errors in ways.items()},
+    }
 
 
 class SurfaceComparison:
@@ -134,9 +149,11 @@ class SurfaceComparison:
             partition_of[partition.vertices] = number
         measured = self._rest_lengths > 0
         crosses = np.diff(partition_of[surface.edges], axis=1)[:, 0] != 0
-        self._across, self._inside = np.flatnonzero(crosses & measured), np.flatnonzero(~crosses & measured)
+        at_border = np.isin(surface.edges, surface.edges[crosses]).any(axis=1)
+        kinds = (crosses, ~crosses & at_border, ~crosses)
+        self._kinds = [np.flatnonzero(kind & measured) for kind in kinds]
 
-    def compare(self, true: np.ndarray, others: tuple[np.ndarray, ...]) -> list[tuple[np.ndarray, float, float]]:
+    def compare(self, true: np.ndarray, others: tuple[np.ndarray, ...]) -> list[tuple[np.ndarray, float, float, float]]:
         """Compare other positions of a pose with the true ones.
 
         Args:
@@ -144,7 +161,7 @@ class SurfaceComparison:
             others: one or more of the same.
 
         Returns:
-            For each of the others, the row that it adds to the three arrays of `SurfaceErrors`.
+            For each of the others, the row that it adds to the arrays of `SurfaceErrors`.
         """
         surface = self._surface
         normals, lengths = surface.normals(true), surface.edge_lengths(true)
@@ -152,13 +169,13 @@ class SurfaceComparison:
         for other in others:
             angles = angles_between(normals, surface.normals(other)).astype(np.float32)
             errors = np.abs(surface.edge_lengths(other) - lengths)
-            rows.append((angles, *(self._mean(errors, edges) for edges in (self._across, self._inside))))
+            rows.append((angles, *(self._mean(errors, edges) for edges in self._kinds)))
         return rows
 
     def _mean(self, errors: np.ndarray, edges: np.ndarray) -> float:
         return float(np.mean(errors[edges] / self._rest_lengths[edges])) if len(edges) else np.nan
 
 
-def surface_errors(rows: list[tuple[np.ndarray, float, float]]) -> SurfaceErrors:
+def surface_errors(rows: list[tuple[np.ndarray, float, float, float]]) -> SurfaceErrors:
     """Put together what `SurfaceComparison.compare` returned for one way over all poses, at least one."""
     return SurfaceErrors(*(np.array(column) for column in zip(*rows, strict=True)))

@@ -16,6 +16,7 @@ from fdda_addon.evaluation import EvaluationSettings, evaluate
 from fdda_addon.scene.mesh import topology
 from fdda_addon.scene.rig import SceneRig, read_rig
 
+EDGES = ["across", "beside", "inside", "ratio"]
 APPROXIMATE = 0.05
 """Degrees. Blender computes normals in float32 and the angles of corners by a polynomial."""
 
@@ -68,14 +69,14 @@ def test_faces_of_a_rig_are_those_of_its_mesh(rig):
 @pytest.fixture
 def report(elbow, tmp_path) -> dict:
     path = tmp_path / "e.json"
-    options = ["--poses", 6, "--seed", 3, "--action", "elbow_wave", "--beyond", 2]
+    options = ["--poses", 24, "--seed", 3, "--action", "elbow_wave", "--beyond", 2]
     assert run("evaluate", elbow.rig, elbow.model, "--json", path, *options) == 0
     return json.loads(path.read_text())
 
 
 def test_figures_of_an_evaluation_are_what_blender_s_normals_and_edges_give(report, rig: SceneRig, elbow):
     """The positions of the true rig and of the linear layer go into meshes of Blender's."""
-    evaluation = drain(evaluate(rig, elbow.model, EvaluationSettings(poses=6, seed=3)))
+    evaluation = drain(evaluate(rig, elbow.model, EvaluationSettings(poses=24, seed=3)))
     arrays = read_rig(rig)
     layer = LinearLayer(arrays)
     partition_of = {int(vertex): p.joint for p in layer.partitions for vertex in p.vertices}
@@ -101,6 +102,8 @@ def test_figures_of_an_evaluation_are_what_blender_s_normals_and_edges_give(repo
     assert found["max"] == pytest.approx(np.max(angles), abs=2 * APPROXIMATE)
     assert edge_errors["across"] == pytest.approx(np.mean(np.array(lengths)[:, crosses]), rel=1e-3)
     assert edge_errors["inside"] == pytest.approx(np.mean(np.array(lengths)[:, ~crosses]), rel=1e-3)
+    at_border = np.isin(edges, edges[crosses]).any(axis=1) & ~crosses
+    assert edge_errors["beside"] == pytest.approx(np.mean(np.array(lengths)[:, at_border]), rel=1e-3)
     assert edge_errors["ratio"] == pytest.approx(edge_errors["across"] / edge_errors["inside"])
 
 
@@ -109,7 +112,7 @@ def test_the_model_shades_better_than_the_linear_layer_everywhere_it_was_compare
         normals, edges = values["normals"], values["edges"]
         assert list(normals) == list(edges) == ["fdda", "linear"]
         for way in ("fdda", "linear"):
-            assert list(normals[way]) == ["mean", "p99", "max"] and list(edges[way]) == ["across", "inside", "ratio"]
+            assert list(normals[way]) == ["mean", "p99", "max"] and list(edges[way]) == EDGES
             assert 0 < normals[way]["mean"] < normals[way]["p99"] <= normals[way]["max"] <= 180
         assert normals["fdda"]["mean"] < normals["linear"]["mean"]
 
@@ -120,8 +123,8 @@ def test_the_table_has_a_line_on_normals_and_one_on_edges(elbow, tmp_path, capfd
     fdda, linear = report["normals"]["fdda"], report["normals"]["linear"]
     assert f"FDDA {fdda['mean']:.3f}, p99 {fdda['p99']:.2f}; linear layer {linear['mean']:.3f}, p99 " in out
     edges = report["edges"]["fdda"]
-    shown = f"FDDA {100 * edges['inside']:.3f}, across borders {100 * edges['across']:.3f} ({edges['ratio']:.2f} times)"
-    assert shown in out
+    percent = " / ".join(f"{100 * edges[kind]:.3f}" for kind in ("inside", "beside", "across"))
+    assert f"FDDA {percent} ({edges['ratio']:.2f} times)" in out
 
 
 def test_a_mesh_without_faces_has_no_normals(rig, tmp_path, capfd):

@@ -87,12 +87,17 @@ def test_errors_across_borders_and_inside():
     other = rest * np.float32([1.25, 1, 1])
     comparison = SurfaceComparison(strip, rest, partitions)
     errors = surface_errors([comparison.compare(rest, (other,))[0], comparison.compare(rest, (rest,))[0]])
-    parts = {True: [], False: []}
+    parts, beside = {True: [], False: []}, []
+    at_border = {int(v) for edge in strip.edges for v in edge if of_vertex[edge[0]] != of_vertex[edge[1]]}
     for a, b in strip.edges:
         lengths = [np.linalg.norm(p[b].astype(float) - p[a]) for p in (rest, other)]
-        parts[of_vertex[a] != of_vertex[b]].append((lengths[1] - lengths[0]) / lengths[0])
+        crosses = of_vertex[a] != of_vertex[b]
+        parts[crosses].append((lengths[1] - lengths[0]) / lengths[0])
+        if not crosses and at_border & {int(a), int(b)}:
+            beside.append(parts[False][-1])
     assert min(len(part) for part in parts.values()) > 5
     np.testing.assert_allclose(errors.across, [np.mean(parts[True]), 0], rtol=1e-5)
+    np.testing.assert_allclose(errors.beside, [np.mean(beside), 0], rtol=1e-5)
     np.testing.assert_allclose(errors.inside, [np.mean(parts[False]), 0], rtol=1e-5)
     found = errors.edges_json()
     assert found["ratio"] == pytest.approx(np.mean(parts[True]) / np.mean(parts[False]), rel=1e-5)
@@ -112,7 +117,7 @@ def test_one_partition_has_no_borders_and_an_edge_of_no_length_no_error():
     positions = np.float32([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 1, 0)])
     comparison = SurfaceComparison(surface((0, 1, 2, 3)), positions, (Partition(0, (), np.arange(4)),))
     found = surface_errors(comparison.compare(positions, (positions * 1.5,))).edges_json()
-    assert found == {"across": None, "inside": pytest.approx(0.5), "ratio": None}
+    assert found == {"across": None, "beside": None, "inside": pytest.approx(0.5), "ratio": None}
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,15 @@ def chain_rig(joints: int = 3, vertices: int = 90, seed: int = 0) -> Rig:
     skin_weights = np.stack([1 - weight, weight], axis=1).astype(np.float32)
     chain = tuple(Joint(f"bone_{number}", number - 1) for number in range(joints))
     fingerprint = Fingerprint("chain", Fingerprint.digest(positions), Fingerprint.digest(skin_weights))
-    return Rig(chain, positions, rest.astype(np.float32), skin_joints, skin_weights, fingerprint)
+    faces = chain_faces(height)
+    return Rig(chain, positions, rest.astype(np.float32), skin_joints, skin_weights, fingerprint, *faces)
+
+
+def chain_faces(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Starts and vertices of triangles, each of three vertices that follow one another along the tube."""
+    order = np.argsort(height)
+    vertices = np.stack([order[:-2], order[1:-1], order[2:]], axis=1)
+    return np.arange(0, vertices.size, 3, dtype=np.int32), vertices.astype(np.int32).ravel()
 
 
 def chain_angles(poses: int, joints: int, seed: int, reach: float = 1.0) -> np.ndarray:

@@ -17,6 +17,8 @@ from fdda_addon.core.recording import read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearLayer
 from trainer.__main__ import main
+from trainer.config import TrainingConfig
+from trainer.data import split_recording
 
 
 @pytest.fixture(scope="module")
@@ -175,3 +177,32 @@ def test_a_rig_of_one_joint_has_nothing_to_learn_and_plays(tmp_path):
     positions, trust = play(session, rig.rest_matrices[None])
     np.testing.assert_allclose(positions[0], rig.rest_positions, atol=1e-5)
     assert trust.tolist() == [[1.0]]
+
+
+def test_report_says_what_shading_shows(report, recording, session):
+    source = read_recording(recording)
+    normals, edges = report["normals"], report["edges"]
+    assert 0 < normals["fdda"]["mean"] < normals["linear"]["mean"] < normals["linear"]["p99"]
+    assert edges["fdda"]["across"] < edges["linear"]["across"]
+    layer, split = LinearLayer(source.rig), split_recording(source, TrainingConfig())
+    triangles = source.rig.face_vertices.reshape(-1, 3)
+    pairs = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    crossing = source_partition(source)[pairs[:, 0]] != source_partition(source)[pairs[:, 1]]
+    rest = np.linalg.norm(np.subtract(*source.rig.rest_positions[pairs.T]), axis=1)
+    errors = []
+    for pose in split.held_out:
+        matrices = np.array(source.pose_matrices[pose : pose + 1])
+        truth = layer.complex_positions(matrices, np.array(source.residuals[pose : pose + 1]))[0]
+        played = play(session, matrices)[0][0]
+        lengths = [np.linalg.norm(np.subtract(*positions[pairs.T]), axis=1) for positions in (played, truth)]
+        errors.append(np.abs(lengths[0] - lengths[1]) / rest)
+    assert edges["fdda"]["across"] == pytest.approx(np.mean(errors, axis=0)[crossing].mean(), rel=1e-3)
+    assert edges["fdda"]["inside"] == pytest.approx(np.mean(errors, axis=0)[~crossing].mean(), rel=1e-3)
+
+
+def source_partition(source) -> np.ndarray:
+    """(V,) number of the partition of each vertex."""
+    found = np.empty(source.rig.vertex_count, int)
+    for number, partition in enumerate(source.partitions):
+        found[partition.vertices] = number
+    return found
