@@ -3,6 +3,7 @@
 
 import contextlib
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from .scene.armature import Poser, clear_pose
 from .scene.borrow import assign_action, borrowed_pose
 from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
 
-BATCH_BYTES = 16 << 20
+BATCH_BYTES = 6 << 20
 BATCH_POSES = 250
 """Poses go to the disk in batches of at most this size, so that an interruption loses little."""
 
@@ -169,20 +170,38 @@ def append_poses(
     When it is closed, the poses that were evaluated are appended.
     """
     size = max(1, min(BATCH_POSES, BATCH_BYTES // (layer.rig.vertex_count * 12)))
-    matrices, positions = [], []
-    try:
-        for _ in poses:
-            pose, evaluated = evaluator.evaluate()
-            matrices.append(pose)
-            positions.append(evaluated)
-            if len(matrices) == size:
-                _append(writer, layer, matrices, positions)
-                matrices, positions = [], []
-            yield writer.complete + len(matrices)
-    except GeneratorExit:
-        if matrices:
-            _append(writer, layer, matrices, positions)
-        raise
+    done = writer.complete
+    with ThreadPoolExecutor(max_workers=1) as appending:
+        # While a batch is turned into residuals and written, Blender evaluates the next one.
+        previous: Future | None = None
+        matrices, positions = [], []
+        try:
+            for _ in poses:
+                pose, evaluated = evaluator.evaluate()
+                matrices.append(pose)
+                positions.append(evaluated)
+                done += 1
+                if len(matrices) == size:
+                    if previous is not None:
+                        previous.result()
+                    previous = appending.submit(_append, writer, layer, matrices, positions)
+                    matrices, positions = [], []
+                yield done
+        except GeneratorExit:
+            _append_last(previous, writer, layer, matrices, positions)
+            raise
+        _append_last(previous, writer, layer, matrices, positions)
+
+
+def _append_last(
+    previous: Future | None,
+    writer: RecordingWriter | RecordingExtension,
+    layer: LinearLayer,
+    matrices: list,
+    positions: list,
+) -> None:
+    if previous is not None:
+        previous.result()
     if matrices:
         _append(writer, layer, matrices, positions)
 

@@ -5,6 +5,8 @@ Matrices act on column vectors. A skin matrix is S_j = P_j B_j^-1, from the rest
 mesh-object space (Bailey et al. 2018, section 3).
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from .partition import Partition, make_partitions
@@ -56,6 +58,9 @@ class LinearLayer:
         self.rig = rig
         self.partitions = make_partitions(rig) if partitions is None else partitions
         self._blocks = [SkinBlock(rig, partition) for partition in self.partitions]
+        # Vertices in the order of the partitions, and back: one gather of all is far cheaper than one each.
+        self._order = np.concatenate([partition.vertices for partition in self.partitions])
+        self._back = np.argsort(self._order)
 
     def positions(self, pose_matrices: np.ndarray) -> np.ndarray:
         """Skin the mesh.
@@ -67,13 +72,10 @@ class LinearLayer:
             (N, V, 3) float32, mesh-object space, metres.
         """
         skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
-        out = np.empty((len(skin), self.rig.vertex_count, 3), np.float32)
-        for partition, block in zip(self.partitions, self._blocks, strict=True):
-            # All rows of all poses in one product: many small ones cost more than what they compute.
-            rows = skin[:, block.joints].transpose(0, 2, 1, 3).reshape(len(skin) * 3, -1)
-            moved = (rows @ block.weighted_rest).reshape(len(skin), 3, -1)
-            out[:, partition.vertices] = moved.transpose(0, 2, 1)
-        return out
+        ordered = np.empty((len(skin), self.rig.vertex_count, 3), np.float32)
+        for _, block, own in self._parts(ordered):
+            own[:] = _moved(skin, block)
+        return np.take(ordered, self._back, axis=1)
 
     def local_residuals(self, pose_matrices: np.ndarray, positions: np.ndarray) -> np.ndarray:
         """Residuals in the frames of the main joints, l_v = R_m^-1 (complex_v - lin_v).
@@ -88,22 +90,36 @@ class LinearLayer:
         Raises:
             numpy.linalg.LinAlgError: a joint's matrix is singular (a scale of zero).
         """
-        residuals = positions - self.positions(pose_matrices)
-        skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :3]
-        inverse = np.linalg.inv(skin)
-        for partition in self.partitions:
-            local = residuals[:, partition.vertices] @ inverse[:, partition.joint].transpose(0, 2, 1)
-            residuals[:, partition.vertices] = local
-        return residuals
+        skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
+        inverse = np.linalg.inv(skin[:, :, :, :3])
+        ordered = np.take(np.asarray(positions, np.float32), self._order, axis=1)
+        for partition, block, own in self._parts(ordered):
+            own -= _moved(skin, block)
+            own[:] = own @ inverse[:, partition.joint].transpose(0, 2, 1)
+        return np.take(ordered, self._back, axis=1)
 
     def complex_positions(self, pose_matrices: np.ndarray, local_residuals: np.ndarray) -> np.ndarray:
         """The inverse of `local_residuals`: lin_v + R_m l_v.
 
         Args and returns as there: (N, J, 4, 4) and (N, V, 3) in, (N, V, 3) float32 in mesh-object space out.
         """
-        positions = self.positions(pose_matrices)
-        skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :3]
-        for partition in self.partitions:
-            turned = local_residuals[:, partition.vertices] @ skin[:, partition.joint].transpose(0, 2, 1)
-            positions[:, partition.vertices] += turned
-        return positions
+        skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
+        ordered = np.take(np.asarray(local_residuals, np.float32), self._order, axis=1)
+        for partition, block, own in self._parts(ordered):
+            own[:] = own @ skin[:, partition.joint, :, :3].transpose(0, 2, 1)
+            own += _moved(skin, block)
+        return np.take(ordered, self._back, axis=1)
+
+    def _parts(self, ordered: np.ndarray) -> Iterator[tuple[Partition, SkinBlock, np.ndarray]]:
+        """Each partition with its part of an (N, V, 3) array in the order of the partitions."""
+        start = 0
+        for partition, block in zip(self.partitions, self._blocks, strict=True):
+            yield partition, block, ordered[:, start : start + len(partition.vertices)]
+            start += len(partition.vertices)
+
+
+def _moved(skin: np.ndarray, block: SkinBlock) -> np.ndarray:
+    """(N, J, 3, 4) skin matrices to the (N, Vp, 3) skinned vertices of a partition, metres."""
+    # All rows of all poses in one product: many small ones cost more than what they compute.
+    rows = skin[:, block.joints].transpose(0, 2, 1, 3).reshape(len(skin) * 3, -1)
+    return (rows @ block.weighted_rest).reshape(len(skin), 3, -1).transpose(0, 2, 1)
