@@ -30,14 +30,15 @@ class PartitionData:
         read_residuals: gives the (N, Vp, 3) float32 local residuals, metres; called once, so that not all
             partitions need to be in memory at a time.
         vertices: Vp.
-        surroundings: what the residuals are fitted to first; None when nothing is known of the joints.
+        read_surroundings: gives what the residuals are fitted to first; called once. None when nothing is known of the
+            joints.
     """
 
     name: str
     features: np.ndarray
     read_residuals: Callable[[], np.ndarray]
     vertices: int
-    surroundings: Surroundings | None = None
+    read_surroundings: Callable[[], Surroundings] | None = None
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ def partitions_of(recording: Recording, inputs: Inputs) -> list[PartitionData]:
             features[:, inputs.columns[number]],
             lambda vertices=partition.vertices: recording.residuals[:, vertices],
             len(partition.vertices),
-            make_surroundings(rig, partition, skin),
+            lambda partition=partition: make_surroundings(rig, partition, skin),
         )
         for number, partition in enumerate(recording.partitions)
     ]
@@ -152,9 +153,10 @@ def prepare(partition: PartitionData, split: Split, tolerance_mm: float, seed: i
     scale = scale[columns].astype(np.float32)
     residuals = np.asarray(partition.read_residuals(), np.float32)
     fit = LinearFit(np.zeros(0, np.int64), np.zeros((0, partition.vertices), np.float32))
-    if partition.surroundings is not None:
-        surroundings = partition.surroundings if len(columns) else partition.surroundings.alone()
-        fit, residuals = surroundings.fit(residuals, split.training)
+    if partition.read_surroundings:
+        surroundings = partition.read_surroundings()
+        seen = surroundings if len(columns) else surroundings.alone()
+        fit, residuals = seen.fit(residuals, split.training)
     residuals = residuals.reshape(len(features), -1)
     tolerance = tolerance_mm / 1000 if len(columns) else np.inf
     basis = make_basis(residuals[split.training], tolerance, np.random.default_rng([seed, 2]))
