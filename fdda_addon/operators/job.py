@@ -13,8 +13,12 @@ import bpy
 from ..core.errors import FDDAError
 from .job_state import JobState, Run, current, redraw, register, request_cancel, state_of, stop, unregister
 
-TICK_BUDGET = 0.03
-"""Seconds that a job may work at a tick; a step that is begun is finished, so steps must be short."""
+TICK_BUDGET, MOST_BUDGET = 0.03, 0.2
+"""Seconds that a job may work at a tick; a step that is begun is finished, so steps must be short.
+
+A job that borrows the scene has each of its poses drawn. Where drawing takes longer than the budget, it may work as
+long as that took, or nearly all the time would go into pictures.
+"""
 TICK_SECONDS, IDLE_TICK_SECONDS = 0.01, 0.1
 """Between the ticks of a job that works in Blender, and of one that waits for another process."""
 BLOCKING_SECONDS = 0.05
@@ -121,13 +125,17 @@ class JobOperator:
         except FDDAError as error:
             self.report({"ERROR"}, str(error))
             return False
-        self._timer, self._shown, self._redrawn = None, None, 0.0
+        self._timer, self._shown, self._redrawn, self._worked = None, None, 0.0, time.monotonic()
         self._run = Run(state, self.steps(context))
         return True
 
     def _tick(self, context: bpy.types.Context) -> set[str] | None:
         """Work a little; returns the operator's result once the job has ended."""
-        result = self._advance(context, TICK_BUDGET)
+        budget = TICK_BUDGET
+        if self.borrows_scene:
+            budget = min(max(budget, time.monotonic() - self._worked), MOST_BUDGET)
+        result = self._advance(context, budget)
+        self._worked = time.monotonic()
         if result is not None:
             self._leave(context)
             return result

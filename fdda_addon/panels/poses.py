@@ -13,7 +13,8 @@ from . import checks
 from .section import Section, draw_sentence, panel_rig
 
 AXES = "xyz"
-LOCATION = "location"
+WIDE = 380
+"""From this width of the sidebar on the table has both ends of a range, pixels at a scale of 1."""
 FITTING_SECONDS = 2.0
 
 _fitting: dict[tuple[int, int], tuple[float, bool]] = {}
@@ -42,7 +43,7 @@ class FDDA_UL_joints(bpy.types.UIList):
         ]
         return flags, []
 
-    def draw_item(self, _context: bpy.types.Context, layout: bpy.types.UILayout, _data, bone, _icon, _active, _name):
+    def draw_item(self, context: bpy.types.Context, layout: bpy.types.UILayout, _data, bone, _icon, _active, _name):
         from ..scene.armature import is_moved_by_constraints
         from ..scene.motion_range import DEFAULT, rotation_ranges
 
@@ -53,10 +54,18 @@ class FDDA_UL_joints(bpy.types.UIList):
             return
         row.label(text=bone.name, icon="BONE_DATA")
         row = row.row(align=True)
+        region = context.region
+        is_wide = region is not None and region.width / context.preferences.system.ui_scale >= WIDE
         for r in rotation_ranges(bone):
             cell = row.row()
             cell.active = r.moves and r.source != DEFAULT
-            cell.label(text=f"{math.degrees(r.low):.0f}…{math.degrees(r.high):.0f}°" if r.moves else "fixed")
+            cell.label(text=_degrees(r.low, r.high, is_wide) if r.moves else "fixed")
+
+
+def _degrees(low: float, high: float, is_wide: bool) -> str:
+    """A range, or only its width where the sidebar is narrow."""
+    low, high = math.degrees(low), math.degrees(high)
+    return f"{low:.0f}…{high:.0f}°" if is_wide else f"{high - low:.0f}°"
 
 
 class FDDA_UL_actions(bpy.types.UIList):
@@ -93,7 +102,7 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         if rig is None:
             return
         session, bones = context.window_manager.fdda, rig.armature_object.pose.bones
-        layout.label(text="Range of motion (X, Y, Z)")
+        layout.label(text="Range of motion about X, Y and Z")
         layout.template_list("FDDA_UL_joints", "", rig.armature_object.pose, "bones", session, "joint_index", rows=5)
         if 0 <= session.joint_index < len(bones):
             _draw_ranges(layout.box(), rig, bones[session.joint_index])
@@ -166,7 +175,7 @@ def _draw_actions(layout: bpy.types.UILayout, context: bpy.types.Context, rig: S
         return
     layout.label(text="Actions to record as well")
     session = context.window_manager.fdda
-    layout.template_list("FDDA_UL_actions", "", bpy.data, "actions", session, "action_index", rows=2, maxrows=5)
+    layout.template_list("FDDA_UL_actions", "", bpy.data, "actions", session, "action_index", rows=min(4, len(fitting)))
     settings = rig.mesh_object.fdda.settings
     if not settings.poses and not any(action.fdda.record for action in fitting):
         draw_sentence(

@@ -78,7 +78,7 @@ def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Scen
         for name, milliseconds in (
             ("This rig", f"{cost.rig:.2f} ms a frame"),
             ("Armature alone", f"{cost.linear:.2f} ms"),
-            ("With a model", f"about {cost.model:.1f} ms (estimate)"),
+            ("With a model", f"{cost.model:.1f} ms, estimated"),
         ):
             row = column.split(factor=0.45)
             row.label(text=name)
