@@ -61,6 +61,8 @@ class Creation:
             self._check_source()
             yield Progress("looking for a Python", 0, 0)
             bases = self._find_bases(log)
+            if self.wheels is not None:
+                self._check_wheels(bases[0])
             complete = False
             try:
                 yield Progress("removing what was there", 0, 0)
@@ -93,10 +95,18 @@ class Creation:
                 )
         elif not self.wheels.is_dir():
             raise TrainerEnvironmentError(f"'{self.wheels}' is no folder; choose the one that holds the wheels.")
-        elif not any(self.wheels.glob("torch-*.whl")):
+
+    def _check_wheels(self, base: BasePython) -> None:
+        """Before what is there is removed: pip would find a missing wheel late, and call it a conflict of versions."""
+        pinned = [line for line in pins(base.version).read_text(encoding="utf-8").splitlines() if "==" in line]
+        wanted = [line.split("==") for line in pinned if line.partition("==")[0] in PACKAGES]
+        missing = [
+            f"{name} {version}" for name, version in wanted if not any(self.wheels.glob(f"{name}-{version}[-+]*.whl"))
+        ]
+        if missing:
             raise TrainerEnvironmentError(
-                f"The folder '{self.wheels}' holds no wheel of torch; download what the trainer needs into it on a "
-                "machine that is online (see the manual)."
+                f"The folder '{self.wheels}' lacks the wheels of {', '.join(missing)}; download what the trainer needs "
+                f"into it on a machine that is online, for Python {base.version[0]}.{base.version[1]} (see the manual)."
             )
 
     def _find_bases(self, log: IO[str]) -> list[BasePython]:
@@ -131,24 +141,33 @@ class Creation:
         )
 
     def _install(self, base: BasePython, log: IO[str]) -> Iterator[Progress]:
-        python, temporary = str(python_in(self.folder)), self.folder / "temporary"
+        temporary = self.folder / "temporary"
         temporary.mkdir()
-        pip = [python, "-I", "-m", "pip"]
+        pip = [str(python_in(self.folder)), "-I", "-m", "pip"]
         command = [*pip, "install", "--no-input", "--disable-pip-version-check", "--no-cache-dir"]
-        command += ["--only-binary=:all:", "--constraint", str(pins(base.version))]
+        command += ["--only-binary=:all:", "--constraint", str(pins(base.version)), *PACKAGES]
         if (yield from self._run([*pip, "--version"], log)) == 0:
             version = re.search(r"pip (\d+)\.(\d+)", "\n".join(self._last_lines))
             raw = version is not None and tuple(map(int, version.groups())) >= PIP_WITH_RAW_PROGRESS
             command.append(f"--progress-bar={'raw' if raw else 'off'}")
         if self.wheels is not None:
             command += ["--no-index", "--find-links", str(self.wheels)]
-        if (yield from self._run([*command, *PACKAGES], log, temporary)) != 0:
+        if (yield from self._run(command, log, self._pip_environment(temporary))) != 0:
             what = f"of '{self.wheels}'" if self.wheels else "of the package index"
             then = "add what is missing" if self.wheels else "is this machine online, the disk full?"
             raise TrainerEnvironmentError(
                 f"The packages {what} could not be installed ({self._last_words()}); {then}; the log is '{self.log}'."
             )
         shutil.rmtree(temporary, ignore_errors=True)
+
+    def _pip_environment(self, temporary: Path) -> dict[str, str]:
+        environment = clean_environment()
+        if self.wheels is not None:
+            # That folder and no other: pip's settings may name more.
+            environment = {name: value for name, value in environment.items() if not name.startswith("PIP_")}
+            environment["PIP_CONFIG_FILE"] = os.devnull
+        # Gigabytes, more than a /tmp in memory holds; what is killed leaves them, to be removed with the rest.
+        return environment | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
 
     def _check(self, log: IO[str]) -> Answer:
         answer = check(str(python_in(self.folder)), f"the log is '{self.log}'")
@@ -158,12 +177,8 @@ class Creation:
             raise TrainerEnvironmentError(f"The packages were installed but do not work: {answer.message}")
         return answer
 
-    def _run(self, command: list[str], log: IO[str], temporary: Path | None = None) -> Iterator[Progress]:
+    def _run(self, command: list[str], log: IO[str], environment: dict[str, str] | None = None) -> Iterator[Progress]:
         """Run one step; returns its exit status. Not in the folder itself: Windows would not let that be removed."""
-        environment = clean_environment()
-        if temporary is not None:
-            # Gigabytes, more than a /tmp in memory holds; what is killed leaves them, to be removed with the rest.
-            environment |= dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
         log.write(f"$ {subprocess.list2cmdline(command)}\n")
         self._last_lines = []
         with self._lock:
@@ -174,7 +189,7 @@ class Creation:
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.PIPE,
                     stderr=subprocess.STDOUT,
-                    env=environment,
+                    env=environment or clean_environment(),
                     cwd=self.folder.parent,
                     start_new_session=True,
                     **hidden(),
@@ -208,9 +223,9 @@ class Creation:
             yield Progress(line, 0, 0)
 
     def _last_words(self) -> str:
-        """The line that says best why a step failed."""
-        errors = [line for line in self._last_lines if line.startswith(("ERROR:", "Error:"))]
-        return (errors or self._last_lines or ["it said nothing"])[-1].removeprefix("ERROR: ")
+        """The line that says best why a step failed: pip's last error, but not the one that points to its manual."""
+        errors = [line for line in self._last_lines if re.match("error:", line, re.IGNORECASE) and "http" not in line]
+        return (errors or self._last_lines or ["it said nothing"])[-1].removeprefix("ERROR: ").rstrip(".")
 
     def _stop_if_cancelled(self) -> None:
         if self._cancelled:

@@ -1,0 +1,277 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The environment that the add-on makes for the trainer: real virtual environments, from wheels of a few lines."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import bpy
+import pytest
+from conftest import run
+from tiny_wheels import pinned, write_wheel, write_wheels
+
+from fdda_addon.core.errors import TrainerEnvironmentError
+from fdda_addon.operators.trainer_environment import FDDA_OT_create_trainer_environment, _watch
+from fdda_addon.trainer_environment import choice, creation, folder, session
+from fdda_addon.trainer_environment.choice import Origin
+from fdda_addon.trainer_environment.creation import Creation
+from fdda_addon.trainer_environment.folder import FolderState
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(autouse=True)
+def user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The add-on's own files lie in a folder of the test, and no variable names a Python."""
+    monkeypatch.setattr(folder, "user_folder", lambda: tmp_path / "user")
+    monkeypatch.delenv(choice.PYTHON_VARIABLE, raising=False)
+    session.stop()
+    return tmp_path / "user"
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_wheels(tmp_path_factory.mktemp("tiny") / "wheels")
+
+
+@pytest.fixture(scope="module")
+def made(wheels: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An environment that is complete."""
+    path = tmp_path_factory.mktemp("made") / "trainer"
+    *_, answer = Creation(path, path.with_name("log"), wheels, sys.executable).steps()
+    assert answer.level == "INFO"
+    return path
+
+
+@pytest.fixture
+def own(made: Path, user: Path) -> Path:
+    """The add-on's own environment, complete."""
+    shutil.copytree(made, folder.own_folder(), symlinks=True)
+    return folder.own_folder()
+
+
+@pytest.fixture
+def preferences():
+    """The preferences, as an installed extension has them."""
+    addon = bpy.context.preferences.addons.new()
+    addon.module = "fdda_addon"
+    yield addon.preferences
+    bpy.context.preferences.addons.remove(addon)
+
+
+def create(**options: str) -> set[str]:
+    return bpy.ops.fdda.create_trainer_environment(python=sys.executable, **options)
+
+
+def refused(operator, **options: str) -> str:
+    """The sentence that an operator refuses with."""
+    with pytest.raises(RuntimeError) as caught:
+        operator(**options)
+    return str(caught.value).removeprefix("Error: ").strip()
+
+
+def test_the_packages_are_what_the_trainer_asks_for():
+    groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
+    assert sorted(folder.PACKAGES) == sorted(requirement.partition("==")[0] for requirement in groups["trainer"])
+    assert all(path.is_file() for path in map(folder.pins, folder.PINS))
+
+
+def test_it_is_created_from_a_folder_of_wheels(user: Path, wheels: Path):
+    junk = folder.own_folder() / "bin" / "left by one that was interrupted"
+    junk.mkdir(parents=True)
+    assert session.own_state() is FolderState.HALF_MADE
+    assert create(wheels=str(wheels)) == {"FINISHED"}
+    assert session.own_state() is FolderState.READY and not junk.exists()
+    assert choice.chosen_python() == (str(folder.python_in(folder.own_folder())), Origin.OWN)
+    assert session.answer.message.endswith(f"torch {pinned('torch')}.")
+    assert session.answer.message.startswith("Ready to train on the processor: Python 3.")
+    assert f"onnx {pinned('onnx')}" in session.answer.details
+    log = folder.log_path().read_text()
+    assert "-m venv" in log and "Successfully installed" in log and "Ready to train" in log
+    assert sorted(path.name for path in user.iterdir()) == ["trainer", "trainer.lock", "trainer.log"]
+    assert not (folder.own_folder() / "temporary").exists()
+
+
+def test_the_other_pythons_come_first(own: Path, preferences, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    assert choice.chosen_python() == (str(folder.python_in(own)), Origin.OWN)
+    monkeypatch.setenv(choice.PYTHON_VARIABLE, "/of/the/variable")
+    assert choice.chosen_python() == ("/of/the/variable", Origin.VARIABLE)
+    preferences.trainer_python = "/of/the/preferences"
+    assert choice.chosen_python() == ("/of/the/preferences", Origin.PREFERENCES)
+    preferences.trainer_python = str(own) + os.sep
+    assert choice.chosen_python() == (str(folder.python_in(own)), Origin.PREFERENCES)
+
+
+def test_without_any_it_is_the_python_that_runs_this():
+    assert choice.chosen_python() == (sys.executable, Origin.THIS)
+
+
+def test_one_that_another_python_hides_says_so(user: Path, wheels: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv(choice.PYTHON_VARIABLE, sys.executable)
+    assert create(wheels=str(wheels)) == {"FINISHED"}
+    assert session.answer is None and session.notice.level == "WARNING"
+    assert "FDDA_TRAINER_PYTHON names another Python, which is used in its place" in session.notice.message
+
+
+def test_a_wheel_that_is_missing(own: Path, wheels: Path, tmp_path: Path):
+    shutil.copytree(wheels, tmp_path / "fewer")
+    next((tmp_path / "fewer").glob("onnx-*")).unlink()
+    text = refused(create, wheels=str(tmp_path / "fewer"))
+    assert text.startswith(
+        f"The folder '{tmp_path}/fewer' lacks the wheels of onnx {pinned('onnx')}; download what the"
+    )
+    assert session.own_state() is FolderState.READY
+    assert session.notice.message == text
+
+
+def test_a_wheel_of_a_package_that_those_need_is_missing(user: Path, wheels: Path, tmp_path: Path):
+    shutil.copytree(wheels, tmp_path / "fewer")
+    write_wheel(tmp_path / "fewer", "onnx", requires="fdda-nowhere")
+    text = refused(create, wheels=str(tmp_path / "fewer"))
+    assert text == (
+        f"The packages of '{tmp_path}/fewer' could not be installed (No matching distribution found for fdda-nowhere); "
+        f"add what is missing; the log is '{folder.log_path()}'."
+    )
+    assert session.own_state() is FolderState.MISSING
+    assert "No matching distribution" in folder.log_path().read_text()
+
+
+def test_packages_that_do_not_work_are_no_environment(user: Path, wheels: Path, tmp_path: Path):
+    shutil.copytree(wheels, tmp_path / "broken")
+    write_wheel(tmp_path / "broken", "torch", "raise OSError('libcudart.so.13 is missing')\n")
+    text = refused(create, wheels=str(tmp_path / "broken"))
+    assert "installed but do not work: torch of" in text and "libcudart.so.13 is missing" in text
+    assert session.own_state() is FolderState.MISSING
+
+
+def test_a_folder_without_wheels_leaves_what_is_there(own: Path, tmp_path: Path):
+    assert refused(create, wheels=str(tmp_path)).startswith(f"The folder '{tmp_path}' lacks the wheels of ")
+    assert refused(create, wheels="/none").startswith("'/none' is no folder; ")
+    assert session.own_state() is FolderState.READY
+
+
+def test_offline_it_asks_for_wheels(user: Path, preferences, tmp_path: Path):
+    assert not bpy.app.online_access
+    assert refused(create) == (
+        "Blender's online access is off: allow it in Preferences > System > Network, choose a folder of wheels, or "
+        "choose an existing Python that has torch."
+    )
+    preferences.wheels_folder = str(tmp_path)
+    assert "lacks the wheels of matplotlib" in refused(create)
+
+
+def test_a_full_disk_is_noticed_before(user: Path, own: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(creation, "NEEDED_GB", 10**9)
+    with pytest.raises(TrainerEnvironmentError, match=r"needs 1000000000 GB and '.*' has [\d.]+ GB left; make room"):
+        list(Creation(own, folder.log_path()).steps())
+    assert session.own_state() is FolderState.READY
+
+
+def test_a_python_that_cannot_make_one(user: Path, wheels: Path, tmp_path: Path):
+    broken = tmp_path / "python"
+    broken.write_text(
+        f'#!/bin/sh\nif [ "$2" = -c ]; then "{sys.executable}" "$@" | sed "s|{sys.executable}|$0|"; exit; fi\n'
+        "echo 'Error: no room for it'; exit 1\n"
+    )
+    broken.chmod(0o755)
+    text = refused(bpy.ops.fdda.create_trainer_environment, python=str(broken), wheels=str(wheels))
+    assert "can make the trainer environment" in text and "Error: no room for it" in text and "install Python 3" in text
+    assert "'/none/python' is no Python that runs; " in refused(
+        bpy.ops.fdda.create_trainer_environment, python="/none/python", wheels=str(wheels)
+    )
+
+
+def test_a_second_blender_waits(user: Path, own: Path):
+    code = "import sys; from pathlib import Path; from fdda_addon.trainer_environment.folder import claimed\n"
+    code += "with claimed(Path(sys.argv[1])): print('mine', flush=True); sys.stdin.read()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, own], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout.readline() == "mine\n"
+        text = refused(bpy.ops.fdda.remove_trainer_environment)
+        assert text == "Another Blender is making or removing the trainer environment; wait until it is done."
+        assert own.is_dir()
+        other.communicate()
+    assert bpy.ops.fdda.remove_trainer_environment() == {"FINISHED"}
+    assert session.own_state() is FolderState.MISSING
+
+
+def wait_for(condition, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_cancelled_it_ends_at_once_and_leaves_nothing(user: Path, wheels: Path):
+    job = Creation(folder.own_folder(), folder.log_path(), wheels, sys.executable)
+    session.start(session.Task("Create", job.steps(), job.cancel, FDDA_OT_create_trainer_environment.keep))
+    assert not bpy.ops.fdda.create_trainer_environment.poll()
+    wait_for(lambda: folder.own_folder().is_dir())
+    process = job._process
+    assert bpy.ops.fdda.cancel_trainer_environment() == {"FINISHED"}
+    wait_for(lambda: session.task.outcome is not None, 10)
+    assert process is None or process.poll() is not None
+    assert _watch() is None and session.task is None
+    assert session.notice.level == "WARNING" and "was cancelled; nothing is left of it" in session.notice.message
+    assert session.own_state() is FolderState.MISSING
+    assert not bpy.ops.fdda.cancel_trainer_environment.poll()
+
+
+def test_unregistering_ends_what_is_under_way(user: Path, wheels: Path):
+    import fdda_addon
+
+    job = Creation(folder.own_folder(), folder.log_path(), wheels, sys.executable)
+    session.start(session.Task("Create", job.steps(), job.cancel, FDDA_OT_create_trainer_environment.keep))
+    wait_for(lambda: folder.own_folder().is_dir())
+    fdda_addon.unregister()
+    assert session.task is None and choice.preferred_python is None and not folder.own_folder().exists()
+
+
+def test_a_check_in_the_background_is_kept(own: Path):
+    python = choice.chosen_python()
+    steps = iter([choice.ping(python)])
+    session.start(session.Task("Check", steps, None, session.remember))
+    wait_for(lambda: session.task.outcome is not None)
+    assert _watch() is None
+    assert session.answer.level == "INFO" and session.notice is None
+
+
+def test_an_environment_whose_python_is_gone(own: Path, elbow, tmp_path: Path, capfd: pytest.CaptureFixture):
+    folder.python_in(own).unlink()
+    assert session.own_state() is FolderState.BROKEN
+    assert run("train", elbow.recording, tmp_path / "m.onnx") == 1
+    python = folder.python_in(own)
+    assert capfd.readouterr().err.strip() == (
+        f"Error: The trainer's Python '{python}' cannot be started (No such file or directory); create the trainer "
+        "environment again, in the add-on's preferences."
+    )
+
+
+def test_an_environment_whose_torch_is_gone(own: Path):
+    shutil.rmtree(next(own.rglob("site-packages/torch")))
+    text = refused(bpy.ops.fdda.check_trainer)
+    assert text.endswith("lacks torch; create the trainer environment again, in the add-on's preferences.")
+    assert session.answer.level == "ERROR" and "torch is missing" in session.answer.details
+
+
+def test_an_environment_of_other_versions_still_trains(own: Path):
+    (own / folder.MARK).write_text("of another time\n")
+    assert session.own_state() is FolderState.OUTDATED
+    assert choice.chosen_python().origin is Origin.OWN
+    (own / folder.MARK).write_bytes(b"\xff\xfe\x00")
+    assert folder.folder_state(own) is FolderState.HALF_MADE
+
+
+def test_what_is_removed_is_half_made_first(own: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(path: object) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(shutil, "rmtree", full)
+    text = refused(bpy.ops.fdda.remove_trainer_environment)
+    assert text.startswith("The trainer environment cannot be removed (Permission denied: ") and str(own) in text
+    assert session.own_state() is FolderState.HALF_MADE and choice.chosen_python().origin is Origin.THIS

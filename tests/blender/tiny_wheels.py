@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Wheels of a few lines with the names and versions of what the trainer needs: enough to install and to import."""
+
+import re
+import sys
+import zipfile
+from pathlib import Path
+
+from fdda_addon.trainer_environment.folder import PACKAGES, pins
+
+TORCH = """__version__ = "{version}"
+class cuda:
+    is_available = staticmethod(lambda: False)
+"""
+
+
+def pinned(package: str) -> str:
+    """The version that an environment made from this Python gets."""
+    return re.search(rf"^{package}==(\S+)$", pins(sys.version_info[:2]).read_text(), re.MULTILINE)[1]
+
+
+def write_wheel(folder: Path, package: str, text: str = '__version__ = "{version}"\n', requires: str = "") -> Path:
+    """Write the wheel of a package whose `__init__.py` is `text`, and which requires another."""
+    version = pinned(package)
+    information = f"{package}-{version}.dist-info"
+    path = folder / f"{package}-{version}-py3-none-any.whl"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(f"{package}/__init__.py", text.replace("{version}", version))
+        metadata = f"Metadata-Version: 2.1\nName: {package}\nVersion: {version}\n"
+        archive.writestr(f"{information}/METADATA", metadata + (f"Requires-Dist: {requires}\n" if requires else ""))
+        archive.writestr(f"{information}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        archive.writestr(f"{information}/RECORD", "")
+    return path
+
+
+def write_wheels(folder: Path) -> Path:
+    """Write the wheels of all that the trainer needs; returns the folder."""
+    folder.mkdir()
+    for package in PACKAGES:
+        write_wheel(folder, package, *([TORCH] if package == "torch" else []))
+    return folder
