@@ -8,7 +8,7 @@ import bpy
 if TYPE_CHECKING:  # Blender starts without numpy.
     import numpy as np
 
-WIDTH, HEIGHT = 256, 128
+WIDTH, HEIGHT = 192, 192
 LINE = 1.6
 """Half the width of a line, pixels."""
 LEGEND = {
@@ -26,10 +26,10 @@ def draw(layout: bpy.types.UILayout, curves: dict[str, list[float]]) -> None:
     lengths = [len(curves.get(name, ())) for name in LEGEND]
     if min(lengths) < 2:
         return
-    layout.template_icon(icon_value=_icon(curves), scale=12)
-    row = layout.row()
+    layout.template_icon(icon_value=_icon(curves), scale=9)
+    column = layout.column(align=True)
     for name, (label, icon, _) in LEGEND.items():
-        row.label(text=f"{label} {curves[name][-1]:.3f} mm", icon=icon)
+        column.label(text=f"{label}: {curves[name][-1]:.3f} mm", icon=icon)
 
 
 def _icon(curves: dict[str, list[float]]) -> int:

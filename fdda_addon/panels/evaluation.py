@@ -25,7 +25,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         return rig is not None and last_evaluation.of(rig.mesh_object) is not None
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, view = self.layout, context.window_manager.fdda_view
+        layout, view = self.usable_layout(), context.window_manager.fdda_view
         scene_rig, reason = panel_rig(context)
         if scene_rig is None:
             draw_sentence(layout, context, reason, "INFO")
@@ -46,7 +46,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
             layout.operator("fdda.open_report", icon="URL")
 
     def _draw_start(self, context: bpy.types.Context, scene_rig: object) -> None:
-        layout, view = self.layout, context.window_manager.fdda_view
+        layout, view = self.usable_layout(), context.window_manager.fdda_view
         state = job.state_of("evaluate")
         if state is not None and state.is_running:
             draw_job(layout, context, "evaluate", "poses")

@@ -57,7 +57,7 @@ class FDDA_PT_models(Section, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
+        layout = self.usable_layout()
         scene_rig, reason = panel_rig(context)
         if scene_rig is None:
             draw_sentence(layout, context, reason, "INFO")
@@ -80,7 +80,7 @@ class FDDA_PT_models(Section, bpy.types.Panel):
     def _draw_entry(
         self, context: bpy.types.Context, mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup
     ) -> None:
-        layout = self.layout
+        layout = self.usable_layout()
         states = _models.look(mesh_object)
         state = (states or {}).get(_key(entry))
         if is_bound(mesh_object, entry):

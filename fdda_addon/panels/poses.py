@@ -97,7 +97,7 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
     bl_label = "Poses"
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
+        layout = self.usable_layout()
         rig = panel_rig(context)[0]
         if rig is None:
             return

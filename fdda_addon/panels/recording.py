@@ -19,6 +19,8 @@ from .section import Section, draw_job, draw_path, draw_sentence, panel_rig
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.recording_folder import FolderContent
 
+UNITS = {"influences": "joint tests"}
+
 _contents: "dict[int, tuple[tuple, FolderContent]]" = {}
 """What was found in the folder of a character, by session_uid of its mesh object, and for which question."""
 
@@ -65,17 +67,17 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
             return False
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
+        layout = self.usable_layout()
         running = job.current()
         if running and running.verb == "record":
-            draw_job(layout, context, "record", running.stage)
+            draw_job(layout, context, "record", UNITS.get(running.stage, running.stage))
             draw_sentence(layout, context, "ESC cancels as well; what is recorded is kept.", "INFO")
             return
         rig = panel_rig(context)[0]
         if rig is None:
             return
         _draw_folder(layout, context, rig)
-        draw_job(layout, context, "record", "poses")
+        draw_job(layout, context, "record", "poses", ("ERROR",))
 
 
 def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:

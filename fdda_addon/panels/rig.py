@@ -31,7 +31,7 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
         return check is not None and not check.problems
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
+        layout = self.usable_layout()
         rig, sentence = panel_rig(context)
         if rig is None:
             draw_sentence(layout, context, sentence, "INFO")

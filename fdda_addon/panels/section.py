@@ -30,6 +30,12 @@ class Section:
         running = job.current()
         return panel_rig(context)[0] is not None or (running is not None and running.verb in cls.verbs)
 
+    def usable_layout(self) -> bpy.types.UILayout:
+        """The layout of the panel; nothing in it can be changed while the job of another section borrows the scene."""
+        running = job.current()
+        self.layout.enabled = running is None or not running.borrows_scene or running.verb in self.verbs
+        return self.layout
+
     @classmethod
     def is_done(cls, _context: bpy.types.Context) -> bool:
         """Whether what this section is for has been done; the header has a tick then."""
@@ -65,13 +71,20 @@ def draw_path(layout: bpy.types.UILayout, owner: bpy.types.bpy_struct, name: str
     column.prop(owner, name, text="")
 
 
-def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context, verb: str, unit: str) -> bool:
+def draw_job(
+    layout: bpy.types.UILayout,
+    context: bpy.types.Context,
+    verb: str,
+    unit: str,
+    levels: tuple[str, ...] = ("INFO", "WARNING", "ERROR"),
+) -> bool:
     """Draw how far the job of this verb is with a button to cancel it, or how it ended.
 
     Args:
         layout, context: as in `draw`.
         verb: of the job.
         unit: what it counts, "poses".
+        levels: ends of these levels are drawn; others, the section says itself.
 
     Returns:
         Whether it runs.
@@ -80,7 +93,10 @@ def draw_job(layout: bpy.types.UILayout, context: bpy.types.Context, verb: str, 
     if state is None:
         return False
     if not state.is_running:
-        draw_sentence(layout, context, state.outcome, OUTCOME_ICONS[state.outcome_level])
+        rig = panel_rig(context)[0]
+        is_own = not state.subject or (rig is not None and rig.mesh_object.name == state.subject)
+        if is_own and state.outcome_level in levels:
+            draw_sentence(layout, context, state.outcome, OUTCOME_ICONS[state.outcome_level])
         return False
     column = layout.column(align=True)
     column.progress(factor=state.fraction, text=f"{state.done} of {state.total} {unit}" if state.total else "Starting…")

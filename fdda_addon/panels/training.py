@@ -41,7 +41,7 @@ class FDDA_PT_training(Section, bpy.types.Panel):
             return False
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
+        layout = self.usable_layout()
         running = job.current()
         if running and running.verb == "train":
             draw_job(layout, context, "train", "epochs")
@@ -57,7 +57,7 @@ class FDDA_PT_training(Section, bpy.types.Panel):
         _draw_settings(layout, context, rig, ready)
         draw_job(layout, context, "train", "epochs")
         ended = job.state_of("train")
-        if ended is not None:
+        if ended is not None and ended.subject == rig.mesh_object.name:
             curves.draw(layout, ended.curves)
         _draw_report(layout, context, rig)
 
@@ -108,7 +108,8 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context, rig: 
             draw_sentence(layout, context, "There is no complete recording of this rig yet; record first.", "INFO")
             ready = False
         elif model.is_file():
-            draw_sentence(layout, context, f"Training replaces '{model.name}'.", "INFO")
+            text = f"'{model.name}' is there: bind it under Playback. To train again replaces it."
+            draw_sentence(layout, context, text, "CHECKMARK")
     row = layout.row()
     row.enabled = ready
     row.scale_y = 1.3
