@@ -72,9 +72,14 @@ class ChoosesModel:
     check_existing: bpy.props.BoolProperty(default=False, options={"HIDDEN"})
 
     def choose(self, context: bpy.types.Context) -> set[str]:
-        """Open the file browser; `execute` follows."""
+        """Open the file browser in the folder of the .blend file; `execute` follows."""
+        self.filepath = bpy.path.abspath("//")
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        # The file browser would list the properties.
+        pass
 
     def path(self) -> Path:
         """The path that was chosen."""

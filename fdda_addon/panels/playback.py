@@ -33,7 +33,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         return rig is not None and rig.mesh_object.fdda.is_bound and not rig.mesh_object.fdda.status
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
+        layout = self.usable_layout()
         scene_rig, reason = panel_rig(context)
         if scene_rig is None:
             draw_sentence(layout, context, reason, "INFO")
@@ -62,7 +62,8 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
 
     def _draw_bound(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
         layout, binding = self.layout, mesh_object.fdda
-        layout.label(text=f"{bound_name(mesh_object)} is bound", icon="CHECKMARK" if not binding.status else "ERROR")
+        verb, icon = ("cannot play", "ERROR") if binding.status else ("is bound", "LINKED")
+        layout.label(text=f"{bound_name(mesh_object)} {verb}", icon=icon)
         if binding.status:
             box = layout.box()
             box.alert = True
@@ -82,7 +83,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         column.prop(binding, "use_in_render")
 
     def _draw_times(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
-        layout = self.layout
+        layout = self.usable_layout()
         header, body = layout.panel("fdda_frame_times", default_closed=False)
         header.label(text="Time a Frame")
         if body is None:

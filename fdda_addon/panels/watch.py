@@ -7,6 +7,8 @@ import bpy
 
 from ..operators.job_state import current, redraw
 
+SECOND_DRAWING = 0.1
+
 
 class Watch:
     """A value about mesh objects.
@@ -57,3 +59,5 @@ class Watch:
             self.now(mesh_object)
         if self._values != before:
             redraw()
+            # A panel of another height than before finds its place at the second drawing.
+            bpy.app.timers.register(redraw, first_interval=SECOND_DRAWING)
