@@ -99,7 +99,7 @@ def _plain(axes: Axes) -> None:
 
 def _legend(figure: Figure, colours: dict[str, str]) -> None:
     handles = [Line2D([], [], color=colour, linewidth=2, label=name) for name, colour in colours.items()]
-    handles.append(Line2D([], [], color=GREY, linewidth=1, linestyle=DASHES, label="what the basis leaves"))
+    handles.append(Line2D([], [], color=GREY, linewidth=1, linestyle=DASHES, label="a network without error"))
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=LABEL)
 
 

@@ -48,7 +48,7 @@ def _errors_and_times(result: dict) -> str:
         left += [f"{fmean(partitions[name]['basis_left']['held_out'] for partitions in every):.4f}", ""]
         errors = every[0][name]["held_out_linear"]
         linear += [f"{errors['mean']:.4f}", f"{errors['max']:.2f}"]
-    rows.append(["the basis alone, its best coefficients known", "", "", *left, "", "", ""])
+    rows.append(["a network without error", "", "", *left, "", "", ""])
     rows.append(["the linear layer", "", "", *linear, "", "", ""])
     return _markdown(rows)
 
@@ -69,7 +69,7 @@ def _effects(result: dict) -> str:
     between = ["largest by smallest of the seeds, median configuration"]
     for measure in measures.values():
         spreads = [max(measure(c)) / min(measure(c)) for c in configurations]
-        between.append(f"{median(spreads):.3f} (up to {max(spreads):.3f})")
+        between.append(f"{median(spreads):.2f} (up to {max(spreads):.2f})")
     return _markdown([*rows, between])
 
 
@@ -88,7 +88,7 @@ def _factor(ratios: list[float]) -> str:
     if not ratios:
         return ""
     lower = sum(ratio < 1 for ratio in ratios)
-    mean, least, most = (f"{value:.3g}" for value in (geometric_mean(ratios), min(ratios), max(ratios)))
+    mean, least, most = (f"{value:.2f}" for value in (geometric_mean(ratios), min(ratios), max(ratios)))
     return f"{mean} ({least} to {most}), less in {lower} of {len(ratios)}"
 
 

@@ -116,7 +116,7 @@ def test_a_factor_is_the_ratio_of_what_differs_in_it_alone(result):
             for partition in training["partitions"].values():
                 partition["held_out"]["mean"] = (2.0 if configuration["units"] == 24 else 4.0) * (1 + seed)
     (row,) = [line for line in tables(result).splitlines() if line.startswith("| 24 units")]
-    assert row.split(" | ")[1] == "0.5 (0.5 to 0.5), less in 4 of 4"
+    assert row.split(" | ")[1] == "0.50 (0.50 to 0.50), less in 4 of 4"
 
 
 def test_it_goes_on_where_it_was_interrupted(studied, recording, held_out, capsys):
