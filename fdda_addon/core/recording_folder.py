@@ -12,6 +12,9 @@ from .recording_lock import LOCK, RecordingLock
 from .recording_writer import different_keys
 from .rig import Fingerprint, Joint, Rig, differences
 
+SETTINGS = {"limits": "range of motion", "sources": "number of poses or actions"}
+"""What people call the keys of a sampling."""
+
 
 class FolderState(enum.Enum):
     """What a folder holds."""
@@ -61,15 +64,17 @@ def read_folder(path: Path, rig: Rig | None = None, sampling: dict | None = None
             *counts,
             f"'{path.name}' holds a recording of another rig: {'; '.join(found)}. Choose another folder, or remove it.",
         )
+    found = different_keys(index["sampling"], sampling) if sampling is not None else []
+    names = ", ".join(sorted({SETTINGS.get(key.partition(".")[0], key) for key in found}))
     if counts[0] == counts[1]:
-        return FolderContent(FolderState.COMPLETE, *counts)
-    if sampling is not None and (found := different_keys(index["sampling"], sampling)):
-        names = sorted({key.partition(".")[0] for key in found})
+        sentence = f"It was recorded with other settings than those above: {names}." if found else ""
+        return FolderContent(FolderState.COMPLETE, *counts, sentence)
+    if found:
         return FolderContent(
             FolderState.OTHER,
             *counts,
-            f"'{path.name}' was begun with other settings ({', '.join(names)}) and has {counts[0]} of {counts[1]} "
-            "poses. Set them as they were to resume, choose another folder, or remove it.",
+            f"'{path.name}' was begun with other settings ({names}) and has {counts[0]} of {counts[1]} poses. Set them "
+            "as they were to resume, choose another folder, or remove it.",
         )
     return FolderContent(FolderState.INCOMPLETE, *counts)
 

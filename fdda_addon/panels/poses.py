@@ -50,7 +50,7 @@ class FDDA_UL_joints(bpy.types.UIList):
         row = layout.split(factor=0.4)
         if is_moved_by_constraints(bone):
             row.label(text=bone.name, icon="CONSTRAINT_BONE")
-            row.label(text="moved by constraints")
+            row.label(text="constrained")
             return
         row.label(text=bone.name, icon="BONE_DATA")
         row = row.row(align=True)
@@ -120,9 +120,9 @@ def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBon
     box.label(text=f"{bone.name} ({', '.join(where[source] for source in sorted(sources))})", icon="BONE_DATA")
     column = box.column(align=True)
     for axis, r in enumerate(ranges):
-        row = column.row(align=True)
-        lock = "LOCKED" if bone.lock_rotation[axis] else "UNLOCKED"
-        row.prop(bone, "lock_rotation", index=axis, text=AXES[axis].upper(), icon=lock, toggle=1)
+        row = column.split(factor=0.25, align=True)
+        # Blender draws the next icon, a closed lock, for an axis that is locked.
+        row.prop(bone, "lock_rotation", index=axis, text=AXES[axis].upper(), icon="UNLOCKED", toggle=1)
         fields = row.row(align=True)
         fields.enabled = not bone.lock_rotation[axis]
         if r.source == DEFAULT:

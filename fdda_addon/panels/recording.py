@@ -106,6 +106,8 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         draw_sentence(
             layout, context, f"'{path.name}' is complete: {content.poses:,} poses. Train on it next.", "CHECKMARK"
         )
+        if content.sentence:
+            draw_sentence(layout, context, content.sentence, "INFO")
     else:
         draw_sentence(layout, context, content.sentence, "ERROR")
     if content.poses:

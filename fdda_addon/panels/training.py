@@ -108,12 +108,14 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context, rig: 
             draw_sentence(layout, context, "There is no complete recording of this rig yet; record first.", "INFO")
             ready = False
         elif model.is_file():
-            text = f"'{model.name}' is there: bind it under Playback. To train again replaces it."
-            draw_sentence(layout, context, text, "CHECKMARK")
+            draw_sentence(layout, context, f"'{model.name}' is there; training again replaces it.", "CHECKMARK")
     row = layout.row()
     row.enabled = ready
     row.scale_y = 1.3
     row.operator("fdda.train", text="Train", icon="PLAY")
+    if model is not None and model.is_file() and not rig.mesh_object.fdda.is_bound:
+        bind = layout.operator("fdda.bind", text=f"Bind '{model.name}'", icon="LINKED")
+        bind.object, bind.filepath = rig.mesh_object.name, str(model)
 
 
 def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
@@ -140,13 +142,14 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 
 
 def _draw_row(table: bpy.types.UILayout, cells: tuple[str, str, str, str]) -> None:
-    row = table.split(factor=0.4)
-    row.label(text=cells[0])
-    row = row.row()
-    for cell in cells[1:]:
-        own = row.row()
-        own.alignment = "RIGHT"
+    rest = table
+    for cell, factor in zip(cells, (0.4, 0.33, 0.5), strict=False):
+        rest = rest.split(factor=factor)
+        own = rest.row()
+        own.alignment = "LEFT" if cell is cells[0] else "RIGHT"
         own.label(text=cell)
+    rest.alignment = "RIGHT"
+    rest.label(text=cells[-1])
 
 
 def _report(path: Path) -> dict | None:
