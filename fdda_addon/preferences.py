@@ -46,7 +46,7 @@ class FDDA_AP_preferences(bpy.types.AddonPreferences):
         layout.use_property_split = True
         layout.use_property_decorate = False
         layout.label(text="Training needs PyTorch, in a Python of its own. Everything else works without it.")
-        layout.prop(self, "trainer_python")
+        layout.prop(self, "trainer_python", placeholder="The trainer environment below")
         if not self.trainer_python and (named := os.environ.get(choice.PYTHON_VARIABLE)):
             draw_lines(layout, f"{choice.PYTHON_VARIABLE} is set: {named}", "INFO")
         draw_check(layout)
@@ -68,9 +68,8 @@ def wheels_folder() -> str:
 
 def draw_check(layout: bpy.types.UILayout) -> None:
     """Which Python trains, a button to check it, and what the last check said. Asks nothing."""
-    row = layout.split(factor=0.4)
-    row.label()
-    row.operator("fdda.check_trainer", text="Check", icon="QUESTION")
+    _, right = _split(layout)
+    right.operator("fdda.check_trainer", text="Check", icon="QUESTION")
     if session.task is None:
         draw_answer(layout, session.answer)
 
@@ -78,16 +77,14 @@ def draw_check(layout: bpy.types.UILayout) -> None:
 def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -> None:
     """The environment that the add-on makes: its state, its buttons, its progress."""
     state = session.own_state()
-    row = layout.split(factor=0.4)
-    row.alignment = "RIGHT"
-    row.label(text="Trainer Environment")
-    row.label(text=SHORT[state], icon="ERROR" if state in (FolderState.HALF_MADE, FolderState.BROKEN) else "NONE")
-    layout.prop(own, "wheels_folder")
+    left, right = _split(layout)
+    left.label(text="Trainer Environment")
+    right.label(text=SHORT[state], icon="ERROR" if state in (FolderState.HALF_MADE, FolderState.BROKEN) else "NONE")
+    layout.prop(own, "wheels_folder", placeholder="None: install from the network")
     if session.task is not None:
         draw_task(layout, session.task)
     else:
-        row = layout.split(factor=0.4)
-        row.label()
+        _, row = _split(layout)
         row = row.row(align=True)
         reason = obstacle(own.wheels_folder)
         again = state is not FolderState.MISSING
@@ -102,6 +99,14 @@ def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -
             draw_lines(layout, f"{reason}.", "INFO")
         draw_answer(layout, session.notice)
     draw_lines(layout, f"Folder: {own_folder()}")
+
+
+def _split(layout: bpy.types.UILayout) -> tuple[bpy.types.UILayout, bpy.types.UILayout]:
+    """A row as Blender splits those of properties: names on the left, values on the right."""
+    split = layout.split(factor=0.4)
+    left, right = split.row(), split.row()
+    left.alignment = "RIGHT"
+    return left, right
 
 
 def draw_task(layout: bpy.types.UILayout, task: session.Task) -> None:

@@ -41,6 +41,7 @@ class Creation:
         self._process: subprocess.Popen | None = None
         self._cancelled = False
         self._last_lines: list[str] = []
+        self._has_begun = False
 
     def steps(self) -> Iterator[Progress | Answer]:
         """Make the environment; yields how far it is, and last the answer of its Python.
@@ -66,6 +67,8 @@ class Creation:
             complete = False
             try:
                 yield Progress("removing what was there", 0, 0)
+                self._stop_if_cancelled()
+                self._has_begun = True
                 remove(self.folder)
                 base = yield from self._make(bases, log)
                 yield from self._install(base, log)
@@ -74,7 +77,7 @@ class Creation:
                 write_mark(self.folder, base.version)
                 complete = True
             finally:
-                if not complete:
+                if self._has_begun and not complete:
                     remove(self.folder)
         yield answer
 
@@ -229,9 +232,8 @@ class Creation:
 
     def _stop_if_cancelled(self) -> None:
         if self._cancelled:
-            raise TrainerEnvironmentError(
-                "The creation of the trainer environment was cancelled; nothing is left of it."
-            )
+            left = "nothing is left of it" if self._has_begun else "what was there stays"
+            raise TrainerEnvironmentError(f"The creation of the trainer environment was cancelled; {left}.")
 
 
 @contextmanager

@@ -222,6 +222,14 @@ def test_cancelled_it_ends_at_once_and_leaves_nothing(user: Path, wheels: Path):
     assert not bpy.ops.fdda.cancel_trainer_environment.poll()
 
 
+def test_cancelled_before_it_begins_it_leaves_what_is_there(own: Path, wheels: Path):
+    job = Creation(own, folder.log_path(), wheels, sys.executable)
+    job.cancel()
+    with pytest.raises(TrainerEnvironmentError, match="was cancelled; what was there stays"):
+        list(job.steps())
+    assert session.own_state() is FolderState.READY
+
+
 def test_unregistering_ends_what_is_under_way(user: Path, wheels: Path):
     import fdda_addon
 
