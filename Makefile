@@ -42,6 +42,12 @@ test-line: .venv-line .venv  ## the core and Blender tiers on LINE=4.5 or LINE=5
 .venv-line:
 	@setup/environment .venv-$(LINE) blender $(or $(PYTHON_$(LINE)),$(error LINE is 4.5 or 5.2))
 
+bench: .venv  ## time the arm at three densities, and other rigs: RIGS="a.blend b.blend"; into out/bench
+	.venv/bin/python benchmarks/bench.py out/bench $(addprefix --rig ,$(RIGS))
+
+sampling: .venv  ## compare ways to choose poses, into out/sampling (20 minutes)
+	.venv/bin/python benchmarks/sampling.py out/sampling
+
 study: .venv  ## compare sizes and activations of the networks, into out/study (30 minutes)
 	.venv/bin/python benchmarks/study.py out/study
 
@@ -68,4 +74,4 @@ requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
 clean:  ## remove what was built and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache
 
-.PHONY: help .venv .venv-line demo test test-core test-trainer test-blender test-all test-line study fixtures lint package requirements clean
+.PHONY: help .venv .venv-line demo test test-core test-trainer test-blender test-all test-line bench sampling study fixtures lint package requirements clean

@@ -11,7 +11,7 @@ from conftest import assert_plays, run
 
 from fdda_addon import demo
 
-MEAN_BAR, MAX_BAR = 0.08, 0.25
+MEAN_BAR, MAX_BAR = 0.04, 0.15
 """Held-out errors of the model as parts of the linear layer's."""
 SPEED_BAR = 4.0
 """A frame of the denser arm is to be so many times as fast as its rig's."""
@@ -41,7 +41,7 @@ def errors(made: Path) -> dict:
 
 def test_files(made):
     assert {path.name for path in made.iterdir()} == {
-        *("arm.blend", "recording", "arm.onnx", "report.json", "report.html"),
+        *("arm.blend", "recording", "arm.onnx", "arm.weights.npz", "report.json", "report.html"),
         *("evaluation.json", "arm_bound.blend", "pictures"),
     }
 
