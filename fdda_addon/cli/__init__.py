@@ -14,6 +14,7 @@ from .registration import registered
 VERBS = {
     "build-arm": ("build_arm", "build the example rig: an arm with a hand"),
     "record": ("record", "record random poses of a rig and their residuals"),
+    "check-trainer": ("check_trainer", "say whether the Python that trains has what it needs, and on which device"),
     "train": ("train", "train a model on a recording"),
     "bind": ("bind", "let a model play in place of a rig"),
     "evaluate": ("evaluate", "compare a model with its rig on poses that training never saw"),

@@ -2,6 +2,7 @@
 """Executes a model with ONNX Runtime."""
 
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,11 @@ class Network:
             # Imported here so that Blender starts without it.
             import onnxruntime
         except ImportError as error:
-            raise ModelError(f"ONNX Runtime cannot be loaded ({error}); install the extension again.") from error
+            version = ".".join(map(str, sys.version_info[:2]))
+            raise ModelError(
+                f"ONNX Runtime cannot be loaded by Python {version} ({error}); install the extension's zip for this "
+                "platform, in a Blender with Python 3.11 or 3.13."
+            ) from error
         onnxruntime.set_default_logger_severity(3)
         onnxruntime.disable_telemetry_events()
         options = onnxruntime.SessionOptions()

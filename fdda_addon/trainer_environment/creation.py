@@ -63,7 +63,7 @@ class Creation:
             yield Progress("looking for a Python", 0, 0)
             bases = self._find_bases(log)
             if self.wheels is not None:
-                self._check_wheels(bases[0])
+                self._check_wheels(bases[0], log)
             complete = False
             try:
                 yield Progress("removing what was there", 0, 0)
@@ -99,7 +99,7 @@ class Creation:
         elif not self.wheels.is_dir():
             raise TrainerEnvironmentError(f"'{self.wheels}' is no folder; choose the one that holds the wheels.")
 
-    def _check_wheels(self, base: BasePython) -> None:
+    def _check_wheels(self, base: BasePython, log: IO[str]) -> None:
         """Before what is there is removed: pip would find a missing wheel late, and call it a conflict of versions."""
         pinned = [line for line in pins(base.version).read_text(encoding="utf-8").splitlines() if "==" in line]
         wanted = [line.split("==") for line in pinned if line.partition("==")[0] in PACKAGES]
@@ -107,9 +107,13 @@ class Creation:
             f"{name} {version}" for name, version in wanted if not any(self.wheels.glob(f"{name}-{version}[-+]*.whl"))
         ]
         if missing:
+            version = f"{base.version[0]}.{base.version[1]}"
+            download = ["pip", "download", "--only-binary=:all:", f"--constraint={pins(base.version)}", "--dest=wheels"]
+            log.write(f"With Python {version} on such a machine as this, but online:\n")
+            log.write(f"$ {subprocess.list2cmdline([f'python{version}', '-m', *download, *PACKAGES])}\n")
             raise TrainerEnvironmentError(
-                f"The folder '{self.wheels}' lacks the wheels of {', '.join(missing)}; download what the trainer needs "
-                f"into it on a machine that is online, for Python {base.version[0]}.{base.version[1]} (see the manual)."
+                f"The folder '{self.wheels}' lacks the wheels of {', '.join(missing)} for Python {version}; download "
+                f"them on a machine that is online, '{self.log}' has the command."
             )
 
     def _find_bases(self, log: IO[str]) -> list[BasePython]:

@@ -3,13 +3,18 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
 import zipfile
 from pathlib import Path
 
+import bpy
 import pytest
+from conftest import pose
+
+from fdda_addon.runtime import playback
 
 ROOT = Path(__file__).resolve().parents[2]
 LIFE = Path(__file__).with_name("extension_life.py")
@@ -111,3 +116,14 @@ def test_it_is_small_enough_and_says_what_it_may_do(package: Path):
         "cp313",
     ]
     assert not [name for name in names if "__pycache__" in name]
+
+
+def test_without_its_wheels_a_bound_file_shows_the_true_rig(elbow, monkeypatch: pytest.MonkeyPatch):
+    """In a Blender whose Python none of the wheels is for."""
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    monkeypatch.setattr(playback, "_networks", {})
+    bpy.ops.wm.open_mainfile(filepath=str(elbow.bound))
+    mesh_object = bpy.data.objects["elbow"]
+    pose(angle=1.0)
+    assert mesh_object.fdda.mode == "RIG"
+    assert re.match(r"ONNX Runtime cannot be loaded by Python 3\.1\d \(.+\); install the", mesh_object.fdda.status)

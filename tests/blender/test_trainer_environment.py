@@ -121,9 +121,8 @@ def test_a_wheel_that_is_missing(own: Path, wheels: Path, tmp_path: Path):
     shutil.copytree(wheels, tmp_path / "fewer")
     next((tmp_path / "fewer").glob("onnx-*")).unlink()
     text = refused(create, wheels=str(tmp_path / "fewer"))
-    assert text.startswith(
-        f"The folder '{tmp_path}/fewer' lacks the wheels of onnx {pinned('onnx')}; download what the"
-    )
+    assert text.startswith(f"The folder '{tmp_path}/fewer' lacks the wheels of onnx {pinned('onnx')} for Python 3.1")
+    assert " -m pip download --only-binary=:all: " in folder.log_path().read_text()
     assert session.own_state() is FolderState.READY
     assert session.notice.message == text
 

@@ -6,11 +6,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from conftest import run
 from tiny_wheels import TORCH
 
 from fdda_addon.trainer_environment import bases, check
 from fdda_addon.trainer_environment.answer import Answer
 from fdda_addon.trainer_environment.bases import ask, find_bases
+from fdda_addon.trainer_environment.choice import PYTHON_VARIABLE
 from fdda_addon.trainer_environment.folder import PACKAGES
 
 ADVICE = "do this"
@@ -44,6 +46,18 @@ def test_it_can_train(packages: Path):
     version = ".".join(map(str, sys.version_info[:3]))
     assert answer.level == "INFO" and answer.message == f"Ready to train on the processor: Python {version}, torch 9."
     assert answer.details[0] == f"Python {version}: {sys.executable}" and answer.details[-1] == "Device: the processor"
+
+
+def test_the_command_line_says_it_too(packages: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture):
+    monkeypatch.setenv(PYTHON_VARIABLE, sys.executable)
+    assert run("check-trainer") == 0
+    assert capfd.readouterr().out.splitlines()[-1].startswith("Ready to train on the processor: ")
+    monkeypatch.setenv(PYTHON_VARIABLE, "/none/python")
+    assert run("check-trainer") == 1
+    assert capfd.readouterr().err == (
+        "Error: The trainer's Python '/none/python' cannot be started (No such file or directory); set "
+        "FDDA_TRAINER_PYTHON to a Python that has torch.\n"
+    )
 
 
 def test_the_device_is_named(packages: Path):

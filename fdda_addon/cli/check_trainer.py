@@ -1,0 +1,25 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`check-trainer`: whether the Python that trains can, as the preferences show it."""
+
+import argparse
+
+from ..core.errors import TrainerEnvironmentError
+from ..trainer_environment.choice import ping
+
+
+def add_options(_parser: argparse.ArgumentParser) -> None:
+    """It has none."""
+
+
+def run(_options: argparse.Namespace) -> None:
+    """Print what the Python says of itself.
+
+    Raises:
+        TrainerEnvironmentError: it cannot train.
+    """
+    answer = ping()
+    for line in answer.details:
+        print(line)
+    if answer.level == "ERROR":
+        raise TrainerEnvironmentError(answer.message)
+    print(answer.message)
