@@ -18,6 +18,8 @@ from .inputs import joints_between
 
 RIDGE = 1e-6
 """Added to the mean squares of the rows: joints that say the same share what they say, and nothing grows large."""
+WORTHWHILE = 0.01
+"""Joints are left out, the least useful first, as long as the fit leaves no larger part more than with all of them."""
 BLOCK_FLOATS = 1 << 22
 """Residuals are fitted in blocks of so many coordinates."""
 
@@ -73,18 +75,24 @@ class Surroundings:
         """
         width = self.rows.shape[2]
         products, moments = np.zeros((width, width)), np.zeros((width, residuals.shape[1]))
+        total = 0.0
         step = max(1, BLOCK_FLOATS // residuals[0].size)
         for start in range(0, len(training), step):
             poses = training[start : start + step]
             rows = self.rows[poses].reshape(-1, width)
             products += rows.T @ rows
-            moments += rows.T @ residuals[poses].transpose(0, 2, 1).reshape(len(rows), -1)
-        solved = np.linalg.solve(products + RIDGE * len(training) * np.eye(width), moments)
+            wanted = residuals[poses].transpose(0, 2, 1).reshape(len(rows), -1).astype(np.float64)
+            moments += rows.T @ wanted
+            total += (wanted**2).sum()
+        products += RIDGE * len(training) * np.eye(width)
+        kept = _useful(products, moments, total)
+        columns = (4 * kept[:, None] + np.arange(4)).ravel()
+        solved = np.linalg.solve(products[np.ix_(columns, columns)], moments[columns])
         left = np.empty_like(residuals)
         for start in range(0, len(residuals), step):
             poses = slice(start, start + step)
-            left[poses] = residuals[poses] - (self.rows[poses] @ solved).transpose(0, 2, 1)
-        return LinearFit(self.joints, self._factors(solved.reshape(len(self.joints), 4, -1))), left
+            left[poses] = residuals[poses] - (self.rows[poses][:, :, columns] @ solved).transpose(0, 2, 1)
+        return LinearFit(self.joints[kept], self._factors(solved.reshape(len(kept), 4, -1))), left
 
     def _factors(self, solved: np.ndarray) -> np.ndarray:
         """(Jf, 4, Vp) for the rows as they are to (4 Jf, Vp) for skin matrices."""
@@ -95,6 +103,34 @@ class Surroundings:
         factors[0, :3] -= self.centre[:, None] * together
         factors[0, 3] -= together
         return factors.reshape(-1, solved.shape[2]).astype(np.float32)
+
+
+def _useful(products: np.ndarray, moments: np.ndarray, total: float) -> np.ndarray:
+    """Which joints to fit to: ascending indices, the first always among them.
+
+    Args:
+        products, moments: (4 Jf, 4 Jf) and (4 Jf, Vp) of the normal equations, the ridge included.
+        total: sum of the squared residuals.
+    """
+    kept = np.arange(len(products) // 4)
+    inverse, gram = np.linalg.inv(products), moments @ moments.T
+    left = total - (inverse * gram).sum()
+    allowed = left * (1 + WORTHWHILE) ** 2
+    while len(kept) > 1:
+        # What leaving out joint j adds: the trace of u_j' C_jj^-1 u_j, with C the inverse and u = C times the moments.
+        by_joint = inverse.reshape(-1, len(kept), 4)
+        own = np.einsum("iaib->iab", inverse.reshape(len(kept), 4, len(kept), 4))
+        outer = np.einsum("iaw,wib->iab", (inverse @ gram).reshape(len(kept), 4, -1), by_joint)
+        added = np.trace(np.linalg.solve(own, outer), axis1=1, axis2=2)
+        least = 1 + int(added[1:].argmin())
+        left += added[least]
+        if left > allowed:
+            break
+        gone = 4 * least + np.arange(4)
+        inverse = inverse - inverse[:, gone] @ np.linalg.solve(own[least], inverse[gone])
+        inverse, gram = (np.delete(np.delete(array, gone, 0), gone, 1) for array in (inverse, gram))
+        kept = np.delete(kept, least)
+    return kept
 
 
 def make_surroundings(rig: Rig, partition: Partition, skin: np.ndarray) -> Surroundings:

@@ -30,13 +30,13 @@ def smooth() -> Rig:
 
 @pytest.fixture(scope="module")
 def poses(smooth) -> np.ndarray:
-    """(80, J, 4, 4); the chain stands far away from the origin."""
+    """(320, J, 4, 4); the chain stands far away from the origin."""
     there = np.eye(4, dtype=np.float32)
     there[:3, 3] = 7, -5, 3
-    return there @ pose_chain(smooth, chain_angles(80, JOINTS, seed=4))
+    return there @ pose_chain(smooth, chain_angles(320, JOINTS, seed=4))
 
 
-TRAINING = np.arange(60)
+TRAINING = np.arange(300)
 
 
 @pytest.mark.parametrize("joint", range(JOINTS))
@@ -52,6 +52,20 @@ def test_skinning_to_the_joints_around_is_found(smooth, poses, joint):
     assert np.abs(residuals).max() > 5e-3 and np.abs(left).max() < 1e-4
     fitted = layer.positions(poses)[:, partition.vertices] + fit.offsets(skin)
     np.testing.assert_allclose(fitted, truth[:, partition.vertices], atol=1e-4)
+
+
+def test_joints_that_say_nothing_are_left_out(smooth, poses):
+    """The last joint is offered and moves, and the residual of the first follows the second alone."""
+    rig = hard(smooth)
+    partition = make_partitions(rig, {0: (1, 2, 3)})[0]
+    skin = skin_matrices(poses, rig.rest_matrices)
+    residuals = LinearLayer(rig).local_residuals(poses, LinearLayer(smooth).positions(poses))[:, partition.vertices]
+    noise = np.random.default_rng(1).normal(0, 1e-3, residuals.shape).astype(np.float32)
+    surroundings = make_surroundings(rig, partition, skin)
+    assert surroundings.joints.tolist() == [0, 1, 2, 3]
+    fit, left = surroundings.fit(residuals + noise, TRAINING)
+    assert fit.joints.tolist() == [0, 1]
+    assert np.abs(left - noise).max() < 1e-3 < np.abs(residuals).max() / 5
 
 
 def random_residuals(rig: Rig, partition: Partition, count: int) -> np.ndarray:
