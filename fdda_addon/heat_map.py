@@ -125,7 +125,8 @@ def _sheets(context: bpy.types.Context) -> list["overlay.Sheet"]:
     if hidden != _hidden:
         _hidden.clear()
         _hidden.update(hidden)
-        redraw_views()
+        # Not from within a drawing.
+        bpy.app.timers.register(redraw_views, first_interval=0)
     return drawn
 
 

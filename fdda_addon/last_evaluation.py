@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 
 MOST_KEPT = 4
 """Errors of a dense mesh take some hundred megabytes."""
-FRAMES_APART = 5
+FRAMES_APART = 10
 """Worst frames that are nearer belong to one movement."""
 WAYS = ("fdda", "linear")
 

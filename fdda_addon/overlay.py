@@ -33,17 +33,17 @@ void main()
 
 _handles: list[object] = []
 _shader: gpu.types.GPUShader | None = None
-_triangles: dict[int, tuple[tuple[int, int], np.ndarray]] = {}
+_triangles: dict[int, tuple[tuple[int, int], gpu.types.GPUIndexBuf]] = {}
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A mesh: (V, 3) positions and normals in its own space, sRGB colours, (T, 3) triangles, and its matrix_world."""
+    """A mesh: (V, 3) float32 positions and normals in its own space, sRGB colours, triangles, and its matrix_world."""
 
     positions: np.ndarray
     normals: np.ndarray
     colors: np.ndarray
-    triangles: np.ndarray
+    triangles: gpu.types.GPUIndexBuf
     matrix: object
 
 
@@ -84,15 +84,15 @@ def sheet(context: bpy.types.Context, mesh_object: bpy.types.Object, colors: np.
     return Sheet(positions, normals, colors, _triangles_of(mesh_object, mesh), evaluated.matrix_world.copy())
 
 
-def _triangles_of(mesh_object: bpy.types.Object, mesh: bpy.types.Mesh) -> np.ndarray:
-    """(T, 3) int32; kept as long as the counts stay: finding them anew costs more than drawing them."""
+def _triangles_of(mesh_object: bpy.types.Object, mesh: bpy.types.Mesh) -> gpu.types.GPUIndexBuf:
+    """The triangles; kept as long as the counts stay: finding them anew costs more than drawing them."""
     key = (len(mesh.vertices), len(mesh.loops))
     kept = _triangles.get(mesh_object.session_uid)
     if kept is None or kept[0] != key:
         mesh.calc_loop_triangles()
         triangles = np.empty((len(mesh.loop_triangles), 3), np.int32)
         mesh.loop_triangles.foreach_get("vertices", triangles.reshape(-1))
-        kept = _triangles[mesh_object.session_uid] = (key, triangles)
+        kept = _triangles[mesh_object.session_uid] = (key, gpu.types.GPUIndexBuf(type="TRIS", seq=triangles))
     return kept[1]
 
 
@@ -104,7 +104,10 @@ def _draw_sheets(sheets: Callable[[bpy.types.Context], list[Sheet]]) -> None:
     try:
         for drawn in sheets(context):
             content = {"position": drawn.positions, "normal": drawn.normals, "color": drawn.colors}
-            batch = batch_for_shader(shader, "TRIS", content, indices=drawn.triangles)
+            vertices = gpu.types.GPUVertBuf(shader.format_calc(), len(drawn.positions))
+            for name, values in content.items():
+                vertices.attr_fill(name, values)
+            batch = gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=drawn.triangles)
             shader.bind()
             shader.uniform_float("transform", view.perspective_matrix @ drawn.matrix)
             towards = (view.view_matrix @ drawn.matrix).to_3x3().inverted_safe().col[2].normalized()

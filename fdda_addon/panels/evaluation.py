@@ -118,18 +118,17 @@ def _draw_colors(
         draw_sentence(body, context, "The heat map is there once the model was evaluated.", "INFO")
     if shown and heat_map.is_hidden(mesh_object):
         text = "The colours show outside edit mode, while no modifier changes the topology in the viewport."
-        draw_sentence(body, context, text, "ERROR")
+        draw_sentence(body, context, text, "INFO")
     if shown != "ERRORS" or last is None:
         return
-    column = body.column()
-    column.use_property_split, column.use_property_decorate = True, False
-    column.row().prop(view, "way", expand=True)
-    column.row().prop(view, "statistic", text="Show", expand=True)
+    column = body.column(align=True)
+    column.row(align=True).prop(view, "way", expand=True)
+    column.row(align=True).prop(view, "statistic", expand=True)
     if view.statistic == "pose" and not last.name and view.pose < 0:
         draw_sentence(body, context, "Jump to a pose below to see its errors.", "INFO")
     elif view.statistic == "pose" and last.name and last.pose_at(context.scene.frame_current) is None:
         draw_sentence(body, context, f"Frame {context.scene.frame_current} was not compared.", "INFO")
-    row = column.row(align=True)
+    row = body.row(align=True)
     row.prop(view, "range_mm")
     row.operator("fdda.fit_range", text="", icon="FULLSCREEN_EXIT")
 
