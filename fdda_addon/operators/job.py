@@ -23,6 +23,7 @@ TICK_SECONDS, IDLE_TICK_SECONDS = 0.01, 0.1
 """Between the ticks of a job that works in Blender, and of one that waits for another process."""
 BLOCKING_SECONDS = 0.05
 REDRAW_SECONDS = 0.1
+TAB_STRIP = 24
 
 LOOKING = {"MOUSEMOVE", "INBETWEEN_MOUSEMOVE", "MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "WINDOW_DEACTIVATE"}
 """Events that are passed on while a job borrows the scene: looking is allowed, changing is not."""
@@ -107,7 +108,8 @@ class JobOperator:
             if result is not None:
                 return result
         if event.type == "TIMER" or not self.borrows_scene or _is_harmless(context, event):
-            return {"RUNNING_MODAL", "PASS_THROUGH"}
+            # Not with RUNNING_MODAL: Blender would then not notice which region the mouse is in, and no button works.
+            return {"PASS_THROUGH"}
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: bpy.types.Context) -> None:
@@ -189,10 +191,12 @@ def _is_harmless(context: bpy.types.Context, event: bpy.types.Event) -> bool:
     """Whether an event may reach the rest of Blender while the scene is borrowed: to look, and to press Cancel."""
     if event.type in LOOKING:
         return True
+    # Not the strip of tabs at either side: on another tab there would be no way back.
+    strip = TAB_STRIP * context.preferences.system.ui_scale
     return event.type == "LEFTMOUSE" and any(
         region.type == "UI"
         and region.active_panel_category == "FDDA"
-        and 0 <= event.mouse_x - region.x < region.width
+        and strip <= event.mouse_x - region.x < region.width - strip
         and 0 <= event.mouse_y - region.y < region.height
         for area in context.screen.areas
         if area.type == "VIEW_3D"

@@ -168,15 +168,20 @@ def redraw() -> None:
                         region.tag_redraw()
 
 
+def _stop(reason: str) -> None:
+    if _running:
+        stop(f"{_running.state.title} ended because {reason}.")
+
+
 @persistent
 def _on_load(*_: object) -> None:
-    stop("Another file was opened.")
+    _stop("another file was opened")
 
 
 @persistent
 def _on_undo(*_: object) -> None:
     if _running and _running.state.borrows_scene:
-        stop("An undo ended it.")
+        _stop("the scene was undone")
 
 
 HANDLERS = {"load_pre": _on_load, "undo_pre": _on_undo, "redo_pre": _on_undo}
@@ -191,7 +196,7 @@ def register() -> None:
 
 def unregister() -> None:
     """End the job and undo `register`. Blender does this when it is closed."""
-    stop("The add-on was disabled.")
+    _stop("the add-on was disabled")
     for name, handler in HANDLERS.items():
         if handler in getattr(bpy.app.handlers, name):
             getattr(bpy.app.handlers, name).remove(handler)

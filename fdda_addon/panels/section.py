@@ -104,8 +104,8 @@ def draw_job(
     row.enabled = not state.cancel_requested
     row.operator("fdda.cancel", text="Cancelling…" if state.cancel_requested else "Cancel", icon="X")
     remaining = state.remaining_seconds
-    if remaining is not None:
-        layout.label(text=f"About {duration(remaining)} left", icon="TIME")
+    # The line is always there: what is below would jump.
+    layout.label(text=f"About {duration(remaining)} left" if remaining is not None else "…", icon="TIME")
     return True
 
 

@@ -124,7 +124,7 @@ def under_way(borrows_scene: bool) -> JobState:
 def test_another_file_ends_a_job(rig):
     state = under_way(borrows_scene=False)
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    assert not state.is_running and state.outcome == "Another file was opened."
+    assert not state.is_running and state.outcome == "Counting ended because another file was opened."
     assert events == ["given back"] and job.current() is None
 
 
