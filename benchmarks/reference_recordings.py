@@ -12,7 +12,7 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from fdda_addon.core.partition import Partition
 from trainer.config import TrainingConfig, add_options, config_from_arguments
 from trainer.data import PartitionData, PreparedPartition, prepare, split_poses
 from trainer.inputs import Inputs, make_inputs
+from trainer.linear_fit import make_surroundings
 from trainer.loop import train
 from trainer.model import Network
 
@@ -58,7 +59,22 @@ def parent_of(joint: str) -> str | None:
     return f"{finger}_{int(number) - 1}" if int(number) else "wrist"
 
 
-def read_partition(arrays: dict, name: str, influencing: list[str]) -> PartitionData:
+@dataclass(frozen=True)
+class ReferencePartition:
+    """A partition of the recordings.
+
+    Attributes:
+        data: as the trainer takes it.
+        joint: index of the main joint.
+        poses: (N, J, 4, 4) float64 pose matrices of the joints that are known, metres.
+    """
+
+    data: PartitionData
+    joint: int
+    poses: np.ndarray
+
+
+def read_partition(arrays: dict, name: str, influencing: list[str]) -> ReferencePartition:
     """One partition with the features that the trainer makes of a recording.
 
     The recordings give influencing joints only. The joints between them stay at the identity: their motion is
@@ -88,14 +104,25 @@ def read_partition(arrays: dict, name: str, influencing: list[str]) -> Partition
     inputs: Inputs = make_inputs(parents, points, [own])
     features = inputs.features(poses.astype(np.float32), np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1)))
     residuals = arrays[f"{name}.residuals"] * np.float32(CM)
-    return PartitionData(name, features[:, inputs.columns[0]], lambda: residuals, residuals.shape[1])
+    data = PartitionData(
+        name,
+        features[:, inputs.columns[0]],
+        lambda: residuals,
+        residuals.shape[1],
+        # The rest pose is not known: the identity stands in for it.
+        lambda: make_surroundings(parents, own, poses, np.zeros(3)),
+    )
+    return ReferencePartition(data, own.joint, poses)
 
 
-def measure(data: PartitionData, prepared: PreparedPartition, network: Network, config, poses: np.ndarray) -> tuple:
-    """Mean and largest distance over poses, and the mean without a network, cm."""
-    coefficients = network.coefficients(prepared.inputs[poses], config.activation)
-    truth = data.read_residuals()[poses]
-    errors = np.linalg.norm(prepared.basis.residuals(coefficients).reshape(truth.shape) - truth, axis=2)
+def measure(
+    partition: ReferencePartition, prepared: PreparedPartition, network: Network, activation: str, chosen: np.ndarray
+) -> tuple[float, float, float]:
+    """Mean and largest distance over the chosen poses, and the mean of the residuals themselves, cm."""
+    truth, poses = partition.data.read_residuals()[chosen], partition.poses[chosen]
+    coefficients = network.coefficients(prepared.inputs[chosen], activation)
+    turned = prepared.fit.offsets(poses) @ np.linalg.inv(poses[:, partition.joint, :3, :3]).transpose(0, 2, 1)
+    errors = np.linalg.norm(turned + prepared.basis.residuals(coefficients).reshape(truth.shape) - truth, axis=2)
     return float(errors.mean() / CM), float(errors.max() / CM), float(np.linalg.norm(truth, axis=2).mean() / CM)
 
 
@@ -106,22 +133,22 @@ def run(folder: Path, config: TrainingConfig, choose: bool) -> dict:
         arrays = dict(arrays)
     started = time.perf_counter()
     every = [read_partition(arrays, entry["partition"], entry["joints"]) for entry in names]
-    poses = len(every[0].features)
+    poses = len(every[0].poses)
     if choose:
         order = np.random.default_rng(config.seed + 1000).permutation(TRAINING_POSES)
         measured, trained_on = np.sort(order[: TRAINING_POSES // 5]), np.sort(order[TRAINING_POSES // 5 :])
     else:
         measured, trained_on = np.arange(TRAINING_POSES, poses), np.arange(TRAINING_POSES)
     split = split_poses(trained_on, config.validation_fraction, config.seed)
-    prepared = [prepare(data, split, config.tolerance_mm, config.seed) for data in every]
+    prepared = [prepare(partition.data, split, config.tolerance_mm, config.seed) for partition in every]
     result = train(prepared, split, config)
     rows = []
-    for data, ready, network in zip(every, prepared, result.networks, strict=True):
-        mean, largest, linear = measure(data, ready, network, config, measured)
-        published = RELU[data.name]
+    for partition, ready, network in zip(every, prepared, result.networks, strict=True):
+        mean, largest, linear = measure(partition, ready, network, config.activation, measured)
+        published = RELU[ready.name]
         rows.append(
             {
-                "partition": data.name,
+                "partition": ready.name,
                 "shapes": len(ready.basis.shapes),
                 "linear_mean": linear,
                 "mean": mean,

@@ -13,7 +13,7 @@ from fdda_addon.core.skinning import skin_matrices
 from .basis import Basis, make_basis
 from .config import TrainingConfig
 from .inputs import Inputs
-from .linear_fit import LinearFit, Surroundings, make_surroundings
+from .linear_fit import LinearFit, Surroundings, surroundings_of_rig
 
 LEAST_POSES = 10
 LEAST_SPREAD = 1e-5
@@ -133,7 +133,7 @@ def partitions_of(recording: Recording, inputs: Inputs) -> list[PartitionData]:
             features[:, inputs.columns[number]],
             lambda vertices=partition.vertices: recording.residuals[:, vertices],
             len(partition.vertices),
-            lambda partition=partition: make_surroundings(rig, partition, skin),
+            lambda partition=partition: surroundings_of_rig(rig, partition, skin),
         )
         for number, partition in enumerate(recording.partitions)
     ]

@@ -133,21 +133,29 @@ def _useful(products: np.ndarray, moments: np.ndarray, total: float) -> np.ndarr
     return kept
 
 
-def make_surroundings(rig: Rig, partition: Partition, skin: np.ndarray) -> Surroundings:
+def surroundings_of_rig(rig: Rig, partition: Partition, skin: np.ndarray) -> Surroundings:
+    """The joints around a partition of a rig; `skin` as in `make_surroundings`."""
+    centre = rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
+    return make_surroundings(rig.parents, partition, skin, centre)
+
+
+def make_surroundings(parents: np.ndarray, partition: Partition, skin: np.ndarray, centre: np.ndarray) -> Surroundings:
     """The joints that may move a partition's residuals: those that only influencing joints move against the main one.
 
     Args:
-        rig, partition: of the recording.
-        skin: (N, J, 4, 4) skin matrices of all poses, metres.
+        parents: (J,) parent index of each joint, -1 for a root.
+        partition: with its main joint and the influencing ones.
+        skin: (N, J, 4, 4) skin matrices of all poses, metres; any fixed matrices may stand in for the rest pose, the
+            fit takes them up.
+        centre: (3,) middle of the partition where all skin matrices are the identity, metres.
     """
     influencing = set(partition.influencing)
     others = [
         joint
-        for joint in range(len(rig.joints))
-        if joint != partition.joint and joints_between(rig.parents, partition.joint, joint) <= influencing
+        for joint in range(len(parents))
+        if joint != partition.joint and joints_between(parents, partition.joint, joint) <= influencing
     ]
     joints = np.array([partition.joint, *others], np.int64)
-    centre = rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
     apart = skin[:, joints, :3].astype(np.float64)
     apart[:, :, :, 3] -= skin[:, partition.joint, None, :3, 3]
     relative = np.linalg.inv(skin[:, partition.joint, None, :3, :3].astype(np.float64)) @ apart

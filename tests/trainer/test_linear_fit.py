@@ -10,7 +10,7 @@ from chain import chain_angles, chain_rig, pose_chain, rotation
 from fdda_addon.core.partition import Partition, make_partitions
 from fdda_addon.core.rig import Joint, Rig
 from fdda_addon.core.skinning import LinearLayer, skin_matrices
-from trainer.linear_fit import make_surroundings
+from trainer.linear_fit import surroundings_of_rig
 
 JOINTS = 4
 INFLUENCING = {joint: tuple(j for j in (joint, joint + 1) if 0 < j < JOINTS) for joint in range(JOINTS)}
@@ -48,7 +48,7 @@ def test_skinning_to_the_joints_around_is_found(smooth, poses, joint):
     truth = LinearLayer(smooth).positions(poses)
     residuals = layer.local_residuals(poses, truth)[:, partition.vertices]
     skin = skin_matrices(poses, rig.rest_matrices)
-    fit, left = make_surroundings(rig, partition, skin).fit(residuals, TRAINING)
+    fit, left = surroundings_of_rig(rig, partition, skin).fit(residuals, TRAINING)
     assert np.abs(residuals).max() > 5e-3 and np.abs(left).max() < 1e-4
     fitted = layer.positions(poses)[:, partition.vertices] + fit.offsets(skin)
     np.testing.assert_allclose(fitted, truth[:, partition.vertices], atol=1e-4)
@@ -61,7 +61,7 @@ def test_joints_that_say_nothing_are_left_out(smooth, poses):
     skin = skin_matrices(poses, rig.rest_matrices)
     residuals = LinearLayer(rig).local_residuals(poses, LinearLayer(smooth).positions(poses))[:, partition.vertices]
     noise = np.random.default_rng(1).normal(0, 1e-3, residuals.shape).astype(np.float32)
-    surroundings = make_surroundings(rig, partition, skin)
+    surroundings = surroundings_of_rig(rig, partition, skin)
     assert surroundings.joints.tolist() == [0, 1, 2, 3]
     fit, left = surroundings.fit(residuals + noise, TRAINING)
     assert fit.joints.tolist() == [0, 1]
@@ -77,7 +77,7 @@ def test_what_is_left_and_the_offsets_make_up_the_residuals(smooth, poses):
     partition = make_partitions(smooth, INFLUENCING)[1]
     skin = skin_matrices(poses, smooth.rest_matrices)
     residuals = random_residuals(smooth, partition, len(poses))
-    fit, left = make_surroundings(smooth, partition, skin).fit(residuals, TRAINING)
+    fit, left = surroundings_of_rig(smooth, partition, skin).fit(residuals, TRAINING)
     inverse = np.linalg.inv(skin[:, partition.joint, :3, :3].astype(np.float64))
     offsets = np.einsum("nab,nvb->nva", inverse, fit.offsets(skin))
     np.testing.assert_allclose(offsets + left, residuals, atol=1e-5)
@@ -87,7 +87,7 @@ def test_what_is_left_and_the_offsets_make_up_the_residuals(smooth, poses):
 def test_moving_the_whole_character_turns_the_offsets_along(smooth, poses):
     partition = make_partitions(smooth, INFLUENCING)[1]
     skin = skin_matrices(poses, smooth.rest_matrices)
-    fit, _ = make_surroundings(smooth, partition, skin).fit(random_residuals(smooth, partition, len(poses)), TRAINING)
+    fit, _ = surroundings_of_rig(smooth, partition, skin).fit(random_residuals(smooth, partition, len(poses)), TRAINING)
     moved = rotation(1, 0.8)
     moved[:3, 3] = 3, 20, -1
     expected = fit.offsets(skin) @ moved[:3, :3].T
@@ -100,7 +100,7 @@ def test_joints_that_only_influencing_joints_move():
     skin = np.tile(np.eye(4, dtype=np.float32), (2, 5, 1, 1))
 
     def around(joint: int, *influencing: int) -> list[int]:
-        return make_surroundings(rig, Partition(joint, influencing, np.arange(3)), skin).joints.tolist()
+        return surroundings_of_rig(rig, Partition(joint, influencing, np.arange(3)), skin).joints.tolist()
 
     assert around(2, 2, 3) == [2, 1, 3]
     assert around(2, 2, 4) == [2, 1], "joint 3 hides joint 4"
@@ -112,7 +112,7 @@ def test_alone_the_main_joint_says_the_mean(smooth, poses):
     partition = make_partitions(smooth, INFLUENCING)[2]
     skin = skin_matrices(poses, smooth.rest_matrices)
     residuals = random_residuals(smooth, partition, len(poses))
-    fit, left = make_surroundings(smooth, partition, skin).alone().fit(residuals, TRAINING)
+    fit, left = surroundings_of_rig(smooth, partition, skin).alone().fit(residuals, TRAINING)
     assert fit.joints.tolist() == [2]
     np.testing.assert_allclose(left, residuals - residuals[TRAINING].mean(axis=0), atol=1e-6)
 
@@ -123,7 +123,7 @@ def test_joints_that_never_moved_give_nothing_large(smooth):
     still = pose_chain(smooth, np.zeros((30, JOINTS, 2)))
     skin = skin_matrices(still, smooth.rest_matrices)
     residuals = random_residuals(smooth, partition, 30)
-    fit, _ = make_surroundings(smooth, partition, skin).fit(residuals, np.arange(30))
+    fit, _ = surroundings_of_rig(smooth, partition, skin).fit(residuals, np.arange(30))
     assert np.abs(fit.factors).max() < 0.1
     bent = skin_matrices(pose_chain(smooth, np.full((1, JOINTS, 2), 0.5)), smooth.rest_matrices)
     assert np.abs(fit.offsets(bent)).max() < 0.1
