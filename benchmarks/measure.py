@@ -21,7 +21,7 @@ import fdda_addon
 from fdda_addon.benchmark import benchmark
 from fdda_addon.core.poses import sample_pose
 from fdda_addon.recording import RecordingSettings, record
-from fdda_addon.runtime import playback
+from fdda_addon.runtime import model_files
 from fdda_addon.runtime.network import Network
 from fdda_addon.scene.armature import Poser, clear_pose
 from fdda_addon.scene.borrow import borrowed_pose
@@ -136,7 +136,7 @@ def cold_start(bound: str) -> dict:
 def _shows_the_model() -> bool:
     mesh_object = next(o for o in bpy.data.objects if o.fdda.is_bound)
     armature_object = armature_modifier(mesh_object).object
-    network = Network(playback.model_path(mesh_object))
+    network = Network(model_files.model_path(mesh_object))
     depsgraph = bpy.context.evaluated_depsgraph_get()
     reader = PoseReader(
         SceneRig(mesh_object, armature_object),

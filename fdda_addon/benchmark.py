@@ -14,7 +14,7 @@ import numpy as np
 
 from .core.poses import sample_pose
 from .recording import Progress, action_frames
-from .runtime import playback
+from .runtime import model_files, playback
 from .runtime.binding import borrowed_binding
 from .scene.armature import Poser, clear_pose
 from .scene.borrow import assign_action, borrowed_attributes, borrowed_pose
@@ -118,7 +118,7 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
                 with prepare(mesh_object):
                     times[way] += time_frames(played, number * each, each)
                 yield Progress("benchmark", number * len(ways) + place, ROUNDS * len(ways))
-        network = playback.network_of(mesh_object)
+        network = model_files.network_of(mesh_object)
         pose = network.info.rest_matrices[None]
         inference = _time([lambda: network.positions(pose)] * (frames + WARM_UP))[WARM_UP:]
     yield Benchmark(len(mesh_object.data.vertices), each * ROUNDS, **times, inference=inference)

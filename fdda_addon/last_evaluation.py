@@ -133,3 +133,8 @@ def keep(
 def of(mesh_object: bpy.types.Object) -> LastEvaluation | None:
     """The last evaluation of an object, None when there was none in this session."""
     return _kept.get(mesh_object.session_uid)
+
+
+def forget(mesh_object: bpy.types.Object) -> None:
+    """Drop the last evaluation of an object: its model is another now."""
+    _kept.pop(mesh_object.session_uid, None)

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import bpy
 
+from . import last_evaluation
 from .core.errors import ModelError, OutputError
 from .core.model import MAX_BYTES, ModelInfo, check_model, check_rig, read_model, read_model_info
 from .core.output import check_writable, replacing
 from .model_list import bound_entry, bound_name, chosen_entry, is_bound
-from .runtime import packed, playback
+from .runtime import model_files, packed, playback
 from .runtime.binding import bind, stored_path, unbind
 from .scene.rig import SceneRig, read_rig
 
@@ -18,11 +19,20 @@ _infos: dict[tuple, ModelInfo] = {}
 
 
 def remember(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGroup:
-    """The entry of a model in the list of its mesh, a new one where there is none; it becomes the chosen one."""
+    """Put a model that the user has chosen or trained into the list of its mesh; it becomes the chosen entry.
+
+    Returns:
+        Its entry, the one that is there already for the same file. Where that is bound, the file is loaded anew.
+    """
     binding = mesh_object.fdda
+    model_files.choose(path)
     for index, entry in enumerate(binding.models):
         if entry.packed is None and _absolute(entry, mesh_object) == Path(os.path.normpath(path.absolute())):
             binding.model_index = index
+            if is_bound(mesh_object, entry) and playback.is_outdated(mesh_object):
+                last_evaluation.forget(mesh_object)
+                playback.forget()
+                mesh_object.update_tag()
             return entry
     entry = binding.models.add()
     entry.name = path.stem
@@ -98,7 +108,7 @@ def relink(scene_rig: SceneRig, path: Path) -> None:
     if entry is None:
         entry = remember(mesh_object, path)
     entry.path, entry.packed, entry.packed_bytes = stored_path(path), None, 0
-    playback.choose(path)
+    model_files.choose(path)
     bind_entry(scene_rig, entry)
     packed.remove_unused()
 
@@ -149,7 +159,7 @@ def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, 
             temporary.write_bytes(data)
     bound = is_bound(mesh_object, entry)
     entry.path, entry.packed, entry.packed_bytes = stored_path(path), None, 0
-    playback.choose(path)
+    model_files.choose(path)
     if bound:
         mesh_object.fdda.model, mesh_object.fdda.packed = entry.path, None
         playback.forget()
@@ -162,7 +172,7 @@ def entry_path(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) ->
     Raises:
         ModelError: the path of a saved file leads out of the file's folder.
     """
-    return _absolute(entry, mesh_object) if entry.packed else playback.allowed_path(mesh_object, entry.path)
+    return _absolute(entry, mesh_object) if entry.packed else model_files.allowed_path(mesh_object, entry.path)
 
 
 def info_of(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> ModelInfo:

@@ -4,7 +4,7 @@
 import bpy
 
 from .core.errors import FDDAError
-from .runtime import playback
+from .runtime import model_files
 from .scene.rig import PoseReader, SceneRig, armature_modifier
 
 _last: dict[int, tuple[object, bytes, list[tuple[str, float]] | None]] = {}
@@ -22,7 +22,7 @@ def partition_trust(mesh_object: bpy.types.Object) -> list[tuple[str, float]] | 
     if modifier is None or not mesh_object.fdda.is_bound:
         return None
     try:
-        network = playback.network_of(mesh_object)
+        network = model_files.network_of(mesh_object)
         names = tuple(joint.name for joint in network.info.joints)
         if any(name not in modifier.object.data.bones for name in names):
             return None

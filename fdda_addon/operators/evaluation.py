@@ -45,7 +45,7 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         from ..evaluation import EvaluationSettings, evaluate, evaluate_action
         from ..runtime.binding import true_rig
-        from ..runtime.playback import network_of
+        from ..runtime.model_files import network_of
 
         scene_rig = self.bound_rig(context)
         self._action = self._action_name(scene_rig.armature_object) if self.source == "ACTION" else ""

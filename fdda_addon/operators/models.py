@@ -57,14 +57,12 @@ class FDDA_OT_add_model(OnModel, ChoosesModel, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> str:
         from .. import models
-        from ..runtime import playback
 
         scene_rig = self.rig(context)
         if not self.filepath:
             raise ModelError("No file was chosen; give the model's file.")
         models.check(scene_rig, self.path())
         models.adopt(scene_rig.mesh_object)
-        playback.choose(self.path())
         entry = models.remember(scene_rig.mesh_object, self.path())
         return f"{entry.name} is in the list of '{scene_rig.mesh_object.name}'; bind it to play it."
 

@@ -113,7 +113,6 @@ class FDDA_OT_bind(OnModel, ChoosesModel, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> str:
         from .. import models
-        from ..runtime import playback
 
         scene_rig = self.rig(context)
         mesh_object = scene_rig.mesh_object
@@ -121,7 +120,6 @@ class FDDA_OT_bind(OnModel, ChoosesModel, bpy.types.Operator):
         if self.filepath:
             # Before it is put into the list: what is no model of this rig does not belong there.
             models.check(scene_rig, self.path())
-            playback.choose(self.path())
             entry = models.remember(mesh_object, self.path())
         else:
             entry = models.chosen(mesh_object)

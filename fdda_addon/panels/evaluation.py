@@ -6,6 +6,7 @@ import sys
 import bpy
 
 from .. import last_evaluation, markers
+from ..model_list import bound_name
 from ..operators import job
 from .section import Section, draw_job, draw_sentence, panel_rig
 
@@ -38,7 +39,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
             self._draw_start(context, scene_rig)
         last = last_evaluation.of(scene_rig.mesh_object)
         if last is not None:
-            _draw_figures(layout, context, view, last)
+            _draw_figures(layout, context, view, last, bound_name(scene_rig.mesh_object))
         _draw_colors(layout, context, view, scene_rig.mesh_object, last)
         if last is not None:
             _draw_worst(layout, context, view, last)
@@ -74,7 +75,11 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
 
 
 def _draw_figures(
-    layout: bpy.types.UILayout, context: bpy.types.Context, view: object, last: last_evaluation.LastEvaluation
+    layout: bpy.types.UILayout,
+    context: bpy.types.Context,
+    view: object,
+    last: last_evaluation.LastEvaluation,
+    bound: str,
 ) -> None:
     what = f"{last.poses} frames of {last.name}" if last.name else f"{last.poses} random poses"
     header, body = layout.panel("fdda_figures", default_closed=False)
@@ -82,6 +87,8 @@ def _draw_figures(
     if body is None:
         return
     draw_sentence(body, context, f"{last.model} on {what}")
+    if bound != last.model:
+        draw_sentence(body, context, f"{last.model} is not what is bound now; evaluate again.", "INFO")
     table = body.column(align=True)
     _row(table, "", [label for label, _ in FIGURES])
     for label, way in (("FDDA", "fdda"), ("Linear layer", "linear")):

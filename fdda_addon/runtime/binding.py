@@ -10,7 +10,7 @@ import bpy
 from ..core.errors import RigError
 from ..core.model import check_rig
 from ..scene.rig import SceneRig, check_topology, deforming_modifiers, read_rig
-from . import nodes, packed, playback, switch
+from . import model_files, nodes, packed, playback, switch
 
 
 def bind(
@@ -32,7 +32,7 @@ def bind(
     if mesh_object.mode == "EDIT":
         raise RigError(f"'{mesh_object.name}' is in edit mode; leave it first.")
     model = model.absolute()
-    network = playback.load_network(model) if packed_model is None else packed.load(packed_model)
+    network = model_files.load_network(model) if packed_model is None else packed.load(packed_model)
     check_rig(model, network.info, read_rig(scene_rig))
     last = max(mesh_object.modifiers.find(modifier.name) for modifier in deforming_modifiers(mesh_object))
     # Those after the last deforming one stay and work on what the model gives.
@@ -41,7 +41,7 @@ def bind(
         unbind(mesh_object)
 
     if packed_model is None:
-        playback.choose(model)
+        model_files.choose(model)
     last = max(mesh_object.modifiers.find(modifier.name) for modifier in deforming_modifiers(mesh_object))
     nodes.add_modifier(mesh_object, last + 1)
     binding = mesh_object.fdda
@@ -117,7 +117,7 @@ def borrowed_binding(scene_rig: SceneRig, model: Path | None) -> Iterator[None]:
         return
     previous = None
     if binding.is_bound:
-        path = Path(binding.model) if binding.packed else playback.model_path(scene_rig.mesh_object)
+        path = Path(binding.model) if binding.packed else model_files.model_path(scene_rig.mesh_object)
         previous = (path, binding.use_in_render, binding.packed)
     mode, stored = binding.mode, binding.model
     bind(scene_rig, model)

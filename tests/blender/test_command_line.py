@@ -13,7 +13,7 @@ import fdda_addon
 from fdda_addon.cli import VERBS
 from fdda_addon.cli.progress import ProgressPrinter
 from fdda_addon.core.recording import read_recording
-from fdda_addon.runtime import playback
+from fdda_addon.runtime import model_files, playback
 
 
 @pytest.mark.parametrize("arguments", [["--help"], *([verb, "--help"] for verb in VERBS)], ids=" ".join)
@@ -141,7 +141,7 @@ def test_a_name_chooses_the_object(elbow, tmp_path):
 def opened(path) -> bpy.types.Object:
     """The elbow of a file, opened as a user would who never chose a model in this session."""
     playback.forget()
-    playback._chosen.clear()
+    model_files._chosen.clear()
     bpy.ops.wm.open_mainfile(filepath=str(path))
     return bpy.data.objects["elbow"]
 

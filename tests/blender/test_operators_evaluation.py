@@ -160,7 +160,7 @@ def test_the_worst_random_pose_is_set(active, view):
 
 
 def active_model(mesh_object):
-    from fdda_addon.runtime.playback import model_path
+    from fdda_addon.runtime.model_files import model_path
 
     return model_path(mesh_object)
 

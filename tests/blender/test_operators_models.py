@@ -233,5 +233,47 @@ def test_a_listed_path_out_of_the_folder_is_not_followed(bound, elbow, second):
     assert bound_entry(bound).name == "second" and len(bound.fdda.models) == 2
 
 
+def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_path):
+    """The file under a bound model is replaced, as a training does."""
+    import numpy as np
+    import onnx
+
+    from fdda_addon import last_evaluation, models
+
+    bpy.context.view_layer.objects.active = bound
+    path = tmp_path / "second.onnx"
+    bpy.ops.fdda.bind(filepath=str(path))
+    bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
+    pose(angle=1.3)
+    before = assert_plays(bound, path)
+    model = onnx.load(path)
+    node = next(node for node in model.graph.node if "positions" in node.output)
+    node.output[0] = "before"
+    model.graph.node.append(onnx.helper.make_node("Add", ["before", "before"], ["positions"]))
+    onnx.save(model, path)
+    models.remember(bound, path)
+    bpy.context.view_layer.update()
+    after = assert_plays(bound, path)
+    np.testing.assert_allclose(after, 2 * before, atol=1e-5)
+    assert last_evaluation.of(bound) is None and len(bound.fdda.models) == 2
+
+
+def test_what_the_section_says_of_the_models(bound, elbow):
+    from fdda_addon.panels import checks
+    from fdda_addon.panels import models as section
+    from fdda_addon.scene.rig import find_rig
+
+    bpy.context.view_layer.objects.active = bound
+    checks.check_now(find_rig())
+    assert section._models.now(bound) == {}
+    bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints[0].max_x += 0.1
+    checks.check_now(find_rig())
+    ((icon, sentence),) = section._models.now(bound).values()
+    assert icon == "INFO" and sentence.startswith("The range of motion of 'lower' has changed")
+    bound.fdda.models[0].path = "//away.onnx"
+    ((icon, sentence),) = section._models.now(bound).values()
+    assert icon == "ERROR" and "cannot be read: No such file or directory; find it, or choose another." in sentence
+
+
 def test_megabytes():
     assert [megabytes(count) for count in (2_340, 1_340_169)] == ["2.3 kB", "1.3 MB"]

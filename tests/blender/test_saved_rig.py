@@ -7,7 +7,7 @@ import pytest
 from conftest import ELBOW, assert_plays, evaluated, pose
 
 import fdda_addon
-from fdda_addon.runtime import playback
+from fdda_addon.runtime import model_files
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ def test_disabling_the_addon_gives_the_rig_back_and_enabling_it_plays(bound, elb
 
 
 def test_a_linked_character_plays(elbow):
-    playback.choose(elbow.model)
+    model_files.choose(elbow.model)
     with bpy.data.libraries.load(str(elbow.bound), link=True) as (_, wanted):
         wanted.objects = [ELBOW, "elbow_rig"]
     for linked in wanted.objects:

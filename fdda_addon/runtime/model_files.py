@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The networks of models, loaded once, and which paths of a .blend file are followed to a model."""
+
+import os
+from pathlib import Path
+
+import bpy
+
+from ..core.errors import ModelError
+from . import packed
+from .network import Network
+
+_networks: dict[Path, tuple[tuple, Network]] = {}
+_chosen: set[Path] = set()
+
+
+def network_of(mesh_object: bpy.types.Object) -> Network:
+    """The network of a bound object: of the model that is packed into the .blend file, else of its file.
+
+    Raises:
+        ModelError: it cannot be loaded.
+    """
+    binding = mesh_object.fdda
+    return load_network(model_path(mesh_object)) if binding.packed is None else packed.load(binding.packed)
+
+
+def load_network(path: Path) -> Network:
+    """A network by its file, loaded once for all objects that use it and again when the file changes.
+
+    Raises:
+        ModelError: it cannot be loaded.
+    """
+    try:
+        status = os.stat(path)
+    except OSError as error:
+        raise ModelError(f"The model '{path}' cannot be read: {error.strerror}; bind another.") from error
+    stamp = (status.st_mtime_ns, status.st_size)
+    if path not in _networks or _networks[path][0] != stamp:
+        _networks[path] = (stamp, Network(path))
+    return _networks[path][1]
+
+
+def model_path(mesh_object: bpy.types.Object) -> Path:
+    """Where the model of a binding is.
+
+    Raises:
+        ModelError: the path of a saved file leads out of the file's folder.
+    """
+    return allowed_path(mesh_object, mesh_object.fdda.model)
+
+
+def allowed_path(mesh_object: bpy.types.Object, stored: str) -> Path:
+    """The absolute path of a model that is stored with an object.
+
+    Raises:
+        ModelError: the path of a saved file leads out of the file's folder.
+    """
+    path = Path(bpy.path.abspath(stored, library=mesh_object.library))
+    file = bpy.path.abspath(mesh_object.library.filepath) if mesh_object.library else bpy.data.filepath
+    # Resolved: the way from the open file to the model leads through "..".
+    if path.resolve() not in _chosen and file and not path.resolve().is_relative_to(Path(file).resolve().parent):
+        raise ModelError(
+            f"The model '{path}' lies outside the folder of '{Path(file).name}' and is not followed; "
+            "move it beside the file and bind it again, or choose it again."
+        )
+    return path
+
+
+def choose(model: Path) -> None:
+    """The user chose this model in this session: it may lie anywhere until the file is loaded again."""
+    _chosen.add(model.resolve())
