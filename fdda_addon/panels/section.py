@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What the sections of the sidebar have in common: where they are, the rig they are about, sentences and jobs."""
 
-import textwrap
+import functools
 
+import blf
 import bpy
 
 from ..core.errors import RigError
@@ -10,9 +11,9 @@ from ..operators import job
 from ..scene.active_rig import active_rig
 from ..scene.scene_rig import SceneRig
 
-CHARACTER_WIDTH = 6.4
-"""Mean width of a letter in the sidebar, pixels at a scale of 1."""
-MARGIN = 40
+MARGIN, ICON = 74, 22
+"""Width of what is left and right of text in a box, and of an icon, pixels at a scale of 1."""
+LEAST_WIDTH = 60
 OUTCOME_ICONS = {"INFO": "CHECKMARK", "WARNING": "INFO", "ERROR": "ERROR"}
 
 
@@ -57,11 +58,25 @@ def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
 def draw_sentence(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
     """Draw text in as many lines as the width of the sidebar takes."""
     scale = context.preferences.system.ui_scale
-    width = (context.region.width if context.region else 300) / scale - MARGIN - (20 if icon != "NONE" else 0)
+    width = context.region.width - (MARGIN + (ICON if icon != "NONE" else 0)) * scale
+    points = context.preferences.ui_styles[0].widget.points * scale
     column = layout.column(align=True)
     column.scale_y = 0.8
-    for number, line in enumerate(textwrap.wrap(text, max(16, int(width / CHARACTER_WIDTH)))):
+    for number, line in enumerate(_lines(text, max(width, LEAST_WIDTH * scale), points)):
         column.label(text=line, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+
+
+@functools.lru_cache(maxsize=256)
+def _lines(text: str, width: float, points: float) -> tuple[str, ...]:
+    """Text in lines of a width in pixels, as the interface's font has it; only a word that is longer goes beyond."""
+    blf.size(0, points)
+    lines: list[str] = []
+    for word in text.split():
+        if lines and blf.dimensions(0, f"{lines[-1]} {word}")[0] <= width:
+            lines[-1] += f" {word}"
+        else:
+            lines.append(word)
+    return tuple(lines)
 
 
 def draw_path(layout: bpy.types.UILayout, owner: bpy.types.bpy_struct, name: str) -> None:

@@ -143,7 +143,7 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 
 def _draw_row(table: bpy.types.UILayout, cells: tuple[str, str, str, str]) -> None:
     rest = table
-    for cell, factor in zip(cells, (0.4, 0.33, 0.5), strict=False):
+    for cell, factor in zip(cells, (0.36, 0.38, 0.5), strict=False):
         rest = rest.split(factor=factor)
         own = rest.row()
         own.alignment = "LEFT" if cell is cells[0] else "RIGHT"
