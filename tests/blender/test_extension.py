@@ -77,7 +77,7 @@ def test_enabled_it_is_all_there(story: dict):
 
 
 def test_blender_starts_as_fast_with_it(package: Path, tmp_path: Path):
-    """The best of three: the first compiles the modules, and the machine may be busy."""
+    """Seconds of the processor, the best of three starts: the first compiles the modules, the machine may be busy."""
     assert blender("install", package, user=tmp_path).returncode == 0
     starts = [json.loads(blender("start", user=tmp_path).stdout.splitlines()[-1]) for _ in range(3)]
     assert all(start["modules"] == [] for start in starts)
