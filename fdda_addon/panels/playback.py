@@ -89,10 +89,8 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         if body is None:
             return
         state = job.state_of("measure_model")
-        if state is not None and (state.is_running or state.outcome_level != "INFO"):
+        if state is not None and state.outcome_level != "INFO":
             draw_job(body, context, "measure_model", "rounds")
-        if state is not None and state.is_running:
-            return
         times = frame_times.of(mesh_object)
         if times is not None:
             grid = body.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
