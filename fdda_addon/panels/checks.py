@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Checks of rigs that panels may draw: a check runs when something has changed, in a timer, never while drawing."""
 
+import array
 from typing import TYPE_CHECKING
 
 import bpy
@@ -21,7 +22,7 @@ _wanted: set[int] = set()
 _outdated: set[int] = set()
 """Meshes whose pose, modifiers or limits may have changed since their check; what `_counters` shows is not in here."""
 _rest_changed: set[str] = set()
-"""Names of meshes and armatures whose data has changed."""
+"""Names of meshes whose data has changed."""
 
 
 def known(scene_rig: SceneRig) -> "RigCheck | None":
@@ -44,7 +45,7 @@ def check_now(scene_rig: SceneRig) -> "RigCheck":
     same_rest = stored is not None and stored[1][0] == counters[0] and not _is_rest_changed(scene_rig)
     result = stored[0].checked_again(scene_rig) if same_rest else check(scene_rig)
     _outdated.discard(uid)
-    _rest_changed.difference_update({scene_rig.mesh_object.data.name, scene_rig.armature_object.data.name})
+    _rest_changed.discard(scene_rig.mesh_object.data.name)
     _checks[uid] = (result, counters)
     return result
 
@@ -72,13 +73,16 @@ def _shown() -> dict[int, tuple]:
 def _counters(scene_rig: SceneRig) -> tuple:
     """What is cheap to read and changes when a check may come out differently: (rest pose, the rest)."""
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
-    mesh = mesh_object.data
+    mesh, bones = mesh_object.data, armature_object.data.bones
+    rest_matrices = array.array("f", bytes(64 * len(bones)))
+    bones.foreach_get("matrix_local", rest_matrices)
     rest = (
         mesh.name,
         len(mesh.vertices),
         len(mesh_object.vertex_groups),
         armature_object.name,
-        len(armature_object.data.bones),
+        len(bones),
+        rest_matrices.tobytes(),
         tuple(mesh_object.scale),
         tuple(armature_object.scale),
     )
@@ -92,7 +96,7 @@ def _is_rest_changed(scene_rig: SceneRig) -> bool:
     # Reading a large mesh takes a moment: not at each stroke of a brush.
     if mesh_object.mode not in {"OBJECT", "POSE"} or not _rest_changed:
         return False
-    return not _rest_changed.isdisjoint({mesh_object.data.name, scene_rig.armature_object.data.name})
+    return mesh_object.data.name in _rest_changed
 
 
 @persistent
@@ -101,14 +105,15 @@ def _on_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
         return
     _outdated.update(_checks)
     for update in depsgraph.updates:
-        if isinstance(update.id, bpy.types.Mesh | bpy.types.Armature):
+        # Not the armatures: Blender counts them as changed with every pose.
+        if isinstance(update.id, bpy.types.Mesh):
             _rest_changed.add(update.id.name)
 
 
 @persistent
 def _on_undone(*_: object) -> None:
     _outdated.update(_checks)
-    _rest_changed.update(data.name for datas in (bpy.data.meshes, bpy.data.armatures) for data in datas)
+    _rest_changed.update(mesh.name for mesh in bpy.data.meshes)
 
 
 @persistent

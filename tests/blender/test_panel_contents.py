@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the sections from rig to training draw, as far as that shows without a window."""
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from conftest import ELBOW
+from scene_state import fresh_elbow
+
+from fdda_addon.core.recording_folder import FolderState
+from fdda_addon.operators import job
+from fdda_addon.operators.job_state import JobState, Run
+from fdda_addon.panels import checks, curves
+from fdda_addon.panels.recording import content_of
+from fdda_addon.panels.section import duration, panel_rig
+from fdda_addon.panels.training import _report
+from fdda_addon.rig_cost import PLAYBACK_MS, RigCost, estimated_playback
+from fdda_addon.scene.rig import SceneRig
+from fdda_addon.settings import model_file, recording_folder
+
+
+@pytest.fixture
+def fresh() -> SceneRig:
+    rig = fresh_elbow()
+    bpy.context.view_layer.objects.active = rig.mesh_object
+    return rig
+
+
+class TestChecks:
+    def test_a_rig_that_is_well(self, fresh):
+        assert checks.known(fresh) is None, "nothing is checked while drawing"
+        check = checks.check_now(fresh)
+        assert check.problems == () and check.rig.joint_names == ("upper", "lower") and len(check.channels) == 4
+        assert checks.known(fresh) is check
+
+    def test_all_problems_at_once_in_the_sentences_of_the_command_line(self, fresh):
+        fresh.armature_object.data.pose_position = "REST"
+        fresh.mesh_object.vertex_groups["lower"].remove([299])
+        problems = checks.check_now(fresh).problems
+        assert problems[0] == "The armature 'elbow_rig' shows its rest position; set it to pose."
+        assert problems[1].startswith(
+            "1 of the 300 vertices of 'elbow' have no weight on a deforming bone (vertex 299)"
+        )
+        assert len(problems) == 2
+
+    def test_a_change_of_the_mesh_reads_it_again_and_a_pose_does_not(self, fresh):
+        first = checks.check_now(fresh)
+        fresh.armature_object.pose.bones["lower"].rotation_euler[0] = 0.5
+        bpy.context.view_layer.update()
+        assert checks.check_now(fresh).rig is first.rig
+        fresh.armature_object.pose.bones["lower"].lock_rotation[0] = True
+        bpy.context.view_layer.update()
+        again = checks.check_now(fresh)
+        assert again.rig is first.rig and len(again.channels) == 3
+        fresh.mesh_object.data.vertices[0].co.x += 0.01
+        fresh.mesh_object.data.update()
+        bpy.context.view_layer.update()
+        moved = checks.check_now(fresh)
+        assert moved.rig is not first.rig
+        assert moved.rig.fingerprint.rest_positions != first.rig.fingerprint.rest_positions
+
+    def test_a_change_of_the_rest_pose_reads_it_again(self, fresh):
+        first = checks.check_now(fresh)
+        bpy.context.view_layer.objects.active = fresh.armature_object
+        bpy.ops.object.mode_set(mode="EDIT")
+        fresh.armature_object.data.edit_bones["lower"].roll += 0.3
+        bpy.ops.object.mode_set(mode="OBJECT")
+        again = checks.check_now(fresh)
+        assert np.abs(again.rig.rest_matrices[1] - first.rig.rest_matrices[1]).max() > 0.1
+
+    def test_a_playing_model_is_no_problem(self, bound):
+        bpy.context.view_layer.objects.active = bound
+        rig, sentence = panel_rig(bpy.context)
+        assert bound.fdda.is_playing and sentence == ""
+        assert checks.check_now(rig).problems == ()
+
+    def test_no_rig_is_a_sentence_and_no_error(self):
+        assert panel_rig(bpy.context) == (
+            None,
+            "Nothing with a rig is active; select the mesh of a character, or its armature.",
+        )
+
+
+class TestFolder:
+    @pytest.fixture
+    def saved(self, rig: SceneRig, tmp_path: Path) -> SceneRig:
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elbow.blend"))
+        bpy.context.view_layer.objects.active = rig.mesh_object
+        rig.mesh_object.fdda.settings.poses = 5
+        return rig
+
+    def look(self, rig: SceneRig) -> FolderState:
+        checks.check_now(rig)
+        return content_of(rig, recording_folder(rig.mesh_object)).state
+
+    def test_what_the_section_says_follows_folder_settings_and_rig(self, saved):
+        assert self.look(saved) is FolderState.FREE
+        bpy.ops.fdda.record()
+        assert self.look(saved) is FolderState.COMPLETE
+        index = recording_folder(saved.mesh_object) / "recording.json"
+        values = json.loads(index.read_text())
+        index.write_text(json.dumps(values | {"complete": 3}))
+        assert self.look(saved) is FolderState.INCOMPLETE
+        saved.mesh_object.fdda.settings.seed = 1
+        assert self.look(saved) is FolderState.OTHER
+        saved.mesh_object.fdda.settings.seed = 0
+        bpy.data.actions["elbow_wave"].fdda.record = True
+        assert self.look(saved) is FolderState.OTHER
+        bpy.data.actions["elbow_wave"].fdda.record = False
+        assert self.look(saved) is FolderState.INCOMPLETE
+        bpy.ops.fdda.state_range(bone="upper", axis="X", low=-1, high=1)
+        assert self.look(saved) is FolderState.OTHER
+
+    def test_the_settings_belong_to_the_character_and_are_saved(self, saved, tmp_path):
+        settings = saved.mesh_object.fdda.settings
+        settings.seed, settings.recording, settings.tolerance_mm = 4, "//takes/one", 0.25
+        bpy.data.actions["elbow_wave"].fdda.record = True
+        bpy.ops.wm.save_mainfile()
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "elbow.blend"))
+        mesh_object = bpy.data.objects[ELBOW]
+        settings = mesh_object.fdda.settings
+        assert (settings.poses, settings.seed, settings.tolerance_mm) == (5, 4, 0.25)
+        assert recording_folder(mesh_object) == tmp_path / "takes" / "one"
+        assert model_file(mesh_object) == tmp_path / "elbow_model" / "elbow.onnx"
+        assert bpy.data.actions["elbow_wave"].fdda.record
+
+
+class TestTraining:
+    def test_curves_fall_in_their_colours(self):
+        falling = {"training": [1.0, 0.1, 0.01], "validation": [2.0, 0.2, 0.02]}
+        pixels = curves.paint(falling)
+        assert pixels.shape == (curves.HEIGHT, curves.WIDTH, 4) and pixels.dtype == np.float32
+        assert pixels.min() >= 0 and pixels.max() <= 1
+        heights = {}
+        for name, (_, _, colour) in curves.LEGEND.items():
+            distance = np.abs(pixels[..., :3] - np.float32(colour)).sum(axis=-1)
+            heights[name] = distance.argmin(axis=0)
+            assert distance.min(axis=0).max() < 0.05, "a line without gaps"
+        for falls in heights.values():
+            assert falls[0] > falls[curves.WIDTH // 2] > falls[-1]
+        assert (heights["validation"] > heights["training"]).all()
+
+    @pytest.mark.parametrize("values", [[0.0, 0.0], [0.5, 0.5], [1e-9, 1e9]])
+    def test_curves_of_any_values_can_be_drawn(self, values):
+        assert np.isfinite(curves.paint({"training": values, "validation": values})).all()
+
+    def test_a_report_is_read_and_a_damaged_one_passed_over(self, elbow, tmp_path):
+        report = _report(elbow.model.with_name("report.json"))
+        assert report["model"] == "elbow.onnx" and {p["joint"] for p in report["partitions"]} == {"upper", "lower"}
+        for number, text in enumerate(("{", "[]", '{"model": 1, "fdda": {}, "partitions": []}')):
+            path = tmp_path / f"{number}.json"
+            path.write_text(text)
+            assert _report(path) is None
+        assert _report(tmp_path / "none.json") is None
+
+    def test_its_trainer_ends_with_the_file(self, rig, elbow, tmp_path):
+        from fdda_addon.training import Training
+
+        trainings = []
+
+        def steps():
+            with Training([str(elbow.recording), str(tmp_path / "m.onnx"), "--epochs", "100000"]) as training:
+                trainings.append(training)
+                yield from training.messages(wait=False)
+
+        run = Run(JobState("train", "Training"), steps())
+        run.advance(0)
+        process = trainings[0]._process
+        assert process.poll() is None
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        assert process.poll() is not None and job.current() is None
+        assert not (tmp_path / "m.onnx").exists()
+
+
+class TestCost:
+    @pytest.mark.parametrize("vertices, milliseconds", PLAYBACK_MS)
+    def test_the_estimate_is_what_was_measured(self, vertices, milliseconds):
+        assert estimated_playback(vertices) == pytest.approx(milliseconds)
+
+    def test_the_estimate_grows_between_and_beyond(self):
+        between = [estimated_playback(count) for count in (100, 5_000, 20_000, 100_000, 200_000)]
+        assert between == sorted(between)
+        assert between[4] - between[3] == pytest.approx(
+            2 * (estimated_playback(100_000) - estimated_playback(50_000)), rel=0.05
+        )
+
+    @pytest.mark.parametrize(
+        "vertices, rig, linear, words",
+        [
+            (9_960, 4.411, 0.229, "A model would pay: a frame is about 3.8 times as fast"),
+            (50_618, 28.572, 0.798, "A model would pay: a frame is about 11.2 times as fast"),
+            (1_476, 0.596, 0.124, "A model would not pay"),
+            (9_960, 1.2, 0.229, "A model would make little difference"),
+        ],
+    )
+    def test_the_figures_of_the_benchmark_come_out_again(self, vertices, rig, linear, words):
+        assert RigCost(vertices, rig, linear).sentence.startswith(words)
+
+
+@pytest.mark.parametrize(
+    "seconds, text", [(0.2, "1 s"), (89, "89 s"), (90, "2 min"), (3600, "60 min"), (7800, "2 h 10 min")]
+)
+def test_durations(seconds, text):
+    assert duration(seconds) == text
