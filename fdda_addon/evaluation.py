@@ -44,6 +44,7 @@ class EvaluationSettings:
         actions: names of actions whose frames are compared as well.
         beyond: factors by which the range of motion is widened for further poses, a quarter as many for each.
         named: poses that are compared as well, each on its own.
+        surface: compare normals and edges too, which takes longer than all else.
     """
 
     poses: int = 200
@@ -51,6 +52,7 @@ class EvaluationSettings:
     actions: tuple[str, ...] = ()
     beyond: tuple[float, ...] = ()
     named: tuple[NamedPose, ...] = ()
+    surface: bool = True
 
 
 @dataclass
@@ -62,7 +64,8 @@ class PoseErrors:
         pose_matrices: (N, J, 4, 4) float32, mesh-object space, metres.
         positions: (N, V, 3) float32, the true rig, mesh-object space, metres.
         fdda, linear: (N, V) float32, distances from the true rig, metres.
-        fdda_surface, linear_surface: errors of normals and edges, None for a mesh without faces.
+        fdda_surface, linear_surface: errors of normals and edges, None for a mesh without faces, or where
+            they were not compared.
     """
 
     name: str
@@ -158,7 +161,7 @@ def evaluate(
     total += sum(len(action_frames(action)) for action in actions)
     with borrowed_pose(scene_rig.armature_object, actions):
         clear_pose(scene_rig.armature_object)
-        comparison = _Comparison(PoseEvaluator(scene_rig, rig), network, layer, total)
+        comparison = _Comparison(PoseEvaluator(scene_rig, rig), network, layer, total, settings.surface)
         poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses)
         held_out = yield from comparison.compare("held-out poses", poses)
         beyond = []
@@ -176,7 +179,7 @@ def evaluate(
 
 
 def evaluate_action(scene_rig: SceneRig, model: Path | Network, name: str) -> Iterator[Progress | Evaluation]:
-    """Compare a model with its rig on the frames of one action alone, which stand in the place of held-out poses.
+    """Compare positions on the frames of one action alone, which stand in the place of held-out poses.
 
     As `evaluate` in all else.
     """
@@ -184,7 +187,7 @@ def evaluate_action(scene_rig: SceneRig, model: Path | Network, name: str) -> It
     network, layer = _prepare(scene_rig, model)
     with borrowed_pose(scene_rig.armature_object, [action]):
         evaluator = PoseEvaluator(scene_rig, layer.rig)
-        comparison = _Comparison(evaluator, network, layer, len(action_frames(action)))
+        comparison = _Comparison(evaluator, network, layer, len(action_frames(action)), surface=False)
         errors = yield from comparison.compare(action.name, _action_poses(scene_rig, action))
     yield Evaluation(layer.partitions, layer.rig.joint_names, errors)
 
@@ -237,13 +240,13 @@ def _action_poses(scene_rig: SceneRig, action: bpy.types.Action) -> Iterator[Non
 class _Comparison:
     """Evaluates poses three ways and counts them."""
 
-    def __init__(self, evaluator: PoseEvaluator, network: Network, layer: LinearLayer, total: int):
+    def __init__(self, evaluator: PoseEvaluator, network: Network, layer: LinearLayer, total: int, surface: bool):
         self._evaluator, self._network, self._layer = evaluator, network, layer
         self._done, self._total = 0, total
         rig, self._surface = layer.rig, None
-        if len(rig.face_starts):
-            surface = Surface(rig.face_starts, rig.face_vertices)
-            self._surface = SurfaceComparison(surface, rig.rest_positions, layer.partitions)
+        if surface and len(rig.face_starts):
+            faces = Surface(rig.face_starts, rig.face_vertices)
+            self._surface = SurfaceComparison(faces, rig.rest_positions, layer.partitions)
 
     def compare(self, name: str, poses: Iterator[None]) -> Iterator[Progress]:
         """Yields progress, returns PoseErrors."""

@@ -54,7 +54,7 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
             if self._action:
                 yield from evaluate_action(scene_rig, network, self._action)
             else:
-                yield from evaluate(scene_rig, network, EvaluationSettings(self.poses, self.seed))
+                yield from evaluate(scene_rig, network, EvaluationSettings(self.poses, self.seed, surface=False))
 
     def finish(self, context: bpy.types.Context, result: object) -> str:
         from ..evaluation_view import redraw_views
