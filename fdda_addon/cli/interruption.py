@@ -12,7 +12,10 @@ from contextlib import contextmanager
 from types import FrameType
 
 _ADDON = __name__.rsplit(".", 2)[0]
-CALLED_BY_BLENDER = {f"{_ADDON}.runtime.handlers", f"{_ADDON}.properties"}
+CALLED_BY_BLENDER = {
+    f"{_ADDON}.{module}"
+    for module in ("runtime.handlers", "properties", "overlay", "operators.job_state", "panels.checks")
+}
 """Modules whose functions Blender calls."""
 
 _pending = False

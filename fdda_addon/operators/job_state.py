@@ -137,7 +137,7 @@ class Run:
                 self.state.show(step)
             else:
                 self.result = step
-            if time.monotonic() >= until:
+            if self.state.cancel_requested or time.monotonic() >= until:
                 return False
 
     def close(self) -> None:

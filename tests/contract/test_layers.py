@@ -5,6 +5,7 @@ Imports inside functions count too: a rule that a late import gets around is no 
 """
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -132,3 +133,14 @@ def test_importing_the_addon_costs_nothing():
     code = "import sys, fdda_addon; print(sorted({'numpy', 'onnxruntime', 'bpy'} & set(sys.modules)))"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_ctrl_c_waits_in_every_module_whose_functions_blender_calls():
+    """Blender prints what leaves a handler and goes on: a Ctrl-C that is raised there is lost."""
+    handlers = {
+        ".".join(file.relative_to(ROOT / "fdda_addon").with_suffix("").parts)
+        for file in python_files("fdda_addon")
+        if re.search(r"^@persistent$", file.read_text(), re.MULTILINE)
+    }
+    text = (ROOT / "fdda_addon/cli/interruption.py").read_text()
+    assert handlers and [name for name in sorted(handlers) if f'"{name}"' not in text] == []
