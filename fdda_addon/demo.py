@@ -20,7 +20,7 @@ from .pictures import draw_comparison, draw_partitions, pictured
 from .scene.rig import find_rig
 from .training import trainer_command
 
-POSES, HELD_OUT_POSES = 1000, 200
+POSES, REFINED_POSES, HELD_OUT_POSES = 750, 250, 200
 VIEW = View(azimuth=15, elevation=50)
 FRAMES = {52: "reach", 110: "flex", 132: "fist", 190: "spread"}
 METACARPAL_RANGE = 20.0
@@ -53,12 +53,16 @@ def main(folder: Path) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(recording, ignore_errors=True)
     start = time.monotonic()
+    refine = ["record", rig, recording, "--refine", model]
     for title, arguments in (
         ("1. The rig", ["build-arm", rig]),
         ("2. Poses and recording", ["record", rig, recording, "--poses", POSES]),
         ("3. Training", ["train", recording, model]),
+        ("… and on, with more poses where the model is worst", [*refine, "--poses", REFINED_POSES]),
+        ("", ["train", recording, model, "--warm-start"]),
     ):
-        print(f"\n== {title}", flush=True)
+        if title:
+            print(f"\n== {title}", flush=True)
         if status := run_verb([str(argument) for argument in arguments], "python -m fdda_addon"):
             return status
 
@@ -79,7 +83,7 @@ def main(folder: Path) -> int:
     print(f"\n{table(evaluation)}\n\nDone in {time.monotonic() - start:.0f} s:")
     for path, what in (
         (rig, "the rig"),
-        (recording, f"{POSES} poses and their residuals"),
+        (recording, f"{POSES + REFINED_POSES} poses and their residuals"),
         (model, "the model"),
         (folder / "report.json", "the training in figures"),
         (folder / "report.html", "the training, the errors and the pictures as a page"),
