@@ -43,7 +43,13 @@ def _check(scene_rig: SceneRig, rig: Rig | None) -> RigCheck:
             problems.append(str(error))
     try:
         rig = rig or read_rig(scene_rig)
-        channels = sampled_channels(scene_rig, rig)
     except RigError as error:
         problems.append(str(error))
+        return RigCheck(tuple(problems), None, ())
+    try:
+        channels = sampled_channels(scene_rig, rig)
+    except RigError as error:
+        # A rig that is driven by controls is recorded by its actions alone.
+        if scene_rig.mesh_object.fdda.settings.poses:
+            problems.append(str(error))
     return RigCheck(tuple(problems), rig, channels)

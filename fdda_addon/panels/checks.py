@@ -88,7 +88,7 @@ def _counters(scene_rig: SceneRig) -> tuple:
     )
     modifiers = tuple((m.name, m.type, m.show_viewport) for m in mesh_object.modifiers)
     state = (mesh_object.mode, armature_object.mode, mesh_object.visible_get(), armature_object.data.pose_position)
-    return rest, modifiers, state, mesh_object.fdda.is_playing
+    return rest, modifiers, state, mesh_object.fdda.is_playing, mesh_object.fdda.settings.poses > 0
 
 
 def _is_rest_changed(scene_rig: SceneRig) -> bool:

@@ -125,7 +125,7 @@ def sampled_channels(scene_rig: SceneRig, rig: Rig) -> tuple[Channel, ...]:
     if not found:
         raise RigError(
             f"No bone of '{scene_rig.armature_object.name}' may be sampled: all {len(rig.joints)} are locked or moved "
-            "by constraints; unlock an axis, give it a Limit Rotation, or record an action with --action and --poses 0."
+            "by constraints; unlock an axis, give it a Limit Rotation, or record an action alone (--action, --poses 0)."
         )
     return found
 

@@ -304,3 +304,15 @@ class TestTraining:
         with pytest.raises(RuntimeError, match="The trainer's Python '/none/python' cannot be started"):
             self.train(saved, elbow)
         assert job.current() is None
+
+
+def test_the_arm_is_in_the_menu_while_the_addon_is_enabled():
+    import fdda_addon
+
+    def entries() -> list[str]:
+        return [draw.__module__ for draw in bpy.types.VIEW3D_MT_armature_add._dyn_ui_initialize()]
+
+    assert entries().count("fdda_addon.operators.rig") == 1
+    fdda_addon.unregister()
+    assert "fdda_addon.operators.rig" not in entries()
+    fdda_addon.register()

@@ -71,6 +71,14 @@ class TestChecks:
         again = checks.check_now(fresh)
         assert np.abs(again.rig.rest_matrices[1] - first.rig.rest_matrices[1]).max() > 0.1
 
+    def test_a_rig_without_a_joint_to_sample_can_be_recorded_by_its_actions(self, fresh):
+        for bone in fresh.armature_object.pose.bones:
+            bone.lock_rotation = (True, True, True)
+        assert checks.check_now(fresh).problems[0].startswith("No bone of 'elbow_rig' may be sampled")
+        fresh.mesh_object.fdda.settings.poses = 0
+        check = checks.check_now(fresh)
+        assert check.problems == () and check.rig is not None and check.channels == ()
+
     def test_a_playing_model_is_no_problem(self, bound):
         bpy.context.view_layer.objects.active = bound
         rig, sentence = panel_rig(bpy.context)
