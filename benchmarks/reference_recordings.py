@@ -34,7 +34,6 @@ SETTINGS = {
     "hidden": (256, 256),
     "batch_size": 32,
     "weight_decay": 1.0,
-    "tolerance_mm": 0.05,
     "validation_fraction": 0.05,
 }
 """What differs from the defaults: networks as large as the largest published, and less trust in few, noisy poses."""

@@ -45,7 +45,7 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
     tolerance_mm: FloatProperty(
         name="Tolerance (mm)",
         description="Error that the shapes of a partition may leave; smaller is more exact and slower",
-        default=0.1,
+        default=0.05,
         min=0.001,
         soft_max=1.0,
         precision=3,

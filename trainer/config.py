@@ -35,7 +35,7 @@ class TrainingConfig:
     """
 
     seed: int = 0
-    tolerance_mm: float = 0.1
+    tolerance_mm: float = 0.05
     hidden: tuple[int, ...] = (64, 64)
     activation: str = "silu"
     epochs: int = 200
