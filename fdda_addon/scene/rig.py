@@ -125,7 +125,8 @@ def sampled_channels(scene_rig: SceneRig, rig: Rig) -> tuple[Channel, ...]:
     if not found:
         raise RigError(
             f"No bone of '{scene_rig.armature_object.name}' may be sampled: all {len(rig.joints)} are locked or moved "
-            "by constraints; unlock an axis, give it a Limit Rotation, or record an action alone (--action, --poses 0)."
+            "by constraints; unlock an axis, give it a Limit Rotation, or record actions alone, with 0 random poses "
+            "(--action NAME --poses 0)."
         )
     return found
 
