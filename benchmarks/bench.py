@@ -154,15 +154,16 @@ def main() -> None:
     parser.add_argument("--poses", type=int, default=POSES)
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    results = []
-    for density in options.densities:
-        rig = options.out / f"arm{density}.blend"
+    rigs = {f"arm{density}": options.out / f"arm{density}.blend" for density in options.densities}
+    for density, rig in zip(options.densities, rigs.values(), strict=True):
         run("-m", "fdda_addon", "build-arm", rig, "--density", density)
-        results.append(bench(f"arm{density}", rig, options.out, options.poses))
-    results += [bench(rig.stem, rig, options.out, options.poses) for rig in options.rig]
-    about = machine() | {"blender": results[0]["frame"]["blender"]}
-    content = json.dumps({"machine": about, "rigs": results}, indent=1)
-    (options.out / "bench.json").write_text(content, encoding="utf-8")
+    results = []
+    for name, rig in (rigs | {rig.stem: rig for rig in options.rig}).items():
+        results.append(bench(name, rig, options.out, options.poses))
+        about = machine() | {"blender": results[0]["frame"]["blender"]}
+        # After every rig: what one of them fails at costs only that one.
+        content = json.dumps({"machine": about, "rigs": results}, indent=1)
+        (options.out / "bench.json").write_text(content, encoding="utf-8")
     print(f"{about['date']}, Blender {about['blender']}, {about['processor']}, {about['cores']} cores\n")
     print(table(results))
 

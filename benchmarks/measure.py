@@ -18,7 +18,7 @@ import bpy
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import fdda_addon
-from fdda_addon.benchmark import benchmark
+from fdda_addon.benchmark import benchmark, random_action
 from fdda_addon.core.poses import sample_pose
 from fdda_addon.recording import RecordingSettings, record
 from fdda_addon.runtime import model_files
@@ -73,9 +73,11 @@ def crowd(bound: str) -> dict:
     """A frame of one bound character and of a crowd, each in a pose of its own; and without the characters."""
     bpy.ops.wm.open_mainfile(filepath=bound)
     first = next(o for o in bpy.data.objects if o.fdda.is_bound)
+    armature_object = armature_modifier(first).object
+    if armature_object.animation_data is None or armature_object.animation_data.action is None:
+        random_action(SceneRig(first, armature_object))
     one = _frame_times(60)
     empty = _without_play(first)
-    armature_object = armature_modifier(first).object
     for number in range(1, CROWD):
         mesh_copy, armature_copy = first.copy(), armature_object.copy()
         for copy in (mesh_copy, armature_copy):

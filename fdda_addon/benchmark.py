@@ -133,7 +133,7 @@ def playing(scene_rig: SceneRig) -> Iterator[range]:
     animation = scene_rig.armature_object.animation_data
     own_action = animation.action if animation else None
     with borrowed_pose(scene_rig.armature_object, [own_action] if own_action else []):
-        action = own_action or _random_action(scene_rig)
+        action = own_action or random_action(scene_rig)
         assign_action(scene_rig.armature_object, action)
         try:
             yield action_frames(action)
@@ -143,7 +143,8 @@ def playing(scene_rig: SceneRig) -> Iterator[range]:
                 bpy.data.actions.remove(action)
 
 
-def _random_action(scene_rig: SceneRig) -> bpy.types.Action:
+def random_action(scene_rig: SceneRig) -> bpy.types.Action:
+    """Key random poses on the armature, a pose every few frames; its action."""
     armature_object = scene_rig.armature_object
     channels = sampled_channels(scene_rig, read_rig(scene_rig))
     clear_pose(armature_object)
