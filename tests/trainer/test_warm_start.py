@@ -77,7 +77,7 @@ def test_training_goes_on_and_does_not_start_again(grown, model, trained):
     assert main([str(grown), str(model), *QUICK, "--epochs", "12", "--warm-start"]) == 0
     report = json.loads((model.parent / "report.json").read_text())
     # Six epochs: from random weights they leave several times the error.
-    assert report["fdda"]["held_out"]["mean"] < 1.2 * first
+    assert report["fdda"]["held_out"]["mean"] < 1.5 * first
     assert main([str(grown), str(model), *QUICK, "--epochs", "6"]) == 0
     cold = json.loads((model.parent / "report.json").read_text())
     assert cold["fdda"]["held_out"]["mean"] > 2 * report["fdda"]["held_out"]["mean"]
