@@ -145,8 +145,10 @@ def _draw_legend(legend: Callable[[bpy.types.Context], tuple[list[str], float | 
     if not lines:
         return
     unit = context.preferences.system.ui_scale
-    left = 24 * unit + sum(r.width for r in context.area.regions if r.type == "TOOLS" and r.width > 1)
-    bottom = 30 * unit
+    regions = [r for r in context.area.regions if r.width > 1]
+    left = 24 * unit + sum(r.width for r in regions if r.type == "TOOLS")
+    # Above what Blender offers there to adjust the last operation.
+    bottom = 30 * unit + sum(r.height for r in regions if r.type == "HUD")
     blf.size(0, 12 * unit)
     blf.enable(0, blf.SHADOW)
     blf.shadow(0, 5, 0, 0, 0, 0.9)
