@@ -32,6 +32,9 @@ test-trainer: .venv  ## the tests of the training, export and report
 test-blender: .venv  ## the tests that run in Blender
 	.venv/bin/python -m pytest tests/blender
 
+test-gui: package  ## press the buttons of the sidebar in a Blender with a window (BLENDER=/path/to/blender), into out/gui
+	.venv/bin/python tests/gui/run.py out/gui $(BLENDER)
+
 test-all: test  ## as test, and the core and Blender tiers on the other LTS line
 	@$(MAKE) test-line LINE=$(OTHER_LINE)
 
@@ -74,4 +77,4 @@ requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
 clean:  ## remove what was built and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache
 
-.PHONY: help .venv .venv-line demo test test-core test-trainer test-blender test-all test-line bench sampling study fixtures lint package requirements clean
+.PHONY: help .venv .venv-line demo test test-core test-trainer test-blender test-gui test-all test-line bench sampling study fixtures lint package requirements clean

@@ -1,0 +1,357 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The path of a rigger, from adding the sample arm to a saved file that plays: a function a step, with its checks.
+
+Buttons are pressed with the mouse. What Blender itself offers for opening and saving is called.
+"""
+
+import importlib
+import json
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import bpy
+import numpy as np
+import sidebar
+from window import StepError, check, click, over, picture, press, redraw, region, rest_mouse, until, vivid_part
+
+EXTENSION = "bl_ext.user_default.fdda"
+VERTICES, JOINTS, POSES, EPOCHS, FRAMES = 1476, 22, 100, 40, 250
+FRAME = 110
+"""Of the action, with elbow and fingers bent: where shapes are compared."""
+MODIFIERS = ["ARMATURE", "CORRECTIVE_SMOOTH"]
+BLEND = "arm.blend"
+PLAY_SECONDS = 4
+COLORED = 0.01
+"""Part of the viewport that the arm takes, at least; without colours it is 0.001."""
+
+_rig_shape: np.ndarray | None = None
+_model_shape: np.ndarray | None = None
+
+
+def part(name: str) -> ModuleType:
+    """A module of the installed extension."""
+    return importlib.import_module(f"{EXTENSION}.fdda_addon.{name}")
+
+
+def arm() -> bpy.types.Object:
+    """The mesh: looked up each time, as an undo or another file makes references invalid."""
+    return bpy.data.objects["arm"]
+
+
+def shape(frame: int = FRAME) -> np.ndarray:
+    """(V, 3) metres: what Blender shows of the arm at a frame of its action."""
+    bpy.context.scene.frame_set(frame)
+    mesh = arm().evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    positions = np.empty((len(mesh.vertices), 3), np.float32)
+    mesh.attributes["position"].data.foreach_get("vector", positions.reshape(-1))
+    return positions
+
+
+def distance_mm(one: np.ndarray, other: np.ndarray) -> float:
+    """Mean distance of vertices."""
+    return float(np.linalg.norm(one - other, axis=1).mean()) * 1000
+
+
+def switches() -> list[tuple[str, bool, bool]]:
+    """The rig's modifiers and where they are shown."""
+    return [(m.type, m.show_viewport, m.show_render) for m in arm().modifiers if m.type in MODIFIERS]
+
+
+def job_done(verb: str, seconds: float) -> Iterator[float]:
+    """Wait until the job that a button started has ended well."""
+    job = part("operators.job")
+    yield from until(lambda: job.state_of(verb) is not None, 10, f"the button starts no job {verb}")
+    yield from until(lambda: not job.state_of(verb).is_running, seconds, f"the job {verb} does not end")
+    state = job.state_of(verb)
+    check(state.outcome_level == "INFO", f"the job {verb} ended with '{state.outcome}'")
+
+
+def find_the_sidebar(_folder: Path) -> Iterator[float]:
+    """The extension was enabled by its installation; its tab is in the sidebar."""
+    check(EXTENSION in bpy.context.preferences.addons, f"{EXTENSION} is not enabled")
+    origin = Path(part("operators.job").__file__)
+    own = Path(os.environ["BLENDER_USER_RESOURCES"])
+    check(origin.is_relative_to(own), f"the add-on comes from {origin}, not from what was installed into {own}")
+    yield from sidebar.show()
+    opened = yield from sidebar.open_sections()
+    check(opened == {"rig"}, f"without a rig the section Rig alone is there, not {sorted(opened)}")
+
+
+def add_the_arm(folder: Path) -> Iterator[float]:
+    """Press Add Sample Arm, and save the file."""
+    bpy.data.objects.remove(bpy.data.objects["Cube"])
+    yield from redraw()
+    yield from sidebar.push("fdda.add_arm")
+    yield from until(lambda: "arm" in bpy.data.objects, 20, "no arm is added")
+    check(bpy.context.view_layer.objects.active == arm(), "the arm is not the active object")
+    check(len(arm().data.vertices) == VERTICES, f"the arm has {len(arm().data.vertices)} vertices")
+    check(len(bpy.data.objects["arm_rig"].pose.bones) == JOINTS, "the armature has other joints")
+    check([m.type for m in arm().modifiers] == MODIFIERS, "the arm has other modifiers")
+    with over("WINDOW"):
+        bpy.ops.view3d.view_selected()
+    yield 0.5
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "work" / BLEND))
+
+
+def measure_the_rig(_folder: Path) -> Iterator[float]:
+    """Press Measure in the section Rig."""
+    yield from sidebar.open_section("rig")
+    yield from sidebar.push("fdda.measure()")
+    yield from job_done("measure", 40)
+    cost = part("operators.rig").cost_of(arm())
+    check(0 < cost.linear < cost.rig, f"the armature alone takes {cost.linear} ms and the whole rig {cost.rig}")
+
+
+def show_a_random_pose(_folder: Path) -> Iterator[float]:
+    """Look at a random pose."""
+    rest = shape()
+    yield from sidebar.open_section("poses")
+    yield from sidebar.push("fdda.preview_pose(step=1)", across=0.54)
+    yield 0.3
+    shown = arm().evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    moved = np.empty_like(rest)
+    shown.attributes["position"].data.foreach_get("vector", moved.reshape(-1))
+    check(distance_mm(moved, rest) > 1, "the button shows no other pose")
+
+
+def choose_a_hundred_poses(_folder: Path) -> Iterator[float]:
+    """Back to the rest pose; type a number into the field of random poses."""
+    yield from sidebar.push("fdda.rest_pose", across=0.85)
+    turned = [b.name for b in bpy.data.objects["arm_rig"].pose.bones if max(map(abs, b.rotation_euler)) > 1e-6]
+    check(not turned, f"{turned} are not at rest")
+    x, y = yield from sidebar.find("settings.poses", across=0.7)
+    yield from click(x, y, times=2)
+    yield from press("ctrl+a", *str(POSES), "Return")
+    poses = arm().fdda.settings.poses
+    check(poses == POSES, f"typed {POSES}, and there are {poses} random poses")
+
+
+def record(folder: Path) -> Iterator[float]:
+    """Press Record and wait."""
+    job = part("operators.job")
+    yield from sidebar.open_section("recording")
+    yield from sidebar.push("fdda.record")
+    yield from until(lambda: job.state_of("record") and job.state_of("record").done > 10, 30, "nothing is recorded")
+    yield from picture(folder / "recording.png")
+    yield from job_done("record", 90)
+    index = part("core.recording").read_index(folder / "work" / "arm_recording")
+    check(index["complete"] == POSES, f"{index['complete']} poses are recorded")
+    check(bpy.data.objects["arm_rig"].animation_data.action is not None, "the recording has not given the action back")
+
+
+def check_the_trainer(_folder: Path) -> Iterator[float]:
+    """Press Check: the trainer's Python has torch."""
+    session = part("trainer_environment.session")
+    yield from sidebar.open_section("training")
+    yield from sidebar.push("fdda.check_trainer", across=0.2)
+    yield from until(lambda: session.answer is not None, 60, "the check does not end")
+    check(session.answer.level == "INFO", f"the check says '{session.answer.message}'")
+    yield 0.3
+
+
+def train(folder: Path) -> Iterator[float]:
+    """Press Train, do something else meanwhile, and wait."""
+    job = part("operators.job")
+    arm().fdda.settings.epochs = EPOCHS
+    yield from sidebar.push("fdda.train")
+    yield from until(lambda: job.current() is not None, 10, "the button starts no training")
+    longest, state = 0.0, job.current()
+    while state.is_running and len(state.curves.get("validation", ())) < EPOCHS // 2:
+        before = time.monotonic()
+        yield 0.05
+        longest = max(longest, time.monotonic() - before)
+    check(longest < 2, f"Blender did not answer for {longest:.1f} s while the trainer worked")
+    if state.is_running:
+        yield from picture(folder / "training.png")
+    yield from job_done("train", 120)
+    check(len(state.curves["training"]) == EPOCHS, f"{len(state.curves['training'])} epochs have a loss")
+    report = json.loads((folder / "work" / "arm_model" / "report.json").read_text(encoding="utf-8"))
+    fdda, linear = (report[way]["held_out"]["mean"] for way in ("fdda", "linear"))
+    check(fdda < linear, f"the held-out error is {fdda} mm and that of the linear layer {linear}")
+
+
+def bind(_folder: Path) -> Iterator[float]:
+    """Press Bind in the section Playback: the mesh moves as the rig does, without its modifiers."""
+    global _rig_shape, _model_shape
+    _rig_shape = shape()
+    yield from sidebar.open_section("playback")
+    yield from sidebar.push("fdda.bind")
+    yield from until(lambda: arm().fdda.is_bound, 20, "the button binds nothing")
+    check(arm().fdda.mode == "FDDA" and not arm().fdda.status, f"it plays {arm().fdda.mode}: {arm().fdda.status}")
+    check(not any(viewport for _, viewport, _ in switches()), f"the rig's modifiers are still on: {switches()}")
+    _model_shape = shape()
+    apart = distance_mm(_model_shape, _rig_shape)
+    check(1e-4 < apart < 5, f"at frame {FRAME} the model is {apart:.4f} mm from the rig")
+
+
+def switch_the_deformation(folder: Path) -> Iterator[float]:
+    """Press Rig, Linear Layer and FDDA, and compare the shapes."""
+    shapes = {}
+    for mode, across in (("RIG", 0.15), ("LINEAR", 0.5), ("FDDA", 0.88)):
+        yield from sidebar.push("fdda.mode", across)
+        yield from until(lambda mode=mode: arm().fdda.mode == mode, 5, f"the button does not switch to {mode}")
+        shapes[mode] = shape()
+        yield from picture(folder / f"mode_{mode.lower()}.png")
+    check(np.allclose(shapes["RIG"], _rig_shape, atol=1e-6), "the true rig is not shown as it was before binding")
+    check(np.allclose(shapes["FDDA"], _model_shape, atol=1e-6), "the model is not shown as before")
+    linear, fdda = (distance_mm(shapes[mode], _rig_shape) for mode in ("LINEAR", "FDDA"))
+    check(fdda < linear, f"the model is {fdda:.3f} mm from the rig, the linear layer {linear:.3f}")
+
+
+def measure_the_model(_folder: Path) -> Iterator[float]:
+    """Press Measure in the section Playback."""
+    yield from sidebar.push("fdda.measure_model")
+    yield from until(lambda: part("frame_times").of(arm()) is not None, 60, "nothing is measured")
+    times = part("frame_times").of(arm())
+    check(min(times.rig, times.linear, times.fdda) > 0, f"there are times of 0: {times}")
+
+
+def play_the_action(_folder: Path) -> Iterator[float]:
+    """Press space over the viewport: the arm moves, frame by frame."""
+    bpy.context.scene.frame_set(1)
+    yield from rest_mouse()
+    yield from press("space")
+    yield from until(lambda: main_screen().is_animation_playing, 5, "the space bar does not play the action")
+    seen, end = {}, time.monotonic() + PLAY_SECONDS
+    while time.monotonic() < end:
+        yield 0.1
+        frame = bpy.context.scene.frame_current
+        mesh = arm().evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+        positions = np.empty((len(mesh.vertices), 3), np.float32)
+        mesh.attributes["position"].data.foreach_get("vector", positions.reshape(-1))
+        seen[frame] = positions
+    yield from press("space")
+    yield from until(lambda: not main_screen().is_animation_playing, 5, "the space bar does not stop the action")
+    check(len(seen) > 2, f"in {PLAY_SECONDS} seconds the frames {sorted(seen)} were shown")
+    first, last = seen[min(seen)], seen[max(seen)]
+    check(distance_mm(first, last) > 1, f"the arm has the same shape at frame {min(seen)} and {max(seen)}")
+    check(not arm().fdda.status, f"the model was switched off: {arm().fdda.status}")
+
+
+def main_screen() -> bpy.types.Screen:
+    return bpy.context.window_manager.windows[0].screen
+
+
+def evaluate(_folder: Path) -> Iterator[float]:
+    """Press Evaluate: the active action, frame by frame."""
+    bpy.context.scene.frame_set(FRAME)
+    yield from sidebar.open_section("evaluation")
+    yield from sidebar.push("fdda.evaluate")
+    evaluations = part("last_evaluation")
+    yield from until(lambda: evaluations.of(arm()) is not None, 90, "nothing is evaluated")
+    last = evaluations.of(arm())
+    check(last.poses == FRAMES, f"{last.poses} frames are compared")
+    fdda, linear = last.total["fdda"].mean, last.total["linear"].mean
+    check(0 < fdda < linear, f"the model is {fdda} mm from the rig and the linear layer {linear}")
+
+
+def show_the_heat_map(folder: Path) -> Iterator[float]:
+    """Press Heat Map: the errors as colours on the arm."""
+    yield from _paint("ERRORS", folder)
+
+
+def show_the_partitions(folder: Path) -> Iterator[float]:
+    """Press Partitions."""
+    yield from _paint("PARTITIONS", folder)
+
+
+def _paint(colors: str, folder: Path) -> Iterator[float]:
+    across = {"ERRORS": 0.5, "PARTITIONS": 0.85}[colors]
+    yield from sidebar.push(f"fdda.paint(colors='{colors}')", across)
+    yield from until(lambda: part("heat_map").painted(arm()) == colors, 5, f"the button does not show {colors}")
+    with over("WINDOW"):
+        bpy.ops.object.select_all(action="DESELECT")
+    shown = folder / "colors.png"
+    yield from picture(shown)
+    vivid = vivid_part(shown)
+    shown.unlink()
+    check(vivid > COLORED, f"{100 * vivid:.2f} % of the viewport has a colour")
+
+
+def mark_the_worst_frames(_folder: Path) -> Iterator[float]:
+    """Press Mark, then the first of the worst frames."""
+    yield from sidebar.push("fdda.mark_worst", across=0.8)
+    worst = part("last_evaluation").of(arm()).worst(5)
+    found = part("markers").find(bpy.context.scene)
+    check(
+        {marker.frame for marker in found} == {index + 1 for index, _ in worst},
+        f"markers are at {sorted(marker.frame for marker in found)}, the worst frames are {worst}",
+    )
+    yield from sidebar.push("fdda.jump_to_worst")
+    yield 0.2
+    frame = bpy.context.scene.frame_current
+    check(frame == worst[0][0] + 1, f"it jumps to frame {frame}, the worst is {worst[0][0] + 1}")
+
+
+def pack_the_model(_folder: Path) -> Iterator[float]:
+    """Press Pack in the section Models."""
+    yield from sidebar.open_section("models")
+    yield from sidebar.push("fdda.pack_model")
+    yield from until(lambda: arm().fdda.packed is not None, 5, "the button packs nothing")
+    check(distance_mm(shape(), _model_shape) < 1e-3, "packed, the model has another shape")
+
+
+def unbind(_folder: Path) -> Iterator[float]:
+    """Press Unbind: the rig has its modifiers back."""
+    part("heat_map").clear_all()
+    yield from sidebar.open_section("playback")
+    yield from sidebar.push("fdda.unbind")
+    yield from until(lambda: not arm().fdda.is_bound, 5, "the button does not unbind")
+    check(switches() == [(kind, True, True) for kind in MODIFIERS], f"the rig's modifiers are {switches()}")
+    check([m.type for m in arm().modifiers] == MODIFIERS, "binding has left a modifier behind")
+    check(np.allclose(shape(), _rig_shape, atol=1e-6), "the rig is not as it was before binding")
+
+
+def undo(_folder: Path) -> Iterator[float]:
+    """Press Ctrl Z over the viewport: the model is bound again, and plays."""
+    yield from rest_mouse()
+    yield from press("ctrl+z")
+    yield from until(lambda: arm().fdda.is_bound, 5, "undo does not bind the model again")
+    yield 0.3
+    apart = distance_mm(shape(), _model_shape)
+    check(apart < 1e-3, f"after the undo the model is {apart:.4f} mm from where it was")
+
+
+def save_and_open_again(folder: Path) -> Iterator[float]:
+    """The file that was saved plays, with the model inside it alone."""
+    bpy.ops.wm.save_mainfile()
+    model = folder / "work" / "arm_model" / "arm.onnx"
+    model.rename(model.with_suffix(".away"))
+    bpy.ops.wm.read_homefile(app_template="")
+    check("arm" not in bpy.data.objects, "the file is still open")
+    yield 0.5
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "work" / BLEND))
+    yield 1.0
+    check(arm().fdda.is_bound and arm().fdda.mode == "FDDA", "the model is not bound any more")
+    apart = distance_mm(shape(), _model_shape)
+    check(apart < 1e-3 and not arm().fdda.status, f"opened again it is {apart:.4f} mm off; {arm().fdda.status}")
+    check(region("UI").active_panel_category == "FDDA", "the sidebar has another tab")
+
+
+STEPS = (
+    find_the_sidebar,
+    add_the_arm,
+    measure_the_rig,
+    show_a_random_pose,
+    choose_a_hundred_poses,
+    record,
+    check_the_trainer,
+    train,
+    bind,
+    switch_the_deformation,
+    measure_the_model,
+    play_the_action,
+    evaluate,
+    show_the_heat_map,
+    show_the_partitions,
+    mark_the_worst_frames,
+    pack_the_model,
+    unbind,
+    undo,
+    save_and_open_again,
+)
+
+__all__ = ["STEPS", "StepError"]
