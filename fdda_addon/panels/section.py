@@ -120,7 +120,11 @@ def draw_job(
     row.operator("fdda.cancel", text="Cancelling…" if state.cancel_requested else "Cancel", icon="X")
     remaining = state.remaining_seconds
     # The line is always there: what is below would jump.
-    layout.label(text=f"About {duration(remaining)} left" if remaining is not None else "…", icon="TIME")
+    if state.total and state.done == state.total:
+        text = "Finishing…"
+    else:
+        text = f"About {duration(remaining)} left" if remaining is not None else "…"
+    layout.label(text=text, icon="TIME")
     return True
 
 
