@@ -99,7 +99,7 @@ def drive(folder: Path, blender: str) -> str:
         return f"after {len(done)} steps Blender ended ({status_name(status)}); see failed.png in {folder}"
     if not done or done[-1]["step"] != LAST_STEP:
         return f"Blender ended before the last step, {LAST_STEP}"
-    for picture in [folder / step["picture"] for step in done]:
+    for picture in {folder / step["picture"] for step in done} | set(folder.glob("*.png")):
         if not picture.is_file() or is_one_color(picture):
             return f"there is nothing to see in {picture}"
     return ""

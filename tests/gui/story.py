@@ -18,7 +18,7 @@ import sidebar
 from window import StepError, check, click, over, picture, press, redraw, region, rest_mouse, until, vivid_part
 
 EXTENSION = "bl_ext.user_default.fdda"
-VERTICES, JOINTS, POSES, EPOCHS, FRAMES = 1476, 22, 100, 40, 250
+VERTICES, JOINTS, POSES, FRAMES = 1476, 22, 100, 250
 FRAME = 110
 """Of the action, with elbow and fingers bent: where shapes are compared."""
 MODIFIERS = ["ARMATURE", "CORRECTIVE_SMOOTH"]
@@ -134,7 +134,7 @@ def record(folder: Path) -> Iterator[float]:
     job = part("operators.job")
     yield from sidebar.open_section("recording")
     yield from sidebar.push("fdda.record")
-    yield from until(lambda: job.state_of("record") and job.state_of("record").done > 10, 30, "nothing is recorded")
+    yield from until(lambda: job.state_of("record") and job.state_of("record").done, 30, "nothing is recorded")
     yield from picture(folder / "recording.png")
     yield from job_done("record", 90)
     index = part("core.recording").read_index(folder / "work" / "arm_recording")
@@ -155,11 +155,11 @@ def check_the_trainer(_folder: Path) -> Iterator[float]:
 def train(folder: Path) -> Iterator[float]:
     """Press Train, do something else meanwhile, and wait."""
     job = part("operators.job")
-    arm().fdda.settings.epochs = EPOCHS
+    epochs = arm().fdda.settings.epochs
     yield from sidebar.push("fdda.train")
     yield from until(lambda: job.current() is not None, 10, "the button starts no training")
     longest, state = 0.0, job.current()
-    while state.is_running and len(state.curves.get("validation", ())) < EPOCHS // 2:
+    while state.is_running and len(state.curves.get("validation", ())) < epochs // 2:
         before = time.monotonic()
         yield 0.05
         longest = max(longest, time.monotonic() - before)
@@ -167,7 +167,7 @@ def train(folder: Path) -> Iterator[float]:
     if state.is_running:
         yield from picture(folder / "training.png")
     yield from job_done("train", 120)
-    check(len(state.curves["training"]) == EPOCHS, f"{len(state.curves['training'])} epochs have a loss")
+    check(len(state.curves["training"]) == epochs, f"{len(state.curves['training'])} epochs have a loss")
     report = json.loads((folder / "work" / "arm_model" / "report.json").read_text(encoding="utf-8"))
     fdda, linear = (report[way]["held_out"]["mean"] for way in ("fdda", "linear"))
     check(fdda < linear, f"the held-out error is {fdda} mm and that of the linear layer {linear}")
@@ -272,7 +272,7 @@ def _paint(colors: str, folder: Path) -> Iterator[float]:
 
 
 def mark_the_worst_frames(_folder: Path) -> Iterator[float]:
-    """Press Mark, then the first of the worst frames."""
+    """Press Mark, then the first of the worst frames, and look at its errors alone."""
     yield from sidebar.push("fdda.mark_worst", across=0.8)
     worst = part("last_evaluation").of(arm()).worst(5)
     found = part("markers").find(bpy.context.scene)
@@ -284,6 +284,12 @@ def mark_the_worst_frames(_folder: Path) -> Iterator[float]:
     yield 0.2
     frame = bpy.context.scene.frame_current
     check(frame == worst[0][0] + 1, f"it jumps to frame {frame}, the worst is {worst[0][0] + 1}")
+    view = bpy.context.window_manager.fdda_view
+    yield from sidebar.push("fdda_view.statistic", across=0.85)
+    yield from until(lambda: view.statistic == "pose", 5, f"the button shows '{view.statistic}', not this frame")
+    before = view.range_mm
+    yield from sidebar.push("fdda.fit_range", across=0.98)
+    yield from until(lambda: view.range_mm > before, 5, f"red begins at {view.range_mm} mm as before")
 
 
 def pack_the_model(_folder: Path) -> Iterator[float]:
@@ -345,8 +351,8 @@ STEPS = (
     measure_the_model,
     play_the_action,
     evaluate,
-    show_the_heat_map,
     show_the_partitions,
+    show_the_heat_map,
     mark_the_worst_frames,
     pack_the_model,
     unbind,
