@@ -51,6 +51,15 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         precision=3,
         step=1,
     )
+    target_mm: FloatProperty(
+        name="Target (mm)",
+        description="What 99.9 % of the held-out vertices are to be within; 0 for no target",
+        default=0.0,
+        min=0.0,
+        soft_max=10.0,
+        precision=2,
+        step=10,
+    )
     epochs: IntProperty(
         name="Epochs",
         description="Passes over the recorded poses; more is more exact and takes longer",

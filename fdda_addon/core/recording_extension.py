@@ -118,3 +118,4 @@ class RecordingExtension:
         for file in self._files.values():
             file.close()
         self._lock.release()
+        self._lock.release()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .errors import OutputError, RecordingError
-from .recording import INDEX, array_shapes, read_index
+from .recording import INDEX, REFINED, array_shapes, read_index
 from .recording_lock import LOCK, RecordingLock
 from .recording_writer import different_keys
 from .rig import Fingerprint, Joint, Rig, differences
@@ -64,7 +64,7 @@ def read_folder(path: Path, rig: Rig | None = None, sampling: dict | None = None
             *counts,
             f"'{path.name}' holds a recording of another rig: {'; '.join(found)}. Choose another folder, or remove it.",
         )
-    found = different_keys(index["sampling"], sampling) if sampling is not None else []
+    found = different_keys(_as_recorded_first(index["sampling"]), sampling) if sampling is not None else []
     names = ", ".join(sorted({SETTINGS.get(key.partition(".")[0], key) for key in found}))
     if counts[0] == counts[1]:
         sentence = f"It was recorded with other settings than those above: {names}." if found else ""
@@ -77,6 +77,11 @@ def read_folder(path: Path, rig: Rig | None = None, sampling: dict | None = None
             "as they were to resume, choose another folder, or remove it.",
         )
     return FolderContent(FolderState.INCOMPLETE, *counts)
+
+
+def _as_recorded_first(sampling: dict) -> dict:
+    """A sampling without the poses that were added where a model was worst."""
+    return {**sampling, "sources": [source for source in sampling["sources"] if source["kind"] != REFINED]}
 
 
 def _differences(index: dict, rig: Rig) -> list[str]:

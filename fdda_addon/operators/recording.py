@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError
-from ..settings import recording_folder
+from ..settings import model_file, recording_folder
 from .job import JobOperator, current
 from .on_rig import OnRig
 
@@ -65,6 +65,39 @@ class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
         return f"Recording cancelled; {self.state.done:,} of {self.state.total:,} poses are kept, resume goes on there."
 
 
+class FDDA_OT_refine(OnRig, JobOperator, bpy.types.Operator):
+    bl_idname = "fdda.refine"
+    bl_label = "Add Poses Where It Is Worst"
+    bl_description = "Compare the trained model with the rig, and add poses to the recording where it errs most"
+    bl_options = {"REGISTER"}
+    verb, title = "refine", "Refinement"
+
+    poses: bpy.props.IntProperty(
+        name="Poses", description="How many poses are added", default=250, min=1, options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.is_idle() and cls.has_rig(context)
+
+    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+        from ..refinement import RefinementSettings, refine
+        from ..runtime.binding import true_rig
+
+        rig = self.rig(context)
+        self._path, model = recording_folder(rig.mesh_object), model_file(rig.mesh_object)
+        wanted = RefinementSettings(self.poses, rig.mesh_object.fdda.settings.seed)
+        with true_rig(rig.mesh_object):
+            yield from refine(rig, self._path, model, wanted)
+
+    def finish(self, _context: bpy.types.Context, _result: object) -> str:
+        return f"Added {self.state.total:,} poses to '{self._path.name}'; train on with them."
+
+    def cancelled(self, _context: bpy.types.Context) -> str:
+        added = self.state.done if self.state.stage == "poses" else 0
+        return f"Refinement cancelled; {added:,} poses were added."
+
+
 class FDDA_OT_remove_recording(OnRig, bpy.types.Operator):
     bl_idname = "fdda.remove_recording"
     bl_label = "Remove Recording"
@@ -115,4 +148,4 @@ def fits(action: bpy.types.Action, armature_object: bpy.types.Object) -> bool:
     return False
 
 
-CLASSES = (FDDA_OT_record, FDDA_OT_remove_recording)
+CLASSES = (FDDA_OT_record, FDDA_OT_refine, FDDA_OT_remove_recording)

@@ -35,6 +35,18 @@ class FDDA_OT_train(OnRig, JobOperator, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
 
+    warm_start: bpy.props.BoolProperty(
+        name="Train On",
+        description="Start from the last weights of the model, on a recording that has grown",
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        if properties.warm_start:
+            return "Go on from the model's last weights, on a recording that has grown: half as long as a training"
+        return cls.bl_description
+
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.is_idle() and cls.has_rig(context)
@@ -51,6 +63,10 @@ class FDDA_OT_train(OnRig, JobOperator, bpy.types.Operator):
         self._model = model
         arguments = [str(recording), str(model), "--seed", str(settings.training_seed)]
         arguments += ["--tolerance-mm", f"{settings.tolerance_mm:.6g}", "--epochs", str(settings.epochs)]
+        if settings.target_mm:
+            arguments += ["--target-mm", f"{settings.target_mm:.6g}"]
+        if self.warm_start:
+            arguments += ["--warm-start"]
         self.state.curves.update(training=[], validation=[])
         # Nothing of Blender's data is used from here on: the user may do as they like.
         with Training(arguments) as training:

@@ -18,6 +18,9 @@ from .recording import content_of
 from .section import Section, draw_job, draw_path, draw_sentence, panel_rig
 
 REPORT = "report.json"
+WEIGHTS = ".weights.npz"
+"""Ending of the file of a model's last weights, beside it."""
+UNITS = {"probes": "poses compared", "poses": "poses added"}
 SHOWN_PARTITIONS = 8
 
 _reports: dict[Path, tuple[int, dict | None]] = {}
@@ -27,7 +30,7 @@ _reports: dict[Path, tuple[int, dict | None]] = {}
 class FDDA_PT_training(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_training"
     bl_label = "Training"
-    verbs = ("train",)
+    verbs = ("train", "refine")
 
     @classmethod
     def is_done(cls, context: bpy.types.Context) -> bool:
@@ -50,11 +53,16 @@ class FDDA_PT_training(Section, bpy.types.Panel):
             curves.draw(layout, running.curves)
             draw_sentence(layout, context, "You can go on working meanwhile.", "INFO")
             return
+        if running and running.verb == "refine":
+            draw_job(layout, context, "refine", UNITS.get(running.stage, running.stage))
+            draw_sentence(layout, context, "ESC cancels as well; the poses that were added are kept.", "INFO")
+            return
         rig = panel_rig(context)[0]
         if rig is None:
             return
         ready = _draw_python(layout, context)
         _draw_settings(layout, context, rig, ready)
+        draw_job(layout, context, "refine", "poses")
         draw_job(layout, context, "train", "epochs")
         ended = job.state_of("train")
         if ended is not None and ended.subject == rig.mesh_object.name:
@@ -92,6 +100,7 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context, rig: 
     column = layout.column()
     column.use_property_split = True
     column.use_property_decorate = False
+    column.prop(settings, "target_mm")
     column.prop(settings, "tolerance_mm")
     column.prop(settings, "epochs")
     column.prop(settings, "training_seed")
@@ -113,6 +122,14 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context, rig: 
     row.enabled = ready
     row.scale_y = 1.3
     row.operator("fdda.train", text="Train", icon="PLAY")
+    if model is not None and model.is_file():
+        # What a better model takes, in the order of the work.
+        on = layout.row(align=True)
+        on.enabled = ready
+        on.operator("fdda.refine", text="Add Poses Where It Is Worst", icon="ADD")
+        train = on.row(align=True)
+        train.enabled = model.with_suffix(WEIGHTS).is_file()
+        train.operator("fdda.train", text="Train On", icon="FF").warm_start = True
     if model is not None and model.is_file() and not rig.mesh_object.fdda.is_bound:
         bind = layout.operator("fdda.bind", text=f"Bind '{model.name}'", icon="LINKED")
         bind.object, bind.filepath = rig.mesh_object.name, str(model)
@@ -126,6 +143,8 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     report = _report(model.with_name(REPORT))
     if report is None or report["model"] != model.name:
         return
+    if target := report.get("target"):
+        draw_sentence(layout, context, *_target(target))
     everything = report["fdda"]["held_out"]
     layout.label(text="Held-out error in mm, worst first")
     table = layout.box().column(align=True)
@@ -139,6 +158,16 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     if len(partitions) > SHOWN_PARTITIONS:
         text = f"Show All {len(partitions)} Partitions"
         layout.prop(context.window_manager.fdda, "show_all_partitions", text=text, toggle=True)
+
+
+def _target(target: dict) -> tuple[str, str]:
+    """A sentence and an icon for what the report says of the target."""
+    reached = f"99.9 % within {target['p999']:.2f} mm, target {target['target']:g} mm"
+    return {
+        "met": (f"{reached}: met.", "CHECKMARK"),
+        "missed": (f"{reached}: missed. Add poses where the model is worst, and train on.", "INFO"),
+        "exhausted": (f"{reached}: missed, and more poses no longer help.", "INFO"),
+    }[target["verdict"]]
 
 
 def _draw_row(table: bpy.types.UILayout, cells: tuple[str, str, str, str]) -> None:
@@ -166,6 +195,8 @@ def _report(path: Path) -> dict | None:
             for partition in report["partitions"]:
                 str(partition["joint"]), int(partition["basis"])
             str(report["model"])
+            if target := report.get("target"):
+                _target(target)
         except (OSError, ValueError, KeyError, TypeError):
             report = None
         _reports[path] = (stamp, report)

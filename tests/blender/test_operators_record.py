@@ -19,6 +19,7 @@ from fdda_addon.core.recording_lock import LOCK
 from fdda_addon.operators import job
 from fdda_addon.operators.rig import cost_of
 from fdda_addon.scene.rig import SceneRig, read_rig, sampled_channels
+from fdda_addon.settings import model_file
 
 
 @pytest.fixture
@@ -288,6 +289,35 @@ class TestTraining:
         assert bpy.ops.fdda.train(**options) == {"CANCELLED"}
         assert job.state_of("train").outcome == "Training cancelled; no model was written."
         assert not (tmp_path / "m.onnx").exists()
+
+    def test_more_poses_where_the_model_is_worst_and_training_on(self, saved, elbow, tmp_path):
+        settings = saved.mesh_object.fdda.settings
+        settings.poses, settings.epochs, settings.target_mm = 40, 4, 0.001
+        assert bpy.ops.fdda.record() == {"FINISHED"}
+        with pytest.raises(RuntimeError, match="There are no last weights"):
+            bpy.ops.fdda.train(warm_start=True)
+        assert bpy.ops.fdda.train() == {"FINISHED"}
+        before = scene_state(saved)
+        assert bpy.ops.fdda.refine(poses=12) == {"FINISHED"}
+        assert job.state_of("refine").outcome == "Added 12 poses to 'elbow_recording'; train on with them."
+        assert_same_state(before, scene_state(saved))
+        assert [s.kind for s in read_recording(recorded_folder(tmp_path)).info.sampling.sources] == [
+            "random",
+            "refined",
+        ]
+        assert not (recorded_folder(tmp_path) / LOCK).exists()
+        assert bpy.ops.fdda.train(warm_start=True) == {"FINISHED"}
+        model = model_file(saved.mesh_object)
+        assert read_model_info(model).training["warm_start"]
+        report = json.loads((model.parent / "report.json").read_text())
+        assert report["poses"] == 52 and report["target"]["verdict"] == "missed"
+        assert any("The target is missed" in line for line in job.state_of("train").log)
+
+    def test_there_must_be_a_model_to_refine(self, saved):
+        saved.mesh_object.fdda.settings.poses = 12
+        bpy.ops.fdda.record()
+        with pytest.raises(RuntimeError, match="train it first"):
+            bpy.ops.fdda.refine()
 
     def test_no_recording_and_one_that_is_not_finished(self, saved, tmp_path):
         with pytest.raises(RuntimeError, match="is not a recording: it has no recording"):

@@ -97,6 +97,16 @@ def test_values_that_are_not_numbers_add_nothing(recording):
     assert_holds(recording)
 
 
+def test_one_process_extends_at_a_time(recording):
+    with (
+        RecordingExtension(read_recording(recording), "limb.onnx"),
+        pytest.raises(RecordingError, match="This Blender is recording into"),
+    ):
+        RecordingExtension(read_recording(recording), "limb.onnx")
+    extend(recording)
+    assert_holds(recording, (MORE, 7))
+
+
 def test_a_grown_recording_is_not_resumed_as_another(recording):
     extend(recording)
     with pytest.raises(RecordingError, match=r"recorded with another poses, sampling\.sources"):
