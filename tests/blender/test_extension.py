@@ -14,7 +14,7 @@ import bpy
 import pytest
 from conftest import pose
 
-from fdda_addon.runtime import playback
+from fdda_addon.runtime import model_files
 
 ROOT = Path(__file__).resolve().parents[2]
 LIFE = Path(__file__).with_name("extension_life.py")
@@ -121,7 +121,7 @@ def test_it_is_small_enough_and_says_what_it_may_do(package: Path):
 def test_without_its_wheels_a_bound_file_shows_the_true_rig(elbow, monkeypatch: pytest.MonkeyPatch):
     """In a Blender whose Python none of the wheels is for."""
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    monkeypatch.setattr(playback, "_networks", {})
+    monkeypatch.setattr(model_files, "_networks", {})
     bpy.ops.wm.open_mainfile(filepath=str(elbow.bound))
     mesh_object = bpy.data.objects["elbow"]
     pose(angle=1.0)
