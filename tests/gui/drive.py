@@ -70,7 +70,7 @@ def tick(path: Iterator[float] = steps()) -> float | None:  # noqa: B008
     except StopIteration:
         finish(0)
     except story.StepError as error:
-        print(f"Step '{under_way}' failed: {error}.", file=sys.stderr, flush=True)
+        print(f"Step '{under_way}' failed: {error}", file=sys.stderr, flush=True)
         give_up()
     except Exception:  # Blender would print it and stay open.
         traceback.print_exc()
