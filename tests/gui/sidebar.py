@@ -20,7 +20,6 @@ TRIES = 4
 
 _drawn: set[str] = set()
 _open_index = 0
-_lowest = 0.0
 _places: dict[str, float] = {}
 """How high buttons were found."""
 
@@ -45,7 +44,7 @@ def open_sections() -> Iterator[float]:
 
 def open_section(name: str) -> Iterator[float]:
     """Close all sections with the mouse, from the top, and open one."""
-    global _open_index, _lowest
+    global _open_index
     opened = yield from open_sections()
     for index, section in enumerate(SECTIONS):
         for _ in range(TRIES):
@@ -53,7 +52,7 @@ def open_section(name: str) -> Iterator[float]:
                 break
             yield from _click_header(index)
             opened = yield from open_sections()
-    _open_index, _lowest = SECTIONS.index(name), 0.0
+    _open_index = SECTIONS.index(name)
     yield from _click_header(_open_index)
     opened = yield from open_sections()
     check(opened == {name}, f"of the sections, {sorted(opened)} are open instead of {name}")
@@ -89,21 +88,18 @@ def find(what: str, across: float = 0.5) -> Iterator[float]:
     Raises:
         StepError: there is none.
     """
-    global _lowest
     sidebar, scale = region("UI"), bpy.context.preferences.system.ui_scale
     # The strip of the tabs is at the right.
     x = sidebar.x + 15 * scale + across * (sidebar.width - 60 * scale)
     first, last = sidebar.y + sidebar.height - (HEADER + _open_index * PITCH) * scale, sidebar.y
     going_down = [first - step * STEP * scale for step in range(int((first - last) / STEP / scale))]
-    # First where it was the last time, then below the button that was found before; people go down as well. From the
-    # top twice, as the sidebar may be drawn anew meanwhile.
+    # First where it was the last time; twice, as the sidebar may be drawn anew meanwhile.
     known = [_places[what]] if what in _places else []
-    below = [y for y in going_down if y < _lowest]
-    for y in [*known, *below, *going_down, *going_down]:
+    for y in [*known, *going_down, *going_down]:
         move(x, y)
         yield from settle()
         if what in below_mouse():
-            _places[what] = _lowest = y
+            _places[what] = y
             return x, y
     check(False, f"there is no button {what} in the sidebar")
 
