@@ -13,13 +13,13 @@ def register() -> None:
         return
     import bpy
 
-    from . import operators, panels, preferences, properties
+    from . import class_lists, operators, panels, preferences, properties
     from .runtime import handlers
 
     properties.register()
     preferences.register()
-    operators.register()
-    panels.register()
+    for package in (operators, panels):
+        class_lists.register(package)
     handlers.register()
     _cli_command = bpy.utils.register_cli_command("fdda", _run_command)
     if not bpy.app.binary_path:
@@ -39,15 +39,15 @@ def unregister() -> None:
         return
     import bpy
 
-    from . import operators, panels, preferences, properties
+    from . import class_lists, operators, panels, preferences, properties
     from .runtime import handlers
 
     atexit.unregister(unregister)
     bpy.utils.unregister_cli_command(_cli_command)
     _cli_command = None
     handlers.unregister()
-    panels.unregister()
-    operators.unregister()
+    for package in (panels, operators):
+        class_lists.unregister(package)
     preferences.unregister()
     properties.unregister()
 
