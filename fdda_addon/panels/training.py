@@ -124,7 +124,7 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context, rig: 
     row.operator("fdda.train", text="Train", icon="PLAY")
     if model is not None and model.is_file():
         # What a better model takes, in the order of the work.
-        on = layout.row(align=True)
+        on = layout.column(align=True)
         on.enabled = ready
         on.operator("fdda.refine", text="Add Poses Where It Is Worst", icon="ADD")
         train = on.row(align=True)

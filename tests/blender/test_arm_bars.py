@@ -17,7 +17,7 @@ SPEED_BAR = 4.0
 """A frame of the denser arm is to be so many times as fast as its rig's."""
 SPEED_FLOOR = 3.0
 """What no version may fall below; docs/benchmarks.md has what is reached."""
-SPEED_RUNS = 3
+SPEED_RUNS = 5
 
 
 @pytest.fixture(scope="module")
@@ -90,18 +90,22 @@ def test_bound_file_plays(made):
 
 @pytest.fixture(scope="module")
 def speed(tmp_path_factory: pytest.TempPathFactory) -> float:
-    """How many times as fast a frame of the denser arm is with a model: the median of some benchmarks."""
+    """How many times as fast a frame of the denser arm is with a model.
+
+    Each way's least median of some benchmarks: what else the machine does can only add to them.
+    """
     folder = tmp_path_factory.mktemp("denser")
     rig, recording, model, times = (folder / name for name in ("arm.blend", "recording", "arm.onnx", "times.json"))
     assert run("build-arm", rig, "--density", 2) == 0
     # The cost of a frame depends on the size of the model, not on how long it was trained.
     assert run("record", rig, recording, "--poses", 400) == 0
     assert run("train", recording, model, "--epochs", 3) == 0
-    ratios = []
+    measured = []
     for _ in range(SPEED_RUNS):
         assert run("benchmark", rig, model, "--json", times) == 0
-        ratios.append(json.loads(times.read_text())["ratio"])
-    return float(np.median(ratios))
+        measured.append(json.loads(times.read_text()))
+    of_rig, of_model = (min(one[way]["median"] for one in measured) for way in ("rig", "fdda"))
+    return of_rig / of_model
 
 
 @pytest.mark.xfail(bpy.app.version >= (5, 0), reason="3.6 on 5.2: docs/benchmarks.md, what falls short", strict=False)
