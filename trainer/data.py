@@ -8,6 +8,7 @@ import numpy as np
 
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.recording import REFINED, Recording
+from fdda_addon.core.rig import Fingerprint
 from fdda_addon.core.skinning import skin_matrices
 
 from .basis import Basis, make_basis
@@ -120,6 +121,16 @@ def split_recording(recording: Recording, config: TrainingConfig) -> Split:
     refined = np.concatenate([np.full(s.poses, s.kind == REFINED) for s in recording.info.sampling.sources])
     split = split_poses(np.flatnonzero(~refined), config.validation_fraction, config.seed, config.held_out_fraction)
     return replace(split, training=np.append(split.training, np.flatnonzero(refined)))
+
+
+def held_back_digest(recording: Recording, split: Split) -> str:
+    """16 hexadecimal digits that stand for the poses that do not train.
+
+    Equal for two recordings and splits when none of the poses that one of them holds back can have trained the other.
+    """
+    return Fingerprint.digest(
+        *(np.array(recording.pose_matrices[poses]) for poses in (split.held_out, split.validation))
+    )
 
 
 def partitions_of(recording: Recording, inputs: Inputs) -> list[PartitionData]:

@@ -18,7 +18,7 @@ from fdda_addon.core.recording import Recording, read_recording
 from . import report
 from .announcements import Announcer
 from .config import TrainingConfig
-from .data import PreparedPartition, Split, partitions_of, prepare, split_recording
+from .data import PreparedPartition, Split, held_back_digest, partitions_of, prepare, split_recording
 from .deformation import Deformation
 from .export import build_model, measure, measure_surface, write_model
 from .inputs import Inputs, make_inputs, middles
@@ -61,7 +61,9 @@ def train_model(
     for path in (model_path, report_json, report_html, weights_path(model_path)):
         check_writable(path)
     recording = read_recording(recording_path)
-    last = _last_weights(model_path, recording, config) if warm_start else None
+    split = split_recording(recording, config)
+    held_back = held_back_digest(recording, split)
+    last = _last_weights(model_path, recording, held_back, config) if warm_start else None
     device = choose_device()
     announcer.say(
         MessageType.STARTED,
@@ -70,7 +72,6 @@ def train_model(
         vertices=recording.rig.vertex_count,
         device=str(device),
     )
-    split = split_recording(recording, config)
     inputs = make_inputs(recording.rig.parents, middles(recording.rig, recording.partitions), recording.partitions)
     prepared = _prepare(recording, inputs, split, config, should_stop)
     seen = [columns[partition.columns] for columns, partition in zip(inputs.columns, prepared, strict=True)]
@@ -121,7 +122,7 @@ def train_model(
     _check_stop(should_stop)
     # From here on nothing stops: the model and what lies beside it belong together.
     write_model(model_path, exported.content)
-    write_weights(weights_path(model_path), deformation, config.hidden, history)
+    write_weights(weights_path(model_path), deformation, held_back, config.hidden, history)
     write_json(report_json, content)
     write_text(report_html, page)
     _announce_end(announcer, model_path, content, outcome, time.perf_counter() - started)
@@ -150,16 +151,21 @@ def _announce_end(
     )
 
 
-def _last_weights(model_path: Path, recording: Recording, config: TrainingConfig) -> LastWeights:
+def _last_weights(model_path: Path, recording: Recording, held_back: str, config: TrainingConfig) -> LastWeights:
     """The weights to start from.
 
     Raises:
-        TrainingError: there are none, or of another rig or other networks.
+        TrainingError: there are none, of another rig or other networks, or of poses that are held back now.
     """
     path = weights_path(model_path)
     last = read_weights(path)
     if last.fingerprint != recording.rig.fingerprint:
         raise TrainingError(f"The last weights '{path}' are of another rig; train without --warm-start.")
+    if last.held_back != held_back:
+        raise TrainingError(
+            f"The last weights '{path}' are of another recording or seed, and may have been trained on poses that are "
+            "held out now; train with the same, or without --warm-start."
+        )
     if (last.hidden, last.activation) != (config.hidden, config.activation):
         raise TrainingError(
             f"The last weights '{path}' are of networks --hidden {' '.join(map(str, last.hidden))} --activation "

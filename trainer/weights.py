@@ -22,7 +22,7 @@ from .deformation import Deformation
 from .model import Network
 
 SUFFIX = ".weights.npz"
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,14 @@ class LastWeights:
 
     Attributes:
         fingerprint: of the rig.
+        held_back: digest of the poses that chose weights or measured the error (`data.held_back_digest`).
         hidden, activation: of the networks.
         history: held-out errors of this training and those before it, oldest first: `{"poses", "p999"}`, in mm.
         partitions: in the order of the recording.
     """
 
     fingerprint: Fingerprint
+    held_back: str
     hidden: tuple[int, ...]
     activation: str
     history: tuple[dict, ...]
@@ -67,8 +69,10 @@ def weights_path(model_path: Path) -> Path:
     return model_path.with_suffix(SUFFIX)
 
 
-def write_weights(path: Path, deformation: Deformation, hidden: tuple[int, ...], history: list[dict]) -> None:
-    """Keep the weights of a training.
+def write_weights(
+    path: Path, deformation: Deformation, held_back: str, hidden: tuple[int, ...], history: list[dict]
+) -> None:
+    """Keep the weights of a training; `held_back`, `hidden` and `history` as in `LastWeights`.
 
     Raises:
         OutputError: the file cannot be written.
@@ -76,6 +80,7 @@ def write_weights(path: Path, deformation: Deformation, hidden: tuple[int, ...],
     about = {
         "version": VERSION,
         "fingerprint": vars(deformation.rig.fingerprint),
+        "held_back": held_back,
         "hidden": list(hidden),
         "activation": deformation.activation,
         "history": history,
@@ -140,7 +145,12 @@ def _read(arrays: np.lib.npyio.NpzFile) -> LastWeights:
         partitions.append(partition)
     history = tuple({"poses": int(entry["poses"]), "p999": float(entry["p999"])} for entry in about["history"])
     return LastWeights(
-        Fingerprint(**about["fingerprint"]), hidden, str(about["activation"]), history, tuple(partitions)
+        Fingerprint(**about["fingerprint"]),
+        str(about["held_back"]),
+        hidden,
+        str(about["activation"]),
+        history,
+        tuple(partitions),
     )
 
 

@@ -112,6 +112,16 @@ def test_weights_of_other_networks_or_rigs_are_refused(recording, model, tmp_pat
     assert "are of another rig" in refused(capsys, tmp_path / "other", model)
 
 
+@pytest.mark.parametrize("options", [["--seed", "1"], ["--held-out-fraction", "0.2"], ["--validation-fraction", "0.2"]])
+def test_poses_that_were_trained_on_are_never_held_out(recording, model, capsys, options):
+    assert "may have been trained on poses that are held out now" in refused(capsys, recording, model, *QUICK, *options)
+
+
+def test_another_recording_of_the_rig_is_refused(model, tmp_path, capsys):
+    write_chain(tmp_path / "other", seed=3)
+    assert "are of another recording or seed" in refused(capsys, tmp_path / "other", model)
+
+
 @pytest.mark.parametrize("damage", ["cut", "text", "packed", "shapes"])
 def test_damaged_weights_are_refused(recording, model, capsys, damage):
     path = weights_path(model)
