@@ -200,6 +200,9 @@ class _Picture:
         # Dither is noise, and noise is what does not compress.
         scene.render.dither_intensity = 0
         scene.render.use_file_extension = False
+        # A picture that is passed on must not say where it was made.
+        for name in [p.identifier for p in scene.render.bl_rna.properties if p.identifier.startswith("use_stamp_")]:
+            setattr(scene.render, name, False)
         scene.render.film_transparent = False
         scene.view_settings.view_transform = "Standard"
         scene.display.render_aa = "8"

@@ -9,14 +9,19 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-FOLDERS = ("fdda_addon", "trainer", "tests", "blend_fixtures", "setup", "requirements", "docs", ".ci")
+FOLDERS = ("fdda_addon", "trainer", "benchmarks", "tests", "blend_fixtures", "setup", "requirements", "docs", ".ci")
 SPDX = "# SPDX-License-Identifier: GPL-3.0-or-later"
 
 # Names that say nothing about what is inside: such a file grows without end.
 EMPTY_NAMES = {"util", "utils", "helper", "helpers", "function", "functions", "misc", "common", "manager", "service"}
 
 # Which mirror packages come from is up to the machine that installs them.
-REGISTRY_HOST = re.compile(r"pypi\.(org|io)|pythonhosted\.org|download\.pytorch|registry\.npmjs|deb\.debian\.org")
+REGISTRY_HOST = re.compile(
+    "|".join(
+        "".join(parts)
+        for parts in (("py", "pi"), ("python", "hosted"), ("npm", "js"), ("deb.", "debian"), ("load.", "pytorch"))
+    )
+)
 
 
 def text_files() -> Iterator[tuple[Path, str]]:
