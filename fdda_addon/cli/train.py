@@ -32,7 +32,7 @@ def run(arguments: list[str]) -> int:
         command, environment = trainer_command(arguments)
         status = subprocess.run(command, env=environment, check=False).returncode
         if arguments:
-            print(f"\n{parser.format_help().partition(chr(10) * 2)[2]}", end="")
+            print(f"\n{parser.format_help()}", end="")
         return status
     options, own = parser.parse_known_args(arguments)
     if options.refine is None:
@@ -81,11 +81,12 @@ def _train_to_target(arguments: list[str], options: argparse.Namespace) -> int:
         # Before the first training: a wrong path or object shows at once.
         _open_rig(options)
         for number in range(MOST_ROUNDS):
+            if number:
+                _refine(recording, model, options, number)
             warm = [WARM_START] if number and WARM_START not in arguments else []
             status, values = _train([*arguments, *warm])
             if status or values.get("verdict") != MISSED:
                 return status
-            _refine(recording, model, options, number)
     print(f"The target is not met after {MOST_ROUNDS} rounds; run the command again with {WARM_START} to go on.")
     return 0
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Appends refined poses to a complete recording, which stays complete at every moment (docs/recording.md)."""
 
-import json
 import math
 import os
 from dataclasses import asdict
@@ -36,18 +35,32 @@ class RecordingExtension:
         self.complete = len(recording.pose_matrices)
         self._start = self.complete
         self._name = name
-        self._index = read_index(self.path)
-        self._sources = list(self._index["sampling"]["sources"])
-        self._shapes = array_shapes(0, len(self._index["joints"]), self._index["vertices"], self._index["influences"])
         self._files = {}
         self._lock = RecordingLock(self.path)
         try:
             self._lock.acquire()
+            self._index = self._read_index()
+            self._shapes = array_shapes(
+                0, len(self._index["joints"]), self._index["vertices"], self._index["influences"]
+            )
             for streamed in STREAMED:
                 self._files[streamed] = open(self.path / f"{streamed}.npy", "r+b")  # noqa: SIM115 - __exit__
         except OSError as error:
             self._close()
             raise self._failed(error) from error
+        except RecordingError:
+            self._close()
+            raise
+
+    def _read_index(self) -> dict:
+        """The index as it is now that no other process can change it."""
+        index = read_index(self.path)
+        if index["poses"] != self.complete:
+            raise RecordingError(
+                f"The recording '{self.path}' had {self.complete} poses when it was read and has {index['poses']} now: "
+                "another process added to it; try again."
+            )
+        return index
 
     def append(self, pose_matrices: np.ndarray, residuals: np.ndarray) -> None:
         """Add poses.
@@ -97,7 +110,7 @@ class RecordingExtension:
 
     def _write_index(self) -> None:
         source = Source(REFINED, self.complete - self._start, self._name)
-        sources = [*self._sources, json.loads(json.dumps(asdict(source)))]
+        sources = [*self._index["sampling"]["sources"], asdict(source)]
         sampling = {**self._index["sampling"], "sources": sources}
         index = {**self._index, "poses": self.complete, "complete": self.complete, "sampling": sampling}
         write_json(self.path / INDEX, index)
@@ -117,5 +130,4 @@ class RecordingExtension:
     def _close(self) -> None:
         for file in self._files.values():
             file.close()
-        self._lock.release()
         self._lock.release()

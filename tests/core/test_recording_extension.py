@@ -107,6 +107,16 @@ def test_one_process_extends_at_a_time(recording):
     assert_holds(recording, (MORE, 7))
 
 
+def test_poses_that_another_process_added_meanwhile_are_not_written_over(recording):
+    before = read_recording(recording)
+    extend(recording)
+    with pytest.raises(RecordingError, match=f"had {POSES} poses when it was read and has {POSES + MORE} now"):
+        RecordingExtension(before, "limb.onnx")
+    assert_holds(recording, (MORE, 7))
+    extend(recording, 2, seed=8)
+    assert_holds(recording, (MORE, 7), (2, 8))
+
+
 def test_a_grown_recording_is_not_resumed_as_another(recording):
     extend(recording)
     with pytest.raises(RecordingError, match=r"recorded with another poses, sampling\.sources"):
