@@ -5,7 +5,8 @@ import bpy
 
 from ..operators import job
 from ..operators.rig import cost_of
-from ..scene.scene_rig import SceneRig, deforming_modifiers
+from ..scene.modifier_stack import deforming_modifiers
+from ..scene.scene_rig import SceneRig
 from . import checks
 from .section import Section, draw_job, draw_sentence, panel_rig
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Checks the rig of a scene and reads it into arrays."""
 
-from collections.abc import Iterable
-
 import bpy
 import numpy as np
 from mathutils import Matrix
@@ -12,60 +10,13 @@ from ..core.poses import Channel
 from ..core.rig import Fingerprint, Joint, Rig
 from . import armature as armature_io
 from . import mesh as mesh_io
-from .scene_rig import DEFORMING, MODIFIER_NAME, SceneRig, armature_modifier, deforming_modifiers, find_rig
+from .modifier_stack import check_evaluable, check_topology, deforming_modifiers
+from .scene_rig import MODIFIER_NAME, SceneRig, armature_modifier, find_rig
 
-TOPOLOGY_CHANGING = {
-    "ARRAY", "BEVEL", "BOOLEAN", "BUILD", "DECIMATE", "EDGE_SPLIT", "EXPLODE", "FLUID", "MASK", "MIRROR", "MULTIRES",
-    "OCEAN", "REMESH", "SCREW", "SKIN", "SOLIDIFY", "SUBSURF", "VOLUME_TO_MESH", "WELD", "WIREFRAME",
-}  # fmt: skip
 SMALLEST_VOLUME = 1e-15
 """An object whose scales multiply to less is flat: no position could be brought into its space."""
 IDENTITY_TOLERANCE = 1e-6
 """Mesh and armature count as unmoved, one against the other, when no matrix element differs by more."""
-
-
-def check_evaluable(scene_rig: SceneRig) -> None:
-    """Fail when what the graph evaluates the mesh to could not be compared with the mesh.
-
-    Raises:
-        RigError: edit mode, the NLA's tweak mode, a hidden object, an Armature modifier that is off, or a modifier
-            that changes the topology.
-    """
-    mesh_object = scene_rig.mesh_object
-    if mesh_object.mode == "EDIT" or scene_rig.armature_object.mode == "EDIT":
-        raise RigError(f"'{mesh_object.name}' or its armature is in edit mode; leave it first.")
-    animation = scene_rig.armature_object.animation_data
-    if animation is not None and animation.use_tweak_mode:
-        raise RigError(f"'{scene_rig.armature_object.name}' is in tweak mode of the NLA editor; leave it first.")
-    check_topology(mesh_object, mesh_object.modifiers)
-    if not armature_modifier(mesh_object).show_viewport:
-        raise RigError(f"The Armature modifier of '{mesh_object.name}' is switched off in the viewport; switch it on.")
-    if scene_rig.armature_object.data.pose_position == "REST":
-        raise RigError(f"The armature '{scene_rig.armature_object.name}' shows its rest position; set it to pose.")
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    if not mesh_object.evaluated_get(depsgraph).is_evaluated:
-        raise RigError(f"'{mesh_object.name}' is hidden, so Blender does not evaluate it; show it in the viewport.")
-    count = len(mesh_object.evaluated_get(depsgraph).data.vertices)
-    if count != len(mesh_object.data.vertices):
-        nodes = [m.name for m in mesh_object.modifiers if m.type not in DEFORMING and m.show_viewport]
-        raise RigError(
-            f"The modifiers of '{mesh_object.name}' turn {len(mesh_object.data.vertices)} vertices into {count}; "
-            f"switch off the one that changes the topology ({', '.join(nodes)})."
-        )
-
-
-def check_topology(mesh_object: bpy.types.Object, modifiers: Iterable[bpy.types.Modifier]) -> None:
-    """Fail when one of these modifiers of a mesh object is on and makes other vertices of those of the mesh.
-
-    Raises:
-        RigError: names it.
-    """
-    for modifier in modifiers:
-        if modifier.type in TOPOLOGY_CHANGING and modifier.show_viewport:
-            raise RigError(
-                f"Modifier '{modifier.name}' of '{mesh_object.name}' changes the topology of the mesh, so its vertices "
-                "cannot be followed; switch it off in the viewport, or apply it."
-            )
 
 
 def read_rig(scene_rig: SceneRig) -> Rig:
@@ -199,7 +150,6 @@ class PoseEvaluator:
 
 
 __all__ = [
-    "DEFORMING", "MODIFIER_NAME", "TOPOLOGY_CHANGING", "PoseEvaluator", "PoseReader", "SceneRig", "armature_modifier",
-    "check_evaluable", "check_topology", "deforming_modifiers", "find_rig", "mesh_from_armature", "read_rig",
-    "sampled_channels",
+    "MODIFIER_NAME", "PoseEvaluator", "PoseReader", "SceneRig", "armature_modifier", "check_evaluable",
+    "check_topology", "deforming_modifiers", "find_rig", "mesh_from_armature", "read_rig", "sampled_channels",
 ]  # fmt: skip

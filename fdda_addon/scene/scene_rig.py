@@ -7,11 +7,6 @@ import bpy
 
 from ..core.errors import RigError
 
-DEFORMING = {
-    "ARMATURE", "CAST", "CLOTH", "CORRECTIVE_SMOOTH", "CURVE", "DISPLACE", "HOOK", "LAPLACIANDEFORM",
-    "LAPLACIANSMOOTH", "LATTICE", "MESH_CACHE", "MESH_DEFORM", "MESH_SEQUENCE_CACHE", "SHRINKWRAP", "SIMPLE_DEFORM",
-    "SMOOTH", "SOFT_BODY", "SURFACE_DEFORM", "VOLUME_DISPLACE", "WARP", "WAVE",
-}  # fmt: skip
 MODIFIER_NAME = "FDDA"
 """Name of the Geometry Nodes modifier that plays a model; it is never part of the rig."""
 
@@ -58,12 +53,3 @@ def armature_modifier(mesh_object: bpy.types.Object) -> bpy.types.ArmatureModifi
         if modifier.type == "ARMATURE" and modifier.object is not None:
             return modifier
     return None
-
-
-def deforming_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier]:
-    """The modifiers of the rig that move vertices, in their order, switched on or not. Geometry Nodes count too."""
-    return [
-        modifier
-        for modifier in mesh_object.modifiers
-        if modifier.type in DEFORMING or (modifier.type == "NODES" and modifier.name != MODIFIER_NAME)
-    ]
