@@ -57,7 +57,9 @@ def cut(recording: Recording, names: tuple[str, ...]) -> Recording:
     )
     partitions = make_partitions(small, {partition.joint: partition.influencing for partition in chosen})
     residuals = np.array(recording.residuals[:, vertices])
-    return Recording(recording.path, recording.info, small, partitions, recording.pose_matrices, residuals)
+    return Recording(
+        recording.path, recording.info, small, partitions, recording.pose_matrices, residuals, recording.controls
+    )
 
 
 def read_material(training: Path, held_out: Path, names: tuple[str, ...]) -> Material:

@@ -172,10 +172,11 @@ def model_info(recording: Recording, deformation: Deformation, held_out: np.ndar
         rig.vertex_count,
         rig.fingerprint,
         tuple(
-            ModelPartition(p.joint, p.influencing, len(p.vertices), len(prepared.basis.shapes))
+            ModelPartition(p.joint, p.influencing, len(p.vertices), len(prepared.basis.shapes), p.controls, p.merged)
             for p, prepared in zip(deformation.partitions, deformation.prepared, strict=True)
         ),
         *(bound[: deformation.inputs.joint_columns].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
+        rig.controls,
         error_statistics(held_out).to_json(),
         0.0,
         {**training, LIMITS: recording.info.sampling.to_json()["limits"]},

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .controls import Control, read_controls
 from .errors import ModelError
 from .onnx_file import read_onnx
 from .poses import Channel
@@ -15,6 +16,7 @@ from .rig import Fingerprint, Joint, Rig, differences
 VERSION = 1
 METADATA_KEY = "fdda"
 POSE_INPUT = "pose_matrices"
+CONTROLS_INPUT = "controls"
 POSITIONS_OUTPUT = "positions"
 TRUST_OUTPUT = "trust"
 LIMITS = "limits"
@@ -24,12 +26,18 @@ MAX_BYTES = 2 << 30
 
 @dataclass(frozen=True)
 class ModelPartition:
-    """What a model says of one partition: joint indices, vertex count and number of basis shapes."""
+    """What a model says of one partition: as `Partition`, but of its vertices only how many; number of basis shapes."""
 
     joint: int
     influencing: tuple[int, ...]
     vertices: int
     basis: int
+    controls: tuple[int, ...] = ()
+    merged: tuple[int, ...] = ()
+
+    def to_json(self) -> dict:
+        value = asdict(self)
+        return {key: value[key] for key in value if value[key] or key not in ("controls", "merged")}
 
 
 @dataclass(frozen=True)
@@ -43,6 +51,7 @@ class ModelInfo:
         fingerprint: of the rig that was recorded.
         partitions: in ascending order of their main joints, the order of the output `trust`.
         feature_low, feature_high: (J, 12) float32, range of the joint features (core.features) in training.
+        controls: the inputs beside the joints, with the ranges that they had in training.
         held_out_mm: error over the poses that were held out of the training, in mm, by the names of
             `metrics.ErrorStatistics`.
         parity_mm: largest difference between ONNX Runtime and PyTorch, in mm.
@@ -56,9 +65,14 @@ class ModelInfo:
     partitions: tuple[ModelPartition, ...]
     feature_low: np.ndarray
     feature_high: np.ndarray
+    controls: tuple[Control, ...] = ()
     held_out_mm: dict[str, float] = field(default_factory=dict)
     parity_mm: float = 0.0
     training: dict = field(default_factory=dict)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return tuple(joint.name for joint in self.joints)
 
     @property
     def limits(self) -> tuple[Channel, ...]:
@@ -73,7 +87,8 @@ class ModelInfo:
             "rest_matrices": self.rest_matrices.reshape(-1, 16).tolist(),
             "vertices": self.vertex_count,
             "fingerprint": asdict(self.fingerprint),
-            "partitions": [asdict(partition) for partition in self.partitions],
+            "partitions": [partition.to_json() for partition in self.partitions],
+            **({"controls": [control.to_json() for control in self.controls]} if self.controls else {}),
             "training_ranges": {"low": self.feature_low.tolist(), "high": self.feature_high.tolist()},
             "held_out_mm": self.held_out_mm,
             "parity_mm": self.parity_mm,
@@ -103,14 +118,20 @@ def _read_info(value: dict) -> ModelInfo:
         raise ValueError(f"it is of version {value['version']!r} and this add-on reads version {VERSION}")
     joints = tuple(Joint(str(j["name"]), int(j["parent"])) for j in value["joints"])
     partitions = tuple(
-        ModelPartition(int(p["joint"]), tuple(map(int, p["influencing"])), int(p["vertices"]), int(p["basis"]))
+        ModelPartition(
+            *(int(p["joint"]), tuple(map(int, p["influencing"])), int(p["vertices"]), int(p["basis"])),
+            *(tuple(map(int, p.get(key, ()))) for key in ("controls", "merged")),
+        )
         for p in value["partitions"]
     )
+    controls = read_controls(value.get("controls", []))
     count = len(joints)
     if not all(-1 <= joint.parent < number for number, joint in enumerate(joints)):
         raise ValueError("a joint stands before its parent")
-    if not all(0 <= joint < count for p in partitions for joint in (p.joint, *p.influencing)):
+    if not all(0 <= joint < count for p in partitions for joint in (p.joint, *p.influencing, *p.merged)):
         raise ValueError("a partition names a joint that is none of its joints")
+    if not all(0 <= control < len(controls) for p in partitions for control in p.controls):
+        raise ValueError("a partition names a control that is none of its controls")
     if sum(p.vertices for p in partitions) != int(value["vertices"]):
         raise ValueError("the partitions do not add up to the vertices")
     rest_matrices = np.array(value["rest_matrices"], np.float32).reshape(count, 4, 4)
@@ -124,6 +145,7 @@ def _read_info(value: dict) -> ModelInfo:
         partitions,
         np.array(value["training_ranges"]["low"], np.float32).reshape(count, 12),
         np.array(value["training_ranges"]["high"], np.float32).reshape(count, 12),
+        controls,
         dict(value["held_out_mm"]),
         float(value["parity_mm"]),
         dict(value["training"]),
@@ -181,12 +203,16 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
         info = ModelInfo.from_json(contents.metadata[METADATA_KEY])
     except ValueError as error:
         raise ModelError(f"The model '{name}' cannot be used: {error}; train it again.") from error
-    if extra := sorted(set(contents.inputs) - {POSE_INPUT}):
+    wanted = {
+        POSE_INPUT: (len(info.joints), 4, 4),
+        **({CONTROLS_INPUT: (len(info.controls),)} if info.controls else {}),
+    }
+    if extra := sorted(set(contents.inputs) - set(wanted)):
         raise ModelError(f"'{name}' asks for inputs that no rig gives ({', '.join(extra)}); train it again.")
-    if contents.inputs.get(POSE_INPUT, ())[1:] != (len(info.joints), 4, 4):
-        raise ModelError(
-            f"The input '{POSE_INPUT}' of '{name}' does not fit its {len(info.joints)} joints; train again."
-        )
+    for key, shape in wanted.items():
+        if contents.inputs.get(key, ())[1:] != shape:
+            what = f"{shape[0]} {'joints' if key == POSE_INPUT else 'controls'}"
+            raise ModelError(f"The input '{key}' of '{name}' does not fit its {what}; train again.")
     if contents.outputs.get(POSITIONS_OUTPUT, ())[1:] != (info.vertex_count, 3):
         raise ModelError(
             f"The output '{POSITIONS_OUTPUT}' of '{name}' does not fit its {info.vertex_count} vertices; train again."

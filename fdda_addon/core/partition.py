@@ -21,11 +21,15 @@ class Partition:
         joint: index of the main joint.
         influencing: indices of the joints that move the local residuals, ascending; may be empty.
         vertices: (Vp,) int32 indices into the mesh, ascending.
+        controls: indices of the controls that move the local residuals, ascending.
+        merged: other main joints, ascending, whose vertices were too few for a partition and count to this one.
     """
 
     joint: int
     influencing: tuple[int, ...]
     vertices: np.ndarray
+    controls: tuple[int, ...] = ()
+    merged: tuple[int, ...] = ()
 
 
 def main_joints(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
@@ -41,18 +45,35 @@ def main_joints(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray
     return np.take_along_axis(skin_joints, slots[:, None], axis=1)[:, 0].astype(np.int32)
 
 
-def make_partitions(rig: Rig, influencing: dict[int, tuple[int, ...]] | None = None) -> tuple[Partition, ...]:
+def make_partitions(
+    rig: Rig,
+    influencing: dict[int, tuple[int, ...]] | None = None,
+    controls: dict[int, tuple[int, ...]] | None = None,
+    merged: dict[int, int] | None = None,
+) -> tuple[Partition, ...]:
     """Cut the mesh by main joint, in ascending order of the joints.
 
     Args:
         rig: the rig.
         influencing: influencing joints by main joint; none for all partitions when left out.
+        controls: influencing controls by main joint; none for all partitions when left out.
+        merged: main joints whose vertices count to the partition of another, and that other one.
     """
     main = main_joints(rig.skin_joints, rig.skin_weights)
-    influencing = influencing or {}
+    influencing, controls, merged = influencing or {}, controls or {}, merged or {}
+    taken: dict[int, list[int]] = {}
+    for joint, other in sorted(merged.items()):
+        main[main == joint] = other
+        taken.setdefault(other, []).append(joint)
     return tuple(
-        Partition(int(joint), tuple(influencing.get(int(joint), ())), np.flatnonzero(main == joint).astype(np.int32))
-        for joint in np.unique(main)
+        Partition(
+            joint,
+            tuple(influencing.get(joint, ())),
+            np.flatnonzero(main == joint).astype(np.int32),
+            tuple(controls.get(joint, ())),
+            tuple(taken.get(joint, ())),
+        )
+        for joint in np.unique(main).tolist()
     )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .controls import read_controls
 from .errors import RecordingError
 from .partition import Partition, make_partitions
 from .poses import Channel
@@ -87,6 +88,7 @@ class Recording:
         partitions: with their influencing joints.
         pose_matrices: (N, J, 4, 4) float32, mesh-object space, metres.
         residuals: (N, V, 3) float32, local residuals, metres.
+        controls: (N, C) float32, values of the controls of the rig, each in the unit of its property.
     """
 
     path: Path
@@ -95,10 +97,11 @@ class Recording:
     partitions: tuple[Partition, ...]
     pose_matrices: np.ndarray
     residuals: np.ndarray
+    controls: np.ndarray
 
 
 def array_shapes(
-    poses: int, joints: int, vertices: int, influences: int, faces: int = 0, corners: int = 0
+    poses: int, joints: int, vertices: int, influences: int, faces: int = 0, corners: int = 0, controls: int = 0
 ) -> dict[str, tuple[tuple, type]]:
     """Shape and dtype of each array of a recording, by name.
 
@@ -106,7 +109,9 @@ def array_shapes(
         poses, joints, vertices: how many.
         influences: I of the skin weights.
         faces, corners: how many; without faces there are no arrays of them.
+        controls: how many; without any there is no array of them.
     """
+    of_controls = {"controls": ((poses, controls), np.float32)}
     of_faces = {"face_starts": ((faces,), np.int32), "face_vertices": ((corners,), np.int32)}
     return {
         "rest_positions": ((vertices, 3), np.float32),
@@ -115,12 +120,22 @@ def array_shapes(
         "skin_weights": ((vertices, influences), np.float32),
         "pose_matrices": ((poses, joints, 4, 4), np.float32),
         "residuals": ((poses, vertices, 3), np.float32),
+        **(of_controls if controls else {}),
         **(of_faces if faces else {}),
     }
 
 
-STREAMED = ("pose_matrices", "residuals")
+STREAMED = ("pose_matrices", "residuals", "controls")
 """The arrays that grow with the poses."""
+
+
+def streamed_arrays(
+    pose_matrices: np.ndarray, residuals: np.ndarray, controls: np.ndarray | None, count: int
+) -> dict[str, np.ndarray]:
+    """The arrays that poses are added to, by name; `count` is C, without controls there is no array of them."""
+    of_controls = {"controls": controls} if count else {}
+    return {"pose_matrices": pose_matrices, "residuals": residuals, **of_controls}
+
 
 HEADER_ERRORS = (TypeError, SyntaxError, RecursionError, MemoryError, tokenize.TokenError)
 """What numpy raises beside ValueError for a damaged header of an array, which is the text of a Python dictionary."""
@@ -168,8 +183,7 @@ def _check_index(index: dict) -> None:
             raise ValueError(f"'{key}' is {index[key]!r}")
     if index.get("corners", 0) < LEAST_CORNERS * index.get("faces", 0):
         raise ValueError(f"{index['faces']} faces cannot have {index.get('corners', 0)} corners")
-    if index["controls"] != []:
-        raise ValueError("it has controls, which this version does not know")
+    controls = read_controls(index["controls"])
     for text in (index["blender"], index["rig"]["file"], index["rig"]["object"]):
         if not isinstance(text, str):
             raise TypeError(f"{text!r} stands where text belongs")
@@ -180,9 +194,12 @@ def _check_index(index: dict) -> None:
         if type(joint["parent"]) is not int or not -1 <= joint["parent"] < number:
             raise ValueError(f"the parent of joint {joint['name']!r} is {joint['parent']!r}")
     for partition in index["partitions"]:
-        for joint in (partition["joint"], *partition["influencing"]):
+        for joint in (partition["joint"], *partition["influencing"], *partition.get("merged", ())):
             if type(joint) is not int or not 0 <= joint < len(names):
                 raise ValueError(f"a partition has joint {joint!r} of {len(names)}")
+        for control in partition.get("controls", ()):
+            if type(control) is not int or not 0 <= control < len(controls):
+                raise ValueError(f"a partition has control {control!r} of {len(controls)}")
     Fingerprint(**index["rig"]["fingerprint"])
     for source in _sampling(index["sampling"]).sources:
         if type(source.poses) is not int or source.poses < 0:
@@ -214,6 +231,7 @@ def read_recording(path: Path) -> Recording:
     shapes = array_shapes(
         *(index["poses"], len(index["joints"]), index["vertices"], index["influences"]),
         *(index.get(key, 0) for key in ("faces", "corners")),
+        len(index["controls"]),
     )
     arrays = {name: _open_array(path / f"{name}.npy", *what) for name, what in shapes.items()}
     joints = tuple(Joint(joint["name"], joint["parent"]) for joint in index["joints"])
@@ -221,14 +239,16 @@ def read_recording(path: Path) -> Recording:
         joints,
         *(np.array(arrays[name]) for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights")),
         Fingerprint(**index["rig"]["fingerprint"]),
-        *(np.array(arrays[name]) for name in ("face_starts", "face_vertices") if name in arrays),
+        *(np.array(arrays.get(name, np.zeros(0, np.int32))) for name in ("face_starts", "face_vertices")),
+        read_controls(index["controls"]),
     )
     _check_skin(path, rig)
     if not are_faces(rig.face_starts, rig.face_vertices, rig.vertex_count):
         raise RecordingError(f"The faces of '{path}' are damaged; record again.")
+    arrays.setdefault("controls", np.zeros((index["poses"], 0), np.float32))
     for name in STREAMED:
         _check_finite(path, name, arrays[name])
-    partitions = make_partitions(rig, {p["joint"]: tuple(p["influencing"]) for p in index["partitions"]})
+    partitions = read_partitions(rig, index["partitions"])
     if [p.joint for p in partitions] != [p["joint"] for p in index["partitions"]]:
         raise RecordingError(f"The partitions of '{path}' contradict its skin weights; record again.")
     sampling = _sampling(index["sampling"])
@@ -244,7 +264,30 @@ def read_recording(path: Path) -> Recording:
         index["blender"],
         sampling,
     )
-    return Recording(path, info, rig, partitions, arrays["pose_matrices"], arrays["residuals"])
+    return Recording(path, info, rig, partitions, *(arrays[name] for name in STREAMED))
+
+
+def partitions_json(partitions: tuple[Partition, ...]) -> list[dict]:
+    """Partitions as `recording.json` has them."""
+    return [
+        {
+            "joint": partition.joint,
+            "influencing": list(partition.influencing),
+            **({"controls": list(partition.controls)} if partition.controls else {}),
+            **({"merged": list(partition.merged)} if partition.merged else {}),
+        }
+        for partition in partitions
+    ]
+
+
+def read_partitions(rig: Rig, values: list[dict]) -> tuple[Partition, ...]:
+    """The partitions of a rig with what `partitions_json` says of them."""
+    return make_partitions(
+        rig,
+        {value["joint"]: tuple(value["influencing"]) for value in values},
+        {value["joint"]: tuple(value.get("controls", ())) for value in values},
+        {joint: value["joint"] for value in values for joint in value.get("merged", ())},
+    )
 
 
 def _open_array(path: Path, shape: tuple, dtype: type) -> np.ndarray:

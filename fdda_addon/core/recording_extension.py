@@ -9,7 +9,7 @@ import numpy as np
 
 from .errors import OutputError, RecordingError
 from .output import write_json
-from .recording import INDEX, REFINED, STREAMED, Recording, Source, array_shapes, read_index
+from .recording import INDEX, REFINED, STREAMED, Recording, Source, array_shapes, read_index, streamed_arrays
 from .recording_lock import RecordingLock
 from .recording_writer import array_header, check_finite
 
@@ -40,10 +40,12 @@ class RecordingExtension:
         try:
             self._lock.acquire()
             self._index = self._read_index()
-            self._shapes = array_shapes(
-                0, len(self._index["joints"]), self._index["vertices"], self._index["influences"]
+            index = self._index
+            shapes = array_shapes(
+                *(0, len(index["joints"]), index["vertices"], index["influences"]), controls=len(index["controls"])
             )
-            for streamed in STREAMED:
+            self._shapes = {name: shapes[name] for name in STREAMED if name in shapes}
+            for streamed in self._shapes:
                 self._files[streamed] = open(self.path / f"{streamed}.npy", "r+b")  # noqa: SIM115 - __exit__
         except OSError as error:
             self._close()
@@ -62,18 +64,19 @@ class RecordingExtension:
             )
         return index
 
-    def append(self, pose_matrices: np.ndarray, residuals: np.ndarray) -> None:
+    def append(self, pose_matrices: np.ndarray, residuals: np.ndarray, controls: np.ndarray | None = None) -> None:
         """Add poses.
 
         Args:
             pose_matrices: (n, J, 4, 4), mesh-object space, metres.
             residuals: (n, V, 3), local residuals, metres.
+            controls: (n, C), where the rig has controls.
 
         Raises:
             OutputError: the disk is full or went away; the poses before stay complete.
             RecordingError: a value is not finite.
         """
-        arrays = {"pose_matrices": pose_matrices, "residuals": residuals}
+        arrays = streamed_arrays(pose_matrices, residuals, controls, len(self._index["controls"]))
         check_finite(arrays, self.complete)
         total = self.complete + len(pose_matrices)
         try:

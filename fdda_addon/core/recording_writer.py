@@ -14,7 +14,17 @@ import numpy as np
 from .errors import OutputError, RecordingError
 from .output import write_json
 from .partition import Partition
-from .recording import FORMAT, INDEX, STREAMED, VERSION, RecordingInfo, array_shapes, read_index
+from .recording import (
+    FORMAT,
+    INDEX,
+    STREAMED,
+    VERSION,
+    RecordingInfo,
+    array_shapes,
+    partitions_json,
+    read_index,
+    streamed_arrays,
+)
 from .recording_lock import LOCK, RecordingLock
 from .rig import Rig
 
@@ -91,6 +101,7 @@ class RecordingWriter:
         shapes = array_shapes(
             *(self.info.poses, len(rig.joints), rig.vertex_count, rig.skin_joints.shape[1]),
             *(self._faces, self._corners),
+            len(rig.controls),
         )
         for name, (shape, dtype) in shapes.items():
             path = self.path / f"{name}.npy"
@@ -142,8 +153,8 @@ class RecordingWriter:
                 "fingerprint": asdict(self.rig.fingerprint),
             },
             "joints": [asdict(joint) for joint in self.rig.joints],
-            "controls": [],
-            "partitions": [{"joint": p.joint, "influencing": list(p.influencing)} for p in self.partitions],
+            "controls": [control.to_json() for control in self.rig.controls],
+            "partitions": partitions_json(self.partitions),
             # Through JSON and back, so that it compares equal with what was read.
             "sampling": json.loads(json.dumps(info.sampling.to_json())),
         }
@@ -151,18 +162,19 @@ class RecordingWriter:
     def _write_index(self) -> None:
         write_json(self.path / INDEX, self._index())
 
-    def append(self, pose_matrices: np.ndarray, residuals: np.ndarray) -> None:
+    def append(self, pose_matrices: np.ndarray, residuals: np.ndarray, controls: np.ndarray | None = None) -> None:
         """Add poses.
 
         Args:
             pose_matrices: (n, J, 4, 4), mesh-object space, metres.
             residuals: (n, V, 3), local residuals, metres.
+            controls: (n, C), where the rig has controls.
 
         Raises:
             OutputError: the disk is full or went away; the poses before stay complete.
             RecordingError: a value is not finite.
         """
-        arrays = {"pose_matrices": pose_matrices, "residuals": residuals}
+        arrays = streamed_arrays(pose_matrices, residuals, controls, len(self.rig.controls))
         check_finite(arrays, self.complete)
         try:
             for name, array in arrays.items():
@@ -200,7 +212,7 @@ class RecordingWriter:
         """Remove a new recording without a pose, and the folders that were made for it."""
         if not self._is_new or self.complete or not self._lock.is_held:
             return
-        shapes = array_shapes(0, 0, 0, 0, 1, 0)
+        shapes = array_shapes(0, 0, 0, 0, 1, 0, 1)
         for path in (self.path / INDEX, *(self.path / f"{name}.npy" for name in shapes)):
             with contextlib.suppress(OSError):
                 path.unlink()

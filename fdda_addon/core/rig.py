@@ -6,6 +6,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from .controls import Control
+
+UNMOVED = ""
+"""Name of the joint that never moves; no bone has it. What follows no bone follows this one.
+
+Its rest and its pose matrix are the identity, its parent is -1."""
+
 REST_TOLERANCE = 1e-4
 """Largest difference of a rest matrix element (metres, or no unit) at which two rest poses count as the same.
 
@@ -52,6 +59,7 @@ class Rig:
         fingerprint: of topology, rest positions and weights.
         face_starts: (F,) int32, where each face starts in `face_vertices`; empty when the faces are not known.
         face_vertices: (C,) int32, vertex indices of the corners, face by face.
+        controls: the inputs beside the joints.
     """
 
     joints: tuple[Joint, ...]
@@ -62,6 +70,7 @@ class Rig:
     fingerprint: Fingerprint
     face_starts: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
     face_vertices: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+    controls: tuple[Control, ...] = ()
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -11,6 +11,8 @@ from damage import array_file, edit, refused
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.recording import read_index, read_recording
 
+FIST = {"owner": "mesh_object", "path": '["fist"]', "low": 0, "high": 1}
+
 
 def test_no_recording(tmp_path):
     refused(tmp_path, f"'{tmp_path}' is not a recording: it has no recording.json; make one with record.")
@@ -75,7 +77,14 @@ def test_a_key_of_another_type(recording, key, value):
         ({"joints": [{"name": "a", "parent": -1}, {"name": "a", "parent": 0}]}, "two of one name"),
         ({"partitions": [{"joint": 4, "influencing": []}]}, "a partition has joint 4 of 4"),
         ({"partitions": [{"joint": 0, "influencing": [-1]}]}, "a partition has joint -1 of 4"),
-        ({"controls": [{"name": "fist"}]}, "it has controls"),
+        ({"controls": [{"name": "fist"}]}, "lacks 'owner'"),
+        ({"controls": {}}, "its controls are no list"),
+        ({"controls": [FIST, FIST]}, "two of its controls have one name"),
+        ({"controls": [{**FIST, "owner": "../scene"}]}, "a control belongs to '../scene'"),
+        ({"controls": [{**FIST, "path": 3}]}, "a control is called 3"),
+        ({"controls": [{**FIST, "low": 2}]}, "has the range 2.0 to 1.0"),
+        ({"partitions": [{"joint": 0, "influencing": [], "controls": [0]}]}, "a partition has control 0 of 0"),
+        ({"partitions": [{"joint": 0, "influencing": [], "merged": [9]}]}, "a partition has joint 9 of 4"),
     ],
 )
 def test_values_that_contradict_each_other(recording, changes, words):

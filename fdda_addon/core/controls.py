@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Controls: inputs of a model beside the joints. Numbers that deform the mesh and that no joint tells of."""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS = "armature_object", "armature", "mesh_object", "shape_keys"
+OWNERS = (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS)
+OTHER_OBJECT = "object:"
+"""Begins the owner of a control of another object; its name follows."""
+LONGEST_PATH = 1000
+
+
+@dataclass(frozen=True)
+class Control:
+    """A number that can be animated.
+
+    Attributes:
+        owner: the datablock as seen from the rig, one of `OWNERS`, or `OTHER_OBJECT` and the name of an object: a
+            character that is linked or renamed keeps its controls.
+        path: RNA path inside the owner, `key_blocks["Smile"].value`, `pose.bones["hand"]["fist"]`; one element of an
+            array is `location[0]`.
+        low, high: its range, in the unit of the property.
+    """
+
+    owner: str
+    path: str
+    low: float
+    high: float
+
+    @property
+    def name(self) -> str:
+        """Owner and path in one; tells controls of a rig apart."""
+        return f"{self.owner}/{self.path}"
+
+    def to_json(self) -> dict:
+        return asdict(self)
+
+    @staticmethod
+    def from_json(value: dict) -> "Control":
+        """Read a control from a file.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is damaged.
+        """
+        control = Control(value["owner"], value["path"], float(value["low"]), float(value["high"]))
+        for text in (control.owner, control.path):
+            if not isinstance(text, str) or not 0 < len(text) <= LONGEST_PATH:
+                raise ValueError(f"a control is called {text!r}")
+        if control.owner not in OWNERS and not control.owner.startswith(OTHER_OBJECT):
+            raise ValueError(f"a control belongs to {control.owner!r}")
+        if not (np.isfinite([control.low, control.high]).all() and control.low <= control.high):
+            raise ValueError(f"the control {control.name!r} has the range {control.low} to {control.high}")
+        return control
+
+
+def read_controls(values: list) -> tuple[Control, ...]:
+    """Read the controls of a recording or model.
+
+    Raises:
+        KeyError, TypeError, ValueError: they are damaged, or two have one name.
+    """
+    if not isinstance(values, list):
+        raise TypeError("its controls are no list")
+    controls = tuple(Control.from_json(value) for value in values)
+    if len({control.name for control in controls}) != len(controls):
+        raise ValueError("two of its controls have one name")
+    return controls
