@@ -9,7 +9,8 @@ import numpy as np
 
 from .errors import OutputError, RecordingError
 from .output import write_json
-from .recording import INDEX, REFINED, STREAMED, Recording, Source, array_shapes, read_index, streamed_arrays
+from .recording import STREAMED, Recording, array_shapes, streamed_arrays
+from .recording_index import INDEX, REFINED, Source, read_index
 from .recording_lock import RecordingLock
 from .recording_writer import array_header, check_finite
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .errors import OutputError, RecordingError
-from .recording import INDEX, REFINED, array_shapes, read_index
+from .recording import array_shapes
+from .recording_index import INDEX, REFINED, read_index
 from .recording_lock import LOCK, RecordingLock
 from .recording_writer import different_keys
 from .rig import Fingerprint, Joint, Rig, differences

@@ -14,17 +14,8 @@ import numpy as np
 from .errors import OutputError, RecordingError
 from .output import write_json
 from .partition import Partition
-from .recording import (
-    FORMAT,
-    INDEX,
-    STREAMED,
-    VERSION,
-    RecordingInfo,
-    array_shapes,
-    partitions_json,
-    read_index,
-    streamed_arrays,
-)
+from .recording import STREAMED, array_shapes, partitions_json, streamed_arrays
+from .recording_index import FORMAT, INDEX, VERSION, RecordingInfo, read_index
 from .recording_lock import LOCK, RecordingLock
 from .rig import Rig
 
