@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Saving the open .blend file elsewhere, wholly or not at all, with sentences in place of Blender's reports."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+
+from ..core.output import check_writable, replacing
+
+SEEK_TABLE_END = bytes.fromhex("b1ea928f")
+"""Last bytes of a compressed .blend file, which is one of Zstandard's seekable format."""
+
+
+def save_copy(path: Path) -> None:
+    """Save the open file to a path, wholly or not at all; relative paths inside are kept right.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    check_writable(path)
+    with replacing(path) as temporary:
+        try:
+            with quiet():
+                bpy.ops.wm.save_as_mainfile(
+                    filepath=str(temporary.absolute()), copy=True, compress=True, check_existing=False
+                )
+        except RuntimeError as error:
+            raise OSError(reason(error)) from error
+        # Blender 4.5 saves half a compressed file to a full disk and calls it finished.
+        if temporary.read_bytes()[-len(SEEK_TABLE_END) :] != SEEK_TABLE_END:
+            raise OSError("Blender wrote only a part of it, the disk may be full")
+
+
+def reason(error: RuntimeError) -> str:
+    """The first of the reports that an operator failed with."""
+    return str(error).strip().removeprefix("Error: ").partition("\n")[0]
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep Blender's own lines ("Read blend: …") off stdout, where a verb prints its results."""
+    sys.stdout.flush()
+    saved = os.dup(1)
+    try:
+        with open(os.devnull, "w") as sink:
+            os.dup2(sink.fileno(), 1)
+            # Blender prints the reports of a failed operator through Python, all else through C.
+            with contextlib.redirect_stdout(sink):
+                yield
+    finally:
+        os.dup2(saved, 1)
+        os.close(saved)
