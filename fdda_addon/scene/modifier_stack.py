@@ -27,26 +27,35 @@ def check_evaluable(scene_rig: SceneRig) -> None:
             that changes the topology.
     """
     mesh_object = scene_rig.mesh_object
-    if mesh_object.mode == "EDIT" or scene_rig.armature_object.mode == "EDIT":
-        raise RigError(f"'{mesh_object.name}' or its armature is in edit mode; leave it first.")
-    animation = scene_rig.armature_object.animation_data
-    if animation is not None and animation.use_tweak_mode:
-        raise RigError(f"'{scene_rig.armature_object.name}' is in tweak mode of the NLA editor; leave it first.")
+    check_posable(scene_rig)
     check_topology(mesh_object, mesh_object.modifiers)
     if not armature_modifier(mesh_object).show_viewport:
         raise RigError(f"The Armature modifier of '{mesh_object.name}' is switched off in the viewport; switch it on.")
-    if scene_rig.armature_object.data.pose_position == "REST":
-        raise RigError(f"The armature '{scene_rig.armature_object.name}' shows its rest position; set it to pose.")
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    if not mesh_object.evaluated_get(depsgraph).is_evaluated:
-        raise RigError(f"'{mesh_object.name}' is hidden, so Blender does not evaluate it; show it in the viewport.")
-    count = len(mesh_object.evaluated_get(depsgraph).data.vertices)
+    count = len(mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.vertices)
     if count != len(mesh_object.data.vertices):
         nodes = [m.name for m in mesh_object.modifiers if m.type not in DEFORMING and m.show_viewport]
         raise RigError(
             f"The modifiers of '{mesh_object.name}' turn {len(mesh_object.data.vertices)} vertices into {count}; "
             f"switch off the one that changes the topology ({', '.join(nodes)})."
         )
+
+
+def check_posable(scene_rig: SceneRig) -> None:
+    """Fail when the poses of a rig could not be read frame by frame, whatever its modifiers do.
+
+    Raises:
+        RigError: edit mode, the NLA's tweak mode, an armature that shows its rest position, or a hidden object.
+    """
+    mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
+    if mesh_object.mode == "EDIT" or armature_object.mode == "EDIT":
+        raise RigError(f"'{mesh_object.name}' or its armature is in edit mode; leave it first.")
+    animation = armature_object.animation_data
+    if animation is not None and animation.use_tweak_mode:
+        raise RigError(f"'{armature_object.name}' is in tweak mode of the NLA editor; leave it first.")
+    if armature_object.data.pose_position == "REST":
+        raise RigError(f"The armature '{armature_object.name}' shows its rest position; set it to pose.")
+    if not mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).is_evaluated:
+        raise RigError(f"'{mesh_object.name}' is hidden, so Blender does not evaluate it; show it in the viewport.")
 
 
 def check_topology(mesh_object: bpy.types.Object, modifiers: Iterable[bpy.types.Modifier]) -> None:
