@@ -12,6 +12,7 @@ from fdda_addon.core.errors import TrainingError
 from .config import TrainingConfig
 from .data import PreparedPartition, Split
 from .model import Network, PartitionNetworks
+from .process import Cancelled
 
 WARM_UP = 0.15
 """Part of the steps in which the learning rate rises."""
@@ -19,10 +20,6 @@ WARM_UP = 0.15
 
 SMOOTHING = 1e-6
 """Added to squared relative errors: the loss is a distance, without the kink at zero."""
-
-
-class Cancelled(Exception):  # noqa: N818 - no error
-    """The training was asked to stop."""
 
 
 @dataclass

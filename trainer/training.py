@@ -22,8 +22,9 @@ from .data import PreparedPartition, Split, held_back_digest, partitions_of, pre
 from .deformation import Deformation
 from .export import build_model, measure, measure_surface, write_model
 from .inputs import Inputs, make_inputs, middles
-from .loop import Cancelled, Trained, choose_device, train
+from .loop import Trained, choose_device, train
 from .page import render_html
+from .process import Cancelled
 from .target import Outcome, judge
 from .trust import make_trust_range
 from .weights import LastWeights, initial_networks, read_weights, weights_path, write_weights

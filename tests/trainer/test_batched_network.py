@@ -8,8 +8,9 @@ from chain import chain_angles
 
 from trainer.config import TrainingConfig
 from trainer.data import PartitionData, prepare, split_poses
-from trainer.loop import Cancelled, train
+from trainer.loop import train
 from trainer.model import ACTIVATIONS, PartitionNetworks
+from trainer.process import Cancelled
 
 CONFIG = TrainingConfig(epochs=30, hidden=(16, 16), batch_size=16, tolerance_mm=0.01, learning_rate=0.01)
 
