@@ -19,7 +19,9 @@ _POSE = {
 
 
 @contextmanager
-def borrowed_pose(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action] = ()) -> Iterator[None]:
+def borrowed_pose(
+    armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action] = (), keep_animation: bool = False
+) -> Iterator[None]:
     """Give back the pose of an armature, its animation and the current frame.
 
     Inside, the armature has no action and no NLA, so that poses stay as they are set.
@@ -28,6 +30,7 @@ def borrowed_pose(armature_object: bpy.types.Object, actions: Iterable[bpy.types
         armature_object: not in the NLA's tweak mode, where its action cannot be changed.
         actions: actions that will drive it; what else they animate, the object itself or a custom property, is given
             back as well.
+        keep_animation: its own action and NLA drive it inside, as they do outside.
     """
     scene = bpy.context.scene
     bones = armature_object.pose.bones
@@ -35,13 +38,15 @@ def borrowed_pose(armature_object: bpy.types.Object, actions: Iterable[bpy.types
     pose = {name: np.empty(len(bones) * size, np.float32) for name, size in _POSE.items()}
     for name, values in pose.items():
         bones.foreach_get(name, values)
-    animated = _animated_values(armature_object, actions)
     animation = armature_object.animation_data
+    own = _driving_actions(animation) if keep_animation and animation is not None else ()
+    animated = _animated_values(armature_object, [*actions, *own])
     if animation is not None:
         action, use_nla = animation.action, animation.use_nla
         slot = getattr(animation, "action_slot", None)
-        animation.use_nla = False
-        animation.action = None
+        if not keep_animation:
+            animation.use_nla = False
+            animation.action = None
     try:
         yield
     finally:
@@ -62,6 +67,12 @@ def borrowed_pose(armature_object: bpy.types.Object, actions: Iterable[bpy.types
             bones.foreach_set(name, values)
         armature_object.update_tag(refresh={"DATA"})
         bpy.context.view_layer.update()
+
+
+def _driving_actions(animation: bpy.types.AnimData) -> list[bpy.types.Action]:
+    """The action of a datablock and those of its NLA strips."""
+    strips = (strip for track in animation.nla_tracks for strip in track.strips)
+    return [action for action in (animation.action, *(strip.action for strip in strips)) if action is not None]
 
 
 def _animated_values(owner: bpy.types.ID, actions: Iterable[bpy.types.Action]) -> dict[str, object]:
