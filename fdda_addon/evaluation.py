@@ -19,6 +19,7 @@ from .recording import Progress, action_frames, find_action
 from .runtime.network import Network
 from .scene.armature import Poser, clear_pose
 from .scene.borrow import assign_action, borrowed_pose
+from .scene.modifier_stack import borrowed_stack
 from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
 
 HELD_OUT_INDEX = 1 << 33
@@ -159,7 +160,7 @@ def evaluate(
     extra = max(1, settings.poses // 4)
     total = settings.poses + extra * len(settings.beyond) + len(settings.named)
     total += sum(len(action_frames(action)) for action in actions)
-    with borrowed_pose(scene_rig.armature_object, actions):
+    with borrowed_stack(scene_rig.mesh_object), borrowed_pose(scene_rig.armature_object, actions):
         clear_pose(scene_rig.armature_object)
         comparison = _Comparison(PoseEvaluator(scene_rig, rig), network, layer, total, settings.surface)
         poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses)
@@ -185,7 +186,7 @@ def evaluate_action(scene_rig: SceneRig, model: Path | Network, name: str) -> It
     """
     action = find_action(name)
     network, layer = _prepare(scene_rig, model)
-    with borrowed_pose(scene_rig.armature_object, [action]):
+    with borrowed_stack(scene_rig.mesh_object), borrowed_pose(scene_rig.armature_object, [action]):
         evaluator = PoseEvaluator(scene_rig, layer.rig)
         comparison = _Comparison(evaluator, network, layer, len(action_frames(action)), surface=False)
         errors = yield from comparison.compare(action.name, _action_poses(scene_rig, action))

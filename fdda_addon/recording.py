@@ -22,6 +22,7 @@ from .core.rig import Rig
 from .core.skinning import LinearLayer
 from .scene.armature import Poser, clear_pose
 from .scene.borrow import assign_action, borrowed_pose
+from .scene.modifier_stack import borrowed_stack
 from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
 
 BATCH_BYTES = 6 << 20
@@ -87,7 +88,7 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         total, 0, Path(bpy.data.filepath).name, scene_rig.mesh_object.name, bpy.app.version_string, sampling
     )
 
-    with borrowed_pose(scene_rig.armature_object, actions):
+    with borrowed_stack(scene_rig.mesh_object), borrowed_pose(scene_rig.armature_object, actions):
         clear_pose(scene_rig.armature_object)
         evaluator = PoseEvaluator(scene_rig, rig)
         partitions = yield from _detect_influences(scene_rig, rig, channels, evaluator, settings)

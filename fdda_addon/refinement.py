@@ -23,6 +23,7 @@ from .recording import append_poses
 from .runtime.network import Network
 from .scene.armature import Poser, clear_pose
 from .scene.borrow import borrowed_pose
+from .scene.modifier_stack import borrowed_stack
 from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
 
 PROBE_INDEX, BASE_INDEX = 1 << 34, 1 << 35
@@ -73,7 +74,7 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
     channels = sampled_channels(scene_rig, rig)
     _check_recording(recording, rig, channels)
     first = len(recording.pose_matrices)
-    with borrowed_pose(scene_rig.armature_object):
+    with borrowed_stack(scene_rig.mesh_object), borrowed_pose(scene_rig.armature_object):
         clear_pose(scene_rig.armature_object)
         evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig.armature_object, channels)
         count = max(LEAST_PROBES, settings.poses)

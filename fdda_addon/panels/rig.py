@@ -5,7 +5,6 @@ import bpy
 
 from ..operators import job
 from ..operators.rig import cost_of
-from ..scene.modifier_stack import deforming_modifiers
 from ..scene.scene_rig import SceneRig
 from . import checks
 from .section import Section, draw_job, draw_sentence, panel_rig
@@ -42,7 +41,8 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
         check = checks.known(rig)
         for problem in check.problems if check else ():
             draw_sentence(layout.box(), context, problem, "ERROR")
-        _draw_replaced(layout, context, rig)
+        if check:
+            _draw_replaced(layout, rig.mesh_object, check.replaced)
         _draw_cost(layout, context, rig)
 
 
@@ -58,11 +58,10 @@ def _draw_counts(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     column.label(text=text, icon="ARMATURE_DATA")
 
 
-def _draw_replaced(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    mesh_object = rig.mesh_object
+def _draw_replaced(layout: bpy.types.UILayout, mesh_object: bpy.types.Object, replaced: tuple[str, ...]) -> None:
     column = layout.column(align=True)
     column.label(text="A model takes the place of:")
-    for modifier in deforming_modifiers(mesh_object):
+    for modifier in (mesh_object.modifiers[name] for name in replaced if name in mesh_object.modifiers):
         column.label(text=modifier.name, icon=MODIFIER_ICONS.get(modifier.type, "MODIFIER"))
     if mesh_object.data.shape_keys:
         count = len(mesh_object.data.shape_keys.key_blocks) - 1

@@ -9,7 +9,8 @@ import bpy
 
 from ..core.errors import RigError
 from ..core.model import check_rig
-from ..scene.rig import SceneRig, check_topology, deforming_modifiers, read_rig
+from ..scene.modifier_stack import check_stack
+from ..scene.rig import SceneRig, read_rig
 from . import model_files, nodes, packed, playback, switch
 
 
@@ -26,7 +27,7 @@ def bind(
 
     Raises:
         ModelError: the file is no model, or was trained for another rig. The scene is as before.
-        RigError: the rig cannot be read.
+        RigError: the rig cannot be read, or no model can stand in for its modifiers.
     """
     mesh_object = scene_rig.mesh_object
     if mesh_object.mode == "EDIT":
@@ -34,16 +35,15 @@ def bind(
     model = model.absolute()
     network = model_files.load_network(model) if packed_model is None else packed.load(packed_model)
     check_rig(model, network.info, read_rig(scene_rig))
-    last = max(mesh_object.modifiers.find(modifier.name) for modifier in deforming_modifiers(mesh_object))
-    # Those after the last deforming one stay and work on what the model gives.
-    check_topology(mesh_object, mesh_object.modifiers[:last])
+    with true_rig(mesh_object):
+        stack = check_stack(mesh_object)
     if mesh_object.fdda.is_bound:
         unbind(mesh_object)
 
     if packed_model is None:
         model_files.choose(model)
-    last = max(mesh_object.modifiers.find(modifier.name) for modifier in deforming_modifiers(mesh_object))
-    nodes.add_modifier(mesh_object, last + 1)
+    # Those after the last deforming one stay and work on what the model gives.
+    nodes.add_modifier(mesh_object, stack.place)
     binding = mesh_object.fdda
     binding.model = stored_path(model)
     binding.packed = packed_model

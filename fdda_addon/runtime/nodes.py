@@ -9,11 +9,11 @@ import bpy
 import numpy as np
 
 from ..scene.compatibility import node_input, set_node_input
-from ..scene.rig import MODIFIER_NAME
+from ..scene.modifier_stack import PLAYBACK_KEY
+from ..scene.scene_rig import MODIFIER_NAME
 
 GROUP_NAME = "FDDA Playback"
 GROUP_VERSION = 1
-VERSION_KEY = "fdda_version"
 
 
 def add_modifier(mesh_object: bpy.types.Object, place: int) -> bpy.types.NodesModifier:
@@ -25,7 +25,8 @@ def add_modifier(mesh_object: bpy.types.Object, place: int) -> bpy.types.NodesMo
     modifier.show_in_editmode = True
     modifier.show_on_cage = False
     modifier.show_expanded = False
-    mesh_object.modifiers.move(len(mesh_object.modifiers) - 1, place)
+    # Not the last where another modifier is pinned to the end.
+    mesh_object.modifiers.move(mesh_object.modifiers.find(modifier.name), place)
     set_node_input(modifier, _cache_socket(group), new_cache(mesh_object))
     return modifier
 
@@ -33,7 +34,7 @@ def add_modifier(mesh_object: bpy.types.Object, place: int) -> bpy.types.NodesMo
 def find_modifier(mesh_object: bpy.types.Object) -> bpy.types.NodesModifier | None:
     """The modifier that plays a model, None when it was removed."""
     for modifier in mesh_object.modifiers:
-        if modifier.type == "NODES" and modifier.node_group is not None and VERSION_KEY in modifier.node_group:
+        if modifier.type == "NODES" and modifier.node_group is not None and PLAYBACK_KEY in modifier.node_group:
             return modifier
     return None
 
@@ -87,10 +88,10 @@ def _cache_socket(group: bpy.types.NodeTree) -> str:
 def _node_group() -> bpy.types.NodeTree:
     """Object Info → Sample Index → Set Position; one group serves all bindings of a file."""
     for group in bpy.data.node_groups:
-        if group.get(VERSION_KEY) == GROUP_VERSION and group.library is None:
+        if group.get(PLAYBACK_KEY) == GROUP_VERSION and group.library is None:
             return group
     group = bpy.data.node_groups.new(GROUP_NAME, "GeometryNodeTree")
-    group[VERSION_KEY] = GROUP_VERSION
+    group[PLAYBACK_KEY] = GROUP_VERSION
     group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
     group.interface.new_socket("Positions", in_out="INPUT", socket_type="NodeSocketObject")
     group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")

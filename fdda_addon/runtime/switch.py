@@ -3,7 +3,7 @@
 
 import bpy
 
-from ..scene.rig import deforming_modifiers
+from ..scene.modifier_stack import deforming_modifiers
 from . import nodes
 
 

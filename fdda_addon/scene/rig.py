@@ -10,7 +10,7 @@ from ..core.poses import Channel
 from ..core.rig import Fingerprint, Joint, Rig
 from . import armature as armature_io
 from . import mesh as mesh_io
-from .modifier_stack import check_evaluable, check_topology, deforming_modifiers
+from .modifier_stack import check_evaluable, deforming_modifiers
 from .scene_rig import MODIFIER_NAME, SceneRig, armature_modifier, find_rig
 
 SMALLEST_VOLUME = 1e-15
@@ -151,5 +151,5 @@ class PoseEvaluator:
 
 __all__ = [
     "MODIFIER_NAME", "PoseEvaluator", "PoseReader", "SceneRig", "armature_modifier", "check_evaluable",
-    "check_topology", "deforming_modifiers", "find_rig", "mesh_from_armature", "read_rig", "sampled_channels",
+    "deforming_modifiers", "find_rig", "mesh_from_armature", "read_rig", "sampled_channels",
 ]  # fmt: skip
