@@ -40,3 +40,7 @@ class TrainerEnvironmentError(FDDAError):
 
 class OutputError(FDDAError):
     """An output path cannot be written."""
+
+
+class PointCacheError(FDDAError):
+    """A point cache cannot be read."""

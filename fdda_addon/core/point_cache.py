@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Point caches: files of format .pc2, the positions of a mesh frame by frame, that most 3D programs read.
+
+Little-endian: the text "POINTCACHE2" and a zero, int32 version, int32 points, float32 first frame, float32 frames a
+sample, int32 samples; then float32 x, y, z of each point, sample by sample.
+"""
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from .errors import PointCacheError
+
+SIGNATURE = b"POINTCACHE2\0"
+VERSION = 1
+HEADER = struct.Struct("<12siiffi")
+
+
+@dataclass(frozen=True)
+class PointCache:
+    """A point cache that was read.
+
+    Attributes:
+        start: frame of the first sample.
+        rate: frames from one sample to the next.
+        positions: (samples, points, 3) float32, mapped from disk.
+    """
+
+    start: float
+    rate: float
+    positions: np.ndarray
+
+
+class PointCacheWriter:
+    """Writes a point cache, one sample a frame, in as many pieces as one likes."""
+
+    def __init__(self, file: BinaryIO, points: int, start: int, samples: int):
+        """Args:
+        file: empty, open for writing.
+        points: of a sample.
+        start: frame of the first sample.
+        samples: how many there will be.
+        """
+        self._file, self._points, self._missing = file, points, samples
+        file.write(HEADER.pack(SIGNATURE, VERSION, points, start, 1.0, samples))
+
+    def append(self, positions: np.ndarray) -> None:
+        """Write samples: (N, points, 3), metres. ValueError when they are of another shape or too many."""
+        if positions.shape[1:] != (self._points, 3) or len(positions) > self._missing:
+            raise ValueError(f"samples of shape {positions.shape} where {self._missing} of {self._points} points fit")
+        self._missing -= len(positions)
+        self._file.write(np.ascontiguousarray(positions, "<f4").data)
+
+    def finish(self) -> None:
+        """ValueError when samples are missing."""
+        if self._missing:
+            raise ValueError(f"{self._missing} samples are missing")
+
+
+def read_point_cache(path: Path) -> PointCache:
+    """Open a point cache.
+
+    Raises:
+        PointCacheError: it cannot be read, is of another format, or its size is not what its header says.
+    """
+    try:
+        with open(path, "rb") as file:
+            head, size = file.read(HEADER.size), path.stat().st_size
+    except OSError as error:
+        raise PointCacheError(f"The point cache '{path}' cannot be read: {error.strerror}.") from error
+    if len(head) < HEADER.size or not head.startswith(SIGNATURE):
+        raise PointCacheError(f"'{path}' is not a point cache; give a .pc2 file.")
+    _, version, points, start, rate, samples = HEADER.unpack(head)
+    if version != VERSION:
+        raise PointCacheError(f"The point cache '{path}' is of version {version} and only version {VERSION} is read.")
+    expected = HEADER.size + 12 * points * samples
+    if points < 1 or samples < 1 or size != expected or not np.isfinite([start, rate]).all():
+        raise PointCacheError(
+            f"The point cache '{path}' is damaged: it has {size} bytes and its header says {samples} samples of "
+            f"{points} points from frame {start:g} on; write it again."
+        )
+    positions = np.memmap(path, "<f4", "r", HEADER.size, (samples, points, 3))
+    return PointCache(start, rate, positions)
