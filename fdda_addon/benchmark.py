@@ -12,6 +12,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
+from .core.errors import RigError
 from .core.poses import sample_pose
 from .recording import Progress, action_frames
 from .runtime import model_files, playback
@@ -189,6 +190,8 @@ def armature_alone(mesh_object: bpy.types.Object) -> Iterator[None]:
     """Blender's own linear skinning: the Armature modifier alone, shape keys pinned."""
     mesh_object.fdda.mode = "RIG"
     skinning = armature_modifier(mesh_object)
+    if skinning is None:
+        raise RigError(f"'{mesh_object.name}' has no Armature modifier: there is no linear skinning to time.")
     with ExitStack() as stack:
         for modifier in deforming_modifiers(mesh_object):
             if modifier != skinning:

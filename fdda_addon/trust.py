@@ -5,7 +5,7 @@ import bpy
 
 from .core.errors import FDDAError
 from .runtime import model_files
-from .scene.rig import PoseReader, SceneRig, armature_modifier
+from .scene.rig import PoseReader, SceneRig, armature_of
 
 _last: dict[int, tuple[object, bytes, list[tuple[str, float]] | None]] = {}
 
@@ -18,19 +18,19 @@ def partition_trust(mesh_object: bpy.types.Object) -> list[tuple[str, float]] | 
     Returns:
         The least trusted first; None when the model does not say, or the pose cannot be read.
     """
-    modifier = armature_modifier(mesh_object)
-    if modifier is None or not mesh_object.fdda.is_bound:
+    armature_object = armature_of(mesh_object)
+    if armature_object is None or not mesh_object.fdda.is_bound:
         return None
     try:
         network = model_files.network_of(mesh_object)
         names = tuple(joint.name for joint in network.info.joints)
-        if any(name not in modifier.object.data.bones for name in names):
+        if any(name not in armature_object.data.bones for name in names):
             return None
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        evaluated = [o.evaluated_get(depsgraph) for o in (mesh_object, modifier.object)]
+        evaluated = [o.evaluated_get(depsgraph) for o in (mesh_object, armature_object)]
         if not all(o.is_evaluated for o in evaluated):
             return None
-        pose = PoseReader(SceneRig(mesh_object, modifier.object), names, network.info.rest_matrices).read(*evaluated)
+        pose = PoseReader(SceneRig(mesh_object, armature_object), names, network.info.rest_matrices).read(*evaluated)
         kept = _last.get(mesh_object.session_uid)
         if kept is None or kept[0] is not network or kept[1] != pose.tobytes():
             trust = network.trust(pose[None])

@@ -5,7 +5,7 @@ import bpy
 
 from ..core.errors import RigError
 from ..scene.active_rig import active_rig
-from ..scene.scene_rig import SceneRig, armature_modifier
+from ..scene.scene_rig import SceneRig, armature_of
 
 
 class OnRig:
@@ -26,7 +26,7 @@ class OnRig:
         try:
             active_rig(context)
         except RigError as error:
-            if any(o.type == "MESH" and armature_modifier(o) is not None for o in context.scene.objects):
+            if any(o.type == "MESH" and armature_of(o) is not None for o in context.scene.objects):
                 return True
             cls.poll_message_set(str(error).rstrip("."))
             return False

@@ -8,7 +8,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..operators import job
-from ..scene.scene_rig import SceneRig, armature_modifier
+from ..scene.scene_rig import SceneRig, armature_of
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..rig_check import RigCheck
@@ -57,17 +57,17 @@ def _check_wanted() -> None:
     for uid in list(_wanted):
         _wanted.discard(uid)
         mesh_object = meshes.get(uid)
-        modifier = mesh_object and armature_modifier(mesh_object)
+        armature_object = mesh_object and armature_of(mesh_object)
         # While a job borrows the scene, nothing is as the user left it.
-        if modifier and not (running and running.borrows_scene):
-            check_now(SceneRig(mesh_object, modifier.object))
+        if armature_object and not (running and running.borrows_scene):
+            check_now(SceneRig(mesh_object, armature_object))
     if _shown() != before:
         job.redraw()
 
 
 def _shown() -> dict[int, tuple]:
     """What panels draw of the checks."""
-    return {uid: (id(check.rig), check.problems, check.channels) for uid, (check, _) in _checks.items()}
+    return {uid: (id(check.rig), check.problems, check.channels, check.replaced) for uid, (check, _) in _checks.items()}
 
 
 def _counters(scene_rig: SceneRig) -> tuple:

@@ -14,10 +14,10 @@ def _states(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
     """What is wrong with the models of a mesh: icon and sentence by path and name; all is well with those left out."""
     from ..model_changes import changes
     from ..models import info_of
-    from ..scene.scene_rig import SceneRig, armature_modifier
+    from ..scene.scene_rig import SceneRig, armature_of
 
-    modifier = armature_modifier(mesh_object)
-    check = checks.known(SceneRig(mesh_object, modifier.object)) if modifier else None
+    armature_object = armature_of(mesh_object)
+    check = checks.known(SceneRig(mesh_object, armature_object)) if armature_object else None
     found = {}
     for entry in mesh_object.fdda.models:
         try:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..core.errors import FDDAError, ModelError, RigError
 from ..core.skinning import LinearLayer
-from ..scene.rig import PoseReader, SceneRig, armature_modifier, read_rig
+from ..scene.rig import PoseReader, SceneRig, armature_of, read_rig
 from . import nodes, switch
 from .model_files import network_of
 from .network import Network
@@ -263,7 +263,7 @@ def _scan() -> None:
 
 
 def _armature(mesh_object: bpy.types.Object) -> bpy.types.Object:
-    modifier = armature_modifier(mesh_object)
-    if modifier is None:
+    armature_object = armature_of(mesh_object)
+    if armature_object is None:
         raise RigError(f"The armature of '{mesh_object.name}' is gone; give its Armature modifier an armature.")
-    return modifier.object
+    return armature_object

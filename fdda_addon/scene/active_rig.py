@@ -4,7 +4,7 @@
 import bpy
 
 from ..core.errors import RigError
-from .scene_rig import SceneRig, armature_modifier, find_rig
+from .scene_rig import SceneRig, armature_of, find_rig
 
 
 def active_rig(context: bpy.types.Context, name: str = "") -> SceneRig:
@@ -26,12 +26,12 @@ def active_rig(context: bpy.types.Context, name: str = "") -> SceneRig:
     if active is None or active.type not in {"MESH", "ARMATURE"}:
         raise RigError("Nothing with a rig is active; select the mesh of a character, or its armature.")
     if active.type == "MESH":
-        modifier = armature_modifier(active)
-        if modifier is None:
+        armature_object = armature_of(active)
+        if armature_object is None:
             raise RigError(
                 f"'{active.name}' has no Armature modifier with an armature; add one, or select another mesh."
             )
-        return SceneRig(active, modifier.object)
+        return SceneRig(active, armature_object)
     return SceneRig(_mesh_of(context, active), active)
 
 
@@ -47,5 +47,4 @@ def _mesh_of(context: bpy.types.Context, armature_object: bpy.types.Object) -> b
 
 
 def _follows(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> bool:
-    modifier = armature_modifier(mesh_object)
-    return modifier is not None and modifier.object == armature_object
+    return armature_of(mesh_object) == armature_object

@@ -6,14 +6,17 @@ import numpy as np
 from mathutils import Euler
 
 from ..core.poses import Channel
+from ..core.rig import UNMOVED
 from .motion_range import DEFAULT, location_ranges, rotation_ranges
 
 LIMITS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
 
 
 def rest_matrices(armature: bpy.types.Armature, names: tuple[str, ...]) -> np.ndarray:
-    """Rest matrices of bones, (J, 4, 4) float64, armature space, metres."""
-    return np.array([armature.bones[name].matrix_local for name in names], np.float64).reshape(-1, 4, 4)
+    """Rest matrices of bones, (J, 4, 4) float64, armature space, metres; the identity for the unmoved joint."""
+    identity = np.eye(4)
+    matrices = [identity if name == UNMOVED else armature.bones[name].matrix_local for name in names]
+    return np.array(matrices, np.float64).reshape(-1, 4, 4)
 
 
 class PoseMatrices:
@@ -25,23 +28,27 @@ class PoseMatrices:
         names: J bones. KeyError for a name that is not there.
         """
         index = {bone.name: number for number, bone in enumerate(armature_object.pose.bones)}
-        order = np.array([index[name] for name in names], np.int32)
+        self._count = len(index)
+        # Behind the bones there is an identity, for the joint that never moves.
+        order = np.array([index[name] if name != UNMOVED else self._count for name in names], np.int32)
         in_a_row = np.array_equal(order, np.arange(len(order)))
         self._order = slice(0, len(order)) if in_a_row else order
-        self._flat = np.empty(len(index) * 16, np.float32)
+        self._matrices = np.empty((self._count + 1, 4, 4), np.float32)
+        self._matrices[-1] = np.eye(4)
+        self._of_bones = self._matrices[:-1].reshape(-1)
 
     def fits(self, armature_object: bpy.types.Object) -> bool:
         """Whether the armature still has as many bones."""
-        return len(armature_object.pose.bones) * 16 == len(self._flat)
+        return len(armature_object.pose.bones) == self._count
 
     def read(self, armature_object: bpy.types.Object) -> np.ndarray:
         """Pose matrices of an evaluated armature object, (J, 4, 4) float32, armature space, metres.
 
         A view of memory that the next call writes into. Bones must not have come or gone (`fits`).
         """
-        armature_object.pose.bones.foreach_get("matrix", self._flat)
+        armature_object.pose.bones.foreach_get("matrix", self._of_bones)
         # Blender keeps matrices column by column.
-        return self._flat.reshape(-1, 4, 4)[self._order].transpose(0, 2, 1)
+        return self._matrices[self._order].transpose(0, 2, 1)
 
 
 def channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Channel, ...]:

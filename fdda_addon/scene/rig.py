@@ -1,17 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Checks the rig of a scene and reads it into arrays."""
 
+from collections.abc import Iterable
+
 import bpy
 import numpy as np
 from mathutils import Matrix
 
 from ..core.errors import RigError
 from ..core.poses import Channel
-from ..core.rig import Fingerprint, Joint, Rig
+from ..core.rig import UNMOVED, Fingerprint, Rig
 from . import armature as armature_io
 from . import mesh as mesh_io
+from .joints import choose_joints
 from .modifier_stack import check_evaluable, deforming_modifiers
-from .scene_rig import MODIFIER_NAME, SceneRig, armature_modifier, find_rig
+from .scene_rig import MODIFIER_NAME, SceneRig, armature_modifier, armature_of, find_rig
+from .skin import read_skin
 
 SMALLEST_VOLUME = 1e-15
 """An object whose scales multiply to less is flat: no position could be brought into its space."""
@@ -19,14 +23,16 @@ IDENTITY_TOLERANCE = 1e-6
 """Mesh and armature count as unmoved, one against the other, when no matrix element differs by more."""
 
 
-def read_rig(scene_rig: SceneRig) -> Rig:
+def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None) -> Rig:
     """Read a rig.
 
-    Its joints are the deforming bones that hold vertices, the bones that have a range of motion, and the ancestors
-    of both.
+    Args:
+        scene_rig: the rig.
+        besides: names of joints beside the bones that have weights, as of a model or a recording; when it is not given,
+            the bones that have a range of motion, and all bones above a joint.
 
     Raises:
-        RigError: a vertex follows no deforming bone, or an object has a scale of zero.
+        RigError: there is no vertex, or an object has a scale of zero.
     """
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
     for scene_object in (mesh_object, armature_object):
@@ -34,20 +40,12 @@ def read_rig(scene_rig: SceneRig) -> Rig:
             raise RigError(f"'{scene_object.name}' has a scale of zero; give it another.")
     if not len(mesh_object.data.vertices):
         raise RigError(f"The mesh of '{mesh_object.name}' has no vertices; choose another object.")
-    bones = armature_object.data.bones
-    groups = mesh_io.used_groups(mesh_object)
-    skinning = {bone.name for bone in bones if bone.use_deform and bone.name in groups}
-    wanted = skinning | {channel.bone for channel in armature_io.channels(armature_object, set())}
-    wanted |= {parent.name for name in wanted for parent in bones[name].parent_recursive}
-    ordered = sorted((bone for bone in bones if bone.name in wanted), key=lambda bone: len(bone.parent_recursive))
-    index = {bone.name: number for number, bone in enumerate(ordered)}
-    joints = tuple(Joint(bone.name, index[bone.parent.name] if bone.parent else -1) for bone in ordered)
+    skin = read_skin(mesh_object, armature_object, armature_modifier(mesh_object))
+    joints = choose_joints(armature_object, skin.bones, besides)
     names = tuple(joint.name for joint in joints)
-
+    skin_joints, skin_weights = skin.arrays({name: number for number, name in enumerate(names)})
     rest_positions = mesh_io.rest_positions(mesh_object.data)
-    skin_joints, skin_weights = mesh_io.skin_weights(mesh_object, {n: i for n, i in index.items() if n in skinning})
-    to_mesh = mesh_from_armature(mesh_object, armature_object)
-    rest = to_mesh @ armature_io.rest_matrices(armature_object.data, names)
+    rest = joint_rest_matrices(scene_rig, names)
     faces = mesh_io.topology(mesh_object.data)
     fingerprint = Fingerprint(
         Fingerprint.digest(*faces),
@@ -55,6 +53,14 @@ def read_rig(scene_rig: SceneRig) -> Rig:
         Fingerprint.digest(skin_joints, skin_weights),
     )
     return Rig(joints, rest_positions, rest.astype(np.float32), skin_joints, skin_weights, fingerprint, *faces)
+
+
+def joint_rest_matrices(scene_rig: SceneRig, names: tuple[str, ...]) -> np.ndarray:
+    """(J, 4, 4) float64 rest pose of joints, mesh-object space, metres; the identity for the unmoved joint."""
+    rest = armature_io.rest_matrices(scene_rig.armature_object.data, names)
+    moved = np.array([name != UNMOVED for name in names], bool)
+    rest[moved] = mesh_from_armature(scene_rig.mesh_object, scene_rig.armature_object) @ rest[moved]
+    return rest
 
 
 def mesh_from_armature(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
@@ -150,6 +156,6 @@ class PoseEvaluator:
 
 
 __all__ = [
-    "MODIFIER_NAME", "PoseEvaluator", "PoseReader", "SceneRig", "armature_modifier", "check_evaluable",
+    "MODIFIER_NAME", "PoseEvaluator", "PoseReader", "SceneRig", "armature_modifier", "armature_of", "check_evaluable",
     "deforming_modifiers", "find_rig", "mesh_from_armature", "read_rig", "sampled_channels",
 ]  # fmt: skip

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Finds the rig in a scene, or says why there is none. Nothing here is evaluated and numpy is not needed."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import bpy
@@ -37,14 +38,16 @@ def find_rig(name: str = "") -> SceneRig:
         meshes = [named]
     if not meshes:
         raise RigError("The scene has no mesh; open a file with a character that an armature deforms.")
-    rigged = [o for o in meshes if armature_modifier(o) is not None]
+    rigged = [o for o in meshes if armature_modifier(o) is not None] or [
+        o for o in meshes if armature_of(o) is not None
+    ]
     if not rigged:
         what = f"'{name}' has no" if name else f"None of the {len(meshes)} meshes of the scene has an"
         raise RigError(f"{what} Armature modifier with an armature; add one, or choose another object.")
     if len(rigged) > 1:
         names = ", ".join(f"'{o.name}'" for o in rigged)
         raise RigError(f"{len(rigged)} meshes have an Armature modifier ({names}); choose one with --object.")
-    return SceneRig(rigged[0], armature_modifier(rigged[0]).object)
+    return SceneRig(rigged[0], armature_of(rigged[0]))
 
 
 def armature_modifier(mesh_object: bpy.types.Object) -> bpy.types.ArmatureModifier | None:
@@ -53,3 +56,35 @@ def armature_modifier(mesh_object: bpy.types.Object) -> bpy.types.ArmatureModifi
         if modifier.type == "ARMATURE" and modifier.object is not None:
             return modifier
     return None
+
+
+def armature_of(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
+    """The armature object that deforms a mesh, None when there is none.
+
+    That of its first Armature modifier; else the first that is reached through the objects that its modifiers read: a
+    cage or a lattice that has an Armature modifier itself, an empty that is the child of a bone.
+    """
+    modifier = armature_modifier(mesh_object)
+    if modifier is not None:
+        return modifier.object
+    seen = {mesh_object}
+    waiting = list(_read_objects(mesh_object))
+    while waiting:
+        found = waiting.pop(0)
+        if found.type == "ARMATURE":
+            return found
+        if found not in seen:
+            seen.add(found)
+            targets = [getattr(constraint, "target", None) for constraint in found.constraints if not constraint.mute]
+            waiting += [other for other in (*_read_objects(found), found.parent, *targets) if other is not None]
+    return None
+
+
+def _read_objects(owner: bpy.types.Object) -> Iterator[bpy.types.Object]:
+    """The objects that the modifiers of an object read."""
+    for modifier in owner.modifiers:
+        for prop in modifier.bl_rna.properties:
+            if prop.type == "POINTER" and prop.fixed_type.identifier == "Object":
+                found = getattr(modifier, prop.identifier)
+                if found is not None:
+                    yield found

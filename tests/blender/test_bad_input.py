@@ -81,27 +81,6 @@ def test_no_armature_modifier(refusal, verb, tmp_path):
     assert "'elbow' has no Armature modifier with an armature" in refusal(*verb(path, "--object", "elbow"))
 
 
-@pytest.mark.parametrize("count", [1, 7])
-def test_unweighted_vertices(refusal, verb, tmp_path, count):
-    def unweight(rig):
-        for group in rig.mesh_object.vertex_groups:
-            group.remove(range(20, 20 + count))
-
-    text = refusal(*verb(save_elbow(tmp_path / "rig.blend", unweight)))
-    total = len(bpy.data.objects["elbow"].data.vertices)
-    assert f"{count} of the {total} vertices of 'elbow' have no weight on a deforming bone" in text
-    assert "(vertex 20)" in text if count == 1 else "(vertex 20, 21, 22, 23, 24, …)" in text
-
-
-def test_vertices_of_a_bone_that_does_not_deform(refusal, verb, tmp_path):
-    def switch_off(rig):
-        rig.armature_object.data.bones["lower"].use_deform = False
-
-    assert "have no weight on a deforming bone (vertex " in refusal(
-        *verb(save_elbow(tmp_path / "rig.blend", switch_off))
-    )
-
-
 def lock_all(rig) -> None:
     for bone in rig.armature_object.pose.bones:
         bone.lock_rotation = (True, True, True)

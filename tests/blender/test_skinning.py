@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The linear layer is what Blender's Armature modifier does, whatever the weights are like."""
+
+from collections.abc import Callable
+
+import bpy
+import numpy as np
+import pytest
+from conftest import ELBOW, evaluated, pose
+
+from fdda_addon.core.rig import UNMOVED
+from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.elbow import build_elbow
+from fdda_addon.scene.rig import PoseEvaluator, find_rig, read_rig
+
+EXACT = 2e-6
+
+
+@pytest.fixture
+def smooth() -> bpy.types.Object:
+    """The elbow with smooth weights of several bones a vertex and its Armature modifier alone."""
+    build_elbow()
+    mesh_object = bpy.data.objects[ELBOW]
+    for modifier in list(mesh_object.modifiers)[1:]:
+        mesh_object.modifiers.remove(modifier)
+    mesh_object.shape_key_clear()
+    along = np.array([vertex.co.z for vertex in mesh_object.data.vertices])
+    along = (along - along.min()) / np.ptp(along)
+    for name, weights in (("upper", 1 - along), ("lower", along)):
+        for vertex, weight in enumerate(weights.tolist()):
+            mesh_object.vertex_groups[name].add([vertex], weight, "REPLACE")
+    return mesh_object
+
+
+def armature_of(mesh_object: bpy.types.Object) -> bpy.types.Armature:
+    return mesh_object.modifiers[0].object.data
+
+
+def plain(mesh_object: bpy.types.Object) -> None:
+    pass
+
+
+def unnormalised(mesh_object: bpy.types.Object) -> None:
+    for vertex in range(0, 40, 3):
+        mesh_object.vertex_groups["upper"].add([vertex], 0.9, "REPLACE")
+        mesh_object.vertex_groups["lower"].add([vertex], 0.7, "REPLACE")
+
+
+def missing(mesh_object: bpy.types.Object) -> None:
+    for group in mesh_object.vertex_groups:
+        group.remove(range(10, 30))
+    mesh_object.vertex_groups["upper"].add([12], 0.00005, "REPLACE")
+    mesh_object.vertex_groups["lower"].add([13], 0.0, "REPLACE")
+    mesh_object.vertex_groups["lower"].add([14], 0.001, "REPLACE")
+
+
+def without_groups(mesh_object: bpy.types.Object) -> None:
+    mesh_object.vertex_groups.clear()
+
+
+def mask(mesh_object: bpy.types.Object) -> None:
+    group = mesh_object.vertex_groups.new(name="mask")
+    for vertex in range(len(mesh_object.data.vertices)):
+        if vertex % 5:
+            group.add([vertex], vertex % 5 / 4, "REPLACE")
+    mesh_object.modifiers[0].vertex_group = "mask"
+
+
+def inverted_mask(mesh_object: bpy.types.Object) -> None:
+    mask(mesh_object)
+    mesh_object.modifiers[0].invert_vertex_group = True
+
+
+def envelopes(mesh_object: bpy.types.Object) -> None:
+    mesh_object.modifiers[0].use_vertex_groups = False
+    mesh_object.modifiers[0].use_bone_envelopes = True
+    for bone, weight in zip(armature_of(mesh_object).bones, (1.0, 0.4), strict=True):
+        bone.head_radius, bone.tail_radius, bone.envelope_distance = 0.03, 0.05, 0.1
+        bone.envelope_weight = weight
+
+
+def envelopes_where_groups_are_missing(mesh_object: bpy.types.Object) -> None:
+    envelopes(mesh_object)
+    mesh_object.modifiers[0].use_vertex_groups = True
+    missing(mesh_object)
+
+
+def narrow_envelopes(mesh_object: bpy.types.Object) -> None:
+    envelopes(mesh_object)
+    for bone in armature_of(mesh_object).bones:
+        bone.head_radius, bone.tail_radius, bone.envelope_distance = 0.01, 0.02, 0.02
+
+
+def multiplied(mesh_object: bpy.types.Object) -> None:
+    envelopes(mesh_object)
+    mesh_object.modifiers[0].use_bone_envelopes = False
+    mesh_object.modifiers[0].use_vertex_groups = True
+    armature_of(mesh_object).bones["lower"].use_envelope_multiply = True
+
+
+def a_bone_that_does_not_deform(mesh_object: bpy.types.Object) -> None:
+    armature_of(mesh_object).bones["lower"].use_deform = False
+
+
+CASES = (
+    *(plain, unnormalised, missing, without_groups, mask, inverted_mask, envelopes, narrow_envelopes),
+    *(envelopes_where_groups_are_missing, multiplied, a_bone_that_does_not_deform),
+)
+
+
+@pytest.mark.parametrize("change", CASES)
+def test_the_linear_layer_is_blenders(smooth: bpy.types.Object, change: Callable):
+    change(smooth)
+    scene_rig = find_rig()
+    rig = read_rig(scene_rig)
+    assert np.allclose(rig.skin_weights.sum(axis=1), 1, atol=1e-6) and (rig.skin_weights >= 0).all()
+    evaluator, layer = PoseEvaluator(scene_rig, rig), LinearLayer(rig)
+    moved = 0.0
+    for angle in (0.0, 0.7, -1.2):
+        pose(angle=angle)
+        pose(angle=angle / 3, bone="upper")
+        matrices, positions = evaluator.evaluate()
+        assert np.array_equal(positions, evaluated(smooth))
+        moved = max(moved, np.abs(positions - rig.rest_positions).max())
+        assert np.abs(layer.positions(matrices[None])[0] - positions).max() < EXACT
+    assert moved > 0.01 or change is without_groups
+
+
+@pytest.mark.parametrize("change", [missing, mask, without_groups])
+def test_what_follows_no_bone_follows_the_unmoved_joint(smooth: bpy.types.Object, change: Callable):
+    change(smooth)
+    rig = read_rig(find_rig())
+    (unmoved,) = (number for number, joint in enumerate(rig.joints) if joint.name == UNMOVED)
+    assert rig.joints[unmoved].parent == -1 and np.array_equal(rig.rest_matrices[unmoved], np.eye(4))
+    assert rig.skin_weights[rig.skin_joints == unmoved].sum() > 1
+
+
+def test_a_rig_reads_the_same_with_the_joints_of_a_model(smooth: bpy.types.Object):
+    missing(smooth)
+    first = read_rig(find_rig())
+    again = read_rig(find_rig(), first.joint_names)
+    assert again.joints == first.joints and again.fingerprint == first.fingerprint
+
+
+def test_envelopes_are_those_of_blender(smooth: bpy.types.Object):
+    """The formula, point by point, against the function that Blender has for it."""
+    from fdda_addon.scene.skin import _envelope
+
+    envelopes(smooth)
+    bone = armature_of(smooth).bones["upper"]
+    points = np.random.default_rng(0).uniform(-0.3, 0.6, (200, 3))
+    expected = [bone.evaluate_envelope(point) for point in points]
+    assert 0 < np.count_nonzero(expected) < 200
+    assert np.allclose(_envelope(bone, points), expected, atol=1e-5)
