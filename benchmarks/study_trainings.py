@@ -13,15 +13,14 @@ import torch
 from fdda_addon.core.errors import RecordingError, TrainingError
 from fdda_addon.core.metrics import error_statistics
 from fdda_addon.core.output import write_json
-from fdda_addon.core.partition import make_partitions
-from fdda_addon.core.recording import Recording, read_recording
+from fdda_addon.core.recording import Recording, partitions_json, read_partitions, read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
 from trainer.config import TrainingConfig
 from trainer.data import partitions_of, prepare, split_poses
 from trainer.deformation import Deformation
 from trainer.export import Measured, build_model, measure, write_model
-from trainer.inputs import Inputs, make_inputs, middles
+from trainer.inputs import Inputs, inputs_of_rig, middles
 from trainer.loop import Curves, train
 from trainer.trust import make_trust_range
 
@@ -54,8 +53,9 @@ def cut(recording: Recording, names: tuple[str, ...]) -> Recording:
         rig.skin_joints[vertices],
         rig.skin_weights[vertices],
         rig.fingerprint,
+        controls=rig.controls,
     )
-    partitions = make_partitions(small, {partition.joint: partition.influencing for partition in chosen})
+    partitions = read_partitions(small, partitions_json(tuple(chosen)))
     residuals = np.array(recording.residuals[:, vertices])
     return Recording(
         recording.path, recording.info, small, partitions, recording.pose_matrices, residuals, recording.controls
@@ -78,7 +78,7 @@ def read_material(training: Path, held_out: Path, names: tuple[str, ...]) -> Mat
         )
     small = cut(whole, names)
     # The neighbours' middles are those of the whole mesh: the networks see what they see when all partitions train.
-    inputs = make_inputs(whole.rig.parents, middles(whole.rig, whole.partitions), small.partitions)
+    inputs = inputs_of_rig(whole.rig, middles(whole.rig, whole.partitions), small.partitions)
     return Material(small, cut(other, names), inputs)
 
 
@@ -91,7 +91,8 @@ def train_once(material: Material, config: TrainingConfig, model_path: Path) -> 
     prepared = [prepare(partition, split, config.tolerance_mm, config.seed) for partition in data]
     trained = train(prepared, split, config, torch.device("cpu"))
     seconds = {"processor": time.process_time() - processor, "wall": time.perf_counter() - wall}
-    seen = inputs.features(np.array(recording.pose_matrices[split.training]), recording.rig.rest_matrices)
+    poses, controls = (np.array(a[split.training]) for a in (recording.pose_matrices, recording.controls))
+    seen = inputs.features(poses, recording.rig.rest_matrices, controls)
     trust = make_trust_range(seen, recording.rig, recording.partitions)
     deformation = Deformation(
         recording.rig, recording.partitions, inputs, tuple(prepared), trained.networks, trust, config.activation

@@ -18,7 +18,7 @@ from .linear_fit import LinearFit, Surroundings, surroundings_of_rig
 
 LEAST_POSES = 10
 LEAST_SPREAD = 1e-5
-"""A feature that spreads less than this over the training poses counts as constant (no unit, or metres)."""
+"""A feature that spreads less than this over the training poses counts as constant (in its unit)."""
 
 
 @dataclass(frozen=True)
@@ -128,15 +128,16 @@ def held_back_digest(recording: Recording, split: Split) -> str:
 
     Equal for two recordings and splits when none of the poses that one of them holds back can have trained the other.
     """
+    arrays = (recording.pose_matrices, recording.controls) if recording.rig.controls else (recording.pose_matrices,)
     return Fingerprint.digest(
-        *(np.array(recording.pose_matrices[poses]) for poses in (split.held_out, split.validation))
+        *(np.array(array[poses]) for array in arrays for poses in (split.held_out, split.validation))
     )
 
 
 def partitions_of(recording: Recording, inputs: Inputs) -> list[PartitionData]:
     """The partitions of a recording, their features as `inputs` chose them."""
     rig = recording.rig
-    features = inputs.features(recording.pose_matrices, rig.rest_matrices)
+    features = inputs.features(recording.pose_matrices, rig.rest_matrices, recording.controls)
     skin = skin_matrices(recording.pose_matrices, rig.rest_matrices)
     return [
         PartitionData(

@@ -12,6 +12,7 @@ from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.features import FEATURES_PER_JOINT
 from fdda_addon.core.metrics import distances, error_statistics
 from fdda_addon.core.model import (
+    CONTROLS_INPUT,
     LIMITS,
     METADATA_KEY,
     POSE_INPUT,
@@ -48,18 +49,21 @@ class Measured:
     linear: np.ndarray
 
 
-def reference_positions(deformation: Deformation, pose_matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def reference_positions(
+    deformation: Deformation, pose_matrices: np.ndarray, controls: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """What the model must play, computed by another way: core's features and linear layer, and the networks in PyTorch.
 
     Args:
         deformation: what was trained.
         pose_matrices: (N, J, 4, 4), mesh-object space, metres.
+        controls: (N, C).
 
     Returns:
         (N, V, 3) float32 positions, mesh-object space, metres, and (N, P) float32 trust.
     """
     rig, trust_range = deformation.rig, deformation.trust
-    features = deformation.inputs.features(pose_matrices, rig.rest_matrices)
+    features = deformation.inputs.features(pose_matrices, rig.rest_matrices, controls)
     trust = trust_range.trust(features)
     mean, scale = deformation.standardisation()
     clamped = np.clip(features, trust_range.low, trust_range.high)
@@ -90,6 +94,14 @@ def open_session(model: bytes) -> onnxruntime.InferenceSession:
         raise TrainingError(f"ONNX Runtime {onnxruntime.__version__} refuses the exported model: {error}") from error
 
 
+def _inputs(recording: Recording, poses: np.ndarray) -> dict[str, np.ndarray]:
+    """What a session takes of some poses of a recording."""
+    inputs = {POSE_INPUT: np.array(recording.pose_matrices[poses])}
+    if recording.rig.controls:
+        inputs[CONTROLS_INPUT] = np.array(recording.controls[poses])
+    return inputs
+
+
 def measure(
     session: onnxruntime.InferenceSession, recording: Recording, deformation: Deformation, poses: np.ndarray
 ) -> Measured:
@@ -98,10 +110,10 @@ def measure(
     fdda, linear = (np.empty((len(poses), vertices), np.float32) for _ in range(2))
     layer = LinearLayer(recording.rig, deformation.partitions)
     for block in _blocks(len(poses), vertices):
-        matrices = np.array(recording.pose_matrices[poses[block]])
-        residuals = np.array(recording.residuals[poses[block]])
-        truth = layer.complex_positions(matrices, residuals)
-        (positions,) = session.run([POSITIONS_OUTPUT], {POSE_INPUT: matrices})
+        inputs = _inputs(recording, poses[block])
+        matrices = inputs[POSE_INPUT]
+        truth = layer.complex_positions(matrices, np.array(recording.residuals[poses[block]]))
+        (positions,) = session.run([POSITIONS_OUTPUT], inputs)
         fdda[block] = distances(positions, truth)
         linear[block] = distances(layer.positions(matrices), truth)
     return Measured(fdda, linear)
@@ -119,9 +131,10 @@ def measure_surface(
         Surface(rig.face_starts, rig.face_vertices), rig.rest_positions, deformation.partitions
     )
     for pose in poses[:: -(-len(poses) // MOST_SURFACES)]:
-        matrices = np.array(recording.pose_matrices[pose, None])
+        inputs = _inputs(recording, np.array([pose]))
+        matrices = inputs[POSE_INPUT]
         truth = layer.complex_positions(matrices, np.array(recording.residuals[pose, None]))
-        (positions,) = session.run([POSITIONS_OUTPUT], {POSE_INPUT: matrices})
+        (positions,) = session.run([POSITIONS_OUTPUT], inputs)
         rows.append(comparison.compare(truth[0], (positions[0], layer.positions(matrices)[0])))
     return surface_json(*(surface_errors(way) for way in zip(*rows, strict=True)))
 
@@ -139,9 +152,10 @@ def check_parity(
     """
     largest = 0.0
     for block in _blocks(len(poses), recording.rig.vertex_count):
-        matrices = np.array(recording.pose_matrices[poses[block]])
-        positions, trust = session.run(None, {POSE_INPUT: matrices})
-        expected, expected_trust = reference_positions(deformation, matrices)
+        inputs = _inputs(recording, poses[block])
+        positions, trust = session.run(None, inputs)
+        controls = np.array(recording.controls[poses[block]])
+        expected, expected_trust = reference_positions(deformation, inputs[POSE_INPUT], controls)
         difference = max(float(distances(positions, expected).max()), 0.0)
         if not np.isfinite(positions).all() or not np.isfinite(trust).all():
             raise TrainingError("The exported model gives values that are not numbers; train with other settings.")
@@ -176,7 +190,7 @@ def model_info(recording: Recording, deformation: Deformation, held_out: np.ndar
             for p, prepared in zip(deformation.partitions, deformation.prepared, strict=True)
         ),
         *(bound[: deformation.inputs.joint_columns].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
-        rig.controls,
+        deformation.trust.controls,
         error_statistics(held_out).to_json(),
         0.0,
         {**training, LIMITS: recording.info.sampling.to_json()["limits"]},

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The model's ONNX graph: from pose matrices to positions and trust, in standard operators.
+"""The model's ONNX graph: from pose matrices and controls to positions and trust, in standard operators.
 
 At one pose a frame the graph costs most of a microsecond a node, whatever the node does, and the time to read its
 constants once: hence few nodes, products with matrices of ones and zeros in place of gathers, and little padding.
-docs/training.md has the measurements. In the modules of the graph: N poses, J joints, Q pairs of joints, F features,
-P partitions, K basis shapes, V vertices.
+docs/training.md has the measurements. In the modules of the graph: N poses, J joints, C controls, Q pairs of joints,
+F features, P partitions, K basis shapes, V vertices.
 """
 
 import onnx
 from onnx import TensorProto, helper
 
-from fdda_addon.core.model import POSE_INPUT, POSITIONS_OUTPUT, TRUST_OUTPUT
+from fdda_addon.core.model import CONTROLS_INPUT, POSE_INPUT, POSITIONS_OUTPUT, TRUST_OUTPUT
 
 from .deformation import Deformation
 from .nodes import Graph
@@ -30,6 +30,8 @@ def build_graph(deformation: Deformation) -> onnx.ModelProto:
     clamped, trust = add_range(graph, features, deformation, [number for group in groups for number in group])
     add_playback(graph, clamped, trust, deformation, groups)
     inputs = [helper.make_tensor_value_info(POSE_INPUT, TensorProto.FLOAT, ["N", len(deformation.rig.joints), 4, 4])]
+    if count := deformation.inputs.control_count:
+        inputs.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", count]))
     outputs = [
         helper.make_tensor_value_info(POSITIONS_OUTPUT, TensorProto.FLOAT, ["N", deformation.rig.vertex_count, 3]),
         helper.make_tensor_value_info(TRUST_OUTPUT, TensorProto.FLOAT, ["N", len(deformation.partitions)]),

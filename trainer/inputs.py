@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What each network sees: its influencing joints relative to their parents, and where its neighbours are.
+"""What each network sees: its joints relative to their parents, its controls, and where its neighbours are.
 
 A smoothed surface depends on where the surface around it is. From the parent-relative transforms a network would have
 to multiply its way to that; so it is also given the middle of the partitions around it, seen from its main joint.
@@ -13,20 +13,21 @@ import numpy as np
 
 from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
 from fdda_addon.core.partition import Partition
-from fdda_addon.core.rig import Rig
+from fdda_addon.core.rig import UNMOVED, Rig
 
 FEATURES_PER_PAIR = 3
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """All features that networks see, F = 12 J + 3 Q of them in a row, and which of them each network sees.
+    """All features that networks see, F = 12 J + C + 3 Q of them in a row, and which of them each network sees.
 
-    First the J joints relative to their parents (`core.features`); then Q points y of joints b as seen from joints a,
-    P_a^-1 P_b y, in metres.
+    First the J joints relative to their parents (`core.features`); then the C controls, each in its own unit; then Q
+    points y of joints b as seen from joints a, P_a^-1 P_b y, in metres.
 
     Attributes:
         parents: (J,) int32, parent of each joint, -1 for a root.
+        control_count: C.
         points: (M, 3) float32, points that move with joints, each in its joint's own frame, metres.
         point_joints: (M,) int64, their joints b.
         pair_references, pair_points: (Q,) int64, joints a and points y of each pair.
@@ -34,6 +35,7 @@ class Inputs:
     """
 
     parents: np.ndarray
+    control_count: int
     points: np.ndarray
     point_joints: np.ndarray
     pair_references: np.ndarray
@@ -42,21 +44,54 @@ class Inputs:
 
     @property
     def joint_columns(self) -> int:
-        """12 J, where the pairs begin."""
+        """12 J, where the controls begin."""
         return len(self.parents) * FEATURES_PER_JOINT
 
-    def features(self, pose_matrices: np.ndarray, rest_matrices: np.ndarray) -> np.ndarray:
-        """(N, J, 4, 4) poses, mesh-object space, metres, to (N, F) float32 features."""
+    @property
+    def own_columns(self) -> int:
+        """12 J + C, where the pairs begin; they follow from what stands before them."""
+        return self.joint_columns + self.control_count
+
+    def features(
+        self, pose_matrices: np.ndarray, rest_matrices: np.ndarray, controls: np.ndarray | None = None
+    ) -> np.ndarray:
+        """What there is to see of poses.
+
+        Args:
+            pose_matrices: (N, J, 4, 4), mesh-object space, metres.
+            rest_matrices: (J, 4, 4), mesh-object space, metres.
+            controls: (N, C) values; may be left out where C is 0.
+
+        Returns:
+            (N, F) float32.
+        """
+        values, shape = controls, (len(pose_matrices), self.control_count)
+        if values is None:
+            values = np.zeros((len(pose_matrices), 0))
+        if values.shape != shape:
+            raise ValueError(f"values of controls are {values.shape} and should be {shape}")
         joints = joint_features(pose_matrices, rest_matrices, self.parents).reshape(len(pose_matrices), -1)
         poses = pose_matrices.astype(np.float64)
         moved = poses[:, self.point_joints]
         there = np.einsum("nmab,mb->nma", moved[:, :, :3, :3], self.points) + moved[:, :, :3, 3]
         apart = there[:, self.pair_points] - poses[:, :, :3, 3][:, self.pair_references]
         seen = np.einsum("nqab,nqb->nqa", np.linalg.inv(poses[:, :, :3, :3])[:, self.pair_references], apart)
-        return np.concatenate([joints, seen.reshape(len(poses), -1).astype(np.float32)], axis=1)
+        parts = [joints, values.astype(np.float32), seen.reshape(len(poses), -1).astype(np.float32)]
+        return np.concatenate(parts, axis=1)
 
 
-def make_inputs(parents: np.ndarray, points: np.ndarray, partitions: Sequence[Partition]) -> Inputs:
+def inputs_of_rig(rig: Rig, points: np.ndarray, partitions: Sequence[Partition]) -> Inputs:
+    """Choose what the networks of a rig see; `points` and `partitions` as in `make_inputs`."""
+    return make_inputs(rig.parents, points, partitions, len(rig.controls), unmoved_joints(rig))
+
+
+def make_inputs(
+    parents: np.ndarray,
+    points: np.ndarray,
+    partitions: Sequence[Partition],
+    control_count: int = 0,
+    unmoved: frozenset[int] = frozenset(),
+) -> Inputs:
     """Choose what the networks see.
 
     A joint is seen from the main joint when every joint that moves one against the other influences the partition,
@@ -65,22 +100,26 @@ def make_inputs(parents: np.ndarray, points: np.ndarray, partitions: Sequence[Pa
     Args:
         parents: (J,) parent index of each joint, -1 for a root.
         points: (J, S, 3) some of each joint, in its own frame, metres; `middles` makes one each of a rig.
-        partitions: with their main and influencing joints.
+        partitions: with their main joints, and the joints and controls that influence them.
+        control_count: C.
+        unmoved: joints that never move.
     """
     references, seen, columns = [], [], []
-    each = points.shape[1]
+    each, first_control = points.shape[1], len(parents) * FEATURES_PER_JOINT
     for partition in partitions:
         own = [_columns(0, joint, FEATURES_PER_JOINT) for joint in partition.influencing]
+        own += [_columns(first_control, control, 1) for control in partition.controls]
         for joint in range(len(parents)):
-            between = joints_between(parents, partition.joint, joint)
+            between = joints_between(parents, partition.joint, joint) - unmoved
             if len(between) >= 2 and between <= set(partition.influencing):
                 for point in range(joint * each, (joint + 1) * each):
-                    own.append(_columns(len(parents) * FEATURES_PER_JOINT, len(seen), FEATURES_PER_PAIR))
+                    own.append(_columns(first_control + control_count, len(seen), FEATURES_PER_PAIR))
                     references.append(partition.joint)
                     seen.append(point)
         columns.append(np.concatenate([*own, np.zeros(0, np.int64)]))
     return Inputs(
         parents,
+        control_count,
         points.reshape(-1, 3).astype(np.float32),
         np.repeat(np.arange(len(parents)), each),
         np.array(references, np.int64),
@@ -98,12 +137,20 @@ def middles(rig: Rig, partitions: Sequence[Partition]) -> np.ndarray:
     return points
 
 
+def unmoved_joints(rig: Rig) -> frozenset[int]:
+    """The joints of a rig that never move: they influence nothing, and hide nothing that does."""
+    return frozenset(number for number, joint in enumerate(rig.joints) if joint.name == UNMOVED)
+
+
 def _columns(start: int, number: int, width: int) -> np.ndarray:
     return start + number * width + np.arange(width)
 
 
 def joints_between(parents: np.ndarray, first: int, second: int) -> set[int]:
-    """The joints whose parent-relative transforms make up that of one joint relative to another."""
+    """The joints whose parent-relative transforms make up that of one joint relative to another.
+
+    Where no joint is above both, these are all from either up to its root.
+    """
     return set(_upwards(parents, first)) ^ set(_upwards(parents, second))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
 
-from .inputs import joints_between
+from .inputs import joints_between, unmoved_joints
 
 RIDGE = 1e-6
 """Added to the mean squares of the rows: joints that say the same share what they say, and nothing grows large."""
@@ -136,10 +136,16 @@ def _useful(products: np.ndarray, moments: np.ndarray, total: float) -> np.ndarr
 def surroundings_of_rig(rig: Rig, partition: Partition, skin: np.ndarray) -> Surroundings:
     """The joints around a partition of a rig; `skin` as in `make_surroundings`."""
     centre = rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
-    return make_surroundings(rig.parents, partition, skin, centre)
+    return make_surroundings(rig.parents, partition, skin, centre, unmoved_joints(rig))
 
 
-def make_surroundings(parents: np.ndarray, partition: Partition, skin: np.ndarray, centre: np.ndarray) -> Surroundings:
+def make_surroundings(
+    parents: np.ndarray,
+    partition: Partition,
+    skin: np.ndarray,
+    centre: np.ndarray,
+    unmoved: frozenset[int] = frozenset(),
+) -> Surroundings:
     """The joints that may move a partition's residuals: those that only influencing joints move against the main one.
 
     Args:
@@ -148,12 +154,13 @@ def make_surroundings(parents: np.ndarray, partition: Partition, skin: np.ndarra
         skin: (N, J, 4, 4) skin matrices of all poses, metres; any fixed matrices may stand in for the rest pose, the
             fit takes them up.
         centre: (3,) middle of the partition where all skin matrices are the identity, metres.
+        unmoved: joints that never move.
     """
     influencing = set(partition.influencing)
     others = [
         joint
         for joint in range(len(parents))
-        if joint != partition.joint and joints_between(parents, partition.joint, joint) <= influencing
+        if joint != partition.joint and joints_between(parents, partition.joint, joint) - unmoved <= influencing
     ]
     joints = np.array([partition.joint, *others], np.int64)
     apart = skin[:, joints, :3].astype(np.float64)

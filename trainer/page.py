@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
+from fdda_addon.core.rig import UNMOVED_LABEL
+
 from .charts import curve_limits, error_bars, histogram, learning_curves
 
 STYLE = """
@@ -130,7 +132,7 @@ STATISTICS = {"mean": "mean", "rms": "rms", "p99": "99 %", "p999": "99.9 %", "ma
 def _errors(report: dict) -> str:
     partitions = report["partitions"]
     bars = error_bars(
-        [p["joint"] for p in partitions],
+        [p["joint"] or UNMOVED_LABEL for p in partitions],
         [p["held_out"]["mean"] for p in partitions],
         [p["linear"]["mean"] for p in partitions],
         [p["held_out"]["max"] for p in partitions],
@@ -167,7 +169,7 @@ def _curves(report: dict) -> str:
     low, high = curve_limits([values for c in curves for values in (c["training"], c["validation"])])
     figures = "".join(
         f"<figure>{learning_curves(p['curve']['training'], p['curve']['validation'], low, high)}"
-        f"<figcaption><b>{escape(p['joint'])}</b> &middot; best at {p['curve']['best_epoch']}</figcaption></figure>"
+        f"<figcaption><b>{_joint(p)}</b> &middot; best at {p['curve']['best_epoch']}</figcaption></figure>"
         for p in report["partitions"]
     )
     return (
@@ -177,21 +179,25 @@ def _curves(report: dict) -> str:
 
 
 def _table(partitions: list[dict], fdda: dict, linear: dict, report: dict) -> str:
-    heads = "<th>partition</th><th>vertices</th><th>joints</th><th>inputs</th><th>shapes</th><th>train mean</th>"
+    controlled = bool(report.get("controls"))
+    heads = "<th>partition</th><th>vertices</th><th>joints</th>" + "<th>controls</th>" * controlled
+    heads += "<th>inputs</th><th>shapes</th><th>train mean</th>"
     heads += "".join(f"<th>{name}</th>" for name in STATISTICS.values()) + "<th>linear mean</th><th>of linear</th>"
     rows = []
     for p in partitions:
         seen = escape(", ".join(p["influencing"])) or "none"
+        merged = escape(", ".join(name or UNMOVED_LABEL for name in p.get("merged", [])))
         rows.append(
-            f"<tr><td>{escape(p['joint'])}</td><td>{p['vertices']:,}</td>"
-            f'<td title="{seen}">{len(p["influencing"])}</td>'
+            f'<tr><td title="{f"with {merged}" if merged else ""}">{_joint(p)}</td><td>{p["vertices"]:,}</td>'
+            f'<td title="{seen}">{len(p["influencing"])}</td>{_controls(p) if controlled else ""}'
             f"<td>{p['features']}</td><td>{p['basis']}</td><td>{p['training']['mean']:.4f}</td>"
             + "".join(f"<td>{p['held_out'][k]:.4f}</td>" for k in STATISTICS)
             + f"<td>{p['linear']['mean']:.3f}</td><td>{_share(p['held_out']['mean'], p['linear']['mean'])}</td></tr>"
         )
     total = (
-        f'<tr class="total"><td>all</td><td>{report["vertices"]:,}</td><td>{report["joints"]}</td><td></td>'
-        f"<td>{sum(p['basis'] for p in partitions)}</td><td>{report['fdda']['training']['mean']:.4f}</td>"
+        f'<tr class="total"><td>all</td><td>{report["vertices"]:,}</td><td>{report["joints"]}</td>'
+        + (f"<td>{len(report['controls'])}</td>" if controlled else "")
+        + f"<td></td><td>{sum(p['basis'] for p in partitions)}</td><td>{report['fdda']['training']['mean']:.4f}</td>"
         + "".join(f"<td>{fdda[k]:.4f}</td>" for k in STATISTICS)
         + f"<td>{linear['mean']:.3f}</td><td>{_share(fdda['mean'], linear['mean'])}</td></tr>"
     )
@@ -199,6 +205,15 @@ def _table(partitions: list[dict], fdda: dict, linear: dict, report: dict) -> st
         "<h2>Partitions</h2><p>Errors in mm; all but the training mean are of held-out poses.</p>"
         f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{"".join(rows)}{total}</tbody></table></div>'
     )
+
+
+def _controls(partition: dict) -> str:
+    names = partition.get("controls", [])
+    return f'<td title="{escape(", ".join(names)) or "none"}">{len(names)}</td>'
+
+
+def _joint(partition: dict) -> str:
+    return escape(partition["joint"] or UNMOVED_LABEL)
 
 
 def _settings(report: dict) -> str:

@@ -3,8 +3,7 @@
 
 import numpy as np
 
-from fdda_addon.core.features import FEATURES_PER_JOINT
-from fdda_addon.core.model import POSE_INPUT, TRUST_OUTPUT
+from fdda_addon.core.model import CONTROLS_INPUT, POSE_INPUT, TRUST_OUTPUT
 from fdda_addon.core.rig import Rig
 
 from .deformation import Deformation
@@ -38,9 +37,10 @@ def add_features(graph: Graph, rig: Rig, inputs: Inputs) -> str:
     square = graph.reshape(halves[0], [0, len(parents), 3, 4], "carried_inverse_rows")
     relative = graph.add("MatMul", [square, offsets], "relative")
     features = graph.reshape(relative, [0, inputs.joint_columns], "joint_features")
-    if not has_pairs:
-        return features
-    return graph.add("Concat", [features, _pair_features(graph, halves[1], inputs)], "features", axis=1)
+    parts = [features, *([CONTROLS_INPUT] if inputs.control_count else [])]
+    if has_pairs:
+        parts.append(_pair_features(graph, halves[1], inputs))
+    return graph.add("Concat", parts, "features", axis=1) if len(parts) > 1 else features
 
 
 def _inverses(graph: Graph, matrices: str, count: int) -> str:
@@ -108,7 +108,7 @@ def add_range(graph: Graph, features: str, deformation: Deformation, order: list
     Returns:
         (N, F) standardised features, clamped, and (N, P + 1) trust in `order`, after it a 1 for what needs no trust.
     """
-    trust, count, own = deformation.trust, len(order), deformation.inputs.joint_columns
+    trust, count, own = deformation.trust, len(order), deformation.inputs.own_columns
     mean, scale = deformation.standardisation()
     low, high = ((bound - mean) / scale for bound in (trust.low, trust.high))
     centred = graph.add("Sub", [features, graph.floats("feature_mean", mean)], "centred")
@@ -124,8 +124,7 @@ def add_range(graph: Graph, features: str, deformation: Deformation, order: list
     # trust from.
     certain = np.zeros_like(trust.counts[:1])
     counts = np.concatenate([trust.counts[order], certain, trust.counts])
-    counts = np.repeat(counts.T, FEATURES_PER_JOINT, axis=0)
-    summed = graph.add("MatMul", [squared, graph.floats("counts", counts)], "partition_excess")
+    summed = graph.add("MatMul", [squared, graph.floats("counts", counts.T)], "partition_excess")
     root = graph.add("Relu", [graph.add("Sub", [graph.floats("one", 1.0), summed], "trust_left")], "trust_root")
     both = graph.add("Mul", [root, root], "trusts")
     return clamped, graph.split(both, [count + 1, count], ["partition_trust", TRUST_OUTPUT], axis=1)[0]

@@ -48,7 +48,7 @@ def make_report(
         surface: `normals` and `edges` of held-out poses.
         model_name: file name of the model.
     """
-    names = recording.rig.joint_names
+    names, controls = recording.rig.joint_names, [control.name for control in recording.rig.controls]
     held_out = exported.held_out
     partitions = []
     for partition, prepared, curve in zip(deformation.partitions, deformation.prepared, curves, strict=True):
@@ -58,6 +58,8 @@ def make_report(
                 "joint": names[partition.joint],
                 "vertices": len(own),
                 "influencing": [names[joint] for joint in partition.influencing],
+                **({"controls": [controls[n] for n in partition.controls]} if partition.controls else {}),
+                **({"merged": [names[joint] for joint in partition.merged]} if partition.merged else {}),
                 "features": len(prepared.columns),
                 "basis": len(prepared.basis.shapes),
                 "truncation": prepared.basis.truncation * 1000,
@@ -82,6 +84,7 @@ def make_report(
         "object": recording.info.object_name,
         "vertices": recording.rig.vertex_count,
         "joints": len(names),
+        **({"controls": controls} if controls else {}),
         "poses": len(recording.pose_matrices),
         "training": exported.info.training,
         "parity": exported.info.parity_mm,

@@ -14,6 +14,7 @@ from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.output import check_writable, write_json, write_text
 from fdda_addon.core.recording import Recording, read_recording
+from fdda_addon.core.rig import UNMOVED_LABEL
 
 from . import report
 from .announcements import Announcer
@@ -21,7 +22,7 @@ from .config import TrainingConfig
 from .data import PreparedPartition, Split, held_back_digest, partitions_of, prepare, split_recording
 from .deformation import Deformation
 from .export import build_model, measure, measure_surface, write_model
-from .inputs import Inputs, make_inputs, middles
+from .inputs import Inputs, inputs_of_rig, middles
 from .loop import Trained, choose_device, train
 from .page import render_html
 from .process import Cancelled
@@ -73,7 +74,7 @@ def train_model(
         vertices=recording.rig.vertex_count,
         device=str(device),
     )
-    inputs = make_inputs(recording.rig.parents, middles(recording.rig, recording.partitions), recording.partitions)
+    inputs = inputs_of_rig(recording.rig, middles(recording.rig, recording.partitions), recording.partitions)
     prepared = _prepare(recording, inputs, split, config, should_stop)
     seen = [columns[partition.columns] for columns, partition in zip(inputs.columns, prepared, strict=True)]
     trained = train(
@@ -135,7 +136,7 @@ def _announce_end(
     for partition in content["partitions"]:
         announcer.say(
             MessageType.PARTITION_FINISHED,
-            joint=partition["joint"],
+            joint=partition["joint"] or UNMOVED_LABEL,
             basis=partition["basis"],
             held_out_mm=partition["held_out"]["mean"],
         )
@@ -156,12 +157,14 @@ def _last_weights(model_path: Path, recording: Recording, held_back: str, config
     """The weights to start from.
 
     Raises:
-        TrainingError: there are none, of another rig or other networks, or of poses that are held back now.
+        TrainingError: there are none, of another rig, other controls or networks, or of poses that are held back now.
     """
     path = weights_path(model_path)
     last = read_weights(path)
     if last.fingerprint != recording.rig.fingerprint:
         raise TrainingError(f"The last weights '{path}' are of another rig; train without --warm-start.")
+    if last.controls != tuple(control.name for control in recording.rig.controls):
+        raise TrainingError(f"The last weights '{path}' are of other controls; train without --warm-start.")
     if last.held_back != held_back:
         raise TrainingError(
             f"The last weights '{path}' are of another recording or seed, and may have been trained on poses that are "
@@ -202,8 +205,8 @@ def _deformation(
     config: TrainingConfig,
 ) -> Deformation:
     rig = recording.rig
-    matrices = np.array(recording.pose_matrices[split.training])
-    features = inputs.features(matrices, rig.rest_matrices)
+    matrices, controls = (np.array(array[split.training]) for array in (recording.pose_matrices, recording.controls))
+    features = inputs.features(matrices, rig.rest_matrices, controls)
     return Deformation(
         rig,
         recording.partitions,

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Trust: how far a pose lies inside what the training has seen.
 
-The range of a joint is a box around its features in the training poses, with a margin. The excess of a pose is its
-distance from the box in units of a fade width that grows with the range. With e the excess over all joints that count
-for a partition, its trust is max(0, 1 - e^2)^2: exactly 1 inside, 0 from one fade width on, smooth at both ends.
+The range of a joint is a box around its features in the training poses, with a margin; that of a control, around its
+values. The excess of a pose is its distance from the box in units of a fade width that grows with the range. With e the
+excess over all joints and controls that count for a partition, its trust is max(0, 1 - e^2)^2: exactly 1 inside, 0 from
+one fade width on, smooth at both ends.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fdda_addon.core.controls import Control
 from fdda_addon.core.features import FEATURES_PER_JOINT
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
@@ -26,56 +28,86 @@ LEAST_MARGIN = (0.01, 0.001)
 LEAST_FADE = (4.0, 0.2)
 """Least margin and fade width: of rotation elements, no unit, and of translations, as a part of the character's size.
 
-A locked axis has no range of its own; these are what it may turn before it counts, and what takes all trust away."""
+A locked axis has no range of its own; these are what it may turn before it counts, and what takes all trust away. Those
+of a control are the first of each, as a part of the range that it was recorded for."""
 LOCKED = 1e-4
 """A joint whose features spread less than this was locked in the recording (no unit, or metres)."""
 
 
 @dataclass(frozen=True)
 class TrustRange:
-    """What the training has seen of each joint.
+    """What the training has seen of each joint and control.
 
     Attributes:
         low, high: (F,) float32, the box with its margin, around all features that networks see (`Inputs`).
-        width: (12 J,) float32, fade width of the joints' own features; only these count.
-        counts: (P, J) bool, the joints that count for a partition: those that influence it, and those beside it that
-            were locked, of which nobody knows whether they would.
+        width: (12 J + C,) float32, fade width of the features of joints and controls; only these count.
+        counts: (P, 12 J + C) bool, the features that count for a partition: those of what influences it, and of what
+            was locked beside it, of which nobody knows whether it would.
+        controls: C controls with the ranges that they had.
     """
 
     low: np.ndarray
     high: np.ndarray
     width: np.ndarray
     counts: np.ndarray
+    controls: tuple[Control, ...] = ()
 
     def trust(self, features: np.ndarray) -> np.ndarray:
         """(N, F) features to (N, P) float32 trust."""
         size = len(self.width)
         own = features[:, :size]
-        excess = (own - np.clip(own, self.low[:size], self.high[:size])) / self.width
-        by_joint = (excess.astype(np.float64) ** 2).reshape(len(own), -1, FEATURES_PER_JOINT).sum(axis=2)
-        return (np.maximum(0, 1 - by_joint @ self.counts.T) ** 2).astype(np.float32)
+        excess = ((own - np.clip(own, self.low[:size], self.high[:size])) / self.width).astype(np.float64)
+        return (np.maximum(0, 1 - excess**2 @ self.counts.T) ** 2).astype(np.float32)
 
 
 def make_trust_range(features: np.ndarray, rig: Rig, partitions: tuple[Partition, ...]) -> TrustRange:
     """Measure the range of the training poses.
 
     Args:
-        features: (n, F) float32 of the training poses, the first 12 J the joints relative to their parents.
+        features: (n, F) float32 of the training poses: 12 J of the joints relative to their parents, C controls, and
+            what follows from these, metres.
         rig, partitions: of the recording.
     """
     low, high = features.min(axis=0), features.max(axis=0)
-    spread, size = high - low, len(rig.joints) * FEATURES_PER_JOINT
-    translation = (np.arange(len(low)) % 4 == 3) | (np.arange(len(low)) >= size)
+    spread, joints = high - low, len(rig.joints) * FEATURES_PER_JOINT
+    own = joints + len(rig.controls)
+    translation = (np.arange(len(low)) % 4 == 3) | (np.arange(len(low)) >= own)
     least_margin, least_fade = (
         np.where(translation, least[1] * rig.size, least[0]) for least in (LEAST_MARGIN, LEAST_FADE)
     )
+    for least, part in ((least_margin, LEAST_MARGIN[0]), (least_fade, LEAST_FADE[0])):
+        least[joints:own] = [part * _unit(control) for control in rig.controls]
     margin = np.maximum(MARGIN * spread, least_margin)
-    width = np.maximum(FADE * spread, least_fade)[:size]
+    width = np.maximum(FADE * spread, least_fade)[:own]
+    ranges = zip(rig.controls, low[joints:own].tolist(), high[joints:own].tolist(), strict=True)
+    return TrustRange(
+        *(array.astype(np.float32) for array in (low - margin, high + margin, width)),
+        np.concatenate([_joints_that_count(spread, rig, partitions), _controls_that_count(rig, partitions)], axis=1),
+        tuple(replace(control, low=least, high=most) for control, least, most in ranges),
+    )
+
+
+def _joints_that_count(spread: np.ndarray, rig: Rig, partitions: tuple[Partition, ...]) -> np.ndarray:
+    """(P, 12 J) bool."""
     counts = np.zeros((len(partitions), len(rig.joints)), bool)
-    locked = (spread[:size].reshape(-1, FEATURES_PER_JOINT) < LOCKED).all(axis=1)
+    by_joint = spread[: len(rig.joints) * FEATURES_PER_JOINT].reshape(-1, FEATURES_PER_JOINT)
+    locked = (by_joint < LOCKED).all(axis=1)
     for number, partition in enumerate(partitions):
         beside = {partition.joint, rig.joints[partition.joint].parent, *SkinBlock(rig, partition).joints.tolist()}
         beside |= {child for child, joint in enumerate(rig.joints) if joint.parent == partition.joint}
         counts[number, [joint for joint in beside if joint >= 0 and locked[joint]]] = True
         counts[number, list(partition.influencing)] = True
-    return TrustRange(*(array.astype(np.float32) for array in (low - margin, high + margin, width)), counts)
+    return np.repeat(counts, FEATURES_PER_JOINT, axis=1)
+
+
+def _controls_that_count(rig: Rig, partitions: tuple[Partition, ...]) -> np.ndarray:
+    """(P, C) bool. A control without a range was never moved to see what it does: it counts for every partition."""
+    counts = np.tile(np.array([control.low == control.high for control in rig.controls], bool), (len(partitions), 1))
+    for number, partition in enumerate(partitions):
+        counts[number, list(partition.controls)] = True
+    return counts
+
+
+def _unit(control: Control) -> float:
+    """The range that a control was recorded for; where it has none its value, or 1, the range of most sliders."""
+    return control.high - control.low or max(1.0, abs(control.low))

@@ -50,6 +50,7 @@ class LastWeights:
 
     Attributes:
         fingerprint: of the rig.
+        controls: names of its controls.
         held_back: digest of the poses that chose weights or measured the error (`data.held_back_digest`).
         hidden, activation: of the networks.
         history: held-out errors of this training and those before it, oldest first: `{"poses", "p999"}`, in mm.
@@ -57,6 +58,7 @@ class LastWeights:
     """
 
     fingerprint: Fingerprint
+    controls: tuple[str, ...]
     held_back: str
     hidden: tuple[int, ...]
     activation: str
@@ -80,6 +82,7 @@ def write_weights(
     about = {
         "version": VERSION,
         "fingerprint": vars(deformation.rig.fingerprint),
+        "controls": [control.name for control in deformation.rig.controls],
         "held_back": held_back,
         "hidden": list(hidden),
         "activation": deformation.activation,
@@ -146,6 +149,7 @@ def _read(arrays: np.lib.npyio.NpzFile) -> LastWeights:
     history = tuple({"poses": int(entry["poses"]), "p999": float(entry["p999"])} for entry in about["history"])
     return LastWeights(
         Fingerprint(**about["fingerprint"]),
+        tuple(str(name) for name in about.get("controls", ())),
         str(about["held_back"]),
         hidden,
         str(about["activation"]),
@@ -174,7 +178,7 @@ def initial_networks(
     """Networks to start from that answer as the last ones did.
 
     Args:
-        last: the same rig, hidden layers and activation.
+        last: the same rig, controls, hidden layers and activation.
         prepared: the partitions as they are now.
         columns: for each, the features that its network sees now, among all features of `Inputs`.
 

@@ -12,6 +12,8 @@ UNMOVED = ""
 """Name of the joint that never moves; no bone has it. What follows no bone follows this one.
 
 Its rest and its pose matrix are the identity, its parent is -1."""
+UNMOVED_LABEL = "no bone"
+"""What people read in place of that name."""
 
 REST_TOLERANCE = 1e-4
 """Largest difference of a rest matrix element (metres, or no unit) at which two rest poses count as the same.

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import ModelError
-from ..core.model import POSE_INPUT, POSITIONS_OUTPUT, TRUST_OUTPUT, check_model, read_model
+from ..core.model import CONTROLS_INPUT, POSE_INPUT, POSITIONS_OUTPUT, TRUST_OUTPUT, check_model, read_model
 
 THREADED_VERTICES = 20_000
 """From this many vertices on a second thread gains more than it costs."""
@@ -62,62 +62,82 @@ class Network:
             ) from error
         self._bound: dict[int, tuple] = {}
 
-    def positions(self, pose_matrices: np.ndarray) -> np.ndarray:
+    def positions(self, pose_matrices: np.ndarray, controls: np.ndarray | None = None) -> np.ndarray:
         """Deform the mesh.
 
         Args:
             pose_matrices: (N, J, 4, 4) float32, mesh-object space, metres.
+            controls: (N, C) float32, values in the order of `info.controls`; a model without controls looks at none.
 
         Returns:
             (N, V, 3) float32, mesh-object space, metres. The array is the network's own: the next call with as many
             poses writes into it, so that a frame needs no new memory.
 
         Raises:
-            ModelError: the model fails or answers in another shape.
+            ModelError: the model fails, or values of its controls are missing.
         """
         count = len(pose_matrices)
         if count not in self._bound:
             if len(self._bound) >= MAX_BOUND:
                 self._bound.clear()
             self._bound[count] = self._bind(count)
-        binding, poses, positions = self._bound[count]
+        binding, poses, values, positions = self._bound[count]
         poses[:] = pose_matrices
+        if values is not None:
+            values[:] = self._controls(controls, count)
         try:
             self._session.run_with_iobinding(binding)
         except Exception as error:  # As above.
             raise ModelError(f"The model '{self.path}' failed ({_first_line(error)}); train it again.") from error
         return positions
 
-    def trust(self, pose_matrices: np.ndarray) -> np.ndarray | None:
+    def trust(self, pose_matrices: np.ndarray, controls: np.ndarray | None = None) -> np.ndarray | None:
         """How far the networks are believed; costs as much as the positions, so not for every frame.
 
         Args:
-            pose_matrices: (N, J, 4, 4) float32, mesh-object space, metres.
+            pose_matrices, controls: as for `positions`.
 
         Returns:
             (N, P) float32, 0 to 1, in the order of `info.partitions`; None when the model does not say.
 
         Raises:
-            ModelError: the model fails or answers in another shape.
+            ModelError: the model fails, answers in another shape, or values of its controls are missing.
         """
         if TRUST_OUTPUT not in {output.name for output in self._session.get_outputs()}:
             return None
+        inputs = {POSE_INPUT: pose_matrices}
+        if self.info.controls:
+            inputs[CONTROLS_INPUT] = np.asarray(self._controls(controls, len(pose_matrices)), np.float32)
         try:
-            (trust,) = self._session.run([TRUST_OUTPUT], {POSE_INPUT: pose_matrices})
+            (trust,) = self._session.run([TRUST_OUTPUT], inputs)
         except Exception as error:  # As above.
             raise ModelError(f"The model '{self.path}' failed ({_first_line(error)}); train it again.") from error
         if trust.shape != (len(pose_matrices), len(self.info.partitions)):
             raise ModelError(f"The model '{self.path}' gives trust of another shape than it says; train it again.")
         return trust
 
-    def _bind(self, count: int) -> tuple[object, np.ndarray, np.ndarray]:
-        """Arrays that the session reads from and writes into, and their binding."""
+    def _controls(self, controls: np.ndarray | None, count: int) -> np.ndarray:
+        """Values of the controls, sure to be there and to be as many as the model takes."""
+        shape, found = (count, len(self.info.controls)), None if controls is None else np.shape(controls)
+        if found != shape:
+            raise ModelError(
+                f"The model '{self.path}' has {shape[1]} controls and takes their values as an array {shape}; "
+                f"it was given {'none' if found is None else found}."
+            )
+        return controls
+
+    def _bind(self, count: int) -> tuple[object, np.ndarray, np.ndarray | None, np.ndarray]:
+        """The binding, and the arrays that the session reads from and writes into: poses, controls, positions."""
         poses = np.zeros((count, len(self.info.joints), 4, 4), np.float32)
         positions = np.empty((count, self.info.vertex_count, 3), np.float32)
         binding = self._session.io_binding()
         binding.bind_input(POSE_INPUT, "cpu", 0, np.float32, poses.shape, poses.ctypes.data)
+        values = None
+        if self.info.controls:
+            values = np.zeros((count, len(self.info.controls)), np.float32)
+            binding.bind_input(CONTROLS_INPUT, "cpu", 0, np.float32, values.shape, values.ctypes.data)
         binding.bind_output(POSITIONS_OUTPUT, "cpu", 0, np.float32, positions.shape, positions.ctypes.data)
-        return binding, poses, positions
+        return binding, poses, values, positions
 
 
 def _first_line(error: Exception) -> str:

@@ -16,7 +16,7 @@ from fdda_addon.core.recording import read_recording
 from fdda_addon.core.skinning import LinearLayer
 from fdda_addon.runtime.network import Network
 from trainer.config import TrainingConfig
-from trainer.inputs import make_inputs, middles
+from trainer.inputs import inputs_of_rig, middles
 
 NAMES = ("bone_1", "bone_2")
 PLAN = Plan(
@@ -91,7 +91,7 @@ def test_the_errors_are_those_of_the_model_on_the_held_out_poses(studied, result
 
 def test_the_networks_see_what_they_see_when_all_partitions_train(recording, held_out):
     whole = read_recording(recording)
-    inputs = make_inputs(whole.rig.parents, middles(whole.rig, whole.partitions), whole.partitions)
+    inputs = inputs_of_rig(whole.rig, middles(whole.rig, whole.partitions), whole.partitions)
     features = inputs.features(whole.pose_matrices, whole.rig.rest_matrices)
     material = read_material(recording, held_out, NAMES)
     own = material.inputs.features(material.training.pose_matrices, material.training.rig.rest_matrices)

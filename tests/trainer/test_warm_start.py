@@ -15,7 +15,7 @@ from fdda_addon.core.recording_extension import RecordingExtension
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data import partitions_of, prepare, split_recording
-from trainer.inputs import make_inputs, middles
+from trainer.inputs import inputs_of_rig, middles
 from trainer.weights import initial_networks, read_weights, weights_path
 
 GROWN = 60
@@ -45,7 +45,7 @@ def model(trained, tmp_path):
 def prepared_of(path, config):
     recording = read_recording(path)
     split = split_recording(recording, config)
-    inputs = make_inputs(recording.rig.parents, middles(recording.rig, recording.partitions), recording.partitions)
+    inputs = inputs_of_rig(recording.rig, middles(recording.rig, recording.partitions), recording.partitions)
     prepared = [prepare(p, split, config.tolerance_mm, config.seed) for p in partitions_of(recording, inputs)]
     return split, prepared, [c[p.columns] for c, p in zip(inputs.columns, prepared, strict=True)]
 
