@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Characters whose modifiers deform them in many ways: one function each, which builds it in the current scene."""
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import bpy
+import numpy as np
+
+from .base import add_driven_key, bulge, cage, drive, link, skin, tube
+
+
+def corrective_smooth() -> None:
+    """Delta mush that was bound to the rest pose."""
+    mesh_object, _ = tube()
+    modifier = mesh_object.modifiers.new("Mush", "CORRECTIVE_SMOOTH")
+    modifier.rest_source, modifier.iterations = "BIND", 8
+    _bind(mesh_object, modifier, bpy.ops.object.correctivesmooth_bind)
+
+
+def lattice() -> None:
+    """A lattice that bulges before the skinning, with a shape key that the bend drives."""
+    mesh_object, armature_object = tube()
+    data = bpy.data.lattices.new("lattice")
+    data.points_u, data.points_v, data.points_w = 6, 3, 3
+    lattice_object = link(bpy.data.objects.new("lattice", data))
+    lattice_object.location, lattice_object.scale = (0.25, 0.0, 0.0), (0.6, 0.15, 0.15)
+    add_driven_key(lattice_object, armature_object, lambda points: points * (1.0, 1.4, 1.4))
+    modifier = mesh_object.modifiers.new("Lattice", "LATTICE")
+    modifier.object = lattice_object
+    _move_first(mesh_object, modifier)
+
+
+def mesh_deform() -> None:
+    """A cage that bulges before the skinning."""
+    mesh_object, armature_object = tube()
+    target = cage("cage", 1.4)
+    add_driven_key(target, armature_object, bulge)
+    modifier = mesh_object.modifiers.new("MeshDeform", "MESH_DEFORM")
+    modifier.object, modifier.precision = target, 4
+    _move_first(mesh_object, modifier)
+    _bind(mesh_object, modifier, bpy.ops.object.meshdeform_bind)
+
+
+def surface_deform() -> None:
+    """A mesh that sticks to another one, which is skinned and smoothed."""
+    mesh_object, armature_object = tube()
+    target = cage("body", 1.1)
+    skin(target, armature_object)
+    _smooth(target)
+    modifier = mesh_object.modifiers.new("SurfaceDeform", "SURFACE_DEFORM")
+    modifier.target = target
+    _bind(mesh_object, modifier, bpy.ops.object.surfacedeform_bind)
+
+
+def shrinkwrap() -> None:
+    """A sleeve that is pulled onto a body, which is skinned and smoothed."""
+    mesh_object, armature_object = tube()
+    target = cage("body", 0.9)
+    skin(target, armature_object)
+    _smooth(target)
+    modifier = mesh_object.modifiers.new("Shrinkwrap", "SHRINKWRAP")
+    modifier.target, modifier.offset = target, 0.003
+
+
+def smooth() -> None:
+    """Plain smoothing after the skinning."""
+    _smooth(tube()[0])
+
+
+def laplacian_smooth() -> None:
+    """Laplacian smoothing after the skinning."""
+    mesh_object, _ = tube()
+    modifier = mesh_object.modifiers.new("LaplacianSmooth", "LAPLACIANSMOOTH")
+    modifier.iterations, modifier.lambda_factor = 2, 0.5
+
+
+def laplacian_deform() -> None:
+    """Both ends of the tube are skinned; what is between them follows their details."""
+    mesh_object, _ = tube()
+    anchors = mesh_object.vertex_groups.new(name="anchors")
+    along = np.array([vertex.co.x for vertex in mesh_object.data.vertices])
+    anchors.add(np.flatnonzero((along < 0.18) | (along > 0.32)).tolist(), 1.0, "REPLACE")
+    modifier = mesh_object.modifiers.new("LaplacianDeform", "LAPLACIANDEFORM")
+    modifier.vertex_group, modifier.iterations = "anchors", 2
+    _bind(mesh_object, modifier, bpy.ops.object.laplaciandeform_bind)
+
+
+def hook() -> None:
+    """A hook to an empty, a child of the lower bone, that pulls at the skin before the joint."""
+    mesh_object, armature_object = tube()
+    empty = link(bpy.data.objects.new("handle", None))
+    empty.parent, empty.parent_type, empty.parent_bone = armature_object, "BONE", "lower"
+    bpy.context.view_layer.update()
+    empty.matrix_world = ((1, 0, 0, 0.3), (0, 1, 0, 0), (0, 0, 1, 0.03), (0, 0, 0, 1))
+    modifier = mesh_object.modifiers.new("Hook", "HOOK")
+    modifier.object, modifier.falloff_radius, modifier.strength = empty, 0.15, 0.5
+    modifier.center = (0.2, 0.0, 0.04)
+    modifier.matrix_inverse = empty.matrix_world.inverted()
+    along = np.array([vertex.co.x for vertex in mesh_object.data.vertices])
+    modifier.vertex_indices_set(np.flatnonzero((along > 0.1) & (along < 0.24)).tolist())
+
+
+def cast() -> None:
+    """Drawn a little towards a sphere after the skinning."""
+    mesh_object, _ = tube()
+    modifier = mesh_object.modifiers.new("Cast", "CAST")
+    modifier.factor, modifier.size, modifier.use_radius_as_size = 0.2, 0.3, False
+
+
+def curve() -> None:
+    """Along a curve that sags after the skinning, with a shape key that the bend drives."""
+    mesh_object, armature_object = tube()
+    data = bpy.data.curves.new("path", "CURVE")
+    data.dimensions = "3D"
+    spline = data.splines.new("POLY")
+    spline.points.add(6)
+    for number, point in enumerate(spline.points):
+        point.co = (number * 0.1, 0.0, 0.0, 1.0)
+    path = link(bpy.data.objects.new("path", data))
+
+    def sag(points: np.ndarray) -> np.ndarray:
+        return points - np.outer(np.sin(points[:, 0] / 0.6 * np.pi), (0.0, 0.0, 0.05))
+
+    add_driven_key(path, armature_object, sag)
+    modifier = mesh_object.modifiers.new("Curve", "CURVE")
+    modifier.object = path
+    _move_first(mesh_object, modifier)
+
+
+def geometry_nodes() -> None:
+    """A node group that moves vertices by where they are after the skinning."""
+    mesh_object, _ = tube()
+    mesh_object.modifiers.new("Ripple", "NODES").node_group = ripple_group()
+
+
+def shape_keys() -> None:
+    """A shape key that the bend drives, one that is muted, and Preserve Volume."""
+    mesh_object, armature_object = tube()
+    add_driven_key(mesh_object, armature_object, bulge)
+    muted = add_driven_key(mesh_object, armature_object, lambda points: points * 3.0)
+    muted.mute = True
+    mesh_object.modifiers["Armature"].use_deform_preserve_volume = True
+
+
+def absolute_shape_keys() -> None:
+    """Shape keys that a driven evaluation time goes through, one after the other."""
+    mesh_object, armature_object = tube()
+    mesh_object.shape_key_add(name="Basis", from_mix=False)
+    thick = mesh_object.shape_key_add(name="thick", from_mix=False)
+    points = np.array([point.co for point in thick.data])
+    thick.data.foreach_set("co", bulge(points).astype(np.float32).ravel())
+    keys = mesh_object.data.shape_keys
+    keys.use_relative = False
+    # Blender sets the keys ten frames apart.
+    drive(keys, "eval_time", armature_object, "10 * bend")
+
+
+def displace() -> None:
+    """Pushed out along the normals after the skinning."""
+    tube()[0].modifiers.new("Displace", "DISPLACE").strength = 0.01
+
+
+def simple_deform() -> None:
+    """Twisted after the skinning."""
+    modifier = tube()[0].modifiers.new("Twist", "SIMPLE_DEFORM")
+    modifier.deform_method, modifier.deform_axis, modifier.angle = "TWIST", "X", 0.5
+
+
+def warp() -> None:
+    """Space around the joint is warped from one empty to another."""
+    mesh_object, _ = tube()
+    ends = [link(bpy.data.objects.new(name, None)) for name in ("from", "to")]
+    for end, height in zip(ends, (0.0, 0.03), strict=True):
+        end.location = (0.3, 0.0, height)
+    modifier = mesh_object.modifiers.new("Warp", "WARP")
+    modifier.object_from, modifier.object_to, modifier.falloff_radius = *ends, 0.2
+
+
+def subdivided() -> None:
+    """Delta mush, and after it modifiers that make vertices: two subdivisions and thickness."""
+    corrective_smooth()
+    mesh_object = bpy.data.objects["elbow"]
+    mesh_object.modifiers.new("Subdivision", "SUBSURF")
+    mesh_object.modifiers.new("Thickness", "SOLIDIFY").thickness = 0.004
+    mesh_object.modifiers.new("Detail", "NODES").node_group = subdividing_group()
+
+
+STACKS: tuple[Callable[[], None], ...] = (
+    corrective_smooth, lattice, mesh_deform, surface_deform, shrinkwrap, smooth, laplacian_smooth, laplacian_deform,
+    hook, cast, curve, geometry_nodes, shape_keys, absolute_shape_keys, displace, simple_deform, warp, subdivided,
+)  # fmt: skip
+
+
+def ripple_group() -> bpy.types.NodeTree:
+    """Moves each vertex by some millimetres, in a direction that depends on its place."""
+    group = chain("Ripple", "GeometryNodeSetPosition")
+    position, wave, scale = (
+        group.nodes.new(kind) for kind in ("GeometryNodeInputPosition", *["ShaderNodeVectorMath"] * 2)
+    )
+    position_scale = group.nodes.new("ShaderNodeVectorMath")
+    position_scale.operation, wave.operation, scale.operation = "SCALE", "SINE", "SCALE"
+    position_scale.inputs["Scale"].default_value, scale.inputs["Scale"].default_value = 30.0, 0.003
+    for source, target in (
+        (position.outputs[0], position_scale.inputs[0]),
+        (position_scale.outputs[0], wave.inputs[0]),
+        (wave.outputs[0], scale.inputs[0]),
+        (scale.outputs[0], group.nodes["Set Position"].inputs["Offset"]),
+    ):
+        group.links.new(source, target)
+    return group
+
+
+def subdividing_group() -> bpy.types.NodeTree:
+    """Makes four faces of each."""
+    return chain("Subdivide", "GeometryNodeSubdivideMesh")
+
+
+def chain(name: str, *kinds: str) -> bpy.types.NodeTree:
+    """A node group that sends its geometry through nodes of these kinds, one after the other."""
+    group = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    for in_out in ("INPUT", "OUTPUT"):
+        group.interface.new_socket("Geometry", in_out=in_out, socket_type="NodeSocketGeometry")
+    nodes = [group.nodes.new(kind) for kind in ("NodeGroupInput", *kinds, "NodeGroupOutput")]
+    for before, after in pairwise(nodes):
+        target = next(socket for socket in after.inputs if socket.type == "GEOMETRY")
+        group.links.new(before.outputs[0], target)
+    return group
+
+
+def _smooth(mesh_object: bpy.types.Object) -> None:
+    modifier = mesh_object.modifiers.new("Smooth", "SMOOTH")
+    modifier.factor, modifier.iterations = 0.5, 4
+
+
+def _move_first(mesh_object: bpy.types.Object, modifier: bpy.types.Modifier) -> None:
+    mesh_object.modifiers.move(mesh_object.modifiers.find(modifier.name), 0)
+
+
+def _bind(mesh_object: bpy.types.Object, modifier: bpy.types.Modifier, operator: Callable) -> None:
+    """Press the button of a modifier that remembers the rest pose."""
+    bpy.context.view_layer.update()
+    with bpy.context.temp_override(object=mesh_object, active_object=mesh_object):
+        operator(modifier=modifier.name)
