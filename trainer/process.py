@@ -74,8 +74,9 @@ def _failed(text: str, announcer: Announcer) -> int:
 
 def missing_package(work: str, error: ModuleNotFoundError) -> TrainingError:
     """The error of a process whose Python lacks a package; `work` is what it cannot do, the start of the sentence."""
+    package = str(error.name).partition(".")[0]
     return TrainingError(
-        f"{work} needs the Python package '{error.name}', which {sys.executable} does not have; install torch, onnx, "
+        f"{work} needs the Python package '{package}', which {sys.executable} does not have; install torch, onnx, "
         "onnxruntime, numpy, scipy and matplotlib there, create the trainer environment in the preferences of the "
         "add-on, or set FDDA_TRAINER_PYTHON to a Python that has them."
     )

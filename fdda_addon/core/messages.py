@@ -16,14 +16,15 @@ class MessageType(enum.Enum):
     """partitions: int, poses: int, vertices: int, device: str."""
     PROGRESS = "progress"
     """epoch: int, epochs: int, training_mm: float, validation_mm: float (mean errors of the training and the validation
-    poses)."""
+    poses). Of a fit of skin weights: done: int, total: int (vertices)."""
     PARTITION_FINISHED = "partition_finished"
     """joint: str, basis: int, held_out_mm: float (mean error of the held-out poses)."""
     LOG = "log"
     """text: str."""
     FINISHED = "finished"
     """model: str (path), seconds: float, held_out_mm and held_out_p999_mm: float (mean and percentile 99.9);
-    verdict: str, "met", "missed" or "exhausted", where there is a target."""
+    verdict: str, "met", "missed" or "exhausted", where there is a target. Of a fit of skin weights: seconds: float,
+    fit: dict (`SkinFit.to_json`)."""
     CANCELLED = "cancelled"
     """No keys. The trainer was asked to stop and wrote no model."""
     FAILED = "failed"

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Fitted skin weights: what is known of a fit, and the weights as text for a model's metadata.
+
+docs/recording.md and docs/model.md describe both.
+"""
+
+import base64
+import binascii
+import json
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+KINDS = ("hard", "smooth")
+"""One joint a vertex, or at most `INFLUENCES`."""
+INFLUENCES = 4
+MOST_INFLUENCES = 64
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Distances of linear layers from the rig over poses and vertices, mm.
+
+    Attributes:
+        rms_mm, max_mm: by "rig" for its own weights and "fitted".
+    """
+
+    rms_mm: dict[str, float]
+    max_mm: dict[str, float]
+
+    def words(self, way: str) -> str:
+        return f"{self.rms_mm[way]:.2f} rms and {self.max_mm[way]:.1f} max"
+
+
+@dataclass(frozen=True)
+class SkinFit:
+    """How skin weights were fitted, and what that brought.
+
+    Attributes:
+        kind: one of `KINDS`.
+        poses: number of poses that were evaluated for it.
+        held_out: on half of the poses, which the weights were not fitted to.
+        training: on the others.
+    """
+
+    kind: str
+    poses: int
+    held_out: Gain
+    training: Gain
+
+    def to_json(self) -> dict:
+        """What `recording.json` and messages say of it."""
+        return {"kind": self.kind, "poses": self.poses, **asdict(self.held_out), "training": asdict(self.training)}
+
+    @staticmethod
+    def from_json(value: dict) -> "SkinFit":
+        """Read what `to_json` gave.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is damaged.
+        """
+        if value["kind"] not in KINDS or type(value["poses"]) is not int or value["poses"] < 0:
+            raise ValueError(f"skin weights were fitted {value['kind']!r} to {value['poses']!r} poses")
+        return SkinFit(value["kind"], value["poses"], _gain(value), _gain(value["training"]))
+
+    def sentence(self) -> str:
+        """The gain, for people."""
+        held_out, training = self.poses // 2, self.poses - self.poses // 2
+        return (
+            f"Linear layer with fitted weights ({self.kind}), mm: {self.held_out.words('fitted')} on {held_out} "
+            f"held-out poses, {self.held_out.words('rig')} with the rig's own weights; "
+            f"{self.training.words('fitted')} on the {training} poses of the fit, {self.training.words('rig')} with "
+            "the rig's own."
+        )
+
+
+def _gain(value: dict) -> Gain:
+    rows = [{way: float(value[name][way]) for way in ("rig", "fitted")} for name in ("rms_mm", "max_mm")]
+    if not np.isfinite([list(row.values()) for row in rows]).all():
+        raise ValueError("the errors of a fit are not numbers")
+    return Gain(*rows)
+
+
+def are_skin_weights(joints: np.ndarray, weights: np.ndarray, joint_count: int) -> bool:
+    """Whether (V, I) joints exist and their (V, I) weights are not negative and sum to 1 in each row."""
+    return bool(
+        np.isfinite(weights).all()
+        and (weights >= 0).all()
+        and np.allclose(weights.sum(axis=1), 1, atol=1e-4)
+        and (joints >= 0).all()
+        and (joints < joint_count).all()
+    )
+
+
+def skin_to_text(joints: np.ndarray, weights: np.ndarray) -> str:
+    """(V, I) int32 joints and (V, I) float32 weights as JSON."""
+    value = {
+        "influences": joints.shape[1],
+        "joints": base64.b64encode(joints.astype("<i4").tobytes()).decode("ascii"),
+        "weights": base64.b64encode(weights.astype("<f4").tobytes()).decode("ascii"),
+    }
+    return json.dumps(value)
+
+
+def skin_from_text(text: str, vertex_count: int, joint_count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Read what `skin_to_text` gave: (V, I) int32 joints and (V, I) float32 weights.
+
+    Raises:
+        ValueError: it is damaged, or not for so many vertices and joints; the text is a clause about the model.
+    """
+    try:
+        value = json.loads(text)
+        influences = value["influences"]
+        if type(influences) is not int or not 1 <= influences <= MOST_INFLUENCES:
+            raise ValueError(f"they have {influences!r} places a vertex")
+        # Before anything is decoded: four bytes a number, four characters for three bytes.
+        length = -(-4 * vertex_count * influences // 3) * 4
+        if any(len(value[name]) != length for name in ("joints", "weights")):
+            raise ValueError(f"they are not for {vertex_count} vertices")
+        joints, weights = (
+            np.frombuffer(base64.b64decode(value[name], validate=True), dtype).reshape(vertex_count, influences)
+            for name, dtype in (("joints", "<i4"), ("weights", "<f4"))
+        )
+    except (binascii.Error, json.JSONDecodeError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"its skin weights cannot be read ({error})") from error
+    except ValueError as error:
+        raise ValueError(f"its skin weights are damaged: {error}") from error
+    if not are_skin_weights(joints, weights, joint_count):
+        raise ValueError("its skin weights are no weights of its joints")
+    return joints.astype(np.int32), weights.astype(np.float32)

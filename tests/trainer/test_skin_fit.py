@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Fitted skin weights: what made the poses is found again, the constraints hold, and bad weights become better."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chain import rotation
+from conftest import REPOSITORY
+
+from fdda_addon.core.errors import RecordingError
+from fdda_addon.core.fit_folder import FitPoses, FitPosesWriter, read_fit_poses, read_fitted
+from fdda_addon.core.messages import Message, MessageType
+from fdda_addon.core.recording_writer import array_header
+from fdda_addon.core.rig import Fingerprint, Joint, Rig
+from fdda_addon.core.skin_fit import SkinFit
+from fdda_addon.core.skinning import LinearLayer
+from trainer.fitted_skin import fit_folder, measure
+from trainer.process import Cancelled
+from trainer.skin_fit import main
+from trainer.skin_solver import SkinSolver, simplex_weights
+
+JOINTS, VERTICES, POSES = 24, 300, 40
+
+
+class Silent:
+    def say(self, kind: MessageType, **values) -> None:
+        pass
+
+
+def random_poses(rng: np.random.Generator, heads: np.ndarray, poses: int = POSES) -> np.ndarray:
+    """(poses, J, 4, 4) float32: each joint turned and moved by itself, and all of them far away together."""
+    matrices = np.empty((poses, len(heads), 4, 4))
+    for pose in matrices:
+        root = rng.normal(0, 5, 3)
+        for matrix, head in zip(pose, heads, strict=True):
+            matrix[:] = rotation(0, rng.normal(0, 0.5)) @ rotation(1, rng.normal(0, 0.5))
+            matrix[:3, 3] = head + rng.normal(0, 0.1, 3) + root
+    return matrices.astype(np.float32)
+
+
+def random_rig(influences: int, seed: int = 0) -> Rig:
+    """A cloud of vertices, skinned to joints anywhere."""
+    rng = np.random.default_rng(seed)
+    heads = rng.uniform(-1, 1, (JOINTS, 3))
+    rest = np.stack([np.eye(4)] * JOINTS)
+    rest[:, :3, 3] = heads
+    skin_joints = np.stack([rng.permutation(JOINTS)[:4] for _ in range(VERTICES)]).astype(np.int32)
+    weights = rng.uniform(0.1, 1, (VERTICES, 4))
+    weights[:, influences:] = 0
+    weights[: VERTICES // 3, 1:] = 0
+    weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+    positions = rng.uniform(-1, 1, (VERTICES, 3)).astype(np.float32)
+    joints = tuple(Joint(str(number), number - 1) for number in range(JOINTS))
+    return Rig(joints, positions, rest.astype(np.float32), skin_joints, weights, Fingerprint("", "", ""))
+
+
+def with_one_joint(rig: Rig, joints: np.ndarray) -> Rig:
+    """The rig with each vertex on one joint."""
+    weights = np.zeros((rig.vertex_count, 4), np.float32)
+    weights[:, 0] = 1
+    places = np.zeros((rig.vertex_count, 4), np.int32)
+    places[:, 0] = joints
+    return replace(rig, skin_joints=places, skin_weights=weights)
+
+
+def posed(rig: Rig, seed: int = 1, noise: float = 0.0, poses: int = POSES) -> FitPoses:
+    """Poses of the rig; the weights that come with them are all on the first joint."""
+    rng = np.random.default_rng(seed)
+    matrices = random_poses(rng, rig.rest_matrices[:, :3, 3], poses)
+    positions = LinearLayer(rig).positions(matrices)
+    positions += rng.normal(0, 1, positions.shape).astype(np.float32) * np.float32(noise)
+    return FitPoses(with_one_joint(rig, np.zeros(rig.vertex_count)), matrices, positions)
+
+
+def fitted(poses: FitPoses, kind: str) -> Rig:
+    """The rig with the weights that the solver finds."""
+    joints, weights = np.zeros((VERTICES, 4), np.int32), np.zeros((VERTICES, 4), np.float32)
+    for block, *found in SkinSolver(poses).fit(kind):
+        joints[block], weights[block] = found
+    return replace(poses.rig, skin_joints=joints, skin_weights=weights)
+
+
+def dense(rig: Rig) -> np.ndarray:
+    """(V, J) weights."""
+    weights = np.zeros((rig.vertex_count, len(rig.joints)))
+    np.add.at(weights, (np.arange(rig.vertex_count)[:, None], rig.skin_joints), rig.skin_weights)
+    return weights
+
+
+def write(folder: Path, poses: FitPoses) -> Path:
+    with FitPosesWriter(folder, poses.rig, len(poses.positions)) as writer:
+        for matrices, positions in zip(poses.pose_matrices, poses.positions, strict=True):
+            writer.append(matrices, positions)
+    return folder
+
+
+@pytest.mark.parametrize("influences", [2, 4])
+def test_smooth_weights_are_found_again(influences):
+    rig = random_rig(influences)
+    assert np.abs(dense(fitted(posed(rig), "smooth")) - dense(rig)).max() < 1e-3
+
+
+def test_rigid_labels_are_found_again():
+    labels = np.random.default_rng(5).integers(0, JOINTS, VERTICES)
+    found = fitted(posed(with_one_joint(random_rig(1), labels), noise=0.01), "hard")
+    np.testing.assert_array_equal(found.skin_joints[:, 0], labels)
+    assert (found.skin_weights == [1, 0, 0, 0]).all() and (found.skin_joints[:, 1:] == 0).all()
+
+
+@pytest.mark.parametrize("kind", ["hard", "smooth"])
+def test_constraints_hold_where_nothing_fits(kind):
+    rig = fitted(posed(random_rig(4), noise=0.3), kind)
+    assert (rig.skin_weights >= 0).all() and (rig.skin_weights > 0).sum(axis=1).max() <= (1 if kind == "hard" else 4)
+    np.testing.assert_allclose(rig.skin_weights.sum(axis=1), 1, atol=1e-6)
+    assert (np.diff(rig.skin_weights, axis=1) <= 0).all()
+    used = [row[weights > 0] for row, weights in zip(rig.skin_joints, rig.skin_weights, strict=True)]
+    assert all(len(set(row)) == len(row) for row in used)
+
+
+def test_five_joints_are_told_by_the_best_four():
+    """A fit with four joints is no worse than the best four of the five that made the poses."""
+    rig = random_rig(4)
+    rig = replace(
+        rig,
+        skin_joints=np.pad(rig.skin_joints, ((0, 0), (0, 1)), constant_values=JOINTS - 1),
+        skin_weights=np.pad(rig.skin_weights * np.float32(0.9), ((0, 0), (0, 1)), constant_values=0.1),
+    )
+    poses = posed(rig)
+    heaviest = replace(rig, skin_joints=rig.skin_joints[:, :4], skin_weights=rig.skin_weights[:, :4] / np.float32(0.9))
+    gain = measure(replace(poses, rig=heaviest), fitted(poses, "smooth"))
+    assert gain.rms_mm["fitted"] < 0.8 * gain.rms_mm["rig"]
+
+
+def test_weights_of_a_simplex_are_the_best():
+    """The conditions of Karush, Kuhn and Tucker: equal slopes where there is a weight, steeper ones elsewhere."""
+    rng = np.random.default_rng(3)
+    factors = rng.normal(size=(50, 6, 8)) + rng.normal(size=(50, 1, 8))
+    errors = factors @ factors.transpose(0, 2, 1)
+    usable = rng.random((50, 6)) < 0.8
+    usable[:, 0] = True
+    weights = simplex_weights(errors, usable, 1e-12)
+    assert (weights >= 0).all() and (weights[~usable] == 0).all()
+    np.testing.assert_allclose(weights.sum(axis=1), 1)
+    slopes = np.einsum("vjk,vk->vj", errors, weights)
+    least = (weights * slopes).sum(axis=1, keepdims=True)
+    assert (slopes > least - 1e-9)[usable].all()
+    np.testing.assert_allclose(slopes[weights > 0], np.broadcast_to(least, slopes.shape)[weights > 0], atol=1e-9)
+    assert ((weights > 0).sum(axis=1) > 1).any() and ((weights == 0) & usable).any()
+
+
+@pytest.mark.parametrize("kind", ["hard", "smooth"])
+def test_of_joints_that_never_move_apart_the_own_or_the_nearest_is_taken(kind):
+    rig = with_one_joint(random_rig(1), np.full(VERTICES, 2))
+    rest = rig.rest_matrices.copy()
+    rest[:6, :3, 3] = [[0, 0, 9], [0, 0, 8], [0, 0, 7], [0, 0, 0], [0, 9, 0], [0, 8, 0]]
+    rig = replace(rig, rest_matrices=rest)
+    poses = posed(rig)
+    moved = poses.pose_matrices[:, 2] @ np.linalg.inv(rest[2])
+    poses.pose_matrices[:, :6] = moved[:, None] @ rest[:6]
+    own = np.where(np.arange(VERTICES) < VERTICES // 2, 4, JOINTS - 1)
+    found = fitted(replace(poses, rig=with_one_joint(rig, own)), kind)
+    np.testing.assert_array_equal(found.skin_joints[:, 0], np.where(own == 4, 4, 3))
+    np.testing.assert_allclose(found.skin_weights[:, 0], 1, atol=1e-4)
+
+
+def test_what_stays_follows_the_joint_that_never_moves():
+    poses = posed(random_rig(4))
+    rest = poses.rig.rest_matrices.copy()
+    rest[7] = np.eye(4)
+    poses.pose_matrices[:, 7] = np.eye(4)
+    poses.positions[:, :50] = poses.rig.rest_positions[:50]
+    found = fitted(replace(poses, rig=replace(poses.rig, rest_matrices=rest)), "smooth")
+    assert (found.skin_joints[:50, 0] == 7).all() and (found.skin_weights[:50, 0] > 0.999).all()
+
+
+@pytest.mark.parametrize("kind", ["hard", "smooth"])
+def test_the_process_says_what_the_fit_brings(kind, tmp_path, capsys):
+    poses = posed(random_rig(2), noise=0.002)
+    assert main([str(write(tmp_path, poses)), kind]) == 0
+    messages = [Message.decode(line) for line in capsys.readouterr().out.splitlines()]
+    assert messages[-2].values == {"done": VERTICES, "total": VERTICES}
+    fit = SkinFit.from_json(json.loads(json.dumps(messages[-1].values["fit"])))
+    assert (messages[-1].type, fit.kind, fit.poses) == (MessageType.FINISHED, kind, POSES)
+    for gain in (fit.held_out, fit.training):
+        assert gain.rms_mm["fitted"] < 0.8 * gain.rms_mm["rig"]
+    joints, weights = read_fitted(tmp_path, poses.rig)
+    found = LinearLayer(replace(poses.rig, skin_joints=joints, skin_weights=weights))
+    # Every other pose is held out.
+    for gain, part in ((fit.held_out, slice(1, None, 2)), (fit.training, slice(0, None, 2))):
+        apart = np.linalg.norm(found.positions(poses.pose_matrices[part]) - poses.positions[part], axis=2)
+        np.testing.assert_allclose(gain.rms_mm["fitted"], 1000 * np.sqrt((apart**2).mean()), rtol=1e-4)
+        np.testing.assert_allclose(gain.max_mm["fitted"], 1000 * apart.max(), rtol=1e-4)
+    if kind == "smooth":
+        # The noise, √3 · 2 mm, is what is left; a little more where it was not fitted to.
+        assert 3.3 < fit.training.rms_mm["fitted"] < fit.held_out.rms_mm["fitted"] < 4
+
+
+def test_a_fit_that_is_asked_to_stop_writes_nothing(tmp_path):
+    write(tmp_path, posed(random_rig(2)))
+    before = set(tmp_path.iterdir())
+    with pytest.raises(Cancelled):
+        fit_folder(tmp_path, "smooth", Silent(), lambda: True)
+    assert set(tmp_path.iterdir()) == before
+
+
+def test_a_python_without_scipy(tmp_path):
+    code = "import sys; sys.modules['scipy'] = None; from trainer.skin_fit import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, str(write(tmp_path, posed(random_rig(2)))), "smooth"]
+    process = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert process.returncode == 1
+    message = Message.decode(process.stdout)
+    assert message.type is MessageType.FAILED
+    assert message.values["text"].startswith("Fitting skin weights needs the Python package 'scipy', which ")
+    assert "numpy, scipy and matplotlib there, create the trainer environment" in message.values["text"]
+
+
+def damage() -> Iterator:
+    def truncate(folder: Path) -> None:
+        content = (folder / "positions.npy").read_bytes()
+        (folder / "positions.npy").write_bytes(content[:-100])
+
+    def change(name: str, value) -> None:
+        def change_it(folder: Path) -> None:
+            np.save(folder / f"{name}.npy", value(np.load(folder / f"{name}.npy")), allow_pickle=False)
+
+        return change_it
+
+    def pickle(folder: Path) -> None:
+        (folder / "parents.npy").write_bytes(array_header((JOINTS,), object) + b"cbuiltins\nprint\n(Vpoor\ntR.")
+
+    def with_nan(array: np.ndarray) -> np.ndarray:
+        array[3, 5, 1] = np.nan
+        return array
+
+    yield "missing", lambda folder: (folder / "parents.npy").unlink(), "'parents.npy' cannot be read (No such file"
+    yield "truncated", truncate, "'positions.npy' is no array, or truncated"
+    yield (
+        "no array",
+        lambda folder: (folder / "positions.npy").write_bytes(b"\x93NUMPY\x01\x00"),
+        "'positions.npy' is no",
+    )
+    yield "pickled", pickle, "'parents.npy' is no array"
+    yield "type", change("skin_weights", lambda a: a.astype(np.float64)), "'skin_weights.npy' holds something else"
+    yield "size", change("positions", lambda a: a[:, 1:]), "rest_positions has the shape (300, 3)"
+    yield "numbers", change("positions", with_nan), "positions holds values that are not numbers"
+    yield "few", change("pose_matrices", lambda a: a[:3]), "positions has the shape (40, 300, 3)"
+    yield "joints", change("skin_joints", lambda a: a + 99), "the skin weights name no joints"
+    yield "parents", change("parents", lambda a: a + 1), "a joint stands before its parent"
+    yield "flat", change("rest_matrices", lambda a: a * 0), "a rest matrix is singular"
+
+
+DAMAGE = {name: (break_it, words) for name, break_it, words in damage()}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_damaged_folder_is_refused(name, tmp_path, capsys):
+    break_it, words = DAMAGE[name]
+    break_it(write(tmp_path, posed(random_rig(2))))
+    assert main([str(tmp_path), "smooth"]) == 1
+    output = capsys.readouterr()
+    text = Message.decode(output.out.splitlines()[-1]).values["text"]
+    assert text.startswith(f"The poses in '{tmp_path}' cannot be fitted: {words}") and text.endswith("; record again.")
+    assert output.err == text + "\n"
+
+
+def test_too_few_poses(tmp_path):
+    with pytest.raises(RecordingError, match="they are 4, and a fit takes 10; record again"):
+        read_fit_poses(write(tmp_path, posed(random_rig(2), poses=4)))
+
+
+def test_fitted_weights_of_another_rig_are_refused(tmp_path):
+    rig = random_rig(2)
+    fit_folder(write(tmp_path, posed(rig)), "hard", Silent(), lambda: False)
+    with pytest.raises(RecordingError, match=r"the fitted weights have the shapes \(300, 4\) and \(300, 4\)"):
+        read_fitted(tmp_path, replace(rig, rest_positions=rig.rest_positions[1:]))
+    np.save(tmp_path / "fitted_weights.npy", np.full((VERTICES, 4), -0.25, np.float32))
+    with pytest.raises(RecordingError, match="the fitted weights are no weights"):
+        read_fitted(tmp_path, rig)

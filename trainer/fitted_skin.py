@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Fits the weights of a folder of poses, and measures what that brings."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fdda_addon.core.fit_folder import FitPoses, read_fit_poses, write_fitted
+from fdda_addon.core.messages import MessageType
+from fdda_addon.core.metrics import distances
+from fdda_addon.core.rig import Rig
+from fdda_addon.core.skin_fit import INFLUENCES, Gain, SkinFit
+from fdda_addon.core.skinning import LinearLayer
+
+from .announcements import Announcer
+from .process import Cancelled
+from .skin_solver import SkinSolver
+
+BLOCK_FLOATS = 1 << 22
+"""Linear layers are compared in blocks of so many coordinates."""
+
+
+def fit_folder(folder: Path, kind: str, announcer: Announcer, should_stop: Callable[[], bool]) -> SkinFit:
+    """Fit the weights of a folder of poses, and write them into it. Every other pose is held out, to measure on.
+
+    Args:
+        folder: one that `FitPosesWriter` wrote.
+        kind: one of `core.skin_fit.KINDS`.
+        announcer: told the progress, and last what the fit brought.
+        should_stop: asked often; nothing has been written when it is heeded.
+
+    Raises:
+        Cancelled: `should_stop` said so.
+        FDDAError: the folder is damaged or cannot be written.
+    """
+    started = time.perf_counter()
+    poses = read_fit_poses(folder)
+    total = poses.rig.vertex_count
+    training, held_out = poses.part(slice(0, None, 2)), poses.part(slice(1, None, 2))
+    joints, weights = np.zeros((total, INFLUENCES), np.int32), np.zeros((total, INFLUENCES), np.float32)
+    for block, *fitted in SkinSolver(training).fit(kind):
+        if should_stop():
+            raise Cancelled
+        joints[block], weights[block] = fitted
+        announcer.say(MessageType.PROGRESS, done=block.stop, total=total)
+    skinned = replace(poses.rig, skin_joints=joints, skin_weights=weights)
+    result = SkinFit(kind, len(poses.positions), *(measure(part, skinned) for part in (held_out, training)))
+    write_fitted(folder, joints, weights)
+    announcer.say(MessageType.FINISHED, seconds=time.perf_counter() - started, fit=result.to_json())
+    return result
+
+
+def measure(poses: FitPoses, fitted: Rig) -> Gain:
+    """How far the linear layers of the rig's own and of the fitted weights are from the poses."""
+    step = max(1, BLOCK_FLOATS // (3 * fitted.vertex_count))
+    rms, largest = {}, {}
+    for name, rig in (("rig", poses.rig), ("fitted", fitted)):
+        layer, squares, most = LinearLayer(rig), 0.0, 0.0
+        for start in range(0, len(poses.positions), step):
+            part = slice(start, start + step)
+            apart = distances(layer.positions(poses.pose_matrices[part]), poses.positions[part]).astype(np.float64)
+            squares, most = squares + float((apart**2).sum()), max(most, float(apart.max()))
+        rms[name] = 1000 * (squares / (len(poses.positions) * fitted.vertex_count)) ** 0.5
+        largest[name] = 1000 * most
+    return Gain(rms, largest)
