@@ -15,7 +15,7 @@ from ..core.errors import TrainerEnvironmentError
 
 EXTENSION = __package__.rpartition(".fdda_addon")[0]
 """The extension's module, "bl_ext.REPOSITORY.fdda"; empty where the add-on was imported and not installed."""
-PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "matplotlib")
+PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "scipy", "matplotlib")
 """What the trainer imports."""
 MARK = "fdda-complete"
 REQUIREMENTS = Path(__file__).parents[2] / "requirements"

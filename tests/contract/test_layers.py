@@ -78,7 +78,7 @@ def test_the_addon_uses_what_blender_and_the_extension_bring():
 
 
 def test_the_trainer_needs_no_blender():
-    allowed = {"numpy", "torch", "onnx", "onnxruntime", "matplotlib", "trainer", "fdda_addon"}
+    allowed = {"numpy", "torch", "onnx", "onnxruntime", "matplotlib", "scipy", "trainer", "fdda_addon"}
     assert foreign_imports("trainer", allowed) == []
 
 
