@@ -4,7 +4,7 @@
 import bpy
 
 from ..core.errors import RigError
-from .scene_rig import SceneRig, armature_of, find_rig
+from .scene_rig import SceneRig, armature_of, find_rig, parenting_sentence
 
 
 def active_rig(context: bpy.types.Context, name: str = "") -> SceneRig:
@@ -29,7 +29,8 @@ def active_rig(context: bpy.types.Context, name: str = "") -> SceneRig:
         armature_object = armature_of(active)
         if armature_object is None:
             raise RigError(
-                f"'{active.name}' has no Armature modifier with an armature; add one, or select another mesh."
+                parenting_sentence(active)
+                or f"'{active.name}' has no Armature modifier with an armature; add one, or select another mesh."
             )
         return SceneRig(active, armature_object)
     return SceneRig(_mesh_of(context, active), active)
@@ -38,6 +39,9 @@ def active_rig(context: bpy.types.Context, name: str = "") -> SceneRig:
 def _mesh_of(context: bpy.types.Context, armature_object: bpy.types.Object) -> bpy.types.Object:
     meshes = [o for o in context.scene.objects if o.type == "MESH" and _follows(o, armature_object)]
     if not meshes:
+        for child in armature_object.children:
+            if child.type == "MESH" and (sentence := parenting_sentence(child)):
+                raise RigError(sentence)
         raise RigError(f"No mesh follows the armature '{armature_object.name}'; give one an Armature modifier.")
     for chosen in (meshes, [o for o in meshes if o.select_get()], [o for o in meshes if o.fdda.is_bound]):
         if len(chosen) == 1:

@@ -42,6 +42,8 @@ def find_rig(name: str = "") -> SceneRig:
         o for o in meshes if armature_of(o) is not None
     ]
     if not rigged:
+        if parented := [sentence for o in meshes if (sentence := parenting_sentence(o))]:
+            raise RigError(parented[0])
         what = f"'{name}' has no" if name else f"None of the {len(meshes)} meshes of the scene has an"
         raise RigError(f"{what} Armature modifier with an armature; add one, or choose another object.")
     if len(rigged) > 1:
@@ -56,6 +58,27 @@ def armature_modifier(mesh_object: bpy.types.Object) -> bpy.types.ArmatureModifi
         if modifier.type == "ARMATURE" and modifier.object is not None:
             return modifier
     return None
+
+
+def parenting_sentence(mesh_object: bpy.types.Object) -> str:
+    """Why a mesh that no modifier ties to an armature is no rig though it is parented to one; empty when it is not."""
+    parent = mesh_object.parent
+    if parent is None or parent.type != "ARMATURE":
+        return ""
+    if mesh_object.parent_type == "BONE":
+        return (
+            f"'{mesh_object.name}' is parented to the bone '{mesh_object.parent_bone}' of '{parent.name}' and moves "
+            "with it as a whole, so there is nothing to learn; choose a mesh with an Armature modifier."
+        )
+    if mesh_object.parent_type == "ARMATURE":
+        return (
+            f"'{mesh_object.name}' is deformed by '{parent.name}' as its parent, without a modifier; set the type of "
+            f"its parent to Object and add an Armature modifier with '{parent.name}'."
+        )
+    return (
+        f"'{mesh_object.name}' is parented to the armature '{parent.name}', and no modifier deforms it with that; add "
+        f"an Armature modifier with '{parent.name}', or choose another mesh."
+    )
 
 
 def armature_of(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
