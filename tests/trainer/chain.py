@@ -89,15 +89,15 @@ def write_chain(path: Path, poses: int = 120, complete: int | None = None, joint
     angles = chain_angles(poses, joints, seed)
     angles[:, joints - 1, 1] = 0
     influencing = {j: tuple(i for i in (j, j + 1) if 0 < i < joints) for j in range(joints)}
-    info = RecordingInfo(
-        poses,
-        0,
-        "chain.blend",
-        "chain",
-        "5.2.0",
-        Sampling(seed, 1.0, (Channel("bone_1", "rotation", 0, -LIMIT, LIMIT),), (Source("random", poses),)),
-    )
+    info = chain_info(poses, seed)
     chosen = angles[: poses if complete is None else complete]
     with RecordingWriter(path, rig, make_partitions(rig, influencing), info) as writer:
         writer.append(pose_chain(rig, chosen), chain_residuals(rig, chosen))
     return rig
+
+
+def chain_info(poses: int, seed: int = 0) -> RecordingInfo:
+    """What a recording of random poses says of itself."""
+    limits = (Channel("bone_1", "rotation", 0, -LIMIT, LIMIT),)
+    sampling = Sampling(seed, 1.0, limits, (Source("random", poses),))
+    return RecordingInfo(poses, 0, "chain.blend", "chain", "5.2.0", sampling)

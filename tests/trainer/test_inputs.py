@@ -2,6 +2,7 @@
 """What a network sees of the joints."""
 
 import numpy as np
+import pytest
 from chain import chain_angles, chain_rig, pose_chain
 
 from fdda_addon.core.features import joint_features
@@ -36,6 +37,19 @@ def test_a_network_is_offered_its_joints_and_its_pairs():
     assert inputs.columns[0].tolist() == [*range(24, 60), *range(60, 66)]
     assert inputs.columns[1].tolist() == [*range(12, 24), *range(36, 48), *range(66, 69)]
     assert inputs.columns[2].tolist() == []
+
+
+def test_controls_stand_between_joints_and_pairs():
+    own = [Partition(2, (2, 3, 4), np.zeros(0, np.int32), (0, 2)), Partition(1, (), np.zeros(0, np.int32), (1,))]
+    inputs = make_inputs(PARENTS, np.zeros((5, 1, 3)), own, control_count=3)
+    assert inputs.columns[0].tolist() == [*range(24, 60), 60, 62, *range(63, 69)]
+    assert inputs.columns[1].tolist() == [61]
+    poses = np.tile(np.eye(4), (2, 5, 1, 1))
+    controls = np.float32([[1, 2, 3], [4, 5, 6]])
+    features = inputs.features(poses, np.tile(np.eye(4), (5, 1, 1)), controls)
+    assert features.shape == (2, 69) and np.array_equal(features[:, 60:63], controls)
+    with pytest.raises(ValueError, match=r"are \(2, 0\) and should be \(2, 3\)"):
+        inputs.features(poses, np.tile(np.eye(4), (5, 1, 1)))
 
 
 def test_a_pair_is_the_middle_of_a_partition_seen_from_a_joint():

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Controls: residuals that no joint tells of are learned from them, and the model asks for their values."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
+from conftest import QUICK
+
+from fdda_addon.core.controls import Control
+from fdda_addon.core.errors import ModelError
+from fdda_addon.core.metrics import distances
+from fdda_addon.core.model import read_model_info
+from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.recording import read_recording
+from fdda_addon.core.recording_writer import RecordingWriter
+from fdda_addon.core.rig import Rig
+from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.runtime.network import Network
+from trainer.__main__ import main
+from trainer.config import TrainingConfig
+from trainer.data import split_recording
+from trainer.inputs import inputs_of_rig, middles
+from trainer.trust import make_trust_range
+
+POSES = 150
+BULGE = Control("shape_keys", 'key_blocks["Bulge"].value', 0, 1)
+PUFF = Control("armature_object", '["puff"]', -2, 2)
+LOCKED = Control("armature", '["locked"]', 0.5, 0.5)
+INFLUENCING = {0: (), 1: (1, 2), 2: (2,)}
+CONTROLLED = {0: (1,), 1: (0,), 2: (0,)}
+"""The first partition follows a control and no joint."""
+
+
+def controlled_rig(*controls: Control) -> Rig:
+    return replace(chain_rig(), controls=controls or (BULGE, PUFF, LOCKED))
+
+
+def controlled_poses(poses: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """(poses, 3, 2) angles and (poses, 3) values of the controls, in nine tenths of their ranges."""
+    values = np.random.default_rng([seed, 1]).uniform(-1, 1, (poses, 3)) * [0.45, 1.8, 0] + [0.5, 0, 0.5]
+    return chain_angles(poses, 3, seed), values.astype(np.float32)
+
+
+def controlled_residuals(rig: Rig, angles: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(N, V, 3): as the chain's above the first joint, and centimetres of the controls."""
+    position = rig.rest_positions[:, 2] * 3
+    residuals = chain_residuals(rig, angles)
+    first = make_partitions(rig)[0].vertices
+    residuals[:, first] = 0
+    residuals[:, first, 1] = np.sin(values[:, 1:2]) * 0.015 * position[first]
+    others = np.setdiff1d(np.arange(rig.vertex_count), first)
+    residuals[:, others, 0] += values[:, :1] * 0.03 * np.exp(-((position[others] - 2) ** 2))
+    return residuals
+
+
+def write_controlled(path: Path, rig: Rig) -> Path:
+    angles, values = controlled_poses(POSES, 0)
+    with RecordingWriter(path, rig, make_partitions(rig, INFLUENCING, CONTROLLED), chain_info(POSES)) as writer:
+        writer.append(pose_chain(rig, angles), controlled_residuals(rig, angles, values), values)
+    return path
+
+
+@pytest.fixture(scope="module")
+def controlled(tmp_path_factory) -> Path:
+    return write_controlled(tmp_path_factory.mktemp("controls") / "recording", controlled_rig())
+
+
+@pytest.fixture(scope="module")
+def model(controlled) -> Path:
+    path = controlled.parent / "model.onnx"
+    assert main([str(controlled), str(path), *QUICK]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def network(model) -> Network:
+    return Network(model)
+
+
+def test_the_error_is_small_with_the_controls_and_large_without(network, model):
+    rig, (angles, values) = controlled_rig(), controlled_poses(50, 9)
+    poses, layer = pose_chain(rig, angles), LinearLayer(rig)
+    truth = layer.complex_positions(poses, controlled_residuals(rig, angles, values))
+    error, linear = distances(network.positions(poses, values), truth), distances(layer.positions(poses), truth)
+    for partition in make_partitions(rig):
+        assert error[:, partition.vertices].mean() < 0.1 * linear[:, partition.vertices].mean()
+    middle = np.tile(values.mean(axis=0), (50, 1))
+    assert distances(network.positions(poses, middle), truth).mean() > 5 * error.mean()
+    report = json.loads(model.with_name("report.json").read_text())
+    assert 0.5 < report["fdda"]["held_out"]["mean"] / (error.mean() * 1000) < 2
+
+
+def test_the_graph_asks_for_controls_only_where_there_are_any(model, trained):
+    def inputs(path: Path) -> dict[str, list]:
+        return {
+            i.name: [d.dim_value or d.dim_param for d in i.type.tensor_type.shape.dim]
+            for i in onnx.load(path).graph.input
+        }
+
+    assert inputs(model) == {"pose_matrices": ["N", 3, 4, 4], "controls": ["N", 3]}
+    assert inputs(trained / "model.onnx") == {"pose_matrices": ["N", 3, 4, 4]}
+    assert read_model_info(trained / "model.onnx").controls == ()
+
+
+def test_metadata_has_the_ranges_that_the_training_poses_had(model, controlled):
+    info, recording = read_model_info(model), read_recording(controlled)
+    values = recording.controls[split_recording(recording, TrainingConfig()).training]
+    assert [c.name for c in info.controls] == [c.name for c in (BULGE, PUFF, LOCKED)]
+    assert [c.low for c in info.controls] == values.min(axis=0).tolist()
+    assert [c.high for c in info.controls] == values.max(axis=0).tolist()
+    assert info.controls[0].low > 0.04 and info.controls[2].low == info.controls[2].high == 0.5
+    assert [p.controls for p in info.partitions] == [(1,), (0,), (0,)]
+    assert 0 < info.parity_mm < 1e-2
+
+
+def test_the_report_names_controls(model):
+    report = json.loads(model.with_name("report.json").read_text())
+    assert report["controls"] == [c.name for c in (BULGE, PUFF, LOCKED)]
+    assert [p["controls"] for p in report["partitions"]] == [[PUFF.name], [BULGE.name], [BULGE.name]]
+    page = model.with_name("report.html").read_text()
+    assert "<th>controls</th>" in page and '<td title="armature_object/[&quot;puff&quot;]">1</td>' in page
+
+
+def trust_of(network: Network, control: int, values: np.ndarray) -> np.ndarray:
+    """(N, 3) trust in the rest pose as one control moves; the others stay at their middles."""
+    controls = np.tile(np.float32([0.5, 0, 0.5]), (len(values), 1))
+    controls[:, control] = values
+    return network.trust(np.tile(network.info.rest_matrices, (len(values), 1, 1, 1)), controls)
+
+
+def test_trust_fades_beyond_the_range_of_a_control(network):
+    trust = trust_of(network, 0, np.linspace(0, 8, 80))
+    assert (trust[:10, 1:] == 1).all() and (trust[-1, 1:] == 0).all()
+    assert (np.diff(trust[:, 1:], axis=0) <= 0).all() and np.abs(np.diff(trust, axis=0)).max() < 0.05
+    assert (trust[:, 0] == 1).all(), "the first partition does not follow this control"
+    # What is left far outside is the linear layer.
+    rest = network.info.rest_matrices[None]
+    far = network.positions(rest, np.float32([[50, 0, 0.5]]))[0]
+    rig = controlled_rig()
+    others = np.concatenate([p.vertices for p in make_partitions(rig)[1:]])
+    np.testing.assert_allclose(far[others], rig.rest_positions[others], atol=1e-6)
+
+
+def test_a_control_that_never_moved_takes_trust_only_when_it_moves(network):
+    trust = trust_of(network, 2, np.float32([0.5, 0.7, 1.5, 5]))
+    assert (trust[0] == 1).all()
+    assert (np.diff(trust, axis=0) < 0).all() and (trust[-1] == 0).all(), "nobody knows what it moves"
+
+
+def test_a_control_that_was_watched_and_stood_still_counts_where_it_influences():
+    rig = controlled_rig(BULGE)
+    partitions = make_partitions(rig, INFLUENCING, {1: (0,)})
+    inputs = inputs_of_rig(rig, middles(rig, partitions), partitions)
+    poses, still = pose_chain(rig, chain_angles(20, 3, 0)), np.full((20, 1), 0.25)
+    own = make_trust_range(inputs.features(poses, rig.rest_matrices, still), rig, partitions)
+    assert own.controls == (replace(BULGE, low=0.25, high=0.25),)
+    trust = own.trust(inputs.features(poses[:3], rig.rest_matrices, np.array([[0.25], [1], [6]])))
+    assert (trust[:, [0, 2]] == 1).all() and trust[0, 1] == 1 > trust[1, 1] > 0.8 and trust[2, 1] == 0
+
+
+def test_values_of_controls_must_be_given(network):
+    rest = np.repeat(network.info.rest_matrices[None], 2, axis=0)
+    for call in (network.positions, network.trust):
+        with pytest.raises(
+            ModelError, match=r"has 3 controls and takes their values as an array \(2, 3\);.* given none"
+        ):
+            call(rest)
+        with pytest.raises(ModelError, match=r"it was given \(3,\)\."):
+            call(rest, np.zeros(3, np.float32))
+
+
+def test_characters_of_a_crowd_have_their_own_values(network):
+    angles, values = controlled_poses(6, 4)
+    poses = pose_chain(controlled_rig(), angles)
+    together = network.positions(poses, values).copy()
+    for number in (0, 5):
+        alone = network.positions(poses[number : number + 1], values[number : number + 1])
+        np.testing.assert_allclose(alone[0], together[number], atol=2e-6)
+    assert np.abs(network.positions(poses, values[::-1]) - together).max() > 1e-3
+
+
+def test_a_model_without_controls_looks_at_none(trained):
+    network = Network(trained / "model.onnx")
+    rest = network.info.rest_matrices[None]
+    alone = network.positions(rest).copy()
+    np.testing.assert_array_equal(network.positions(rest, np.zeros((1, 0), np.float32)), alone)
+
+
+def test_a_warm_start_takes_the_same_controls(controlled, model, tmp_path, capsys):
+    for path in (model, model.with_suffix(".weights.npz")):
+        shutil.copy(path, tmp_path)
+    again = tmp_path / "model.onnx"
+    before = json.loads(model.with_name("report.json").read_text())["fdda"]["held_out"]["mean"]
+    assert main([str(controlled), str(again), *QUICK, "--epochs", "10", "--warm-start"]) == 0
+    after = json.loads((tmp_path / "report.json").read_text())["fdda"]["held_out"]["mean"]
+    assert after < 1.5 * before
+    other = controlled_rig(PUFF, BULGE, LOCKED)
+    write_controlled(tmp_path / "other", other)
+    assert main([str(tmp_path / "other"), str(again), *QUICK, "--warm-start"]) == 1
+    assert "are of other controls; train without --warm-start." in capsys.readouterr().err
+
+
+def test_poses_that_differ_in_controls_alone_are_other_poses(controlled, model, tmp_path, capsys):
+    for path in (model, model.with_suffix(".weights.npz")):
+        shutil.copy(path, tmp_path)
+    shutil.copytree(controlled, tmp_path / "recording")
+    values = np.load(tmp_path / "recording" / "controls.npy")
+    np.save(tmp_path / "recording" / "controls.npy", values[::-1].copy())
+    assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *QUICK, "--warm-start"]) == 1
+    assert "may have been trained on poses that are held out now" in capsys.readouterr().err

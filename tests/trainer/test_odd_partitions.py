@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Partitions that took in others, and vertices that follow no bone, train and play like any."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chain import chain_angles, chain_info, chain_rig, pose_chain
+from conftest import QUICK
+
+from fdda_addon.core.metrics import distances
+from fdda_addon.core.model import read_model_info
+from fdda_addon.core.partition import Partition, main_joints, make_partitions
+from fdda_addon.core.recording_writer import RecordingWriter
+from fdda_addon.core.rig import UNMOVED, Joint, Rig
+from fdda_addon.core.skinning import LinearLayer, skin_matrices
+from fdda_addon.runtime.network import Network
+from trainer.__main__ import main
+from trainer.inputs import inputs_of_rig, joints_between, middles
+from trainer.linear_fit import surroundings_of_rig
+
+POSES, JOINTS = 120, 4
+UNMOVED_JOINT = JOINTS
+MERGED, TAKEN_IN_BY = 3, 2
+INFLUENCING = {0: (0, 1), 1: (0, 1, 2, 3), TAKEN_IN_BY: (2, 3), UNMOVED_JOINT: (0, 1)}
+
+
+def odd_rig() -> Rig:
+    """A chain of four joints whose first tenth follows no bone."""
+    rig = chain_rig(JOINTS)
+    skin_joints, skin_weights = rig.skin_joints.copy(), rig.skin_weights.copy()
+    start = rig.rest_positions[:, 2] < 0.1
+    skin_joints[start], skin_weights[start] = [UNMOVED_JOINT, 0], [1, 0]
+    rest = np.append(rig.rest_matrices, np.eye(4, dtype=np.float32)[None], axis=0)
+    joints = (*rig.joints, Joint(UNMOVED, -1))
+    return replace(rig, joints=joints, rest_matrices=rest, skin_joints=skin_joints, skin_weights=skin_weights)
+
+
+def odd_partitions(rig: Rig) -> tuple[Partition, ...]:
+    return make_partitions(rig, INFLUENCING, merged={MERGED: TAKEN_IN_BY})
+
+
+def odd_poses(rig: Rig, poses: int, seed: int) -> np.ndarray:
+    angles = np.concatenate([chain_angles(poses, JOINTS, seed), np.zeros((poses, 1, 2))], axis=1)
+    # The root turns: what follows no bone stays behind.
+    angles[:, 0] = np.random.default_rng([seed, 1]).uniform(-0.5, 0.5, (poses, 2))
+    return pose_chain(rig, angles)
+
+
+def smoothed(rig: Rig, poses: np.ndarray) -> np.ndarray:
+    """(N, V, 3): every vertex follows the joints of the chain beside it, more softly than its weights say."""
+    height = rig.rest_positions[:, 2, None] * JOINTS
+    weights = np.exp(-(((height - np.arange(JOINTS) - 0.5) / 0.6) ** 2))
+    weights = np.concatenate([weights, np.exp(-((height / 0.6) ** 2))], axis=1)
+    weights /= weights.sum(axis=1, keepdims=True)
+    rest = np.append(rig.rest_positions, np.ones((rig.vertex_count, 1)), axis=1)
+    return np.einsum("vj,njab,vb->nva", weights, skin_matrices(poses, rig.rest_matrices)[:, :, :3], rest)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> Path:
+    folder, rig = tmp_path_factory.mktemp("odd"), odd_rig()
+    partitions, poses = odd_partitions(rig), odd_poses(rig, POSES, 0)
+    with RecordingWriter(folder / "recording", rig, partitions, chain_info(POSES)) as writer:
+        writer.append(poses, LinearLayer(rig, partitions).local_residuals(poses, smoothed(rig, poses)))
+    assert main([str(folder / "recording"), str(folder / "model.onnx"), *QUICK]) == 0
+    return folder / "model.onnx"
+
+
+def test_every_partition_approximates_unseen_poses(model):
+    rig = odd_rig()
+    poses, partitions = odd_poses(rig, 40, 9), odd_partitions(rig)
+    positions, truth = Network(model).positions(poses), smoothed(rig, poses)
+    error, linear = distances(positions, truth), distances(LinearLayer(rig).positions(poses), truth)
+    for partition in partitions:
+        assert error[:, partition.vertices].mean() < 0.1 * linear[:, partition.vertices].mean()
+    main_joint = main_joints(rig.skin_joints, rig.skin_weights)
+    for joint in (MERGED, UNMOVED_JOINT):
+        own = main_joint == joint
+        assert own.sum() > 5 and error[:, own].mean() < 0.1 * linear[:, own].mean()
+
+
+def test_model_and_report_say_what_was_merged(model):
+    info, report = read_model_info(model), json.loads(model.with_name("report.json").read_text())
+    assert [(p.joint, p.merged) for p in info.partitions] == [(0, ()), (1, ()), (2, (3,)), (4, ())]
+    assert sum(p.vertices for p in info.partitions) == info.vertex_count
+    names = [(p["joint"], p.get("merged")) for p in report["partitions"]]
+    assert names == [("bone_0", None), ("bone_1", None), ("bone_2", ["bone_3"]), (UNMOVED, None)]
+    page = model.with_name("report.html").read_text()
+    assert '<td title="with bone_3">bone_2</td>' in page and ">no bone</td>" in page
+
+
+def test_trust_is_one_where_nothing_moves_that_did_not(model):
+    assert (Network(model).trust(odd_poses(odd_rig(), 10, 0)) == 1).all()
+
+
+def test_what_follows_no_bone_sees_the_joints_that_influence_it():
+    rig = odd_rig()
+    partitions = odd_partitions(rig)
+    inputs = inputs_of_rig(rig, middles(rig, partitions), partitions)
+    seen = [(a, b) for a, b in zip(inputs.pair_references.tolist(), inputs.pair_points.tolist(), strict=True)]
+    assert (UNMOVED_JOINT, 1) in seen, "two joints move the second bone against what follows none"
+    assert (1, UNMOVED_JOINT) in seen and (2, UNMOVED_JOINT) not in seen, "the root does not influence the third"
+    skin = skin_matrices(odd_poses(rig, 3, 0), rig.rest_matrices)
+    assert surroundings_of_rig(rig, partitions[3], skin).joints.tolist() == [UNMOVED_JOINT, 0, 1]
+    assert surroundings_of_rig(rig, partitions[0], skin).joints.tolist() == [0, 1, UNMOVED_JOINT]
+    assert surroundings_of_rig(rig, partitions[2], skin).joints.tolist() == [2, 1, 3]
+
+
+def test_between_two_roots_are_all_joints_up_to_both():
+    parents = np.array([-1, 0, 1, -1, 3])
+    assert joints_between(parents, 2, 4) == joints_between(parents, 4, 2) == {0, 1, 2, 3, 4}
+    assert joints_between(parents, 0, 3) == {0, 3} and joints_between(parents, 1, 3) == {0, 1, 3}
+    assert joints_between(parents, 2, 0) == {1, 2}
