@@ -17,12 +17,14 @@ from fdda_addon.core.model import (
     METADATA_KEY,
     POSE_INPUT,
     POSITIONS_OUTPUT,
+    SKIN_KEY,
     ModelInfo,
     ModelPartition,
     read_model_info,
 )
 from fdda_addon.core.output import replacing
 from fdda_addon.core.recording import Recording
+from fdda_addon.core.skin_fit import skin_to_text
 from fdda_addon.core.skinning import LinearLayer, skin_matrices
 from fdda_addon.core.surface import Surface, SurfaceComparison, surface_errors, surface_json
 
@@ -225,6 +227,9 @@ def build_model(recording: Recording, deformation: Deformation, validation: np.n
     measured = measure(session, recording, deformation, validation)
     info = replace(model_info(recording, deformation, measured.fdda, training), parity_mm=parity * 1000)
     model.metadata_props.add(key=METADATA_KEY, value=info.to_json())
+    if recording.info.fit:
+        skin = skin_to_text(recording.rig.skin_joints, recording.rig.skin_weights)
+        model.metadata_props.add(key=SKIN_KEY, value=skin)
     return Exported(model.SerializeToString(), info, measured, session)
 
 

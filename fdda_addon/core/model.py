@@ -12,9 +12,12 @@ from .errors import ModelError
 from .onnx_file import read_onnx
 from .poses import Channel
 from .rig import Fingerprint, Joint, Rig, differences
+from .skin_fit import skin_from_text
 
 VERSION = 1
 METADATA_KEY = "fdda"
+SKIN_KEY = "fdda_skin"
+"""Metadata property of a model whose linear layer has fitted skin weights."""
 POSE_INPUT = "pose_matrices"
 CONTROLS_INPUT = "controls"
 POSITIONS_OUTPUT = "positions"
@@ -218,6 +221,28 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
             f"The output '{POSITIONS_OUTPUT}' of '{name}' does not fit its {info.vertex_count} vertices; train again."
         )
     return info
+
+
+def read_skin(data: bytes, info: ModelInfo, name: Path | str) -> tuple[np.ndarray, np.ndarray] | None:
+    """The fitted skin weights of a model's linear layer; None where it has those of the rig.
+
+    Args:
+        data: the bytes of a model that `check_model` has passed, and `info` what it gave.
+        name: what errors call the model.
+
+    Returns:
+        (V, I) int32 joints and (V, I) float32 weights, each row summing to 1.
+
+    Raises:
+        ModelError: they are damaged.
+    """
+    text = read_onnx(data).metadata.get(SKIN_KEY)
+    if text is None:
+        return None
+    try:
+        return skin_from_text(text, info.vertex_count, len(info.joints))
+    except ValueError as error:
+        raise ModelError(f"The model '{name}' cannot be used: {error}; train it again.") from error
 
 
 def read_model_info(path: Path) -> ModelInfo:

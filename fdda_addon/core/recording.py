@@ -17,6 +17,7 @@ from .errors import RecordingError
 from .partition import Partition, make_partitions
 from .recording_index import INDEX, REFINED, RecordingInfo, Sampling, Source, read_index, read_info
 from .rig import Fingerprint, Joint, Rig
+from .skin_fit import are_skin_weights
 from .surface import are_faces
 
 __all__ = [
@@ -207,10 +208,7 @@ def _check_skin(path: Path, rig: Rig) -> None:
         np.isfinite(rig.rest_positions).all()
         and np.isfinite(rig.rest_matrices).all()
         and (np.abs(np.linalg.det(rig.rest_matrices.astype(np.float64))) > 1e-12).all()
-        and rig.skin_joints.min() >= 0
-        and rig.skin_joints.max() < len(rig.joints)
-        and np.allclose(rig.skin_weights.sum(axis=1), 1, atol=1e-4)
-        and (rig.skin_weights >= 0).all()
+        and are_skin_weights(rig.skin_joints, rig.skin_weights, len(rig.joints))
     )
     if not good:
         raise RecordingError(f"The rest pose or skin weights of '{path}' are damaged; record again.")

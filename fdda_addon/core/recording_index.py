@@ -9,6 +9,7 @@ from .controls import read_controls
 from .errors import RecordingError
 from .poses import Channel
 from .rig import Fingerprint
+from .skin_fit import SkinFit
 from .surface import LEAST_CORNERS
 
 FORMAT = "fdda-recording"
@@ -56,7 +57,7 @@ class Sampling:
 
 @dataclass(frozen=True)
 class RecordingInfo:
-    """What `recording.json` says beside the arrays."""
+    """What `recording.json` says beside the arrays; `fit` where its skin weights are not the rig's own."""
 
     poses: int
     complete: int
@@ -64,6 +65,7 @@ class RecordingInfo:
     object_name: str
     blender: str
     sampling: Sampling
+    fit: SkinFit | None = None
 
 
 def read_index(path: Path) -> dict:
@@ -126,6 +128,8 @@ def _check_index(index: dict) -> None:
             if type(control) is not int or not 0 <= control < len(controls):
                 raise ValueError(f"a partition has control {control!r} of {len(controls)}")
     Fingerprint(**index["rig"]["fingerprint"])
+    if "fit" in index:
+        SkinFit.from_json(index["fit"])
     for source in _sampling(index["sampling"]).sources:
         if type(source.poses) is not int or source.poses < 0:
             raise ValueError(f"a source has {source.poses!r} poses")
@@ -149,4 +153,5 @@ def read_info(index: dict) -> RecordingInfo:
         index["rig"]["object"],
         index["blender"],
         _sampling(index["sampling"]),
+        SkinFit.from_json(index["fit"]) if "fit" in index else None,
     )

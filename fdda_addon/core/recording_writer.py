@@ -146,6 +146,7 @@ class RecordingWriter:
             "joints": [asdict(joint) for joint in self.rig.joints],
             "controls": [control.to_json() for control in self.rig.controls],
             "partitions": partitions_json(self.partitions),
+            **({"fit": info.fit.to_json()} if info.fit else {}),
             # Through JSON and back, so that it compares equal with what was read.
             "sampling": json.loads(json.dumps(info.sampling.to_json())),
         }

@@ -3,12 +3,14 @@
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..core.errors import ModelError
-from ..core.model import CONTROLS_INPUT, POSE_INPUT, POSITIONS_OUTPUT, TRUST_OUTPUT, check_model, read_model
+from ..core.model import CONTROLS_INPUT, POSE_INPUT, POSITIONS_OUTPUT, TRUST_OUTPUT, check_model, read_model, read_skin
+from ..core.rig import Rig
 
 THREADED_VERTICES = 20_000
 """From this many vertices on a second thread gains more than it costs."""
@@ -37,6 +39,7 @@ class Network:
         """
         self.path = path
         self.info, data = read_model(path) if data is None else (check_model(data, path), data)
+        self._skin = read_skin(data, self.info, path)
         try:
             # Imported here so that Blender starts without it.
             import onnxruntime
@@ -115,6 +118,13 @@ class Network:
         if trust.shape != (len(pose_matrices), len(self.info.partitions)):
             raise ModelError(f"The model '{self.path}' gives trust of another shape than it says; train it again.")
         return trust
+
+    def linear_rig(self, rig: Rig) -> Rig:
+        """A rig that the model fits, with the skin weights of the model's linear layer, which may be fitted ones."""
+        if self._skin is None:
+            return rig
+        joints, weights = self._skin
+        return replace(rig, skin_joints=joints, skin_weights=weights)
 
     def _controls(self, controls: np.ndarray | None, count: int) -> np.ndarray:
         """Values of the controls, sure to be there and to be as many as the model takes."""
