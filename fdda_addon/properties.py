@@ -15,6 +15,11 @@ from bpy.props import (
 from . import evaluation_view, settings
 from .scene.compatibility import BLEND_RELATIVE_PATH
 
+OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}
+"""A linked character keeps in the shot what is set there: Blender resets everything else of a library override."""
+INSERTABLE = OVERRIDABLE | {"USE_INSERTION"}
+"""As `OVERRIDABLE`, and a library override may have entries besides those of its library."""
+
 
 def _apply(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
     from .runtime.binding import apply
@@ -25,39 +30,47 @@ def _apply(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
 class FDDA_PG_modifier(bpy.types.PropertyGroup):
     """A modifier of the rig and how it was shown before a model took its place."""
 
-    uid: IntProperty()
-    show_viewport: BoolProperty()
-    show_render: BoolProperty()
+    uid: IntProperty(override=OVERRIDABLE)
+    show_viewport: BoolProperty(override=OVERRIDABLE)
+    show_render: BoolProperty(override=OVERRIDABLE)
 
 
 class FDDA_PG_model(bpy.types.PropertyGroup):
     """A model of a mesh: its file, or the text that holds it."""
 
-    name: StringProperty(name="Name", description="What the model is called")
+    name: StringProperty(name="Name", description="What the model is called", override=OVERRIDABLE)
     path: StringProperty(
         name="File",
         description="The model, an .onnx file; where it came from when it is packed",
         subtype="FILE_PATH",
         options=BLEND_RELATIVE_PATH,
+        override=OVERRIDABLE,
     )
     packed: PointerProperty(
-        name="Packed Model", description="The text that holds the model inside this file", type=bpy.types.Text
+        name="Packed Model",
+        description="The text that holds the model inside this file",
+        type=bpy.types.Text,
+        override=OVERRIDABLE,
     )
-    packed_bytes: IntProperty(name="Size", description="Size of the packed model in bytes")
+    packed_bytes: IntProperty(name="Size", description="Size of the packed model in bytes", override=OVERRIDABLE)
 
 
 class FDDA_PG_binding(bpy.types.PropertyGroup):
     """A model bound to a mesh object."""
 
-    is_bound: BoolProperty(name="Bound", description="A model is bound to this object")
+    is_bound: BoolProperty(name="Bound", description="A model is bound to this object", override=OVERRIDABLE)
     model: StringProperty(
         name="Model",
         description="The model, an .onnx file",
         subtype="FILE_PATH",
         options=BLEND_RELATIVE_PATH,
+        override=OVERRIDABLE,
     )
     packed: PointerProperty(
-        name="Packed Model", description="The text that holds the model inside this file", type=bpy.types.Text
+        name="Packed Model",
+        description="The text that holds the model inside this file",
+        type=bpy.types.Text,
+        override=OVERRIDABLE,
     )
     mode: EnumProperty(
         name="Mode",
@@ -69,6 +82,7 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
         ),
         default="RIG",
         update=_apply,
+        override=OVERRIDABLE,
     )
     strength: FloatProperty(
         name="Strength",
@@ -78,21 +92,31 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
         default=1,
         subtype="FACTOR",
         update=_apply,
+        override=OVERRIDABLE,
     )
     use_in_render: BoolProperty(
-        name="Use in Render", description="Final renders use the model as well, not the rig", update=_apply
+        name="Use in Render",
+        description="Final renders use the model as well, not the rig",
+        update=_apply,
+        override=OVERRIDABLE,
     )
-    status: StringProperty(name="Status", description="Why the model was switched off, empty when all is well")
+    status: StringProperty(
+        name="Status", description="Why the model was switched off, empty when all is well", override=OVERRIDABLE
+    )
 
-    is_playing: BoolProperty(description="The modifiers of the rig are switched off and `modifiers` says how they were")
-    modifiers: CollectionProperty(type=FDDA_PG_modifier)
-    show_only_shape_key: BoolProperty()
-    active_shape_key_index: IntProperty()
+    is_playing: BoolProperty(
+        description="The modifiers of the rig are switched off and `modifiers` says how they were", override=OVERRIDABLE
+    )
+    modifiers: CollectionProperty(type=FDDA_PG_modifier, override=INSERTABLE)
+    show_only_shape_key: BoolProperty(override=OVERRIDABLE)
+    active_shape_key_index: IntProperty(override=OVERRIDABLE)
 
-    models: CollectionProperty(type=FDDA_PG_model)
-    model_index: IntProperty(name="Model", description="The model that the buttons below are about")
+    models: CollectionProperty(type=FDDA_PG_model, override=INSERTABLE)
+    model_index: IntProperty(
+        name="Model", description="The model that the buttons below are about", override=OVERRIDABLE
+    )
 
-    settings: PointerProperty(type=settings.FDDA_PG_character)
+    settings: PointerProperty(type=settings.FDDA_PG_character, override=OVERRIDABLE)
 
 
 CLASSES = (FDDA_PG_modifier, FDDA_PG_model, FDDA_PG_binding)
@@ -103,7 +127,7 @@ def register() -> None:
     evaluation_view.register()
     for cls in CLASSES:
         bpy.utils.register_class(cls)
-    bpy.types.Object.fdda = PointerProperty(type=FDDA_PG_binding)
+    bpy.types.Object.fdda = PointerProperty(type=FDDA_PG_binding, override=OVERRIDABLE)
 
 
 def unregister() -> None:
