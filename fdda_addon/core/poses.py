@@ -5,6 +5,8 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+ROTATION, LOCATION, SCALE, CONTROL = "rotation", "location", "scale", "control"
+"""Kinds of channels."""
 DEFAULT_RANGE = (-np.pi / 4, np.pi / 4)
 """Range of a rotation axis that the rig neither limits nor locks, radians."""
 
@@ -20,9 +22,10 @@ class Channel:
     """One number of a pose that may be sampled.
 
     Attributes:
-        bone: name of the bone.
-        kind: "rotation" (Euler angle, radians) or "location" (metres), relative to the rest pose.
-        axis: 0, 1 or 2.
+        bone: name of the bone, or of the control (`Control.name`).
+        kind: `ROTATION` (Euler angle, radians), `LOCATION` (metres) or `SCALE` (factor) of a bone, relative to the rest
+            pose, or `CONTROL` (the unit of its property).
+        axis: 0, 1 or 2; 0 for a control.
         low, high: the range of motion.
     """
 

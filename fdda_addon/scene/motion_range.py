@@ -57,7 +57,15 @@ def _rotation_range(bone: bpy.types.PoseBone, constraint: bpy.types.Constraint |
 
 def location_ranges(bone: bpy.types.PoseBone) -> dict[int, tuple[float, float]]:
     """Range by axis, metres, of the axes that a Limit Location constraint limits on both ends."""
-    constraint = local_limit(bone, "LIMIT_LOCATION")
+    return _limited(local_limit(bone, "LIMIT_LOCATION"))
+
+
+def scale_ranges(bone: bpy.types.PoseBone) -> dict[int, tuple[float, float]]:
+    """Range by axis, factors, of the axes that a Limit Scale constraint limits on both ends."""
+    return _limited(local_limit(bone, "LIMIT_SCALE"))
+
+
+def _limited(constraint: bpy.types.Constraint | None) -> dict[int, tuple[float, float]]:
     if constraint is None:
         return {}
     return {

@@ -91,7 +91,7 @@ def armature_of(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
     if modifier is not None:
         return modifier.object
     seen = {mesh_object}
-    waiting = list(_read_objects(mesh_object))
+    waiting = list(read_objects(mesh_object))
     while waiting:
         found = waiting.pop(0)
         if found.type == "ARMATURE":
@@ -99,11 +99,11 @@ def armature_of(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
         if found not in seen:
             seen.add(found)
             targets = [getattr(constraint, "target", None) for constraint in found.constraints if not constraint.mute]
-            waiting += [other for other in (*_read_objects(found), found.parent, *targets) if other is not None]
+            waiting += [other for other in (*read_objects(found), found.parent, *targets) if other is not None]
     return None
 
 
-def _read_objects(owner: bpy.types.Object) -> Iterator[bpy.types.Object]:
+def read_objects(owner: bpy.types.Object) -> Iterator[bpy.types.Object]:
     """The objects that the modifiers of an object read."""
     for modifier in owner.modifiers:
         for prop in modifier.bl_rna.properties:

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Controls in and out: which numbers there are, their ranges, their values."""
+
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+import bpy
+import numpy as np
+
+from ..core.controls import ARMATURE, ARMATURE_OBJECT, MESH_OBJECT, OTHER_OBJECT, OWNERS, SHAPE_KEYS, Control
+from ..core.errors import RigError
+from .scene_rig import SceneRig
+
+WIDEST_RANGE = 1e4
+"""A property whose range is wider than this states none."""
+
+_STATED = re.compile(r"(?P<name>.+?)(?:=(?P<low>[-+.\deE]+):(?P<high>[-+.\deE]+))?", re.DOTALL)
+_CUSTOM = re.compile(r'(?P<owner>.*)\["(?P<name>(?:[^"\\]|\\.)*)"\]')
+_ELEMENT = re.compile(r"(?P<array>.*[^\"\]])\[(?P<index>\d+)\]")
+
+
+def owner_of(scene_rig: SceneRig, owner: str) -> bpy.types.ID | None:
+    """The datablock that `Control.owner` means for a rig, None when there is none."""
+    mesh_object = scene_rig.mesh_object
+    if owner.startswith(OTHER_OBJECT):
+        return bpy.data.objects.get(owner.removeprefix(OTHER_OBJECT))
+    return {
+        ARMATURE_OBJECT: scene_rig.armature_object,
+        ARMATURE: scene_rig.armature_object.data,
+        MESH_OBJECT: mesh_object,
+        SHAPE_KEYS: mesh_object.data.shape_keys,
+    }.get(owner)
+
+
+def owner_name(scene_rig: SceneRig, datablock: bpy.types.ID) -> str:
+    """The inverse of `owner_of`; empty for a datablock that no control can belong to."""
+    for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
+        if owner_of(scene_rig, owner) == datablock:
+            return owner
+    return f"{OTHER_OBJECT}{datablock.name}" if isinstance(datablock, bpy.types.Object) else ""
+
+
+def make_control(scene_rig: SceneRig, owner: str, path: str, stated: tuple[float, float] | None = None) -> Control:
+    """A control of a rig, with the range that its property states.
+
+    Args:
+        scene_rig: the rig.
+        owner, path: as of `Control`.
+        stated: its range, in place of what the property states.
+
+    Raises:
+        RigError: there is no such number, or nobody states its range.
+    """
+    name = f"{owner}/{path}"
+    datablock = owner_of(scene_rig, owner)
+    if datablock is None or _value(datablock, path) is None:
+        raise RigError(
+            f"'{scene_rig.mesh_object.name}' has no control '{name}'; give the name of a shape key, or OWNER/PATH of a "
+            f"number, with OWNER one of {', '.join(OWNERS)} and {OTHER_OBJECT}NAME."
+        )
+    low, high = stated or _property_range(datablock, path)
+    if not low < high or high - low > WIDEST_RANGE:
+        raise RigError(f"The control '{name}' states no range; give one: '{name}=LOW:HIGH'.")
+    return Control(owner, path, float(low), float(high))
+
+
+def stated_controls(scene_rig: SceneRig, texts: Iterable[str]) -> tuple[Control, ...]:
+    """Controls as a user lists them.
+
+    Args:
+        scene_rig: the rig.
+        texts: each OWNER/PATH, or the name of a shape key, and after it =LOW:HIGH where the property's range is not
+            meant; `shape_keys` means every shape key that no driver moves.
+
+    Raises:
+        RigError: as `make_control`.
+    """
+    found: dict[str, Control] = {}
+    for text in texts:
+        match = _STATED.fullmatch(text)
+        name, stated = match["name"], None
+        if match["low"]:
+            try:
+                stated = float(match["low"]), float(match["high"])
+            except ValueError as error:
+                raise RigError(f"'{text}' states no range; write it as NAME=LOW:HIGH, with two numbers.") from error
+        for owner, path in _meant(scene_rig, name):
+            control = make_control(scene_rig, owner, path, stated)
+            found[control.name] = control
+    return tuple(found.values())
+
+
+def _meant(scene_rig: SceneRig, name: str) -> list[tuple[str, str]]:
+    keys = scene_rig.mesh_object.data.shape_keys
+    blocks = [b for b in keys.key_blocks if b != keys.reference_key] if keys else []
+    if name == SHAPE_KEYS:
+        paths = [f'key_blocks["{bpy.utils.escape_identifier(block.name)}"].value' for block in blocks]
+        return [(SHAPE_KEYS, path) for path in paths if not is_driven(keys, path)]
+    if any(block.name == name for block in blocks):
+        return [(SHAPE_KEYS, f'key_blocks["{bpy.utils.escape_identifier(name)}"].value')]
+    owner, _, path = name.partition("/")
+    return [(owner, path)]
+
+
+def is_driven(datablock: bpy.types.ID, path: str) -> bool:
+    """Whether a driver sets a number."""
+    array, index = _element(path)
+    animation = datablock.animation_data
+    return animation is not None and any(
+        curve.data_path == array and (index is None or curve.array_index == index) for curve in animation.drivers
+    )
+
+
+def _element(path: str) -> tuple[str, int | None]:
+    match = _ELEMENT.fullmatch(path)
+    return (match["array"], int(match["index"])) if match else (path, None)
+
+
+def _value(datablock: bpy.types.ID, path: str) -> float | None:
+    """The number at a path, None when there is none."""
+    try:
+        value = datablock.path_resolve(path)
+    except ValueError:
+        return None
+    return float(value) if isinstance(value, int | float) and np.isfinite(value) else None
+
+
+def _property_range(datablock: bpy.types.ID, path: str) -> tuple[float, float]:
+    array, _ = _element(path)
+    if match := _CUSTOM.fullmatch(array):
+        struct = datablock.path_resolve(match["owner"]) if match["owner"] else datablock
+        name = bpy.utils.unescape_identifier(match["name"])
+        if isinstance(struct[name], bool):
+            return 0.0, 1.0
+        settings = struct.id_properties_ui(name).as_dict()
+        return _narrower(*((settings[f"{kind}min"], settings[f"{kind}max"]) for kind in ("soft_", "")))
+    struct, _, attribute = array.rpartition(".")
+    owner = datablock.path_resolve(struct) if struct else datablock
+    if isinstance(owner, bpy.types.ShapeKey) and attribute == "value":
+        return owner.slider_min, owner.slider_max
+    prop = owner.bl_rna.properties[attribute]
+    if prop.type == "BOOLEAN":
+        return 0.0, 1.0
+    return _narrower((prop.soft_min, prop.soft_max), (prop.hard_min, prop.hard_max))
+
+
+def _narrower(soft: tuple[float, float], hard: tuple[float, float]) -> tuple[float, float]:
+    return soft if soft[1] - soft[0] <= hard[1] - hard[0] else hard
+
+
+class ControlReader:
+    """Reads the values of some controls of a rig, again and again."""
+
+    def __init__(self, scene_rig: SceneRig, controls: tuple[Control, ...]):
+        """Args:
+            scene_rig: the rig.
+            controls: C of them.
+
+        Raises:
+            RigError: the rig lacks one.
+        """
+        self._controls = controls
+        for control in controls:
+            datablock = owner_of(scene_rig, control.owner)
+            if datablock is None or _value(datablock, control.path) is None:
+                raise RigError(
+                    f"'{scene_rig.mesh_object.name}' lacks the control '{control.name}'; name it as before, or record "
+                    "and train this rig."
+                )
+
+    def read(self, scene_rig: SceneRig, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
+        """(C,) float32 values as a dependency graph has evaluated them, each in the unit of its property.
+
+        A control that is gone reads as 0.
+        """
+        values = np.zeros(len(self._controls), np.float32)
+        evaluated: dict[str, bpy.types.ID] = {}
+        for place, control in enumerate(self._controls):
+            if control.owner not in evaluated:
+                datablock = owner_of(scene_rig, control.owner)
+                evaluated[control.owner] = datablock and datablock.evaluated_get(depsgraph)
+            datablock = evaluated[control.owner]
+            values[place] = (datablock and _value(datablock, control.path)) or 0.0
+        return values
+
+
+def set_control(scene_rig: SceneRig, name: str, value: float) -> None:
+    """Set a control by its name; a number that counts is rounded. The graph is not evaluated."""
+    owner, _, path = name.partition("/")
+    datablock = owner_of(scene_rig, owner)
+    array, index = _element(path)
+    old = datablock.path_resolve(path)
+    new = type(old)(round(value)) if isinstance(old, bool | int) else value
+    if index is not None:
+        datablock.path_resolve(array)[index] = new
+    elif match := _CUSTOM.fullmatch(path):
+        struct = datablock.path_resolve(match["owner"]) if match["owner"] else datablock
+        struct[bpy.utils.unescape_identifier(match["name"])] = new
+    else:
+        struct, _, attribute = path.rpartition(".")
+        setattr(datablock.path_resolve(struct) if struct else datablock, attribute, new)
+    # Custom properties do not tell the graph by themselves.
+    datablock.update_tag()
+
+
+@contextmanager
+def borrowed_controls(scene_rig: SceneRig, names: Iterable[str]) -> Iterator[None]:
+    """Give back the values of controls, by name, and what animates them. Inside, nothing animates them.
+
+    What animates the armature object is not touched: `borrow.borrowed_pose` takes care of it.
+    """
+    names = list(names)
+    owners = {name.partition("/")[0] for name in names} - {ARMATURE_OBJECT}
+    animations = [a for a in (owner_of(scene_rig, owner).animation_data for owner in owners) if a is not None]
+    kept = [(a, a.action, getattr(a, "action_slot", None), a.use_nla) for a in animations]
+    values = {name: owner_of(scene_rig, name.partition("/")[0]).path_resolve(name.partition("/")[2]) for name in names}
+    for animation in animations:
+        animation.use_nla, animation.action = False, None
+    try:
+        yield
+    finally:
+        for animation, action, slot, use_nla in kept:
+            animation.action = action
+            if action is not None and slot is not None:
+                animation.action_slot = slot
+            animation.use_nla = use_nla
+        for name, value in values.items():
+            set_control(scene_rig, name, value)
