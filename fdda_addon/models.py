@@ -12,7 +12,8 @@ from .core.model import MAX_BYTES, ModelInfo, check_model, check_rig, read_model
 from .core.output import check_writable, replacing
 from .model_list import bound_entry, bound_name, chosen_entry, is_bound
 from .runtime import model_files, packed, playback
-from .runtime.binding import bind, stored_path, unbind
+from .runtime.binding import bind, unbind
+from .runtime.model_files import absolute_path, path_for
 from .scene.rig import SceneRig, read_rig
 
 _infos: dict[tuple, ModelInfo] = {}
@@ -27,7 +28,7 @@ def remember(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGro
     binding = mesh_object.fdda
     model_files.choose(path)
     for index, entry in enumerate(binding.models):
-        if entry.packed is None and _absolute(entry, mesh_object) == Path(os.path.normpath(path.absolute())):
+        if entry.packed is None and absolute_path(mesh_object, entry.path) == Path(os.path.normpath(path.absolute())):
             binding.model_index = index
             if is_bound(mesh_object, entry) and playback.is_outdated(mesh_object):
                 last_evaluation.forget(mesh_object)
@@ -36,7 +37,7 @@ def remember(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGro
             return entry
     entry = binding.models.add()
     entry.name = path.stem
-    entry.path = stored_path(path)
+    entry.path = path_for(mesh_object, path)
     binding.model_index = len(binding.models) - 1
     return entry
 
@@ -83,7 +84,7 @@ def bind_entry(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> None:
     mode, use_in_render = binding.mode, binding.use_in_render
     path = entry_path(mesh_object, entry)
     bind(scene_rig, path, use_in_render, entry.packed)
-    entry.path = binding.model = stored_path(path)
+    entry.path = binding.model = path_for(mesh_object, path)
     binding.model_index = list(binding.models).index(entry)
     # Evaluated here, so that what cannot play is told now and not at the next frame.
     bpy.context.view_layer.update()
@@ -107,7 +108,7 @@ def relink(scene_rig: SceneRig, path: Path) -> None:
     entry = bound_entry(mesh_object)
     if entry is None:
         entry = remember(mesh_object, path)
-    entry.path, entry.packed, entry.packed_bytes = stored_path(path), None, 0
+    entry.path, entry.packed, entry.packed_bytes = path_for(mesh_object, path), None, 0
     model_files.choose(path)
     bind_entry(scene_rig, entry)
     packed.remove_unused()
@@ -158,7 +159,7 @@ def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, 
         with replacing(path) as temporary:
             temporary.write_bytes(data)
     bound = is_bound(mesh_object, entry)
-    entry.path, entry.packed, entry.packed_bytes = stored_path(path), None, 0
+    entry.path, entry.packed, entry.packed_bytes = path_for(mesh_object, path), None, 0
     model_files.choose(path)
     if bound:
         mesh_object.fdda.model, mesh_object.fdda.packed = entry.path, None
@@ -172,7 +173,7 @@ def entry_path(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) ->
     Raises:
         ModelError: the path of a saved file leads out of the file's folder.
     """
-    return _absolute(entry, mesh_object) if entry.packed else model_files.allowed_path(mesh_object, entry.path)
+    return absolute_path(mesh_object, entry.path) if entry.packed else model_files.allowed_path(mesh_object, entry.path)
 
 
 def info_of(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> ModelInfo:
@@ -197,10 +198,6 @@ def info_of(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> Mo
             del _infos[old]
         _infos[key] = read_model_info(path)
     return _infos[key]
-
-
-def _absolute(entry: bpy.types.PropertyGroup, mesh_object: bpy.types.Object) -> Path:
-    return Path(os.path.normpath(bpy.path.abspath(entry.path, library=mesh_object.library)))
 
 
 def _same(path: Path, data: bytes) -> bool:

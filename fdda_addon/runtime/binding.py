@@ -45,21 +45,12 @@ def bind(
     # Those after the last deforming one stay and work on what the model gives.
     nodes.add_modifier(mesh_object, stack.place)
     binding = mesh_object.fdda
-    binding.model = stored_path(model)
+    binding.model = model_files.path_for(mesh_object, model)
     binding.packed = packed_model
     binding.use_in_render = use_in_render
     binding.is_bound = True
     binding.mode = "FDDA"
     playback.forget()
-
-
-def stored_path(model: Path) -> str:
-    """How the open file remembers where a model is: relative to itself, where that can be said."""
-    try:
-        return bpy.path.relpath(str(model.absolute())) if bpy.data.filepath else str(model.absolute())
-    except ValueError:
-        # On another drive of Windows.
-        return str(model.absolute())
 
 
 def unbind(mesh_object: bpy.types.Object) -> None:
