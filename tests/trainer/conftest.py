@@ -3,6 +3,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -27,6 +28,12 @@ def start_trainer(*arguments: str | Path, **options) -> subprocess.Popen:
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
         **options,
     )
+
+
+def run_page(name: str, folder: Path) -> str:
+    """Run the block of code of a page of the documents in a folder; returns what it prints."""
+    (code,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs" / f"{name}.md").read_text("utf-8"), re.DOTALL)
+    return subprocess.run([sys.executable, "-c", code], cwd=folder, check=True, capture_output=True, text=True).stdout
 
 
 @pytest.fixture(scope="session")

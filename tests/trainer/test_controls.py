@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 import pytest
 from chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
-from conftest import QUICK
+from conftest import QUICK, run_page
 
 from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import ModelError
@@ -183,6 +183,10 @@ def test_characters_of_a_crowd_have_their_own_values(network):
         alone = network.positions(poses[number : number + 1], values[number : number + 1])
         np.testing.assert_allclose(alone[0], together[number], atol=2e-6)
     assert np.abs(network.positions(poses, values[::-1]) - together).max() > 1e-3
+
+
+def test_the_code_of_the_page_on_models_plays_it(model):
+    assert run_page("model", model.parent).startswith("['bone_0', 'bone_1', 'bone_2'] (2, 90, 3) [1. ")
 
 
 def test_a_model_without_controls_looks_at_none(trained):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chain import chain_angles, chain_info, chain_rig, pose_chain
-from conftest import QUICK
+from conftest import QUICK, run_page
 
 from fdda_addon.core.metrics import distances
 from fdda_addon.core.model import read_model_info
@@ -90,6 +90,14 @@ def test_model_and_report_say_what_was_merged(model):
     assert names == [("bone_0", None), ("bone_1", None), ("bone_2", ["bone_3"]), (UNMOVED, None)]
     page = model.with_name("report.html").read_text()
     assert '<td title="with bone_3">bone_2</td>' in page and ">no bone</td>" in page
+
+
+def test_the_code_of_the_page_on_recordings_reads_it(model):
+    rig = odd_rig()
+    pose = odd_poses(rig, POSES, 0)[:1]
+    expected = distances(smoothed(rig, pose), LinearLayer(rig).positions(pose)).mean() * 1000
+    shape, residual = run_page("recording", model.parent).split(" mean residual ")
+    assert shape == "(90, 3)" and float(residual.removesuffix(" mm\n")) == pytest.approx(expected, rel=1e-4)
 
 
 def test_trust_is_one_where_nothing_moves_that_did_not(model):
