@@ -156,11 +156,11 @@ def evaluate(
     rig = layer.rig
     if settings.poses < 1:
         raise RigError("There is nothing to evaluate: 0 poses; give --poses.")
-    channels = sampled_channels(scene_rig, rig)
+    channels = model_channels(scene_rig, rig, network.info)
     extra = max(1, settings.poses // 4)
     total = settings.poses + extra * len(settings.beyond) + len(settings.named)
     total += sum(len(action_frames(action)) for action in actions)
-    with borrowed_stack(scene_rig.mesh_object), borrowed_pose(scene_rig.armature_object, actions):
+    with borrowed_stack(scene_rig.mesh_object), borrowed_pose(scene_rig.armature_object, actions), borrowed_controls(scene_rig, control_names(rig, channels)):
         clear_pose(scene_rig.armature_object)
         comparison = _Comparison(PoseEvaluator(scene_rig, rig), network, layer, total, settings.surface)
         poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses)
@@ -196,9 +196,9 @@ def evaluate_action(scene_rig: SceneRig, model: Path | Network, name: str) -> It
 def _prepare(scene_rig: SceneRig, model: Path | Network) -> tuple[Network, LinearLayer]:
     network = model if isinstance(model, Network) else Network(model)
     check_evaluable(scene_rig)
-    rig = read_rig(scene_rig)
+    rig = read_model_rig(scene_rig, network.info)
     check_rig(network.path, network.info, rig)
-    return network, LinearLayer(rig)
+    return network, LinearLayer(network.linear_rig(rig))
 
 
 def pose_held_out(scene_rig: SceneRig, seed: int, index: int) -> None:
@@ -207,7 +207,8 @@ def pose_held_out(scene_rig: SceneRig, seed: int, index: int) -> None:
     Raises:
         RigError: nothing may be sampled.
     """
-    channels = sampled_channels(scene_rig, read_rig(scene_rig))
+    info = model_files.network_of(scene_rig.mesh_object).info
+    channels = model_channels(scene_rig, read_model_rig(scene_rig, info), info)
     clear_pose(scene_rig.armature_object)
     next(_random_poses(scene_rig, channels, seed, HELD_OUT_INDEX + index, 1))
 
@@ -215,7 +216,7 @@ def pose_held_out(scene_rig: SceneRig, seed: int, index: int) -> None:
 def _random_poses(
     scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, first: int, count: int
 ) -> Iterator[None]:
-    poser = Poser(scene_rig.armature_object, channels)
+    poser = Poser(scene_rig, channels)
     for index in range(first, first + count):
         poser.set(sample_pose(channels, seed, index))
         yield
@@ -224,7 +225,7 @@ def _random_poses(
 def _named_pose(scene_rig: SceneRig, pose: NamedPose) -> Iterator[None]:
     clear_pose(scene_rig.armature_object)
     Poser(
-        scene_rig.armature_object,
+        scene_rig,
         tuple(Channel(bone, "rotation", axis, 0, 0) for bone in pose.rotations for axis in range(3)),
     ).set(np.array([angle for angles in pose.rotations.values() for angle in angles]))
     yield
@@ -253,8 +254,8 @@ class _Comparison:
         """Yields progress, returns PoseErrors."""
         matrices, positions, fdda, linear, surface = [], [], [], [], []
         for _ in poses:
-            pose, true = self._evaluator.evaluate()
-            moved = self._network.positions(pose[None])[0]
+            pose, true, controls = self._evaluator.evaluate()
+            moved = self._network.positions(pose[None], controls[None])[0]
             for values, what in ((true, "The rig"), (moved, f"The model '{self._network.path}'")):
                 if not np.isfinite(values).all():
                     raise FDDAError(

@@ -72,7 +72,8 @@ def draw_comparison(
         ModelError: the model cannot be read.
         OutputError: the file cannot be written.
     """
-    layer, network = LinearLayer(read_rig(scene_rig)), Network(model)
+    network = Network(model)
+    layer = LinearLayer(network.linear_rig(read_rig(scene_rig)))
     rows = []
     for pose in poses:
         linear = layer.positions(pose.pose_matrices[None])[0]

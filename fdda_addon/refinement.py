@@ -93,7 +93,7 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         chosen = choose_poses(probes, channels, _owned(recording, channels), base, rng)
         with RecordingExtension(recording, model.name) as extension:
             posed = (poser.set(pose) for pose in chosen)
-            layer = LinearLayer(rig, recording.partitions)
+            layer = LinearLayer(recording.rig, recording.partitions)
             with contextlib.closing(append_poses(posed, evaluator, layer, extension)) as steps:
                 for done in steps:
                     yield Progress("poses", done - first, settings.poses)

@@ -114,7 +114,7 @@ class LiveBinding:
     def linear_positions(self, mesh_object: bpy.types.Object, pose_matrices: np.ndarray) -> np.ndarray:
         """(V, 3) float32 of the linear layer alone, mesh-object space, metres."""
         if self._linear_layer is None:
-            rig = read_rig(SceneRig(mesh_object, _armature(mesh_object)))
+            rig = self.network.linear_rig(read_rig(SceneRig(mesh_object, _armature(mesh_object))))
             # The rest pose of the model: the objects may have moved since, and pose matrices refer to it.
             self._linear_layer = LinearLayer(replace(rig, rest_matrices=self.network.info.rest_matrices))
         return self._linear_layer.positions(pose_matrices[None])[0]
@@ -253,8 +253,8 @@ def _scan() -> None:
                 cache = nodes.new_cache(mesh_object)
                 nodes.set_cache(modifier, cache)
             caches.add(cache.name)
-        if mesh_object.fdda.mode != "RIG" and not mesh_object.fdda.is_playing:
-            # Linked or appended from a file, which holds the true rig.
+        if mesh_object.fdda.is_playing != (mesh_object.fdda.mode != "RIG"):
+            # Linked or appended from a file, which holds the true rig; or a library was reloaded.
             switch.switch_modifiers(mesh_object)
         if mesh_object.fdda.is_playing and mesh_object.session_uid not in _live:
             with _failing(mesh_object):
