@@ -32,6 +32,9 @@ test-trainer: .venv  ## the tests of the training, export and report
 test-blender: .venv  ## the tests that run in Blender
 	.venv/bin/python -m pytest tests/blender
 
+test-examples: .venv  ## the examples of docs/elsewhere.md, in Python and in Chromium (CHROMIUM=/path/to/chromium)
+	.venv/bin/python -m pytest tests/examples
+
 test-gui: package  ## press the buttons of the sidebar in a Blender with a window (BLENDER=/path/to/blender), into out/gui
 	.venv/bin/python tests/gui/run.py out/gui $(BLENDER)
 
@@ -75,6 +78,6 @@ requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
 		--output-file requirements/python-$$version.txt || exit; done
 
 clean:  ## remove what was built and the environments
-	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache
+	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-line demo test test-core test-trainer test-blender test-gui test-all test-line bench sampling study fixtures lint package requirements clean
+.PHONY: help .venv .venv-line demo test test-core test-trainer test-blender test-examples test-gui test-all test-line bench sampling study fixtures lint package requirements clean

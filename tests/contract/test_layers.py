@@ -54,7 +54,7 @@ def layer_of(unit: str) -> int:
 
 
 def python_files(folder: str) -> list[Path]:
-    files = sorted((ROOT / folder).rglob("*.py"))
+    files = sorted(file for file in (ROOT / folder).rglob("*.py") if "node_modules" not in file.parts)
     assert files, f"{folder} has no Python files: the rule would hold for nothing"
     return files
 
@@ -85,6 +85,10 @@ def test_the_trainer_needs_no_blender():
 def test_the_trainer_uses_only_the_core_of_the_addon():
     names = [(file.name, name) for file in python_files("trainer") for name in imported_names(file)]
     assert [pair for pair in names if pair[1].startswith("fdda_addon") and unit_of(pair[1]) != "core"] == []
+
+
+def test_the_examples_need_nothing_of_ours():
+    assert foreign_imports("examples", {"numpy", "onnxruntime"}) == []
 
 
 def test_imports_in_the_addon_point_one_way():

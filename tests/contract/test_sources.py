@@ -2,6 +2,7 @@
 """What every source file keeps to: its licence, its first sentence, nothing that runs data as code, no host names."""
 
 import ast
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +10,20 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-FOLDERS = ("fdda_addon", "trainer", "benchmarks", "tests", "blend_fixtures", "setup", "requirements", "docs", ".ci")
+FOLDERS = (
+    "fdda_addon",
+    "trainer",
+    "benchmarks",
+    "tests",
+    "blend_fixtures",
+    "setup",
+    "requirements",
+    "docs",
+    "examples",
+    ".ci",
+)
+INSTALLED = {"node_modules", "dist"}
+"""Folders of others, inside of ours."""
 SPDX = "# SPDX-License-Identifier: GPL-3.0-or-later"
 
 # Names that say nothing about what is inside: such a file grows without end.
@@ -27,13 +41,17 @@ REGISTRY_HOST = re.compile(
 def text_files() -> Iterator[tuple[Path, str]]:
     """Every text file of the project, with its text."""
     files = [file for file in ROOT.iterdir() if file.is_file() and not file.name.startswith(".venv")]
-    files += [file for folder in FOLDERS for file in (ROOT / folder).rglob("*") if file.is_file()]
+    for folder, inner, names in (step for top in FOLDERS for step in os.walk(ROOT / top)):
+        inner[:] = sorted(set(inner) - INSTALLED)
+        files += [Path(folder, name) for name in names]
     for file in files:
         try:
             yield file.relative_to(ROOT), file.read_text(encoding="utf-8")
         except UnicodeDecodeError:
             continue
 
+
+WEB_FILES = (".js", ".mjs", ".css", ".html")
 
 PYTHON_FILES = {str(path): text for path, text in sorted(text_files()) if path.suffix == ".py"}
 
@@ -52,6 +70,11 @@ def called_names(tree: ast.AST) -> Iterator[str]:
 def test_it_names_its_licence(source: str):
     lines = source.splitlines()
     assert SPDX in lines[:2]
+
+
+def test_files_of_web_pages_name_their_licence():
+    texts = {str(path): text for path, text in text_files() if path.suffix in WEB_FILES}
+    assert texts and [path for path, text in texts.items() if SPDX[2:] not in "".join(text.splitlines()[:2])] == []
 
 
 def test_it_says_what_it_is_for(source: str):
