@@ -221,11 +221,19 @@ def chain(name: str, *kinds: str) -> bpy.types.NodeTree:
     group = bpy.data.node_groups.new(name, "GeometryNodeTree")
     for in_out in ("INPUT", "OUTPUT"):
         group.interface.new_socket("Geometry", in_out=in_out, socket_type="NodeSocketGeometry")
-    nodes = [group.nodes.new(kind) for kind in ("NodeGroupInput", *kinds, "NodeGroupOutput")]
-    for before, after in pairwise(nodes):
-        target = next(socket for socket in after.inputs if socket.type == "GEOMETRY")
-        group.links.new(before.outputs[0], target)
+    for kind in ("NodeGroupInput", *kinds, "NodeGroupOutput"):
+        group.nodes.new(kind)
+    link_chain(group)
     return group
+
+
+def link_chain(group: bpy.types.NodeTree) -> None:
+    """Send geometry through the nodes of a group in their order, as far as they have sockets for it."""
+    for before, after in pairwise(group.nodes):
+        source = next((socket for socket in before.outputs if socket.type == "GEOMETRY"), None)
+        target = next((socket for socket in after.inputs if socket.type == "GEOMETRY"), None)
+        if source and target:
+            group.links.new(source, target)
 
 
 def _smooth(mesh_object: bpy.types.Object) -> None:

@@ -22,12 +22,11 @@ PLAYBACK_KEY = "fdda_version"
 DEFORMING = {
     "ARMATURE", "CAST", "CLOTH", "CORRECTIVE_SMOOTH", "CURVE", "DISPLACE", "HOOK", "LAPLACIANDEFORM",
     "LAPLACIANSMOOTH", "LATTICE", "MESH_CACHE", "MESH_DEFORM", "MESH_SEQUENCE_CACHE", "SHRINKWRAP", "SIMPLE_DEFORM",
-    "SMOOTH", "SOFT_BODY", "SURFACE_DEFORM", "VOLUME_DISPLACE", "WARP", "WAVE",
+    "SMOOTH", "SOFT_BODY", "SURFACE_DEFORM", "WARP", "WAVE",
 }  # fmt: skip
 TOPOLOGY_CHANGING = {
-    "ARRAY", "BEVEL", "BOOLEAN", "BUILD", "DECIMATE", "EDGE_SPLIT", "EXPLODE", "MASK", "MESH_TO_VOLUME", "MIRROR",
-    "MULTIRES", "PARTICLE_INSTANCE", "REMESH", "SCREW", "SKIN", "SOLIDIFY", "SUBSURF", "VOLUME_TO_MESH", "WELD",
-    "WIREFRAME",
+    "ARRAY", "BEVEL", "BOOLEAN", "BUILD", "DECIMATE", "EDGE_SPLIT", "EXPLODE", "MASK", "MIRROR", "MULTIRES",
+    "PARTICLE_INSTANCE", "REMESH", "SCREW", "SKIN", "SOLIDIFY", "SUBSURF", "VOLUME_TO_MESH", "WELD", "WIREFRAME",
 }  # fmt: skip
 IN_TIME = {
     "BUILD": "changes with time", "CLOTH": "is a simulation", "DYNAMIC_PAINT": "is a simulation",
@@ -40,6 +39,8 @@ BOUND = {
     "SURFACE_DEFORM": "is_bound",
 }  # fmt: skip
 """Modifiers that remember the rest pose, and the property that says whether they do."""
+NEED_ORIGINAL = {"MULTIRES", "SOFT_BODY"}
+"""Blender lets no modifier that makes a mesh, as the one that plays a model does, stand before these, on or off."""
 
 
 class _Kind(Enum):
@@ -56,7 +57,8 @@ class ModifierStack:
     """The modifiers of a rig, by name, in their order.
 
     Attributes:
-        replaced: those that move vertices, switched on or not, up to the last of them that is on.
+        replaced: those that move vertices, switched on or not, up to the last of them that is on, and what a model
+            cannot stand before.
         misplaced: those that are on and change the topology before the last of `replaced`.
         live: those that are on and change the topology after it.
         place: index after the last of `replaced`, the modifier that plays a model not counted.
@@ -92,12 +94,13 @@ def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
         with _switched_off(mesh_object, [m for m in generating if m != modifiers[i]]):
             kinds[i] = _Kind.DEFORMS if _keeps_topology(mesh_object) else _Kind.GENERATES
     deforming = [i for i, kind in enumerate(kinds) if kind in moving]
+    bound = {i for i, m in enumerate(modifiers) if m.type in NEED_ORIGINAL}
     # Where all are off, the last of all: what the user switches on later is replaced.
-    last = max([i for i in deforming if modifiers[i].show_viewport] or deforming, default=-1)
+    last = max(*([i for i in deforming if modifiers[i].show_viewport] or deforming), *bound, -1, -1)
     generating = [i for i, kind in enumerate(kinds) if kind is _Kind.GENERATES and modifiers[i].show_viewport]
     return ModifierStack(
-        replaced=tuple(modifiers[i].name for i in deforming if i <= last),
-        misplaced=tuple(modifiers[i].name for i in generating if i < last),
+        replaced=tuple(m.name for i, m in enumerate(modifiers[: last + 1]) if i in bound.union(deforming)),
+        misplaced=tuple(modifiers[i].name for i in generating if i <= last),
         live=tuple(modifiers[i].name for i in generating if i > last),
         place=last + 1,
     )
@@ -137,11 +140,16 @@ def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
             )
         if _is_unbound(modifier):
             raise RigError(f"{what} is not bound, so it does nothing; bind it first, or switch it off in the viewport.")
-    if stack.misplaced:
+    for name in stack.misplaced:
+        what = f"Modifier '{name}' of '{mesh_object.name}' changes the topology of the mesh"
+        if mesh_object.modifiers[name].type in NEED_ORIGINAL:
+            raise RigError(
+                f"{what}, and Blender lets nothing that plays a model stand before it; switch it off in the viewport, "
+                "or apply it."
+            )
         raise RigError(
-            f"Modifier '{stack.misplaced[0]}' of '{mesh_object.name}' changes the topology of the mesh before "
-            f"'{stack.replaced[-1]}' deforms it, so its vertices cannot be followed; move it to the end of the "
-            "modifiers, switch it off in the viewport, or apply it."
+            f"{what} before '{stack.replaced[-1]}', which a model replaces, so its vertices cannot be followed; move "
+            "it to the end of the modifiers, switch it off in the viewport, or apply it."
         )
     return stack
 
@@ -250,8 +258,9 @@ def _keeps_topology(mesh_object: bpy.types.Object) -> bool:
 def _check_count(mesh_object: bpy.types.Object, stack: ModifierStack) -> None:
     count = len(_evaluated(mesh_object).data.vertices)
     if count != len(mesh_object.data.vertices):
-        names = [m.name for m in mesh_object.modifiers if m.show_viewport and m.name not in stack.replaced]
+        others = [m.name for m in mesh_object.modifiers if m.name not in stack.replaced and m.show_viewport]
+        names = stack.live or others or stack.replaced
         raise RigError(
             f"The modifiers of '{mesh_object.name}' turn {len(mesh_object.data.vertices)} vertices into {count}; "
-            f"switch off the one that changes the topology ({', '.join(names) or 'none of its own'})."
+            f"switch off the one that changes the topology ({', '.join(names)})."
         )

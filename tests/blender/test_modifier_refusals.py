@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What no model can stand in for is refused with the modifier's name, and parenting alone with the mesh's."""
+
+import bpy
+import pytest
+from conftest import ELBOW, ELBOW_RIG, assert_plays
+from modifiers import FEW, at, character, nodes_at
+from scene_state import assert_same_state, drain, scene_state
+
+from blend_fixtures.characters import stacks
+from blend_fixtures.characters.base import drive, tube
+from fdda_addon.core.errors import RigError
+from fdda_addon.evaluation import EvaluationSettings, evaluate
+from fdda_addon.recording import record
+from fdda_addon.rig_check import check
+from fdda_addon.runtime.binding import bind
+from fdda_addon.scene.rig import find_rig
+
+
+def simulating(mesh_object: bpy.types.Object) -> None:
+    group = stacks.chain("Group", "GeometryNodeSimulationInput", "GeometryNodeSimulationOutput")
+    group.nodes["Simulation Input"].pair_with_output(group.nodes["Simulation Output"])
+    stacks.link_chain(group)
+    at(2, "NODES", node_group=group)(mesh_object)
+
+
+def in_a_nested_group(mesh_object: bpy.types.Object) -> None:
+    inner, outer = stacks.ripple_group(), stacks.chain("Outer", "GeometryNodeGroup")
+    inner.nodes.new("GeometryNodeInputSceneTime")
+    outer.nodes["Group"].node_tree = inner
+    stacks.link_chain(outer)
+    at(2, "NODES", node_group=outer)(mesh_object)
+
+
+def painted(mesh_object: bpy.types.Object) -> None:
+    mesh_object.modifiers.new("It", "DYNAMIC_PAINT")
+    with bpy.context.temp_override(object=mesh_object, active_object=mesh_object):
+        bpy.ops.dpaint.type_toggle(type="CANVAS")
+    mesh_object.modifiers["It"].canvas_settings.canvas_surfaces[0].surface_type = "DISPLACE"
+
+
+POSE = "so its result does not follow from the pose; switch it off in the viewport, or remove it."
+MIDDLE = (
+    "changes the topology of the mesh before 'Mush', which a model replaces, so its vertices cannot be followed; move "
+    "it to the end of the modifiers, switch it off in the viewport, or apply it."
+)
+ORIGINAL = (
+    "changes the topology of the mesh, and Blender lets nothing that plays a model stand before it; switch it off in "
+    "the viewport, or apply it."
+)
+UNBOUND = "is not bound, so it does nothing; bind it first, or switch it off in the viewport."
+REFUSED = {
+    **{kind: (at(2, kind), f"is a simulation, {POSE}") for kind in ("CLOTH", "SOFT_BODY")},
+    **{kind: (at(2, kind), f"plays a cache, {POSE}") for kind in ("MESH_CACHE", "MESH_SEQUENCE_CACHE")},
+    **{kind: (at(0, kind), f"changes with time, {POSE}") for kind in ("WAVE", "BUILD")},
+    "OCEAN": (at(2, "OCEAN", geometry_mode="DISPLACE", resolution=2), f"changes with time, {POSE}"),
+    "EXPLODE": (at(1, "EXPLODE"), f"is a simulation, {POSE}"),
+    "FLUID": (at(1, "FLUID", fluid_type="DOMAIN"), f"is a simulation, {POSE}"),
+    "DYNAMIC_PAINT": (painted, f"is a simulation, {POSE}"),
+    "simulation zone": (simulating, f"changes with time (node 'Simulation Input' of 'Group'), {POSE}"),
+    "scene time": (in_a_nested_group, f"changes with time (node 'Scene Time' of 'Ripple'), {POSE}"),
+    **{
+        f"{kind} at {place}": (at(place, kind), MIDDLE)
+        for kind in ("SUBSURF", "MIRROR", "DECIMATE", "SOLIDIFY")
+        for place in (0, 1)
+    },
+    **{f"MULTIRES at {place}": (at(place, "MULTIRES"), ORIGINAL) for place in (0, 2)},
+    "subdividing nodes": (nodes_at(1, "GeometryNodeSubdivideMesh"), MIDDLE),
+    "CORRECTIVE_SMOOTH": (at(2, "CORRECTIVE_SMOOTH", rest_source="BIND"), UNBOUND),
+    **{kind: (at(0, kind), UNBOUND) for kind in ("SURFACE_DEFORM", "MESH_DEFORM", "LAPLACIANDEFORM")},
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_no_model_can_stand_in_for_is_named(name, elbow, tmp_path):
+    add, sentence = REFUSED[name]
+    rig = character(stacks.corrective_smooth)
+    add(rig.mesh_object)
+    sentence = f"Modifier 'It' of 'elbow' {sentence}"
+    before = scene_state(rig)
+    for refused in (
+        lambda: drain(record(rig, tmp_path / "recording", FEW)),
+        lambda: drain(evaluate(rig, elbow.model, EvaluationSettings(poses=2))),
+        lambda: bind(rig, elbow.model),
+    ):
+        with pytest.raises(RigError) as error:
+            refused()
+        assert str(error.value) == sentence
+    assert sentence in check(rig).problems
+    assert_same_state(before, scene_state(rig))
+    assert not (tmp_path / "recording").exists()
+    # Switched off, nothing is wrong with it.
+    rig.mesh_object.modifiers["It"].show_viewport = False
+    assert check(rig).problems == ()
+    bind(rig, elbow.model)
+    assert_plays(rig.mesh_object, elbow.model)
+
+
+def test_hidden_nodes_cannot_be_sorted(elbow):
+    rig = character()
+    nodes_at(1, "GeometryNodeTransform")(rig.mesh_object)
+    rig.mesh_object.hide_viewport = True
+    with pytest.raises(RigError, match="'elbow' is hidden, so Blender does not evaluate it"):
+        bind(rig, elbow.model)
+
+
+def test_a_live_modifier_that_a_driver_keeps_on(tmp_path):
+    rig = character()
+    modifier = rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
+    drive(modifier, "show_viewport", rig.armature_object, "1")
+    count = len(rig.mesh_object.data.vertices)
+    with pytest.raises(RigError) as error:
+        drain(record(rig, tmp_path / "recording", FEW))
+    assert f"The modifiers of 'elbow' turn {count} vertices into " in str(error.value)
+    assert str(error.value).endswith("; switch off the one that changes the topology (Subdivision).")
+
+
+PARENTED = {
+    "ARMATURE": "'elbow' is deformed by 'elbow_rig' as its parent, without a modifier; set the type of its parent to "
+    "Object and add an Armature modifier with 'elbow_rig'.",
+    "BONE": "'elbow' is parented to the bone 'lower' of 'elbow_rig' and moves with it as a whole, so there is nothing "
+    "to learn; choose a mesh with an Armature modifier.",
+    "OBJECT": "'elbow' is parented to the armature 'elbow_rig', and no modifier deforms it with that; add an Armature "
+    "modifier with 'elbow_rig', or choose another mesh.",
+}
+
+
+@pytest.mark.parametrize("kind", PARENTED)
+@pytest.mark.parametrize("way", ["the only mesh", "by name", "active", "active armature"])
+def test_parenting_alone_is_no_rig(kind, way):
+    from fdda_addon.scene.active_rig import active_rig
+
+    mesh_object, armature_object = tube()
+    mesh_object.modifiers.clear()
+    mesh_object.parent_type = kind
+    if kind == "BONE":
+        mesh_object.parent_bone = "lower"
+    bpy.context.view_layer.objects.active = armature_object if way == "active armature" else mesh_object
+    with pytest.raises(RigError) as error:
+        active_rig(bpy.context) if way.startswith("active") else find_rig(ELBOW if way == "by name" else "")
+    assert str(error.value) == PARENTED[kind]
+
+
+def test_a_mesh_beside_a_parented_one_is_found():
+    mesh_object, armature_object = tube()
+    prop = bpy.data.objects.new("prop", bpy.data.meshes.new("prop"))
+    bpy.context.scene.collection.objects.link(prop)
+    prop.parent, prop.parent_type, prop.parent_bone = armature_object, "BONE", "lower"
+    assert find_rig().mesh_object == mesh_object
+    assert bpy.data.objects[ELBOW_RIG] == armature_object

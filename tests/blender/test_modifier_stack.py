@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Every deforming modifier is recorded and played, what comes after the rig stays on, what cannot be is named."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import assert_plays, evaluated, pose
+from modifiers import FEW, at, character, nodes_at
+from scene_state import assert_same_state, drain, scene_state
+
+from blend_fixtures.characters import stacks
+from fdda_addon.evaluation import EvaluationSettings, evaluate
+from fdda_addon.recording import record
+from fdda_addon.rig_check import check
+from fdda_addon.runtime.binding import bind, unbind
+from fdda_addon.scene.modifier_stack import ModifierStack, read_stack
+from fdda_addon.scene.rig import SceneRig
+
+MOVES = 0.001
+"""Metres by which a stack moves some vertex, at the least, from where linear skinning has it."""
+
+
+def residuals(rig: SceneRig, folder: Path) -> np.ndarray:
+    drain(record(rig, folder / "recording", FEW))
+    return np.load(folder / "recording" / "residuals.npy")
+
+
+def shown(rig: SceneRig) -> list[tuple]:
+    return [(m.name, m.show_viewport, m.show_render) for m in rig.mesh_object.modifiers]
+
+
+@pytest.mark.parametrize("build", stacks.STACKS, ids=lambda build: build.__name__)
+def test_a_deforming_stack_is_recorded_and_played(build, elbow, tmp_path):
+    rig = character(build)
+    assert check(rig).problems == ()
+    before, modifiers = scene_state(rig), shown(rig)
+    assert np.linalg.norm(residuals(rig, tmp_path), axis=2).max() > MOVES
+    assert_same_state(before, scene_state(rig))
+
+    pose(angle=1.0)
+    true = evaluated(rig.mesh_object)
+    bind(rig, elbow.model)
+    live = [m for m in rig.mesh_object.modifiers if m.name in read_live(rig)]
+    assert len(evaluated(rig.mesh_object)) == len(true)
+    for modifier in live:
+        modifier.show_viewport = False
+    for mode in ("FDDA", "LINEAR"):
+        rig.mesh_object.fdda.mode = mode
+        assert len(evaluated(rig.mesh_object)) == len(rig.mesh_object.data.vertices)
+    rig.mesh_object.fdda.mode = "FDDA"
+    assert_plays(rig.mesh_object, elbow.model)
+    for modifier in live:
+        modifier.show_viewport = True
+    unbind(rig.mesh_object)
+    assert shown(rig) == modifiers
+    np.testing.assert_allclose(evaluated(rig.mesh_object), true, atol=1e-6)
+
+
+def read_live(rig: SceneRig) -> tuple[str, ...]:
+    """The live modifiers of a bound object."""
+    with_rig, rig.mesh_object.fdda.mode = rig.mesh_object.fdda.mode, "RIG"
+    live = read_stack(rig.mesh_object).live
+    rig.mesh_object.fdda.mode = with_rig
+    return live
+
+
+def test_what_makes_vertices_after_the_rig_works_on_what_the_model_gives(elbow):
+    rig = character(stacks.subdivided)
+    assert read_stack(rig.mesh_object) == ModifierStack(
+        ("Armature", "Mush"), (), ("Subdivision", "Thickness", "Detail"), 2
+    )
+    pose(angle=1.0)
+    true = evaluated(rig.mesh_object)
+    bind(rig, elbow.model)
+    playing = evaluated(rig.mesh_object)
+    assert len(playing) == len(true) > 8 * len(rig.mesh_object.data.vertices)
+    # The mush of this character is not quite the one that the model has learnt.
+    assert np.linalg.norm(playing - true, axis=1).mean() < 0.002
+    assert [m.name for m in rig.mesh_object.modifiers if m.show_viewport] == [
+        "FDDA", "Subdivision", "Thickness", "Detail",
+    ]  # fmt: skip
+
+
+def test_an_evaluation_borrows_what_is_live(rig, elbow):
+    settings = EvaluationSettings(poses=3, beyond=())
+    errors = drain(evaluate(rig, elbow.model, settings)).fdda
+    rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
+    before = scene_state(rig)
+    assert drain(evaluate(rig, elbow.model, settings)).fdda == errors
+    assert_same_state(before, scene_state(rig))
+
+
+def test_what_is_live_comes_back_when_a_recording_is_broken_off(tmp_path):
+    rig = character(stacks.subdivided)
+    before = scene_state(rig)
+    drain(record(rig, tmp_path / "recording", FEW), stop_after=2)
+    assert_same_state(before, scene_state(rig))
+
+
+def test_modifiers_that_do_not_deform_stay_as_they_are_wherever_they_are(elbow, tmp_path):
+    rig = character(stacks.corrective_smooth)
+    plain = residuals(rig, tmp_path)
+    first = ("UV_WARP", "VERTEX_WEIGHT_EDIT", "DATA_TRANSFER")
+    for kind in ("WEIGHTED_NORMAL", "TRIANGULATE", "PARTICLE_SYSTEM", "FLUID", "COLLISION", *first):
+        rig.mesh_object.modifiers.new(kind, kind)
+    for place in range(len(first)):
+        rig.mesh_object.modifiers.move(len(rig.mesh_object.modifiers) - 1, place)
+    (tmp_path / "again").mkdir()
+    assert read_stack(rig.mesh_object).replaced == ("Armature", "Mush")
+    np.testing.assert_allclose(residuals(rig, tmp_path / "again"), plain, atol=1e-6)
+    bind(rig, elbow.model)
+    assert {m.name for m in rig.mesh_object.modifiers if not m.show_viewport} == {"Armature", "Mush"}
+    assert_plays(rig.mesh_object, elbow.model)
+
+
+def test_a_modifier_that_only_renders_show_is_off_while_a_model_renders(elbow):
+    rig = character(stacks.corrective_smooth)
+    rig.mesh_object.modifiers.new("Subdivision", "SUBSURF").show_viewport = False
+    rig.mesh_object.modifiers.move(2, 1)
+    before = shown(rig)
+    bind(rig, elbow.model, use_in_render=True)
+    assert not rig.mesh_object.modifiers["Subdivision"].show_render
+    rig.mesh_object.fdda.mode = "RIG"
+    assert [state for state in shown(rig) if state[0] != "FDDA"] == before
+
+
+def test_a_modifier_that_is_off_after_what_is_live_stays_out_of_it(elbow):
+    rig = character(stacks.subdivided)
+    rig.mesh_object.modifiers.new("Cast", "CAST").show_viewport = False
+    bind(rig, elbow.model)
+    assert rig.mesh_object.modifiers.find("FDDA") == 2
+
+
+def test_the_modifier_that_plays_goes_before_one_that_is_pinned_to_the_end(elbow):
+    rig = character(stacks.corrective_smooth)
+    last = rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
+    last.use_pin_to_last = True
+    bind(rig, elbow.model)
+    assert [m.name for m in rig.mesh_object.modifiers] == ["Armature", "Mush", "FDDA", "Subdivision"]
+
+
+@pytest.mark.parametrize("kind", ["BUILD", "EXPLODE", "PARTICLE_INSTANCE"])
+def test_what_makes_vertices_in_time_after_the_rig_is_live(kind):
+    rig = character(stacks.corrective_smooth)
+    at(2, kind)(rig.mesh_object)
+    assert read_stack(rig.mesh_object).live == ("It",)
+    assert check(rig).problems == ()
+
+
+@pytest.mark.parametrize(
+    ("kinds", "expected"),
+    [
+        ((), "neutral"),
+        (("GeometryNodeSetShadeSmooth", "GeometryNodeStoreNamedAttribute"), "neutral"),
+        (("GeometryNodeSetPosition", "GeometryNodeSetMaterial"), "replaced"),
+        (("GeometryNodeTransform",), "replaced"),
+        (("GeometryNodeJoinGeometry",), "replaced"),
+        (("GeometryNodeTriangulate",), "live"),
+        (("GeometryNodeSubdivideMesh",), "live"),
+        (("GeometryNodeFlipFaces",), "live"),
+        (("GeometryNodeMeshToPoints",), "live"),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, tuple) else value,
+)
+@pytest.mark.parametrize("after", ["", "SUBSURF"])
+def test_geometry_nodes_are_sorted_by_what_they_do(kinds, expected, after):
+    rig = character(stacks.corrective_smooth)
+    nodes_at(2, *kinds)(rig.mesh_object)
+    if after:
+        rig.mesh_object.modifiers.new("After", after)
+    before = scene_state(rig)
+    stack = read_stack(rig.mesh_object)
+    assert stack.replaced == ("Armature", "Mush") + (("It",) if expected == "replaced" else ())
+    assert stack.live == (("It",) if expected == "live" else ()) + (("After",) if after else ())
+    assert_same_state(before, scene_state(rig))
+
+
+def test_a_group_whose_geometry_leads_nowhere_leaves_no_vertices():
+    rig = character()
+    nodes_at(1)(rig.mesh_object)
+    group = rig.mesh_object.modifiers["It"].node_group
+    group.links.clear()
+    assert read_stack(rig.mesh_object).live == ("It",)
+
+
+def test_an_attribute_that_is_the_position_moves_vertices():
+    rig = character()
+    nodes_at(1, "GeometryNodeStoreNamedAttribute")(rig.mesh_object)
+    group = rig.mesh_object.modifiers["It"].node_group
+    group.nodes["Store Named Attribute"].inputs["Name"].default_value = "position"
+    assert read_stack(rig.mesh_object).replaced == ("Armature", "It")
+
+
+def test_shading_nodes_after_a_subdivision_are_no_reason_to_refuse_it(elbow, tmp_path):
+    """As Blender adds them to every file that had auto smooth."""
+    rig = character(stacks.corrective_smooth)
+    rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
+    nodes_at(3, "GeometryNodeSetShadeSmooth")(rig.mesh_object)
+    rig.mesh_object.modifiers["It"].use_pin_to_last = True
+    assert len(residuals(rig, tmp_path)) == FEW.poses
+    bind(rig, elbow.model)
+    assert [m.name for m in rig.mesh_object.modifiers if m.show_viewport] == ["FDDA", "Subdivision", "It"]
