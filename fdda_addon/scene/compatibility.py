@@ -15,6 +15,36 @@ def animation_curves(action: bpy.types.Action) -> list[bpy.types.FCurve]:
     return list(getattr(action, "fcurves", ()))
 
 
+def slot_of(action: bpy.types.Action, datablock: bpy.types.ID) -> "bpy.types.ActionSlot | None":
+    """The slot with which an action animates a datablock, None when there is none (4.4 and later have slots).
+
+    The one of its name, else the only one. An armature object takes any other that animates bones: it plays actions
+    that were made for another character. Which slot it had last does not count, for the answer must not depend on what
+    was played before.
+    """
+    known = getattr(action, "slots", ())
+    slots = [slot for slot in known if slot.target_id_type in {datablock.id_type, "UNSPECIFIED"}]
+    chosen = [slot for slot in slots if slot.name_display == datablock.name]
+    if len(known) == 1:
+        chosen += slots
+    if not chosen and getattr(datablock, "type", "") == "ARMATURE":
+        chosen = [s for s in slots if any(c.data_path.startswith("pose.bones[") for c in _curves_of_slot(action, s))]
+    return chosen[0] if chosen else None
+
+
+def curves_of(action: bpy.types.Action, datablock: bpy.types.ID) -> list[bpy.types.FCurve]:
+    """The F-curves with which an action animates a datablock."""
+    if not hasattr(action, "slots"):
+        return list(action.fcurves) if action.id_root == datablock.id_type else []
+    slot = slot_of(action, datablock)
+    return [] if slot is None else _curves_of_slot(action, slot)
+
+
+def _curves_of_slot(action: bpy.types.Action, slot: "bpy.types.ActionSlot") -> list[bpy.types.FCurve]:
+    bags = (strip.channelbag(slot) for layer in action.layers for strip in layer.strips)
+    return [curve for bag in bags if bag is not None for curve in bag.fcurves]
+
+
 def set_node_input(modifier: bpy.types.NodesModifier, identifier: str, value: object) -> None:
     """Set an input of a Geometry Nodes modifier by the identifier of its socket."""
     if hasattr(modifier, "properties") and hasattr(modifier.properties, "inputs"):
@@ -28,3 +58,8 @@ def node_input(modifier: bpy.types.NodesModifier, identifier: str) -> object:
     if hasattr(modifier, "properties") and hasattr(modifier.properties, "inputs"):
         return getattr(getattr(modifier.properties.inputs, identifier, None), "value", None)
     return modifier.get(identifier)
+
+
+def is_selected(bone: bpy.types.PoseBone) -> bool:
+    """Whether a bone is selected (5.0 and later keep that with the pose)."""
+    return bone.select if hasattr(bone, "select") else bone.bone.select
