@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Self
 
 from .core.errors import TrainingError, WrongUsageError
 from .core.messages import Message, MessageType
@@ -27,35 +28,47 @@ def trainer_python() -> str:
     return chosen_python().path
 
 
-def trainer_command(arguments: list[str], python: str | None = None) -> tuple[list[str], dict[str, str]]:
+def trainer_command(
+    arguments: list[str], python: str | None = None, module: str = "trainer"
+) -> tuple[list[str], dict[str, str]]:
     """Command line and environment of the trainer, for `subprocess`.
 
     Args:
         arguments: of `python -m trainer`.
         python: the interpreter, `trainer_python()` when left out.
+        module: another one of the trainer's that can be run.
     """
     root = Path(__file__).parent.parent
     paths = [str(root), *filter(None, [os.environ.get("PYTHONPATH")])]
     # -P: a folder `trainer` in the current folder must not be run in place of ours.
-    command = [python or trainer_python(), "-P", "-m", "trainer", *arguments]
+    command = [python or trainer_python(), "-P", "-m", module, *arguments]
     return command, {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
-class Training:
-    """A training in a process of its own; use as a context manager: the process is gone when the block ends."""
+class TrainerProcess:
+    """A process of the trainer; use as a context manager: the process is gone when the block ends.
+
+    Attributes:
+        module: what `python -m` runs.
+        failed, lost: what errors say where the process does not.
+    """
+
+    module = "trainer"
+    failed = "The training failed."
+    lost = "no model was written, train again"
 
     def __init__(self, arguments: list[str], python: str | None = None):
-        """Start the trainer.
+        """Start the process.
 
         Args:
-            arguments: of `python -m trainer`: recording, model and settings.
+            arguments: of the module.
             python: the interpreter, `trainer_python()` when left out.
 
         Raises:
             TrainingError: the interpreter cannot be started.
         """
         advice = chosen_python().origin.value if python is None else "name a Python that has torch"
-        command, environment = trainer_command(["--messages", *arguments], python)
+        command, environment = trainer_command(arguments, python, self.module)
         self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - __exit__ closes it
         try:
             self._process = subprocess.Popen(
@@ -116,7 +129,7 @@ class Training:
                 # A library that prints; not worth losing a training.
                 continue
             if message.type is MessageType.FAILED:
-                raise TrainingError(str(message.values.get("text", "The training failed.")))
+                raise TrainingError(str(message.values.get("text", self.failed)))
             yield message
             last = message
         while not wait and self._process.poll() is None:
@@ -133,13 +146,13 @@ class Training:
         text = self._error_text().strip().splitlines()
         reason = f" ({text[-1].strip()})" if text else ""
         how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
-        return f"The trainer {how} before it was done{reason}; no model was written, train again."
+        return f"The trainer {how} before it was done{reason}; {self.lost}."
 
     def _error_text(self) -> str:
         self._errors.seek(0)
         return self._errors.read()
 
-    def __enter__(self) -> "Training":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -155,3 +168,11 @@ class Training:
         if not self._reader.is_alive():
             self._process.stdout.close()
         self._errors.close()
+
+
+class Training(TrainerProcess):
+    """A training in a process of its own."""
+
+    def __init__(self, arguments: list[str], python: str | None = None):
+        """Start the trainer; `arguments` are recording, model and settings, all else as in `TrainerProcess`."""
+        super().__init__(["--messages", *arguments], python)

@@ -31,7 +31,9 @@ __all__ = [
     "array_shapes",
     "partitions_json",
     "read_index",
+    "read_info",
     "read_partitions",
+    "read_recorded_skin",
     "read_recording",
     "streamed_arrays",
 ]
@@ -146,6 +148,25 @@ def read_recording(path: Path) -> Recording:
             f"The index of '{path}' is damaged: its sources do not add up to its {index['poses']} poses; record again."
         )
     return Recording(path, info, rig, partitions, *(arrays[name] for name in STREAMED))
+
+
+def read_recorded_skin(path: Path, index: dict) -> tuple[np.ndarray, np.ndarray]:
+    """The skin weights of a recording, complete or not; `index` is what `read_index` gave.
+
+    Returns:
+        (V, I) int32 joints and (V, I) float32 weights.
+
+    Raises:
+        RecordingError: they are missing or damaged.
+    """
+    shape = index["vertices"], index["influences"]
+    joints, weights = (
+        np.array(_open_array(path / f"{name}.npy", shape, dtype))
+        for name, dtype in (("skin_joints", np.int32), ("skin_weights", np.float32))
+    )
+    if not are_skin_weights(joints, weights, len(index["joints"])):
+        raise RecordingError(f"The skin weights of '{path}' are damaged; record again.")
+    return joints, weights
 
 
 def partitions_json(partitions: tuple[Partition, ...]) -> list[dict]:
