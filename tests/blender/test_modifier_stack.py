@@ -3,6 +3,7 @@
 
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
 from conftest import assert_plays, evaluated, pose
@@ -201,3 +202,16 @@ def test_shading_nodes_after_a_subdivision_are_no_reason_to_refuse_it(elbow, tmp
     assert len(residuals(rig, tmp_path)) == FEW.poses
     bind(rig, elbow.model)
     assert [m.name for m in rig.mesh_object.modifiers if m.show_viewport] == ["FDDA", "Subdivision", "It"]
+
+
+def test_a_simulation_after_the_rig_works_on_what_the_model_gives(elbow):
+    rig = character(stacks.corrective_smooth)
+    at(2, "CLOTH", show_viewport=False)(rig.mesh_object)
+    bind(rig, elbow.model)
+    rig.mesh_object.modifiers["It"].show_viewport = True
+    for frame in range(1, 5):
+        bpy.context.scene.frame_set(frame)
+    falling = evaluated(rig.mesh_object)
+    rig.mesh_object.modifiers["It"].show_viewport = False
+    moved = falling - assert_plays(rig.mesh_object, elbow.model)
+    assert len(falling) == len(rig.mesh_object.data.vertices) and -0.2 < moved[:, 2].mean() < -0.001
