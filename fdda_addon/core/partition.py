@@ -10,6 +10,8 @@ from .rig import Rig
 
 INFLUENCE_TOLERANCE = 1e-4
 """A joint influences a partition when it moves a local residual by more than this part of the character's size."""
+LEAST_VERTICES = 8
+"""Partitions of fewer vertices are merged into others."""
 GOLDEN_RATIO = 0.618034
 
 
@@ -75,6 +77,60 @@ def make_partitions(
         )
         for joint in np.unique(main).tolist()
     )
+
+
+def small_partition_merges(rig: Rig, least: int = LEAST_VERTICES) -> dict[int, int]:
+    """Choose where the vertices of small partitions go.
+
+    The smallest goes first: to the partition whose joint has the most weight on its vertices, else to that of the
+    nearest ancestor or descendant. One with neither stays, and so does the last of all.
+
+    Args:
+        rig: the rig.
+        least: partitions of fewer vertices are small; 0 merges none.
+
+    Returns:
+        For each main joint whose vertices go elsewhere the joint whose partition takes them, for `make_partitions`.
+    """
+    main = main_joints(rig.skin_joints, rig.skin_weights)
+    weights: dict[int, np.ndarray] = {}
+    for joint in np.unique(main).tolist():
+        own = main == joint
+        weights[joint] = np.bincount(
+            rig.skin_joints[own].ravel(), rig.skin_weights[own].ravel(), minlength=len(rig.joints)
+        )
+    counts = dict(zip(*(values.tolist() for values in np.unique(main, return_counts=True)), strict=True))
+    merged: dict[int, int] = {}
+    stays: set[int] = set()
+    while small := [joint for joint in counts if counts[joint] < least and joint not in stays]:
+        joint = min(small, key=lambda j: (counts[j], j))
+        other = _merge_target(rig, joint, weights)
+        if other is None:
+            stays.add(joint)
+            continue
+        counts[other] += counts.pop(joint)
+        weights[other] += weights.pop(joint)
+        stays.discard(other)
+        merged = {j: other if into == joint else into for j, into in merged.items()} | {joint: other}
+    return merged
+
+
+def _merge_target(rig: Rig, joint: int, weights: dict[int, np.ndarray]) -> int | None:
+    """The joint whose partition takes the vertices of a small one; `weights` has the joints that have one."""
+    others = [other for other in weights if other != joint]
+    heaviest = max(others, key=lambda other: weights[joint][other], default=None)
+    if heaviest is None or weights[joint][heaviest] > 0:
+        return heaviest
+    steps = {other: _steps_down(rig, other, joint) or _steps_down(rig, joint, other) for other in others}
+    return min((other for other in others if steps[other]), key=lambda other: steps[other], default=None)
+
+
+def _steps_down(rig: Rig, ancestor: int, joint: int) -> int:
+    """How many generations a joint is below an ancestor; 0 when it is not."""
+    steps = 0
+    while joint >= 0 and joint != ancestor:
+        joint, steps = rig.joints[joint].parent, steps + 1
+    return steps if joint >= 0 else 0
 
 
 def residual_changes(partitions: tuple[Partition, ...], moved: np.ndarray, base: np.ndarray) -> np.ndarray:
