@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A warning about a recording, and the words that such sentences share."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+from .rig import UNMOVED, Rig
+
+MOST_LISTED = 3
+
+
+@dataclass(frozen=True)
+class RecordingWarning:
+    """Something about a recording that makes a bad model likely.
+
+    Attributes:
+        name: which kind, the heading in docs/checks.md.
+        text: one sentence for the user: what was found, with names and numbers, and what to do.
+    """
+
+    name: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"Warning ({self.name}): {self.text}"
+
+    def to_json(self) -> dict:
+        return asdict(self)
+
+
+def listed(names: Sequence[object], most: int = MOST_LISTED) -> str:
+    """The first of some names or numbers: "'a', 'b', 'c' and 4 more"; texts are quoted."""
+    shown = [f"'{name}'" if isinstance(name, str) else str(name) for name in names[:most]]
+    if len(names) > most:
+        return f"{', '.join(shown)} and {len(names) - most} more"
+    return f"{', '.join(shown[:-1])} and {shown[-1]}" if len(shown) > 1 else "".join(shown)
+
+
+def counted(names: Sequence[object], noun: str, plural: str = "") -> str:
+    """How many and which: "the joint 'a'", "the 7 joints 'a', 'b', 'c' and 4 more"."""
+    if len(names) == 1:
+        return f"the {noun} {listed(names)}"
+    return f"the {len(names)} {plural or noun + 's'} {listed(names)}"
+
+
+def joint_name(rig: Rig, joint: int) -> str:
+    """Name of a joint for people, also of the one that never moves."""
+    name = rig.joints[joint].name
+    return "(no bone)" if name == UNMOVED else name
+
+
+def length(metres: float) -> str:
+    """A length for people: "0.04 mm", "87 mm", "1.2 m"."""
+    if metres < 1:
+        return f"{metres * 1000:.2g} mm" if metres < 0.1 else f"{metres * 1000:.0f} mm"
+    return f"{metres:.3g} m"

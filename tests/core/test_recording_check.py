@@ -1,0 +1,352 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Each warning is found in a recording that was spoilt for it, and in no other."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from good_recording import BONE, JOINTS, LIMIT, good_recording, pose_rig, turns, with_rig
+
+from fdda_addon.core import residual_scan
+from fdda_addon.core.controls import Control
+from fdda_addon.core.flip_check import alike_poses
+from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.poses import Channel
+from fdda_addon.core.recording import Recording, Source
+from fdda_addon.core.recording_check import NAMES, bone_lengths, check_recording
+from fdda_addon.core.recording_warning import RecordingWarning, counted, length, listed
+from fdda_addon.core.rig import UNMOVED, Joint
+
+CHECKS = Path(__file__).resolve().parents[2] / "docs" / "checks.md"
+
+
+@pytest.fixture
+def good() -> Recording:
+    return good_recording()
+
+
+def warned(recording: Recording) -> dict[str, str]:
+    return {warning.name: warning.text for warning in check_recording(recording)}
+
+
+def only(recording: Recording, name: str) -> str:
+    """The text of the one warning of a recording."""
+    found = warned(recording)
+    assert list(found) == [name]
+    return found[name]
+
+
+def with_partitions(recording: Recording, **changes) -> Recording:
+    return replace(recording, partitions=tuple(replace(p, **changes) for p in recording.partitions))
+
+
+def with_sources(recording: Recording, *sources: Source) -> Recording:
+    sampling = replace(recording.info.sampling, sources=sources)
+    return replace(recording, info=replace(recording.info, sampling=sampling))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nothing_is_said_of_a_good_recording(seed):
+    assert check_recording(good_recording(seed=seed)) == []
+    assert check_recording(good_recording(poses=12, seed=seed)) == []
+
+
+def test_a_mesh_in_another_unit(good):
+    rig = good.rig
+    text = only(with_rig(good, rest_positions=rig.rest_positions * 20), "units")
+    assert text.startswith(
+        "The 4 joints that skin the mesh lie 750 mm apart and their vertices 15.3 m, 20.5 times as far"
+    )
+    small = good.pose_matrices.copy()
+    small[:, :, :3, 3] *= 0.01
+    rest = rig.rest_matrices.copy()
+    rest[:, :3, 3] *= 0.01
+    assert "102 times as far" in only(with_rig(replace(good, pose_matrices=small), rest_matrices=rest), "units")
+
+
+@pytest.mark.parametrize(("factor", "size"), [(200.0, "198 m"), (0.002, "2 mm")])
+def test_a_character_in_another_unit(good, factor, size):
+    rest, poses = good.rig.rest_matrices.copy(), good.pose_matrices.copy()
+    for matrices in (rest, poses):
+        matrices[..., :3, 3] *= factor
+    scaled = with_rig(good, rest_matrices=rest, rest_positions=good.rig.rest_positions * factor)
+    text = only(replace(scaled, pose_matrices=poses, residuals=good.residuals * factor), "units")
+    assert text.startswith(f"The mesh is {size} large; lengths count as metres")
+
+
+@pytest.mark.parametrize(("axis", "angle"), [(0, 90), (0, -90), (1, 90), (1, -90), (0, 180)])
+def test_a_mesh_on_other_axes(good, axis, angle):
+    turn = turns(np.radians(np.array(angle)), axis)[:3, :3]
+    text = only(with_rig(good, rest_positions=(good.rig.rest_positions @ turn.T).astype(np.float32)), "axes")
+    # About which of two axes the tube is turned upside down cannot be told.
+    shown = f"{angle} degrees about {'[XY]' if angle == 180 else 'XYZ'[axis]}"
+    assert re.search(f"of the 4 joints that skin the mesh lie outside its bounds.* fit after a turn of {shown}:", text)
+
+
+def test_a_mesh_elsewhere(good):
+    moved = good.rig.rest_positions + np.array([0, -0.8, 0], np.float32)
+    text = only(with_rig(good, rest_positions=moved), "axes")
+    assert text.startswith(
+        "4 of the 4 joints that skin the mesh lie outside its bounds, and joints lie 753 mm from the nearest vertex "
+        "that follows them (median), most of it along -Y: "
+    )
+
+
+def test_joints_that_skin_nothing_may_lie_anywhere(good):
+    rest = good.rig.rest_matrices.copy()
+    rest[0, :3, 3] = 0, 0, -0.4
+    # The root skins nothing but carries the others.
+    skin_joints = np.maximum(good.rig.skin_joints, 1)
+    changed = with_rig(good, rest_matrices=rest, skin_joints=skin_joints)
+    assert "axes" not in warned(replace(changed, partitions=make_partitions(changed.rig)))
+
+
+def test_residuals_larger_than_bones(good):
+    residuals = good.residuals.copy()
+    vertices = good.partitions[2].vertices
+    residuals[:, vertices] += 0.4
+    text = only(replace(good, residuals=residuals), "large-residuals")
+    assert text.startswith(
+        "Residuals are larger than bones and vertices of 1 of 4 partitions, most of 'lower', 696 mm rms where bone and "
+        "vertices are 254 mm long: "
+    )
+    assert text.endswith("or record with --fit-linear smooth.")
+
+
+def test_one_vertex_far_away_in_one_pose(good):
+    good.residuals[17, 33] = 3, 4, 0
+    text = warned(good)["large-residuals"]
+    assert text.startswith("The residual of vertex 33 is 5 m in pose 17, and the character is 990 mm large: ")
+
+
+def test_poses_that_repeat(good):
+    for array in (good.pose_matrices, good.controls, good.residuals):
+        array[150:190] = array[150]
+    text = only(with_sources(good, Source("random", 120), Source("action", 80, "idle", (1, 1))), "duplicate-poses")
+    assert text.startswith(
+        "39 of 200 poses repeat an earlier one, such as pose 151 pose 150, 39 of them of the action 'idle': "
+    )
+    good.controls[150:190, 0] = np.linspace(0, 1, 40)
+    assert warned(good) == {}
+
+
+def test_a_few_poses_may_repeat(good):
+    for array in (good.pose_matrices, good.controls, good.residuals):
+        array[190:] = array[:10]
+    assert warned(good) == {}
+
+
+def test_equal_poses_with_other_residuals(good):
+    for array in (good.pose_matrices, good.controls, good.residuals):
+        array[190:193] = array[10:13]
+    good.residuals[191, 5:9, 2] += 0.012
+    text = only(good, "hidden-inputs")
+    assert text.startswith(
+        "Poses 11 and 191 have the same joints and controls and yet vertices lie up to 12 mm apart: "
+    )
+
+
+def test_joints_that_collapse(good):
+    local = turns(np.random.default_rng(1).uniform(-LIMIT, LIMIT, (200, len(JOINTS))))
+    local[[7, 50], 2, :3, :3] *= 0.01
+    local[90, 3, :3, :3] *= -1
+    good = replace(good, pose_matrices=pose_rig(good.rig, local))
+    text = warned(good)["degenerate-poses"]
+    # The hand shrinks with its parent.
+    assert text.startswith(
+        "The 2 joints 'lower' and 'hand' have a scale near zero, huge or negative in the 3 poses 7, 50 and 90, volumes "
+        "by a factor of 1e-06: "
+    )
+    local[[7, 50, 90]] = local[[8, 51, 91]]
+    assert "degenerate-poses" not in warned(replace(good, pose_matrices=pose_rig(good.rig, local)))
+
+
+def flipping(poses: int, reach: float, jump: float, seed: int = 0) -> Recording:
+    """The tube, whose lower joint turns by up to `reach` times 180 degrees and jumps where it has passed 180."""
+    angles = np.random.default_rng(seed).uniform(-LIMIT, LIMIT, (poses, len(JOINTS)))
+    angles[:, 2] *= reach * np.pi / LIMIT
+    recording = good_recording(angles=angles)
+    # Beyond 180 degrees the rotation is one on the other side: from there on the shorter way is the other one.
+    beyond = np.mod(angles[:, 2] + np.pi, 2 * np.pi) - np.pi
+    near = np.exp(-(((recording.rig.rest_positions[:, 2] / BONE - 2) / 0.4) ** 2))
+    recording.residuals[:, :, 0] += jump * (beyond / (2 * np.pi))[:, None] * near
+    return recording
+
+
+@pytest.mark.parametrize("poses", [100, 300, 1500])
+def test_a_joint_that_flips(poses):
+    text = only(flipping(poses, 1.1, 0.08), "flips")
+    assert re.match(
+        r"Vertices of '(upper|lower)' jump up to \d\d mm between poses that are alike in 'lower' \(\d+ pairs?, such as "
+        r"poses \d+ and \d+\); [12] more partitions? jumps? too, and no network follows a jump: keep the turn of "
+        "'lower' below 180 degrees",
+        text,
+    )
+
+
+def test_the_poses_of_a_flip_are_those_that_jump():
+    recording = flipping(1500, 1.1, 0.08)
+    a, b = map(int, re.search(r"poses (\d+) and (\d+)\)", only(recording, "flips")).groups())
+    apart = np.linalg.norm(recording.residuals[a] - recording.residuals[b], axis=1)
+    assert apart.max() > 0.06
+    # Alike: the lower joint stands nearly the same in both, on the two sides of the jump.
+    local = [np.linalg.inv(recording.pose_matrices[p, 1]) @ recording.pose_matrices[p, 2] for p in (a, b)]
+    assert np.abs(local[0] - local[1]).max() < 0.3
+
+
+@pytest.mark.parametrize(("reach", "jump"), [(0.95, 0.08), (1.1, 0.0), (0.5, 0.3), (1.1, 0.0005)])
+def test_what_is_no_flip(reach, jump):
+    for seed in range(4):
+        assert "flips" not in warned(flipping(400, reach, jump, seed))
+
+
+def test_a_control_that_switches(good):
+    near = np.exp(-((good.rig.rest_positions[:, 2] / BONE - 1.5) ** 2))
+    good.residuals[:, :, 1] += 0.05 * (good.controls > 0.6) * near
+    text = only(good, "flips")
+    assert "alike in 'shape_keys/key_blocks[\"Bulge\"].value' (" in text
+    assert "look for what 'shape_keys/key_blocks[\"Bulge\"].value' switches" in text
+
+
+def test_alike_poses_are_near():
+    values = np.random.default_rng(0).uniform(0, 1, (300, 1))
+    pairs = alike_poses(values)
+    assert len(pairs) > 300 and (pairs[:, 0] < pairs[:, 1]).all()
+    assert np.abs(values[pairs[:, 0]] - values[pairs[:, 1]]).max() < 0.05
+    assert len(alike_poses(np.ones((300, 4)))) == 0
+
+
+def test_controls_that_change_nothing(good):
+    controls = (*good.rig.controls, Control("armature_object", '["fist"]', 0, 1), Control("armature", "x", 0, 1))
+    values = np.concatenate([good.controls, good.controls[::-1], np.full((200, 1), 0.5)], axis=1).astype(np.float32)
+    with_idle = replace(with_rig(good, controls=controls), controls=values)
+    text = only(with_idle, "dead-controls")
+    assert text.startswith(
+        "The 2 controls 'armature_object/[\"fist\"]' and 'armature/x' change nothing in this recording, 'armature/x' "
+        "of them always the same: leave them out"
+    )
+    assert "The control 'armature/x' changes nothing" in only(
+        replace(with_idle, partitions=tuple(replace(p, controls=(0, 1)) for p in good.partitions)), "dead-controls"
+    )
+
+
+def with_joint(recording: Recording, joint: Joint, local: np.ndarray, sampled: bool = True) -> Recording:
+    """The recording with one joint more, which skins nothing."""
+    rig = recording.rig
+    rest = np.concatenate([rig.rest_matrices, rig.rest_matrices[-1:]])
+    changed = replace(rig, joints=(*rig.joints, joint), rest_matrices=rest)
+    pose = recording.pose_matrices[:, joint.parent] @ np.linalg.inv(rest[joint.parent]) @ rest[-1] @ local
+    matrices = np.concatenate([recording.pose_matrices, pose[:, None]], axis=1).astype(np.float32)
+    sampling = recording.info.sampling
+    channels = (*sampling.channels, Channel(joint.name, "rotation", 0, -1, 1)) if sampled else sampling.channels
+    info = replace(recording.info, sampling=replace(sampling, channels=channels))
+    return replace(recording, rig=changed, pose_matrices=matrices, info=info)
+
+
+def test_joints_that_move_nothing(good):
+    local = turns(np.random.default_rng(9).uniform(-1, 1, 200))
+    extra = with_joint(good, Joint("helper", 2), local)
+    assert only(extra, "dead-joints").startswith("The joint 'helper' is sampled but moves no vertex: lock all axes")
+    # One that was not sampled, one that influences a partition, and one whose child skins.
+    assert warned(with_joint(good, Joint("helper", 2), local, sampled=False)) == {}
+    assert warned(with_partitions(extra, influencing=(1, 2, 3, 4))) == {}
+    root_skins_nothing = with_rig(good, skin_joints=np.maximum(good.rig.skin_joints, 1))
+    partitions = tuple(p for p in good.partitions if p.joint)
+    assert "dead-joints" not in warned(replace(root_skins_nothing, partitions=partitions))
+
+
+def test_a_joint_that_drives_another_is_not_dead(good):
+    """As the target of an inverse kinematics does: what it drives is not sampled."""
+    angles = np.random.default_rng(9).uniform(-1, 1, 200)
+    driving = with_joint(good, Joint("target", 0), turns(angles))
+    assert "dead-joints" in warned(driving)
+    channels = tuple(channel for channel in driving.info.sampling.channels if channel.bone != "hand")
+    sampling = replace(driving.info.sampling, channels=channels)
+    driving = replace(driving, info=replace(driving.info, sampling=sampling))
+    assert "dead-joints" in warned(driving)
+    driving.pose_matrices[:, 3] = (
+        driving.pose_matrices[:, 2]
+        @ np.linalg.inv(good.rig.rest_matrices[2])
+        @ (good.rig.rest_matrices[3] @ turns(0.5 * angles + 0.1))
+    )
+    assert "dead-joints" not in warned(driving)
+
+
+def test_vertices_that_never_move(good):
+    angles = np.random.default_rng(0).uniform(-LIMIT, LIMIT, (200, len(JOINTS)))
+    angles[:, 0] = 0
+    locked = good_recording(angles=angles)
+    locked.residuals[:, locked.rig.rest_positions[:, 2] < 0.3 * BONE] = 0
+    count = int((locked.rig.rest_positions[:, 2] < 0.3 * BONE).sum())
+    text = only(locked, "still-vertices")
+    assert text.startswith(f"{count} of 240 vertices never move, of the partition 'root': if they should, weight them")
+    locked.residuals[100, :, 0] += 0.001
+    assert warned(locked) == {}
+
+
+def test_vertices_without_a_bone(good):
+    rest = np.concatenate([good.rig.rest_matrices, np.eye(4, dtype=np.float32)[None]])
+    still = np.tile(np.eye(4, dtype=np.float32), (200, 1, 1, 1))
+    skin_joints, skin_weights = good.rig.skin_joints.copy(), good.rig.skin_weights.copy()
+    skin_joints[-20:], skin_weights[-20:] = 4, (1, 0)
+    good.residuals[:, -20:] = 0
+    joints = (*good.rig.joints, Joint(UNMOVED, -1))
+    good = with_rig(good, joints=joints, rest_matrices=rest, skin_joints=skin_joints, skin_weights=skin_weights)
+    good = replace(good, pose_matrices=np.concatenate([good.pose_matrices, still], axis=1))
+    good = replace(good, partitions=make_partitions(good.rig))
+    assert "20 of 240 vertices never move, of the partition '(no bone)'" in warned(good)["still-vertices"]
+
+
+def test_small_partitions(good):
+    skin_joints, skin_weights = good.rig.skin_joints.copy(), good.rig.skin_weights.copy()
+    tip = good.rig.rest_positions[:, 2].argsort()[-5:]
+    own = skin_joints[:, 1] == 3
+    skin_joints[own], skin_weights[own] = 2, (0.5, 0.5)
+    skin_joints[tip], skin_weights[tip] = 3, (0.5, 0.5)
+    small = with_rig(good, skin_joints=skin_joints, skin_weights=skin_weights)
+    partitions = make_partitions(small.rig, {3: (3,)}, dict.fromkeys(range(4), (0,)))
+    text = only(replace(small, partitions=partitions), "small-partitions")
+    assert text.startswith("The partition 'hand' has fewer than 8 vertices (5), and a network each: ")
+    partitions = make_partitions(small.rig, None, dict.fromkeys(range(4), (0,)), merged={3: 2})
+    assert warned(replace(small, partitions=partitions)) == {}
+
+
+def test_the_length_of_bones(good):
+    assert bone_lengths(good.rig) == pytest.approx([BONE] * 4)
+
+
+def test_no_more_poses_are_read_than_are_needed(good, monkeypatch):
+    monkeypatch.setattr(residual_scan, "MOST_POSES", 50)
+    monkeypatch.setattr(residual_scan, "SAMPLED_VERTICES", 40)
+    scan = residual_scan.scan_residuals(good)
+    assert len(scan.poses) == 50 and (scan.poses[0], scan.poses[-1]) == (0, 199)
+    assert all(len(r) == 50 and 8 <= r.shape[1] <= 10 for r in scan.residuals)
+    for own, partition in zip(scan.vertices, good.partitions, strict=True):
+        assert set(own) <= set(partition.vertices)
+    lengths = np.linalg.norm(good.residuals[scan.poses], axis=2)
+    np.testing.assert_allclose(scan.rms, np.sqrt((lengths**2).mean(axis=0)), rtol=1e-5)
+    np.testing.assert_allclose(scan.largest, lengths.max(axis=0), rtol=1e-5)
+    apart = np.linalg.norm(good.residuals[scan.poses] - good.residuals[0], axis=2)
+    np.testing.assert_allclose(scan.change, apart.max(axis=0), rtol=1e-4, atol=1e-9)
+    vertex = int(lengths.max(axis=0).argmax())
+    assert scan.largest_pose[vertex] == scan.poses[lengths[:, vertex].argmax()]
+
+
+def test_warnings_are_sentences():
+    warning = RecordingWarning("flips", "It jumps; limit it.")
+    assert str(warning) == "Warning (flips): It jumps; limit it."
+    assert warning.to_json() == {"name": "flips", "text": "It jumps; limit it."}
+    assert (
+        listed(["a"]) == "'a'"
+        and listed(["a", "b"]) == "'a' and 'b'"
+        and listed([1, 2, 3, 4, 5]) == "1, 2, 3 and 2 more"
+    )
+    assert counted([3], "pose") == "the pose 3" and counted(["a", "b"], "joint") == "the 2 joints 'a' and 'b'"
+    assert [length(m) for m in (0.00004, 0.0871, 0.25, 1.234)] == ["0.04 mm", "87 mm", "250 mm", "1.23 m"]
+
+
+def test_every_warning_is_documented():
+    headings = re.findall(r"^## `(.+)`$", CHECKS.read_text(encoding="utf-8"), re.MULTILINE)
+    assert headings == list(NAMES)
