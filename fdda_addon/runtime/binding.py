@@ -27,9 +27,10 @@ def bind(
 
     Raises:
         ModelError: the file is no model, or was trained for another rig. The scene is as before.
-        RigError: the rig cannot be read, or no model can stand in for its modifiers.
+        RigError: the rig cannot be read, no model can stand in for its modifiers, or the object is linked.
     """
     mesh_object = scene_rig.mesh_object
+    _check_editable(mesh_object)
     if mesh_object.mode == "EDIT":
         raise RigError(f"'{mesh_object.name}' is in edit mode; leave it first.")
     model = model.absolute()
@@ -54,20 +55,35 @@ def bind(
 
 
 def unbind(mesh_object: bpy.types.Object) -> None:
-    """Give the mesh back to its rig and remove everything that `bind` added."""
+    """Give the mesh back to its rig and remove everything that `bind` added.
+
+    Raises:
+        RigError: the object is linked.
+    """
     binding = mesh_object.fdda
     if not binding.is_bound:
         return
+    _check_editable(mesh_object)
     binding.mode = "RIG"
     modifier = nodes.find_modifier(mesh_object)
     if modifier is not None:
         cache = nodes.cache_of(modifier)
         nodes.set_cache(modifier, None)
-        mesh_object.modifiers.remove(modifier)
+        if not nodes.is_inherited(modifier):
+            mesh_object.modifiers.remove(modifier)
         nodes.remove_cache(cache)
     for name in ("is_bound", "model", "packed", "use_in_render", "status"):
         binding.property_unset(name)
     playback.forget()
+
+
+def _check_editable(mesh_object: bpy.types.Object) -> None:
+    if mesh_object.library is not None:
+        file = Path(mesh_object.library.filepath).name
+        raise RigError(
+            f"'{mesh_object.name}' is linked from '{file}' and cannot be changed here; give it a library override, or "
+            "bind the model in that file."
+        )
 
 
 def apply(mesh_object: bpy.types.Object) -> None:

@@ -53,6 +53,13 @@ def _on_reloaded(*_: object) -> None:
 
 
 @persistent
+def _on_linking(*_: object) -> None:
+    # A library that is reloaded brings other objects under the same names.
+    if playback := _playback():
+        playback.forget()
+
+
+@persistent
 def _on_render_begins(*_: object) -> None:
     # A render that shows the rig needs its shape keys; pinning them is not a matter of viewport or render.
     if playback := _playback():
@@ -105,6 +112,9 @@ HANDLERS = {
     "save_post": _on_save_ended,
     "save_post_fail": _on_save_ended,
 }
+if hasattr(bpy.app.handlers, "blend_import_pre"):
+    # 4.3 and later. Before, a library that was reloaded is noticed with the next object that comes or goes.
+    HANDLERS["blend_import_pre"] = _on_linking
 
 
 def register() -> None:

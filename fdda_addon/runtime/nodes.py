@@ -17,7 +17,14 @@ GROUP_VERSION = 1
 
 
 def add_modifier(mesh_object: bpy.types.Object, place: int) -> bpy.types.NodesModifier:
-    """Add the modifier at a place of the stack, with a new cache object that holds the mesh's own positions."""
+    """Add the modifier at a place of the stack, with a new cache object that holds the mesh's own positions.
+
+    A library override may have one of its library, which cannot be removed; that one serves again.
+    """
+    modifier = find_modifier(mesh_object)
+    if modifier is not None and is_inherited(modifier):
+        set_cache(modifier, new_cache(mesh_object))
+        return modifier
     group = _node_group()
     modifier = mesh_object.modifiers.new(MODIFIER_NAME, "NODES")
     modifier.node_group = group
@@ -39,6 +46,11 @@ def find_modifier(mesh_object: bpy.types.Object) -> bpy.types.NodesModifier | No
     return None
 
 
+def is_inherited(modifier: bpy.types.NodesModifier) -> bool:
+    """Whether a library override has a modifier from its library."""
+    return modifier.id_data.override_library is not None and modifier.is_override_data
+
+
 def new_cache(mesh_object: bpy.types.Object) -> bpy.types.Object:
     """A cache object with the vertices of a mesh; it is in no scene."""
     name = f"{mesh_object.name} {MODIFIER_NAME} positions"
@@ -47,7 +59,11 @@ def new_cache(mesh_object: bpy.types.Object) -> bpy.types.Object:
     positions = np.empty(len(mesh.vertices) * 3, np.float32)
     mesh_object.data.vertices.foreach_get("co", positions)
     mesh.vertices.foreach_set("co", positions)
-    return bpy.data.objects.new(name, mesh)
+    cache = bpy.data.objects.new(name, mesh)
+    if mesh_object.library is not None:
+        # Saved, it would stay behind in the file: that a linked object uses it is not saved.
+        mesh.is_runtime_data = cache.is_runtime_data = True
+    return cache
 
 
 def cache_of(modifier: bpy.types.NodesModifier) -> bpy.types.Object | None:

@@ -13,8 +13,8 @@ from . import switch
 def give_back_rigs() -> None:
     """Let the rigs of the open file show as if no model played."""
     for mesh_object in bpy.data.objects:
-        # Linked objects are not saved with the file.
-        if mesh_object.type == "MESH" and mesh_object.fdda.is_playing and mesh_object.library is None:
+        # Linked ones too, which are not saved: of a library override Blender saves how it differs from them.
+        if mesh_object.type == "MESH" and mesh_object.fdda.is_playing:
             switch.give_back(mesh_object)
 
 

@@ -14,6 +14,11 @@ FRAME = 22
 
 @pytest.fixture
 def camera(bound):
+    return set_camera()
+
+
+def set_camera() -> bpy.types.Object:
+    """A camera that sees the elbow, at a frame where it is well bent."""
     scene = bpy.context.scene
     scene.render.engine = "BLENDER_WORKBENCH"
     scene.render.resolution_x, scene.render.resolution_y = 160, 120
