@@ -2,12 +2,13 @@
 """What the networks are trained on: features and coefficients of each partition."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.recording import REFINED, Recording
+from fdda_addon.core.recording import Recording
+from fdda_addon.core.recording_index import RANDOM, REFINED, Source
 from fdda_addon.core.rig import Fingerprint
 from fdda_addon.core.skinning import skin_matrices
 
@@ -17,6 +18,8 @@ from .inputs import Inputs
 from .linear_fit import LinearFit, Surroundings, surroundings_of_rig
 
 LEAST_POSES = 10
+BLOCK_FRAMES = 10
+"""Frames of animation that are held back together: neighbours are nearly the same pose."""
 LEAST_SPREAD = 1e-5
 """A feature that spreads less than this over the training poses counts as constant (in its unit)."""
 
@@ -98,13 +101,19 @@ def split_poses(poses: np.ndarray, validation_fraction: float, seed: int, held_o
     Raises:
         TrainingError: there are too few poses.
     """
-    if len(poses) < LEAST_POSES:
-        raise TrainingError(
-            f"The recording has {len(poses)} poses and training takes at least {LEAST_POSES}; record more."
-        )
-    order = np.random.default_rng([seed, 1]).permutation(poses)
-    validation = max(1, round(len(poses) * validation_fraction))
-    held_out = max(1, round(len(poses) * held_out_fraction)) if held_out_fraction else 0
+    _check_count(len(poses))
+    return _split(poses, validation_fraction, seed, held_out_fraction)
+
+
+def _check_count(count: int) -> None:
+    if count < LEAST_POSES:
+        raise TrainingError(f"The recording has {count} poses and training takes at least {LEAST_POSES}; record more.")
+
+
+def _split(items: np.ndarray, validation_fraction: float, seed: int, held_out_fraction: float) -> Split:
+    order = np.random.default_rng([seed, 1]).permutation(items)
+    validation = max(1, round(len(items) * validation_fraction))
+    held_out = max(1, round(len(items) * held_out_fraction)) if held_out_fraction else 0
     parts = np.split(order, [held_out, held_out + validation])
     return Split(np.sort(parts[2]), np.sort(parts[1]), np.sort(parts[0]))
 
@@ -112,15 +121,51 @@ def split_poses(poses: np.ndarray, validation_fraction: float, seed: int, held_o
 def split_recording(recording: Recording, config: TrainingConfig) -> Split:
     """Split the poses of a recording.
 
-    Refined poses all train: they are no sample of the range of motion, and an error measured on them would say
-    nothing of it. What is held out stays so when a recording is extended.
+    Random poses are split one by one, frames of animation in blocks: an error on a pose would say nothing when the
+    frames before and after it have trained. Refined poses all train: they are no sample of the range of motion, and an
+    error measured on them would say nothing of it. What is held out stays so when a recording is extended.
 
     Raises:
         TrainingError: there are too few poses beside the refined ones.
     """
-    refined = np.concatenate([np.full(s.poses, s.kind == REFINED) for s in recording.info.sampling.sources])
-    split = split_poses(np.flatnonzero(~refined), config.validation_fraction, config.seed, config.held_out_fraction)
-    return replace(split, training=np.append(split.training, np.flatnonzero(refined)))
+    sources = recording.info.sampling.sources
+    refined = np.concatenate([np.full(s.poses, s.kind == REFINED) for s in sources])
+    _check_count(int((~refined).sum()))
+    random = np.concatenate([np.full(s.poses, s.kind == RANDOM) for s in sources])
+    fractions = config.validation_fraction, config.seed, config.held_out_fraction
+    splits = [_split(np.flatnonzero(random), *fractions)] if random.any() else []
+    if blocks := _blocks(sources):
+        chosen = _split(np.arange(len(blocks)), *fractions)
+        splits.append(
+            Split(*(_poses_of(blocks, part) for part in (chosen.training, chosen.validation, chosen.held_out)))
+        )
+    training, validation, held_out = (
+        np.sort(np.concatenate([getattr(split, part) for split in splits]))
+        for part in ("training", "validation", "held_out")
+    )
+    return Split(np.append(training, np.flatnonzero(refined)), validation, held_out)
+
+
+def _blocks(sources: tuple[Source, ...]) -> list[list[int]]:
+    """Poses by blocks of frames that follow one another; a frame and its mirror image are of one block.
+
+    Short animations have shorter blocks, so that there are some to hold back.
+    """
+    animated = [source for source in sources if source.kind not in (RANDOM, REFINED)]
+    frames = sum({source.name: source.poses for source in animated}.values())
+    length = max(1, min(BLOCK_FRAMES, frames // LEAST_POSES))
+    blocks: dict[tuple[str, int], list[int]] = {}
+    pose = 0
+    for source in sources:
+        if source in animated:
+            for number in range(source.poses):
+                blocks.setdefault((source.name, number // length), []).append(pose + number)
+        pose += source.poses
+    return list(blocks.values())
+
+
+def _poses_of(blocks: list[list[int]], chosen: np.ndarray) -> np.ndarray:
+    return np.array([pose for number in chosen for pose in blocks[number]], np.int64)
 
 
 def held_back_digest(recording: Recording, split: Split) -> str:

@@ -16,6 +16,9 @@ FORMAT = "fdda-recording"
 VERSION = 1
 INDEX = "recording.json"
 MAX_INDEX_BYTES = 64 << 20
+RANDOM, ACTION, STRIP, MIRRORED = "random", "action", "strip", "mirrored"
+"""Kinds of the poses that a recording is made of: drawn at random, frames of an action, frames of a strip of the NLA,
+and the frames of the source before, left and right exchanged."""
 REFINED = "refined"
 """Kind of the poses that were added where a model was worst: no sample of the range of motion, so never held out."""
 
@@ -25,10 +28,11 @@ class Source:
     """Where poses of a recording came from.
 
     Attributes:
-        kind: "random", "action" or `REFINED`.
+        kind: `RANDOM`, `ACTION`, `STRIP`, `MIRRORED` or `REFINED`.
         poses: how many.
-        name: of the action; file name of the model that refined poses were chosen for; empty for random poses.
-        frames: first frame of the action and the step between poses, (0, 0) for other poses.
+        name: of the action or strip, mirrored or not; file name of the model that refined poses were chosen for; empty
+            for random poses.
+        frames: first frame of the action or strip and the step between poses, (0, 0) for other poses.
     """
 
     kind: str

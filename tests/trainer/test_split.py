@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which poses train, which choose the weights and which measure the error: random poses, and frames of animation."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chain import write_chain
+
+from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.recording import Recording, read_recording
+from fdda_addon.core.recording_index import ACTION, MIRRORED, RANDOM, REFINED, Source
+from trainer.config import TrainingConfig
+from trainer.data import BLOCK_FRAMES, Split, split_recording
+
+CONFIG = TrainingConfig(seed=3)
+PARTS = ("training", "validation", "held_out")
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> Recording:
+    path: Path = tmp_path_factory.mktemp("split") / "chain"
+    write_chain(path, 4)
+    return read_recording(path)
+
+
+def split(source: Recording, *sources: Source, config: TrainingConfig = CONFIG) -> Split:
+    """How a recording of these sources is split; each pose in exactly one part."""
+    sampling = replace(source.info.sampling, sources=sources)
+    found = split_recording(replace(source, info=replace(source.info, sampling=sampling)), config)
+    poses = np.concatenate([getattr(found, part) for part in PARTS])
+    assert np.array_equal(np.sort(poses), np.arange(sum(s.poses for s in sources)))
+    return found
+
+
+def part_of(found: Split, poses: int) -> np.ndarray:
+    """(poses,) number of the part that each pose is in."""
+    parts = np.empty(poses, int)
+    for number, part in enumerate(PARTS):
+        parts[getattr(found, part)] = number
+    return parts
+
+
+def test_random_poses_are_split_one_by_one(source):
+    found = split(source, Source(RANDOM, 200))
+    order = np.random.default_rng([3, 1]).permutation(200)
+    assert np.array_equal(found.held_out, np.sort(order[:20]))
+    assert np.array_equal(found.validation, np.sort(order[20:30]))
+
+
+def test_frames_are_held_back_in_blocks(source):
+    found = split(source, Source(ACTION, 400, "walk", (1, 1)))
+    blocks = part_of(found, 400).reshape(-1, BLOCK_FRAMES)
+    assert (blocks == blocks[:, :1]).all()
+    assert [(blocks[:, 0] == number).sum() for number in range(3)] == [34, 2, 4]
+    other = split(source, Source(ACTION, 400, "walk", (1, 1)), config=TrainingConfig(seed=4))
+    assert not np.array_equal(found.held_out, other.held_out)
+
+
+def test_random_poses_beside_frames_are_split_as_alone(source):
+    alone = part_of(split(source, Source(RANDOM, 100)), 100)
+    found = part_of(split(source, Source(RANDOM, 100), Source(ACTION, 120, "walk", (1, 1))), 220)
+    assert np.array_equal(found[:100], alone)
+    assert set(found[100:]) == {0, 1, 2}
+
+
+def test_a_frame_and_its_mirror_image_are_in_one_part(source):
+    walk, run = Source(ACTION, 95, "walk", (1, 1)), Source(ACTION, 60, "run", (5, 1))
+    sources = (walk, replace(walk, kind=MIRRORED), run, replace(run, kind=MIRRORED))
+    parts = part_of(split(source, *sources), 310)
+    assert np.array_equal(parts[:95], parts[95:190]) and np.array_equal(parts[190:250], parts[250:])
+    assert set(parts[:190]) | set(parts[190:]) == {0, 1, 2}
+
+
+def test_short_animations_have_shorter_blocks(source):
+    parts = part_of(split(source, Source(ACTION, 34, "nod", (1, 1))), 34)
+    runs = np.split(parts, np.arange(3, 34, 3))
+    assert all(len(set(run)) == 1 for run in runs) and set(parts) == {0, 1, 2}
+
+
+def test_refined_poses_beside_frames_all_train(source):
+    before = split(source, Source(ACTION, 100, "walk", (1, 1)))
+    after = split(source, Source(ACTION, 100, "walk", (1, 1)), Source(REFINED, 7, "model.onnx"))
+    assert np.array_equal(after.held_out, before.held_out) and np.array_equal(after.validation, before.validation)
+    assert np.array_equal(after.training[-7:], np.arange(100, 107))
+
+
+def test_too_few_poses_are_refused(source):
+    with pytest.raises(TrainingError, match="has 9 poses and training takes at least 10; record more"):
+        split(source, Source(RANDOM, 4), Source(ACTION, 5, "nod", (1, 1)), Source(REFINED, 50, "model.onnx"))
