@@ -111,12 +111,12 @@ def open_page(built: Path, chromium: str, tmp_path_factory: pytest.TempPathFacto
 
 
 @pytest.fixture(scope="session")
-def at_rest(chain: Character, open_page: Callable[..., Shown]) -> Shown:
+def at_rest(open_page: Callable[..., Shown], chain: Character) -> Shown:
     return open_page(chain)
 
 
 @pytest.fixture(scope="session")
-def posed(chain: Character, open_page: Callable[..., Shown]) -> Shown:
+def posed(open_page: Callable[..., Shown], chain: Character) -> Shown:
     return open_page(chain, *sliders(TURNS))
 
 
@@ -141,7 +141,7 @@ def mesh_part(view: np.ndarray) -> np.ndarray:
     return (view.min(axis=-1) > 0.3) & (np.ptp(view, axis=-1) < 0.08)
 
 
-def test_it_shows_what_python_computes(chain: Character, at_rest: Shown, posed: Shown):
+def test_it_shows_what_python_computes(at_rest: Shown, posed: Shown, chain: Character):
     for shown, turns in (at_rest, {}), (posed, TURNS):
         assert (shown.state, shown.errors) == ("ready", [])
         assert re.fullmatch(r"Trust \d+ %, \d+\.\d ms", shown.status)
@@ -164,13 +164,13 @@ def test_the_mesh_is_seen_and_follows_the_sliders(at_rest: Shown, posed: Shown):
     assert (mesh_part(at_rest.view) != mesh_part(posed.view)).mean() > 0.01
 
 
-def test_a_button_leads_back_to_the_rest_pose(chain: Character, open_page: Callable[..., Shown], at_rest: Shown):
+def test_a_button_leads_back_to_the_rest_pose(open_page: Callable[..., Shown], at_rest: Shown, chain: Character):
     back = open_page(chain, *sliders(TURNS), "#joint=bone_0", "#rest")
     assert np.array_equal(back.positions, at_rest.positions)
     assert np.array_equal(mesh_part(back.view), mesh_part(at_rest.view))
 
 
-def test_controls_have_sliders_and_what_never_moves_has_none(controlled: Character, open_page: Callable[..., Shown]):
+def test_controls_have_sliders_and_what_never_moves_has_none(open_page: Callable[..., Shown], controlled: Character):
     low = read_model_info(controlled.model).controls[0].low
     for steps, value in ([], low), (["#control-0=0.9"], 0.9):
         shown = open_page(controlled, *sliders(TURNS), *steps)
