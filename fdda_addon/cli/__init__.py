@@ -19,6 +19,7 @@ VERBS = {
     "bind": ("bind", "let a model play in place of a rig"),
     "evaluate": ("evaluate", "compare a model with its rig on poses that training never saw"),
     "benchmark": ("benchmark", "time a whole frame of rig, linear layer and model"),
+    "bake": ("bake", "write an action as the model shows it, to play without the add-on"),
 }
 TRAIN = "train"
 INTERRUPTED = 130

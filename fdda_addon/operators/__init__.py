@@ -9,6 +9,7 @@ MODULES: tuple[str, ...] = (
     "recording",
     "training",
     "playback",
+    "baking",
     "evaluation",
     "worst_poses",
     "models",

@@ -25,7 +25,7 @@ _trusts = Watch(_trust, 0.2)
 class FDDA_PT_playback(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_playback"
     bl_label = "Playback"
-    verbs = ("measure_model",)
+    verbs = ("measure_model", "bake")
 
     @classmethod
     def is_done(cls, context: bpy.types.Context) -> bool:
@@ -46,6 +46,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         if not mesh_object.fdda.status:
             self._draw_times(context, mesh_object)
             self._draw_trust(context, mesh_object)
+            self._draw_bake(context)
         layout.operator("fdda.unbind", icon="UNLINKED")
 
     def _draw_unbound(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
@@ -124,6 +125,10 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             row.progress(factor=value, text=f"{100 * value:.0f} %")
         if len(doubtful) > MOST_SHOWN:
             column.label(text=f"and {len(doubtful) - MOST_SHOWN} more")
+
+    def _draw_bake(self, context: bpy.types.Context) -> None:
+        if not draw_job(self.layout, context, "bake", "frames"):
+            self.layout.operator("fdda.bake", icon="EXPORT")
 
 
 CLASSES = (FDDA_PT_playback,)

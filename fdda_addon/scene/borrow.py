@@ -2,7 +2,7 @@
 """Scene state that is borrowed for a while and given back, whatever happens."""
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import bpy
 import numpy as np
@@ -108,6 +108,23 @@ def borrowed_attributes(owner: object, **values: object) -> Iterator[None]:
     finally:
         for name, value in old.items():
             setattr(owner, name, value)
+
+
+@contextmanager
+def borrowed_visibility(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
+    """Show objects that animation hides in some frames: Blender evaluates no pose of what it does not show.
+
+    What is hidden in all frames stays hidden, and is evaluated when something that shows needs it.
+    """
+    with ExitStack() as stack:
+        for scene_object in (o for o in objects if o.animation_data is not None):
+            animation = scene_object.animation_data
+            curves = [curve for action in _driving_actions(animation) for curve in animation_curves(action)]
+            if hiding := [curve for curve in (*curves, *animation.drivers) if curve.data_path == "hide_viewport"]:
+                for curve in hiding:
+                    stack.enter_context(borrowed_attributes(curve, mute=True))
+                stack.enter_context(borrowed_attributes(scene_object, hide_viewport=False))
+        yield
 
 
 def assign_action(armature_object: bpy.types.Object, action: bpy.types.Action) -> None:

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Baked files play what the model says in a Blender that has never heard of the add-on."""
+
+import shutil
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from baked_files import CLOSE, WAVE, elbow_wave, plain_blender, read_pc2
+from conftest import ELBOW, ELBOW_RIG, evaluated, run
+from refusals import files, save_elbow
+from scene_state import fresh_elbow
+
+from fdda_addon.cli.files import save_copy
+
+
+@pytest.fixture(scope="module")
+def wave(elbow) -> np.ndarray:
+    return elbow_wave(elbow)
+
+
+@pytest.fixture(scope="module")
+def baked(elbow, tmp_path_factory) -> Path:
+    """A folder with a bake of each kind."""
+    folder = tmp_path_factory.mktemp("baked")
+    for options in (["walk.pc2"], ["cache.blend"], ["keys.blend", "--shape-keys"]):
+        arguments = ["--action", "elbow_wave", *options[1:]]
+        assert run("bake", elbow.rig, elbow.model, folder / options[0], *arguments) == 0
+    return folder
+
+
+class TestFiles:
+    def test_a_point_cache_holds_what_the_model_says(self, baked, wave):
+        start, rate, positions = read_pc2(baked / "walk.pc2")
+        assert (start, rate) == (1, 1) and positions.shape == wave.shape
+        assert np.abs(positions - wave).max() < 1e-6 < np.abs(np.diff(wave, axis=0)).max()
+
+    def test_only_these_files_are_written(self, baked):
+        assert sorted(files(baked)) == ["cache.blend", "cache.pc2", "keys.blend", "walk.pc2"]
+        assert (baked / "cache.pc2").read_bytes() == (baked / "walk.pc2").read_bytes()
+
+    @pytest.mark.parametrize("name", ["cache.blend", "keys.blend"])
+    def test_the_rig_no_longer_deforms(self, baked, name):
+        bpy.ops.wm.open_mainfile(filepath=str(baked / name))
+        mesh_object = bpy.data.objects[ELBOW]
+        assert [m.type for m in mesh_object.modifiers] == (["MESH_CACHE"] if name == "cache.blend" else [])
+        assert len(bpy.data.objects) == 2 and mesh_object.parent == bpy.data.objects[ELBOW_RIG]
+        assert bpy.context.scene.frame_current == 1
+
+
+class TestWithoutTheAddOn:
+    def test_files_play_what_the_model_says(self, baked, wave, tmp_path):
+        """Every frame, between frames, before the first and after the last; also from another folder."""
+        moved = shutil.copytree(baked, tmp_path / "moved")
+        (moved / "walk.pc2").unlink()
+        inside, between = list(map(float, WAVE)), 8.25
+        times = [*inside, between, -5.0, 99.0]
+        jobs = [(folder / name, times) for name in ("cache.blend", "keys.blend") for folder in (baked, moved)]
+        shown = plain_blender(tmp_path, *jobs)
+        for path, _ in jobs:
+            frames = np.array([shown[path, time] for time in inside])
+            assert np.abs(frames - wave).max() < CLOSE
+            assert np.abs(shown[path, between] - (0.75 * wave[7] + 0.25 * wave[8])).max() < CLOSE
+            assert np.abs(shown[path, -5.0] - wave[0]).max() < CLOSE
+            assert np.abs(shown[path, 99.0] - wave[-1]).max() < CLOSE
+
+    def test_the_cache_that_moved_along_is_the_one_that_plays(self, baked, tmp_path):
+        moved = shutil.copytree(baked, tmp_path / "moved")
+        data = bytearray((moved / "cache.pc2").read_bytes())
+        data[32:] = np.ones((len(data) - 32) // 4, "<f4").tobytes()
+        (moved / "cache.pc2").write_bytes(data)
+        path = moved / "cache.blend"
+        assert (plain_blender(tmp_path, (path, [4.0]))[path, 4.0] == 1).all()
+
+    def test_an_output_in_another_folder_than_the_rig(self, elbow, wave, tmp_path, monkeypatch):
+        (tmp_path / "in").mkdir()
+        (tmp_path / "out").mkdir()
+        rig = shutil.copy(elbow.rig, tmp_path / "in" / "rig.blend")
+        monkeypatch.chdir(tmp_path)
+        assert run("bake", rig, elbow.model, "out/a.blend") == 0
+        bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "a.blend"))
+        assert bpy.data.objects[ELBOW].modifiers[0].filepath == "//a.pc2"
+        assert np.abs(evaluated(bpy.data.objects[ELBOW]) - wave[0]).max() < CLOSE
+
+    def test_a_subdivision_above_stays_live(self, elbow, wave, tmp_path):
+        def subdivide(rig):
+            rig.mesh_object.modifiers.new("Finer", "SUBSURF").levels = 1
+
+        rig = save_elbow(tmp_path / "rig.blend", subdivide)
+        outs = [tmp_path / "cache.blend", tmp_path / "keys.blend"]
+        for out, options in zip(outs, ([], ["--shape-keys"]), strict=True):
+            assert run("bake", rig, elbow.model, out, "--action", "elbow_wave", *options) == 0
+        bpy.ops.wm.open_mainfile(filepath=str(outs[0]))
+        assert [m.type for m in bpy.data.objects[ELBOW].modifiers] == ["MESH_CACHE", "SUBSURF"]
+        shown = plain_blender(tmp_path, *((out, [10.0]) for out in outs))
+        mesh_object = fresh_elbow().mesh_object
+        mesh_object.modifiers.clear()
+        mesh_object.data.attributes["position"].data.foreach_set("vector", wave[9].reshape(-1))
+        mesh_object.modifiers.new("Finer", "SUBSURF").levels = 1
+        expected = evaluated(mesh_object)
+        assert len(expected) > 3 * len(wave[9])
+        for out in outs:
+            assert np.abs(shown[out, 10.0] - expected).max() < CLOSE
+
+    def test_keys_of_the_mesh_and_a_parent_that_deforms_do_not_show(self, elbow, wave, tmp_path):
+        """The mesh that another object shares keeps its own keys."""
+
+        def change(rig):
+            mesh_object = rig.mesh_object
+            twin = bpy.data.objects.new("twin", mesh_object.data)
+            bpy.context.scene.collection.objects.link(twin)
+            mesh_object.shape_key_add(name="Basis")
+            fat = mesh_object.shape_key_add(name="Fat")
+            fat.data.foreach_set("co", np.full(3 * len(mesh_object.data.vertices), 5, np.float32))
+            fat.value = 1.0
+            mesh_object.parent_type = "ARMATURE"
+            mesh_object.show_only_shape_key, mesh_object.active_shape_key_index = True, 0
+
+        rig = save_elbow(tmp_path / "rig.blend", change)
+        outs = [tmp_path / "cache.blend", tmp_path / "keys.blend"]
+        for out, options in zip(outs, ([], ["--shape-keys"]), strict=True):
+            assert run("bake", rig, elbow.model, out, "--action", "elbow_wave", *options) == 0
+        shown = plain_blender(tmp_path, *((out, [1.0, 10.0]) for out in outs))
+        for out in outs:
+            assert np.abs(shown[out, 10.0] - wave[9]).max() < CLOSE
+            assert np.abs(shown[out, 1.0] - wave[0]).max() < CLOSE
+        bpy.ops.wm.open_mainfile(filepath=str(outs[1]))
+        assert [key.name for key in bpy.data.objects["twin"].data.shape_keys.key_blocks] == ["Basis", "Fat"]
+        keys = bpy.data.objects[ELBOW].data.shape_keys.key_blocks
+        assert [key.name for key in keys] == ["Basis", *(f"Frame {frame}" for frame in WAVE)]
+
+
+class TestLinked:
+    @pytest.fixture
+    def shot(self, elbow, tmp_path) -> Path:
+        """A file that links the elbow, with a library override when asked."""
+
+        def make(override: bool) -> Path:
+            bpy.ops.wm.read_factory_settings(use_empty=True)
+            path = tmp_path / "shot.blend"
+            save_copy(path)
+            bpy.ops.wm.open_mainfile(filepath=str(path))
+            with bpy.data.libraries.load(str(elbow.rig), link=True) as (_, into):
+                into.objects = [ELBOW, ELBOW_RIG]
+            for linked in list(into.objects):
+                bpy.context.scene.collection.objects.link(linked)
+            if override:
+                for linked in list(into.objects):
+                    linked.override_create(remap_local_usages=True)
+            save_copy(path)
+            return path
+
+        return make
+
+    def test_a_linked_character(self, shot, elbow, wave, tmp_path, capfd):
+        path = shot(override=False)
+        assert run("bake", path, elbow.model, tmp_path / "a.pc2", "--frames", 1, 30) == 0
+        assert np.abs(read_pc2(tmp_path / "a.pc2")[2] - wave).max() < 1e-6
+        assert run("bake", path, elbow.model, tmp_path / "a.blend") == 1
+        assert "so its modifiers cannot be replaced here; bake it in that file" in capfd.readouterr().err
+
+    @pytest.mark.parametrize("options", [[], ["--shape-keys"]], ids=["cache", "keys"])
+    def test_a_library_override(self, shot, elbow, wave, tmp_path, options):
+        path = shot(override=True)
+        out = tmp_path / "a.blend"
+        assert run("bake", path, elbow.model, out, "--frames", 1, 30, *options) == 0
+        shown = plain_blender(tmp_path, (out, [9.0]))
+        assert np.abs(shown[out, 9.0] - wave[8]).max() < CLOSE

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Bakes that are refused: one sentence each, and nothing half written."""
+
+import re
+import shutil
+
+import bpy
+import numpy as np
+import pytest
+from conftest import run
+from refusals import Refusal, files, save_elbow, small_files
+
+
+class TestRefusals:
+    @pytest.fixture
+    def refusal(self, tmp_path, capfd) -> Refusal:
+        return Refusal(tmp_path, capfd)
+
+    @pytest.fixture
+    def refusal_on_a_full_disk(self, tmp_path, capsys) -> Refusal:
+        return Refusal(tmp_path, capsys)
+
+    def test_no_such_action(self, refusal, elbow, tmp_path):
+        text = refusal("bake", elbow.rig, elbow.model, tmp_path / "a.pc2", "--action", "jump")
+        assert text == "The file has no action 'jump'; its actions: 'elbow_wave'."
+
+    def test_a_model_of_another_rig(self, refusal, elbow, tmp_path):
+        def move(rig):
+            rig.mesh_object.data.vertices[0].co.x += 0.01
+
+        rig = save_elbow(tmp_path / "rig.blend", move)
+        assert f"The model '{elbow.model}' was trained for another rig: " in refusal(
+            "bake", rig, elbow.model, tmp_path / "a.pc2"
+        )
+
+    def test_no_model(self, refusal, elbow, tmp_path):
+        assert "none.onnx' cannot be read" in refusal("bake", elbow.rig, tmp_path / "none.onnx", tmp_path / "a.pc2")
+
+    @pytest.mark.parametrize(
+        ("out", "options", "words"),
+        [
+            ("a.abc", [], "a.abc' ends in neither .pc2 nor .blend; give it the extension of what to write."),
+            ("a", [], "ends in neither .pc2 nor .blend"),
+            ("a.pc2", ["--shape-keys"], "Shape keys are written into a .blend file; give '"),
+            ("a.pc2", ["--frames", 9, 8], "There is nothing to bake from frame 9 to 8; give the first frame first."),
+            ("a.pc2", ["--frames", 1, 2000000], "Blender has frames up to 1048574, not from 1 to 2000000; give fewer."),
+        ],
+    )
+    def test_wrong_usage(self, elbow, tmp_path, capfd, out, options, words):
+        assert run("bake", elbow.rig, elbow.model, tmp_path / out, *options) == 2
+        captured = capfd.readouterr()
+        assert words in captured.err and captured.err.count("\n") == 1 and not captured.out
+        assert files(tmp_path) == {}
+
+    def test_the_file_of_the_rig(self, refusal, elbow, tmp_path):
+        rig = shutil.copy(elbow.rig, tmp_path / "rig.blend")
+        text = refusal("bake", rig, elbow.model, rig)
+        assert text == f"'{rig}' is the file with the rig, which a bake replaces; give another name."
+
+    def test_a_point_cache_that_cannot_be_written(self, refusal, elbow, tmp_path):
+        (tmp_path / "a.pc2").mkdir()
+        text = refusal("bake", elbow.rig, elbow.model, tmp_path / "a.blend")
+        assert text == f"Cannot write '{tmp_path / 'a.pc2'}': it is a folder; give the name of a file."
+
+    def test_a_folder_that_is_not_there(self, refusal, elbow, tmp_path):
+        assert "does not exist; create it first." in refusal("bake", elbow.rig, elbow.model, tmp_path / "b" / "a.pc2")
+
+    @pytest.mark.parametrize(("out", "options"), [("a.pc2", []), ("a.blend", []), ("a.blend", ["--shape-keys"])])
+    @pytest.mark.parametrize("limit", [100, 60_000, 150_000])
+    def test_a_disk_that_fills_up_leaves_the_old_files(
+        self, refusal_on_a_full_disk, elbow, tmp_path, out, options, limit
+    ):
+        """At once, in the middle of the positions, and after them, in the .blend file."""
+        if limit > 100_000 and out == "a.pc2":
+            pytest.skip("has nothing but positions")
+
+        def fatten(_rig):
+            # Larger than the limit also when it is compressed.
+            bpy.context.scene["noise"] = np.random.default_rng(0).bytes(200_000).hex()
+
+        rig = save_elbow(tmp_path / "rig.blend", fatten)
+        for name in ("a.pc2", "a.blend"):
+            (tmp_path / name).write_text("old")
+        with small_files(limit):
+            text = refusal_on_a_full_disk("bake", rig, elbow.model, tmp_path / out, *options)
+        assert re.match(f"Cannot write '{tmp_path / 'a'}.", text)
+
+    def test_a_modifier_that_changes_the_topology_below(self, refusal, elbow, tmp_path):
+        def add(rig):
+            rig.mesh_object.modifiers.new("Changes", "SUBSURF")
+            rig.mesh_object.modifiers.move(2, 0)
+
+        rig = save_elbow(tmp_path / "rig.blend", add)
+        assert "Modifier 'Changes' of 'elbow' changes the topology of the mesh before" in refusal(
+            "bake", rig, elbow.model, tmp_path / "a.blend"
+        )
+
+    def test_an_armature_at_rest(self, refusal, elbow, tmp_path):
+        rig = save_elbow(tmp_path / "rig.blend", lambda rig: setattr(rig.armature_object.data, "pose_position", "REST"))
+        assert "shows its rest position; set it to pose." in refusal("bake", rig, elbow.model, tmp_path / "a.pc2")
