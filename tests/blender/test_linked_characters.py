@@ -16,7 +16,7 @@ from test_renders import render_positions, rig_pixels, set_camera, still
 
 import fdda_addon
 from fdda_addon import models
-from fdda_addon.core.errors import RigError
+from fdda_addon.core.errors import ModelError, RigError
 from fdda_addon.runtime import model_files, nodes, playback
 from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.scene.rig import SceneRig, armature_modifier
@@ -503,6 +503,35 @@ def test_an_override_keeps_the_name_of_the_librarys_model(pair, library, tmp_pat
     assert pair[0].fdda.model == "//elbow.onnx"
     save_and_open(tmp_path)
     assert_play(library)
+
+
+def test_a_model_of_the_librarys_list_is_not_forgotten(library, elbow, tmp_path):
+    elsewhere(f"pack_model({str(library.path)!r})")
+    mesh_object = override(link(library.path), 0.6)
+    own = models.remember(mesh_object, elbow.model)
+    assert [entry.name for entry in mesh_object.fdda.models] == ["elbow", own.name]
+    with pytest.raises(ModelError, match="'elbow' is in the list of 'elbow.blend'; remove it there, or unbind it here"):
+        models.forget_entry(mesh_object, 0)
+    models.forget_entry(mesh_object, 1)
+    assert mesh_object.fdda.is_bound and len(mesh_object.fdda.models) == 1
+
+
+def test_a_shot_that_was_saved_by_itself(library, tmp_path):
+    """An auto-save calls no handler: the override of a character that is saved with its rig is caught playing."""
+    elsewhere(f"pack_model({str(library.path)!r})")
+    mesh_object = override(link(library.path), 0.6)
+    mesh_object.fdda.mode = "FDDA"
+    expected = assert_plays(mesh_object, library.model)
+    handlers = [bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:]]
+    bpy.app.handlers.save_pre.clear()
+    bpy.app.handlers.save_post.clear()
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot(tmp_path)))
+    bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:] = handlers
+    bpy.ops.wm.open_mainfile(filepath=str(shot(tmp_path)))
+    mesh_object = own_characters()[0]
+    assert np.array_equal(assert_plays(mesh_object, library.model), expected)
+    mesh_object.fdda.mode = "RIG"
+    assert [m.show_viewport for m in mesh_object.modifiers] == [True, True, False]
 
 
 def test_an_override_of_an_override(library, tmp_path):
