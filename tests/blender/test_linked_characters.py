@@ -510,7 +510,7 @@ def test_a_model_of_the_librarys_list_is_not_forgotten(library, elbow, tmp_path)
     mesh_object = override(link(library.path), 0.6)
     own = models.remember(mesh_object, elbow.model)
     assert [entry.name for entry in mesh_object.fdda.models] == ["elbow", own.name]
-    with pytest.raises(ModelError, match="'elbow' is in the list of 'elbow.blend'; remove it there, or unbind it here"):
+    with pytest.raises(ModelError, match=r"'elbow' is in the list of 'elbow\.blend'; remove it there, or unbind"):
         models.forget_entry(mesh_object, 0)
     models.forget_entry(mesh_object, 1)
     assert mesh_object.fdda.is_bound and len(mesh_object.fdda.models) == 1
