@@ -123,11 +123,11 @@ def forget_entry(mesh_object: bpy.types.Object, index: int) -> str:
     binding = mesh_object.fdda
     entry = binding.models[index]
     name = entry.name
-    if is_bound(mesh_object, entry):
     override = mesh_object.override_library
     if override is not None and override.reference is not None and index < len(override.reference.fdda.models):
         file = Path(override.reference.library.filepath).name
         raise ModelError(f"The model '{name}' is in the list of '{file}'; remove it there, or unbind it here.")
+    if is_bound(mesh_object, entry):
         unbind(mesh_object)
     binding.models.remove(index)
     binding.model_index = max(0, min(binding.model_index, len(binding.models) - 1))
