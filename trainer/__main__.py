@@ -27,7 +27,7 @@ def _train(options: argparse.Namespace, announcer: Announcer, stop: StopRequest)
         from .training import train_model
     except ModuleNotFoundError as error:
         raise missing_package("Training", error) from error
-    train_model(options.recording, options.model, config, announcer, stop, options.warm_start)
+    train_model(options.recording, options.model, config, announcer, stop, options.warm_start, options.strict)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -40,6 +40,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--warm-start", action="store_true", help="start from the last weights of the model, on a recording that grew"
     )
+    parser.add_argument("--strict", action="store_true", help="let warnings about the recording be errors")
     add_options(parser)
     return parser
 

@@ -53,6 +53,7 @@ def render_html(report: dict, pictures: Sequence[Path] = (), evaluation: dict | 
     """
     parts = [
         _head(report),
+        _warnings(report),
         _pictures(pictures),
         _evaluation(evaluation),
         _errors(report),
@@ -96,6 +97,13 @@ def _head(report: dict) -> str:
         "that neither trained nor chose anything.</p>"
         f'<div class="cards">{shown}</div>'
     )
+
+
+def _warnings(report: dict) -> str:
+    if not report.get("warnings"):
+        return ""
+    rows = "".join(f"<dt>{escape(w['name'])}</dt><dd>{escape(w['text'])}</dd>" for w in report["warnings"])
+    return f"<h2>Warnings</h2><p>What is suspicious about the recording.</p><dl>{rows}</dl>"
 
 
 def _pictures(pictures: Sequence[Path]) -> str:

@@ -14,6 +14,8 @@ from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.output import check_writable, write_json, write_text
 from fdda_addon.core.recording import Recording, read_recording
+from fdda_addon.core.recording_check import check_recording
+from fdda_addon.core.recording_warning import RecordingWarning, refuse
 from fdda_addon.core.rig import UNMOVED_LABEL
 
 from . import report
@@ -43,6 +45,7 @@ def train_model(
     announcer: Announcer,
     should_stop: Callable[[], bool] = lambda: False,
     warm_start: bool = False,
+    strict: bool = False,
 ) -> None:
     """Train a model, and write it with its report and its last weights beside it.
 
@@ -53,6 +56,7 @@ def train_model(
         announcer: told everything from `STARTED` to `FINISHED`; not told of errors.
         should_stop: asked often; nothing has been written when it is heeded.
         warm_start: start from the last weights of the model, on a recording that may have grown since.
+        strict: warnings about the recording are errors.
 
     Raises:
         Cancelled: `should_stop` said so.
@@ -74,6 +78,8 @@ def train_model(
         vertices=recording.rig.vertex_count,
         device=str(device),
     )
+    warnings = _check(recording, announcer, strict)
+    _check_stop(should_stop)
     inputs = inputs_of_rig(recording.rig, middles(recording.rig, recording.partitions), recording.partitions)
     prepared = _prepare(recording, inputs, split, config, should_stop)
     seen = [columns[partition.columns] for columns, partition in zip(inputs.columns, prepared, strict=True)]
@@ -113,6 +119,7 @@ def train_model(
     content = report.make_report(
         recording, deformation, exported, on_training, surface, trained.curves, model_path.name
     )
+    content["warnings"] = [warning.to_json() for warning in warnings]
     poses, p999 = len(recording.pose_matrices), exported.info.held_out_mm["p999"]
     history = [*(last.history if last else ()), {"poses": poses, "p999": p999}]
     outcome = None
@@ -128,6 +135,20 @@ def train_model(
     write_json(report_json, content)
     write_text(report_html, page)
     _announce_end(announcer, model_path, content, outcome, time.perf_counter() - started)
+
+
+def _check(recording: Recording, announcer: Announcer, strict: bool) -> list[RecordingWarning]:
+    """Look at the recording, and announce what is suspicious about it.
+
+    Raises:
+        RecordingError: something is, and `strict` says that it is an error.
+    """
+    warnings = check_recording(recording)
+    for warning in warnings:
+        announcer.say(MessageType.LOG, text=str(warning))
+    if strict:
+        refuse(warnings)
+    return warnings
 
 
 def _announce_end(

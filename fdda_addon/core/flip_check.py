@@ -117,7 +117,8 @@ def alike_poses(values: np.ndarray) -> np.ndarray:
     squares = np.einsum("nf,nf->n", values, values)
     distances = np.maximum(squares[:, None] + squares - 2 * values @ values.T, 0)
     near = NEAR**2 * np.median(distances[:: 1 + len(values) // 100])
-    np.fill_diagonal(distances, np.inf)
+    # Equal poses say nothing of a jump between different ones.
+    distances[distances < LEAST_SPREAD] = np.inf
     nearest = np.argpartition(distances, NEIGHBOURS, axis=1)[:, :NEIGHBOURS]
     own = np.repeat(np.arange(len(values)), NEIGHBOURS)
     pairs = np.sort(np.stack([own, nearest.ravel()], axis=1)[distances[own, nearest.ravel()] < near], axis=1)

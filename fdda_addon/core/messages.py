@@ -20,7 +20,7 @@ class MessageType(enum.Enum):
     PARTITION_FINISHED = "partition_finished"
     """joint: str, basis: int, held_out_mm: float (mean error of the held-out poses)."""
     LOG = "log"
-    """text: str."""
+    """text: str. One of a `RecordingWarning` is that as text, "Warning (NAME): …"."""
     FINISHED = "finished"
     """model: str (path), seconds: float, held_out_mm and held_out_p999_mm: float (mean and percentile 99.9);
     verdict: str, "met", "missed" or "exhausted", where there is a target. Of a fit of skin weights: seconds: float,

@@ -4,7 +4,8 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from .rig import UNMOVED, Rig
+from .errors import RecordingError
+from .rig import UNMOVED_LABEL, Rig
 
 MOST_LISTED = 3
 
@@ -28,6 +29,19 @@ class RecordingWarning:
         return asdict(self)
 
 
+def refuse(warnings: Sequence[RecordingWarning]) -> None:
+    """Make an error of warnings: the sentence of the first, with its name and those of the others.
+
+    Raises:
+        RecordingError: there are some.
+    """
+    if not warnings:
+        return
+    others = [warning.name for warning in warnings[1:]]
+    more = f"; {len(others)} more: {', '.join(others)}" if others else ""
+    raise RecordingError(f"{warnings[0].text.removesuffix('.')} ({warnings[0].name}{more}).")
+
+
 def listed(names: Sequence[object], most: int = MOST_LISTED) -> str:
     """The first of some names or numbers: "'a', 'b', 'c' and 4 more"; texts are quoted."""
     shown = [f"'{name}'" if isinstance(name, str) else str(name) for name in names[:most]]
@@ -45,8 +59,7 @@ def counted(names: Sequence[object], noun: str, plural: str = "") -> str:
 
 def joint_name(rig: Rig, joint: int) -> str:
     """Name of a joint for people, also of the one that never moves."""
-    name = rig.joints[joint].name
-    return "(no bone)" if name == UNMOVED else name
+    return rig.joints[joint].name or UNMOVED_LABEL
 
 
 def length(metres: float) -> str:

@@ -218,6 +218,12 @@ def test_alike_poses_are_near():
     assert len(alike_poses(np.ones((300, 4)))) == 0
 
 
+def test_equal_poses_are_no_neighbours():
+    values = np.repeat(np.random.default_rng(0).uniform(0, 1, (100, 1)), 3, axis=0)
+    pairs = alike_poses(values)
+    assert len(pairs) and (values[pairs[:, 0]] != values[pairs[:, 1]]).all()
+
+
 def test_controls_that_change_nothing(good):
     controls = (*good.rig.controls, Control("armature_object", '["fist"]', 0, 1), Control("armature", "x", 0, 1))
     values = np.concatenate([good.controls, good.controls[::-1], np.full((200, 1), 0.5)], axis=1).astype(np.float32)
@@ -296,7 +302,7 @@ def test_vertices_without_a_bone(good):
     good = with_rig(good, joints=joints, rest_matrices=rest, skin_joints=skin_joints, skin_weights=skin_weights)
     good = replace(good, pose_matrices=np.concatenate([good.pose_matrices, still], axis=1))
     good = replace(good, partitions=make_partitions(good.rig))
-    assert "20 of 240 vertices never move, of the partition '(no bone)'" in warned(good)["still-vertices"]
+    assert "20 of 240 vertices never move, of the partition 'no bone'" in warned(good)["still-vertices"]
 
 
 def test_small_partitions(good):

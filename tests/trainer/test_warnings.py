@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Warnings about a recording are announced and reported, and end the training where they are errors."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import QUICK
+
+from fdda_addon.core.messages import Message, MessageType
+from trainer.__main__ import main
+
+
+@pytest.fixture(scope="module")
+def suspicious(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The chain's recording, in which 30 of 120 poses repeat one another, one of them with other residuals."""
+    path = shutil.copytree(recording, tmp_path_factory.mktemp("suspicious") / "recording")
+    for name in ("pose_matrices", "residuals"):
+        array = np.load(path / f"{name}.npy", mmap_mode="r+")
+        array[20:51] = array[20]
+        if name == "residuals":
+            array[50, :, 0] += 0.0005
+        array.flush()
+    return path
+
+
+WARNINGS = ["duplicate-poses", "hidden-inputs"]
+
+
+def test_warnings_are_announced_before_the_training_and_reported(suspicious, tmp_path, capsys):
+    assert main([str(suspicious), str(tmp_path / "m.onnx"), "--messages", *QUICK[2:], "--epochs", "2"]) == 0
+    messages = [Message.decode(line) for line in capsys.readouterr().out.splitlines()]
+    assert [m.type for m in messages[:4]] == [MessageType.STARTED, *[MessageType.LOG] * 2, MessageType.PROGRESS]
+    texts = [m.values["text"] for m in messages[1:3]]
+    report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    assert [w["name"] for w in report["warnings"]] == WARNINGS
+    assert texts == [f"Warning ({w['name']}): {w['text']}" for w in report["warnings"]]
+    assert texts[0].startswith(
+        "Warning (duplicate-poses): 30 of 120 poses repeat an earlier one, such as pose 21 pose 20"
+    )
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<h2>Warnings</h2>" in page and page.count("<dt>hidden-inputs</dt>") == 1
+    assert "Poses 20 and 50 have the same joints and controls" in page
+
+
+@pytest.mark.parametrize("messages", [[], ["--messages"]])
+def test_strict_ends_the_training_before_it_begins(suspicious, tmp_path, capsys, messages):
+    assert main([str(suspicious), str(tmp_path / "m.onnx"), "--strict", *messages, *QUICK]) == 1
+    output = capsys.readouterr()
+    assert output.err.startswith("30 of 120 poses repeat an earlier one, such as pose 21 pose 20: ")
+    assert output.err.endswith(" (duplicate-poses; 1 more: hidden-inputs).\n")
+    assert output.err.count("\n") == 1
+    assert "Warning (hidden-inputs): " in output.out
+    assert ("epoch" in output.out, list(tmp_path.iterdir())) == (False, [])
+
+
+def test_the_text_for_a_person_has_the_warnings(report, suspicious, tmp_path, capsys):
+    assert main([str(suspicious), str(tmp_path / "m.onnx"), *QUICK[2:], "--epochs", "1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in lines[1:3]] == [f"Warning ({name})" for name in WARNINGS]
+    assert report["warnings"] == []
