@@ -76,9 +76,8 @@ def play_point_cache(mesh_object: bpy.types.Object, stack: ModifierStack, path: 
     modifier.time_mode, modifier.play_mode = "FRAME", "SCENE"
     modifier.frame_start, modifier.frame_scale = first, 1.0
     modifier.interpolation, modifier.deform_mode = "LINEAR", "OVERWRITE"
-    # Blender's own axes: nothing is turned.
+    # Blender's own axes: nothing is turned, and nothing is flipped as long as nobody says so.
     modifier.forward_axis, modifier.up_axis = "POS_Y", "POS_Z"
-    modifier.flip_axis = (False, False, False)
 
 
 def play_shape_keys(mesh_object: bpy.types.Object, stack: ModifierStack, positions: np.ndarray, first: int) -> None:
