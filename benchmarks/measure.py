@@ -52,7 +52,7 @@ def recording(rig: str, poses: str = "60") -> dict:
 
 def _bare_loop(scene_rig: SceneRig, count: int) -> float:
     channels = sampled_channels(scene_rig, read_rig(scene_rig))
-    poser = Poser(scene_rig.armature_object, channels)
+    poser = Poser(scene_rig, channels)
     with borrowed_pose(scene_rig.armature_object):
         clear_pose(scene_rig.armature_object)
         values = [sample_pose(channels, 0, index) for index in range(count)]

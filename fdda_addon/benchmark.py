@@ -13,13 +13,23 @@ import bpy
 import numpy as np
 
 from .core.errors import RigError
-from .core.poses import sample_pose
+from .core.poses import CONTROL, ROTATION, Channel, sample_pose
 from .recording import Progress, action_frames
 from .runtime import model_files, playback
 from .runtime.binding import borrowed_binding
+from .runtime.network import Network
 from .scene.armature import Poser, clear_pose
 from .scene.borrow import assign_action, borrowed_attributes, borrowed_pose
-from .scene.rig import SceneRig, armature_modifier, check_evaluable, deforming_modifiers, read_rig, sampled_channels
+from .scene.rig import (
+    SceneRig,
+    armature_modifier,
+    check_evaluable,
+    deforming_modifiers,
+    model_channels,
+    read_model_rig,
+    read_rig,
+    sampled_channels,
+)
 
 ROUNDS = 5
 """The ways take turns so often."""
@@ -110,7 +120,9 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
     """
     check_evaluable(scene_rig)
     mesh_object = scene_rig.mesh_object
-    with playing(scene_rig) as played, borrowed_binding(scene_rig, model):
+    info = Network(model).info if model else model_files.network_of(mesh_object).info
+    channels = model_channels(scene_rig, read_model_rig(scene_rig, info), info)
+    with playing(scene_rig, channels) as played, borrowed_binding(scene_rig, model):
         ways = {"rig": _rig, "linear": armature_alone, "fdda": _fdda, "floor": _floor}
         times: dict[str, list[float]] = {way: [] for way in ways}
         each = max(1, -(-frames // ROUNDS))
@@ -121,20 +133,21 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
                 yield Progress("benchmark", number * len(ways) + place, ROUNDS * len(ways))
         network = model_files.network_of(mesh_object)
         pose = network.info.rest_matrices[None]
-        inference = _time([lambda: network.positions(pose)] * (frames + WARM_UP))[WARM_UP:]
+        controls = np.zeros((1, len(network.info.controls)), np.float32)
+        inference = _time([lambda: network.positions(pose, controls)] * (frames + WARM_UP))[WARM_UP:]
     yield Benchmark(len(mesh_object.data.vertices), each * ROUNDS, **times, inference=inference)
 
 
 @contextmanager
-def playing(scene_rig: SceneRig) -> Iterator[range]:
-    """Let its action drive the armature, one of random poses where it has none; gives the frames.
+def playing(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> Iterator[range]:
+    """Let its action drive the armature, one of random poses (`random_action`) where it has none; gives the frames.
 
     Pose and animation are as before afterwards.
     """
     animation = scene_rig.armature_object.animation_data
     own_action = animation.action if animation else None
     with borrowed_pose(scene_rig.armature_object, [own_action] if own_action else []):
-        action = own_action or random_action(scene_rig)
+        action = own_action or random_action(scene_rig, channels)
         assign_action(scene_rig.armature_object, action)
         try:
             yield action_frames(action)
@@ -144,18 +157,24 @@ def playing(scene_rig: SceneRig) -> Iterator[range]:
                 bpy.data.actions.remove(action)
 
 
-def random_action(scene_rig: SceneRig) -> bpy.types.Action:
-    """Key random poses on the armature, a pose every few frames; its action."""
+def random_action(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> bpy.types.Action:
+    """Key random poses on the armature, a pose every few frames; its action.
+
+    Args:
+        scene_rig: the rig.
+        channels: what a pose moves, those of the rig when left out; controls are left as they are.
+    """
     armature_object = scene_rig.armature_object
-    channels = sampled_channels(scene_rig, read_rig(scene_rig))
+    channels = [c for c in channels or sampled_channels(scene_rig, read_rig(scene_rig)) if c.kind != CONTROL]
     clear_pose(armature_object)
-    poser = Poser(armature_object, channels)
+    poser = Poser(scene_rig, channels)
     paths = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
     for index in range(RANDOM_POSES):
         poser.set(sample_pose(channels, 0, index))
-        for name in {channel.bone for channel in channels}:
+        for name, kind in {(channel.bone, channel.kind) for channel in channels}:
             bone = armature_object.pose.bones[name]
-            bone.keyframe_insert(paths.get(bone.rotation_mode, "rotation_euler"), frame=1 + index * KEY_STEP)
+            path = paths.get(bone.rotation_mode, "rotation_euler") if kind == ROTATION else kind
+            bone.keyframe_insert(path, frame=1 + index * KEY_STEP)
     return armature_object.animation_data.action
 
 

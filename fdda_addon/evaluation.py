@@ -15,12 +15,13 @@ from .core.partition import Partition
 from .core.poses import Channel, beyond_range, sample_pose
 from .core.skinning import LinearLayer
 from .core.surface import Surface, SurfaceComparison, SurfaceErrors, surface_errors, surface_json
-from .recording import Progress, action_frames, find_action
+from .recording import Progress, action_frames, control_names, find_action
 from .runtime.network import Network
 from .scene.armature import Poser, clear_pose
 from .scene.borrow import assign_action, borrowed_pose
+from .scene.controls import borrowed_controls
 from .scene.modifier_stack import borrowed_stack
-from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
+from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, model_channels, read_model_rig
 
 HELD_OUT_INDEX = 1 << 33
 """Held-out poses are drawn from indices that no recording reaches, so that they differ from the poses of any recording
@@ -64,6 +65,7 @@ class PoseErrors:
         name: what the poses are.
         pose_matrices: (N, J, 4, 4) float32, mesh-object space, metres.
         positions: (N, V, 3) float32, the true rig, mesh-object space, metres.
+        controls: (N, C) float32, values of the controls.
         fdda, linear: (N, V) float32, distances from the true rig, metres.
         fdda_surface, linear_surface: errors of normals and edges, None for a mesh without faces, or where
             they were not compared.
@@ -72,6 +74,7 @@ class PoseErrors:
     name: str
     pose_matrices: np.ndarray
     positions: np.ndarray
+    controls: np.ndarray
     fdda: np.ndarray
     linear: np.ndarray
     fdda_surface: SurfaceErrors | None = None
@@ -96,6 +99,7 @@ class Evaluation:
         held_out: errors of the random poses.
         actions, beyond, named: errors of the actions, of the poses beyond the range of motion by factor, and of the
             poses given by hand.
+        channels: that the random poses were drawn from.
     """
 
     partitions: tuple[Partition, ...]
@@ -104,6 +108,7 @@ class Evaluation:
     actions: list[PoseErrors] = field(default_factory=list)
     beyond: list[PoseErrors] = field(default_factory=list)
     named: list[PoseErrors] = field(default_factory=list)
+    channels: tuple[Channel, ...] = ()
 
     @property
     def fdda(self) -> ErrorStatistics:
@@ -160,7 +165,11 @@ def evaluate(
     extra = max(1, settings.poses // 4)
     total = settings.poses + extra * len(settings.beyond) + len(settings.named)
     total += sum(len(action_frames(action)) for action in actions)
-    with borrowed_stack(scene_rig.mesh_object), borrowed_pose(scene_rig.armature_object, actions), borrowed_controls(scene_rig, control_names(rig, channels)):
+    with (
+        borrowed_stack(scene_rig.mesh_object),
+        borrowed_pose(scene_rig.armature_object, actions),
+        borrowed_controls(scene_rig, control_names(rig, channels)),
+    ):
         clear_pose(scene_rig.armature_object)
         comparison = _Comparison(PoseEvaluator(scene_rig, rig), network, layer, total, settings.surface)
         poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses)
@@ -176,7 +185,7 @@ def evaluate(
         compared_actions = []
         for action in actions:
             compared_actions.append((yield from comparison.compare(action.name, _action_poses(scene_rig, action))))
-    yield Evaluation(layer.partitions, rig.joint_names, held_out, compared_actions, beyond, named)
+    yield Evaluation(layer.partitions, rig.joint_names, held_out, compared_actions, beyond, named, channels)
 
 
 def evaluate_action(scene_rig: SceneRig, model: Path | Network, name: str) -> Iterator[Progress | Evaluation]:
@@ -201,14 +210,8 @@ def _prepare(scene_rig: SceneRig, model: Path | Network) -> tuple[Network, Linea
     return network, LinearLayer(network.linear_rig(rig))
 
 
-def pose_held_out(scene_rig: SceneRig, seed: int, index: int) -> None:
-    """Pose a rig as for one of the random poses that `evaluate` compares.
-
-    Raises:
-        RigError: nothing may be sampled.
-    """
-    info = model_files.network_of(scene_rig.mesh_object).info
-    channels = model_channels(scene_rig, read_model_rig(scene_rig, info), info)
+def pose_held_out(scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, index: int) -> None:
+    """Pose a rig as for one of the random poses that `evaluate` compares, with the channels of that evaluation."""
     clear_pose(scene_rig.armature_object)
     next(_random_poses(scene_rig, channels, seed, HELD_OUT_INDEX + index, 1))
 
@@ -252,18 +255,19 @@ class _Comparison:
 
     def compare(self, name: str, poses: Iterator[None]) -> Iterator[Progress]:
         """Yields progress, returns PoseErrors."""
-        matrices, positions, fdda, linear, surface = [], [], [], [], []
+        matrices, positions, values, fdda, linear, surface = [], [], [], [], [], []
         for _ in poses:
             pose, true, controls = self._evaluator.evaluate()
             moved = self._network.positions(pose[None], controls[None])[0]
-            for values, what in ((true, "The rig"), (moved, f"The model '{self._network.path}'")):
-                if not np.isfinite(values).all():
+            for points, what in ((true, "The rig"), (moved, f"The model '{self._network.path}'")):
+                if not np.isfinite(points).all():
                     raise FDDAError(
                         f"{what} gives positions that are not numbers ({name}, pose {len(fdda)}); "
                         "look for a scale of zero or a broken driver in the rig, else train again."
                     )
             matrices.append(pose)
             positions.append(true)
+            values.append(controls)
             fdda.append(distances(moved, true))
             skinned = self._layer.positions(pose[None])[0]
             linear.append(distances(skinned, true))
@@ -271,5 +275,5 @@ class _Comparison:
                 surface.append(self._surface.compare(true, (moved, skinned)))
             self._done += 1
             yield Progress("evaluation", self._done, self._total)
-        stacked = (np.stack(arrays) for arrays in (matrices, positions, fdda, linear))
+        stacked = (np.stack(arrays) for arrays in (matrices, positions, values, fdda, linear))
         return PoseErrors(name, *stacked, *(surface_errors(rows) for rows in zip(*surface, strict=True)))

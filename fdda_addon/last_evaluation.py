@@ -10,6 +10,7 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     import numpy as np
 
     from .core.metrics import ErrorStatistics
+    from .core.poses import Channel
     from .evaluation import Evaluation
 
 MOST_KEPT = 4
@@ -43,6 +44,7 @@ class LastEvaluation:
         errors: (N, V) float32, metres, by the names of `WAYS`.
         total: statistics of all vertices by the names of `WAYS`.
         partitions: the worst first, by the largest error of the model.
+        channels: that the random poses were drawn from.
     """
 
     name: str
@@ -52,6 +54,7 @@ class LastEvaluation:
     errors: "dict[str, np.ndarray]"
     total: "dict[str, ErrorStatistics]"
     partitions: tuple[PartitionErrors, ...]
+    channels: "tuple[Channel, ...]"
 
     @property
     def poses(self) -> int:
@@ -122,6 +125,7 @@ def keep(
         errors,
         {way: error_statistics(errors[way]) for way in WAYS},
         tuple(partitions),
+        evaluation.channels,
     )
     _kept.pop(mesh_object.session_uid, None)
     while len(_kept) >= MOST_KEPT:

@@ -9,7 +9,7 @@ from .core.model import ModelInfo
 from .core.poses import Channel, range_changes
 from .core.rig import Rig, differences
 from .models import info_of
-from .scene.rig import SceneRig, read_rig, sampled_channels
+from .scene.rig import SceneRig, read_model_rig, sampled_channels
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,16 @@ class Changes:
 
 
 def changes(name: str, info: ModelInfo, rig: Rig, channels: tuple[Channel, ...]) -> Changes:
-    """Compare a rig, and the range of motion of its poses, with what a model was trained for."""
+    """Compare a rig, and the range of motion of its poses, with what a model was trained for.
+
+    Args:
+        name, info: the model.
+        rig: with the joints of the model (`scene.rig.read_model_rig`).
+        channels: of the rig as it stands. The ranges of control bones were chosen by the user and are not compared.
+    """
     clauses = differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
-    return Changes(name, tuple(clauses), tuple(range_changes(info.limits, channels)) if info.limits else ())
+    is_own = all(channel.bone in rig.joint_names for channel in info.limits)
+    return Changes(name, tuple(clauses), tuple(range_changes(info.limits, channels)) if info.limits and is_own else ())
 
 
 def changes_since(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> Changes:
@@ -61,5 +68,6 @@ def changes_since(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> Change
     Raises:
         FDDAError: the rig or the model cannot be read.
     """
-    rig = read_rig(scene_rig)
-    return changes(entry.name, info_of(scene_rig.mesh_object, entry), rig, sampled_channels(scene_rig, rig))
+    info = info_of(scene_rig.mesh_object, entry)
+    rig = read_model_rig(scene_rig, info)
+    return changes(entry.name, info, rig, sampled_channels(scene_rig, rig))

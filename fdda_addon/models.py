@@ -14,7 +14,7 @@ from .model_list import bound_entry, bound_name, chosen_entry, is_bound
 from .runtime import model_files, packed, playback
 from .runtime.binding import bind, unbind
 from .runtime.model_files import absolute_path, path_for
-from .scene.rig import SceneRig, read_rig
+from .scene.rig import SceneRig, read_model_rig
 
 _infos: dict[tuple, ModelInfo] = {}
 
@@ -69,7 +69,8 @@ def check(scene_rig: SceneRig, path: Path) -> None:
     Raises:
         FDDAError: says why.
     """
-    check_rig(path, read_model_info(path), read_rig(scene_rig))
+    info = read_model_info(path)
+    check_rig(path, info, read_model_rig(scene_rig, info))
 
 
 def bind_entry(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> None:

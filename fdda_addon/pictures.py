@@ -12,7 +12,7 @@ from .core.skinning import LinearLayer
 from .drawing import Cell, View, draw
 from .evaluation import PoseErrors
 from .runtime.network import Network
-from .scene.rig import SceneRig, read_rig
+from .scene.rig import SceneRig, read_model_rig, read_rig
 
 PLAIN = (0.78, 0.64, 0.55)
 
@@ -24,11 +24,14 @@ class PicturedPose:
     name: str
     pose_matrices: np.ndarray
     positions: np.ndarray
+    controls: np.ndarray
 
 
 def pictured(errors: PoseErrors, index: int, name: str = "") -> PicturedPose:
     """One of the poses that were evaluated."""
-    return PicturedPose(name or f"{errors.name} {index}", errors.pose_matrices[index], errors.positions[index])
+    return PicturedPose(
+        name or f"{errors.name} {index}", errors.pose_matrices[index], errors.positions[index], errors.controls[index]
+    )
 
 
 def worst_poses(errors: PoseErrors) -> list[PicturedPose]:
@@ -73,11 +76,11 @@ def draw_comparison(
         OutputError: the file cannot be written.
     """
     network = Network(model)
-    layer = LinearLayer(network.linear_rig(read_rig(scene_rig)))
+    layer = LinearLayer(network.linear_rig(read_model_rig(scene_rig, network.info)))
     rows = []
     for pose in poses:
         linear = layer.positions(pose.pose_matrices[None])[0]
-        fdda = network.positions(pose.pose_matrices[None])[0].copy()
+        fdda = network.positions(pose.pose_matrices[None], pose.controls[None])[0].copy()
         cells = [(pose.positions, f"{pose.name}: true rig"), (linear, "linear layer"), (fdda, "FDDA")]
         rows.append([_cell(positions, pose.positions, label, heat) for positions, label in cells])
     title = title or ("Distance from the true rig" if heat else "True rig, linear layer and FDDA")

@@ -4,7 +4,7 @@
 import contextlib
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
@@ -12,18 +12,23 @@ import numpy as np
 
 from .core.errors import RecordingError, RigError
 from .core.output import check_folder_writable
-from .core.partition import INFLUENCE_TOLERANCE, make_partitions, residual_changes
-from .core.poses import DEFAULT_SPREAD, Channel, sample_pose
+from .core.partition import GOLDEN_RATIO, INFLUENCE_TOLERANCE, make_partitions
+from .core.poses import CONTROL, DEFAULT_SPREAD, Channel, sample_pose
 from .core.progress import Progress
 from .core.recording import RecordingInfo, Sampling, Source
 from .core.recording_extension import RecordingExtension
 from .core.recording_writer import RecordingWriter
 from .core.rig import Rig
 from .core.skinning import LinearLayer
+from .influences import Search, find_influences
+from .residuals import local_residuals
 from .scene.armature import Poser, clear_pose
 from .scene.borrow import assign_action, borrowed_pose
+from .scene.controls import borrowed_controls, stated_controls
+from .scene.dependencies import read_dependencies
 from .scene.modifier_stack import borrowed_stack
 from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
+from .scene.sampling import choose
 
 BATCH_BYTES = 6 << 20
 BATCH_POSES = 250
@@ -46,6 +51,9 @@ class RecordingSettings:
         influence_tolerance: a joint influences a partition when it moves a local residual by more than this part of
             the character's size.
         resume: continue a recording that was interrupted.
+        sample: which control bones the random poses move, as `sampling.choose` reads it; the bones of the rig as it
+            stands when it is empty.
+        controls: which numbers are inputs and are sampled beside those that are found, as `stated_controls` reads it.
     """
 
     poses: int = 1000
@@ -55,6 +63,8 @@ class RecordingSettings:
     influence_poses: int = 10
     influence_tolerance: float = INFLUENCE_TOLERANCE
     resume: bool = False
+    sample: tuple[str, ...] = ()
+    controls: tuple[str, ...] = ()
 
 
 def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iterator[Progress]:
@@ -77,8 +87,7 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
     """
     actions = [find_action(name) for name in settings.actions]
     check_evaluable(scene_rig)
-    rig = read_rig(scene_rig)
-    channels = sampled_channels(scene_rig, rig) if settings.poses else ()
+    rig, channels = planned_rig(scene_rig, settings)
     check_folder_writable(path)
     sampling = planned_sampling(settings, channels)
     total = sum(source.poses for source in sampling.sources)
@@ -88,10 +97,21 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         total, 0, Path(bpy.data.filepath).name, scene_rig.mesh_object.name, bpy.app.version_string, sampling
     )
 
-    with borrowed_stack(scene_rig.mesh_object), borrowed_pose(scene_rig.armature_object, actions):
+    with (
+        borrowed_stack(scene_rig.mesh_object),
+        borrowed_pose(scene_rig.armature_object, actions),
+        borrowed_controls(scene_rig, control_names(rig, channels)),
+    ):
         clear_pose(scene_rig.armature_object)
         evaluator = PoseEvaluator(scene_rig, rig)
-        partitions = yield from _detect_influences(scene_rig, rig, channels, evaluator, settings)
+        search = Search(
+            channels,
+            lambda number: sample_pose(channels, settings.seed, INFLUENCE_SEED_OFFSET + number, settings.spread),
+            lambda number: _show_frame(scene_rig, actions, number),
+            settings.influence_poses,
+            settings.influence_tolerance,
+        )
+        partitions = yield from find_influences(scene_rig, rig, make_partitions(rig), evaluator, search)
         layer = LinearLayer(rig, partitions)
         with RecordingWriter(path, rig, partitions, info, settings.resume) as writer:
             poses = _poses(scene_rig, channels, settings, actions, writer.complete)
@@ -100,6 +120,30 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
             with contextlib.closing(append_poses(poses, evaluator, layer, writer)) as steps:
                 for done in steps:
                     yield Progress("poses", done, total)
+
+
+def planned_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
+    """The rig with its controls, and the channels of its random poses, as these settings record it.
+
+    The joints of a rig whose control bones are sampled are the bones that have weights, and those that the mesh depends
+    on otherwise: what animators pose is no input of a model, what follows from it is.
+
+    Raises:
+        RigError: the rig cannot be read, or nothing may be sampled.
+    """
+    dependencies = read_dependencies(scene_rig)
+    controls = {control.name: control for control in dependencies.controls}
+    controls |= {control.name: control for control in stated_controls(scene_rig, settings.controls)}
+    choice = choose(scene_rig, settings.sample, tuple(controls.values()))
+    rig = read_rig(scene_rig, None if choice.bones is None else dependencies.bones)
+    channels = sampled_channels(scene_rig, rig, choice) if settings.poses else ()
+    return replace(rig, controls=choice.controls), channels
+
+
+def control_names(rig: Rig, channels: tuple[Channel, ...]) -> list[str]:
+    """Names of the controls that a rig has or that are sampled."""
+    sampled = [channel.bone for channel in channels if channel.kind == CONTROL]
+    return list(dict.fromkeys([*(control.name for control in rig.controls), *sampled]))
 
 
 def planned_sampling(settings: RecordingSettings, channels: tuple[Channel, ...]) -> Sampling:
@@ -145,7 +189,7 @@ def _poses(
     first: int,
 ) -> Iterator[None]:
     """Pose the rig, one pose an iteration, from pose `first` of the recording on."""
-    poser = Poser(scene_rig.armature_object, channels)
+    poser = Poser(scene_rig, channels)
     for index in range(first, settings.poses):
         poser.set(sample_pose(channels, settings.seed, index, settings.spread))
         yield
@@ -175,101 +219,41 @@ def append_poses(
     with ThreadPoolExecutor(max_workers=1) as appending:
         # While a batch is turned into residuals and written, Blender evaluates the next one.
         previous: Future | None = None
-        matrices, positions = [], []
+        batch: list[tuple] = []
         try:
             for _ in poses:
-                pose, evaluated = evaluator.evaluate()
-                matrices.append(pose)
-                positions.append(evaluated)
+                batch.append(evaluator.evaluate())
                 done += 1
-                if len(matrices) == size:
+                if len(batch) == size:
                     if previous is not None:
                         previous.result()
-                    previous = appending.submit(_append, writer, layer, matrices, positions)
-                    matrices, positions = [], []
+                    previous = appending.submit(_append, writer, layer, batch)
+                    batch = []
                 yield done
         except GeneratorExit:
-            _append_last(previous, writer, layer, matrices, positions)
+            _append_last(previous, writer, layer, batch)
             raise
-        _append_last(previous, writer, layer, matrices, positions)
+        _append_last(previous, writer, layer, batch)
 
 
 def _append_last(
-    previous: Future | None,
-    writer: RecordingWriter | RecordingExtension,
-    layer: LinearLayer,
-    matrices: list,
-    positions: list,
+    previous: Future | None, writer: RecordingWriter | RecordingExtension, layer: LinearLayer, batch: list[tuple]
 ) -> None:
     if previous is not None:
         previous.result()
-    if matrices:
-        _append(writer, layer, matrices, positions)
+    if batch:
+        _append(writer, layer, batch)
 
 
-def _append(writer: RecordingWriter | RecordingExtension, layer: LinearLayer, matrices: list, positions: list) -> None:
-    pose_matrices = np.stack(matrices)
-    writer.append(pose_matrices, _local_residuals(layer, pose_matrices, np.stack(positions)))
+def _append(writer: RecordingWriter | RecordingExtension, layer: LinearLayer, batch: list[tuple]) -> None:
+    pose_matrices, positions, controls = (np.stack(arrays) for arrays in zip(*batch, strict=True))
+    writer.append(pose_matrices, local_residuals(layer, pose_matrices, positions), controls)
 
 
-def _local_residuals(layer: LinearLayer, pose_matrices: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """As `LinearLayer.local_residuals`, with a sentence for a joint without extent."""
-    try:
-        return layer.local_residuals(pose_matrices, positions)
-    except np.linalg.LinAlgError as error:
-        flat = np.abs(np.linalg.det(pose_matrices[:, :, :3, :3].astype(np.float64))).min(axis=0)
-        raise RigError(
-            f"Bone '{layer.rig.joint_names[int(flat.argmin())]}' has a scale of zero in some pose; "
-            "look for a constraint or driver that sets it."
-        ) from error
-
-
-def _detect_influences(
-    scene_rig: SceneRig,
-    rig: Rig,
-    channels: tuple[Channel, ...],
-    evaluator: PoseEvaluator,
-    settings: RecordingSettings,
-) -> Iterator[Progress]:
-    """Move one joint at a time, from the rest pose and from random ones; returns the partitions.
-
-    A joint that a constraint moves is left out: it follows from the joint that moves it. When no joint may be moved
-    (an action alone is recorded), nothing is known and every joint influences every partition.
-    """
-    partitions = make_partitions(rig)
-    if not channels:
-        return make_partitions(rig, {partition.joint: tuple(range(len(rig.joints))) for partition in partitions})
-    layer = LinearLayer(rig, partitions)
-    poser = Poser(scene_rig.armature_object, channels)
-    threshold = settings.influence_tolerance * rig.size
-    places = {
-        joint: [i for i, c in enumerate(channels) if c.bone == name] for joint, name in enumerate(rig.joint_names)
-    }
-    moved = {joint: own for joint, own in places.items() if own}
-    rest = np.array([min(max(0.0, c.low), c.high) for c in channels])
-    count = settings.influence_poses
-    influencing: dict[int, set[int]] = {partition.joint: set() for partition in partitions}
-
-    def local_residuals(values: np.ndarray) -> np.ndarray:
-        poser.set(values)
-        pose, positions = evaluator.evaluate()
-        return _local_residuals(layer, pose[None], positions[None])
-
-    def draw(index: int) -> np.ndarray:
-        return sample_pose(channels, settings.seed, INFLUENCE_SEED_OFFSET + index, settings.spread)
-
-    total = count * (len(moved) + 1)
-    # One base pose serves all joints: the rest pose for half of the moves, a random pose each for the others.
-    bases = [rest] * (count - count // 2) + [draw(number) for number in range(count // 2)]
-    for number, base in enumerate(bases):
-        base_residuals = local_residuals(base)
-        for step, (joint, own) in enumerate(moved.items(), number * (len(moved) + 1) + 1):
-            yield Progress("influences", step, total)
-            values = base.copy()
-            values[own] = draw((joint + 1) * count + number)[own]
-            changes = residual_changes(partitions, local_residuals(values), base_residuals)
-            for partition, change in zip(partitions, changes, strict=True):
-                if change > threshold:
-                    influencing[partition.joint].add(joint)
-        yield Progress("influences", (number + 1) * (len(moved) + 1), total)
-    return make_partitions(rig, {joint: tuple(sorted(found)) for joint, found in influencing.items()})
+def _show_frame(scene_rig: SceneRig, actions: list[bpy.types.Action], number: int) -> None:
+    """Pose the rig as on one of the frames of some actions, far apart for numbers that follow each other."""
+    frames = [(action, frame) for action in actions for frame in action_frames(action)]
+    action, frame = frames[int(number * GOLDEN_RATIO * len(frames)) % len(frames)]
+    clear_pose(scene_rig.armature_object)
+    assign_action(scene_rig.armature_object, action)
+    bpy.context.scene.frame_set(frame)

@@ -19,12 +19,14 @@ from .core.recording_extension import RecordingExtension
 from .core.refinement import Probes, choose_poses, nearest_distances
 from .core.rig import Rig, differences
 from .core.skinning import LinearLayer
-from .recording import append_poses
+from .recording import append_poses, control_names
 from .runtime.network import Network
 from .scene.armature import Poser, clear_pose
 from .scene.borrow import borrowed_pose
+from .scene.controls import borrowed_controls
 from .scene.modifier_stack import borrowed_stack
-from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
+from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, model_channels, read_model_rig
+from .scene.sampling import states_channels
 
 PROBE_INDEX, BASE_INDEX = 1 << 34, 1 << 35
 """Poses are drawn from indices that neither a recording nor an evaluation reaches."""
@@ -69,21 +71,25 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
     network = Network(model)
     recording = read_recording(path)
     check_evaluable(scene_rig)
-    rig = read_rig(scene_rig)
+    rig = read_model_rig(scene_rig, network.info)
     check_rig(model, network.info, rig)
-    channels = sampled_channels(scene_rig, rig)
-    _check_recording(recording, rig, channels)
+    channels = model_channels(scene_rig, rig, network.info)
+    _check_recording(scene_rig, recording, rig, channels)
     first = len(recording.pose_matrices)
-    with borrowed_stack(scene_rig.mesh_object), borrowed_pose(scene_rig.armature_object):
+    with (
+        borrowed_stack(scene_rig.mesh_object),
+        borrowed_pose(scene_rig.armature_object),
+        borrowed_controls(scene_rig, control_names(rig, channels)),
+    ):
         clear_pose(scene_rig.armature_object)
-        evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig.armature_object, channels)
+        evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig, channels)
         count = max(LEAST_PROBES, settings.poses)
         values = np.stack([_probe(channels, settings.seed, PROBE_INDEX + first + i) for i in range(count)])
         matrices, errors = [], []
         for number, pose in enumerate(values):
             poser.set(pose)
-            pose_matrices, true = evaluator.evaluate()
-            moved = distances(network.positions(pose_matrices[None])[0], true)
+            pose_matrices, true, controls = evaluator.evaluate()
+            moved = distances(network.positions(pose_matrices[None], controls[None])[0], true)
             matrices.append(pose_matrices)
             errors.append([moved[partition.vertices].max() for partition in recording.partitions])
             yield Progress("probes", number + 1, count)
@@ -103,7 +109,7 @@ def _probe(channels: tuple[Channel, ...], seed: int, index: int) -> np.ndarray:
     return sample_pose(channels, seed, index, WIDE_SPREAD if index % 2 else DEFAULT_SPREAD)
 
 
-def _check_recording(recording: Recording, rig: Rig, channels: tuple[Channel, ...]) -> None:
+def _check_recording(scene_rig: SceneRig, recording: Recording, rig: Rig, channels: tuple[Channel, ...]) -> None:
     own = recording.rig
     found = differences(own.joints, own.rest_matrices, own.vertex_count, own.fingerprint, rig)
     if found:
@@ -113,7 +119,7 @@ def _check_recording(recording: Recording, rig: Rig, channels: tuple[Channel, ..
             f"'{recording.path}' has no random poses, so there is no range of motion to choose from; record with "
             "--poses."
         )
-    if recording.info.sampling.channels != channels:
+    if recording.info.sampling.channels != channels or not states_channels(scene_rig, channels):
         raise RecordingError(
             f"The range of motion of the rig is not that of '{recording.path}' any more; record anew into another "
             "folder."
@@ -138,6 +144,9 @@ def _thinness(recording: Recording, pose_matrices: np.ndarray) -> np.ndarray:
 
 def _owned(recording: Recording, channels: tuple[Channel, ...]) -> list[np.ndarray]:
     """For each partition the channels of the joints that influence it."""
-    names = recording.rig.joint_names
-    influencing = [{names[joint] for joint in partition.influencing} for partition in recording.partitions]
+    names, controls = recording.rig.joint_names, recording.rig.controls
+    influencing = [
+        {names[joint] for joint in partition.influencing} | {controls[control].name for control in partition.controls}
+        for partition in recording.partitions
+    ]
     return [np.array([i for i, c in enumerate(channels) if c.bone in own], int) for own in influencing]

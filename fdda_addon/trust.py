@@ -4,7 +4,9 @@
 import bpy
 
 from .core.errors import FDDAError
+from .core.rig import UNMOVED
 from .runtime import model_files
+from .scene.controls import ControlReader
 from .scene.rig import PoseReader, SceneRig, armature_of
 
 _last: dict[int, tuple[object, bytes, list[tuple[str, float]] | None]] = {}
@@ -24,22 +26,25 @@ def partition_trust(mesh_object: bpy.types.Object) -> list[tuple[str, float]] | 
     try:
         network = model_files.network_of(mesh_object)
         names = tuple(joint.name for joint in network.info.joints)
-        if any(name not in armature_object.data.bones for name in names):
+        if any(name not in armature_object.data.bones for name in names if name != UNMOVED):
             return None
         depsgraph = bpy.context.evaluated_depsgraph_get()
         evaluated = [o.evaluated_get(depsgraph) for o in (mesh_object, armature_object)]
         if not all(o.is_evaluated for o in evaluated):
             return None
-        pose = PoseReader(SceneRig(mesh_object, armature_object), names, network.info.rest_matrices).read(*evaluated)
+        scene_rig = SceneRig(mesh_object, armature_object)
+        pose = PoseReader(scene_rig, names, network.info.rest_matrices).read(*evaluated)
+        controls = ControlReader(scene_rig, network.info.controls).read(scene_rig, depsgraph)
+        shown = pose.tobytes() + controls.tobytes()
         kept = _last.get(mesh_object.session_uid)
-        if kept is None or kept[0] is not network or kept[1] != pose.tobytes():
-            trust = network.trust(pose[None])
+        if kept is None or kept[0] is not network or kept[1] != shown:
+            trust = network.trust(pose[None], controls[None])
             values = None
             if trust is not None:
                 partitions = zip(network.info.partitions, trust[0].tolist(), strict=True)
                 values = sorted(((names[p.joint], value) for p, value in partitions), key=lambda pair: pair[1])
             _last.clear()
-            kept = _last[mesh_object.session_uid] = (network, pose.tobytes(), values)
+            kept = _last[mesh_object.session_uid] = (network, shown, values)
         return kept[2]
     except FDDAError:
         # The playback itself says what is wrong.

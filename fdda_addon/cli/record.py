@@ -24,6 +24,22 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--spread", type=float, default=1.0, help="standard deviation as a part of half the range (default 1.0)"
     )
     parser.add_argument("--action", action="append", default=[], metavar="NAME", help="record its frames as well")
+    parser.add_argument(
+        "--sample",
+        action="append",
+        default=[],
+        metavar="WHAT",
+        help="what the random poses move, in place of the bones that have weights: collection:NAME, action:NAME (what it "
+        "keys, in its range), bone:NAME or selected; may be given several times",
+    )
+    parser.add_argument(
+        "--control",
+        action="append",
+        default=[],
+        metavar="NAME[=LOW:HIGH]",
+        help="a number that deforms the mesh beside the joints: the name of a shape key, shape_keys for all of them, or "
+        "OWNER/PATH; those that drivers of the mesh read are found by themselves; may be given several times",
+    )
     parser.add_argument("--resume", action="store_true", help="continue a recording that was interrupted")
     parser.add_argument(
         "--refine", metavar="MODEL.onnx", type=Path, help="add poses to the recording where this model is worst"
@@ -41,8 +57,10 @@ def run(options: argparse.Namespace) -> None:
     # Wider is uniform already, and most draws would fall outside and be drawn again.
     if not 0 < options.spread <= 10:
         raise WrongUsageError("--spread must be more than 0 and at most 10.")
-    if options.refine and (options.action or options.resume or options.poses == 0):
-        raise WrongUsageError("--refine adds random poses to a complete recording; leave --action and --resume out.")
+    if options.refine and (options.action or options.resume or options.sample or options.control or options.poses == 0):
+        raise WrongUsageError(
+            "--refine adds random poses to a complete recording; leave --action, --sample, --control and --resume out."
+        )
     scene_rig = open_rig(options)
     start = time.monotonic()
     with ProgressPrinter() as progress, true_rig(scene_rig.mesh_object):
@@ -61,6 +79,12 @@ def _steps(scene_rig: "SceneRig", options: argparse.Namespace) -> "Iterator[Prog
         settings = RefinementSettings(seed=options.seed, **given)
         return refine(scene_rig, options.recording, options.refine, settings)
     settings = RecordingSettings(
-        seed=options.seed, spread=options.spread, actions=tuple(options.action), resume=options.resume, **given
+        seed=options.seed,
+        spread=options.spread,
+        actions=tuple(options.action),
+        resume=options.resume,
+        sample=tuple(options.sample),
+        controls=tuple(options.control),
+        **given,
     )
     return record(scene_rig, options.recording, settings)

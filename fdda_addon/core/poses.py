@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 ROTATION, LOCATION, SCALE, CONTROL = "rotation", "location", "scale", "control"
+KINDS = (ROTATION, LOCATION, SCALE, CONTROL)
 """Kinds of channels."""
 DEFAULT_RANGE = (-np.pi / 4, np.pi / 4)
 """Range of a rotation axis that the rig neither limits nor locks, radians."""
@@ -34,6 +35,11 @@ class Channel:
     axis: int
     low: float
     high: float
+
+    @property
+    def rest(self) -> float:
+        """The value of the rest pose, or what comes nearest to it in the range."""
+        return min(max(1.0 if self.kind == SCALE else 0.0, self.low), self.high)
 
     def to_json(self) -> dict:
         return asdict(self)

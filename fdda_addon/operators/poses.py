@@ -8,6 +8,7 @@ import bpy
 from ..core.errors import FDDAError, RigError
 from .job import current
 from .on_rig import OnRig
+from .recording import recorded_actions
 
 
 class _OnPose(OnRig):
@@ -68,7 +69,7 @@ class FDDA_OT_preview_pose(_OnPose, bpy.types.Operator):
         start = self.number if self.number >= 0 else session.pose_number
         number = max(0, start + self.step)
         clear_pose(rig.armature_object)
-        Poser(rig.armature_object, channels).set(sample_pose(channels, settings.seed, number, settings.spread))
+        Poser(rig, channels).set(sample_pose(channels, settings.seed, number, settings.spread))
         rig.armature_object.update_tag(refresh={"DATA"})
         session.pose_number = number
         return f"Random pose {number} of seed {settings.seed}."
@@ -151,4 +152,41 @@ class FDDA_OT_unstate_range(_OnRange, bpy.types.Operator):
         return f"'{bone.name}' states no range about {self.axis} any more."
 
 
-CLASSES = (FDDA_OT_preview_pose, FDDA_OT_rest_pose, FDDA_OT_state_range, FDDA_OT_unstate_range)
+class FDDA_OT_limits_from_actions(_OnPose, bpy.types.Operator):
+    bl_idname = "fdda.limits_from_actions"
+    bl_label = "Set Limits from Actions"
+    bl_description = (
+        "Make how far the ticked actions move each bone its range of motion. Posing stays free: what IK limits cannot "
+        "say goes into Limit constraints without influence"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    margin: bpy.props.FloatProperty(
+        name="Margin",
+        description="Part of the width of a range that is added at each end",
+        default=0.1,
+        min=0.0,
+        max=10.0,
+    )
+
+    def change(self, context: bpy.types.Context) -> str:
+        from ..scene.measured_limits import state_measured_limits
+
+        rig = self.rig(context)
+        names = recorded_actions(rig.armature_object)
+        if not names:
+            raise RigError("No action is ticked; tick those of Actions to record as well that show how the rig moves.")
+        limits = state_measured_limits(rig, [bpy.data.actions[name] for name in names], self.margin)
+        stated = {limit.bone for limit in limits if not limit.why_not}
+        left = [limit for limit in limits if limit.why_not]
+        others = f"; {len(left)} axes were left as they are ('{left[0].bone}' {left[0].why_not})" if left else ""
+        return f"{len(stated)} bones have the ranges of {', '.join(names)}{others}."
+
+
+CLASSES = (
+    FDDA_OT_preview_pose,
+    FDDA_OT_rest_pose,
+    FDDA_OT_state_range,
+    FDDA_OT_unstate_range,
+    FDDA_OT_limits_from_actions,
+)

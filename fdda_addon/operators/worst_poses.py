@@ -83,7 +83,7 @@ class FDDA_OT_jump_to_worst(OnWorst, bpy.types.Operator):
             return f"Frame {last.first_frame + index}: at most {error_mm:.2f} mm."
         from ..evaluation import pose_held_out
 
-        pose_held_out(scene_rig, last.seed, index)
+        pose_held_out(scene_rig, last.channels, last.seed, index)
         context.view_layer.update()
         context.window_manager.fdda_view.pose = index
         return f"Random pose {index}: at most {error_mm:.2f} mm."

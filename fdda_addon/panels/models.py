@@ -9,6 +9,22 @@ from . import checks
 from .section import Section, draw_sentence, panel_rig
 from .watch import Watch
 
+_rigs: dict[tuple, object] = {}
+
+
+def _rig_of_model(scene_rig: object, rig: object, info: object) -> object:
+    """The rig with the joints of a model, read once for each rig that was checked: panels are drawn often."""
+    from ..scene.rig import read_model_rig
+
+    if set(rig.joint_names) == set(info.joint_names):
+        return rig
+    key = (id(rig), info.joint_names)
+    if key not in _rigs:
+        _rigs.clear()
+        # The checked rig stands beside what was read, so that its identifier is no other's.
+        _rigs[key] = (rig, read_model_rig(scene_rig, info))
+    return _rigs[key][1]
+
 
 def _states(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
     """What is wrong with the models of a mesh: icon and sentence by path and name; all is well with those left out."""
@@ -17,13 +33,15 @@ def _states(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
     from ..scene.scene_rig import SceneRig, armature_of
 
     armature_object = armature_of(mesh_object)
-    check = checks.known(SceneRig(mesh_object, armature_object)) if armature_object else None
+    scene_rig = SceneRig(mesh_object, armature_object)
+    check = checks.known(scene_rig) if armature_object else None
     found = {}
     for entry in mesh_object.fdda.models:
         try:
             info = info_of(mesh_object, entry)
             if check is not None and check.rig is not None:
-                changed = changes(entry.name, info, check.rig, check.channels)
+                rig = _rig_of_model(scene_rig, check.rig, info)
+                changed = changes(entry.name, info, rig, check.channels)
                 if changed.sentence:
                     found[_key(entry)] = ("ERROR" if changed.prevents else "INFO", changed.sentence)
         except FDDAError as error:

@@ -10,7 +10,7 @@ import bpy
 from ..core.errors import RigError
 from ..core.model import check_rig
 from ..scene.modifier_stack import check_stack
-from ..scene.rig import SceneRig, read_rig
+from ..scene.rig import SceneRig, read_model_rig
 from . import model_files, nodes, packed, playback, switch
 
 
@@ -35,7 +35,7 @@ def bind(
         raise RigError(f"'{mesh_object.name}' is in edit mode; leave it first.")
     model = model.absolute()
     network = model_files.load_network(model) if packed_model is None else packed.load(packed_model)
-    check_rig(model, network.info, read_rig(scene_rig))
+    check_rig(model, network.info, read_model_rig(scene_rig, network.info))
     with true_rig(mesh_object):
         stack = check_stack(mesh_object)
     if mesh_object.fdda.is_bound:

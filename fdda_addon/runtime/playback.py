@@ -13,8 +13,10 @@ import bpy
 import numpy as np
 
 from ..core.errors import FDDAError, ModelError, RigError
+from ..core.rig import UNMOVED
 from ..core.skinning import LinearLayer
-from ..scene.rig import PoseReader, SceneRig, armature_of, read_rig
+from ..scene.controls import ControlReader
+from ..scene.rig import PoseReader, SceneRig, armature_of, read_model_rig
 from . import nodes, switch
 from .model_files import network_of
 from .network import Network
@@ -38,6 +40,7 @@ class LiveBinding:
         self.network = network_of(mesh_object)
         self.armature_uid = _armature(mesh_object).session_uid
         self._reader = self._make_reader(mesh_object)
+        self._controls = ControlReader(self._scene_rig(mesh_object), self.network.info.controls)
         self._linear_layer: LinearLayer | None = None
         self._shown: tuple | None = None
         self._cache_name = ""
@@ -46,7 +49,7 @@ class LiveBinding:
         info = self.network.info
         names = tuple(joint.name for joint in info.joints)
         armature_object = _armature(mesh_object)
-        if missing := [name for name in names if name not in armature_object.data.bones]:
+        if missing := [name for name in names if name not in armature_object.data.bones and name != UNMOVED]:
             raise ModelError(
                 f"The armature '{armature_object.name}' lacks the joint '{missing[0]}' of the model "
                 f"'{self.network.path.name}'; name it as before, or bind a model of this rig."
@@ -63,8 +66,13 @@ class LiveBinding:
             self.name = found.name
         return found if found.fdda.is_bound else None
 
-    def read_pose(self, mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray | None:
-        """Pose matrices (J, 4, 4), None when the graph does not hold the object.
+    def _scene_rig(self, mesh_object: bpy.types.Object) -> SceneRig:
+        return SceneRig(mesh_object, _armature(mesh_object))
+
+    def read_pose(
+        self, mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Pose matrices (J, 4, 4) and controls (C,), None when the graph does not hold the object.
 
         Raises:
             FDDAError: the mesh or the armature no longer fits the model.
@@ -82,7 +90,8 @@ class LiveBinding:
                 f"'{mesh_object.name}' has {count} vertices and its model was trained for {expected}; "
                 "undo the change, or record and train again."
             )
-        return self._reader.read(evaluated_mesh, evaluated_armature)
+        controls = self._controls.read(SceneRig(mesh_object, armature_object), depsgraph)
+        return self._reader.read(evaluated_mesh, evaluated_armature), controls
 
     def find_cache(self, mesh_object: bpy.types.Object) -> bpy.types.Object:
         """The cache object of the mesh object.
@@ -114,14 +123,14 @@ class LiveBinding:
     def linear_positions(self, mesh_object: bpy.types.Object, pose_matrices: np.ndarray) -> np.ndarray:
         """(V, 3) float32 of the linear layer alone, mesh-object space, metres."""
         if self._linear_layer is None:
-            rig = self.network.linear_rig(read_rig(SceneRig(mesh_object, _armature(mesh_object))))
+            rig = self.network.linear_rig(read_model_rig(self._scene_rig(mesh_object), self.network.info))
             # The rest pose of the model: the objects may have moved since, and pose matrices refer to it.
             self._linear_layer = LinearLayer(replace(rig, rest_matrices=self.network.info.rest_matrices))
         return self._linear_layer.positions(pose_matrices[None])[0]
 
 
-_Job = tuple[LiveBinding, bpy.types.Object, np.ndarray, float]
-"""An object to move: its pose matrices and its strength, 0 for the linear layer alone."""
+_Job = tuple[LiveBinding, bpy.types.Object, tuple[np.ndarray, np.ndarray], float]
+"""An object to move: its pose matrices and controls, and its strength, 0 for the linear layer alone."""
 
 
 def is_outdated(mesh_object: bpy.types.Object) -> bool:
@@ -173,7 +182,7 @@ def evaluate(depsgraph: bpy.types.Depsgraph) -> None:
         strength = binding.strength if mode == "FDDA" else 0.0
         with _failing(mesh_object):
             pose = live.read_pose(mesh_object, depsgraph)
-            if pose is not None and not live.is_shown((pose.tobytes(), strength)):
+            if pose is not None and not live.is_shown((*(part.tobytes() for part in pose), strength)):
                 jobs.setdefault(live.network, []).append((live, mesh_object, pose, strength))
     for network, own in jobs.items():
         _move(network, own)
@@ -190,18 +199,18 @@ def constant_positions() -> Iterator[None]:
         _constants = None
 
 
-def _positions(network: Network, pose_matrices: np.ndarray) -> np.ndarray:
-    if _constants is None:
-        return network.positions(pose_matrices)
-    key = (network, len(pose_matrices))
-    if key not in _constants:
-        _constants[key] = network.positions(pose_matrices)
-    return _constants[key]
+def _positions(network: Network, poses: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    if _constants is not None and (network, len(poses)) in _constants:
+        return _constants[network, len(poses)]
+    positions = network.positions(*(np.array(parts) for parts in zip(*poses, strict=True)))
+    if _constants is not None:
+        _constants[network, len(poses)] = positions
+    return positions
 
 
 def _move(network: Network, jobs: list[_Job]) -> None:
     try:
-        positions = _positions(network, np.array([pose for _, _, pose, _ in jobs]))
+        positions = _positions(network, [pose for _, _, pose, _ in jobs])
     except FDDAError as error:
         for _, mesh_object, _, _ in jobs:
             fail(mesh_object, error)
@@ -209,7 +218,7 @@ def _move(network: Network, jobs: list[_Job]) -> None:
     for (live, mesh_object, pose, strength), moved in zip(jobs, positions, strict=True):
         with _failing(mesh_object):
             if strength < 1:
-                linear = live.linear_positions(mesh_object, pose)
+                linear = live.linear_positions(mesh_object, pose[0])
                 moved = linear + np.float32(strength) * (moved - linear)
             nodes.write_cache(live.find_cache(mesh_object), moved)
 

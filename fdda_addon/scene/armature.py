@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Armatures in and out: joints, pose matrices, ranges of motion, posing."""
+"""Armatures in and out: rest pose, pose matrices, posing."""
 
 import bpy
 import numpy as np
 from mathutils import Euler
 
-from ..core.poses import Channel
+from ..core.poses import CONTROL, LOCATION, ROTATION, SCALE, Channel
 from ..core.rig import UNMOVED
-from .motion_range import DEFAULT, location_ranges, rotation_ranges
-
-LIMITS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
+from .controls import set_control
+from .scene_rig import SceneRig
 
 
 def rest_matrices(armature: bpy.types.Armature, names: tuple[str, ...]) -> np.ndarray:
@@ -51,38 +50,6 @@ class PoseMatrices:
         return self._matrices[self._order].transpose(0, 2, 1)
 
 
-def channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Channel, ...]:
-    """What of a pose may be sampled, and its range of motion.
-
-    The range is that of Limit Rotation and Limit Location constraints in local space, else of the bone's IK limits,
-    else the default; locked axes are left out. A bone that another constraint moves is left out: sampling it would
-    change nothing.
-
-    Args:
-        armature_object: the armature object.
-        names: bones that are sampled even when the rig states no range for them.
-    """
-    found = []
-    for bone in armature_object.pose.bones:
-        if is_moved_by_constraints(bone):
-            continue
-        ranges = rotation_ranges(bone)
-        if bone.name in names or any(r.source != DEFAULT for r in ranges):
-            for axis, r in enumerate(ranges):
-                if r.moves:
-                    found.append(Channel(bone.name, "rotation", axis, r.low, r.high))
-        if not bone.bone.use_connect:
-            for axis, (low, high) in location_ranges(bone).items():
-                if not bone.lock_location[axis] and low < high:
-                    found.append(Channel(bone.name, "location", axis, low, high))
-    return tuple(found)
-
-
-def is_moved_by_constraints(bone: bpy.types.PoseBone) -> bool:
-    """Whether a constraint other than a limit moves a bone."""
-    return any(c.type not in LIMITS and not c.mute and c.influence > 0 for c in bone.constraints)
-
-
 def clear_pose(armature_object: bpy.types.Object) -> None:
     """Bring every bone to its rest pose."""
     bones = armature_object.pose.bones
@@ -98,18 +65,16 @@ def clear_pose(armature_object: bpy.types.Object) -> None:
 class Poser:
     """Sets poses given as values of channels. Bones must be at rest where no channel reaches (`clear_pose`)."""
 
-    def __init__(self, armature_object: bpy.types.Object, pose_channels: tuple[Channel, ...]):
-        self._armature_object = armature_object
-        self._rotations: dict[str, list[tuple[int, int]]] = {}
-        self._locations: dict[str, list[tuple[int, int]]] = {}
-        for place, channel in enumerate(pose_channels):
-            kind = self._rotations if channel.kind == "rotation" else self._locations
-            kind.setdefault(channel.bone, []).append((place, channel.axis))
+    def __init__(self, scene_rig: SceneRig, channels: tuple[Channel, ...]):
+        self._scene_rig = scene_rig
+        self._places: dict[str, dict[str, list[tuple[int, int]]]] = {}
+        for place, channel in enumerate(channels):
+            self._places.setdefault(channel.kind, {}).setdefault(channel.bone, []).append((place, channel.axis))
 
     def set(self, values: np.ndarray) -> None:
-        """Pose the armature: (C,) radians or metres, in the order of the channels. The graph is not evaluated."""
-        bones = self._armature_object.pose.bones
-        for name, places in self._rotations.items():
+        """Pose the rig: (C,) values in the order of the channels, each in its unit. The graph is not evaluated."""
+        bones = self._scene_rig.armature_object.pose.bones
+        for name, places in self._places.get(ROTATION, {}).items():
             angles = [0.0, 0.0, 0.0]
             for place, axis in places:
                 angles[axis] = values[place]
@@ -121,7 +86,10 @@ class Poser:
                 bone.rotation_axis_angle = (angle, *axis_vector)
             else:
                 bone.rotation_euler = angles
-        for name, places in self._locations.items():
-            bone = bones[name]
-            for place, axis in places:
-                bone.location[axis] = values[place]
+        for kind in (LOCATION, SCALE):
+            for name, places in self._places.get(kind, {}).items():
+                values_of_bone = getattr(bones[name], kind)
+                for place, axis in places:
+                    values_of_bone[axis] = values[place]
+        for name, places in self._places.get(CONTROL, {}).items():
+            set_control(self._scene_rig, name, float(values[places[0][0]]))

@@ -54,7 +54,7 @@ def make_control(scene_rig: SceneRig, owner: str, path: str, stated: tuple[float
     """
     name = f"{owner}/{path}"
     datablock = owner_of(scene_rig, owner)
-    if datablock is None or _value(datablock, path) is None:
+    if not is_number(datablock, path):
         raise RigError(
             f"'{scene_rig.mesh_object.name}' has no control '{name}'; give the name of a shape key, or OWNER/PATH of a "
             f"number, with OWNER one of {', '.join(OWNERS)} and {OTHER_OBJECT}NAME."
@@ -112,6 +112,11 @@ def is_driven(datablock: bpy.types.ID, path: str) -> bool:
     )
 
 
+def is_number(datablock: bpy.types.ID | None, path: str) -> bool:
+    """Whether there is a number at a path of a datablock."""
+    return datablock is not None and _value(datablock, path) is not None
+
+
 def _element(path: str) -> tuple[str, int | None]:
     match = _ELEMENT.fullmatch(path)
     return (match["array"], int(match["index"])) if match else (path, None)
@@ -162,8 +167,7 @@ class ControlReader:
         """
         self._controls = controls
         for control in controls:
-            datablock = owner_of(scene_rig, control.owner)
-            if datablock is None or _value(datablock, control.path) is None:
+            if not is_number(owner_of(scene_rig, control.owner), control.path):
                 raise RigError(
                     f"'{scene_rig.mesh_object.name}' lacks the control '{control.name}'; name it as before, or record "
                     "and train this rig."

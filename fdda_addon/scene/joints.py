@@ -7,14 +7,16 @@ import bpy
 import numpy as np
 
 from ..core.rig import UNMOVED, Joint
-from .armature import channels
+from .dependencies import read_dependencies
+from .sampling import own_channels
+from .scene_rig import SceneRig
 
 COINCIDENT = 1e-5
 """Bones whose ends lie no farther apart at rest coincide, as a part of their length."""
 
 
 def choose_joints(
-    armature_object: bpy.types.Object, skinning: Iterable[str], besides: Iterable[str] | None = None
+    scene_rig: SceneRig, skinning: Iterable[str], besides: Iterable[str] | None = None
 ) -> tuple[Joint, ...]:
     """The joints of a rig, every parent before its children.
 
@@ -22,11 +24,12 @@ def choose_joints(
     deforming bones are children of bones that others pose, each in the place of a deforming one.
 
     Args:
-        armature_object: the armature object.
+        scene_rig: the rig.
         skinning: names of the bones that have weights; all deforming bones when there are none. `UNMOVED` counts.
         besides: names of other joints; those that the armature lacks are left out. When it is not given, the bones
-            that state a range of motion, and all bones above a joint.
+            that state a range of motion, those that the mesh depends on otherwise, and all bones above a joint.
     """
+    armature_object = scene_rig.armature_object
     bones = armature_object.data.bones
     wanted = set(skinning)
     if not wanted - {UNMOVED}:
@@ -34,7 +37,8 @@ def choose_joints(
     if besides is not None:
         wanted |= {name for name in besides if name in bones or name == UNMOVED}
     else:
-        wanted |= {channel.bone for channel in channels(armature_object, set())}
+        wanted |= {channel.bone for channel in own_channels(armature_object, set())}
+        wanted |= read_dependencies(scene_rig).bones
         wanted |= {above.name for name in wanted - {UNMOVED} for above in bones[name].parent_recursive}
     own = [bone for bone in bones if bone.name in wanted]
     parents = _parents(own)

@@ -2,18 +2,21 @@
 """Checks the rig of a scene and reads it into arrays."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
 from ..core.errors import RigError
-from ..core.poses import Channel
+from ..core.model import ModelInfo
 from ..core.rig import UNMOVED, Fingerprint, Rig
 from . import armature as armature_io
 from . import mesh as mesh_io
+from .controls import ControlReader
 from .joints import choose_joints
 from .modifier_stack import check_evaluable, deforming_modifiers
+from .sampling import model_channels, sampled_channels
 from .scene_rig import MODIFIER_NAME, SceneRig, armature_modifier, armature_of, find_rig
 from .skin import read_skin
 
@@ -29,7 +32,7 @@ def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None) -> Rig:
     Args:
         scene_rig: the rig.
         besides: names of joints beside the bones that have weights, as of a model or a recording; when it is not given,
-            the bones that have a range of motion, and all bones above a joint.
+            the bones that have a range of motion, those that the mesh depends on otherwise, and all above a joint.
 
     Raises:
         RigError: there is no vertex, or an object has a scale of zero.
@@ -41,7 +44,7 @@ def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None) -> Rig:
     if not len(mesh_object.data.vertices):
         raise RigError(f"The mesh of '{mesh_object.name}' has no vertices; choose another object.")
     skin = read_skin(mesh_object, armature_object, armature_modifier(mesh_object))
-    joints = choose_joints(armature_object, skin.bones, besides)
+    joints = choose_joints(scene_rig, skin.bones, besides)
     names = tuple(joint.name for joint in joints)
     skin_joints, skin_weights = skin.arrays({name: number for number, name in enumerate(names)})
     rest_positions = mesh_io.rest_positions(mesh_object.data)
@@ -53,6 +56,15 @@ def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None) -> Rig:
         Fingerprint.digest(skin_joints, skin_weights),
     )
     return Rig(joints, rest_positions, rest.astype(np.float32), skin_joints, skin_weights, fingerprint, *faces)
+
+
+def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
+    """Read a rig with the joints and the controls of a model; `core.model.check_rig` says in what they differ.
+
+    Raises:
+        RigError: as `read_rig`.
+    """
+    return replace(read_rig(scene_rig, info.joint_names), controls=info.controls)
 
 
 def joint_rest_matrices(scene_rig: SceneRig, names: tuple[str, ...]) -> np.ndarray:
@@ -70,22 +82,6 @@ def mesh_from_armature(mesh_object: bpy.types.Object, armature_object: bpy.types
 
 def _relation(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> Matrix:
     return mesh_object.matrix_world.inverted_safe() @ armature_object.matrix_world
-
-
-def sampled_channels(scene_rig: SceneRig, rig: Rig) -> tuple[Channel, ...]:
-    """The channels of a random pose.
-
-    Raises:
-        RigError: nothing may be sampled.
-    """
-    found = armature_io.channels(scene_rig.armature_object, set(rig.joint_names))
-    if not found:
-        raise RigError(
-            f"No bone of '{scene_rig.armature_object.name}' may be sampled: all {len(rig.joints)} are locked or moved "
-            "by constraints; unlock an axis, give it a Limit Rotation, or record actions alone, with 0 random poses "
-            "(--action NAME --poses 0)."
-        )
-    return found
 
 
 class PoseReader:
@@ -136,26 +132,47 @@ class PoseReader:
 
 
 class PoseEvaluator:
-    """Evaluates the scene as it is posed and reads pose matrices and positions."""
+    """Evaluates the scene as it is posed and reads pose matrices, positions and controls."""
 
     def __init__(self, scene_rig: SceneRig, rig: Rig):
+        """Args:
+            scene_rig, rig: the rig.
+
+        Raises:
+            RigError: the rig lacks one of its controls.
+        """
         self._scene_rig = scene_rig
         self._reader = PoseReader(scene_rig, rig.joint_names, rig.rest_matrices)
+        self._controls = ControlReader(scene_rig, rig.controls)
 
-    def evaluate(self) -> tuple[np.ndarray, np.ndarray]:
+    def evaluate(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Evaluate the pose that is set now.
 
         Returns:
-            pose_matrices (J, 4, 4) and positions (V, 3), both float32, mesh-object space, metres.
+            pose_matrices (J, 4, 4) and positions (V, 3), both float32, mesh-object space, metres, and the values of the
+            controls (C,) float32.
         """
         depsgraph = bpy.context.evaluated_depsgraph_get()
         mesh_object = self._scene_rig.mesh_object.evaluated_get(depsgraph)
         armature_object = self._scene_rig.armature_object.evaluated_get(depsgraph)
         positions = mesh_io.evaluated_positions(self._scene_rig.mesh_object, depsgraph)
-        return self._reader.read(mesh_object, armature_object), positions
+        controls = self._controls.read(self._scene_rig, depsgraph)
+        return self._reader.read(mesh_object, armature_object), positions, controls
 
 
 __all__ = [
-    "MODIFIER_NAME", "PoseEvaluator", "PoseReader", "SceneRig", "armature_modifier", "armature_of", "check_evaluable",
-    "deforming_modifiers", "find_rig", "mesh_from_armature", "read_rig", "sampled_channels",
+    "MODIFIER_NAME",
+    "PoseEvaluator",
+    "PoseReader",
+    "SceneRig",
+    "armature_modifier",
+    "armature_of",
+    "check_evaluable",
+    "deforming_modifiers",
+    "find_rig",
+    "mesh_from_armature",
+    "model_channels",
+    "read_model_rig",
+    "read_rig",
+    "sampled_channels",
 ]  # fmt: skip

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 import bpy
 
+from ..core.controls import Control
 from ..core.errors import RigError
-from ..core.poses import CONTROL, LOCATION, ROTATION, SCALE, Channel
+from ..core.model import ModelInfo
+from ..core.poses import CONTROL, KINDS, LOCATION, ROTATION, SCALE, Channel
 from ..core.rig import Rig
-from .action_range import measured_controls, measured_ranges
-from .controls import Control, is_driven, owner_of
+from .compatibility import is_selected
+from .controls import is_driven, is_number, owner_of
 from .motion_range import DEFAULT, location_ranges, rotation_ranges, scale_ranges
 from .scene_rig import SceneRig
 
@@ -45,13 +47,15 @@ def choose(scene_rig: SceneRig, texts: Iterable[str], controls: tuple[Control, .
 
     Args:
         scene_rig: the rig.
-        texts: `selected` for the selected bones, `collection:NAME` for those of a bone collection and the ones below it,
-            `action:NAME` for what an action keys, `bone:NAME`; none for the bones of the rig as it stands.
+        texts: `selected` for the selected bones, `collection:NAME` for those of a bone collection and of the ones below
+            it, `action:NAME` for what an action keys, `bone:NAME`; none for the bones of the rig as it stands.
         controls: that are sampled too.
 
     Raises:
         RigError: there is no such collection, action or bone, or it chooses nothing.
     """
+    from .action_range import measured_controls, measured_ranges
+
     texts = list(texts)
     if not texts:
         return Choice(controls=controls)
@@ -75,6 +79,8 @@ def choose(scene_rig: SceneRig, texts: Iterable[str], controls: tuple[Control, .
 
 
 def _bones_of(scene_rig: SceneRig, text: str) -> set[str]:
+    from .action_range import measured_ranges
+
     armature_object = scene_rig.armature_object
     bones, data = armature_object.pose.bones, armature_object.data
     if text == SELECTED:
@@ -100,7 +106,7 @@ def _bones_of(scene_rig: SceneRig, text: str) -> set[str]:
     return {name}
 
 
-def sampled_channels(scene_rig: SceneRig, rig: Rig, choice: Choice = Choice()) -> tuple[Channel, ...]:  # noqa: B008
+def sampled_channels(scene_rig: SceneRig, rig: Rig, choice: Choice = Choice()) -> tuple[Channel, ...]:
     """The channels of a random pose.
 
     Args:
@@ -123,10 +129,40 @@ def sampled_channels(scene_rig: SceneRig, rig: Rig, choice: Choice = Choice()) -
     if not found:
         raise RigError(
             f"No bone of '{armature_object.name}' may be sampled: all {len(rig.joints)} are locked or moved by "
-            "constraints; unlock an axis, give it a Limit Rotation, choose the bones that an animator poses (--sample), "
-            "or record actions alone, with 0 random poses (--action NAME --poses 0)."
+            "constraints; unlock an axis, give it a Limit Rotation, choose the bones that an animator poses "
+            "(--sample), or record actions alone, with 0 random poses (--action NAME --poses 0)."
         )
     return found
+
+
+def model_channels(scene_rig: SceneRig, rig: Rig, info: ModelInfo) -> tuple[Channel, ...]:
+    """The channels that a model's random poses were drawn from; those of the rig where there were none.
+
+    Raises:
+        RigError: the rig lacks one of them, or nothing may be sampled.
+    """
+    bones = scene_rig.armature_object.pose.bones
+    for channel in info.limits:
+        owner, _, path = channel.bone.partition("/")
+        if channel.kind == CONTROL:
+            there = is_number(owner_of(scene_rig, owner), path)
+        else:
+            there = channel.bone in bones and channel.kind in KINDS
+        if not there or channel.axis not in range(3):
+            raise RigError(
+                f"'{scene_rig.armature_object.name}' lacks '{channel.bone}', which the random poses of the model "
+                "moved; name it as before, or record and train this rig."
+            )
+    return info.limits or sampled_channels(scene_rig, rig)
+
+
+def states_channels(scene_rig: SceneRig, channels: tuple[Channel, ...]) -> bool:
+    """Whether a rig still has the ranges that channels have, as far as it states them."""
+    bones = frozenset(channel.bone for channel in channels)
+    now = {(c.bone, c.kind, c.axis): c for c in chosen_channels(scene_rig.armature_object, Choice(bones))}
+    stated = [c for c in channels if (c.bone, c.kind, c.axis) in now]
+    locked = [c for c in channels if c.kind == ROTATION and (c.bone, c.kind, c.axis) not in now]
+    return not locked and all(now[c.bone, c.kind, c.axis] == c for c in stated)
 
 
 def own_channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Channel, ...]:

@@ -12,7 +12,8 @@ import pytest
 import fdda_addon
 from fdda_addon.cli import main
 from fdda_addon.runtime.network import Network
-from fdda_addon.scene.rig import PoseReader, SceneRig, armature_modifier, find_rig
+from fdda_addon.scene.controls import ControlReader
+from fdda_addon.scene.rig import PoseReader, SceneRig, armature_of, find_rig
 
 ELBOW = "elbow"
 ELBOW_RIG = "elbow_rig"
@@ -92,11 +93,13 @@ def predicted(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:
     """(V, 3), what the model says of the pose that Blender has evaluated; nothing of the playback is used."""
     network = Network(model)
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    armature_object = armature_modifier(mesh_object).object
+    armature_object = armature_of(mesh_object)
     names = tuple(joint.name for joint in network.info.joints)
-    reader = PoseReader(SceneRig(mesh_object, armature_object), names, network.info.rest_matrices)
+    scene_rig = SceneRig(mesh_object, armature_object)
+    reader = PoseReader(scene_rig, names, network.info.rest_matrices)
     matrices = reader.read(mesh_object.evaluated_get(depsgraph), armature_object.evaluated_get(depsgraph))
-    return network.positions(matrices[None])[0]
+    controls = ControlReader(scene_rig, network.info.controls).read(scene_rig, depsgraph)
+    return network.positions(matrices[None], controls[None])[0]
 
 
 def assert_plays(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:

@@ -62,7 +62,7 @@ def by_hand(rig, elbow, channels, seed: int, indices) -> tuple[np.ndarray, np.nd
     arrays = read_rig(rig)
     layer, network = LinearLayer(arrays), Network(elbow.model)
     bones, errors = rig.armature_object.pose.bones, ([], [])
-    poser = Poser(rig.armature_object, channels)
+    poser = Poser(rig, channels)
     for index in indices:
         poser.set(sample_pose(channels, seed, index))
         true = evaluated_positions(rig.mesh_object, bpy.context.evaluated_depsgraph_get())

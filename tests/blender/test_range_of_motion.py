@@ -159,7 +159,7 @@ def test_nothing_to_sample(fresh):
 def test_posing_in_every_rotation_mode(fresh, lower, mode):
     lower.rotation_mode = mode
     angles = (0.3, -0.5, 0.8)
-    Poser(fresh.armature_object, tuple(Channel("lower", "rotation", axis, -1, 1) for axis in range(3))).set(
+    Poser(fresh, tuple(Channel("lower", "rotation", axis, -1, 1) for axis in range(3))).set(
         np.array(angles)
     )
     bpy.context.view_layer.update()
@@ -170,7 +170,7 @@ def test_posing_in_every_rotation_mode(fresh, lower, mode):
 def test_posing_locations(fresh):
     upper = fresh.armature_object.pose.bones["upper"]
     channels = (Channel("upper", "location", 2, -1, 1), Channel("upper", "rotation", 0, -1, 1))
-    Poser(fresh.armature_object, channels).set(np.array([0.25, 0.5]))
+    Poser(fresh, channels).set(np.array([0.25, 0.5]))
     bpy.context.view_layer.update()
     expected = Matrix.Translation((0, 0, 0.25)) @ Euler((0.5, 0, 0)).to_matrix().to_4x4()
     np.testing.assert_allclose(np.array(upper.matrix_basis), np.array(expected), atol=1e-6)

@@ -59,7 +59,7 @@ def test_what_is_added_is_what_the_rig_does(elbow, recording):
         basis = np.vstack([features[joint].reshape(3, 4), [0, 0, 0, 1]])
         scene_rig.armature_object.pose.bones[name].matrix_basis = Matrix(basis)
     bpy.context.view_layer.update()
-    pose, positions = evaluator.evaluate()
+    pose, positions, _ = evaluator.evaluate()
     assert np.abs(pose - read.pose_matrices[-1]).max() < 1e-5
     layer = LinearLayer(read.rig, read.partitions)
     recorded = layer.complex_positions(read.pose_matrices[-1:], read.residuals[-1:])[0]

@@ -119,7 +119,7 @@ def test_the_linear_layer_is_blenders(smooth: bpy.types.Object, change: Callable
     for angle in (0.0, 0.7, -1.2):
         pose(angle=angle)
         pose(angle=angle / 3, bone="upper")
-        matrices, positions = evaluator.evaluate()
+        matrices, positions, _ = evaluator.evaluate()
         assert np.array_equal(positions, evaluated(smooth))
         moved = max(moved, np.abs(positions - rig.rest_positions).max())
         assert np.abs(layer.positions(matrices[None])[0] - positions).max() < EXACT
