@@ -4,6 +4,8 @@
 import bpy
 import numpy as np
 
+from ..core.errors import RigError
+
 
 def rest_positions(mesh: bpy.types.Mesh) -> np.ndarray:
     """Positions before anything deforms the mesh: the reference shape key where there are keys.
@@ -35,9 +37,17 @@ def evaluated_positions(mesh_object: bpy.types.Object, depsgraph: bpy.types.Deps
     """What the dependency graph evaluates the mesh to.
 
     Returns:
-        (V', 3) float32, mesh-object space, metres; V' differs from V when a modifier changes the topology.
+        (V, 3) float32, mesh-object space, metres.
+
+    Raises:
+        RigError: it has other vertices than the mesh object's own mesh.
     """
-    mesh = mesh_object.evaluated_get(depsgraph).data
+    mesh, count = mesh_object.evaluated_get(depsgraph).data, len(mesh_object.data.vertices)
+    if len(mesh.vertices) != count:
+        raise RigError(
+            f"In some pose the modifiers of '{mesh_object.name}' turn {count} vertices into {len(mesh.vertices)}; look "
+            "for Geometry Nodes that make or remove vertices depending on the pose, and switch them off."
+        )
     positions = np.empty((len(mesh.vertices), 3), np.float32)
     mesh.attributes["position"].data.foreach_get("vector", positions.reshape(-1))
     return positions

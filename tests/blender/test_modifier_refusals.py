@@ -11,7 +11,7 @@ from blend_fixtures.characters import stacks
 from blend_fixtures.characters.base import drive, tube
 from fdda_addon.core.errors import RigError
 from fdda_addon.evaluation import EvaluationSettings, evaluate
-from fdda_addon.recording import record
+from fdda_addon.recording import RecordingSettings, record
 from fdda_addon.rig_check import check
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.rig import find_rig
@@ -113,6 +113,25 @@ def test_a_live_modifier_that_a_driver_keeps_on(tmp_path):
         drain(record(rig, tmp_path / "recording", FEW))
     assert f"The modifiers of 'elbow' turn {count} vertices into " in str(error.value)
     assert str(error.value).endswith("; switch off the one that changes the topology (Subdivision).")
+
+
+def test_nodes_that_remove_vertices_in_some_poses(tmp_path):
+    rig = character()
+    nodes_at(1, "GeometryNodeDeleteGeometry")(rig.mesh_object)
+    group = rig.mesh_object.modifiers["It"].node_group
+    position, height, above = (
+        group.nodes.new(kind) for kind in ("GeometryNodeInputPosition", "ShaderNodeSeparateXYZ", "ShaderNodeMath")
+    )
+    above.operation, above.inputs[1].default_value = "GREATER_THAN", 0.1
+    group.links.new(position.outputs[0], height.inputs[0])
+    group.links.new(height.outputs["Z"], above.inputs[0])
+    group.links.new(above.outputs[0], group.nodes["Delete Geometry"].inputs["Selection"])
+    before = scene_state(rig)
+    with pytest.raises(
+        RigError, match=r"In some pose the modifiers of 'elbow' turn 300 vertices into \d+; look for Geo"
+    ):
+        drain(record(rig, tmp_path / "recording", RecordingSettings(poses=20)))
+    assert_same_state(before, scene_state(rig))
 
 
 PARENTED = {
