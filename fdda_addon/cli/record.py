@@ -29,16 +29,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="WHAT",
-        help="what the random poses move, in place of the bones that have weights: collection:NAME, action:NAME (what it "
-        "keys, in its range), bone:NAME or selected; may be given several times",
+        help="what the random poses move, in place of the bones that have weights: collection:NAME, action:NAME (what "
+        "it keys, in its range), bone:NAME or selected; may be given several times",
     )
     parser.add_argument(
         "--control",
         action="append",
         default=[],
         metavar="NAME[=LOW:HIGH]",
-        help="a number that deforms the mesh beside the joints: the name of a shape key, shape_keys for all of them, or "
-        "OWNER/PATH; those that drivers of the mesh read are found by themselves; may be given several times",
+        help="a number that deforms the mesh beside the joints: the name of a shape key, shape_keys for all of them, "
+        "or OWNER/PATH; those that drivers of the mesh read are found by themselves; may be given several times",
     )
     parser.add_argument("--resume", action="store_true", help="continue a recording that was interrupted")
     parser.add_argument(
