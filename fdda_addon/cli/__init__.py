@@ -13,7 +13,9 @@ from .registration import registered
 
 VERBS = {
     "build-arm": ("build_arm", "build the example rig: an arm with a hand"),
+    "limits": ("limits", "set the range of motion of a rig from actions"),
     "record": ("record", "record random poses of a rig and their residuals"),
+    "check-recording": ("check_recording", "say what is suspicious about a recording"),
     "check-trainer": ("check_trainer", "say whether the Python that trains has what it needs, and on which device"),
     "train": ("train", "train a model on a recording"),
     "bind": ("bind", "let a model play in place of a rig"),

@@ -2,7 +2,7 @@
 """The range of motion where Blender's users keep it: read from a bone, and written to it.
 
 The range is that of Limit Rotation and Limit Location constraints in local space, else of the bone's IK limits, else
-the default; locked axes do not move.
+the default; locked axes do not move. A Limit constraint whose influence is 0 states a range and holds nothing.
 """
 
 from dataclasses import dataclass
@@ -13,6 +13,8 @@ from ..core.errors import RigError
 from ..core.poses import DEFAULT_RANGE
 
 AXES = "xyz"
+RANGE_NAME = "FDDA Range"
+"""Name of the constraints that state a range and hold nothing."""
 CONSTRAINT, IK, DEFAULT = "CONSTRAINT", "IK", "DEFAULT"
 
 
@@ -129,3 +131,56 @@ def unstate_rotation_range(bone: bpy.types.PoseBone, axis: int) -> None:
     else:
         setattr(bone, f"use_ik_limit_{letter}", False)
         setattr(bone, f"lock_ik_{letter}", False)
+
+
+def stating_constraint(bone: bpy.types.PoseBone, kind: str) -> bpy.types.Constraint:
+    """The constraint that states the ranges of a bone without holding it: one of influence 0, made where there is none.
+
+    It goes before what the bone states its ranges with, and takes them over.
+
+    Args:
+        bone: the pose bone.
+        kind: "LIMIT_ROTATION", "LIMIT_LOCATION" or "LIMIT_SCALE".
+    """
+    stated = local_limit(bone, kind)
+    if stated is not None and stated.influence == 0:
+        return stated
+    rotations = rotation_ranges(bone)
+    others = {"LIMIT_LOCATION": location_ranges, "LIMIT_SCALE": scale_ranges}.get(kind, lambda _bone: {})(bone)
+    constraint = bone.constraints.new(kind)
+    constraint.name, constraint.owner_space, constraint.influence = RANGE_NAME, "LOCAL", 0.0
+    bone.constraints.move(len(bone.constraints) - 1, 0)
+    if kind == "LIMIT_ROTATION":
+        for axis, r in enumerate(rotations):
+            if r.source != DEFAULT:
+                set_limit(constraint, axis, r.low, r.high)
+            elif r.is_locked and not bone.lock_rotation[axis]:
+                # An IK lock is not read beside a constraint.
+                set_limit(constraint, axis, 0.0, 0.0)
+    for axis, bounds in others.items():
+        set_limit(constraint, axis, *bounds)
+    return constraint
+
+
+def set_limit(constraint: bpy.types.Constraint, axis: int, low: float, high: float) -> None:
+    """Limit one axis in a Limit Rotation, Limit Location or Limit Scale constraint; radians, metres or factors."""
+    letter = AXES[axis]
+    for name in (f"use_limit_{letter}", f"use_min_{letter}", f"use_max_{letter}"):
+        if hasattr(constraint, name):
+            setattr(constraint, name, True)
+    setattr(constraint, f"min_{letter}", low)
+    setattr(constraint, f"max_{letter}", high)
+
+
+def held_range(bone: bpy.types.PoseBone, kind: str, axis: int) -> tuple[float, float]:
+    """What the Limit constraints in local space that hold a bone leave of an axis; infinite where none does."""
+    low, high, letter = -float("inf"), float("inf"), AXES[axis]
+    for constraint in bone.constraints:
+        if constraint.type != kind or constraint.owner_space != "LOCAL" or constraint.mute or not constraint.influence:
+            continue
+        use = f"use_limit_{letter}"
+        if getattr(constraint, use if hasattr(constraint, use) else f"use_min_{letter}"):
+            low = max(low, getattr(constraint, f"min_{letter}"))
+        if getattr(constraint, use if hasattr(constraint, use) else f"use_max_{letter}"):
+            high = min(high, getattr(constraint, f"max_{letter}"))
+    return low, high

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`limits RIG.blend OUT.blend --action NAME`: the range of motion of a rig, set from actions."""
+
+import argparse
+import math
+from pathlib import Path
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    from ..scene.measured_limits import DEFAULT_MARGIN
+    from .files import add_rig_options
+
+    add_rig_options(parser)
+    parser.add_argument("out", metavar="OUT.blend", type=Path, help="where to save the file with the limits")
+    parser.add_argument("--action", action="append", required=True, metavar="NAME", help="an action to measure")
+    parser.add_argument(
+        "--margin",
+        type=float,
+        default=DEFAULT_MARGIN,
+        help=f"part of the width of a range that is added at each end (default {DEFAULT_MARGIN})",
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    from ..core.errors import WrongUsageError
+    from ..core.output import check_writable
+    from ..recording import find_action
+    from ..scene.measured_limits import limit_lines, state_measured_limits
+    from .files import open_rig, save_copy
+
+    if not 0 <= options.margin <= 10 or math.isnan(options.margin):
+        raise WrongUsageError("--margin must be 0 to 10.")
+    check_writable(options.out)
+    scene_rig = open_rig(options)
+    limits = state_measured_limits(scene_rig, [find_action(name) for name in options.action], options.margin)
+    save_copy(options.out)
+    for line in limit_lines(scene_rig.armature_object, limits):
+        print(line)
+    bones = len({limit.bone for limit in limits if not limit.why_not})
+    print(f"{options.out}: '{scene_rig.armature_object.name}' states the ranges of {bones} bones")

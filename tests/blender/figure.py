@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A figure with two arms, the same on both sides, that animation moves: bones, a custom property, a shape key."""
+
+import math
+from collections.abc import Callable
+
+import bpy
+import numpy as np
+from mathutils import Euler
+
+from fdda_addon.scene.rig import SceneRig
+
+REACH, HEIGHT, RADIUS = 0.8, 0.9, 0.06
+WAVE, FRAMES = "wave", 24
+SMILE = 'key_blocks["Smile"].value'
+_AROUND, _RINGS = 8, 24
+
+
+def build_figure() -> SceneRig:
+    """A new figure in an empty scene: `body`, a bar along X, and `figure_rig` with the bones spine, arm.L and arm.R."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    armature_object = bpy.data.objects.new("figure_rig", bpy.data.armatures.new("figure_rig"))
+    bpy.context.scene.collection.objects.link(armature_object)
+    bpy.context.view_layer.objects.active = armature_object
+    _add_bones(armature_object)
+    points = _points()
+    mesh = bpy.data.meshes.new("body")
+    faces = [
+        (ring * _AROUND + j, ring * _AROUND + (j + 1) % _AROUND, *(((ring + 1) * _AROUND + k) for k in (_next(j), j)))
+        for ring in range(_RINGS)
+        for j in range(_AROUND)
+    ]
+    mesh.from_pydata(points.tolist(), [], faces)
+    body = bpy.data.objects.new("body", mesh)
+    bpy.context.scene.collection.objects.link(body)
+    left = np.clip((points[:, 0] - 0.1) / 0.2, 0, 1)
+    right = left.reshape(_RINGS + 1, _AROUND)[::-1].ravel()
+    for name, weights in (("arm.L", left), ("arm.R", right), ("spine", 1 - left - right)):
+        group = body.vertex_groups.new(name=name)
+        for index in np.flatnonzero(weights > 0):
+            group.add([int(index)], float(weights[index]), "REPLACE")
+    body.modifiers.new("Armature", "ARMATURE").object = armature_object
+    smooth = body.modifiers.new("CorrectiveSmooth", "CORRECTIVE_SMOOTH")
+    smooth.rest_source, smooth.factor, smooth.iterations = "ORCO", 0.6, 4
+    body.shape_key_add(name="Basis")
+    smile = body.shape_key_add(name="Smile")
+    for index, point in enumerate(points):
+        smile.data[index].co = point * [1, 1, 1 + 0.05 * (abs(point[0]) < 0.1)]
+    bpy.context.view_layer.update()
+    return SceneRig(body, armature_object)
+
+
+def _next(place: int) -> int:
+    return (place + 1) % _AROUND
+
+
+def _points() -> np.ndarray:
+    angles = (np.arange(_AROUND) + 0.5) * 2 * np.pi / _AROUND
+    along = np.linspace(-REACH, REACH, _RINGS + 1)
+    return np.array([(x, RADIUS * np.cos(a), HEIGHT + RADIUS * np.sin(a)) for x in along for a in angles])
+
+
+def _add_bones(armature_object: bpy.types.Object) -> None:
+    bpy.ops.object.mode_set(mode="EDIT")
+    bones = armature_object.data.edit_bones
+    ends = {"spine": ((0, 0, 0), (0, 0, HEIGHT)), "arm.L": ((0.2, 0, HEIGHT), (REACH, 0, HEIGHT))}
+    ends["arm.R"] = tuple((-x, y, z) for x, y, z in ends["arm.L"])
+    for name, (head, tail) in ends.items():
+        bone = bones.new(name)
+        bone.head, bone.tail = head, tail
+        bone.align_roll((0, -1, 0))
+        bone.parent = bones["spine"] if name != "spine" else None
+    bpy.ops.object.mode_set(mode="OBJECT")
+    for bone in armature_object.pose.bones:
+        bone.rotation_mode = "XYZ" if bone.name == "spine" else "QUATERNION"
+        bone["fist"] = 0.0
+
+
+def key(bone: bpy.types.PoseBone, frame: int, channel: str, value: object) -> None:
+    """Set a channel of a bone and key it."""
+    setattr(bone, channel, value)
+    bone.keyframe_insert(channel, frame=frame)
+
+
+def add_wave(rig: SceneRig) -> bpy.types.Action:
+    """The action `wave`: the spine turns and rises, the left arm swings farther than the right, its fist closes."""
+    animation = rig.armature_object.animation_data_create()
+    animation.action = action = bpy.data.actions.new(WAVE)
+    bones = rig.armature_object.pose.bones
+    for frame in range(1, FRAMES + 1):
+        part = math.sin((frame - 1) / (FRAMES - 1) * math.pi)
+        key(bones["spine"], frame, "rotation_euler", (0.1 * part, 0.4 * part, 0))
+        key(bones["spine"], frame, "location", (0.02 * part, 0.05 * part, 0))
+        for name, turn in (("arm.L", (0.2 + part, 0, 0.3 * part)), ("arm.R", (0.3 * part, 0.1 * part, 0))):
+            key(bones[name], frame, "rotation_quaternion", Euler(turn).to_quaternion())
+        key(bones["arm.R"], frame, "scale", (1, 1 + 0.1 * part, 1))
+        bones["arm.L"]["fist"] = part
+        bones["arm.L"].keyframe_insert('["fist"]', frame=frame)
+    bpy.context.view_layer.update()
+    return action
+
+
+def add_smile(rig: SceneRig, action: bpy.types.Action) -> None:
+    """Let the action move the shape key as well; only where actions have slots."""
+    keys = rig.mesh_object.data.shape_keys
+    animation = keys.animation_data_create()
+    action.slots.new(id_type="KEY", name=keys.name)
+    animation.action = action
+    for frame, value in ((1, 0.0), (FRAMES // 2, 0.8), (FRAMES, 0.0)):
+        keys.key_blocks["Smile"].value = value
+        keys.keyframe_insert(SMILE, frame=frame)
+    keys.key_blocks["Smile"].value = 0
+    animation.action = None
+
+
+def edit_bones(rig: SceneRig, change: Callable[[bpy.types.ArmatureEditBones], None]) -> None:
+    """Change the rest pose."""
+    bpy.context.view_layer.objects.active = rig.armature_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    change(rig.armature_object.data.edit_bones)
+    bpy.ops.object.mode_set(mode="OBJECT")
