@@ -11,6 +11,7 @@ from modifiers import FEW, at, character, nodes_at
 from scene_state import assert_same_state, drain, scene_state
 
 from blend_fixtures.characters import stacks
+from fdda_addon import benchmark, rig_cost
 from fdda_addon.evaluation import EvaluationSettings, evaluate
 from fdda_addon.recording import record
 from fdda_addon.rig_check import check
@@ -89,6 +90,25 @@ def test_an_evaluation_borrows_what_is_live(rig, elbow):
     rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     before = scene_state(rig)
     assert drain(evaluate(rig, elbow.model, settings)).fdda == errors
+    assert_same_state(before, scene_state(rig))
+
+
+def test_times_are_those_of_a_frame_with_what_is_live(rig, elbow, monkeypatch):
+    rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
+    before = scene_state(rig)
+    seen, time_frames = [], benchmark.time_frames
+
+    def watch(*arguments: object) -> list[float]:
+        seen.append([m.name for m in rig.mesh_object.modifiers if m.show_viewport])
+        return time_frames(*arguments)
+
+    monkeypatch.setattr(benchmark, "time_frames", watch)
+    monkeypatch.setattr(rig_cost, "time_frames", watch)
+    drain(benchmark.benchmark(rig, elbow.model, 5))
+    drain(rig_cost.measure(rig))
+    true, linear, model = ([*own, "Subdivision"] for own in (["Armature", "CorrectiveSmooth"], ["Armature"], ["FDDA"]))
+    rounds = benchmark.ROUNDS
+    assert seen == [true, linear, model, model] * rounds + [true, linear] * rig_cost.ROUNDS
     assert_same_state(before, scene_state(rig))
 
 
