@@ -8,6 +8,8 @@ import enum
 import json
 from dataclasses import dataclass, field
 
+WARNING = "Warning ("
+
 
 class MessageType(enum.Enum):
     """Types of a message, with the keys that it carries beside `type`."""
@@ -20,7 +22,7 @@ class MessageType(enum.Enum):
     PARTITION_FINISHED = "partition_finished"
     """joint: str, basis: int, held_out_mm: float (mean error of the held-out poses)."""
     LOG = "log"
-    """text: str. One of a `RecordingWarning` is that as text, "Warning (NAME): …"."""
+    """text: str; what begins with `WARNING` is about the recording, "Warning (NAME): …"."""
     FINISHED = "finished"
     """model: str (path), seconds: float, held_out_mm and held_out_p999_mm: float (mean and percentile 99.9);
     verdict: str, "met", "missed" or "exhausted", where there is a target. Of a fit of skin weights: seconds: float,

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from .errors import RecordingError
+from .messages import WARNING
 from .rig import UNMOVED_LABEL, Rig
 
 MOST_LISTED = 3
@@ -23,7 +24,7 @@ class RecordingWarning:
     text: str
 
     def __str__(self) -> str:
-        return f"Warning ({self.name}): {self.text}"
+        return f"{WARNING}{self.name}): {self.text}"
 
     def to_json(self) -> dict:
         return asdict(self)

@@ -8,6 +8,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError
+from ..core.messages import WARNING
 from ..operators import job
 from ..preferences import MODULE, preferences
 from ..scene.scene_rig import SceneRig
@@ -51,6 +52,9 @@ class FDDA_PT_training(Section, bpy.types.Panel):
             if not running.total:
                 draw_sentence(layout, context, "The trainer starts and reads the recording.")
             curves.draw(layout, running.curves)
+            for line in running.log:
+                if line.startswith(WARNING):
+                    draw_sentence(layout, context, line, "INFO")
             draw_sentence(layout, context, "You can go on working meanwhile.", "INFO")
             return
         if running and running.verb == "refine":
@@ -145,6 +149,8 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         return
     if target := report.get("target"):
         draw_sentence(layout, context, *_target(target))
+    for warning in report.get("warnings", ()):
+        draw_sentence(layout, context, f"Warning: {warning['name']}; the report says what to do.", "INFO")
     everything = report["fdda"]["held_out"]
     layout.label(text="Held-out error in mm, worst first")
     table = layout.box().column(align=True)
@@ -195,6 +201,8 @@ def _report(path: Path) -> dict | None:
             for partition in report["partitions"]:
                 str(partition["joint"]), int(partition["basis"])
             str(report["model"])
+            for warning in report.get("warnings", ()):
+                str(warning["name"])
             if target := report.get("target"):
                 _target(target)
         except (OSError, ValueError, KeyError, TypeError):

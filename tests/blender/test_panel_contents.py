@@ -164,6 +164,11 @@ class TestTraining:
             path.write_text(text)
             assert _report(path) is None
         assert _report(tmp_path / "none.json") is None
+        cases = (([{"name": "flips", "text": "…"}], True), ([{"text": "…"}], False), (7, False))
+        for number, (warnings, passed) in enumerate(cases):
+            path = tmp_path / f"warned_{number}.json"
+            path.write_text(json.dumps({**report, "warnings": warnings}))
+            assert (_report(path) is not None) is passed
 
     def test_its_trainer_ends_with_the_file(self, rig, elbow, tmp_path):
         from fdda_addon.training import Training

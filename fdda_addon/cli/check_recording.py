@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`check-recording RECORDING`: what is suspicious about a recording."""
+
+import argparse
+from pathlib import Path
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
+    parser.add_argument("--strict", action="store_true", help="let warnings be errors")
+    parser.add_argument("--json", metavar="OUT.json", type=Path, help="write the warnings")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Print the warnings, one a line.
+
+    Raises:
+        RecordingError: the recording cannot be read, or there are warnings and they are errors.
+        OutputError: the file cannot be written.
+    """
+    from ..core.output import check_writable, write_json
+    from ..core.recording import read_recording
+    from ..core.recording_check import check_recording
+    from ..core.recording_warning import refuse
+
+    if options.json:
+        check_writable(options.json)
+    warnings = check_recording(read_recording(options.recording))
+    for warning in warnings:
+        print(warning)
+    if options.json:
+        write_json(options.json, {"warnings": [warning.to_json() for warning in warnings]})
+    if options.strict:
+        refuse(warnings)
+    if not warnings:
+        print(f"{options.recording}: nothing suspicious was found")
