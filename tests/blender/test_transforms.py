@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Characters with any transforms, parents and units are recorded, trained, bound, and play what their model says."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from conftest import ELBOW, ELBOW_RIG, evaluated, predicted, run
+from training_in_one import train_all
+
+import fdda_addon
+from blend_fixtures.characters.transforms import CENTIMETRES, TRANSFORMS
+from fdda_addon.cli.files import save_copy
+from fdda_addon.runtime.binding import bind
+from fdda_addon.scene.rig import find_rig
+
+POSES = ((0.3, -0.2, 0.1), (1.2, 0.5, -0.4), (1.9, 0.1, 0.6))
+"""Radians: the bend of the lower bone, two turns of the upper one."""
+
+BEST_PART = 0.3
+"""What the model's error may be of the linear layer's, after so short a training."""
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Path]]:
+    """Rig file and model of each character, by its name."""
+    folder, files = tmp_path_factory.mktemp("transforms"), {}
+    fdda_addon.register()
+    try:
+        for build in TRANSFORMS:
+            own = folder / build.__name__
+            own.mkdir()
+            bpy.ops.wm.read_factory_settings(use_empty=True)
+            build()
+            save_copy(own / "rig.blend")
+            assert run("record", own / "rig.blend", own / "recording", "--poses", 120) == 0
+            files[build.__name__] = (own / "rig.blend", own / "elbow.onnx")
+    finally:
+        fdda_addon.unregister()
+    train_all([(model.with_name("recording"), model) for _, model in files.values()], "--epochs", 40)
+    return files
+
+
+@pytest.fixture(params=TRANSFORMS, ids=lambda build: build.__name__)
+def character(request, trained) -> tuple[bpy.types.Object, Path, float]:
+    """The mesh object with its model bound, the model, and how many units of the mesh make a metre."""
+    build: Callable[[], None] = request.param
+    rig, model = trained[build.__name__]
+    bpy.ops.wm.open_mainfile(filepath=str(rig))
+    bind(find_rig(), model)
+    mesh_object = bpy.data.objects[ELBOW]
+    size = CENTIMETRES if max(mesh_object.dimensions) / min(mesh_object.matrix_world.to_scale()) > 10 else 1.0
+    return mesh_object, model, size
+
+
+def show(mesh_object: bpy.types.Object, mode: str) -> np.ndarray:
+    mesh_object.fdda.mode = mode
+    return evaluated(mesh_object)
+
+
+def assert_equal(mesh_object: bpy.types.Object, model: Path, size: float) -> None:
+    assert np.abs(show(mesh_object, "FDDA") - predicted(mesh_object, model)).max() < 1e-5 * size
+    assert not mesh_object.fdda.status
+
+
+def errors(mesh_object: bpy.types.Object) -> np.ndarray:
+    """Mean errors of the model and of the linear layer in this pose, units of the mesh."""
+    true, playing, linear = (show(mesh_object, mode) for mode in ("RIG", "FDDA", "LINEAR"))
+    return np.array([np.linalg.norm(positions - true, axis=1).mean() for positions in (playing, linear)])
+
+
+def assert_better_than_linear(found: list[np.ndarray]) -> None:
+    model, linear = np.mean(found, axis=0)
+    assert model < BEST_PART * linear
+
+
+def test_random_poses(character):
+    mesh_object, model, size = character
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    armature_object.animation_data_clear()
+    found = []
+    for bend, turn, twist in POSES:
+        armature_object.pose.bones["lower"].rotation_euler[0] = bend
+        armature_object.pose.bones["upper"].rotation_euler = (turn, twist, 0.0)
+        bpy.context.view_layer.update()
+        assert_equal(mesh_object, model, size)
+        found.append(errors(mesh_object))
+    assert_better_than_linear(found)
+
+
+def test_frames_of_an_action(character):
+    """The elbow's own action, and that of the empty where there is one."""
+    mesh_object, model, size = character
+    found = []
+    for frame in (4, 15, 26):
+        bpy.context.scene.frame_set(frame)
+        assert_equal(mesh_object, model, size)
+        found.append(errors(mesh_object))
+    assert_better_than_linear(found)
+
+
+def test_the_linear_layer_is_blenders_skinning(character):
+    mesh_object, _, size = character
+    for frame in (4, 15, 26):
+        bpy.context.scene.frame_set(frame)
+        linear = show(mesh_object, "LINEAR")
+        mesh_object.fdda.mode = "RIG"
+        mesh_object.modifiers["CorrectiveSmooth"].show_viewport = False
+        largest = np.abs(evaluated(mesh_object) - linear).max()
+        mesh_object.modifiers["CorrectiveSmooth"].show_viewport = True
+        # Where Blender itself has no more than single precision.
+        assert largest < 1e-5 * size + 1e-6 * np.abs(mesh_object.matrix_world.translation).max()
