@@ -2,7 +2,7 @@
 """Turns poses of a rig into a recording."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Container, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +29,7 @@ from .scene.dependencies import read_dependencies
 from .scene.modifier_stack import borrowed_stack
 from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
 from .scene.sampling import choose
+from .weight_fitting import check_has_weights, fit_weights, poses_to_fit, recorded_weights
 
 BATCH_BYTES = 6 << 20
 BATCH_POSES = 250
@@ -53,6 +54,7 @@ class RecordingSettings:
         resume: continue a recording that was interrupted.
         sample: which control bones the random poses move, as `sampling.choose` reads it; the bones of the rig as it
             stands when it is empty.
+        fit_linear: kind of the skin weights that are fitted (`core.skin_fit.KINDS`); empty for those of the rig.
         controls: which numbers are inputs and are sampled beside those that are found, as `stated_controls` reads it.
     """
 
@@ -65,6 +67,7 @@ class RecordingSettings:
     resume: bool = False
     sample: tuple[str, ...] = ()
     controls: tuple[str, ...] = ()
+    fit_linear: str = ""
 
 
 def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iterator[Progress]:
@@ -78,10 +81,11 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         settings: what to record.
 
     Yields:
-        Progress of the stages "influences" and "poses".
+        Progress of the stages "influences" and "poses", before them "poses to fit" and "fit" where weights are fitted.
 
     Raises:
         RigError: the rig cannot be recorded.
+        TrainingError: weights are to be fitted, and the trainer's Python cannot.
         RecordingError: there is a recording already, or the one to resume is of something else.
         OutputError: the folder cannot be written.
     """
@@ -97,13 +101,11 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         total, 0, Path(bpy.data.filepath).name, scene_rig.mesh_object.name, bpy.app.version_string, sampling
     )
 
-    with (
-        borrowed_stack(scene_rig.mesh_object),
-        borrowed_pose(scene_rig.armature_object, actions),
-        borrowed_controls(scene_rig, control_names(rig, channels)),
-    ):
-        clear_pose(scene_rig.armature_object)
-        evaluator = PoseEvaluator(scene_rig, rig)
+    def poses(wanted: Container[int]) -> Iterator[None]:
+        return _poses(scene_rig, channels, settings, actions, wanted)
+
+    rig, fit = yield from _linear_layer(scene_rig, rig, channels, path, settings, poses)
+    with _borrowed(scene_rig, rig, channels, actions) as evaluator:
         search = Search(
             channels,
             lambda number: sample_pose(channels, settings.seed, INFLUENCE_SEED_OFFSET + number, settings.spread),
@@ -113,13 +115,49 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         )
         partitions = yield from find_influences(scene_rig, rig, make_partitions(rig), evaluator, search)
         layer = LinearLayer(rig, partitions)
-        with RecordingWriter(path, rig, partitions, info, settings.resume) as writer:
-            poses = _poses(scene_rig, channels, settings, actions, writer.complete)
+        with RecordingWriter(path, rig, partitions, replace(info, fit=fit), settings.resume) as writer:
             yield Progress("poses", writer.complete, total)
+            left = poses(range(writer.complete, total))
             # Closed before the writer: what was evaluated is kept when the recording is broken off.
-            with contextlib.closing(append_poses(poses, evaluator, layer, writer)) as steps:
+            with contextlib.closing(append_poses(left, evaluator, layer, writer)) as steps:
                 for done in steps:
                     yield Progress("poses", done, total)
+
+
+@contextlib.contextmanager
+def _borrowed(
+    scene_rig: SceneRig, rig: Rig, channels: tuple[Channel, ...], actions: list[bpy.types.Action]
+) -> Iterator[PoseEvaluator]:
+    """What a recording changes in the scene, given back afterwards; the rig is at rest."""
+    with (
+        borrowed_stack(scene_rig.mesh_object),
+        borrowed_pose(scene_rig.armature_object, actions),
+        borrowed_controls(scene_rig, control_names(rig, channels)),
+    ):
+        clear_pose(scene_rig.armature_object)
+        yield PoseEvaluator(scene_rig, rig)
+
+
+def _linear_layer(
+    scene_rig: SceneRig,
+    rig: Rig,
+    channels: tuple[Channel, ...],
+    path: Path,
+    settings: RecordingSettings,
+    poses: Callable[[Container[int]], Iterator[None]],
+) -> Iterator[Progress]:
+    """Returns the rig with the weights that its linear layer is to have, and the SkinFit, None for those of the rig."""
+    if settings.resume and (recorded := recorded_weights(path, rig, settings.fit_linear)):
+        return recorded
+    if not settings.fit_linear:
+        check_has_weights(scene_rig, rig)
+        return rig, None
+    sampling = planned_sampling(settings, channels)
+    numbers = poses_to_fit(sum(source.poses for source in sampling.sources), rig.vertex_count)
+    actions = [find_action(name) for name in settings.actions]
+    with _borrowed(scene_rig, rig, channels, actions) as evaluator:
+        posed = poses(frozenset(numbers))
+        return (yield from fit_weights(rig, settings.fit_linear, posed, len(numbers), evaluator))
 
 
 def planned_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
@@ -186,19 +224,20 @@ def _poses(
     channels: tuple[Channel, ...],
     settings: RecordingSettings,
     actions: list[bpy.types.Action],
-    first: int,
+    wanted: Container[int],
 ) -> Iterator[None]:
-    """Pose the rig, one pose an iteration, from pose `first` of the recording on."""
+    """Pose the rig, one pose an iteration, as in the poses of the recording that are wanted, by their numbers."""
     poser = Poser(scene_rig, channels)
-    for index in range(first, settings.poses):
-        poser.set(sample_pose(channels, settings.seed, index, settings.spread))
-        yield
+    for index in range(settings.poses):
+        if index in wanted:
+            poser.set(sample_pose(channels, settings.seed, index, settings.spread))
+            yield
     start = settings.poses
     for action in actions:
         clear_pose(scene_rig.armature_object)
         assign_action(scene_rig.armature_object, action)
         for index, frame in enumerate(action_frames(action), start):
-            if index >= first:
+            if index in wanted:
                 bpy.context.scene.frame_set(frame)
                 yield
         start += len(action_frames(action))

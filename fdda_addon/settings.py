@@ -8,7 +8,7 @@
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
 
 from .core.errors import OutputError
 from .scene.compatibility import BLEND_RELATIVE_PATH
@@ -29,6 +29,16 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         min=0.05,
         max=10.0,
         step=10,
+    )
+    fit_linear: EnumProperty(
+        name="Linear Layer",
+        description="Skin weights of the linear layer that a model learns to correct",
+        items=(
+            ("RIG", "Rig's Weights", "The weights that the mesh has, as they are"),
+            ("HARD", "Fitted, Rigid", "One joint a vertex, the one that explains the recorded poses best"),
+            ("SMOOTH", "Fitted, Smooth", "At most four joints a vertex, with the weights that explain the poses best"),
+        ),
+        default="RIG",
     )
     recording: StringProperty(
         name="Folder",
@@ -68,6 +78,11 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         soft_max=1000,
     )
     training_seed: IntProperty(name="Seed", description="Other seeds start the training elsewhere", min=0)
+
+
+def wanted_fit(settings: FDDA_PG_character) -> str:
+    """Kind of the skin weights that are fitted (`core.skin_fit.KINDS`); empty for those of the rig."""
+    return "" if settings.fit_linear == "RIG" else settings.fit_linear.lower()
 
 
 class FDDA_PG_action(bpy.types.PropertyGroup):

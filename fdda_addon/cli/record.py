@@ -40,6 +40,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="a number that deforms the mesh beside the joints: the name of a shape key, shape_keys for all of them, "
         "or OWNER/PATH; those that drivers of the mesh read are found by themselves; may be given several times",
     )
+    parser.add_argument(
+        "--fit-linear",
+        choices=("hard", "smooth"),
+        default="",
+        help="fit the skin weights of the linear layer to the poses: one joint a vertex, or at most four",
+    )
     parser.add_argument("--resume", action="store_true", help="continue a recording that was interrupted")
     parser.add_argument(
         "--refine", metavar="MODEL.onnx", type=Path, help="add poses to the recording where this model is worst"
@@ -57,15 +63,21 @@ def run(options: argparse.Namespace) -> None:
     # Wider is uniform already, and most draws would fall outside and be drawn again.
     if not 0 < options.spread <= 10:
         raise WrongUsageError("--spread must be more than 0 and at most 10.")
-    if options.refine and (options.action or options.resume or options.sample or options.control or options.poses == 0):
+    of_new = (options.action, options.resume, options.sample, options.control, options.fit_linear)
+    if options.refine and (any(of_new) or options.poses == 0):
         raise WrongUsageError(
-            "--refine adds random poses to a complete recording; leave --action, --sample, --control and --resume out."
+            "--refine adds random poses to a complete recording; leave --action, --sample, --control, --fit-linear and "
+            "--resume out."
         )
     scene_rig = open_rig(options)
     start = time.monotonic()
     with ProgressPrinter() as progress, true_rig(scene_rig.mesh_object):
         for step in _steps(scene_rig, options):
             progress.show(step.stage, step.done, step.total)
+    if options.fit_linear:
+        from ..core.recording import read_index, read_info
+
+        print(read_info(read_index(options.recording)).fit.sentence())
     added = "added " if options.refine else ""
     print(f"{options.recording}: {step.total} poses {added}in {time.monotonic() - start:.1f} s")
 
@@ -85,6 +97,7 @@ def _steps(scene_rig: "SceneRig", options: argparse.Namespace) -> "Iterator[Prog
         resume=options.resume,
         sample=tuple(options.sample),
         controls=tuple(options.control),
+        fit_linear=options.fit_linear,
         **given,
     )
     return record(scene_rig, options.recording, settings)

@@ -8,12 +8,13 @@ from pathlib import Path
 
 from .errors import OutputError, RecordingError
 from .recording import array_shapes
-from .recording_index import INDEX, REFINED, read_index
+from .recording_index import INDEX, REFINED, read_index, read_info
 from .recording_lock import LOCK, RecordingLock
 from .recording_writer import different_keys
 from .rig import Fingerprint, Joint, Rig, differences
+from .skin_fit import SkinFit
 
-SETTINGS = {"limits": "range of motion", "sources": "number of poses or actions"}
+SETTINGS = {"limits": "range of motion", "sources": "number of poses or actions", "fit": "linear layer"}
 """What people call the keys of a sampling."""
 
 
@@ -34,21 +35,25 @@ class FolderState(enum.Enum):
 
 @dataclass(frozen=True)
 class FolderContent:
-    """What a folder holds: poses of the recording in it, and a sentence where it is not as it should be."""
+    """What a folder holds: poses of the recording in it, a sentence where it is not as it should be, its fit if any."""
 
     state: FolderState
     complete: int = 0
     poses: int = 0
     sentence: str = ""
+    fit: SkinFit | None = None
 
 
-def read_folder(path: Path, rig: Rig | None = None, sampling: dict | None = None) -> FolderContent:
+def read_folder(
+    path: Path, rig: Rig | None = None, sampling: dict | None = None, fit_linear: str | None = None
+) -> FolderContent:
     """Look into the folder of a recording.
 
     Args:
         path: the folder, which need not exist.
         rig: the rig at hand; None leaves the comparison out.
         sampling: `Sampling.to_json` of what would be recorded; None leaves the comparison out.
+        fit_linear: kind of the skin weights that would be fitted, empty for the rig's own; None leaves it out.
     """
     if not os.path.exists(path / INDEX):
         if os.path.exists(path) and (not os.path.isdir(path) or {*os.listdir(path)} - {LOCK}):
@@ -66,10 +71,13 @@ def read_folder(path: Path, rig: Rig | None = None, sampling: dict | None = None
             f"'{path.name}' holds a recording of another rig: {'; '.join(found)}. Choose another folder, or remove it.",
         )
     found = different_keys(_as_recorded_first(index["sampling"]), sampling) if sampling is not None else []
+    fit = read_info(index).fit
+    if fit_linear is not None and fit_linear != (fit.kind if fit else ""):
+        found.append("fit")
     names = ", ".join(sorted({SETTINGS.get(key.partition(".")[0], key) for key in found}))
     if counts[0] == counts[1]:
         sentence = f"It was recorded with other settings than those above: {names}." if found else ""
-        return FolderContent(FolderState.COMPLETE, *counts, sentence)
+        return FolderContent(FolderState.COMPLETE, *counts, sentence, fit)
     if found:
         return FolderContent(
             FolderState.OTHER,

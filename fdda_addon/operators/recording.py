@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError
-from ..settings import model_file, recording_folder
+from ..settings import model_file, recording_folder, wanted_fit
 from .job import JobOperator, current
 from .on_rig import OnRig
 
@@ -52,6 +52,7 @@ class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
             spread=settings.spread,
             actions=recorded_actions(rig.armature_object),
             resume=self.resume,
+            fit_linear=wanted_fit(settings),
         )
         with true_rig(rig.mesh_object):
             yield from record(rig, self._path, wanted)

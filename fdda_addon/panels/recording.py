@@ -12,14 +12,14 @@ from ..core.errors import FDDAError
 from ..operators import job
 from ..operators.recording import recorded_actions
 from ..scene.scene_rig import SceneRig
-from ..settings import recording_folder
+from ..settings import recording_folder, wanted_fit
 from . import checks
 from .section import Section, draw_job, draw_path, draw_sentence, panel_rig
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.recording_folder import FolderContent
 
-UNITS = {"influences": "joint tests"}
+UNITS = {"influences": "joint tests", "fit": "vertices fitted"}
 
 _contents: "dict[int, tuple[tuple, FolderContent]]" = {}
 """What was found in the folder of a character, by session_uid of its mesh object, and for which question."""
@@ -38,13 +38,14 @@ def content_of(rig: SceneRig, path: Path) -> "FolderContent":
     except OSError:
         stamp = -1 if path.exists() else 0
     uid = rig.mesh_object.session_uid
-    question = (path, stamp, id(check), settings.poses, settings.seed, settings.spread, actions)
+    fit = wanted_fit(settings)
+    question = (path, stamp, id(check), settings.poses, settings.seed, settings.spread, actions, fit)
     if uid not in _contents or _contents[uid][0] != question:
         wanted = RecordingSettings(settings.poses, settings.seed, settings.spread, actions)
         own, sampling = None, None
         if check is not None and check.rig is not None:
             own, sampling = check.rig, json.loads(json.dumps(planned_sampling(wanted, check.channels).to_json()))
-        _contents[uid] = (question, read_folder(path, own, sampling))
+        _contents[uid] = (question, read_folder(path, own, sampling, fit))
     return _contents[uid][1]
 
 
@@ -83,7 +84,9 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
 def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
     from ..core.recording_folder import FolderState
 
-    draw_path(layout, rig.mesh_object.fdda.settings, "recording")
+    settings = rig.mesh_object.fdda.settings
+    draw_path(layout, settings, "recording")
+    layout.prop(settings, "fit_linear")
     try:
         path = recording_folder(rig.mesh_object)
         content = content_of(rig, path)
@@ -106,6 +109,8 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         draw_sentence(
             layout, context, f"'{path.name}' is complete: {content.poses:,} poses. Train on it next.", "CHECKMARK"
         )
+        if content.fit:
+            draw_sentence(layout, context, content.fit.sentence())
         if content.sentence:
             draw_sentence(layout, context, content.sentence, "INFO")
     else:

@@ -14,7 +14,7 @@ from scene_state import fresh_elbow
 from fdda_addon.cli.files import save_copy
 from fdda_addon.scene.rig import SceneRig
 
-PROGRESS = re.compile(r"(influences|poses|training|evaluation|benchmark|frames): \d+ of \d+, .*")
+PROGRESS = re.compile(r"(poses to fit|fit|influences|poses|training|evaluation|benchmark|frames): \d+ of \d+, .*")
 
 
 def files(folder: Path) -> dict[str, bytes | None]:

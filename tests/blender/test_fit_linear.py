@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A linear layer with fitted weights: recorded, trained, bound and compared; resumed, and refused."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from conftest import ELBOW, assert_plays, evaluated, pose, run
+from refusals import Refusal, save_elbow
+from scene_state import assert_same_state, drain, fresh_elbow, scene_state
+
+from blend_fixtures.characters.base import cage, skin, tube
+from fdda_addon.cli.files import save_copy
+from fdda_addon.core.errors import RecordingError
+from fdda_addon.core.model import read_model_info
+from fdda_addon.core.recording import read_recording
+from fdda_addon.core.recording_folder import FolderState, read_folder
+from fdda_addon.core.rig import Rig
+from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.elbow import build_elbow, lower_weights
+from fdda_addon.evaluation import EvaluationSettings, evaluate
+from fdda_addon.recording import RecordingSettings, record
+from fdda_addon.runtime.binding import bind
+from fdda_addon.scene.rig import PoseReader, SceneRig, find_rig, read_rig
+from fdda_addon.trainer_environment.choice import PYTHON_VARIABLE
+
+SMOOTH = RecordingSettings(poses=60, influence_poses=2, fit_linear="smooth")
+
+
+def rigid_elbow() -> None:
+    """An elbow that is skinned to one bone a vertex; what makes it smooth is delta mush."""
+    mesh_object, _ = build_elbow()
+    lower = lower_weights(np.array([vertex.co for vertex in mesh_object.data.vertices])) >= 0.5
+    for name, own in (("upper", ~lower), ("lower", lower)):
+        mesh_object.vertex_groups[name].remove(range(len(own)))
+        mesh_object.vertex_groups[name].add(np.flatnonzero(own).tolist(), 1.0, "REPLACE")
+
+
+def cloth() -> SceneRig:
+    """A mesh without weights that sticks to a skinned body."""
+    mesh_object, armature_object = tube()
+    mesh_object.modifiers.clear()
+    mesh_object.vertex_groups.clear()
+    body = cage("body", 1.1)
+    skin(body, armature_object)
+    modifier = mesh_object.modifiers.new("SurfaceDeform", "SURFACE_DEFORM")
+    modifier.target = body
+    bpy.context.view_layer.update()
+    with bpy.context.temp_override(object=mesh_object, active_object=mesh_object):
+        bpy.ops.object.surfacedeform_bind(modifier=modifier.name)
+    return SceneRig(mesh_object, armature_object)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fitted:
+    """The files of a character with a fitted linear layer, and what `record` printed."""
+
+    rig: Path
+    recording: Path
+    model: Path
+    printed: str
+
+    def open(self) -> SceneRig:
+        bpy.ops.wm.open_mainfile(filepath=str(self.rig))
+        return find_rig(ELBOW)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable], Fitted]:
+    """Makes a character once: records it with a fitted linear layer, and trains."""
+    made: dict[str, Fitted] = {}
+
+    def make(kind: str, build: Callable[[], object], capfd: pytest.CaptureFixture) -> Fitted:
+        if kind not in made:
+            folder = tmp_path_factory.mktemp("fitted")
+            files = [folder / name for name in ("rig.blend", "recording", "model.onnx")]
+            bpy.ops.wm.read_factory_settings(use_empty=True)
+            build()
+            save_copy(files[0])
+            capfd.readouterr()
+            options = ("--object", ELBOW, "--poses", 120, "--fit-linear", kind)
+            assert run("record", *files[:2], *options) == 0
+            printed = capfd.readouterr().out
+            assert run("train", *files[1:], "--epochs", 40) == 0
+            made[kind] = Fitted(*files, printed)
+        return made[kind]
+
+    return make
+
+
+CHARACTERS = [("hard", cloth), ("smooth", rigid_elbow)]
+
+
+def pose_matrices(rig: SceneRig, recorded: Rig) -> np.ndarray:
+    """(J, 4, 4), the pose that Blender has evaluated, of the joints of a recording."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    reader = PoseReader(rig, recorded.joint_names, recorded.rest_matrices)
+    return reader.read(*(o.evaluated_get(depsgraph) for o in (rig.mesh_object, rig.armature_object)))
+
+
+@pytest.mark.parametrize(("kind", "build"), CHARACTERS)
+def test_from_the_fit_to_playback(kind, build, fitted, capfd):
+    files = fitted(kind, build, capfd)
+    recording, info = read_recording(files.recording), read_model_info(files.model)
+    fit = recording.info.fit
+    assert fit.sentence() in files.printed and (fit.kind, fit.poses) == (kind, 120)
+    for gain in (fit.held_out, fit.training):
+        assert gain.rms_mm["fitted"] < 0.8 * gain.rms_mm["rig"]
+
+    rig = files.open()
+    own = read_rig(rig)
+    # The fingerprint is that of the rig: it does not matter to it which linear layer a model has.
+    assert recording.rig.fingerprint == own.fingerprint == info.fingerprint
+    assert [own.joint_names[p.joint] for p in info.partitions] == ["upper", "lower"]
+    assert (recording.rig.skin_weights > 0).sum(axis=1).max() == (1 if kind == "hard" else 2)
+    assert (own.skin_weights > 0).sum(axis=1).max() == 1
+
+    evaluation = drain(evaluate(rig, files.model, EvaluationSettings(30)))
+    assert evaluation.fdda.rms < 0.5 * evaluation.linear.rms
+    # On other poses: those of the fit are 120, and every other one of them.
+    assert evaluation.linear.rms == pytest.approx(fit.held_out.rms_mm["fitted"], rel=0.3)
+    assert [p.joint for p in evaluation.partitions] == [p.joint for p in info.partitions]
+    assert [len(p.vertices) for p in evaluation.partitions] == [p.vertices for p in info.partitions]
+
+
+@pytest.mark.parametrize(("kind", "build"), CHARACTERS)
+def test_the_fitted_linear_layer_is_what_plays(kind, build, fitted, capfd):
+    files = fitted(kind, build, capfd)
+    rig = files.open()
+    pose(angle=1.2)
+    true = evaluated(rig.mesh_object)
+    bind(rig, files.model)
+    shown = assert_plays(rig.mesh_object, files.model)
+    rig.mesh_object.fdda.mode = "LINEAR"
+    linear = evaluated(rig.mesh_object)
+    recording = read_recording(files.recording)
+    matrices = pose_matrices(rig, recording.rig)
+    np.testing.assert_allclose(linear, LinearLayer(recording.rig).positions(matrices[None])[0], atol=1e-5)
+    errors = [np.linalg.norm(positions - true, axis=1).mean() for positions in (shown, linear)]
+    assert errors[0] < errors[1] < 0.01
+
+
+@pytest.fixture
+def refusal(tmp_path, capfd) -> Refusal:
+    return Refusal(tmp_path, capfd)
+
+
+def test_a_mesh_without_weights_is_refused_unless_they_are_fitted(refusal, tmp_path):
+    cloth()
+    save_copy(tmp_path / "cloth.blend")
+    assert refusal("record", tmp_path / "cloth.blend", tmp_path / "recording", "--object", ELBOW) == (
+        "The vertices of 'elbow' have no weights on deforming bones of 'elbow_rig', so there is no linear layer to "
+        "learn from; have one fitted (--fit-linear smooth, or Linear Layer in the sidebar), or paint weights."
+    )
+
+
+def test_too_few_poses_to_fit(refusal, tmp_path):
+    path = save_elbow(tmp_path / "elbow.blend")
+    assert refusal("record", path, tmp_path / "recording", "--poses", 9, "--fit-linear", "hard") == (
+        "Skin weights are fitted to at least 10 poses, and these are 9; record more, or leave --fit-linear out."
+    )
+
+
+def test_a_python_without_scipy_leaves_no_recording(refusal, tmp_path, monkeypatch):
+    path = save_elbow(tmp_path / "elbow.blend")
+    packages = tmp_path / "packages"
+    packages.mkdir()
+    (packages / "sitecustomize.py").write_text("import sys\nsys.modules['scipy'] = None\n")
+    monkeypatch.setenv("PYTHONPATH", str(packages))
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    text = refusal("record", path, tmp_path / "recording", "--poses", 12, "--fit-linear", "smooth")
+    assert text.startswith("Fitting skin weights needs the Python package 'scipy', which ")
+
+
+def test_a_fit_that_dies_is_reported(refusal, tmp_path, monkeypatch):
+    path = save_elbow(tmp_path / "elbow.blend")
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\nexit 3\n")
+    python.chmod(0o755)
+    monkeypatch.setenv(PYTHON_VARIABLE, str(python))
+    assert refusal("record", path, tmp_path / "recording", "--poses", 12, "--fit-linear", "smooth") == (
+        "The trainer ended with status 3 before it was done; no skin weights were fitted, record again."
+    )
+
+
+def test_refined_poses_take_the_linear_layer_of_the_recording(tmp_path, refusal):
+    assert run("record", save_elbow(tmp_path / "elbow.blend"), tmp_path / "recording", "--poses", 3) == 0
+    status = run(
+        "record", tmp_path / "elbow.blend", tmp_path / "recording", "--refine", "m.onnx", "--fit-linear", "hard"
+    )
+    assert status == 2
+
+
+def test_a_resumed_recording_keeps_its_weights(tmp_path, monkeypatch):
+    rig = fresh_elbow()
+    before = scene_state(rig)
+    drain(record(rig, tmp_path / "whole", SMOOTH))
+    assert_same_state(before, scene_state(rig))
+    steps = record(rig, tmp_path / "broken", SMOOTH)
+    for step in steps:
+        if step.stage == "poses" and step.done == 30:
+            break
+    steps.close()
+    assert read_folder(tmp_path / "broken").complete == 30
+    # No trainer is asked: the weights are there.
+    monkeypatch.setenv(PYTHON_VARIABLE, "/none/python")
+    resumed = dataclasses.replace(SMOOTH, resume=True)
+    for other in ("", "hard"):
+        with pytest.raises(RecordingError) as error:
+            drain(record(rig, tmp_path / "broken", dataclasses.replace(resumed, fit_linear=other)))
+        assert str(error.value) == (
+            f"Cannot resume '{tmp_path / 'broken'}': it was recorded with --fit-linear smooth; give that, or record "
+            "into another folder."
+        )
+    drain(record(rig, tmp_path / "broken", resumed))
+    for file in (tmp_path / "whole").iterdir():
+        assert file.read_bytes() == (tmp_path / "broken" / file.name).read_bytes(), file.name
+
+
+def test_a_recording_of_the_rigs_own_weights_is_not_resumed_with_others(tmp_path):
+    rig = fresh_elbow()
+    drain(record(rig, tmp_path / "own", RecordingSettings(poses=4, influence_poses=1)))
+    with pytest.raises(RecordingError, match="it was recorded with the rig's own weights; give that"):
+        drain(record(rig, tmp_path / "own", dataclasses.replace(SMOOTH, poses=4, resume=True)))
+
+
+def test_a_fit_that_is_cancelled_leaves_nothing(tmp_path):
+    rig = fresh_elbow()
+    before = scene_state(rig)
+    for stage in ("poses to fit", "fit"):
+        steps = record(rig, tmp_path / "recording", SMOOTH)
+        assert any(step.stage == stage for step in steps)
+        steps.close()
+    assert_same_state(before, scene_state(rig))
+    assert not (tmp_path / "recording").exists()
+
+
+def test_the_sidebar_fits_as_the_command_line_does(tmp_path):
+    rig = fresh_elbow()
+    settings = rig.mesh_object.fdda.settings
+    settings.poses, settings.fit_linear = 12, "HARD"
+    assert bpy.ops.fdda.record(object=ELBOW, folder=str(tmp_path / "recording")) == {"FINISHED"}
+    index = json.loads((tmp_path / "recording" / "recording.json").read_text())
+    assert (index["fit"]["kind"], index["fit"]["poses"]) == ("hard", 12)
+    own = read_rig(rig)
+    same = read_folder(tmp_path / "recording", own, index["sampling"], "hard")
+    assert (same.state, same.sentence, same.fit.poses) == (FolderState.COMPLETE, "", 12)
+    other = read_folder(tmp_path / "recording", own, index["sampling"], "")
+    assert other.sentence == "It was recorded with other settings than those above: linear layer."
