@@ -94,12 +94,13 @@ def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
         with _switched_off(mesh_object, [m for m in generating if m != modifiers[i]]):
             kinds[i] = _Kind.DEFORMS if _keeps_topology(mesh_object) else _Kind.GENERATES
     deforming = [i for i, kind in enumerate(kinds) if kind in moving]
-    bound = {i for i, m in enumerate(modifiers) if m.type in NEED_ORIGINAL}
+    original = [i for i, m in enumerate(modifiers) if m.type in NEED_ORIGINAL]
     # Where all are off, the last of all: what the user switches on later is replaced.
-    last = max(*([i for i in deforming if modifiers[i].show_viewport] or deforming), *bound, -1, -1)
+    shown = [i for i in deforming if modifiers[i].show_viewport] or deforming
+    last = max(shown + original, default=-1)
     generating = [i for i, kind in enumerate(kinds) if kind is _Kind.GENERATES and modifiers[i].show_viewport]
     return ModifierStack(
-        replaced=tuple(m.name for i, m in enumerate(modifiers[: last + 1]) if i in bound.union(deforming)),
+        replaced=tuple(m.name for i, m in enumerate(modifiers[: last + 1]) if i in deforming + original),
         misplaced=tuple(modifiers[i].name for i in generating if i <= last),
         live=tuple(modifiers[i].name for i in generating if i > last),
         place=last + 1,
