@@ -71,7 +71,8 @@ def play_point_cache(mesh_object: bpy.types.Object, stack: ModifierStack, path: 
     """
     place = _remove_deformation(mesh_object, stack)
     modifier = mesh_object.modifiers.new(MODIFIER_NAME, "MESH_CACHE")
-    mesh_object.modifiers.move(len(mesh_object.modifiers) - 1, place)
+    # Not always the last: another may be pinned to the end.
+    mesh_object.modifiers.move(mesh_object.modifiers.find(modifier.name), place)
     modifier.cache_format, modifier.filepath = "PC2", stored_path(path)
     modifier.time_mode, modifier.play_mode = "FRAME", "SCENE"
     modifier.frame_start, modifier.frame_scale = first, 1.0

@@ -85,7 +85,8 @@ class TestWithoutTheAddOn:
 
     def test_a_subdivision_above_stays_live(self, elbow, wave, tmp_path):
         def subdivide(rig):
-            rig.mesh_object.modifiers.new("Finer", "SUBSURF").levels = 1
+            finer = rig.mesh_object.modifiers.new("Finer", "SUBSURF")
+            finer.levels, finer.use_pin_to_last = 1, True
 
         rig = save_elbow(tmp_path / "rig.blend", subdivide)
         outs = [tmp_path / "cache.blend", tmp_path / "keys.blend"]
