@@ -207,7 +207,8 @@ def _prepare(scene_rig: SceneRig, model: Path | Network) -> tuple[Network, Linea
     check_evaluable(scene_rig)
     rig = read_model_rig(scene_rig, network.info)
     check_rig(network.path, network.info, rig)
-    return network, LinearLayer(network.linear_rig(rig))
+    rig = network.linear_rig(rig)
+    return network, LinearLayer(rig, network.info.partitions_of(rig))
 
 
 def pose_held_out(scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, index: int) -> None:

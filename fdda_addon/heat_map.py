@@ -12,7 +12,7 @@ import numpy as np
 
 from . import last_evaluation, overlay
 from .core.metrics import heat_colors
-from .core.partition import make_partitions, partition_colors
+from .core.partition import LEAST_VERTICES, merged_partitions, partition_colors
 from .evaluation_view import redraw_views
 from .scene.rig import SceneRig, read_rig
 
@@ -37,14 +37,14 @@ def paint_errors(mesh_object: bpy.types.Object) -> None:
     _paint(mesh_object, Paint(ERRORS))
 
 
-def paint_partitions(scene_rig: SceneRig) -> None:
-    """Show the partitions of a rig.
+def paint_partitions(scene_rig: SceneRig, least_vertices: int = LEAST_VERTICES) -> None:
+    """Show the partitions that a rig is recorded with.
 
     Raises:
         RigError: the rig cannot be read.
     """
     rig = read_rig(scene_rig)
-    partitions = make_partitions(rig)
+    partitions = merged_partitions(rig, least_vertices)
     colors = partition_colors(partitions, rig.vertex_count)
     _paint(scene_rig.mesh_object, Paint(PARTITIONS, colors, len(partitions)))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from .core.metrics import distances, heat_colors
-from .core.partition import make_partitions, partition_colors
+from .core.partition import merged_partitions, partition_colors
 from .core.skinning import LinearLayer
 from .drawing import Cell, View, draw
 from .evaluation import PoseErrors
@@ -48,7 +48,7 @@ def draw_partitions(scene_rig: SceneRig, path: Path, view: View = View()) -> Non
         OutputError: the file cannot be written.
     """
     rig = read_rig(scene_rig)
-    partitions = make_partitions(rig)
+    partitions = merged_partitions(rig)
     colors = partition_colors(partitions, rig.vertex_count)
     cell = Cell(rig.rest_positions, colors, f"{len(partitions)} partitions, {rig.vertex_count} vertices")
     draw(scene_rig.mesh_object.data, [[cell]], path, "Partitions by main joint", view)

@@ -12,7 +12,7 @@ import numpy as np
 
 from .core.errors import RecordingError, RigError
 from .core.output import check_folder_writable
-from .core.partition import GOLDEN_RATIO, INFLUENCE_TOLERANCE, make_partitions
+from .core.partition import GOLDEN_RATIO, INFLUENCE_TOLERANCE, LEAST_VERTICES, merged_partitions
 from .core.poses import CONTROL, DEFAULT_SPREAD, Channel, sample_pose
 from .core.progress import Progress
 from .core.recording import RecordingInfo, Sampling, Source
@@ -49,13 +49,12 @@ class RecordingSettings:
         spread: standard deviation of the random poses as a part of half the range of motion.
         actions: names of actions whose frames are recorded after the random poses.
         influence_poses: how often each joint is moved alone to find the partitions that it influences.
-        influence_tolerance: a joint influences a partition when it moves a local residual by more than this part of
-            the character's size.
+        influence_tolerance: part of the character's size by which a joint moves the residuals that it influences.
         resume: continue a recording that was interrupted.
-        sample: which control bones the random poses move, as `sampling.choose` reads it; the bones of the rig as it
-            stands when it is empty.
+        sample: which control bones the random poses move, as `sampling.choose` reads it; empty for those of the rig.
         fit_linear: kind of the skin weights that are fitted (`core.skin_fit.KINDS`); empty for those of the rig.
         controls: which numbers are inputs and are sampled beside those that are found, as `stated_controls` reads it.
+        least_vertices: partitions of fewer vertices are merged into others; 0 merges none.
     """
 
     poses: int = 1000
@@ -68,6 +67,7 @@ class RecordingSettings:
     sample: tuple[str, ...] = ()
     controls: tuple[str, ...] = ()
     fit_linear: str = ""
+    least_vertices: int = LEAST_VERTICES
 
 
 def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iterator[Progress]:
@@ -113,7 +113,8 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
             settings.influence_poses,
             settings.influence_tolerance,
         )
-        partitions = yield from find_influences(scene_rig, rig, make_partitions(rig), evaluator, search)
+        cut = merged_partitions(rig, settings.least_vertices)
+        partitions = yield from find_influences(scene_rig, rig, cut, evaluator, search)
         layer = LinearLayer(rig, partitions)
         with RecordingWriter(path, rig, partitions, replace(info, fit=fit), settings.resume) as writer:
             yield Progress("poses", writer.complete, total)

@@ -46,6 +46,13 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         subtype="DIR_PATH",
         options=BLEND_RELATIVE_PATH,
     )
+    least_vertices: IntProperty(
+        name="Least Vertices",
+        description="Parts of the mesh with fewer vertices go with another part, which has the network; 0 for none",
+        default=8,
+        min=0,
+        soft_max=100,
+    )
     model: StringProperty(
         name="Model",
         description="File that the trained model is written to; empty for one in a folder beside the .blend file",

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
+    from ..core.partition import LEAST_VERTICES
     from .files import add_rig_options
 
     add_rig_options(parser)
@@ -46,6 +47,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default="",
         help="fit the skin weights of the linear layer to the poses: one joint a vertex, or at most four",
     )
+    parser.add_argument(
+        "--least-vertices",
+        type=int,
+        default=LEAST_VERTICES,
+        metavar="N",
+        help=f"merge partitions of fewer vertices into others, 0 for none (default {LEAST_VERTICES})",
+    )
     parser.add_argument("--resume", action="store_true", help="continue a recording that was interrupted")
     parser.add_argument(
         "--refine", metavar="MODEL.onnx", type=Path, help="add poses to the recording where this model is worst"
@@ -54,12 +62,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from ..core.errors import WrongUsageError
+    from ..core.recording_check import merges_in_words
+    from ..core.recording_index import read_index, read_info
     from ..runtime.binding import true_rig
     from .files import open_rig
     from .progress import ProgressPrinter
 
-    if (options.poses or 0) < 0 or options.seed < 0:
-        raise WrongUsageError("--poses and --seed must be 0 or more.")
+    if (options.poses or 0) < 0 or options.seed < 0 or options.least_vertices < 0:
+        raise WrongUsageError("--poses, --seed and --least-vertices must be 0 or more.")
     # Wider is uniform already, and most draws would fall outside and be drawn again.
     if not 0 < options.spread <= 10:
         raise WrongUsageError("--spread must be more than 0 and at most 10.")
@@ -74,10 +84,12 @@ def run(options: argparse.Namespace) -> None:
     with ProgressPrinter() as progress, true_rig(scene_rig.mesh_object):
         for step in _steps(scene_rig, options):
             progress.show(step.stage, step.done, step.total)
-    if options.fit_linear:
-        from ..core.recording import read_index, read_info
-
-        print(read_info(read_index(options.recording)).fit.sentence())
+    if not options.refine:
+        index = read_index(options.recording)
+        if options.fit_linear:
+            print(read_info(index).fit.sentence())
+        if line := merges_in_words(index, options.least_vertices):
+            print(line)
     added = "added " if options.refine else ""
     print(f"{options.recording}: {step.total} poses {added}in {time.monotonic() - start:.1f} s")
 
@@ -98,6 +110,7 @@ def _steps(scene_rig: "SceneRig", options: argparse.Namespace) -> "Iterator[Prog
         sample=tuple(options.sample),
         controls=tuple(options.control),
         fit_linear=options.fit_linear,
+        least_vertices=options.least_vertices,
         **given,
     )
     return record(scene_rig, options.recording, settings)

@@ -10,6 +10,7 @@ import numpy as np
 from .controls import Control, read_controls
 from .errors import ModelError
 from .onnx_file import read_onnx
+from .partition import Partition, make_partitions
 from .poses import Channel
 from .rig import Fingerprint, Joint, Rig, differences
 from .skin_fit import skin_from_text
@@ -76,6 +77,15 @@ class ModelInfo:
     @property
     def joint_names(self) -> tuple[str, ...]:
         return tuple(joint.name for joint in self.joints)
+
+    def partitions_of(self, rig: Rig) -> tuple[Partition, ...]:
+        """The partitions of the model, with their vertices in a rig that has the weights of its linear layer."""
+        return make_partitions(
+            rig,
+            {p.joint: p.influencing for p in self.partitions},
+            {p.joint: p.controls for p in self.partitions},
+            {joint: p.joint for p in self.partitions for joint in p.merged},
+        )
 
     @property
     def limits(self) -> tuple[Channel, ...]:

@@ -79,6 +79,11 @@ def make_partitions(
     )
 
 
+def merged_partitions(rig: Rig, least: int = LEAST_VERTICES) -> tuple[Partition, ...]:
+    """Cut the mesh by main joint, and merge what has fewer than `least` vertices as `small_partition_merges` says."""
+    return make_partitions(rig, merged=small_partition_merges(rig, least))
+
+
 def small_partition_merges(rig: Rig, least: int = LEAST_VERTICES) -> dict[int, int]:
     """Choose where the vertices of small partitions go.
 

@@ -11,7 +11,7 @@ from .recording import Recording
 from .recording_warning import RecordingWarning, counted, joint_name, length, listed
 from .residual_scan import ResidualScan, scan_residuals
 from .rest_check import check_rest
-from .rig import Rig
+from .rig import UNMOVED_LABEL, Rig
 
 NAMES = (
     *("units", "axes", "large-residuals", "duplicate-poses", "hidden-inputs", "degenerate-poses", "flips"),
@@ -47,6 +47,25 @@ def check_recording(recording: Recording) -> list[RecordingWarning]:
         *_check_small(recording),
     ]
     return sorted(found, key=lambda warning: NAMES.index(warning.name))
+
+
+def merges_in_words(index: dict, least: int) -> str:
+    """A line about the small partitions that were merged: "1 partition of fewer than 8 vertices is merged: …".
+
+    Args:
+        index: of the recording.
+        least: how many vertices a partition was to have.
+
+    Returns:
+        The line, empty when none were merged.
+    """
+    names = [joint["name"] or UNMOVED_LABEL for joint in index["joints"]]
+    merges = [f"'{names[j]}' into '{names[p['joint']]}'" for p in index["partitions"] for j in p.get("merged", ())]
+    if not merges:
+        return ""
+    which = "1 partition" if len(merges) == 1 else f"{len(merges)} partitions"
+    verb = "is" if len(merges) == 1 else "are"
+    return f"{which} of fewer than {least} vertices {verb} merged: {', '.join(merges)}."
 
 
 def bone_lengths(rig: Rig) -> np.ndarray:

@@ -53,6 +53,7 @@ class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
             actions=recorded_actions(rig.armature_object),
             resume=self.resume,
             fit_linear=wanted_fit(settings),
+            least_vertices=settings.least_vertices,
         )
         with true_rig(rig.mesh_object):
             yield from record(rig, self._path, wanted)

@@ -87,6 +87,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     settings = rig.mesh_object.fdda.settings
     draw_path(layout, settings, "recording")
     layout.prop(settings, "fit_linear")
+    layout.prop(settings, "least_vertices")
     try:
         path = recording_folder(rig.mesh_object)
         content = content_of(rig, path)

@@ -10,6 +10,7 @@ import pytest
 from conftest import ELBOW, ELBOW_RIG, run
 
 from fdda_addon.cli.files import save_copy
+from fdda_addon.core.partition import LEAST_VERTICES
 from fdda_addon.core.recording import read_recording
 from fdda_addon.core.recording_check import check_recording
 from fdda_addon.elbow import build_elbow
@@ -70,3 +71,85 @@ def test_an_armature_beside_its_mesh(tmp_path):
     found = {w.name: w.text for w in check_recording(read_recording(tmp_path / "recording"))}
     assert found["axes"].startswith("2 of the 2 joints that skin the mesh lie outside its bounds, and joints lie ")
     assert "most of it along -Z" in found["axes"]
+
+
+class TestSmallPartitions:
+    """The elbow with a bone `tip` that has the last ring, 12 vertices, and `nail` with 3 of them."""
+
+    @pytest.fixture
+    def rig(self, tmp_path: Path) -> Path:
+        elbow, rig = build_elbow()
+        bpy.context.view_layer.objects.active = rig
+        bpy.ops.object.mode_set(mode="EDIT")
+        for name, parent in (("tip", "lower"), ("nail", "tip")):
+            bone = rig.data.edit_bones.new(name)
+            bone.head, bone.tail = (0.48, 0, 0), (0.5, 0, 0)
+            bone.parent = rig.data.edit_bones[parent]
+        bpy.ops.object.mode_set(mode="OBJECT")
+        last = [v.index for v in elbow.data.vertices if v.co.x > 0.499]
+        assert len(last) == 12
+        for name, indices in (("tip", last[3:]), ("nail", last[:3])):
+            elbow.vertex_groups["lower"].remove(indices)
+            elbow.vertex_groups.new(name=name).add(indices, 1.0, "REPLACE")
+        save_copy(tmp_path / "tip.blend")
+        return tmp_path / "tip.blend"
+
+    def partitions(self, recording: Path) -> dict[str, tuple[int, list[str]]]:
+        read = read_recording(recording)
+        names = read.rig.joint_names
+        return {names[p.joint]: (len(p.vertices), [names[j] for j in p.merged]) for p in read.partitions}
+
+    def test_they_are_merged_and_shown(self, rig, tmp_path, capsys):
+        assert run("record", rig, tmp_path / "merged", "--poses", 30) == 0
+        line = "1 partition of fewer than 8 vertices is merged: 'nail' into 'tip'.\n"
+        assert line in capsys.readouterr().out
+        assert self.partitions(tmp_path / "merged") == {
+            **{"upper": (156, []), "lower": (132, [])},
+            "tip": (12, ["nail"]),
+        }
+        assert run("check-recording", tmp_path / "merged", "--strict") == 0
+        assert run("record", rig, tmp_path / "all", "--poses", 30, "--least-vertices", 13) == 0
+        line = "2 partitions of fewer than 13 vertices are merged: 'tip' into 'lower', 'nail' into 'lower'.\n"
+        assert line in capsys.readouterr().out
+        assert self.partitions(tmp_path / "all")["lower"] == (144, ["tip", "nail"])
+
+    def test_none_are_when_nobody_wants_it(self, rig, tmp_path, capsys):
+        assert run("record", rig, tmp_path / "apart", "--poses", 30, "--least-vertices", 0) == 0
+        assert "merged" not in capsys.readouterr().out
+        assert self.partitions(tmp_path / "apart")["nail"] == (3, [])
+        assert run("check-recording", tmp_path / "apart") == 0
+        assert capsys.readouterr().out.startswith(
+            "Warning (small-partitions): The partition 'nail' has fewer than 8 vertices (3), and a network each: "
+        )
+        assert run("record", rig, tmp_path / "apart", "--poses", 30, "--least-vertices", -1) == 2
+
+    def test_a_recording_goes_on_with_the_same_partitions_only(self, rig, tmp_path, capsys):
+        assert run("record", rig, tmp_path / "r", "--poses", 30) == 0
+        index = json.loads((tmp_path / "r" / "recording.json").read_text(encoding="utf-8"))
+        (tmp_path / "r" / "recording.json").write_text(json.dumps({**index, "complete": 10}), encoding="utf-8")
+        assert run("record", rig, tmp_path / "r", "--poses", 30, "--resume", "--least-vertices", 0) == 1
+        assert "partitions" in capsys.readouterr().err
+        assert run("record", rig, tmp_path / "r", "--poses", 30, "--resume") == 0
+
+    def test_the_model_and_its_evaluation_have_them(self, rig, tmp_path, capsys):
+        assert run("record", rig, tmp_path / "r", "--poses", 60) == 0
+        assert run("train", tmp_path / "r", tmp_path / "m.onnx", "--epochs", 20) == 0
+        assert run("evaluate", rig, tmp_path / "m.onnx", "--json", tmp_path / "e.json", "--poses", 20) == 0
+        evaluation = json.loads((tmp_path / "e.json").read_text(encoding="utf-8"))
+        sizes = {p["joint"]: p["vertices"] for p in evaluation["partitions"]}
+        assert sizes == {"upper": 156, "lower": 132, "tip": 12}
+        report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+        assert {p["joint"]: p.get("merged", []) for p in report["partitions"]} == {
+            **{"upper": [], "lower": []},
+            "tip": ["nail"],
+        }
+        assert evaluation["fdda"]["mean"] < 0.5 * evaluation["linear"]["mean"]
+
+    def test_the_sidebar_has_the_same_default_and_records_with_its_own(self, rig, tmp_path):
+        bpy.ops.wm.open_mainfile(filepath=str(rig))
+        elbow = bpy.data.objects[ELBOW]
+        assert elbow.fdda.settings.least_vertices == LEAST_VERTICES
+        elbow.fdda.settings.least_vertices, elbow.fdda.settings.poses = 0, 30
+        bpy.context.view_layer.objects.active = elbow
+        assert bpy.ops.fdda.record(object=ELBOW, folder=str(tmp_path / "apart")) == {"FINISHED"}
+        assert self.partitions(tmp_path / "apart")["nail"] == (3, [])
