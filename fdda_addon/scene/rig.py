@@ -100,7 +100,7 @@ class PoseReader:
         """
         self._matrices = armature_io.PoseMatrices(scene_rig.armature_object, names)
         self._rest = rest_matrices.astype(np.float64)
-        self._bone_rest = armature_io.rest_matrices(scene_rig.armature_object.data, names)
+        self._from_bone_rest = np.linalg.inv(armature_io.rest_matrices(scene_rig.armature_object.data, names))
         self._relation: Matrix | None = None
         self._left: np.ndarray | None = None
         self._right: np.ndarray | None = None
@@ -125,7 +125,8 @@ class PoseReader:
         """Prepare P = T pose inv(T bone_rest) rest; a factor that is the identity is None."""
         self._relation = relation
         left = np.array(relation, np.float64)
-        right = np.linalg.inv(left @ self._bone_rest) @ self._rest
+        # One inverse a frame, not one a joint: where an animated parent moves both, rounding changes T each time.
+        right = self._from_bone_rest @ (np.linalg.inv(left) @ self._rest)
         self._left, self._right = (
             None if np.abs(factor - np.eye(4)).max() < IDENTITY_TOLERANCE else factor for factor in (left, right)
         )
