@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from baked_files import CLOSE, WAVE, elbow_wave, plain_blender, read_pc2
+from baked_files import CLOSE, WAVE, elbow_wave, model_says, plain_blender, read_pc2
 from conftest import ELBOW, ELBOW_RIG, evaluated, run
 from refusals import files, save_elbow
 from scene_state import fresh_elbow
@@ -168,3 +168,31 @@ class TestLinked:
         assert run("bake", path, elbow.model, out, "--frames", 1, 30, *options) == 0
         shown = plain_blender(tmp_path, (out, [9.0]))
         assert np.abs(shown[out, 9.0] - wave[8]).max() < CLOSE
+
+
+def test_controls_are_baked_along(tmp_path):
+    """A key that no bone moves is an input of the model; its animation is in the bake, and it is gone itself."""
+
+    def add_key(rig):
+        rig.mesh_object.shape_key_add(name="Basis")
+        key, keys = rig.mesh_object.shape_key_add(name="Fat"), rig.mesh_object.data.shape_keys
+        for vertex in key.data:
+            vertex.co *= 1.3
+        for frame, value in ((1, 0.0), (20, 1.0)):
+            key.value = value
+            keys.keyframe_insert('key_blocks["Fat"].value', frame=frame)
+
+    rig, model, out = save_elbow(tmp_path / "rig.blend", add_key), tmp_path / "m.onnx", tmp_path / "a.blend"
+    assert run("record", rig, tmp_path / "r", "--poses", 40, "--control", "Fat") == 0
+    assert run("train", tmp_path / "r", model, "--epochs", 4) == 0
+    assert run("bake", rig, model, out, "--action", "elbow_wave", "--shape-keys") == 0
+    assert run("bake", rig, model, tmp_path / "a.pc2", "--action", "elbow_wave") == 0
+    bpy.ops.wm.open_mainfile(filepath=str(rig))
+    expected = model_says(WAVE, model)
+    keys = bpy.data.objects[ELBOW].data.shape_keys
+    keys.animation_data_clear()
+    keys.key_blocks["Fat"].value = 0.0
+    assert np.abs(model_says([20], model)[0] - expected[19]).max() > 0.01, "the key matters"
+    assert np.abs(read_pc2(tmp_path / "a.pc2")[2] - expected).max() < 1e-6
+    shown = plain_blender(tmp_path, (out, [20.0]))
+    assert np.abs(shown[out, 20.0] - expected[19]).max() < CLOSE
