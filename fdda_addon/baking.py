@@ -16,12 +16,13 @@ from .core.model import check_rig
 from .core.output import check_writable, replacing
 from .core.point_cache import PointCacheWriter, read_point_cache
 from .core.progress import Progress
-from .recording import action_frames, find_action
 from .runtime.binding import true_rig
 from .runtime.network import Network
+from .scene.action_range import action_frames
 from .scene.armature import clear_pose
 from .scene.blend_file import save_copy
 from .scene.borrow import assign_action, borrowed_attributes, borrowed_pose, borrowed_visibility
+from .scene.clip import find_action
 from .scene.controls import ControlReader
 from .scene.modifier_stack import check_evaluable, read_stack
 from .scene.rig import PoseReader, SceneRig, read_model_rig

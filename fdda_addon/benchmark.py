@@ -14,10 +14,11 @@ import numpy as np
 
 from .core.errors import RigError
 from .core.poses import CONTROL, ROTATION, Channel, sample_pose
-from .recording import Progress, action_frames
+from .core.progress import Progress
 from .runtime import model_files, playback
 from .runtime.binding import borrowed_binding
 from .runtime.network import Network
+from .scene.action_range import action_frames
 from .scene.armature import Poser, clear_pose
 from .scene.borrow import assign_action, borrowed_attributes, borrowed_pose
 from .scene.rig import (

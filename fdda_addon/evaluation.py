@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import bpy
 import numpy as np
 
 from .core.errors import FDDAError, RigError
@@ -13,14 +12,13 @@ from .core.metrics import ErrorStatistics, distances, error_statistics
 from .core.model import check_rig
 from .core.partition import Partition
 from .core.poses import Channel, beyond_range, sample_pose
+from .core.progress import Progress
 from .core.skinning import LinearLayer
 from .core.surface import Surface, SurfaceComparison, SurfaceErrors, surface_errors, surface_json
-from .recording import Progress, action_frames, control_names, find_action
 from .runtime.network import Network
 from .scene.armature import Poser, clear_pose
-from .scene.borrow import assign_action, borrowed_pose
-from .scene.controls import borrowed_controls
-from .scene.modifier_stack import borrowed_stack
+from .scene.borrowed_rig import borrowed_rig
+from .scene.clip import find_clips
 from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, model_channels, read_model_rig
 
 HELD_OUT_INDEX = 1 << 33
@@ -41,9 +39,9 @@ class EvaluationSettings:
     """What to compare on.
 
     Attributes:
-        poses: number of random held-out poses.
+        poses: number of random held-out poses; with 0 of them the first action or strip stands in their place.
         seed: of the random poses.
-        actions: names of actions whose frames are compared as well.
+        actions, strips: names of actions, and of strips of the NLA, whose frames are compared as well.
         beyond: factors by which the range of motion is widened for further poses, a quarter as many for each.
         named: poses that are compared as well, each on its own.
         surface: compare normals and edges too, which takes longer than all else.
@@ -55,6 +53,7 @@ class EvaluationSettings:
     beyond: tuple[float, ...] = ()
     named: tuple[NamedPose, ...] = ()
     surface: bool = True
+    strips: tuple[str, ...] = ()
 
 
 @dataclass
@@ -96,9 +95,9 @@ class Evaluation:
 
     Attributes:
         partitions: of the rig. joints: names by joint index.
-        held_out: errors of the random poses.
-        actions, beyond, named: errors of the actions, of the poses beyond the range of motion by factor, and of the
-            poses given by hand.
+        held_out: errors of the random poses, or of the first action or strip where there are none.
+        actions, beyond, named: errors of the actions and strips, of the poses beyond the range of motion by factor,
+            and of the poses given by hand.
         channels: that the random poses were drawn from.
     """
 
@@ -156,24 +155,22 @@ def evaluate(
         RigError: the rig cannot be evaluated.
         ModelError: the model cannot be read, or is of another rig.
     """
-    actions = [find_action(name) for name in settings.actions]
+    clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips)
+    if not settings.poses and not clips:
+        raise RigError("There is nothing to evaluate: 0 poses and no action; give --poses or --action.")
     network, layer = _prepare(scene_rig, model)
     rig = layer.rig
-    if settings.poses < 1:
-        raise RigError("There is nothing to evaluate: 0 poses; give --poses.")
-    channels = model_channels(scene_rig, rig, network.info)
+    # A rig that is posed by actions alone may have nothing to sample.
+    channels = model_channels(scene_rig, rig, network.info) if settings.poses or settings.beyond else ()
     extra = max(1, settings.poses // 4)
     total = settings.poses + extra * len(settings.beyond) + len(settings.named)
-    total += sum(len(action_frames(action)) for action in actions)
-    with (
-        borrowed_stack(scene_rig.mesh_object),
-        borrowed_pose(scene_rig.armature_object, actions),
-        borrowed_controls(scene_rig, control_names(rig, channels)),
-    ):
-        clear_pose(scene_rig.armature_object)
+    total += sum(len(clip.frames) for clip in clips)
+    with borrowed_rig(scene_rig, rig, channels, clips) as player:
         comparison = _Comparison(PoseEvaluator(scene_rig, rig), network, layer, total, settings.surface)
-        poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses)
-        held_out = yield from comparison.compare("held-out poses", poses)
+        held_out = None
+        if settings.poses:
+            poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses)
+            held_out = yield from comparison.compare("held-out poses", poses)
         beyond = []
         for number, factor in enumerate(settings.beyond, 1):
             first = HELD_OUT_INDEX * (1 + number)
@@ -182,10 +179,10 @@ def evaluate(
         named = []
         for pose in settings.named:
             named.append((yield from comparison.compare(pose.name, _named_pose(scene_rig, pose))))
-        compared_actions = []
-        for action in actions:
-            compared_actions.append((yield from comparison.compare(action.name, _action_poses(scene_rig, action))))
-    yield Evaluation(layer.partitions, rig.joint_names, held_out, compared_actions, beyond, named, channels)
+        actions = []
+        for clip in clips:
+            actions.append((yield from comparison.compare(clip.title, player.frames(clip))))
+    yield Evaluation(layer.partitions, rig.joint_names, held_out or actions[0], actions, beyond, named, channels)
 
 
 def evaluate_action(scene_rig: SceneRig, model: Path | Network, name: str) -> Iterator[Progress | Evaluation]:
@@ -193,12 +190,12 @@ def evaluate_action(scene_rig: SceneRig, model: Path | Network, name: str) -> It
 
     As `evaluate` in all else.
     """
-    action = find_action(name)
+    clips = find_clips(scene_rig.armature_object, [name])
     network, layer = _prepare(scene_rig, model)
-    with borrowed_stack(scene_rig.mesh_object), borrowed_pose(scene_rig.armature_object, [action]):
+    with borrowed_rig(scene_rig, layer.rig, (), clips) as player:
         evaluator = PoseEvaluator(scene_rig, layer.rig)
-        comparison = _Comparison(evaluator, network, layer, len(action_frames(action)), surface=False)
-        errors = yield from comparison.compare(action.name, _action_poses(scene_rig, action))
+        comparison = _Comparison(evaluator, network, layer, len(clips[0].frames), surface=False)
+        errors = yield from comparison.compare(name, player.frames(clips[0]))
     yield Evaluation(layer.partitions, layer.rig.joint_names, errors)
 
 
@@ -233,14 +230,6 @@ def _named_pose(scene_rig: SceneRig, pose: NamedPose) -> Iterator[None]:
         tuple(Channel(bone, "rotation", axis, 0, 0) for bone in pose.rotations for axis in range(3)),
     ).set(np.array([angle for angles in pose.rotations.values() for angle in angles]))
     yield
-
-
-def _action_poses(scene_rig: SceneRig, action: bpy.types.Action) -> Iterator[None]:
-    clear_pose(scene_rig.armature_object)
-    assign_action(scene_rig.armature_object, action)
-    for frame in action_frames(action):
-        bpy.context.scene.frame_set(frame)
-        yield
 
 
 class _Comparison:

@@ -36,6 +36,7 @@ class Search:
         channels: of the random poses; may be empty.
         draw: gives the values of the channels, (C,), for a number from 0 on.
         show: poses the rig as one of the recorded poses, for a number from 0 on, when there are no channels.
+        stop: ends what `show` lets drive the rig.
         poses: how often each joint is moved alone.
         tolerance: a joint influences a partition when it moves a local residual by more than this part of the
             character's size.
@@ -44,6 +45,7 @@ class Search:
     channels: tuple[Channel, ...]
     draw: Callable[[int], np.ndarray]
     show: Callable[[int], None]
+    stop: Callable[[], None]
     poses: int = 10
     tolerance: float = INFLUENCE_TOLERANCE
 
@@ -210,6 +212,5 @@ def _seen_states(scene_rig: SceneRig, rig: Rig, search: Search, count: int) -> l
         else:
             search.show(number)
         states.append(_State(held.read(), reader.read(scene_rig, bpy.context.evaluated_depsgraph_get())))
-    if scene_rig.armature_object.animation_data is not None:
-        scene_rig.armature_object.animation_data.action = None
+    search.stop()
     return states

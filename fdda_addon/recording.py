@@ -10,23 +10,25 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from .core.errors import RecordingError, RigError
+from .core.errors import RecordingError
 from .core.output import check_folder_writable
 from .core.partition import GOLDEN_RATIO, INFLUENCE_TOLERANCE, LEAST_VERTICES, merged_partitions
-from .core.poses import CONTROL, DEFAULT_SPREAD, Channel, sample_pose
+from .core.poses import DEFAULT_SPREAD, Channel, sample_pose
 from .core.progress import Progress
 from .core.recording import RecordingInfo, Sampling, Source
 from .core.recording_extension import RecordingExtension
+from .core.recording_index import RANDOM
 from .core.recording_writer import RecordingWriter
 from .core.rig import Rig
 from .core.skinning import LinearLayer
 from .influences import Search, find_influences
 from .residuals import local_residuals
-from .scene.armature import Poser, clear_pose
-from .scene.borrow import assign_action, borrowed_pose
-from .scene.controls import borrowed_controls, stated_controls
+from .scene.armature import Poser
+from .scene.borrowed_rig import borrowed_rig
+from .scene.clip import Clip, find_clips
+from .scene.clip_player import ClipPlayer
+from .scene.controls import stated_controls
 from .scene.dependencies import read_dependencies
-from .scene.modifier_stack import borrowed_stack
 from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
 from .scene.sampling import choose
 from .weight_fitting import check_has_weights, fit_weights, poses_to_fit, recorded_weights
@@ -47,7 +49,8 @@ class RecordingSettings:
         poses: number of random poses.
         seed: of the random poses.
         spread: standard deviation of the random poses as a part of half the range of motion.
-        actions: names of actions whose frames are recorded after the random poses.
+        actions, strips: names of actions, and of strips of the NLA, whose frames are recorded after the random poses.
+        mirror: record each of these frames a second time, mirrored.
         influence_poses: how often each joint is moved alone to find the partitions that it influences.
         influence_tolerance: part of the character's size by which a joint moves the residuals that it influences.
         resume: continue a recording that was interrupted.
@@ -68,6 +71,8 @@ class RecordingSettings:
     controls: tuple[str, ...] = ()
     fit_linear: str = ""
     least_vertices: int = LEAST_VERTICES
+    strips: tuple[str, ...] = ()
+    mirror: bool = False
 
 
 def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iterator[Progress]:
@@ -89,11 +94,13 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         RecordingError: there is a recording already, or the one to resume is of something else.
         OutputError: the folder cannot be written.
     """
-    actions = [find_action(name) for name in settings.actions]
+    clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
+    if settings.mirror and not clips:
+        raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
     check_evaluable(scene_rig)
     rig, channels = planned_rig(scene_rig, settings)
     check_folder_writable(path)
-    sampling = planned_sampling(settings, channels)
+    sampling = planned_sampling(scene_rig, settings, channels)
     total = sum(source.poses for source in sampling.sources)
     if total < 1:
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
@@ -101,15 +108,17 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         total, 0, Path(bpy.data.filepath).name, scene_rig.mesh_object.name, bpy.app.version_string, sampling
     )
 
-    def poses(wanted: Container[int]) -> Iterator[None]:
-        return _poses(scene_rig, channels, settings, actions, wanted)
+    def poses(player: ClipPlayer, wanted: Container[int]) -> Iterator[None]:
+        return _poses(scene_rig, channels, settings, clips, player, wanted)
 
     rig, fit = yield from _linear_layer(scene_rig, rig, channels, path, settings, poses)
-    with _borrowed(scene_rig, rig, channels, actions) as evaluator:
+    with borrowed_rig(scene_rig, rig, channels, clips) as player:
+        evaluator = PoseEvaluator(scene_rig, rig)
         search = Search(
             channels,
             lambda number: sample_pose(channels, settings.seed, INFLUENCE_SEED_OFFSET + number, settings.spread),
-            lambda number: _show_frame(scene_rig, actions, number),
+            lambda number: _show_frame(player, clips, number),
+            player.stop,
             settings.influence_poses,
             settings.influence_tolerance,
         )
@@ -118,25 +127,11 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
         layer = LinearLayer(rig, partitions)
         with RecordingWriter(path, rig, partitions, replace(info, fit=fit), settings.resume) as writer:
             yield Progress("poses", writer.complete, total)
-            left = poses(range(writer.complete, total))
+            left = poses(player, range(writer.complete, total))
             # Closed before the writer: what was evaluated is kept when the recording is broken off.
             with contextlib.closing(append_poses(left, evaluator, layer, writer)) as steps:
                 for done in steps:
                     yield Progress("poses", done, total)
-
-
-@contextlib.contextmanager
-def _borrowed(
-    scene_rig: SceneRig, rig: Rig, channels: tuple[Channel, ...], actions: list[bpy.types.Action]
-) -> Iterator[PoseEvaluator]:
-    """What a recording changes in the scene, given back afterwards; the rig is at rest."""
-    with (
-        borrowed_stack(scene_rig.mesh_object),
-        borrowed_pose(scene_rig.armature_object, actions),
-        borrowed_controls(scene_rig, control_names(rig, channels)),
-    ):
-        clear_pose(scene_rig.armature_object)
-        yield PoseEvaluator(scene_rig, rig)
 
 
 def _linear_layer(
@@ -145,7 +140,7 @@ def _linear_layer(
     channels: tuple[Channel, ...],
     path: Path,
     settings: RecordingSettings,
-    poses: Callable[[Container[int]], Iterator[None]],
+    poses: Callable[[ClipPlayer, Container[int]], Iterator[None]],
 ) -> Iterator[Progress]:
     """Returns the rig with the weights that its linear layer is to have, and the SkinFit, None for those of the rig."""
     if settings.resume and (recorded := recorded_weights(path, rig, settings.fit_linear)):
@@ -153,12 +148,12 @@ def _linear_layer(
     if not settings.fit_linear:
         check_has_weights(scene_rig, rig)
         return rig, None
-    sampling = planned_sampling(settings, channels)
+    sampling = planned_sampling(scene_rig, settings, channels)
     numbers = poses_to_fit(sum(source.poses for source in sampling.sources), rig.vertex_count)
-    actions = [find_action(name) for name in settings.actions]
-    with _borrowed(scene_rig, rig, channels, actions) as evaluator:
-        posed = poses(frozenset(numbers))
-        return (yield from fit_weights(rig, settings.fit_linear, posed, len(numbers), evaluator))
+    clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
+    with borrowed_rig(scene_rig, rig, channels, clips) as player:
+        posed = poses(player, frozenset(numbers))
+        return (yield from fit_weights(rig, settings.fit_linear, posed, len(numbers), PoseEvaluator(scene_rig, rig)))
 
 
 def planned_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
@@ -179,52 +174,24 @@ def planned_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, 
     return replace(rig, controls=choice.controls), channels
 
 
-def control_names(rig: Rig, channels: tuple[Channel, ...]) -> list[str]:
-    """Names of the controls that a rig has or that are sampled."""
-    sampled = [channel.bone for channel in channels if channel.kind == CONTROL]
-    return list(dict.fromkeys([*(control.name for control in rig.controls), *sampled]))
-
-
-def planned_sampling(settings: RecordingSettings, channels: tuple[Channel, ...]) -> Sampling:
+def planned_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]) -> Sampling:
     """How the poses of a recording with these settings are chosen.
 
     Raises:
-        RigError: there is no action of a name that the settings have.
+        RigError: there is no action or strip of a name that the settings have.
     """
-    sources = [Source("random", settings.poses)] if settings.poses else []
-    sources += [_action_source(find_action(name)) for name in settings.actions]
+    sources = [Source(RANDOM, settings.poses)] if settings.poses else []
+    clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
+    sources += [clip.source for clip in clips]
     return Sampling(settings.seed, settings.spread, channels if settings.poses else (), tuple(sources))
-
-
-def find_action(name: str) -> bpy.types.Action:
-    """An action of the file by its name.
-
-    Raises:
-        RigError: there is none of this name.
-    """
-    action = bpy.data.actions.get(name)
-    if action is None:
-        known = ", ".join(f"'{a.name}'" for a in bpy.data.actions) or "none"
-        raise RigError(f"The file has no action '{name}'; its actions: {known}.")
-    return action
-
-
-def action_frames(action: bpy.types.Action) -> range:
-    """The whole frames of an action."""
-    first, last = (round(frame) for frame in action.frame_range)
-    return range(first, last + 1)
-
-
-def _action_source(action: bpy.types.Action) -> Source:
-    frames = action_frames(action)
-    return Source("action", len(frames), action.name, (frames.start, 1))
 
 
 def _poses(
     scene_rig: SceneRig,
     channels: tuple[Channel, ...],
     settings: RecordingSettings,
-    actions: list[bpy.types.Action],
+    clips: tuple[Clip, ...],
+    player: ClipPlayer,
     wanted: Container[int],
 ) -> Iterator[None]:
     """Pose the rig, one pose an iteration, as in the poses of the recording that are wanted, by their numbers."""
@@ -233,15 +200,11 @@ def _poses(
         if index in wanted:
             poser.set(sample_pose(channels, settings.seed, index, settings.spread))
             yield
-    start = settings.poses
-    for action in actions:
-        clear_pose(scene_rig.armature_object)
-        assign_action(scene_rig.armature_object, action)
-        for index, frame in enumerate(action_frames(action), start):
-            if index in wanted:
-                bpy.context.scene.frame_set(frame)
-                yield
-        start += len(action_frames(action))
+    frames = ((clip, frame) for clip in clips for frame in clip.frames)
+    for index, (clip, frame) in enumerate(frames, settings.poses):
+        if index in wanted:
+            player.show(clip, frame)
+            yield
 
 
 def append_poses(
@@ -290,10 +253,7 @@ def _append(writer: RecordingWriter | RecordingExtension, layer: LinearLayer, ba
     writer.append(pose_matrices, local_residuals(layer, pose_matrices, positions), controls)
 
 
-def _show_frame(scene_rig: SceneRig, actions: list[bpy.types.Action], number: int) -> None:
-    """Pose the rig as on one of the frames of some actions, far apart for numbers that follow each other."""
-    frames = [(action, frame) for action in actions for frame in action_frames(action)]
-    action, frame = frames[int(number * GOLDEN_RATIO * len(frames)) % len(frames)]
-    clear_pose(scene_rig.armature_object)
-    assign_action(scene_rig.armature_object, action)
-    bpy.context.scene.frame_set(frame)
+def _show_frame(player: ClipPlayer, clips: tuple[Clip, ...], number: int) -> None:
+    """Pose the rig as on one of the frames of some clips, far apart for numbers that follow each other."""
+    frames = [(clip, frame) for clip in clips for frame in clip.frames]
+    player.show(*frames[int(number * GOLDEN_RATIO * len(frames)) % len(frames)])

@@ -19,12 +19,10 @@ from .core.recording_extension import RecordingExtension
 from .core.refinement import Probes, choose_poses, nearest_distances
 from .core.rig import Rig, differences
 from .core.skinning import LinearLayer
-from .recording import append_poses, control_names
+from .recording import append_poses
 from .runtime.network import Network
-from .scene.armature import Poser, clear_pose
-from .scene.borrow import borrowed_pose
-from .scene.controls import borrowed_controls
-from .scene.modifier_stack import borrowed_stack
+from .scene.armature import Poser
+from .scene.borrowed_rig import borrowed_rig
 from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, model_channels, read_model_rig
 from .scene.sampling import states_channels
 
@@ -76,12 +74,7 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
     channels = model_channels(scene_rig, rig, network.info)
     _check_recording(scene_rig, recording, rig, channels)
     first = len(recording.pose_matrices)
-    with (
-        borrowed_stack(scene_rig.mesh_object),
-        borrowed_pose(scene_rig.armature_object),
-        borrowed_controls(scene_rig, control_names(rig, channels)),
-    ):
-        clear_pose(scene_rig.armature_object)
+    with borrowed_rig(scene_rig, rig, channels):
         evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig, channels)
         count = max(LEAST_PROBES, settings.poses)
         values = np.stack([_probe(channels, settings.seed, PROBE_INDEX + first + i) for i in range(count)])

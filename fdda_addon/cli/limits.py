@@ -24,7 +24,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     from ..core.errors import WrongUsageError
     from ..core.output import check_writable
-    from ..recording import find_action
+    from ..scene.clip import find_action
     from ..scene.measured_limits import limit_lines, state_measured_limits
     from .files import open_rig, save_copy
 

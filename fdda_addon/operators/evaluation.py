@@ -58,7 +58,7 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
 
     def finish(self, context: bpy.types.Context, result: object) -> str:
         from ..evaluation_view import redraw_views
-        from ..recording import action_frames
+        from ..scene.action_range import action_frames
 
         mesh_object = self.bound_rig(context).mesh_object
         first = action_frames(bpy.data.actions[self._action]).start if self._action else 0

@@ -44,7 +44,7 @@ def content_of(rig: SceneRig, path: Path) -> "FolderContent":
         wanted = RecordingSettings(settings.poses, settings.seed, settings.spread, actions)
         own, sampling = None, None
         if check is not None and check.rig is not None:
-            own, sampling = check.rig, json.loads(json.dumps(planned_sampling(wanted, check.channels).to_json()))
+            own, sampling = check.rig, json.loads(json.dumps(planned_sampling(rig, wanted, check.channels).to_json()))
         _contents[uid] = (question, read_folder(path, own, sampling, fit))
     return _contents[uid][1]
 
@@ -128,7 +128,7 @@ def _draw_record(layout: bpy.types.UILayout, text: str, enabled: bool, resume: b
 
 
 def _plan(rig: SceneRig) -> str:
-    from ..recording import action_frames
+    from ..scene.action_range import action_frames
 
     settings = rig.mesh_object.fdda.settings
     frames = [len(action_frames(bpy.data.actions[name])) for name in recorded_actions(rig.armature_object)]

@@ -33,7 +33,7 @@ Curves = dict[str, dict[int, bpy.types.FCurve]]
 """F-curves of a bone by channel and index."""
 
 
-def whole_frames(action: bpy.types.Action) -> range:
+def action_frames(action: bpy.types.Action) -> range:
     """The whole frames of an action."""
     first, last = (round(frame) for frame in action.frame_range)
     return range(first, last + 1)
@@ -55,7 +55,7 @@ def measured_ranges(
     """
     found: dict[tuple[str, str, int], tuple[float, float]] = {}
     for action in actions:
-        frames = whole_frames(action)
+        frames = action_frames(action)
         for bone, curves in _curves_by_bone(armature_object, action).items():
             for kind, axis, values in _channels(armature_object.pose.bones[bone], curves, frames):
                 low, high = found.get((bone, kind, axis), (np.inf, -np.inf))
@@ -75,7 +75,7 @@ def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) 
     """
     found: dict[tuple[str, str], tuple[float, float]] = {}
     for action in actions:
-        frames = whole_frames(action)
+        frames = action_frames(action)
         for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
             datablock = owner_of(scene_rig, owner)
             for curve in curves_of(action, datablock) if datablock else ():

@@ -7,15 +7,16 @@ from contextlib import ExitStack, contextmanager
 import bpy
 import numpy as np
 
-from .compatibility import animation_curves
+from .compatibility import animation_curves, slot_of
 
-_POSE = {
+POSE_CHANNELS = {
     "location": 3,
     "rotation_euler": 3,
     "rotation_quaternion": 4,
     "rotation_axis_angle": 4,
     "scale": 3,
 }
+"""Channels of a bone and how many numbers each has."""
 
 
 @contextmanager
@@ -35,12 +36,12 @@ def borrowed_pose(
     scene = bpy.context.scene
     bones = armature_object.pose.bones
     frame, subframe = scene.frame_current, scene.frame_subframe
-    pose = {name: np.empty(len(bones) * size, np.float32) for name, size in _POSE.items()}
+    pose = {name: np.empty(len(bones) * size, np.float32) for name, size in POSE_CHANNELS.items()}
     for name, values in pose.items():
         bones.foreach_get(name, values)
     animation = armature_object.animation_data
-    own = _driving_actions(animation) if keep_animation and animation is not None else ()
-    animated = _animated_values(armature_object, [*actions, *own])
+    own = driving_actions(animation) if keep_animation and animation is not None else ()
+    animated = animated_values(armature_object, [*actions, *own])
     if animation is not None:
         action, use_nla = animation.action, animation.use_nla
         slot = getattr(animation, "action_slot", None)
@@ -62,20 +63,20 @@ def borrowed_pose(
         # The frame first: evaluating it sets animated channels, and the borrowed pose may differ from its keys.
         scene.frame_set(frame, subframe=subframe)
         for path, value in animated.items():
-            _set_value(armature_object, path, value)
+            set_value(armature_object, path, value)
         for name, values in pose.items():
             bones.foreach_set(name, values)
         armature_object.update_tag(refresh={"DATA"})
         bpy.context.view_layer.update()
 
 
-def _driving_actions(animation: bpy.types.AnimData) -> list[bpy.types.Action]:
+def driving_actions(animation: bpy.types.AnimData) -> list[bpy.types.Action]:
     """The action of a datablock and those of its NLA strips."""
     strips = (strip for track in animation.nla_tracks for strip in track.strips)
     return [action for action in (animation.action, *(strip.action for strip in strips)) if action is not None]
 
 
-def _animated_values(owner: bpy.types.ID, actions: Iterable[bpy.types.Action]) -> dict[str, object]:
+def animated_values(owner: bpy.types.ID, actions: Iterable[bpy.types.Action]) -> dict[str, object]:
     """Values by RNA path of all that actions animate in a datablock."""
     values = {}
     for path in {curve.data_path for action in actions for curve in animation_curves(action)}:
@@ -88,7 +89,7 @@ def _animated_values(owner: bpy.types.ID, actions: Iterable[bpy.types.Action]) -
     return values
 
 
-def _set_value(owner: bpy.types.ID, path: str, value: object) -> None:
+def set_value(owner: bpy.types.ID, path: str, value: object) -> None:
     """Set what `path_resolve` reads."""
     struct = owner.path_resolve(path, False).data
     if path.endswith('"]'):
@@ -119,7 +120,7 @@ def borrowed_visibility(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
     with ExitStack() as stack:
         for scene_object in (o for o in objects if o.animation_data is not None):
             animation = scene_object.animation_data
-            curves = [curve for action in _driving_actions(animation) for curve in animation_curves(action)]
+            curves = [curve for action in driving_actions(animation) for curve in animation_curves(action)]
             if hiding := [curve for curve in (*curves, *animation.drivers) if curve.data_path == "hide_viewport"]:
                 for curve in hiding:
                     stack.enter_context(borrowed_attributes(curve, mute=True))
@@ -127,9 +128,10 @@ def borrowed_visibility(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
         yield
 
 
-def assign_action(armature_object: bpy.types.Object, action: bpy.types.Action) -> None:
-    """Let an action drive an armature, with the first of its slots that fits (4.4 and later have slots)."""
-    animation = armature_object.animation_data or armature_object.animation_data_create()
+def assign_action(datablock: bpy.types.ID, action: bpy.types.Action) -> None:
+    """Let an action drive an armature, or another datablock, with the slot of `compatibility.slot_of`."""
+    animation = datablock.animation_data or datablock.animation_data_create()
     animation.action = action
-    if hasattr(animation, "action_slot") and animation.action_slot is None and animation.action_suitable_slots:
-        animation.action_slot = animation.action_suitable_slots[0]
+    slot = slot_of(action, datablock)
+    if slot is not None and animation.action_slot != slot:
+        animation.action_slot = slot
