@@ -16,7 +16,7 @@ from ..core.errors import FDDAError, ModelError, RigError
 from ..core.rig import UNMOVED
 from ..core.skinning import LinearLayer
 from ..scene.controls import ControlReader
-from ..scene.rig import PoseReader, SceneRig, armature_of, read_model_rig
+from ..scene.rig import PoseReader, SceneRig, armature_of, is_flat, read_model_rig
 from . import nodes, switch
 from .model_files import network_of
 from .network import Network
@@ -72,7 +72,7 @@ class LiveBinding:
     def read_pose(
         self, mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Pose matrices (J, 4, 4) and controls (C,), None when the graph does not hold the object.
+        """Pose matrices (J, 4, 4) and controls (C,), None when the graph does not hold the object, or nobody sees it.
 
         Raises:
             FDDAError: the mesh or the armature no longer fits the model.
@@ -83,6 +83,9 @@ class LiveBinding:
         evaluated_mesh = mesh_object.evaluated_get(depsgraph)
         evaluated_armature = armature_object.evaluated_get(depsgraph)
         if not (evaluated_mesh.is_evaluated and evaluated_armature.is_evaluated):
+            return None
+        if is_flat(evaluated_mesh) or is_flat(evaluated_armature):
+            # Animators hide a character so.
             return None
         count, expected = len(mesh_object.data.vertices), self.network.info.vertex_count
         if count != expected and mesh_object.mode != "EDIT":

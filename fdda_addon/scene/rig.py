@@ -39,7 +39,7 @@ def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None) -> Rig:
     """
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
     for scene_object in (mesh_object, armature_object):
-        if abs(scene_object.matrix_world.to_3x3().determinant()) < SMALLEST_VOLUME:
+        if is_flat(scene_object):
             raise RigError(f"'{scene_object.name}' has a scale of zero; give it another.")
     if not len(mesh_object.data.vertices):
         raise RigError(f"The mesh of '{mesh_object.name}' has no vertices; choose another object.")
@@ -73,6 +73,11 @@ def joint_rest_matrices(scene_rig: SceneRig, names: tuple[str, ...]) -> np.ndarr
     moved = np.array([name != UNMOVED for name in names], bool)
     rest[moved] = mesh_from_armature(scene_rig.mesh_object, scene_rig.armature_object) @ rest[moved]
     return rest
+
+
+def is_flat(scene_object: bpy.types.Object) -> bool:
+    """Whether an object has a scale of zero along an axis, its own or its parents'."""
+    return abs(scene_object.matrix_world.to_3x3().determinant()) < SMALLEST_VOLUME
 
 
 def mesh_from_armature(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
@@ -110,9 +115,16 @@ class PoseReader:
         return self._matrices.fits(armature_object)
 
     def read(self, mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
-        """Pose matrices of evaluated objects: (J, 4, 4) float32, mesh-object space, metres."""
+        """Pose matrices of evaluated objects: (J, 4, 4) float32, mesh-object space, metres.
+
+        Raises:
+            RigError: an object has a scale of zero.
+        """
         relation = _relation(mesh_object, armature_object)
         if relation != self._relation:
+            for scene_object in (mesh_object, armature_object):
+                if is_flat(scene_object):
+                    raise RigError(f"'{scene_object.name}' has a scale of zero in some pose; give it another there.")
             self._set_relation(relation)
         pose = self._matrices.read(armature_object)
         if self._left is not None:
@@ -171,6 +183,7 @@ __all__ = [
     "check_evaluable",
     "deforming_modifiers",
     "find_rig",
+    "is_flat",
     "mesh_from_armature",
     "model_channels",
     "read_model_rig",
