@@ -9,9 +9,10 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ..core.errors import RigError
 from ..core.rig import UNMOVED, Joint
 from .armature import PoseMatrices, rest_matrices
-from .scene_rig import SceneRig
+from .scene_rig import SMALLEST_VOLUME, SceneRig, is_flat
 
 _OF_POSE = re.compile(r'pose\.bones\["(?:[^"\\]|\\.)*"\]\.(?:location|rotation_\w+|scale)')
 
@@ -35,9 +36,18 @@ class HeldPose:
         self.rest = self._relative(rest_matrices(scene_rig.armature_object.data, names))
 
     def read(self) -> np.ndarray:
-        """(J, 4, 4) float64, each joint relative to its parent joint as the scene is evaluated now."""
-        depsgraph = bpy.context.evaluated_depsgraph_get()
-        return self._relative(self._matrices.read(self._armature_object.evaluated_get(depsgraph)).astype(np.float64))
+        """(J, 4, 4) float64, each joint relative to its parent joint as the scene is evaluated now.
+
+        Raises:
+            RigError: the armature, or a bone, has a scale of zero.
+        """
+        armature_object = self._armature_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        matrices = self._matrices.read(armature_object).astype(np.float64)
+        flat = np.abs(np.linalg.det(matrices[:, :3, :3])) < SMALLEST_VOLUME
+        if is_flat(armature_object) or flat.any():
+            name = armature_object.name if is_flat(armature_object) else self._joints[int(flat.argmax())].name
+            raise RigError(f"'{name}' has a scale of zero in some pose; give it another there.")
+        return self._relative(matrices)
 
     def _relative(self, matrices: np.ndarray) -> np.ndarray:
         parents = [joint.parent for joint in self._joints]

@@ -17,11 +17,9 @@ from .controls import ControlReader
 from .joints import choose_joints
 from .modifier_stack import check_evaluable, deforming_modifiers
 from .sampling import model_channels, sampled_channels
-from .scene_rig import MODIFIER_NAME, SceneRig, armature_modifier, armature_of, find_rig
+from .scene_rig import MODIFIER_NAME, SceneRig, armature_modifier, armature_of, find_rig, is_flat
 from .skin import read_skin
 
-SMALLEST_VOLUME = 1e-15
-"""An object whose scales multiply to less is flat: no position could be brought into its space."""
 IDENTITY_TOLERANCE = 1e-6
 """Mesh and armature count as unmoved, one against the other, when no matrix element differs by more."""
 
@@ -73,11 +71,6 @@ def joint_rest_matrices(scene_rig: SceneRig, names: tuple[str, ...]) -> np.ndarr
     moved = np.array([name != UNMOVED for name in names], bool)
     rest[moved] = mesh_from_armature(scene_rig.mesh_object, scene_rig.armature_object) @ rest[moved]
     return rest
-
-
-def is_flat(scene_object: bpy.types.Object) -> bool:
-    """Whether an object has a scale of zero along an axis, its own or its parents'."""
-    return abs(scene_object.matrix_world.to_3x3().determinant()) < SMALLEST_VOLUME
 
 
 def mesh_from_armature(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:

@@ -11,6 +11,9 @@ from ..core.errors import RigError
 MODIFIER_NAME = "FDDA"
 """Name of the Geometry Nodes modifier that plays a model; it is never part of the rig."""
 
+SMALLEST_VOLUME = 1e-15
+"""An object whose scales multiply to less is flat: no position could be brought into its space."""
+
 
 @dataclass(frozen=True)
 class SceneRig:
@@ -50,6 +53,11 @@ def find_rig(name: str = "") -> SceneRig:
         names = ", ".join(f"'{o.name}'" for o in rigged)
         raise RigError(f"{len(rigged)} meshes have an Armature modifier ({names}); choose one with --object.")
     return SceneRig(rigged[0], armature_of(rigged[0]))
+
+
+def is_flat(scene_object: bpy.types.Object) -> bool:
+    """Whether an object has a scale of zero along an axis, its own or its parents'."""
+    return abs(scene_object.matrix_world.to_3x3().determinant()) < SMALLEST_VOLUME
 
 
 def armature_modifier(mesh_object: bpy.types.Object) -> bpy.types.ArmatureModifier | None:

@@ -7,14 +7,14 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW, ELBOW_RIG, evaluated, predicted, run
+from conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, predicted, run
 from training_in_one import train_all
 
 import fdda_addon
 from blend_fixtures.characters.transforms import CENTIMETRES, TRANSFORMS
 from fdda_addon.cli.files import save_copy
 from fdda_addon.runtime.binding import bind
-from fdda_addon.scene.rig import find_rig
+from fdda_addon.scene.rig import armature_modifier, find_rig
 
 POSES = ((0.3, -0.2, 0.1), (1.2, 0.5, -0.4), (1.9, 0.1, 0.6))
 """Radians: the bend of the lower bone, two turns of the upper one."""
@@ -112,3 +112,36 @@ def test_the_linear_layer_is_blenders_skinning(character):
         mesh_object.modifiers["CorrectiveSmooth"].show_viewport = True
         # Where Blender itself has no more than single precision.
         assert largest < 1e-5 * size + 1e-6 * np.abs(mesh_object.matrix_world.translation).max()
+
+
+def test_an_animated_scale_of_zero(bound, elbow, capsys):
+    """Nothing is shown then; what else plays goes on, and the character comes back."""
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    hider = bpy.data.objects.new("hider", None)
+    bpy.context.scene.collection.objects.link(hider)
+    other_rig, other = armature_object.copy(), bound.copy()
+    for copy in (other_rig, other):
+        bpy.context.scene.collection.objects.link(copy)
+    other.parent = armature_modifier(other).object = other_rig
+    armature_object.parent = hider
+    for frame, scale in ((4, (1, 1, 1)), (5, (0, 0, 0)), (10, (0, 0, 0)), (11, (0.5, 0.5, 0.5)), (20, (0, 1, 1))):
+        hider.scale = scale
+        hider.keyframe_insert("scale", frame=frame)
+    for frame in (3, 7, 11, 20, 4):
+        bpy.context.scene.frame_set(frame)
+        assert_plays(other, elbow.model)
+        assert (bound.fdda.mode, bound.fdda.status) == ("FDDA", "")
+        if frame not in (7, 20):
+            assert_plays(bound, elbow.model)
+    assert "Traceback" not in "".join(capsys.readouterr())
+
+
+def test_a_scale_of_zero_is_not_recorded(rig, capsys, tmp_path):
+    rig.armature_object.keyframe_insert("scale", frame=1)
+    rig.armature_object.scale = (1, 0, 1)
+    rig.armature_object.keyframe_insert("scale", frame=5)
+    action = rig.armature_object.animation_data.action.name
+    bpy.context.scene.frame_set(1)
+    save_copy(tmp_path / "flat.blend")
+    assert run("record", tmp_path / "flat.blend", tmp_path / "flat", "--poses", 0, "--action", action) == 1
+    assert "has a scale of zero in some pose; give it another there." in capsys.readouterr().err
