@@ -22,6 +22,8 @@ STILL = 1e-5
 """What moves by less than this part of the character's size, in all poses, counts as still."""
 MOST_STILL = 0.01
 """Part of the vertices that may be still."""
+MOST_MERGES = 10
+"""Merges beyond this many are counted, not listed."""
 RELATED = 0.3
 """Correlation from which on a joint counts as moved by another."""
 
@@ -65,7 +67,8 @@ def merges_in_words(index: dict, least: int) -> str:
         return ""
     which = "1 partition" if len(merges) == 1 else f"{len(merges)} partitions"
     verb = "is" if len(merges) == 1 else "are"
-    return f"{which} of fewer than {least} vertices {verb} merged: {', '.join(merges)}."
+    more = f" and {len(merges) - MOST_MERGES} more" if len(merges) > MOST_MERGES else ""
+    return f"{which} of fewer than {least} vertices {verb} merged: {', '.join(merges[:MOST_MERGES])}{more}."
 
 
 def bone_lengths(rig: Rig) -> np.ndarray:

@@ -15,7 +15,7 @@ from fdda_addon.core.flip_check import alike_poses
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.poses import Channel
 from fdda_addon.core.recording import Recording, Source
-from fdda_addon.core.recording_check import NAMES, bone_lengths, check_recording
+from fdda_addon.core.recording_check import NAMES, bone_lengths, check_recording, merges_in_words
 from fdda_addon.core.recording_warning import RecordingWarning, counted, length, listed
 from fdda_addon.core.rig import UNMOVED, Joint
 
@@ -317,6 +317,18 @@ def test_small_partitions(good):
     assert text.startswith("The partition 'hand' has fewer than 8 vertices (5), and a network each: ")
     partitions = make_partitions(small.rig, None, dict.fromkeys(range(4), (0,)), merged={3: 2})
     assert warned(replace(small, partitions=partitions)) == {}
+
+
+def test_merges_in_words():
+    joints = [{"name": name} for name in ("root", "a", "b", UNMOVED, *map(str, range(20)))]
+    none = {"joints": joints, "partitions": [{"joint": 0}]}
+    assert merges_in_words(none, 8) == ""
+    few = {"joints": joints, "partitions": [{"joint": 0, "merged": [2, 3]}, {"joint": 1}]}
+    assert merges_in_words(few, 8) == (
+        "2 partitions of fewer than 8 vertices are merged: 'b' into 'root', 'no bone' into 'root'."
+    )
+    many = {"joints": joints, "partitions": [{"joint": 0, "merged": list(range(4, 20))}]}
+    assert merges_in_words(many, 5).endswith("'8' into 'root', '9' into 'root' and 6 more.")
 
 
 def test_the_length_of_bones(good):
