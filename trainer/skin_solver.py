@@ -25,8 +25,11 @@ ROUNDS = 2
 """As often as this."""
 TIE = 1e-5
 """Joints whose errors for a vertex differ by less than this part of the character's size count as equally good."""
+WORTHWHILE = 0.1
+"""A weight is left out where the others leave no larger part more of the error. Every joint that moves a partition a
+little is one more input to learn from: docs/training.md, Fitted skin weights."""
 LEAST = 1e-3
-"""Smaller weights are left out."""
+"""Smaller weights are left out in any case."""
 ROUNDING = 1e-12
 """The least ridge, as a part of the errors: less would drown in the rounding of the products."""
 BLOCK_FLOATS = 1 << 22
@@ -51,6 +54,7 @@ class SkinSolver:
         blocks = self._products.reshape(self._joints, 4, self._joints, 4).transpose(0, 2, 1, 3)
         self._blocks = np.ascontiguousarray(blocks).reshape(self._joints, self._joints, 16)
         self._size = max(rig.size, 1e-9)
+        self.tie = self._count * (TIE * self._size) ** 2
         self._heads = rig.rest_matrices[:, :3, 3].astype(np.float64) - self._centre
 
     def fit(self, kind: str) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
@@ -118,13 +122,13 @@ class _Block:
             return _padded(rank.argmin(axis=1)[:, None], np.ones((len(rank), 1)))
         rank[self._own_places()] = self.preference[self._own_places()] - 2
         tried = np.argsort(rank, axis=1, kind="stable")[:, : OWN + BEST]
-        weights = self._solve(tried)
+        weights, squares = self._solve(tried)
         for _ in range(ROUNDS if tried.shape[1] < self._solver._joints else 0):
             kept = np.sort(np.argsort(-weights, axis=1, kind="stable")[:, : OWN + BEST], axis=1)
             tried, weights = (np.take_along_axis(array, kept, axis=1) for array in (tried, weights))
             tried = np.concatenate([tried, self._improving(tried, weights)], axis=1)
-            weights = self._solve(tried)
-        return _padded(*self._pruned(tried, weights))
+            weights, squares = self._solve(tried)
+        return _padded(*self._pruned(tried, weights, squares))
 
     def _own_places(self) -> np.ndarray:
         """(B, J) bool, where a joint is one of the heaviest of the rig's own weights of a vertex."""
@@ -142,31 +146,50 @@ class _Block:
         np.put_along_axis(slopes, tried, np.inf, axis=1)
         return np.argsort(slopes, axis=1, kind="stable")[:, : min(ADDED, self._solver._joints - tried.shape[1])]
 
-    def _pruned(self, tried: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Leave out weights, the smallest first, and solve again without them until at most four are left."""
-        allowed = weights > LEAST
-        while len(more := np.flatnonzero(allowed.sum(axis=1) > INFLUENCES)):
-            smallest = np.where(allowed[more], weights[more], np.inf).argmin(axis=1)
-            allowed[more, smallest] = False
-            weights[more] = self._solve(tried, allowed, more)[more]
-            allowed[more] &= weights[more] > LEAST
+    def _pruned(self, tried: np.ndarray, weights: np.ndarray, squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Joints and weights, at most four a vertex, and none without which the others do nearly as well.
+
+        The smallest weight goes first, and the others are solved again. `squares` is what the weights leave.
+        """
+        order = np.argsort(-weights, axis=1, kind="stable")[:, : (weights > LEAST).sum(axis=1).max()]
+        tried, weights = (np.take_along_axis(array, order, axis=1) for array in (tried, weights))
+        allowed, limits = weights > LEAST, self._limits(squares)
+        left = np.arange(len(weights))
+        while len(left := left[allowed[left].sum(axis=1) > 1]):
+            fewer = allowed[left]
+            fewer[np.arange(len(left)), np.where(fewer, weights[left], np.inf).argmin(axis=1)] = False
+            solved, squares = self._solve(tried, fewer, left)
+            must = allowed[left].sum(axis=1) > INFLUENCES
+            good = must | (squares <= limits[left])
+            left, solved, squares, fewer = left[good], solved[good], squares[good], fewer[good]
+            weights[left], allowed[left] = solved, fewer & (solved > LEAST)
+            # What four weights leave is what fewer are measured by.
+            limits[left] = np.where(must[good], self._limits(squares), limits[left])
         return tried, np.where(allowed, weights, 0)
 
-    def _solve(self, tried: np.ndarray, allowed: np.ndarray | None = None, only: np.ndarray | None = None):
-        """(B, C) non-negative weights of the joints that are tried; each row sums to 1.
+    def _limits(self, squares: np.ndarray) -> np.ndarray:
+        """Squared errors that fewer weights may leave where more leave `squares`."""
+        return squares * (1 + WORTHWHILE) ** 2 + self._solver.tie
+
+    def _solve(
+        self, tried: np.ndarray, allowed: np.ndarray | None = None, chosen: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Weights of the joints that are tried, and what they leave.
 
         Args:
             tried: (B, C) joint indices, no joint twice.
-            allowed: (B, C) bool, which of them may have a weight; all of them when left out.
-            only: indices of the vertices to solve, the others are left 0; all of them when left out.
+            allowed: (n, C) bool, which of them may have a weight; all of them when left out.
+            chosen: (n,) indices of the vertices to solve; all of them when left out.
+
+        Returns:
+            (n, C) non-negative weights, each row summing to 1, and (n,) squared errors, summed over the poses.
         """
-        chosen = np.arange(len(tried)) if only is None else only
+        chosen = np.arange(len(tried)) if chosen is None else chosen
         errors = self._errors(tried[chosen], chosen)
-        usable = np.ones(errors.shape[:2], bool) if allowed is None else allowed[chosen]
-        usable = usable & ~_repeated(errors, self._solver._count * (TIE * self._solver._size) ** 2)
-        weights = np.zeros(tried.shape)
-        weights[chosen] = simplex_weights(errors, usable, self._solver._count * (TIE * self._solver._size) ** 2)
-        return weights
+        usable = np.ones(errors.shape[:2], bool) if allowed is None else allowed
+        usable = usable & ~_repeated(errors, self._solver.tie)
+        weights = simplex_weights(errors, usable, self._solver.tie)
+        return weights, np.maximum(np.einsum("vj,vjk,vk->v", weights, errors, weights), 0)
 
     def _errors(self, tried: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """(B, C, C): with e_nj = S_nj x - y_n, sum_n e_nj . e_nk of the joints that are tried, square metres.

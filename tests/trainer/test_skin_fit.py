@@ -123,6 +123,14 @@ def test_constraints_hold_where_nothing_fits(kind):
     assert all(len(set(row)) == len(row) for row in used)
 
 
+def test_noise_brings_no_joints():
+    """Each joint can take a little off of any noise; none but the true one takes off enough."""
+    labels = np.random.default_rng(5).integers(0, JOINTS, VERTICES)
+    found = fitted(posed(with_one_joint(random_rig(1), labels), noise=0.05), "smooth")
+    assert (found.skin_weights > 0).sum(axis=1).mean() < 1.02
+    np.testing.assert_array_equal(found.skin_joints[:, 0], labels)
+
+
 def test_five_joints_are_told_by_the_best_four():
     """A fit with four joints is no worse than the best four of the five that made the poses."""
     rig = random_rig(4)
