@@ -40,6 +40,11 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         ),
         default="RIG",
     )
+    mirror: BoolProperty(
+        name="Mirrored",
+        description="Record each frame of the actions a second time, left and right exchanged; the armature has to be "
+        "the same on both sides",
+    )
     recording: StringProperty(
         name="Folder",
         description="Folder of the recording; empty for one beside the .blend file",

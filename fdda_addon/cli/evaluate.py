@@ -18,9 +18,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_rig_options(parser)
     parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model")
     parser.add_argument("--json", metavar="OUT.json", type=Path, required=True, help="where to write the errors")
-    parser.add_argument("--poses", type=int, default=200, help="number of held-out poses (default 200)")
+    parser.add_argument(
+        "--poses", type=int, default=200, help="number of held-out poses (default 200), 0 for actions alone"
+    )
     parser.add_argument("--seed", type=int, default=1, help="of the held-out poses (default 1)")
     parser.add_argument("--action", action="append", default=[], metavar="NAME", help="compare its frames as well")
+    parser.add_argument(
+        "--strip", action="append", default=[], metavar="NAME", help="compare the frames of a strip of the NLA as well"
+    )
     parser.add_argument(
         "--beyond", type=float, action="append", default=[], metavar="X", help="compare at X times the range as well"
     )
@@ -28,13 +33,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    if options.poses < 1 or options.seed < 0 or min(options.beyond, default=1) <= 0:
-        raise WrongUsageError("--poses must be 1 or more, --seed 0 or more, and --beyond more than 0.")
+    if options.poses < 0 or options.seed < 0 or min(options.beyond, default=1) <= 0:
+        raise WrongUsageError("--poses and --seed must be 0 or more, and --beyond more than 0.")
+    if not options.poses and (options.beyond or not (options.action or options.strip)):
+        raise WrongUsageError("With --poses 0 only actions and strips are compared; give --action and no --beyond.")
     check_writable(options.json)
     if options.heatmap:
         check_writable(options.heatmap)
     scene_rig = open_rig(options)
-    settings = EvaluationSettings(options.poses, options.seed, tuple(options.action), tuple(options.beyond))
+    settings = EvaluationSettings(
+        options.poses, options.seed, tuple(options.action), tuple(options.beyond), strips=tuple(options.strip)
+    )
     evaluation = run_evaluation(scene_rig, options.model, settings)
     if options.heatmap:
         from ..pictures import draw_comparison, worst_poses
@@ -57,7 +66,8 @@ def table(evaluation: Evaluation) -> str:
     """The errors as text, in mm."""
     head = f"{'error in mm':<24}{'mean':>10}{'rms':>10}{'p99':>10}{'p99.9':>10}{'max':>10}"
     lines = [head, "-" * len(head)]
-    for errors in (evaluation.held_out, *evaluation.beyond, *evaluation.named, *evaluation.actions):
+    random = [] if any(errors is evaluation.held_out for errors in evaluation.actions) else [evaluation.held_out]
+    for errors in (*random, *evaluation.beyond, *evaluation.named, *evaluation.actions):
         values = errors.to_json()
         lines.append(f"{errors.name}, {values['poses']} poses")
         for key, label in (("linear", "  linear layer"), ("fdda", "  FDDA")):

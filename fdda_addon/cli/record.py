@@ -26,6 +26,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--action", action="append", default=[], metavar="NAME", help="record its frames as well")
     parser.add_argument(
+        "--strip", action="append", default=[], metavar="NAME", help="record the frames of a strip of the NLA as well"
+    )
+    parser.add_argument(
+        "--mirror", action="store_true", help="record the frames of actions and strips a second time, mirrored"
+    )
+    parser.add_argument(
         "--sample",
         action="append",
         default=[],
@@ -73,11 +79,19 @@ def run(options: argparse.Namespace) -> None:
     # Wider is uniform already, and most draws would fall outside and be drawn again.
     if not 0 < options.spread <= 10:
         raise WrongUsageError("--spread must be more than 0 and at most 10.")
-    of_new = (options.action, options.resume, options.sample, options.control, options.fit_linear)
+    of_new = (
+        options.action,
+        options.strip,
+        options.mirror,
+        options.resume,
+        options.sample,
+        options.control,
+        options.fit_linear,
+    )
     if options.refine and (any(of_new) or options.poses == 0):
         raise WrongUsageError(
-            "--refine adds random poses to a complete recording; leave --action, --sample, --control, --fit-linear and "
-            "--resume out."
+            "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --sample, "
+            "--control, --fit-linear and --resume out."
         )
     scene_rig = open_rig(options)
     start = time.monotonic()
@@ -111,6 +125,8 @@ def _steps(scene_rig: "SceneRig", options: argparse.Namespace) -> "Iterator[Prog
         controls=tuple(options.control),
         fit_linear=options.fit_linear,
         least_vertices=options.least_vertices,
+        strips=tuple(options.strip),
+        mirror=options.mirror,
         **given,
     )
     return record(scene_rig, options.recording, settings)

@@ -46,11 +46,13 @@ class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
         rig = self.rig(context)
         settings = rig.mesh_object.fdda.settings
         self._path = Path(bpy.path.abspath(self.folder)) if self.folder else recording_folder(rig.mesh_object)
+        actions = recorded_actions(rig.armature_object)
         wanted = RecordingSettings(
             poses=settings.poses,
             seed=settings.seed,
             spread=settings.spread,
-            actions=recorded_actions(rig.armature_object),
+            actions=actions,
+            mirror=settings.mirror and bool(actions),
             resume=self.resume,
             fit_linear=wanted_fit(settings),
             least_vertices=settings.least_vertices,

@@ -176,10 +176,11 @@ def _draw_actions(layout: bpy.types.UILayout, context: bpy.types.Context, rig: S
     layout.label(text="Actions to record as well")
     session = context.window_manager.fdda
     layout.template_list("FDDA_UL_actions", "", bpy.data, "actions", session, "action_index", rows=min(4, len(fitting)))
+    settings = rig.mesh_object.fdda.settings
     row = layout.row()
     row.enabled = any(action.fdda.record for action in fitting)
+    row.prop(settings, "mirror")
     row.operator("fdda.limits_from_actions", icon="CON_ROTLIMIT")
-    settings = rig.mesh_object.fdda.settings
     if not settings.poses and not any(action.fdda.record for action in fitting):
         draw_sentence(
             layout, context, "There is nothing to record: raise the number of poses, or tick an action.", "ERROR"

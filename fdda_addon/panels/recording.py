@@ -39,9 +39,11 @@ def content_of(rig: SceneRig, path: Path) -> "FolderContent":
         stamp = -1 if path.exists() else 0
     uid = rig.mesh_object.session_uid
     fit = wanted_fit(settings)
-    question = (path, stamp, id(check), settings.poses, settings.seed, settings.spread, actions, fit)
+    question = (path, stamp, id(check), settings.poses, settings.seed, settings.spread, actions, settings.mirror, fit)
     if uid not in _contents or _contents[uid][0] != question:
-        wanted = RecordingSettings(settings.poses, settings.seed, settings.spread, actions)
+        wanted = RecordingSettings(
+            settings.poses, settings.seed, settings.spread, actions, mirror=settings.mirror and bool(actions)
+        )
         own, sampling = None, None
         if check is not None and check.rig is not None:
             own, sampling = check.rig, json.loads(json.dumps(planned_sampling(rig, wanted, check.channels).to_json()))
@@ -135,6 +137,8 @@ def _plan(rig: SceneRig) -> str:
     parts = [f"{settings.poses:,} random poses"] if settings.poses or not frames else []
     if frames:
         parts.append(f"{sum(frames):,} frames of {len(frames)} {'action' if len(frames) == 1 else 'actions'}")
+        if settings.mirror:
+            parts.append("as many mirrored ones")
     return " and ".join(parts)
 
 

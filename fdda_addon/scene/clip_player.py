@@ -136,6 +136,8 @@ def played_clips(scene_rig: SceneRig, clips: tuple[Clip, ...], controls: Iterabl
     finally:
         for datablock, state in states:
             _restore(datablock, state)
+        # What animates them again is evaluated first: the numbers may differ from its keys.
+        bpy.context.view_layer.update()
         player.give_back_numbers()
         bpy.context.view_layer.update()
 
