@@ -19,11 +19,17 @@ GROUP_VERSION = 1
 def add_modifier(mesh_object: bpy.types.Object, place: int) -> bpy.types.NodesModifier:
     """Add the modifier at a place of the stack, with a new cache object that holds the mesh's own positions.
 
-    A library override may have one of its library, which cannot be removed; that one serves again.
+    A library override may have one of its library, which cannot be removed; that one serves again. So does one that is
+    left from a binding that is gone: an override forgets its binding when it is saved where the add-on is missing.
     """
     modifier = find_modifier(mesh_object)
-    if modifier is not None and is_inherited(modifier):
+    if modifier is not None:
+        before = cache_of(modifier)
         set_cache(modifier, new_cache(mesh_object))
+        remove_cache(before)
+        if not is_inherited(modifier):
+            now = mesh_object.modifiers.find(modifier.name)
+            mesh_object.modifiers.move(now, place - (now < place))
         return modifier
     group = _node_group()
     modifier = mesh_object.modifiers.new(MODIFIER_NAME, "NODES")
@@ -87,7 +93,7 @@ def write_cache(cache: bpy.types.Object, positions: np.ndarray) -> None:
 
 def remove_cache(cache: bpy.types.Object | None) -> None:
     """Delete a cache object and its mesh, unless something else uses them."""
-    if cache is not None and cache.users == 0:
+    if cache is not None and cache.users == 0 and cache.library is None:
         mesh = cache.data
         bpy.data.objects.remove(cache)
         if mesh.users == 0:

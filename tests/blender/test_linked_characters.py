@@ -471,6 +471,25 @@ def test_binding_to_an_override(elbow, tmp_path):
     assert np.abs(evaluated(mesh_object) - true).max() < 1e-6
 
 
+def test_an_override_that_was_saved_without_the_addon_is_bound_again(elbow, tmp_path):
+    source, model = tmp_path / "plain.blend", tmp_path / "shots" / "elbow.onnx"
+    save_character(elbow.rig, source)
+    new_shot(tmp_path)
+    shutil.copy(elbow.model, model)
+    bind(rig_of(override(link(source), 1.1)), model)
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot(tmp_path)))
+    fdda_addon.unregister()
+    save_and_open(tmp_path)
+    save_and_open(tmp_path)
+    fdda_addon.register()
+    mesh_object = own_characters()[0]
+    assert not mesh_object.fdda.is_bound
+    bind(rig_of(mesh_object), model)
+    assert_plays(mesh_object, model)
+    assert [m.name for m in mesh_object.modifiers] == ["Armature", "CorrectiveSmooth", "FDDA"]
+    assert sum("positions" in o.name for o in bpy.data.objects) == 1
+
+
 def rig_of(mesh_object: bpy.types.Object) -> SceneRig:
     return SceneRig(mesh_object, armature_of(mesh_object))
 
