@@ -259,9 +259,10 @@ def _scan() -> None:
         modifier = nodes.find_modifier(mesh_object)
         if modifier is not None:
             cache = nodes.cache_of(modifier)
-            if cache is None or cache.name in caches or cache.library is not None:
-                # A duplicate still points to the positions of its original, a linked object to those of its library,
-                # which Blender does not evaluate anew.
+            is_linked = mesh_object.library is not None
+            if cache is None or cache.name in caches or cache.library is not None or cache.is_runtime_data != is_linked:
+                # A duplicate still points to the positions of its original, an override to those of the linked object,
+                # a linked object to those of its library, which Blender does not evaluate anew.
                 cache = nodes.new_cache(mesh_object)
                 nodes.set_cache(modifier, cache)
             caches.add(cache.name)

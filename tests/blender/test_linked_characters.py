@@ -307,6 +307,25 @@ def test_a_linked_character_without_override_plays_its_action(library, tmp_path)
     assert_plays(next(o for o in bpy.context.scene.objects if o.type == "MESH"), library.model)
 
 
+def test_an_override_of_what_plays_already(library, tmp_path):
+    """As users do it: link with an instance, then make an override of what it shows."""
+    empty = bpy.data.objects.new("instance", None)
+    empty.instance_type, empty.instance_collection = "COLLECTION", link(library.path)
+    bpy.context.scene.collection.objects.link(empty)
+    bpy.context.scene.frame_set(9)
+    empty.select_set(True)
+    bpy.context.view_layer.objects.active = empty
+    bpy.ops.object.make_override_library()
+    mesh_object = own_characters()[0]
+    armature_of(mesh_object).animation_data.action = None
+    bend(mesh_object, 0.8)
+    assert_play(library, (0.8,))
+    cache = nodes.cache_of(nodes.find_modifier(mesh_object))
+    assert not cache.is_runtime_data
+    save_and_open(tmp_path)
+    assert_play(library, (0.8,))
+
+
 @pytest.mark.parametrize("is_linked", [True, False], ids=["linked", "local"])
 def test_instances_of_a_collection_show_one_pose(library, is_linked):
     if is_linked:
