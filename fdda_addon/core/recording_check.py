@@ -25,7 +25,9 @@ MOST_STILL = 0.01
 MOST_MERGES = 10
 """Merges beyond this many are counted, not listed."""
 RELATED = 0.3
-"""Correlation from which on a joint counts as moved by another."""
+"""Correlation from which on a joint counts as moved by another, or by a control;"""
+MOST_RELATED = 500
+"""over so many poses at most."""
 
 
 def check_recording(recording: Recording) -> list[RecordingWarning]:
@@ -123,7 +125,12 @@ def _check_controls(recording: Recording) -> list[RecordingWarning]:
     used = {control for partition in recording.partitions for control in partition.controls}
     controls = recording.rig.controls
     still = {c for c in range(len(controls)) if np.ptp(recording.controls[:, c]) == 0}
-    dead = [c for c in range(len(controls)) if c not in used or c in still]
+    idle = [c for c in range(len(controls)) if c not in used and c not in still]
+    poses, features = _sampled_features(recording)
+    features = features.reshape(len(poses), -1)
+    # One that moves joints, as a switch between IK and FK, has done its part.
+    idle = [c for c in idle if not _are_related(recording.controls[poses, c : c + 1], features)]
+    dead = sorted([*idle, *still])
     if not dead:
         return []
     kept = f", {listed([controls[c].name for c in dead if c in still])} of them always the same" if still else ""
@@ -162,14 +169,28 @@ def _moves_others(recording: Recording, joint: int, sampled: set[str]) -> bool:
     """Whether joints that are not sampled themselves move with this one: through constraints, not as its children."""
     rig = recording.rig
     driven = [j for j, other in enumerate(rig.joints) if other.name not in sampled]
-    poses = np.unique(np.linspace(0, len(recording.pose_matrices) - 1, 500).round().astype(np.int64))
-    features = joint_features(np.array(recording.pose_matrices[poses]), rig.rest_matrices, rig.parents)
-    columns = []
-    for values in (features[:, joint], features[:, driven].reshape(len(poses), -1)):
-        scale = values.std(axis=0)
-        columns.append((values - values.mean(axis=0))[:, scale > STILL] / scale[scale > STILL])
-    related = np.abs(columns[0].T @ columns[1]) / len(poses)
-    return bool(related.max(initial=0) > max(RELATED, 5 / np.sqrt(len(poses))))
+    poses, features = _sampled_features(recording)
+    return _are_related(features[:, joint], features[:, driven].reshape(len(poses), -1))
+
+
+def _sampled_features(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) indices of evenly spaced poses, and their (n, J, 12) joint features."""
+    rig, count = recording.rig, len(recording.pose_matrices)
+    poses = np.unique(np.linspace(0, count - 1, MOST_RELATED).round().astype(np.int64))
+    return poses, joint_features(np.array(recording.pose_matrices[poses]), rig.rest_matrices, rig.parents)
+
+
+def _are_related(first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether any of the (n, A) values goes along with any of the (n, B) values or with how far it is from its mean."""
+    standard = []
+    for values in (first.astype(np.float64), second.astype(np.float64)):
+        values = values[:, values.std(axis=0) > STILL]
+        standard.append((values - values.mean(axis=0)) / values.std(axis=0))
+    far = np.abs(standard[1])
+    far = far - far.mean(axis=0)
+    columns = np.concatenate([standard[1], far / np.maximum(far.std(axis=0), STILL)], axis=1)
+    related = np.abs(standard[0].T @ columns) / len(first)
+    return bool(related.max(initial=0) > max(RELATED, 5 / np.sqrt(len(first))))
 
 
 def _check_still(recording: Recording, scan: ResidualScan, moving: np.ndarray) -> list[RecordingWarning]:

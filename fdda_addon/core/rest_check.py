@@ -53,7 +53,7 @@ def check_rest(rig: Rig) -> list[RecordingWarning]:
     outside = int(((places < low) | (places > high)).any(axis=1).sum())
     seen = (
         f"their places fit after {turn}"
-        if turn and likeness > max(ALIKE, upright + 0.2)
+        if turn and len(joints) > 2 and likeness > max(ALIKE, upright + 0.2)
         else f"most of it along {_direction(np.median(middles - places, axis=0))}"
     )
     text = (
