@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A character in a library, and shots that link it."""
+
+import itertools
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from conftest import ELBOW, ELBOW_RIG, ElbowFiles, assert_plays
+
+import fdda_addon
+from fdda_addon import models
+from fdda_addon.runtime import model_files, nodes
+from fdda_addon.scene.rig import SceneRig, armature_modifier
+
+COLLECTION = "Character"
+ANGLES = (0.3, 1.4)
+"""Radians: the bend of the elbows of a shot."""
+
+
+@dataclass(frozen=True)
+class Library:
+    """A character that is linked: its file, and its model beside it."""
+
+    path: Path
+    model: Path
+
+
+def save_character(source: Path, path: Path) -> None:
+    """Save what a file holds, in a collection to be linked."""
+    bpy.ops.wm.open_mainfile(filepath=str(source))
+    collection = bpy.data.collections.new(COLLECTION)
+    bpy.context.scene.collection.children.link(collection)
+    for name in (ELBOW, ELBOW_RIG):
+        bpy.context.scene.collection.objects.unlink(bpy.data.objects[name])
+        collection.objects.link(bpy.data.objects[name])
+    bpy.data.objects[ELBOW].fdda.model = "//elbow.onnx" if bpy.data.objects[ELBOW].fdda.is_bound else ""
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+
+
+def make_library(elbow: ElbowFiles, folder: Path) -> Library:
+    """The bound elbow in a folder of its own; the open file is an empty shot, saved in another."""
+    model_files._chosen.clear()
+    files = Library(folder / "characters" / "elbow.blend", folder / "characters" / "elbow.onnx")
+    files.path.parent.mkdir()
+    shutil.copy(elbow.model, files.model)
+    save_character(elbow.bound, files.path)
+    new_shot(folder)
+    return files
+
+
+def new_shot(folder: Path) -> None:
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    fdda_addon.register()
+    (folder / "shots").mkdir(exist_ok=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot(folder)))
+
+
+def shot(folder: Path) -> Path:
+    return folder / "shots" / "shot.blend"
+
+
+def save_and_open(folder: Path) -> None:
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot(folder)))
+    bpy.ops.wm.open_mainfile(filepath=str(shot(folder)))
+
+
+def link(path: Path) -> bpy.types.Collection:
+    with bpy.data.libraries.load(str(path), link=True, relative=True) as (_, wanted):
+        wanted.collections = [COLLECTION]
+    return wanted.collections[0]
+
+
+def override(collection: bpy.types.Collection, angle: float | None = None, is_editable: bool = True):
+    """A library override of a linked character in a pose, without its action; its mesh object."""
+    root = collection.override_hierarchy_create(
+        bpy.context.scene, bpy.context.view_layer, do_fully_editable=is_editable
+    )
+    mesh_object = next(o for o in root.all_objects if o.type == "MESH")
+    if angle is not None:
+        armature_of(mesh_object).animation_data.action = None
+        bend(mesh_object, angle)
+    return mesh_object
+
+
+def armature_of(mesh_object: bpy.types.Object) -> bpy.types.Object:
+    return armature_modifier(mesh_object).object
+
+
+def rig_of(mesh_object: bpy.types.Object) -> SceneRig:
+    return SceneRig(mesh_object, armature_of(mesh_object))
+
+
+def bend(mesh_object: bpy.types.Object, angle: float) -> None:
+    armature_of(mesh_object).pose.bones["lower"].rotation_euler[0] = angle
+
+
+def own_characters() -> list[bpy.types.Object]:
+    """The mesh objects of the open file's overrides, by name."""
+    return [o for o in bpy.data.objects if o.type == "MESH" and o.override_library]
+
+
+def cache_name(mesh_object: bpy.types.Object) -> str:
+    return nodes.cache_of(nodes.find_modifier(mesh_object)).name
+
+
+def assert_play(library: Library, angles: tuple[float, ...] = ANGLES) -> list[np.ndarray]:
+    """Each override shows the model's output for its own pose; their positions."""
+    bpy.context.view_layer.update()
+    mesh_objects = own_characters()
+    found = [armature_of(o).pose.bones["lower"].rotation_euler[0] for o in mesh_objects]
+    assert found == pytest.approx(angles)
+    positions = [assert_plays(o, library.model) for o in mesh_objects]
+    for one, other in itertools.pairwise(positions):
+        assert np.abs(one - other).max() > 1e-3
+    return positions
+
+
+def elsewhere(call: str) -> None:
+    """Call a function of this file in a process of its own, which has done nothing before."""
+    folders = [str(Path(fdda_addon.__file__).parents[1]), str(Path(__file__).parent)]
+    code = f"""
+import sys
+sys.path[:0] = {folders!r}
+import fdda_addon, linked
+fdda_addon.register()
+try:
+    linked.{call}
+finally:
+    fdda_addon.unregister()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def open_shot(path: str, model: str) -> None:
+    """Open a shot; its overrides play as they were saved."""
+    bpy.ops.wm.open_mainfile(filepath=path)
+    assert_play(Library(Path(), Path(model)))
+
+
+def pack_model(path: str) -> None:
+    """Pack the model into the file of the character, and let the character be saved with the rig shown."""
+    bpy.ops.wm.open_mainfile(filepath=path)
+    mesh_object = bpy.data.objects[ELBOW]
+    models.adopt(mesh_object)
+    models.pack_entry(mesh_object, mesh_object.fdda.models[0])
+    mesh_object.fdda.mode = "RIG"
+    bpy.ops.wm.save_mainfile()

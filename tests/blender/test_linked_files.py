@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What shots save of linked characters, where their models are found, and what a changed library brings."""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated
+from linked import (
+    ANGLES,
+    COLLECTION,
+    Library,
+    assert_play,
+    bend,
+    cache_name,
+    elsewhere,
+    link,
+    make_library,
+    new_shot,
+    override,
+    own_characters,
+    save_and_open,
+    shot,
+)
+
+import fdda_addon
+from fdda_addon import models
+from fdda_addon.runtime import model_files
+
+OWN = {"parent", 'modifiers["Armature"].object', 'modifiers["FDDA"].properties.inputs.Socket_1.value'}
+"""What an override of the elbow's mesh differs in anyway: it follows its own armature and has its own positions."""
+
+
+@pytest.fixture
+def library(elbow, tmp_path):
+    return make_library(elbow, tmp_path)
+
+
+@pytest.fixture
+def pair(library):
+    """Two overrides of the elbow in two poses."""
+    collection = link(library.path)
+    return [override(collection, angle) for angle in ANGLES]
+
+
+def test_overrides_keep_mode_strength_and_use_in_render(pair, library, tmp_path):
+    first, second = pair
+    first.fdda.mode, second.fdda.strength, second.fdda.use_in_render = "RIG", 0.25, True
+    bpy.context.view_layer.update()
+    before = evaluated(first), evaluated(second)
+    save_and_open(tmp_path)
+    first, second = own_characters()
+    assert (first.fdda.mode, first.fdda.is_playing) == ("RIG", False)
+    assert (second.fdda.mode, second.fdda.strength, second.fdda.use_in_render) == ("FDDA", 0.25, True)
+    for mesh_object, positions in zip((first, second), before, strict=True):
+        assert np.abs(evaluated(mesh_object) - positions).max() < 1e-6
+
+
+def show_all(mesh_objects: list[bpy.types.Object], mode: str) -> list[np.ndarray]:
+    for mesh_object in mesh_objects:
+        mesh_object.fdda.mode = mode
+    bpy.context.view_layer.update()
+    return [evaluated(mesh_object) for mesh_object in mesh_objects]
+
+
+def test_saved_overrides_hold_the_true_rig(pair, library, tmp_path):
+    pair[0].fdda.use_in_render = True
+    true, shown = (show_all(pair, mode) for mode in ("RIG", "FDDA"))
+    assert all(np.abs(a - b).max() > 1e-4 for a, b in zip(true, shown, strict=True))
+    bpy.ops.ed.undo_push(message="playing")
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot(tmp_path)))
+    fdda_addon.unregister()
+    bpy.ops.wm.open_mainfile(filepath=str(shot(tmp_path)))
+    for mesh_object, positions in zip(own_characters(), true, strict=True):
+        assert not hasattr(mesh_object, "fdda")
+        shown = {m.name: (m.show_viewport, m.show_render) for m in mesh_object.modifiers}
+        assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
+        assert np.abs(evaluated(mesh_object) - positions).max() < 1e-6
+
+
+def overridden_paths(mesh_object: bpy.types.Object) -> set[str]:
+    """What an override differs in from its library; spelled as in 5.2."""
+    paths = {found.rna_path for found in mesh_object.override_library.properties}
+    return {path.replace('["Socket_1"]', ".properties.inputs.Socket_1.value") for path in paths}
+
+
+def test_a_saved_shot_holds_what_was_changed_and_no_more(pair, library, tmp_path):
+    pair[0].fdda.strength = 0.5
+    bpy.context.view_layer.update()
+    bpy.ops.ed.undo_push(message="playing")
+    save_and_open(tmp_path)
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot(tmp_path)))
+    # Blender has just looked for what differs.
+    assert overridden_paths(own_characters()[0]) - OWN == {"fdda.strength"}
+    assert overridden_paths(own_characters()[1]) - OWN == set()
+    fdda_addon.unregister()
+    bpy.ops.wm.open_mainfile(filepath=str(shot(tmp_path)))
+    first, second = own_characters()
+    # The linked elbow itself plays nowhere, and its positions have no place in the shot.
+    own = {o.name for o in bpy.data.objects if o.library is None and o.type == "MESH"}
+    assert own == {*(o.name for o in (first, second)), *(cache_name(o) for o in (first, second))}
+
+
+def test_a_shot_that_was_saved_by_itself(library, tmp_path):
+    """An auto-save calls no handler: the override of a character that is saved with its rig is caught playing."""
+    elsewhere(f"pack_model({str(library.path)!r})")
+    mesh_object = override(link(library.path), 0.6)
+    mesh_object.fdda.mode = "FDDA"
+    expected = assert_plays(mesh_object, library.model)
+    handlers = [bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:]]
+    bpy.app.handlers.save_pre.clear()
+    bpy.app.handlers.save_post.clear()
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot(tmp_path)))
+    bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:] = handlers
+    bpy.ops.wm.open_mainfile(filepath=str(shot(tmp_path)))
+    mesh_object = own_characters()[0]
+    assert np.array_equal(assert_plays(mesh_object, library.model), expected)
+    mesh_object.fdda.mode = "RIG"
+    assert [m.show_viewport for m in mesh_object.modifiers] == [True, True, False]
+
+
+def test_a_packed_model_is_found_in_the_library(library, tmp_path):
+    bpy.ops.wm.open_mainfile(filepath=str(library.path))
+    mesh_object = bpy.data.objects[ELBOW]
+    models.adopt(mesh_object)
+    models.pack_entry(mesh_object, mesh_object.fdda.models[0])
+    bpy.ops.wm.save_as_mainfile(filepath=str(library.path))
+    moved = library.model.rename(tmp_path / "moved.onnx")
+    new_shot(tmp_path)
+    collection = link(library.path)
+    for angle in ANGLES:
+        override(collection, angle)
+    bpy.context.scene.collection.children.link(collection)
+    assert_play(Library(library.path, moved))
+    save_and_open(tmp_path)
+    assert_play(Library(library.path, moved))
+    assert own_characters()[0].fdda.packed.library is not None
+    assert_plays(own_characters()[0].override_library.reference, moved)
+
+
+def test_a_path_out_of_the_folder_of_the_library_is_not_followed(library, tmp_path):
+    bpy.ops.wm.open_mainfile(filepath=str(library.path))
+    outside = library.model.rename(tmp_path / "shots" / "elbow.onnx")
+    bpy.data.objects[ELBOW].fdda.model = f"//../shots/{outside.name}"
+    bpy.ops.wm.save_as_mainfile(filepath=str(library.path))
+    model_files._chosen.clear()
+    new_shot(tmp_path)
+    mesh_object = override(link(library.path), 0.5)
+    bpy.context.view_layer.update()
+    assert "lies outside the folder of 'elbow.blend' and is not followed" in mesh_object.fdda.status
+    assert (mesh_object.fdda.mode, mesh_object.modifiers["Armature"].show_viewport) == ("RIG", True)
+
+
+def change_library(library: Library, change, folder: Path) -> None:
+    """Change the library's file; the shot, saved before, is open again."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot(folder)))
+    bpy.ops.wm.open_mainfile(filepath=str(library.path))
+    change()
+    bpy.ops.wm.save_as_mainfile(filepath=str(library.path))
+
+
+def add_a_hat() -> None:
+    """Something new in the character, so that its overrides have to be made anew."""
+    hat = bpy.data.objects.new("hat", bpy.data.meshes.new("hat"))
+    hat.parent = bpy.data.objects[ELBOW_RIG]
+    bpy.data.collections[COLLECTION].objects.link(hat)
+    bpy.data.objects[ELBOW].modifiers.new("Cast", "CAST").factor = 0
+    bpy.data.objects[ELBOW].modifiers.new("Subdivision", "SUBSURF").show_viewport = False
+
+
+def test_a_resynced_override_plays_on(pair, library, tmp_path):
+    assert_play(library)
+    change_library(library, add_a_hat, tmp_path)
+    bpy.ops.wm.open_mainfile(filepath=str(shot(tmp_path)))
+    assert sum("hat" in o.name and o.library is None for o in bpy.data.objects) == 2
+    pair = [o for o in own_characters() if o.fdda.is_bound]
+    assert [[m.name for m in o.modifiers][2:] for o in pair] == [["FDDA", "Cast", "Subdivision"]] * 2
+    for mesh_object in pair:
+        assert_plays(mesh_object, library.model)
+        bend(mesh_object, 0.5)
+    bpy.context.view_layer.update()
+    for mesh_object in pair:
+        assert_plays(mesh_object, library.model)
+
+
+def test_a_reloaded_library_plays_on(pair, library, tmp_path):
+    bpy.context.scene.collection.children.link(pair[0].override_library.reference.users_collection[0])
+    assert_play(library)
+    bpy.data.libraries[0].reload()
+    assert_play(library)
+    bend(own_characters()[0], 0.6)
+    assert_play(library, (0.6, 1.4))
+    assert_plays(own_characters()[0].override_library.reference, library.model)
+    save_and_open(tmp_path)
+    assert_play(library, (0.6, 1.4))
+
+
+def test_a_reloaded_library_brings_its_new_model(pair, library, tmp_path, elbow):
+    """Reloaded while the shot is open; another process has saved the library with its model packed and mode RIG."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot(tmp_path)), copy=True)
+    pair[1].fdda.mode = "LINEAR"
+    bpy.context.view_layer.update()
+    elsewhere(f"pack_model({str(library.path)!r})")
+    library.model.unlink()
+    bpy.data.libraries[0].reload()
+    bpy.context.view_layer.update()
+    first, second = own_characters()
+    # The first has the mode of its library, the second its own.
+    assert [(o.fdda.mode, o.fdda.is_playing) for o in (first, second)] == [("RIG", False), ("LINEAR", True)]
+    assert first.modifiers["Armature"].show_viewport and not second.modifiers["Armature"].show_viewport
+    first.fdda.mode = second.fdda.mode = "FDDA"
+    bpy.context.view_layer.update()
+    for mesh_object in (first, second):
+        assert mesh_object.fdda.packed is not None
+        assert_plays(mesh_object, elbow.model)
+
+
+def test_an_override_of_an_override(library, tmp_path):
+    """The shot links a set that holds an override of the character: two libraries away, the model is found."""
+    mesh_object = override(link(library.path), 0.2)
+    collection = mesh_object.users_collection[0]
+    collection.name = COLLECTION
+    folder = tmp_path / "sets"
+    folder.mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "set.blend"), copy=True)
+    new_shot(tmp_path)
+    collection = link(folder / "set.blend")
+    for angle in ANGLES:
+        override(collection, angle)
+    save_and_open(tmp_path)
+    mesh_objects = [o for o in own_characters() if o.library is None]
+    for mesh_object in mesh_objects:
+        assert mesh_object.override_library.reference.override_library
+        assert_plays(mesh_object, library.model)
+    assert len(mesh_objects) == 2

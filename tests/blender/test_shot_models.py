@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Models that are bound in the shot to an override of a linked character."""
+
+import shutil
+
+import bpy
+import numpy as np
+import pytest
+from conftest import assert_plays, evaluated
+from linked import (
+    ANGLES,
+    assert_play,
+    elsewhere,
+    link,
+    make_library,
+    new_shot,
+    override,
+    own_characters,
+    rig_of,
+    save_and_open,
+    save_character,
+    shot,
+)
+
+import fdda_addon
+from fdda_addon import models
+from fdda_addon.core.errors import ModelError, RigError
+from fdda_addon.runtime import model_files
+from fdda_addon.runtime.binding import bind, unbind
+
+
+@pytest.fixture
+def library(elbow, tmp_path):
+    return make_library(elbow, tmp_path)
+
+
+@pytest.fixture
+def pair(library):
+    """Two overrides of the elbow in two poses."""
+    collection = link(library.path)
+    return [override(collection, angle) for angle in ANGLES]
+
+
+def test_binding_to_an_override(elbow, tmp_path):
+    """A model in the shot for a character whose library has none."""
+    source, model = tmp_path / "plain.blend", tmp_path / "shots" / "elbow.onnx"
+    save_character(elbow.rig, source)
+    new_shot(tmp_path)
+    shutil.copy(elbow.model, model)
+    mesh_object = override(link(source), 1.1)
+    bpy.context.view_layer.update()
+    true = evaluated(mesh_object)
+    models.bind_entry(rig_of(mesh_object), models.remember(mesh_object, model))
+    model_files._chosen.clear()
+    for _ in range(2):
+        mesh_object = own_characters()[0]
+        assert_plays(mesh_object, model)
+        assert [m.name for m in mesh_object.modifiers] == ["Armature", "CorrectiveSmooth", "FDDA"]
+        assert [entry.path for entry in mesh_object.fdda.models] == [mesh_object.fdda.model] == ["//elbow.onnx"]
+        save_and_open(tmp_path)
+    unbind(own_characters()[0])
+    save_and_open(tmp_path)
+    mesh_object = own_characters()[0]
+    assert not mesh_object.fdda.is_bound
+    assert [(m.name, m.show_viewport) for m in mesh_object.modifiers] == [
+        ("Armature", True),
+        ("CorrectiveSmooth", True),
+    ]
+    assert np.abs(evaluated(mesh_object) - true).max() < 1e-6
+
+
+def test_an_override_that_was_saved_without_the_addon_is_bound_again(elbow, tmp_path):
+    source, model = tmp_path / "plain.blend", tmp_path / "shots" / "elbow.onnx"
+    save_character(elbow.rig, source)
+    new_shot(tmp_path)
+    shutil.copy(elbow.model, model)
+    bind(rig_of(override(link(source), 1.1)), model)
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot(tmp_path)))
+    fdda_addon.unregister()
+    save_and_open(tmp_path)
+    save_and_open(tmp_path)
+    fdda_addon.register()
+    mesh_object = own_characters()[0]
+    assert not mesh_object.fdda.is_bound
+    bind(rig_of(mesh_object), model)
+    assert_plays(mesh_object, model)
+    assert [m.name for m in mesh_object.modifiers] == ["Armature", "CorrectiveSmooth", "FDDA"]
+    assert sum("positions" in o.name for o in bpy.data.objects) == 1
+
+
+def test_another_model_in_the_shot(pair, library, elbow, tmp_path):
+    """One override unbound and bound to a model beside the shot, which is called as the library's own is."""
+    model = tmp_path / "shots" / "elbow.onnx"
+    shutil.copy(elbow.model, model)
+    unbind(pair[0])
+    assert [m.show_viewport for m in pair[0].modifiers] == [True, True, False]
+    save_and_open(tmp_path)
+    first, second = own_characters()
+    assert not first.fdda.is_bound and second.fdda.is_bound
+    models.bind_entry(rig_of(first), models.remember(first, model))
+    model_files._chosen.clear()
+    assert sum(m.type == "NODES" for m in first.modifiers) == 1
+    assert model_files.model_path(first) == model
+    library.model.unlink()
+    save_and_open(tmp_path)
+    bpy.context.view_layer.update()
+    first, second = own_characters()
+    assert_plays(first, model)
+    assert "elbow.onnx' cannot be read" in second.fdda.status
+
+
+def test_an_override_keeps_the_name_of_the_librarys_model(pair, library, tmp_path):
+    models.adopt(pair[0])
+    models.bind_entry(rig_of(pair[0]), pair[0].fdda.models[0])
+    model_files._chosen.clear()
+    assert pair[0].fdda.model == "//elbow.onnx"
+    save_and_open(tmp_path)
+    assert_play(library)
+
+
+def test_a_model_of_the_librarys_list_is_not_forgotten(library, elbow, tmp_path):
+    elsewhere(f"pack_model({str(library.path)!r})")
+    mesh_object = override(link(library.path), 0.6)
+    own = models.remember(mesh_object, elbow.model)
+    assert [entry.name for entry in mesh_object.fdda.models] == ["elbow", own.name]
+    with pytest.raises(ModelError, match=r"'elbow' is in the list of 'elbow\.blend'; remove it there, or unbind"):
+        models.forget_entry(mesh_object, 0)
+    models.forget_entry(mesh_object, 1)
+    assert mesh_object.fdda.is_bound and len(mesh_object.fdda.models) == 1
+
+
+def test_a_linked_character_is_not_bound(library):
+    bpy.context.scene.collection.children.link(link(library.path))
+    linked = next(o for o in bpy.context.scene.objects if o.type == "MESH")
+    sentence = "'elbow' is linked from 'elbow.blend' and cannot be changed here; give it a library override"
+    with pytest.raises(RigError, match=sentence):
+        bind(rig_of(linked), library.model)
+    with pytest.raises(RigError, match=sentence):
+        unbind(linked)
+    assert_plays(linked, library.model)
