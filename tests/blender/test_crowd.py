@@ -42,9 +42,9 @@ def calls(monkeypatch) -> list[int]:
     """How many poses each call of a network got."""
     counted, real = [], Network.positions
 
-    def positions(network: Network, pose_matrices: np.ndarray) -> np.ndarray:
+    def positions(network: Network, pose_matrices: np.ndarray, *controls: np.ndarray) -> np.ndarray:
         counted.append(len(pose_matrices))
-        return real(network, pose_matrices)
+        return real(network, pose_matrices, *controls)
 
     monkeypatch.setattr(playback.Network, "positions", positions)
     return counted
