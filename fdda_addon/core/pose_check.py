@@ -6,9 +6,12 @@ import hashlib
 import numpy as np
 
 from .recording import Recording
+from .recording_index import ACTION, MIRRORED, STRIP
 from .recording_warning import RecordingWarning, counted, length
 from .skinning import skin_matrices
 
+_ANIMATED = {ACTION: "the action", STRIP: "the strip", MIRRORED: "the mirrored"}
+"""How the frames of animation are called."""
 SAME = 1e-5
 """Poses whose elements (metres, no unit, or those of a control) round to the same multiple of this are the same."""
 MOST_REPEATED = 0.05
@@ -61,9 +64,9 @@ def _sources(recording: Recording, poses: np.ndarray) -> str:
     of_pose = np.searchsorted(np.cumsum([source.poses for source in sources]), poses, side="right")
     counts = np.bincount(of_pose, minlength=len(sources))
     parts = [
-        f"{count} of them of the action '{source.name}'"
+        f"{count} of them of {_ANIMATED[source.kind]} '{source.name}'"
         for count, source in zip(counts, sources, strict=True)
-        if count and source.kind == "action"
+        if count and source.kind in _ANIMATED
     ]
     return "".join(f", {part}" for part in parts[:2])
 

@@ -36,15 +36,7 @@ class ClipPlayer:
             RigError: a clip is to be mirrored, and the rig is not the same on both sides.
         """
         self._scene_rig, self._clip = scene_rig, None
-        self._others = [
-            datablock
-            for datablock in (
-                scene_rig.armature_object.data,
-                scene_rig.mesh_object,
-                scene_rig.mesh_object.data.shape_keys,
-            )
-            if datablock is not None and any(_drives(clip, datablock) for clip in clips)
-        ]
+        self._others = [d for d in _others(scene_rig) if any(_drives(clip, d) for clip in clips)]
         self._idle: list[tuple] | None = None
         animated = {
             (datablock, path): value
@@ -95,12 +87,11 @@ class ClipPlayer:
             self._idle = [_state(datablock) for datablock in self._others]
         self._clip = clip
         self._reset()
-        for datablock in (self._scene_rig.armature_object, *self._others):
+        driven = [d for d in (self._scene_rig.armature_object, *self._others) if _drives(clip, d)]
+        for datablock in driven:
             if clip.kind == ACTION:
-                action = bpy.data.actions[clip.name]
-                if datablock == self._scene_rig.armature_object or curves_of(action, datablock):
-                    assign_action(datablock, action)
-            elif datablock.animation_data is not None and datablock.animation_data.nla_tracks:
+                assign_action(datablock, bpy.data.actions[clip.name])
+            else:
                 datablock.animation_data.action, datablock.animation_data.use_nla = None, True
 
     def _reset(self) -> None:
@@ -127,10 +118,7 @@ def played_clips(scene_rig: SceneRig, clips: tuple[Clip, ...], controls: Iterabl
         RigError: as `ClipPlayer`.
     """
     player = ClipPlayer(scene_rig, clips, controls)
-    others = [
-        d for d in (scene_rig.armature_object.data, scene_rig.mesh_object, scene_rig.mesh_object.data.shape_keys) if d
-    ]
-    states = [(datablock, _state(datablock)) for datablock in others]
+    states = [(datablock, _state(datablock)) for datablock in _others(scene_rig)]
     try:
         yield player
     finally:
@@ -147,6 +135,13 @@ def clip_actions(scene_rig: SceneRig, clips: tuple[Clip, ...]) -> list[bpy.types
     return _actions(scene_rig, clips, scene_rig.armature_object)
 
 
+def _others(scene_rig: SceneRig) -> list[bpy.types.ID]:
+    """The datablocks of a rig beside the armature object."""
+    mesh_object = scene_rig.mesh_object
+    found = (scene_rig.armature_object.data, mesh_object, mesh_object.data.shape_keys)
+    return [datablock for datablock in found if datablock is not None]
+
+
 def _actions(scene_rig: SceneRig, clips: tuple[Clip, ...], datablock: bpy.types.ID) -> list[bpy.types.Action]:
     actions = [bpy.data.actions[clip.name] for clip in clips if clip.kind == ACTION]
     if datablock.animation_data is not None and any(clip.kind != ACTION for clip in clips):
@@ -155,7 +150,7 @@ def _actions(scene_rig: SceneRig, clips: tuple[Clip, ...], datablock: bpy.types.
 
 
 def _drives(clip: Clip, datablock: bpy.types.ID) -> bool:
-    """Whether a clip animates a datablock beside the armature object."""
+    """Whether a clip animates a datablock."""
     if clip.kind == ACTION:
         return bool(curves_of(bpy.data.actions[clip.name], datablock))
     return datablock.animation_data is not None and len(datablock.animation_data.nla_tracks) > 0
