@@ -161,7 +161,7 @@ def test_trust_is_what_the_model_says_and_asked_once_a_pose(bound, elbow, monkey
     network = Network(elbow.model)
     calls = []
     monkeypatch.setattr(
-        Network, "trust", lambda self, poses: calls.append(1) or np.ones((1, len(network.info.partitions)))
+        Network, "trust", lambda self, *inputs: calls.append(1) or np.ones((1, len(network.info.partitions)))
     )
     assert trust.partition_trust(bound) == outside and not calls
     pose(angle=2.0)
