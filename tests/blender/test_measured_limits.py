@@ -208,6 +208,24 @@ def test_actions_of_another_rig_are_refused(figure):
         state_measured_limits(figure, [other])
 
 
+def test_linked_rigs_are_refused_and_overrides_are_not(figure, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "figure.blend"))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    with bpy.data.libraries.load(str(tmp_path / "figure.blend"), link=True) as (_, linked):
+        linked.objects, linked.actions = ["body", "figure_rig"], [WAVE]
+    for linked_object in bpy.data.objects:
+        bpy.context.scene.collection.objects.link(linked_object)
+    with pytest.raises(RigError, match="'figure_rig' is linked and its limits belong to another file; set them there"):
+        state_measured_limits(find_rig(), [wave()])
+    override = bpy.data.objects["figure_rig"].override_create(remap_local_usages=True)
+    state_measured_limits(SceneRig(bpy.data.objects["body"], override), [wave()])
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shot.blend"))
+    (own,) = [o for o in bpy.data.objects if o.override_library is not None]
+    assert location_ranges(own.pose.bones["spine"])[1] == pytest.approx((-0.005, 0.055), abs=1e-3)
+    assert rotation_ranges(own.pose.bones["arm.L"])[0].low == pytest.approx(0.1, abs=2e-2)
+
+
 def test_command_line(tmp_path, capsys):
     build_figure()
     add_wave(find_rig())
