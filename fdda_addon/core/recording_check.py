@@ -212,9 +212,10 @@ def _check_small(recording: Recording) -> list[RecordingWarning]:
     if not small or len(recording.partitions) == 1:
         return []
     names = [joint_name(recording.rig, p.joint) for p in small]
+    fewest = min(len(p.vertices) for p in small)
     text = (
         f"{counted(names, 'partition')} {'has' if len(small) == 1 else 'have'} fewer than {LEAST_VERTICES} vertices "
-        f"({listed([len(p.vertices) for p in small])}), and a network each: record with --least-vertices "
-        f"{LEAST_VERTICES} to merge them into others."
+        f"(the smallest {fewest}), and a network each: record with --least-vertices {LEAST_VERTICES} to merge them "
+        "into others."
     )
     return [RecordingWarning("small-partitions", text[0].upper() + text[1:])]

@@ -119,7 +119,7 @@ class TestSmallPartitions:
         assert self.partitions(tmp_path / "apart")["nail"] == (3, [])
         assert run("check-recording", tmp_path / "apart") == 0
         assert capsys.readouterr().out.startswith(
-            "Warning (small-partitions): The partition 'nail' has fewer than 8 vertices (3), and a network each: "
+            "Warning (small-partitions): The partition 'nail' has fewer than 8 vertices (the smallest 3), and"
         )
         assert run("record", rig, tmp_path / "apart", "--poses", 30, "--least-vertices", -1) == 2
 

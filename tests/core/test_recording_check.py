@@ -356,7 +356,7 @@ def test_small_partitions(good):
     small = with_rig(good, skin_joints=skin_joints, skin_weights=skin_weights)
     partitions = make_partitions(small.rig, {3: (3,)}, dict.fromkeys(range(4), (0,)))
     text = only(replace(small, partitions=partitions), "small-partitions")
-    assert text.startswith("The partition 'hand' has fewer than 8 vertices (5), and a network each: ")
+    assert text.startswith("The partition 'hand' has fewer than 8 vertices (the smallest 5), and a network each: ")
     partitions = make_partitions(small.rig, None, dict.fromkeys(range(4), (0,)), merged={3: 2})
     assert warned(replace(small, partitions=partitions)) == {}
 
