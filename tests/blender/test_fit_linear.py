@@ -85,7 +85,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable]
             options = ("--object", ELBOW, "--poses", 120, "--fit-linear", kind)
             assert run("record", *files[:2], *options) == 0
             printed = capfd.readouterr().out
-            assert run("train", *files[1:], "--epochs", 40) == 0
+            assert run("train", *files[1:], "--epochs", 25) == 0
             made[kind] = Fitted(*files, printed)
         return made[kind]
 
