@@ -57,6 +57,11 @@ sampling: .venv  ## compare ways to choose poses, into out/sampling (20 minutes)
 study: .venv  ## compare sizes and activations of the networks, into out/study (30 minutes)
 	.venv/bin/python benchmarks/study.py out/study
 
+characters: .venv  ## record, train, bind and compare every kind of character on both LTS lines, for docs/characters.md
+	@$(MAKE) .venv-line LINE=$(OTHER_LINE)
+	.venv/bin/python benchmarks/characters.py out/characters
+	.venv-$(OTHER_LINE)/bin/python benchmarks/characters.py out/characters
+
 pictures: demo  ## make the README's pictures again, from those of the demo
 	.venv/bin/python docs/pictures/make_pictures.py out/demo/pictures
 
@@ -80,4 +85,4 @@ requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
 clean:  ## remove what was built and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-line demo test test-core test-trainer test-blender test-examples test-gui test-all test-line bench sampling study fixtures lint package requirements clean
+.PHONY: help .venv .venv-line demo test test-core test-trainer test-blender test-examples test-gui test-all test-line bench sampling study characters fixtures lint package requirements clean

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Records, binds and compares the characters of `rows`; the training in between is that of `training`."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from fdda_addon.cli.files import save_copy
+from fdda_addon.core.poses import Channel
+from fdda_addon.evaluation import EvaluationSettings, evaluate, pose_held_out
+from fdda_addon.recording import record
+from fdda_addon.runtime.binding import bind
+from fdda_addon.runtime.network import Network
+from fdda_addon.scene.controls import ControlReader
+from fdda_addon.scene.mesh import evaluated_positions, rest_positions
+from fdda_addon.scene.modifier_stack import read_stack
+from fdda_addon.scene.rig import PoseReader, SceneRig, armature_of, find_rig, model_channels, read_model_rig
+
+from .rows import Row
+
+HELD_OUT = EvaluationSettings(poses=25, seed=1, surface=False)
+PLAYED = 5
+"""Poses that are played and compared with the model's output."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of one mesh of a character.
+
+    Attributes:
+        mesh: name of the mesh object.
+        linear_mm, fdda_mm: mean error of the linear layer and of the model on held-out poses.
+        moved_mm: how far the rig moves a vertex from its rest position in these poses, mean.
+        difference: the largest between the evaluated mesh and the model's output, in any coordinate; metres.
+    """
+
+    mesh: str
+    linear_mm: float
+    fdda_mm: float
+    moved_mm: float
+    difference: float
+
+
+def record_row(row: Row, folder: Path) -> Iterator[tuple[Path, Path]]:
+    """Build a character, save it as `rig.blend` and record each of its meshes.
+
+    Args:
+        row: the character.
+        folder: an empty folder of its own.
+
+    Yields:
+        The recording of a mesh, and where its model is to go.
+    """
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    row.build()
+    bpy.context.view_layer.update()
+    save_copy(folder / "rig.blend")
+    for name in row.meshes:
+        model = model_path(row, folder, name)
+        model.parent.mkdir()
+        for _ in record(find_rig(name), model.with_name("recording"), row.recording):
+            pass
+        yield model.with_name("recording"), model
+
+
+def model_path(row: Row, folder: Path, mesh: str) -> Path:
+    """Where the model of a mesh goes; each has a folder of its own, for its report lies beside it."""
+    assert mesh in row.meshes
+    return folder / mesh / f"{mesh}.onnx"
+
+
+def compare_row(row: Row, folder: Path) -> list[Result]:
+    """Measure the errors of the models of a character, bind all of them and play; a result for each mesh."""
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "rig.blend"))
+    rigs = [find_rig(name) for name in row.meshes]
+    networks = [Network(model_path(row, folder, name)) for name in row.meshes]
+    errors = [_errors(row, scene_rig, network) for scene_rig, network in zip(rigs, networks, strict=True)]
+    channels = model_channels(rigs[0], read_model_rig(rigs[0], networks[0].info), networks[0].info)
+    for scene_rig, network in zip(rigs, networks, strict=True):
+        live = read_stack(scene_rig.mesh_object).live
+        bind(scene_rig, network.path)
+        for name in live:
+            scene_rig.mesh_object.modifiers[name].show_viewport = False
+    if row.is_linked:
+        rigs = _overrides(rigs[0], folder)
+        differences = [max(_play(rigs, networks * len(rigs), channels))]
+    else:
+        differences = _play(rigs, networks, channels)
+    return [
+        Result(name, *own, difference / row.unit)
+        for name, own, difference in zip(row.meshes, errors, differences, strict=True)
+    ]
+
+
+def _errors(row: Row, scene_rig: SceneRig, network: Network) -> tuple[float, float, float]:
+    """`linear_mm`, `fdda_mm` and `moved_mm` of a Result."""
+    *_, evaluation = evaluate(scene_rig, network, HELD_OUT)
+    held_out = evaluation.held_out
+    moved = np.linalg.norm(held_out.positions - rest_positions(scene_rig.mesh_object.data), axis=-1)
+    return tuple(float(distances.mean()) * 1000 / row.unit for distances in (held_out.linear, held_out.fdda, moved))
+
+
+def _play(rigs: list[SceneRig], networks: list[Network], channels: tuple[Channel, ...]) -> list[float]:
+    """Play bound rigs; the largest difference of each from its model. Each armature takes poses of its own."""
+    armatures = {scene_rig.armature_object: scene_rig for scene_rig in rigs}
+    for armature_object in armatures:
+        if armature_object.animation_data is not None:
+            armature_object.animation_data.action = None
+    differences = [0.0] * len(rigs)
+    for pose in range(PLAYED):
+        for seed, scene_rig in enumerate(armatures.values(), HELD_OUT.seed + 1):
+            pose_held_out(scene_rig, channels, seed, pose)
+        bpy.context.view_layer.update()
+        now = [_difference(scene_rig, network) for scene_rig, network in zip(rigs, networks, strict=True)]
+        differences = [max(pair) for pair in zip(differences, now, strict=True)]
+    return differences
+
+
+def _difference(scene_rig: SceneRig, network: Network) -> float:
+    """The largest between what Blender shows and what the model says of the pose; nothing of the playback is used."""
+    if problem := scene_rig.mesh_object.fdda.status:
+        raise AssertionError(problem)
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    info = network.info
+    reader = PoseReader(scene_rig, info.joint_names, info.rest_matrices)
+    matrices = reader.read(
+        scene_rig.mesh_object.evaluated_get(depsgraph), scene_rig.armature_object.evaluated_get(depsgraph)
+    )
+    controls = ControlReader(scene_rig, info.controls).read(scene_rig, depsgraph)
+    shown = evaluated_positions(scene_rig.mesh_object, depsgraph)
+    return float(np.abs(shown - network.positions(matrices[None], controls[None])[0]).max())
+
+
+def _overrides(scene_rig: SceneRig, folder: Path) -> list[SceneRig]:
+    """Save the bound character as a library, link it into a new file, and override it twice."""
+    collection = bpy.data.collections.new("Character")
+    bpy.context.scene.collection.children.link(collection)
+    for scene_object in (scene_rig.mesh_object, scene_rig.armature_object):
+        bpy.context.scene.collection.objects.unlink(scene_object)
+        collection.objects.link(scene_object)
+    library = folder / "library.blend"
+    save_copy(library)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
+    with bpy.data.libraries.load(str(library), link=True, relative=True) as (_, wanted):
+        wanted.collections = ["Character"]
+    rigs = []
+    for _ in range(2):
+        own = wanted.collections[0].override_hierarchy_create(
+            bpy.context.scene, bpy.context.view_layer, do_fully_editable=True
+        )
+        mesh_object = next(o for o in own.all_objects if o.type == "MESH")
+        rigs.append(SceneRig(mesh_object, armature_of(mesh_object)))
+    return rigs
