@@ -5,16 +5,20 @@ They are drawn over what Blender evaluates, so nothing of the file is touched, a
 meshes are painted lasts for the session; without a window nothing is drawn.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import bpy
 import numpy as np
 
 from . import last_evaluation, overlay
+from .core.errors import ModelError
 from .core.metrics import heat_colors
+from .core.model import check_rig
 from .core.partition import LEAST_VERTICES, merged_partitions, partition_colors
 from .evaluation_view import redraw_views
-from .scene.rig import SceneRig, read_rig
+from .runtime.model_files import network_of
+from .scene.rig import SceneRig, read_model_rig, read_rig
 
 ERRORS, PARTITIONS = "ERRORS", "PARTITIONS"
 
@@ -38,13 +42,20 @@ def paint_errors(mesh_object: bpy.types.Object) -> None:
 
 
 def paint_partitions(scene_rig: SceneRig, least_vertices: int = LEAST_VERTICES) -> None:
-    """Show the partitions that a rig is recorded with.
+    """Show the partitions of the bound model; where none is bound that can be read, those that a rig is recorded with.
 
     Raises:
         RigError: the rig cannot be read.
     """
     rig = read_rig(scene_rig)
     partitions = merged_partitions(rig, least_vertices)
+    if scene_rig.mesh_object.fdda.is_bound:
+        with suppress(ModelError):
+            network = network_of(scene_rig.mesh_object)
+            # Fitted skin weights cut the mesh otherwise than those of the rig.
+            model_rig = read_model_rig(scene_rig, network.info)
+            check_rig(network.path, network.info, model_rig)
+            partitions = network.info.partitions_of(network.linear_rig(model_rig))
     colors = partition_colors(partitions, rig.vertex_count)
     _paint(scene_rig.mesh_object, Paint(PARTITIONS, colors, len(partitions)))
 

@@ -14,6 +14,7 @@ from refusals import Refusal, save_elbow
 from scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
 from blend_fixtures.characters.base import cage, skin, tube
+from fdda_addon import heat_map
 from fdda_addon.cli.files import save_copy
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.model import read_model_info
@@ -135,6 +136,8 @@ def test_the_fitted_linear_layer_is_what_plays(kind, build, fitted, capfd):
     true = evaluated(rig.mesh_object)
     bind(rig, files.model)
     shown = assert_plays(rig.mesh_object, files.model)
+    heat_map.paint_partitions(rig)
+    assert len(np.unique(heat_map.colors_of(rig.mesh_object), axis=0)) == 2
     rig.mesh_object.fdda.mode = "LINEAR"
     linear = evaluated(rig.mesh_object)
     recording = read_recording(files.recording)
