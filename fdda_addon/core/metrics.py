@@ -26,9 +26,9 @@ class ErrorStatistics:
         return asdict(self)
 
 
-def distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Distance of each vertex: (N, V, 3) and (N, V, 3), metres, to (N, V) float32, metres."""
-    return np.linalg.norm(first - second, axis=-1)
+def distances(first: np.ndarray, second: np.ndarray, metres_per_unit: float = 1.0) -> np.ndarray:
+    """Distance of each vertex: (N, V, 3) and (N, V, 3), in units of so many metres, to (N, V) float32, metres."""
+    return np.linalg.norm(first - second, axis=-1) * metres_per_unit
 
 
 def error_statistics(errors: np.ndarray) -> ErrorStatistics:

@@ -14,6 +14,7 @@ from .partition import Partition, make_partitions
 from .poses import Channel
 from .rig import Fingerprint, Joint, Rig, differences
 from .skin_fit import skin_from_text
+from .unit import read_unit, unit_json
 
 VERSION = 1
 METADATA_KEY = "fdda"
@@ -60,6 +61,7 @@ class ModelInfo:
             `metrics.ErrorStatistics`.
         parity_mm: largest difference between ONNX Runtime and PyTorch, in mm.
         training: settings and seed of the training.
+        metres_per_unit: length of one unit of mesh-object space, as in `Rig`.
     """
 
     joints: tuple[Joint, ...]
@@ -73,6 +75,7 @@ class ModelInfo:
     held_out_mm: dict[str, float] = field(default_factory=dict)
     parity_mm: float = 0.0
     training: dict = field(default_factory=dict)
+    metres_per_unit: float = 1.0
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -106,6 +109,7 @@ class ModelInfo:
             "held_out_mm": self.held_out_mm,
             "parity_mm": self.parity_mm,
             "training": self.training,
+            **unit_json(self.metres_per_unit),
         }
         return json.dumps(value, allow_nan=False)
 
@@ -162,6 +166,7 @@ def _read_info(value: dict) -> ModelInfo:
         dict(value["held_out_mm"]),
         float(value["parity_mm"]),
         dict(value["training"]),
+        read_unit(value),
     )
     if not all(isinstance(c.bone, str) and np.isfinite([c.low, c.high]).all() for c in info.limits):
         raise ValueError("its range of motion cannot be read")

@@ -19,6 +19,7 @@ from .recording_index import INDEX, REFINED, RecordingInfo, Sampling, Source, re
 from .rig import Fingerprint, Joint, Rig
 from .skin_fit import are_skin_weights
 from .surface import are_faces
+from .unit import read_unit
 
 __all__ = [
     "INDEX",
@@ -132,6 +133,7 @@ def read_recording(path: Path) -> Recording:
         Fingerprint(**index["rig"]["fingerprint"]),
         *(np.array(arrays.get(name, np.zeros(0, np.int32))) for name in ("face_starts", "face_vertices")),
         read_controls(index["controls"]),
+        read_unit(index),
     )
     _check_skin(path, rig)
     if not are_faces(rig.face_starts, rig.face_vertices, rig.vertex_count):

@@ -11,6 +11,7 @@ from .poses import Channel
 from .rig import Fingerprint
 from .skin_fit import SkinFit
 from .surface import LEAST_CORNERS
+from .unit import read_unit
 
 FORMAT = "fdda-recording"
 VERSION = 1
@@ -132,6 +133,7 @@ def _check_index(index: dict) -> None:
             if type(control) is not int or not 0 <= control < len(controls):
                 raise ValueError(f"a partition has control {control!r} of {len(controls)}")
     Fingerprint(**index["rig"]["fingerprint"])
+    read_unit(index)
     if "fit" in index:
         SkinFit.from_json(index["fit"])
     for source in _sampling(index["sampling"]).sources:

@@ -6,7 +6,7 @@ import io
 import json
 import math
 import os
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from .recording import STREAMED, array_shapes, partitions_json, streamed_arrays
 from .recording_index import FORMAT, INDEX, VERSION, RecordingInfo, read_index
 from .recording_lock import LOCK, RecordingLock
 from .rig import Rig
+from .unit import read_unit, unit_json
 
 
 class RecordingWriter:
@@ -79,6 +80,8 @@ class RecordingWriter:
         # A recording of a version that did not write the faces stays without them.
         if "faces" not in previous:
             self._faces = self._corners = 0
+        # The scale of an object may be animated; no array depends on it.
+        self.rig = replace(self.rig, metres_per_unit=read_unit(previous))
         own = self._index()
         if different := [key for key in different_keys(previous, own) if key != "complete"]:
             raise RecordingError(
@@ -137,6 +140,7 @@ class RecordingWriter:
             "influences": int(self.rig.skin_joints.shape[1]),
             **({"faces": self._faces, "corners": self._corners} if self._faces else {}),
             "units": {"length": "m", "angle": "rad"},
+            **unit_json(self.rig.metres_per_unit),
             "blender": info.blender,
             "rig": {
                 "file": info.rig_file,

@@ -54,7 +54,7 @@ class Rig:
 
     Attributes:
         joints: J joints, every parent before its children.
-        rest_positions: (V, 3) float32, mesh-object space, metres.
+        rest_positions: (V, 3) float32, mesh-object space, metres (see `metres_per_unit`).
         rest_matrices: (J, 4, 4) float32, rest pose of the joints in mesh-object space, column vectors.
         skin_joints: (V, I) int32, indices of the joints that a vertex follows; unused places hold 0.
         skin_weights: (V, I) float32, their weights; each row sums to 1, unused places hold 0.
@@ -62,6 +62,8 @@ class Rig:
         face_starts: (F,) int32, where each face starts in `face_vertices`; empty when the faces are not known.
         face_vertices: (C,) int32, vertex indices of the corners, face by face.
         controls: the inputs beside the joints.
+        metres_per_unit: length of one unit of mesh-object space. What is called metres above, in recordings and in
+            models are such units; a distance in them times this is in metres.
     """
 
     joints: tuple[Joint, ...]
@@ -73,6 +75,7 @@ class Rig:
     face_starts: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
     face_vertices: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
     controls: tuple[Control, ...] = ()
+    metres_per_unit: float = 1.0
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -89,7 +92,7 @@ class Rig:
 
     @property
     def size(self) -> float:
-        """Diagonal of the bounding box of the rest positions, metres."""
+        """Diagonal of the bounding box of the rest positions, units of mesh-object space."""
         return float(np.linalg.norm(np.ptp(self.rest_positions, axis=0)))
 
 
