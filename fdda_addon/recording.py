@@ -30,7 +30,7 @@ from .scene.clip_player import ClipPlayer
 from .scene.controls import stated_controls
 from .scene.dependencies import read_dependencies
 from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
-from .scene.sampling import choose
+from .scene.sampling import Choice, choose
 from .weight_fitting import check_has_weights, fit_weights, poses_to_fit, recorded_weights
 
 BATCH_BYTES = 6 << 20
@@ -159,19 +159,29 @@ def _linear_layer(
 def planned_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
     """The rig with its controls, and the channels of its random poses, as these settings record it.
 
+    Raises:
+        RigError: the rig cannot be read, or nothing may be sampled.
+    """
+    choice, besides = planned_choice(scene_rig, settings)
+    rig = read_rig(scene_rig, besides)
+    channels = sampled_channels(scene_rig, rig, choice) if settings.poses else ()
+    return replace(rig, controls=choice.controls), channels
+
+
+def planned_choice(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Choice, frozenset[str] | None]:
+    """What these settings sample, and which joints the rig has beside the bones that have weights (`read_rig`).
+
     The joints of a rig whose control bones are sampled are the bones that have weights, and those that the mesh depends
     on otherwise: what animators pose is no input of a model, what follows from it is.
 
     Raises:
-        RigError: the rig cannot be read, or nothing may be sampled.
+        RigError: the rig lacks what the settings name.
     """
     dependencies = read_dependencies(scene_rig)
     controls = {control.name: control for control in dependencies.controls}
     controls |= {control.name: control for control in stated_controls(scene_rig, settings.controls)}
     choice = choose(scene_rig, settings.sample, tuple(controls.values()))
-    rig = read_rig(scene_rig, None if choice.bones is None else dependencies.bones)
-    channels = sampled_channels(scene_rig, rig, choice) if settings.poses else ()
-    return replace(rig, controls=choice.controls), channels
+    return choice, None if choice.bones is None else dependencies.bones
 
 
 def planned_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]) -> Sampling:

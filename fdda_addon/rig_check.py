@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Checks a rig as a recording would, and says all that is wrong at once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from .core.controls import Control
 from .core.errors import RigError
 from .core.poses import Channel
 from .core.rig import Rig
+from .recording import RecordingSettings, planned_choice
+from .scene.controls import stated_controls
 from .scene.modifier_stack import deforming_modifiers
 from .scene.rig import SceneRig, check_evaluable, read_rig, sampled_channels
+
+DEFAULTS = RecordingSettings()
 
 
 @dataclass(frozen=True)
@@ -19,43 +24,50 @@ class RigCheck:
         rig: its arrays, None when they cannot be read.
         channels: what a random pose may move, empty when nothing.
         replaced: names of the modifiers that a model takes the place of.
+        found: the controls that nobody listed: drivers of the mesh read them, or the actions that are sampled key them.
+        besides: joints that the rig was read with (`read_rig`).
     """
 
     problems: tuple[str, ...]
     rig: Rig | None
     channels: tuple[Channel, ...]
     replaced: tuple[str, ...] = ()
+    found: tuple[Control, ...] = ()
+    besides: frozenset[str] | None = None
 
-    def checked_again(self, scene_rig: SceneRig) -> "RigCheck":
-        """The check without reading the mesh again: for changes of modifiers, modes and ranges of motion."""
-        return _check(scene_rig, self.rig) if self.rig else check(scene_rig)
+    def checked_again(self, scene_rig: SceneRig, settings: RecordingSettings = DEFAULTS) -> "RigCheck":
+        """The check without reading the mesh again: for changes of modifiers, modes, ranges of motion and choices."""
+        return _check(scene_rig, settings, self)
 
 
-def check(scene_rig: SceneRig) -> RigCheck:
+def check(scene_rig: SceneRig, settings: RecordingSettings = DEFAULTS) -> RigCheck:
     """Check a rig. While a model plays, the modifiers of the rig are off, so what they evaluate to is not checked."""
-    return _check(scene_rig, None)
+    return _check(scene_rig, settings, None)
 
 
-def _check(scene_rig: SceneRig, rig: Rig | None) -> RigCheck:
+def _check(scene_rig: SceneRig, settings: RecordingSettings, before: RigCheck | None) -> RigCheck:
+    result = RigCheck((), None, ())
     problems: list[str] = []
-    channels: tuple[Channel, ...] = ()
-    replaced: tuple[str, ...] = ()
     if not scene_rig.mesh_object.fdda.is_playing:
         try:
             check_evaluable(scene_rig)
         except RigError as error:
             problems.append(str(error))
     try:
-        replaced = tuple(modifier.name for modifier in deforming_modifiers(scene_rig.mesh_object))
-        rig = rig or read_rig(scene_rig)
+        result = replace(result, replaced=tuple(m.name for m in deforming_modifiers(scene_rig.mesh_object)))
+        choice, besides = planned_choice(scene_rig, settings)
+        if before is not None and before.rig is not None and before.besides == besides:
+            rig = before.rig
+        else:
+            rig = read_rig(scene_rig, besides)
+        if rig.controls != choice.controls:
+            rig = replace(rig, controls=choice.controls)
+        listed = stated_controls(scene_rig, settings.controls)
+        found = tuple(control for control in choice.controls if control not in listed)
+        result = replace(result, rig=rig, found=found, besides=besides)
+        result = replace(result, channels=sampled_channels(scene_rig, rig, choice))
     except RigError as error:
-        if str(error) not in problems:
+        # A rig of which nothing may be sampled is recorded by its actions alone.
+        if str(error) not in problems and (result.rig is None or settings.poses):
             problems.append(str(error))
-        return RigCheck(tuple(problems), None, (), replaced)
-    try:
-        channels = sampled_channels(scene_rig, rig)
-    except RigError as error:
-        # A rig that is driven by controls is recorded by its actions alone.
-        if scene_rig.mesh_object.fdda.settings.poses:
-            problems.append(str(error))
-    return RigCheck(tuple(problems), rig, channels, replaced)
+    return replace(result, problems=tuple(problems))

@@ -8,10 +8,49 @@
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
 
 from .core.errors import OutputError
 from .scene.compatibility import BLEND_RELATIVE_PATH
+from .scene.scene_rig import SceneRig, armature_of
+
+
+class FDDA_PG_bone(bpy.types.PropertyGroup):
+    """A bone that random poses move."""
+
+    name: StringProperty(name="Bone")
+
+
+def _suggested_controls(control: "FDDA_PG_control", _context: bpy.types.Context, _text: str) -> list[str]:
+    from .scene.control_names import suggested_controls
+
+    mesh_object = control.id_data
+    armature_object = armature_of(mesh_object)
+    return suggested_controls(SceneRig(mesh_object, armature_object)) if armature_object else []
+
+
+class FDDA_PG_control(bpy.types.PropertyGroup):
+    """A number that is an input of the model, as `scene.controls.stated_controls` reads it."""
+
+    name: StringProperty(
+        name="Control",
+        description="Name of a shape key, or OWNER/PATH of a number that can be animated",
+        search=_suggested_controls,
+        search_options={"SUGGESTION"},
+    )
+    has_range: BoolProperty(
+        name="Own Range", description="Sample it in this range, in place of the one that its property has"
+    )
+    low: FloatProperty(name="Minimum", description="Lowest value of random poses", default=0.0)
+    high: FloatProperty(name="Maximum", description="Highest value of random poses", default=1.0)
 
 
 class FDDA_PG_character(bpy.types.PropertyGroup):
@@ -30,6 +69,21 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         max=10.0,
         step=10,
     )
+    sample: EnumProperty(
+        name="Random Poses Move",
+        description="Bones that random poses move",
+        items=(
+            ("WEIGHTS", "Bones with Weights", "The bones that the mesh follows, and all that state a range of motion"),
+            ("COLLECTION", "Bone Collection", "The bones of a bone collection and of the ones below it"),
+            ("ACTIONS", "Ticked Actions", "What the actions that are ticked for recording key, in their ranges"),
+            ("SELECTED", "Selected Bones", "The bones that were selected when Use Selected Bones was pressed"),
+        ),
+        default="WEIGHTS",
+    )
+    bone_collection: StringProperty(name="Collection", description="Bone collection with what animators pose")
+    sampled_bones: CollectionProperty(type=FDDA_PG_bone)
+    controls: CollectionProperty(type=FDDA_PG_control)
+    control_index: IntProperty(name="Control", description="The control that the fields below are about")
     fit_linear: EnumProperty(
         name="Linear Layer",
         description="Skin weights of the linear layer that a model learns to correct",
@@ -114,7 +168,7 @@ class FDDA_PG_session(bpy.types.PropertyGroup):
     show_all_partitions: BoolProperty(name="Show All", description="All partitions of the model, not only the worst")
 
 
-CLASSES = (FDDA_PG_character, FDDA_PG_action, FDDA_PG_session)
+CLASSES = (FDDA_PG_bone, FDDA_PG_control, FDDA_PG_character, FDDA_PG_action, FDDA_PG_session)
 
 
 def register() -> None:

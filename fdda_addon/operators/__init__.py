@@ -5,6 +5,7 @@ MODULES: tuple[str, ...] = (
     "job",
     "trainer_environment",
     "rig",
+    "sampling",
     "poses",
     "recording",
     "training",

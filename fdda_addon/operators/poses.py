@@ -2,40 +2,16 @@
 """The poses: look at those that are recorded, and state the range of motion."""
 
 import math
+from dataclasses import replace
 
 import bpy
 
-from ..core.errors import FDDAError, RigError
-from .job import current
-from .on_rig import OnRig
-from .recording import recorded_actions
+from ..core.errors import RigError
+from .on_pose import OnPose
+from .sampling import recorded_actions, recording_settings
 
 
-class _OnPose(OnRig):
-    """Mixin for an operator that changes the armature of a rig."""
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        job = current()
-        if job is not None and job.borrows_scene:
-            cls.poll_message_set(f"{job.title} is under way; wait for it or cancel it")
-            return False
-        if context.mode not in {"OBJECT", "POSE"}:
-            cls.poll_message_set("Only in object mode and pose mode")
-            return False
-        return cls.has_rig(context)
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        try:
-            sentence = self.change(context)
-        except FDDAError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        self.report({"INFO"}, sentence)
-        return {"FINISHED"}
-
-
-class FDDA_OT_preview_pose(_OnPose, bpy.types.Operator):
+class FDDA_OT_preview_pose(OnPose, bpy.types.Operator):
     bl_idname = "fdda.preview_pose"
     bl_label = "Show Random Pose"
     bl_description = "Pose the rig as one of the random poses that are recorded"
@@ -60,12 +36,13 @@ class FDDA_OT_preview_pose(_OnPose, bpy.types.Operator):
 
     def change(self, context: bpy.types.Context) -> str:
         from ..core.poses import sample_pose
+        from ..recording import planned_rig
         from ..scene.armature import Poser, clear_pose
-        from ..scene.rig import read_rig, sampled_channels
 
         rig = self.rig(context)
         settings, session = rig.mesh_object.fdda.settings, context.window_manager.fdda
-        channels = sampled_channels(rig, read_rig(rig))
+        wanted = recording_settings(rig)
+        _, channels = planned_rig(rig, replace(wanted, poses=max(1, wanted.poses)))
         start = self.number if self.number >= 0 else session.pose_number
         number = max(0, start + self.step)
         clear_pose(rig.armature_object)
@@ -75,21 +52,29 @@ class FDDA_OT_preview_pose(_OnPose, bpy.types.Operator):
         return f"Random pose {number} of seed {settings.seed}."
 
 
-class FDDA_OT_rest_pose(_OnPose, bpy.types.Operator):
+class FDDA_OT_rest_pose(OnPose, bpy.types.Operator):
     bl_idname = "fdda.rest_pose"
     bl_label = "Rest Pose"
-    bl_description = "Bring every bone back to its rest pose"
+    bl_description = (
+        "Bring every bone back to its rest pose, and every control that is sampled to where it does nothing"
+    )
     bl_options = {"REGISTER", "UNDO"}
 
     def change(self, context: bpy.types.Context) -> str:
+        from ..recording import planned_choice
         from ..scene.armature import clear_pose
+        from ..scene.control_names import resting_value
+        from ..scene.controls import is_driven, owner_of, set_control
 
-        armature_object = self.rig(context).armature_object
-        clear_pose(armature_object)
-        return f"'{armature_object.name}' is in its rest pose."
+        rig = self.rig(context)
+        clear_pose(rig.armature_object)
+        for control in planned_choice(rig, recording_settings(rig))[0].controls:
+            if not is_driven(owner_of(rig, control.owner), control.path):
+                set_control(rig, control.name, resting_value(rig, control.name))
+        return f"'{rig.armature_object.name}' is in its rest pose."
 
 
-class _OnRange(_OnPose):
+class _OnRange(OnPose):
     """Mixin for an operator that changes the range of one rotation axis."""
 
     bone: bpy.props.StringProperty(name="Bone", description="Name of the bone", options={"SKIP_SAVE"})
@@ -152,7 +137,7 @@ class FDDA_OT_unstate_range(_OnRange, bpy.types.Operator):
         return f"'{bone.name}' states no range about {self.axis} any more."
 
 
-class FDDA_OT_limits_from_actions(_OnPose, bpy.types.Operator):
+class FDDA_OT_limits_from_actions(OnPose, bpy.types.Operator):
     bl_idname = "fdda.limits_from_actions"
     bl_label = "Set Limits from Actions"
     bl_description = (

@@ -7,9 +7,10 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError
-from ..settings import model_file, recording_folder, wanted_fit
+from ..settings import model_file, recording_folder
 from .job import JobOperator, current
 from .on_rig import OnRig
+from .sampling import recording_settings
 
 
 class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
@@ -40,25 +41,13 @@ class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_rig(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..recording import RecordingSettings, record
+        from ..recording import record
         from ..runtime.binding import true_rig
 
         rig = self.rig(context)
-        settings = rig.mesh_object.fdda.settings
         self._path = Path(bpy.path.abspath(self.folder)) if self.folder else recording_folder(rig.mesh_object)
-        actions = recorded_actions(rig.armature_object)
-        wanted = RecordingSettings(
-            poses=settings.poses,
-            seed=settings.seed,
-            spread=settings.spread,
-            actions=actions,
-            mirror=settings.mirror and bool(actions),
-            resume=self.resume,
-            fit_linear=wanted_fit(settings),
-            least_vertices=settings.least_vertices,
-        )
         with true_rig(rig.mesh_object):
-            yield from record(rig, self._path, wanted)
+            yield from record(rig, self._path, recording_settings(rig, self.resume))
 
     def finish(self, _context: bpy.types.Context, _result: object) -> str:
         return f"Recorded {self.state.total:,} poses into '{self._path.name}'."
@@ -133,23 +122,6 @@ class FDDA_OT_remove_recording(OnRig, bpy.types.Operator):
             return {"CANCELLED"}
         self.report({"INFO"}, f"Removed the recording '{path.name}'.")
         return {"FINISHED"}
-
-
-def recorded_actions(armature_object: bpy.types.Object) -> tuple[str, ...]:
-    """Names of the actions that the user has chosen for recording and that move a bone of this armature."""
-    return tuple(action.name for action in bpy.data.actions if action.fdda.record and fits(action, armature_object))
-
-
-def fits(action: bpy.types.Action, armature_object: bpy.types.Object) -> bool:
-    """Whether an action moves a bone of this armature."""
-    from ..scene.compatibility import animation_curves
-
-    bones = armature_object.pose.bones
-    for curve in animation_curves(action):
-        path = curve.data_path
-        if path.startswith('pose.bones["') and path[12 : path.find('"]', 12)] in bones:
-            return True
-    return False
 
 
 CLASSES = (FDDA_OT_record, FDDA_OT_refine, FDDA_OT_remove_recording)

@@ -2,12 +2,15 @@
 """Checks of rigs that panels may draw: a check runs when something has changed, in a timer, never while drawing."""
 
 import array
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import bpy
 from bpy.app.handlers import persistent
 
+from ..core.errors import RigError
 from ..operators import job
+from ..operators.sampling import recording_settings
 from ..scene.scene_rig import SceneRig, armature_of
 
 if TYPE_CHECKING:  # Blender starts without numpy.
@@ -38,12 +41,18 @@ def known(scene_rig: SceneRig) -> "RigCheck | None":
 
 def check_now(scene_rig: SceneRig) -> "RigCheck":
     """Check a rig, as far as it has changed."""
+    from ..recording import RecordingSettings
     from ..rig_check import check
 
+    try:
+        settings, problems = recording_settings(scene_rig), ()
+    except RigError as error:
+        settings, problems = RecordingSettings(poses=0), (str(error),)
     uid, counters = scene_rig.mesh_object.session_uid, _counters(scene_rig)
     stored = _checks.get(uid)
     same_rest = stored is not None and stored[1][0] == counters[0] and not _is_rest_changed(scene_rig)
-    result = stored[0].checked_again(scene_rig) if same_rest else check(scene_rig)
+    result = stored[0].checked_again(scene_rig, settings) if same_rest else check(scene_rig, settings)
+    result = replace(result, problems=result.problems + problems)
     _outdated.discard(uid)
     _rest_changed.discard(scene_rig.mesh_object.data.name)
     _checks[uid] = (result, counters)
@@ -67,7 +76,10 @@ def _check_wanted() -> None:
 
 def _shown() -> dict[int, tuple]:
     """What panels draw of the checks."""
-    return {uid: (id(check.rig), check.problems, check.channels, check.replaced) for uid, (check, _) in _checks.items()}
+    return {
+        uid: (id(check.rig), check.problems, check.channels, check.replaced, check.found)
+        for uid, (check, _) in _checks.items()
+    }
 
 
 def _counters(scene_rig: SceneRig) -> tuple:
@@ -88,7 +100,16 @@ def _counters(scene_rig: SceneRig) -> tuple:
     )
     modifiers = tuple((m.name, m.type, m.show_viewport) for m in mesh_object.modifiers)
     state = (mesh_object.mode, armature_object.mode, mesh_object.visible_get(), armature_object.data.pose_position)
-    return rest, modifiers, state, mesh_object.fdda.is_playing, mesh_object.fdda.settings.poses > 0
+    return rest, modifiers, state, mesh_object.fdda.is_playing, _choices(scene_rig)
+
+
+def _choices(scene_rig: SceneRig) -> tuple:
+    """What the user has chosen to sample."""
+    try:
+        settings = recording_settings(scene_rig)
+    except RigError as error:
+        return (str(error),)
+    return settings.poses > 0, settings.sample, settings.controls
 
 
 def _is_rest_changed(scene_rig: SceneRig) -> bool:

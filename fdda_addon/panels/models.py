@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The section Models: those of a mesh, which is bound, packing, and what has changed since they were trained."""
 
+from typing import TYPE_CHECKING
+
 import bpy
 
 from ..core.errors import FDDAError
@@ -8,6 +10,10 @@ from ..model_list import chosen_entry, is_bound, megabytes
 from . import checks
 from .section import Section, draw_sentence, panel_rig
 from .watch import Watch
+
+if TYPE_CHECKING:  # Blender starts without numpy.
+    from ..core.model import ModelInfo
+    from ..core.poses import Channel
 
 _rigs: dict[tuple, object] = {}
 
@@ -41,12 +47,23 @@ def _states(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
             info = info_of(mesh_object, entry)
             if check is not None and check.rig is not None:
                 rig = _rig_of_model(scene_rig, check.rig, info)
-                changed = changes(entry.name, info, rig, check.channels)
+                changed = changes(entry.name, info, rig, _compared_channels(mesh_object, check.channels, info))
                 if changed.sentence:
                     found[_key(entry)] = ("ERROR" if changed.prevents else "INFO", changed.sentence)
         except FDDAError as error:
             found[_key(entry)] = ("ERROR", str(error))
     return found
+
+
+def _compared_channels(
+    mesh_object: bpy.types.Object, channels: "tuple[Channel, ...]", info: "ModelInfo"
+) -> "tuple[Channel, ...]":
+    """Ranges to compare those of a model with: of the rig as it stands, or its own where others are chosen now."""
+    from ..core.poses import CONTROL
+
+    if mesh_object.fdda.settings.sample != "WEIGHTS":
+        return info.limits
+    return tuple(channel for channel in channels if channel.kind != CONTROL)
 
 
 def _key(entry: bpy.types.PropertyGroup) -> str:

@@ -3,14 +3,18 @@
 
 import math
 import time
+from typing import TYPE_CHECKING
 
 import bpy
 
 from ..operators.poses import FDDA_OT_state_range
-from ..operators.recording import fits
+from ..operators.sampling import fits
 from ..scene.scene_rig import SceneRig
-from . import checks
+from . import checks, sampled
 from .section import Section, draw_sentence, panel_rig
+
+if TYPE_CHECKING:  # Blender starts without numpy.
+    from ..core.poses import Channel
 
 AXES = "xyz"
 WIDE = 380
@@ -30,15 +34,18 @@ def fits_now(action: bpy.types.Action, armature_object: bpy.types.Object) -> boo
 
 
 class FDDA_UL_joints(bpy.types.UIList):
-    """The joints of the rig with their range about each axis."""
+    """The joints of the rig, or the control bones that were chosen, with their range about each axis."""
 
     def filter_items(self, context: bpy.types.Context, data: object, name: str) -> tuple[list[int], list[int]]:
         rig = panel_rig(context)[0]
         check = checks.known(rig) if rig else None
-        joints = set(check.rig.joint_names) if check and check.rig else set()
+        channels = sampled_by_bone(rig) if rig else None
+        listed = set(check.rig.joint_names) if check and check.rig else set()
+        if channels is not None:
+            listed = set(channels)
         text = self.filter_name.lower()
         flags = [
-            self.bitflag_filter_item if (not joints or bone.name in joints) and text in bone.name.lower() else 0
+            self.bitflag_filter_item if (not listed or bone.name in listed) and text in bone.name.lower() else 0
             for bone in getattr(data, name)
         ]
         return flags, []
@@ -48,18 +55,50 @@ class FDDA_UL_joints(bpy.types.UIList):
         from ..scene.motion_range import DEFAULT, rotation_ranges
 
         row = layout.split(factor=0.4)
+        rig = panel_rig(context)[0]
+        channels = sampled_by_bone(rig) if rig else None
+        region = context.region
+        is_wide = region is not None and region.width / context.preferences.system.ui_scale >= WIDE
+        if channels is not None:
+            row.label(text=bone.name, icon="BONE_DATA")
+            _draw_sampled(row.row(align=True), channels.get(bone.name, ()), is_wide)
+            return
         if is_moved_by_constraints(bone):
             row.label(text=bone.name, icon="CONSTRAINT_BONE")
             row.label(text="constrained")
             return
         row.label(text=bone.name, icon="BONE_DATA")
         row = row.row(align=True)
-        region = context.region
-        is_wide = region is not None and region.width / context.preferences.system.ui_scale >= WIDE
         for r in rotation_ranges(bone):
             cell = row.row()
             cell.active = r.moves and r.source != DEFAULT
             cell.label(text=_degrees(r.low, r.high, is_wide) if r.moves else "fixed")
+
+
+def sampled_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None":
+    """Channels of the bones that a user has chosen to sample, by bone; None where none were chosen, or not known."""
+    check = checks.known(rig)
+    if rig.mesh_object.fdda.settings.sample == "WEIGHTS" or check is None or not check.channels:
+        return None
+    from ..core.poses import CONTROL
+
+    found: dict[str, list[Channel]] = {}
+    for channel in check.channels:
+        if channel.kind != CONTROL:
+            found.setdefault(channel.bone, []).append(channel)
+    return found
+
+
+def _draw_sampled(row: bpy.types.UILayout, channels: "list[Channel]", is_wide: bool) -> None:
+    """The ranges about the axes, and by which other channels the bone is moved."""
+    from ..core.poses import LOCATION, ROTATION
+
+    turns = {channel.axis: channel for channel in channels if channel.kind == ROTATION}
+    moves = "".join("XYZ"[channel.axis] for channel in channels if channel.kind == LOCATION)
+    for axis in range(3) if turns else ():
+        row.label(text=_degrees(turns[axis].low, turns[axis].high, is_wide) if axis in turns else "fixed")
+    if moves:
+        row.label(text=f"moves {moves}" if not turns else f"+{moves}")
 
 
 def _degrees(low: float, high: float, is_wide: bool) -> str:
@@ -102,12 +141,22 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         if rig is None:
             return
         session, bones = context.window_manager.fdda, rig.armature_object.pose.bones
+        sampled.draw_choice(layout, context, rig)
         layout.label(text="Range of motion about X, Y and Z")
         layout.template_list("FDDA_UL_joints", "", rig.armature_object.pose, "bones", session, "joint_index", rows=5)
         if 0 <= session.joint_index < len(bones):
-            _draw_ranges(layout.box(), rig, bones[session.joint_index])
+            _draw_bone(layout.box(), rig, bones[session.joint_index])
+        sampled.draw_controls(layout, rig)
         _draw_random(layout, context, rig)
         _draw_actions(layout, context, rig)
+
+
+def _draw_bone(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
+    channels = sampled_by_bone(rig)
+    if channels is not None and rig.mesh_object.fdda.settings.sample == "ACTIONS" and bone.name in channels:
+        sampled.draw_channels(box, bone, channels[bone.name])
+    else:
+        _draw_ranges(box, rig, bone)
 
 
 def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
@@ -187,4 +236,4 @@ def _draw_actions(layout: bpy.types.UILayout, context: bpy.types.Context, rig: S
         )
 
 
-CLASSES = (FDDA_UL_joints, FDDA_UL_actions, FDDA_PT_poses)
+CLASSES = (FDDA_UL_joints, sampled.FDDA_UL_controls, FDDA_UL_actions, FDDA_PT_poses)

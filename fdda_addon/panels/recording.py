@@ -10,9 +10,9 @@ import bpy
 
 from ..core.errors import FDDAError
 from ..operators import job
-from ..operators.recording import recorded_actions
+from ..operators.sampling import recorded_actions, recording_settings
 from ..scene.scene_rig import SceneRig
-from ..settings import recording_folder, wanted_fit
+from ..settings import recording_folder
 from . import checks
 from .section import Section, draw_job, draw_path, draw_sentence, panel_rig
 
@@ -29,25 +29,20 @@ def content_of(rig: SceneRig, path: Path) -> "FolderContent":
     """What is in the folder of a recording; it is read again when it, the rig or the settings have changed."""
     from ..core.recording import INDEX
     from ..core.recording_folder import read_folder
-    from ..recording import RecordingSettings, planned_sampling
+    from ..recording import planned_sampling
 
-    check, settings = checks.known(rig), rig.mesh_object.fdda.settings
-    actions = recorded_actions(rig.armature_object)
+    check, wanted = checks.known(rig), recording_settings(rig)
     try:
         stamp = os.stat(path / INDEX).st_mtime_ns
     except OSError:
         stamp = -1 if path.exists() else 0
     uid = rig.mesh_object.session_uid
-    fit = wanted_fit(settings)
-    question = (path, stamp, id(check), settings.poses, settings.seed, settings.spread, actions, settings.mirror, fit)
+    question = (path, stamp, id(check), wanted)
     if uid not in _contents or _contents[uid][0] != question:
-        wanted = RecordingSettings(
-            settings.poses, settings.seed, settings.spread, actions, mirror=settings.mirror and bool(actions)
-        )
         own, sampling = None, None
         if check is not None and check.rig is not None:
             own, sampling = check.rig, json.loads(json.dumps(planned_sampling(rig, wanted, check.channels).to_json()))
-        _contents[uid] = (question, read_folder(path, own, sampling, fit))
+        _contents[uid] = (question, read_folder(path, own, sampling, wanted.fit_linear))
     return _contents[uid][1]
 
 

@@ -122,6 +122,16 @@ def _element(path: str) -> tuple[str, int | None]:
     return (match["array"], int(match["index"])) if match else (path, None)
 
 
+def parent_and_name(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.bpy_struct, str, int | None]:
+    """What has the property at a path, the property's name (of a custom one, `["NAME"]`) and the place in an array."""
+    array, index = _element(path)
+    if match := _CUSTOM.fullmatch(array):
+        owner, name = match["owner"], array[len(match["owner"]) :]
+    else:
+        owner, _, name = array.rpartition(".")
+    return datablock.path_resolve(owner) if owner else datablock, name, index
+
+
 def _value(datablock: bpy.types.ID, path: str) -> float | None:
     """The number at a path, None when there is none."""
     try:

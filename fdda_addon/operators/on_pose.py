@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Operators that change the armature of a rig, or what is recorded of it."""
+
+import bpy
+
+from ..core.errors import FDDAError
+from .job import current
+from .on_rig import OnRig
+
+
+class OnPose(OnRig):
+    """Mixin for an operator that changes the armature of a rig."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        job = current()
+        if job is not None and job.borrows_scene:
+            cls.poll_message_set(f"{job.title} is under way; wait for it or cancel it")
+            return False
+        if context.mode not in {"OBJECT", "POSE"}:
+            cls.poll_message_set("Only in object mode and pose mode")
+            return False
+        return cls.has_rig(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            sentence = self.change(context)
+        except FDDAError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, sentence)
+        return {"FINISHED"}

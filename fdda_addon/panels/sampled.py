@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The part of the section "Poses" about what random poses move: which bones, and which controls beside them."""
+
+import math
+from typing import TYPE_CHECKING
+
+import bpy
+
+from ..operators.sampling import ALL_SHAPE_KEYS, recorded_actions
+from ..scene.scene_rig import SceneRig
+from . import checks
+from .section import draw_sentence
+
+if TYPE_CHECKING:  # Blender starts without numpy.
+    from ..core.poses import Channel
+    from ..rig_check import RigCheck
+
+MOST_LINES = 8
+"""So many of the controls that were found are listed."""
+
+
+class FDDA_UL_controls(bpy.types.UIList):
+    """The controls that a user has listed, with the ranges in which they are sampled."""
+
+    def draw_item(self, _context: bpy.types.Context, layout: bpy.types.UILayout, _data, control, _icon, _active, _name):
+        row = layout.row()
+        text = "All Shape Keys" if control.name == ALL_SHAPE_KEYS else control.name or "not named yet"
+        row.label(text=text, icon="SHAPEKEY_DATA" if "/" not in control.name else "DRIVER")
+        side = row.row()
+        side.alignment = "RIGHT"
+        side.label(text=f"{control.low:g}…{control.high:g}" if control.has_range else "its range")
+
+
+def draw_choice(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
+    """Which bones random poses move."""
+    settings = rig.mesh_object.fdda.settings
+    column = layout.column()
+    column.label(text="Random poses move")
+    column.prop(settings, "sample", text="")
+    if settings.sample == "COLLECTION":
+        column.prop_search(settings, "bone_collection", rig.armature_object.data, "collections_all", text="")
+    elif settings.sample == "ACTIONS" and not recorded_actions(rig.armature_object):
+        draw_sentence(column, context, "Tick the actions below that show how the rig moves.", "INFO")
+    elif settings.sample == "SELECTED":
+        count = len(settings.sampled_bones)
+        if not count:
+            draw_sentence(column, context, "Select bones in pose mode, then press the button.", "INFO")
+        column.operator("fdda.use_selected_bones", icon="RESTRICT_SELECT_OFF").object = rig.mesh_object.name
+    check = checks.known(rig)
+    if check is not None and check.channels and (settings.sample != "WEIGHTS" or check.rig.controls):
+        draw_sentence(layout, context, counted(check))
+
+
+def counted(check: "RigCheck") -> str:
+    """How much random poses move, a sentence."""
+    from ..core.poses import CONTROL
+
+    channels = [channel for channel in check.channels if channel.kind != CONTROL]
+    bones, controls = len({channel.bone for channel in channels}), len(check.channels) - len(channels)
+    parts = []
+    if bones:
+        parts.append(f"{bones} {'bone' if bones == 1 else 'bones'} in {len(channels)} channels")
+    if controls:
+        parts.append(f"{controls} {'control' if controls == 1 else 'controls'}")
+    return f"{' and '.join(parts)} are sampled."
+
+
+def draw_channels(box: bpy.types.UILayout, bone: bpy.types.PoseBone, channels: "list[Channel]") -> None:
+    """How a bone is sampled that was chosen: nothing to edit, for the ranges may come from actions."""
+    from ..core.poses import LOCATION, ROTATION
+
+    box.label(text=f"{bone.name}, as it is sampled", icon="BONE_DATA")
+    column = box.column(align=True)
+    verbs = {ROTATION: "Turn", LOCATION: "Move"}
+    for channel in channels:
+        row = column.split(factor=0.4)
+        row.label(text=f"{verbs.get(channel.kind, 'Scale')} {'XYZ'[channel.axis]}")
+        low, high = channel.low, channel.high
+        if channel.kind == ROTATION:
+            row.label(text=f"{math.degrees(low):.0f}…{math.degrees(high):.0f}°")
+        else:
+            row.label(text=f"{low:.3g}…{high:.3g}")
+
+
+def draw_controls(layout: bpy.types.UILayout, rig: SceneRig) -> None:
+    """The controls that are listed, and those that were found."""
+    settings, check = rig.mesh_object.fdda.settings, checks.known(rig)
+    found = check.found if check is not None else ()
+    count = len(settings.controls) + len(found)
+    header, body = layout.panel("fdda_controls", default_closed=True)
+    header.label(text=f"Controls ({count})" if count else "Controls")
+    if body is None:
+        return
+    row = body.row()
+    row.template_list("FDDA_UL_controls", "", settings, "controls", settings, "control_index", rows=2)
+    side = row.column(align=True)
+    side.operator("fdda.add_control", text="", icon="ADD").object = rig.mesh_object.name
+    side.operator("fdda.remove_control", text="", icon="REMOVE").object = rig.mesh_object.name
+    if 0 <= settings.control_index < len(settings.controls):
+        control = settings.controls[settings.control_index]
+        column = body.column(align=True)
+        column.prop(control, "name", text="")
+        row = column.row(align=True)
+        row.prop(control, "has_range")
+        fields = row.row(align=True)
+        fields.active = control.has_range
+        fields.prop(control, "low", text="")
+        fields.prop(control, "high", text="")
+    if rig.mesh_object.data.shape_keys and ALL_SHAPE_KEYS not in settings.controls:
+        properties = body.operator("fdda.add_control", text="All Shape Keys", icon="SHAPEKEY_DATA")
+        properties.object, properties.name = rig.mesh_object.name, ALL_SHAPE_KEYS
+    if found:
+        column = body.column(align=True)
+        column.label(text="Found: drivers or ticked actions use them")
+        for control in found[:MOST_LINES]:
+            column.label(text=f"{control.name} {control.low:g}…{control.high:g}", icon="DOT")
+        if len(found) > MOST_LINES:
+            column.label(text=f"and {len(found) - MOST_LINES} more", icon="BLANK1")

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Names of controls that a user may want, and the value at which a control does nothing."""
+
+import bpy
+
+from ..core.controls import ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS
+from .controls import is_driven, is_number, owner_of, parent_and_name
+from .scene_rig import SceneRig
+
+
+def suggested_controls(scene_rig: SceneRig) -> list[str]:
+    """Shape keys and custom properties that no driver sets, as `stated_controls` reads them; all shape keys first."""
+    mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
+    found = []
+    if keys := mesh_object.data.shape_keys:
+        blocks = [block for block in keys.key_blocks if block != keys.reference_key]
+        free = [block.name for block in blocks if not is_driven(keys, block.path_from_id("value"))]
+        found += [SHAPE_KEYS, *free] if free else []
+    for owner, datablock in ((ARMATURE_OBJECT, armature_object), (MESH_OBJECT, mesh_object)):
+        found += [f"{owner}/{path}" for path in _custom_numbers(datablock, "")]
+    for bone in armature_object.pose.bones:
+        found += [f"{ARMATURE_OBJECT}/{path}" for path in _custom_numbers(armature_object, bone.path_from_id())]
+    return found
+
+
+def _custom_numbers(datablock: bpy.types.ID, path: str) -> list[str]:
+    """Paths of the custom properties of a datablock, or of what is at a path of it, that are numbers."""
+    struct = datablock.path_resolve(path) if path else datablock
+    paths = [f'{path}["{bpy.utils.escape_identifier(name)}"]' for name, _ in struct.items()]
+    return [one for one in paths if is_number(datablock, one) and not is_driven(datablock, one)]
+
+
+def resting_value(scene_rig: SceneRig, name: str) -> float:
+    """The value that a control has by default; 0 for a shape key."""
+    owner, _, path = name.partition("/")
+    struct, attribute, index = parent_and_name(owner_of(scene_rig, owner), path)
+    if isinstance(struct, bpy.types.ShapeKey):
+        return 0.0
+    if attribute.startswith("["):
+        own = bpy.utils.unescape_identifier(attribute[2:-2])
+        return 0.0 if isinstance(struct[own], bool) else float(struct.id_properties_ui(own).as_dict()["default"])
+    prop = struct.bl_rna.properties[attribute]
+    return float(prop.default if index is None else prop.default_array[index])
