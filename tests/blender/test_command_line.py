@@ -124,18 +124,19 @@ def test_plain_lines_come_ten_times_a_stage():
     )
 
 
-def test_a_name_chooses_the_object(elbow, tmp_path):
+def test_a_name_chooses_the_object(elbow, tmp_path, capfd):
     def add_second(rig):
         second = rig.mesh_object.copy()
         second.data = second.data.copy()
         second.name = "sleeve"
         bpy.context.scene.collection.objects.link(second)
-        rig.mesh_object.vertex_groups.remove(rig.mesh_object.vertex_groups["upper"])
+        rig.mesh_object.hide_viewport = True
 
     path = save_elbow(tmp_path / "rig.blend", add_second)
     assert run("record", path, tmp_path / "r", "--object", "sleeve", "--poses", 3) == 0
     assert read_recording(tmp_path / "r").info.object_name == "sleeve"
     assert run("record", path, tmp_path / "other", "--object", "elbow", "--poses", 3) == 1
+    assert "'elbow' is hidden" in capfd.readouterr().err
 
 
 def opened(path) -> bpy.types.Object:
