@@ -239,6 +239,7 @@ class _Comparison:
         self._evaluator, self._network, self._layer = evaluator, network, layer
         self._done, self._total = 0, total
         rig, self._surface = layer.rig, None
+        self._metres_per_unit = rig.metres_per_unit
         if surface and len(rig.face_starts):
             faces = Surface(rig.face_starts, rig.face_vertices)
             self._surface = SurfaceComparison(faces, rig.rest_positions, layer.partitions)
@@ -258,9 +259,9 @@ class _Comparison:
             matrices.append(pose)
             positions.append(true)
             values.append(controls)
-            fdda.append(distances(moved, true))
+            fdda.append(distances(moved, true, self._metres_per_unit))
             skinned = self._layer.positions(pose[None])[0]
-            linear.append(distances(skinned, true))
+            linear.append(distances(skinned, true, self._metres_per_unit))
             if self._surface:
                 surface.append(self._surface.compare(true, (moved, skinned)))
             self._done += 1

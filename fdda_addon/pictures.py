@@ -82,13 +82,15 @@ def draw_comparison(
         linear = layer.positions(pose.pose_matrices[None])[0]
         fdda = network.positions(pose.pose_matrices[None], pose.controls[None])[0].copy()
         cells = [(pose.positions, f"{pose.name}: true rig"), (linear, "linear layer"), (fdda, "FDDA")]
-        rows.append([_cell(positions, pose.positions, label, heat) for positions, label in cells])
+        rows.append(
+            [_cell(positions, pose.positions, label, heat, network.info.metres_per_unit) for positions, label in cells]
+        )
     title = title or ("Distance from the true rig" if heat else "True rig, linear layer and FDDA")
     draw(scene_rig.mesh_object.data, rows, path, title, view, heat_scale=heat, sculpted=not heat)
 
 
-def _cell(positions: np.ndarray, true: np.ndarray, label: str, heat: bool) -> Cell:
-    errors = distances(positions, true)
+def _cell(positions: np.ndarray, true: np.ndarray, label: str, heat: bool, metres_per_unit: float) -> Cell:
+    errors = distances(positions, true, metres_per_unit)
     if errors.any():
         label += f"  mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.1f} mm"
     colors = heat_colors(errors) if heat else np.tile(np.float32(PLAIN), (len(positions), 1))

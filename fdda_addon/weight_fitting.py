@@ -73,15 +73,15 @@ def fit_weights(rig: Rig, kind: str, poses: Iterator[None], count: int, evaluato
                 pose_matrices, positions, *_ = evaluator.evaluate()
                 writer.append(pose_matrices, positions)
                 yield Progress("poses to fit", number, count)
-        fit = yield from _fit_folder(folder, kind, rig.vertex_count)
+        fit = yield from _fit_folder(folder, kind, rig)
         joints, weights = read_fitted(folder, rig)
     return replace(rig, skin_joints=joints, skin_weights=weights), fit
 
 
-def _fit_folder(folder: Path, kind: str, vertices: int) -> Iterator[Progress]:
+def _fit_folder(folder: Path, kind: str, rig: Rig) -> Iterator[Progress]:
     """Yields progress, returns the SkinFit."""
-    progress = Progress("fit", 0, vertices)
-    with SkinFitting([str(folder), kind]) as fitting:
+    progress, vertices = Progress("fit", 0, rig.vertex_count), rig.vertex_count
+    with SkinFitting([str(folder), kind, "--metres-per-unit", repr(rig.metres_per_unit)]) as fitting:
         for message in fitting.messages(wait=False):
             if message is None:
                 time.sleep(WAIT_SECONDS)

@@ -76,6 +76,7 @@ class PreparedPartition:
         residual_rms: rms distance over training poses and vertices that the fit leaves, about the mean, metres.
         validation_truncation: (n,) rms distance over the vertices that the basis leaves of each validation pose,
             metres.
+        mm_per_unit: what lengths above have to be multiplied by to be in mm, as in `Rig.metres_per_unit`.
     """
 
     name: str
@@ -89,6 +90,7 @@ class PreparedPartition:
     coefficients: np.ndarray
     residual_rms: float
     validation_truncation: np.ndarray
+    mm_per_unit: float = 1000.0
 
 
 def split_poses(poses: np.ndarray, validation_fraction: float, seed: int, held_out_fraction: float = 0.0) -> Split:
@@ -196,7 +198,9 @@ def partitions_of(recording: Recording, inputs: Inputs) -> list[PartitionData]:
     ]
 
 
-def prepare(partition: PartitionData, split: Split, tolerance_mm: float, seed: int) -> PreparedPartition:
+def prepare(
+    partition: PartitionData, split: Split, tolerance_mm: float, seed: int, metres_per_unit: float = 1.0
+) -> PreparedPartition:
     """Standardise the features of a partition and turn its residuals into coefficients.
 
     What the joints around say is taken off first. Everything is measured on the training poses alone. A partition that
@@ -215,7 +219,8 @@ def prepare(partition: PartitionData, split: Split, tolerance_mm: float, seed: i
         seen = surroundings if len(columns) else surroundings.alone()
         fit, residuals = seen.fit(residuals, split.training)
     residuals = residuals.reshape(len(features), -1)
-    tolerance = tolerance_mm / 1000 if len(columns) else np.inf
+    mm_per_unit = 1000 * metres_per_unit
+    tolerance = tolerance_mm / mm_per_unit if len(columns) else np.inf
     basis = make_basis(residuals[split.training], tolerance, np.random.default_rng([seed, 2]))
     coefficients = basis.coefficients(residuals)
     held_out = residuals[split.validation] - basis.residuals(coefficients[split.validation])
@@ -232,4 +237,5 @@ def prepare(partition: PartitionData, split: Split, tolerance_mm: float, seed: i
         coefficients,
         float(np.sqrt((spread**2).sum() / partition.vertices)),
         np.sqrt((held_out**2).sum(axis=1) / partition.vertices),
+        mm_per_unit,
     )

@@ -32,7 +32,7 @@ from .deformation import Deformation
 from .graph import build_graph
 
 MOST_DIFFERENCE = 1e-5
-"""Metres. An export whose positions differ more from the reference fails; scaled up for rigs larger than a metre."""
+"""Units of the mesh. An export that differs more from the reference fails; scaled up for rigs larger than a unit."""
 MOST_SURFACES = 50
 """Normals are compared in so many poses: at 50,000 vertices a pose takes a tenth of a second."""
 BLOCK_FLOATS = 1 << 24
@@ -116,8 +116,8 @@ def measure(
         matrices = inputs[POSE_INPUT]
         truth = layer.complex_positions(matrices, np.array(recording.residuals[poses[block]]))
         (positions,) = session.run([POSITIONS_OUTPUT], inputs)
-        fdda[block] = distances(positions, truth)
-        linear[block] = distances(layer.positions(matrices), truth)
+        fdda[block] = distances(positions, truth, recording.rig.metres_per_unit)
+        linear[block] = distances(layer.positions(matrices), truth, recording.rig.metres_per_unit)
     return Measured(fdda, linear)
 
 
@@ -152,19 +152,19 @@ def check_parity(
     Raises:
         TrainingError: it is too large, or the model gives values that are not numbers.
     """
-    largest = 0.0
+    largest, metres_per_unit = 0.0, recording.rig.metres_per_unit
     for block in _blocks(len(poses), recording.rig.vertex_count):
         inputs = _inputs(recording, poses[block])
         positions, trust = session.run(None, inputs)
         controls = np.array(recording.controls[poses[block]])
         expected, expected_trust = reference_positions(deformation, inputs[POSE_INPUT], controls)
-        difference = max(float(distances(positions, expected).max()), 0.0)
+        difference = max(float(distances(positions, expected, metres_per_unit).max()), 0.0)
         if not np.isfinite(positions).all() or not np.isfinite(trust).all():
             raise TrainingError("The exported model gives values that are not numbers; train with other settings.")
         if np.abs(trust - expected_trust).max(initial=0) > 1e-3:
             raise TrainingError("The trust of the exported model differs from PyTorch; this is a defect, report it.")
         largest = max(largest, difference)
-    allowed = MOST_DIFFERENCE * max(1.0, recording.rig.size)
+    allowed = MOST_DIFFERENCE * max(1.0, recording.rig.size) * metres_per_unit
     if largest > allowed:
         raise TrainingError(
             f"The exported model differs from PyTorch by {largest * 1000:.3g} mm, more than the allowed "
@@ -196,6 +196,7 @@ def model_info(recording: Recording, deformation: Deformation, held_out: np.ndar
         error_statistics(held_out).to_json(),
         0.0,
         {**training, LIMITS: recording.info.sampling.to_json()["limits"]},
+        rig.metres_per_unit,
     )
 
 

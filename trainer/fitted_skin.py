@@ -23,7 +23,9 @@ BLOCK_FLOATS = 1 << 22
 """Linear layers are compared in blocks of so many coordinates."""
 
 
-def fit_folder(folder: Path, kind: str, announcer: Announcer, should_stop: Callable[[], bool]) -> SkinFit:
+def fit_folder(
+    folder: Path, kind: str, announcer: Announcer, should_stop: Callable[[], bool], metres_per_unit: float = 1.0
+) -> SkinFit:
     """Fit the weights of a folder of poses, and write them into it. Every other pose is held out, to measure on.
 
     Args:
@@ -31,6 +33,7 @@ def fit_folder(folder: Path, kind: str, announcer: Announcer, should_stop: Calla
         kind: one of `core.skin_fit.KINDS`.
         announcer: told the progress, and last what the fit brought.
         should_stop: asked often; nothing has been written when it is heeded.
+        metres_per_unit: as in `Rig`.
 
     Raises:
         Cancelled: `should_stop` said so.
@@ -46,7 +49,7 @@ def fit_folder(folder: Path, kind: str, announcer: Announcer, should_stop: Calla
             raise Cancelled
         joints[block], weights[block] = fitted
         announcer.say(MessageType.PROGRESS, done=block.stop, total=total)
-    skinned = replace(poses.rig, skin_joints=joints, skin_weights=weights)
+    skinned = replace(poses.rig, skin_joints=joints, skin_weights=weights, metres_per_unit=metres_per_unit)
     result = SkinFit(kind, len(poses.positions), *(measure(part, skinned) for part in (held_out, training)))
     write_fitted(folder, joints, weights)
     announcer.say(MessageType.FINISHED, seconds=time.perf_counter() - started, fit=result.to_json())
@@ -55,13 +58,14 @@ def fit_folder(folder: Path, kind: str, announcer: Announcer, should_stop: Calla
 
 def measure(poses: FitPoses, fitted: Rig) -> Gain:
     """How far the linear layers of the rig's own and of the fitted weights are from the poses."""
-    step = max(1, BLOCK_FLOATS // (3 * fitted.vertex_count))
+    step, metres_per_unit = max(1, BLOCK_FLOATS // (3 * fitted.vertex_count)), fitted.metres_per_unit
     rms, largest = {}, {}
     for name, rig in (("rig", poses.rig), ("fitted", fitted)):
         layer, squares, most = LinearLayer(rig), 0.0, 0.0
         for start in range(0, len(poses.positions), step):
             part = slice(start, start + step)
-            apart = distances(layer.positions(poses.pose_matrices[part]), poses.positions[part]).astype(np.float64)
+            positions = layer.positions(poses.pose_matrices[part])
+            apart = distances(positions, poses.positions[part], metres_per_unit).astype(np.float64)
             squares, most = squares + float((apart**2).sum()), max(most, float(apart.max()))
         rms[name] = 1000 * (squares / (len(poses.positions) * fitted.vertex_count)) ** 0.5
         largest[name] = 1000 * most

@@ -108,11 +108,13 @@ class _Loop:
         targets = [p.coefficients / scale for p, scale in zip(partitions, self.scales, strict=True)]
         self.x, self.y = (_padded(arrays, split.training, device) for arrays in (inputs, targets))
         self.x_held, self.y_held = (_padded(arrays, split.validation, device) for arrays in (inputs, targets))
-        self.to_mm = torch.tensor([p.residual_rms * 1000 for p in partitions], device=device)[:, None]
+        self.to_mm = torch.tensor([p.residual_rms * p.mm_per_unit for p in partitions], device=device)[:, None]
         self.truncation_mm = torch.tensor(
-            np.stack([p.validation_truncation for p in partitions]) * 1000, dtype=torch.float32, device=device
+            np.stack([p.validation_truncation * p.mm_per_unit for p in partitions]),
+            dtype=torch.float32,
+            device=device,
         )
-        self.left_mm = torch.tensor([p.basis.truncation * 1000 for p in partitions], device=device)[:, None]
+        self.left_mm = torch.tensor([p.basis.truncation * p.mm_per_unit for p in partitions], device=device)[:, None]
         self.model = PartitionNetworks(
             [a.shape[1] for a in inputs],
             [a.shape[1] for a in targets],
@@ -158,7 +160,7 @@ class _Loop:
         drop_generator = torch.Generator(self.device).manual_seed(config.seed + 2)
         vertices = np.array([p.vertices for p in everything])
         constant = [p for p in everything if not len(p.basis.shapes)]
-        constant_mm = sum(float(p.validation_truncation.mean()) * 1000 * p.vertices for p in constant)
+        constant_mm = sum(float(p.validation_truncation.mean()) * p.mm_per_unit * p.vertices for p in constant)
         learning_vertices = np.array([p.vertices for p in self.partitions])
         for epoch in range(1, config.epochs + 1):
             order = torch.randperm(poses, generator=order_generator).to(self.device)

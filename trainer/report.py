@@ -62,7 +62,7 @@ def make_report(
                 **({"merged": [names[joint] for joint in partition.merged]} if partition.merged else {}),
                 "features": len(prepared.columns),
                 "basis": len(prepared.basis.shapes),
-                "truncation": prepared.basis.truncation * 1000,
+                "truncation": prepared.basis.truncation * prepared.mm_per_unit,
                 "training": error_statistics(on_training.fdda[:, own]).to_json(),
                 "held_out": error_statistics(held_out.fdda[:, own]).to_json(),
                 "linear": error_statistics(held_out.linear[:, own]).to_json(),

@@ -18,6 +18,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser("trainer.skin_fit", description="Fit skin weights to the poses in a folder.")
     parser.add_argument("folder", type=Path, help="folder that record made")
     parser.add_argument("kind", choices=("hard", "smooth"), help="one joint a vertex, or at most four")
+    parser.add_argument("--metres-per-unit", type=float, default=1.0, help="length of a unit of the mesh")
     options = parser.parse_args(arguments)
     announcer, stop = MessageLines(), StopRequest()
     return run_announced(lambda: _fit(options, announcer, stop), announcer)
@@ -28,7 +29,7 @@ def _fit(options: argparse.Namespace, announcer: Announcer, stop: StopRequest) -
         from .fitted_skin import fit_folder
     except ModuleNotFoundError as error:
         raise missing_package("Fitting skin weights", error) from error
-    fit_folder(options.folder, options.kind, announcer, stop)
+    fit_folder(options.folder, options.kind, announcer, stop, options.metres_per_unit)
 
 
 if __name__ == "__main__":

@@ -210,10 +210,10 @@ def _shorter(config: TrainingConfig) -> TrainingConfig:
 def _prepare(
     recording: Recording, inputs: Inputs, split: Split, config: TrainingConfig, should_stop: Callable[[], bool]
 ) -> list[PreparedPartition]:
-    prepared = []
+    prepared, metres_per_unit = [], recording.rig.metres_per_unit
     for partition in partitions_of(recording, inputs):
         _check_stop(should_stop)
-        prepared.append(prepare(partition, split, config.tolerance_mm, config.seed))
+        prepared.append(prepare(partition, split, config.tolerance_mm, config.seed, metres_per_unit))
     return prepared
 
 

@@ -100,7 +100,8 @@ def _errors(row: Row, scene_rig: SceneRig, network: Network) -> tuple[float, flo
     *_, evaluation = evaluate(scene_rig, network, HELD_OUT)
     held_out = evaluation.held_out
     moved = np.linalg.norm(held_out.positions - rest_positions(scene_rig.mesh_object.data), axis=-1)
-    return tuple(float(distances.mean()) * 1000 / row.unit for distances in (held_out.linear, held_out.fdda, moved))
+    moved *= network.info.metres_per_unit
+    return tuple(float(distances.mean()) * 1000 for distances in (held_out.linear, held_out.fdda, moved))
 
 
 def _play(rigs: list[SceneRig], networks: list[Network], channels: tuple[Channel, ...]) -> list[float]:

@@ -63,6 +63,7 @@ def check_flips(recording: Recording, scan: ResidualScan) -> list[RecordingWarni
     if not flips:
         return []
     worst, rig = max(flips, key=lambda flip: flip.jump), recording.rig
+    jump = length(rig, worst.jump)
     pairs = "1 pair" if worst.pairs == 1 else f"{worst.pairs} pairs"
     others = len(flips) - 1
     too = f"; {others} more {'partition jumps' if others == 1 else 'partitions jump'} too" if others else ""
@@ -71,7 +72,7 @@ def check_flips(recording: Recording, scan: ResidualScan) -> list[RecordingWarni
         where = f", '{rig.joints[worst.joint].name}' on the two sides of 180 degrees"
         advice = "keep its turn below 180 degrees, beyond which Preserve Volume turns the other way round"
     text = (
-        f"Vertices of '{joint_name(rig, recording.partitions[worst.partition].joint)}' jump up to {length(worst.jump)} "
+        f"Vertices of '{joint_name(rig, recording.partitions[worst.partition].joint)}' jump up to {jump} "
         f"between poses that are alike{where} ({pairs}, such as poses {worst.poses[0]} and {worst.poses[1]}){too}, and "
         f"no network follows a jump: {advice}, and record again."
     )

@@ -37,9 +37,10 @@ def repeated_poses(recording: Recording) -> np.ndarray:
     pairs = []
     for start in range(0, len(recording.pose_matrices), BATCH):
         part = slice(start, start + BATCH)
-        matrices, controls = recording.pose_matrices[part], recording.controls[part]
+        matrices, controls = np.array(recording.pose_matrices[part], np.float64), recording.controls[part]
+        matrices[..., :3, 3] *= recording.rig.metres_per_unit
         rows = np.concatenate([matrices.reshape(len(matrices), -1), controls], axis=1)
-        for pose, row in enumerate(np.round(rows.astype(np.float64) / SAME).astype(np.int64), start):
+        for pose, row in enumerate(np.round(rows / SAME).astype(np.int64), start):
             earlier = first.setdefault(hashlib.sha256(row.tobytes()).digest(), pose)
             if earlier != pose:
                 pairs.append((pose, earlier))
@@ -82,8 +83,8 @@ def _check_contradictions(recording: Recording, pairs: np.ndarray) -> list[Recor
         return []
     text = (
         f"Poses {worst[2]} and {worst[1]} have the same joints and controls and yet vertices lie up to "
-        f"{length(worst[0])} apart: something else moves the mesh, a property without a control, the frame or a "
-        "simulation; list it as a control, or switch it off, and record again."
+        f"{length(recording.rig, worst[0])} apart: something else moves the mesh, a property without a control, the "
+        "frame or a simulation; list it as a control, or switch it off, and record again."
     )
     return [RecordingWarning("hidden-inputs", text)]
 

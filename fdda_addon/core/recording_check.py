@@ -107,7 +107,7 @@ def _check_large(recording: Recording, scan: ResidualScan) -> list[RecordingWarn
         _, rms, own, name = max(large)
         text = (
             f"Residuals are larger than bones and vertices of {len(large)} of {len(recording.partitions)} partitions, "
-            f"most of '{name}', {length(rms)} rms where bone and vertices are {length(own)} long: {advice}"
+            f"most of '{name}', {length(rig, rms)} rms where bone and vertices are {length(rig, own)} long: {advice}"
         )
         return [RecordingWarning("large-residuals", text)]
     vertex = int(scan.largest.argmax())
@@ -115,8 +115,8 @@ def _check_large(recording: Recording, scan: ResidualScan) -> list[RecordingWarn
     if scan.largest[vertex] <= size:
         return []
     text = (
-        f"The residual of vertex {vertex} is {length(float(scan.largest[vertex]))} in pose "
-        f"{scan.largest_pose[vertex]}, and the character is {length(size)} large: {advice}"
+        f"The residual of vertex {vertex} is {length(rig, float(scan.largest[vertex]))} in pose "
+        f"{scan.largest_pose[vertex]}, and the character is {length(rig, size)} large: {advice}"
     )
     return [RecordingWarning("large-residuals", text)]
 

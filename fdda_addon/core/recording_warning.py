@@ -63,8 +63,9 @@ def joint_name(rig: Rig, joint: int) -> str:
     return rig.joints[joint].name or UNMOVED_LABEL
 
 
-def length(metres: float) -> str:
-    """A length for people: "0.04 mm", "87 mm", "1.2 m"."""
+def length(rig: Rig, units: float) -> str:
+    """A length in the space of a rig for people: "0.04 mm", "87 mm", "1.2 m"."""
+    metres = units * rig.metres_per_unit
     if metres < 1:
         return f"{metres * 1000:.2g} mm" if metres < 0.1 else f"{metres * 1000:.0f} mm"
     return f"{metres:.3g} m"

@@ -21,10 +21,11 @@ FAR = 0.1
 
 def check_rest(rig: Rig) -> list[RecordingWarning]:
     """Warnings "units" and "axes"."""
-    if not SMALLEST <= rig.size <= LARGEST:
+    if not SMALLEST <= rig.size * rig.metres_per_unit <= LARGEST:
         text = (
-            f"The mesh is {length(rig.size)} large; lengths count as metres here, so errors and tolerances in mm mean "
-            "little: scale the character to its true size in metres, apply the scale, and record again."
+            f"The mesh is {length(rig, rig.size)} large, so errors and tolerances in mm mean little: set the unit "
+            "scale of the scene to the unit that the character is built in (0.01 for centimetres), or scale it to its "
+            "true size, and record again."
         )
         return [RecordingWarning("units", text)]
     main = main_joints(rig.skin_joints, rig.skin_weights)
@@ -39,9 +40,10 @@ def check_rest(rig: Rig) -> list[RecordingWarning]:
     spans = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in (places, middles)]
     ratio = spans[1] / max(spans[0], 1e-9)
     if len(joints) > 2 and likeness > ALIKE and not 1 / SCALE_RATIO < ratio < SCALE_RATIO:
+        of_joints, of_vertices = (length(rig, span) for span in spans)
         text = (
-            f"The {len(joints)} joints that skin the mesh lie {length(spans[0])} apart and their vertices "
-            f"{length(spans[1])}, {_times(ratio)}: the scale of mesh or armature is not applied, or one was imported "
+            f"The {len(joints)} joints that skin the mesh lie {of_joints} apart and their vertices "
+            f"{of_vertices}, {_times(ratio)}: the scale of mesh or armature is not applied, or one was imported "
             "in another unit; give both one size in the rest pose and record again."
         )
         return [RecordingWarning("units", text)]
@@ -58,7 +60,7 @@ def check_rest(rig: Rig) -> list[RecordingWarning]:
     )
     text = (
         f"{outside} of the {len(joints)} joints that skin the mesh lie outside its bounds, and joints lie "
-        f"{length(float(np.median(apart)))} from the nearest vertex that follows them (median), {seen}: mesh and "
+        f"{length(rig, float(np.median(apart)))} from the nearest vertex that follows them (median), {seen}: mesh and "
         "armature do not match in the rest pose; bring them together, apply their transforms and record again."
     )
     return [RecordingWarning("axes", text)]

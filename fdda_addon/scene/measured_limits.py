@@ -21,6 +21,7 @@ from .motion_range import (
     stating_constraint,
 )
 from .scene_rig import SceneRig
+from .unit import metres_per_unit
 
 DEFAULT_MARGIN = 0.1
 """Part of the width of a measured range that is added at each end."""
@@ -134,7 +135,7 @@ def _state_without_holding(bone: bpy.types.PoseBone, kind: str, limits: list[Mea
 
 def limit_lines(armature_object: bpy.types.Object, limits: Iterable[MeasuredLimit]) -> list[str]:
     """A line for each bone, in degrees and millimetres."""
-    factors = {ROTATION: 180 / math.pi, LOCATION: 1000 * armature_object.matrix_world.median_scale, SCALE: 1.0}
+    factors = {ROTATION: 180 / math.pi, LOCATION: 1000 * metres_per_unit(armature_object), SCALE: 1.0}
     by_bone: dict[str, list[str]] = {}
     for limit in limits:
         (verb, unit, digits), factor = _WORDS[limit.kind], factors[limit.kind]

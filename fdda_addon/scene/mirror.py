@@ -9,6 +9,7 @@ import numpy as np
 
 from ..core.errors import RigError
 from .borrow import POSE_CHANNELS, set_value
+from .unit import metres_per_unit
 
 LEAST_DISTANCE, PART_OF_SIZE = 1e-3, 1e-3
 """Ends of bones may lie off their mirror image by one millimetre, or by this part of the armature's size if larger."""
@@ -84,8 +85,9 @@ def _check_symmetric(armature_object: bpy.types.Object, partners: np.ndarray) ->
     flip = np.diag([-1.0, 1.0, 1.0, 1.0])
     images = flip @ matrices[partners] @ flip
     ends = np.concatenate([matrices[:, :3, 3], tails])
-    tolerance = max(LEAST_DISTANCE, PART_OF_SIZE * float(np.ptp(ends, axis=0).max()))
-    off = np.maximum(
+    metres = metres_per_unit(armature_object)
+    tolerance = max(LEAST_DISTANCE, PART_OF_SIZE * metres * float(np.ptp(ends, axis=0).max()))
+    off = metres * np.maximum(
         np.linalg.norm(images[:, :3, 3] - matrices[:, :3, 3], axis=1),
         np.linalg.norm(tails[partners] * [-1, 1, 1] - tails, axis=1),
     )
@@ -93,7 +95,7 @@ def _check_symmetric(armature_object: bpy.types.Object, partners: np.ndarray) ->
     for number, bone in enumerate(bones):
         other = bones[int(partners[number])]
         if off[number] > tolerance:
-            what = f"by {off[number] * 1000 * armature_object.matrix_world.median_scale:.1f} mm"
+            what = f"by {off[number] * 1000:.1f} mm"
         elif turned[number] > AXIS_TOLERANCE:
             what = f"in roll or direction, by {np.degrees(2 * np.arcsin(min(1.0, turned[number] / 2))):.1f}°"
         elif armature_object.pose.bones[bone.name].rotation_mode != _mode(armature_object, other.name):

@@ -19,6 +19,7 @@ from .modifier_stack import check_evaluable, deforming_modifiers
 from .sampling import model_channels, sampled_channels
 from .scene_rig import MODIFIER_NAME, SceneRig, armature_modifier, armature_of, find_rig, is_flat
 from .skin import read_skin
+from .unit import metres_per_unit
 
 IDENTITY_TOLERANCE = 1e-6
 """Mesh and armature count as unmoved, one against the other, when no matrix element differs by more."""
@@ -53,16 +54,26 @@ def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None) -> Rig:
         Fingerprint.digest(rest_positions),
         Fingerprint.digest(skin_joints, skin_weights),
     )
-    return Rig(joints, rest_positions, rest.astype(np.float32), skin_joints, skin_weights, fingerprint, *faces)
+    return Rig(
+        joints,
+        rest_positions,
+        rest.astype(np.float32),
+        skin_joints,
+        skin_weights,
+        fingerprint,
+        *faces,
+        metres_per_unit=metres_per_unit(mesh_object),
+    )
 
 
 def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
-    """Read a rig with the joints and the controls of a model; `core.model.check_rig` says in what they differ.
+    """Read a rig with joints, controls and unit of a model; `core.model.check_rig` says in what they differ.
 
     Raises:
         RigError: as `read_rig`.
     """
-    return replace(read_rig(scene_rig, info.joint_names), controls=info.controls)
+    rig = read_rig(scene_rig, info.joint_names)
+    return replace(rig, controls=info.controls, metres_per_unit=info.metres_per_unit)
 
 
 def joint_rest_matrices(scene_rig: SceneRig, names: tuple[str, ...]) -> np.ndarray:

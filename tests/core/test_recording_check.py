@@ -42,6 +42,15 @@ def with_partitions(recording: Recording, **changes) -> Recording:
     return replace(recording, partitions=tuple(replace(p, **changes) for p in recording.partitions))
 
 
+def enlarged(recording: Recording, factor: float) -> Recording:
+    """The same character, so many times as large."""
+    rest, poses = recording.rig.rest_matrices.copy(), recording.pose_matrices.copy()
+    for matrices in (rest, poses):
+        matrices[..., :3, 3] *= factor
+    scaled = with_rig(recording, rest_matrices=rest, rest_positions=recording.rig.rest_positions * factor)
+    return replace(scaled, pose_matrices=poses, residuals=recording.residuals * factor)
+
+
 def with_sources(recording: Recording, *sources: Source) -> Recording:
     sampling = replace(recording.info.sampling, sources=sources)
     return replace(recording, info=replace(recording.info, sampling=sampling))
@@ -68,12 +77,19 @@ def test_a_mesh_in_another_unit(good):
 
 @pytest.mark.parametrize(("factor", "size"), [(200.0, "198 m"), (0.002, "2 mm")])
 def test_a_character_in_another_unit(good, factor, size):
-    rest, poses = good.rig.rest_matrices.copy(), good.pose_matrices.copy()
-    for matrices in (rest, poses):
-        matrices[..., :3, 3] *= factor
-    scaled = with_rig(good, rest_matrices=rest, rest_positions=good.rig.rest_positions * factor)
-    text = only(replace(scaled, pose_matrices=poses, residuals=good.residuals * factor), "units")
-    assert text.startswith(f"The mesh is {size} large; lengths count as metres")
+    text = only(enlarged(good, factor), "units")
+    assert text.startswith(f"The mesh is {size} large, so errors and tolerances in mm mean little: set the unit scale")
+
+
+@pytest.mark.parametrize("factor", [100.0, 200.0, 0.002])
+def test_a_character_of_its_true_size_in_another_unit(good, factor):
+    """Nothing is said of one built in centimetres where the scene or the object says that it is."""
+    assert check_recording(with_rig(enlarged(good, factor), metres_per_unit=1 / factor)) == []
+
+
+def test_a_character_of_another_size_in_its_unit(good):
+    text = only(with_rig(enlarged(good, 20_000.0), metres_per_unit=0.01), "units")
+    assert text.startswith("The mesh is 198 m large, ")
 
 
 @pytest.mark.parametrize(("axis", "angle"), [(0, 90), (0, -90), (1, 90), (1, -90), (0, 180)])
@@ -404,7 +420,13 @@ def test_warnings_are_sentences():
         and listed([1, 2, 3, 4, 5]) == "1, 2, 3 and 2 more"
     )
     assert counted([3], "pose") == "the pose 3" and counted(["a", "b"], "joint") == "the 2 joints 'a' and 'b'"
-    assert [length(m) for m in (0.00004, 0.0871, 0.25, 1.234)] == ["0.04 mm", "87 mm", "250 mm", "1.23 m"]
+
+
+def test_lengths_are_metres_in_any_unit(good):
+    words = ["0.04 mm", "87 mm", "250 mm", "1.23 m"]
+    for metres in (1.0, 0.01):
+        rig = with_rig(good, metres_per_unit=metres).rig
+        assert [length(rig, m / metres) for m in (0.00004, 0.0871, 0.25, 1.234)] == words
 
 
 def test_every_warning_is_documented():
