@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What random poses move, chosen in the sidebar: control bones in each way, and controls beside them."""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from blend_fixtures.characters import control_rigs, controls
+from fdda_addon.core.poses import CONTROL, LOCATION, ROTATION
+from fdda_addon.core.recording import Recording, read_index, read_recording
+from fdda_addon.operators.sampling import recording_settings
+from fdda_addon.panels import checks
+from fdda_addon.panels.poses import sampled_by_bone
+from fdda_addon.panels.recording import content_of
+from fdda_addon.panels.sampled import counted
+from fdda_addon.recording import planned_rig
+from fdda_addon.scene.compatibility import curves_of
+from fdda_addon.scene.control_names import resting_value, suggested_controls
+from fdda_addon.scene.rig import SceneRig, find_rig
+from fdda_addon.settings import recording_folder
+
+DEFORMING = ("upper", "lower")
+CONTROL_BONES = {"fk_upper", "fk_lower", "ik_hand", "ik_pole"}
+IK = 'armature_object/["ik"]'
+
+
+def saved(tmp_path: Path) -> SceneRig:
+    """The character of the scene, active, in a file of its own, with few poses to record."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
+    rig = find_rig()
+    bpy.context.view_layer.objects.active = rig.mesh_object
+    rig.mesh_object.fdda.settings.poses = 6
+    return rig
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> SceneRig:
+    """An arm that is posed by an IK and an FK chain, which its deforming bones copy."""
+    control_rigs.ik_fk()
+    return saved(tmp_path)
+
+
+@pytest.fixture
+def face(tmp_path: Path) -> SceneRig:
+    """Two shape keys that an animator sets by hand."""
+    controls.free_shape_keys()
+    return saved(tmp_path)
+
+
+def recorded(rig: SceneRig) -> Recording:
+    assert bpy.ops.fdda.record() == {"FINISHED"}
+    return read_recording(recording_folder(rig.mesh_object))
+
+
+def sampled_bones(recording: Recording) -> set[str]:
+    return {channel.bone for channel in recording.info.sampling.channels if channel.kind != CONTROL}
+
+
+def select(rig: SceneRig, *names: str) -> None:
+    for bone in rig.armature_object.pose.bones:
+        owner = bone if hasattr(bone, "select") else bone.bone
+        owner.select = bone.name in names
+
+
+def wave(rig: SceneRig) -> bpy.types.Action:
+    """An action that turns the lower bone of the FK chain about X, and blends to the IK chain; ticked."""
+    bone, action = rig.armature_object.pose.bones["fk_lower"], bpy.data.actions.new("wave")
+    rig.armature_object.animation_data_create().action = action
+    for frame, angle, ik in ((1, 0.0, 0.0), (11, 0.8, 0.5)):
+        bone.rotation_euler[0], rig.armature_object["ik"] = angle, ik
+        bone.keyframe_insert("rotation_euler", index=0, frame=frame)
+        rig.armature_object.keyframe_insert('["ik"]', frame=frame)
+    assert len(curves_of(action, rig.armature_object)) == 2
+    action.fdda.record = True
+    return action
+
+
+class TestBones:
+    def test_those_with_weights_where_nothing_is_chosen(self, arm):
+        assert recording_settings(arm).sample == ()
+        assert checks.check_now(arm).problems == ()
+        assert sampled_by_bone(arm) is None, "the list has the joints"
+
+    def test_a_bone_collection(self, arm):
+        settings = arm.mesh_object.fdda.settings
+        settings.sample = "COLLECTION"
+        assert checks.check_now(arm).problems == (
+            "Random poses are to move a bone collection, and none is chosen; choose it under Poses.",
+        )
+        with pytest.raises(RuntimeError, match="move a bone collection, and none is chosen"):
+            bpy.ops.fdda.record()
+        settings.bone_collection = control_rigs.CONTROLS
+        bpy.ops.fdda.add_control(name=IK)
+        check = checks.check_now(arm)
+        assert check.problems == () and set(sampled_by_bone(arm)) == CONTROL_BONES
+        assert check.rig.joint_names == DEFORMING
+        assert counted(check) == "4 bones in 8 channels and 1 control are sampled."
+        recording = recorded(arm)
+        assert recording.rig.joint_names == DEFORMING and sampled_bones(recording) == CONTROL_BONES
+        assert [control.name for control in recording.rig.controls] == [IK]
+        assert np.ptp(recording.controls, axis=0) > 0.1
+
+    def test_a_collection_that_is_gone(self, arm):
+        settings = arm.mesh_object.fdda.settings
+        settings.sample, settings.bone_collection = "COLLECTION", "Face"
+        assert checks.check_now(arm).problems == (
+            "'elbow_rig' has no bone collection 'Face'; its collections: 'Controls'.",
+        )
+
+    def test_what_the_ticked_actions_key(self, arm):
+        settings = arm.mesh_object.fdda.settings
+        settings.sample = "ACTIONS"
+        with pytest.raises(RuntimeError, match="what the ticked actions key, and none is ticked; tick one"):
+            bpy.ops.fdda.record()
+        action = wave(arm)
+        check = checks.check_now(arm)
+        assert check.problems == () and [control.name for control in check.found] == [IK]
+        (turn,) = sampled_by_bone(arm)["fk_lower"]
+        assert (turn.kind, turn.axis) == (ROTATION, 0)
+        recording = recorded(arm)
+        assert sampled_bones(recording) == {"fk_lower"}
+        assert [source.name for source in recording.info.sampling.sources] == ["", action.name]
+        (ik,) = (channel for channel in recording.info.sampling.channels if channel.kind == CONTROL)
+        assert (ik.low, ik.high) == pytest.approx((0.0, 0.5))
+
+    def test_the_bones_that_were_selected(self, arm):
+        settings = arm.mesh_object.fdda.settings
+        settings.sample = "SELECTED"
+        select(arm)
+        assert checks.check_now(arm).problems[0].endswith("select them and press Use Selected Bones.")
+        with pytest.raises(RuntimeError, match="No bone of 'elbow_rig' is selected; select bones in pose mode"):
+            bpy.ops.fdda.use_selected_bones()
+        select(arm, "ik_hand", "ik_pole")
+        assert bpy.ops.fdda.use_selected_bones() == {"FINISHED"}
+        select(arm, "fk_upper")
+        assert set(sampled_by_bone_now(arm)) == {"ik_hand", "ik_pole"}
+        arm.armature_object["ik"] = 1.0
+        recording = recorded(arm)
+        assert sampled_bones(recording) == {"ik_hand", "ik_pole"}, "not those that are selected later"
+        assert {channel.kind for channel in recording.info.sampling.channels} >= {LOCATION}
+        bpy.ops.wm.save_mainfile()
+        bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+        assert recording_settings(find_rig()).sample == ("bone:ik_hand", "bone:ik_pole")
+
+    def test_another_choice_is_another_recording(self, arm):
+        settings = arm.mesh_object.fdda.settings
+        settings.sample, settings.bone_collection = "COLLECTION", control_rigs.CONTROLS
+        recorded(arm)
+        checks.check_now(arm)
+        assert content_of(arm, recording_folder(arm.mesh_object)).sentence == ""
+        select(arm, "fk_upper")
+        bpy.ops.fdda.use_selected_bones()
+        checks.check_now(arm)
+        sentence = content_of(arm, recording_folder(arm.mesh_object)).sentence
+        assert sentence == "It was recorded with other settings than those above: range of motion."
+
+    def test_the_mesh_is_not_read_again_for_another_choice_of_control_bones(self, arm):
+        settings = arm.mesh_object.fdda.settings
+        settings.sample, settings.bone_collection = "COLLECTION", control_rigs.CONTROLS
+        first = checks.check_now(arm)
+        select(arm, "fk_upper")
+        bpy.ops.fdda.use_selected_bones()
+        again = checks.check_now(arm)
+        assert again.rig is first.rig and again.channels != first.channels
+
+
+def sampled_by_bone_now(rig: SceneRig) -> dict:
+    checks.check_now(rig)
+    return sampled_by_bone(rig)
+
+
+class TestPreview:
+    def test_what_is_shown_is_what_is_recorded(self, arm):
+        settings = arm.mesh_object.fdda.settings
+        settings.sample, settings.bone_collection = "COLLECTION", control_rigs.CONTROLS
+        bpy.ops.fdda.add_control(name=IK)
+        recording = recorded(arm)
+        names = recording.rig.joint_names
+        for number in (1, 4):
+            assert bpy.ops.fdda.preview_pose(number=number) == {"FINISHED"}
+            bpy.context.view_layer.update()
+            shown = [np.array(arm.armature_object.pose.bones[name].matrix) for name in names]
+            np.testing.assert_allclose(recording.pose_matrices[number], shown, atol=1e-5)
+            assert arm.armature_object["ik"] == pytest.approx(recording.controls[number, 0], abs=1e-6)
+
+    def test_the_rest_pose_puts_controls_back(self, face):
+        keys = face.mesh_object.data.shape_keys.key_blocks
+        bpy.ops.fdda.add_control(name="shape_keys")
+        bpy.ops.fdda.preview_pose(number=2)
+        assert keys["flexed"].value > 0 and keys["thin"].value != 0
+        assert bpy.ops.fdda.rest_pose() == {"FINISHED"}
+        assert keys["flexed"].value == keys["thin"].value == 0
+
+    def test_also_where_actions_alone_are_recorded(self, arm):
+        settings = arm.mesh_object.fdda.settings
+        settings.sample, settings.bone_collection, settings.poses = "COLLECTION", control_rigs.CONTROLS, 0
+        assert bpy.ops.fdda.preview_pose(number=1) == {"FINISHED"}
+
+
+class TestControls:
+    def test_a_shape_key_with_and_without_a_range(self, face):
+        assert bpy.ops.fdda.add_control(name="flexed") == {"FINISHED"}
+        assert bpy.ops.fdda.add_control(name="thin") == {"FINISHED"}
+        control = face.mesh_object.fdda.settings.controls["flexed"]
+        control.has_range, control.low, control.high = True, 0.25, 0.75
+        check = checks.check_now(face)
+        assert check.problems == () and check.found == ()
+        assert counted(check).endswith(" and 2 controls are sampled.")
+        recording = recorded(face)
+        ranges = {control.path: (control.low, control.high) for control in recording.rig.controls}
+        assert ranges == {'key_blocks["flexed"].value': (0.25, 0.75), 'key_blocks["thin"].value': (-0.5, 1.0)}
+        assert recording.controls[:, 0].min() >= 0.25 and recording.controls[:, 0].max() <= 0.75
+        assert np.ptp(recording.controls[:, 0]) > 0.1
+
+    def test_all_shape_keys(self, face):
+        assert bpy.ops.fdda.add_control(name="shape_keys") == {"FINISHED"}
+        with pytest.raises(RuntimeError, match="The control 'shape_keys' is in the list already"):
+            bpy.ops.fdda.add_control(name="shape_keys")
+        recorded(face)
+        index = read_index(recording_folder(face.mesh_object))
+        assert [control["path"] for control in index["controls"]] == [
+            'key_blocks["flexed"].value',
+            'key_blocks["thin"].value',
+        ]
+
+    def test_one_that_is_not_there_and_one_without_a_name(self, face):
+        with pytest.raises(RuntimeError, match="'elbow' has no control 'smile/'; give the name of a shape key"):
+            bpy.ops.fdda.add_control(name="smile")
+        settings = face.mesh_object.fdda.settings
+        assert bpy.ops.fdda.add_control() == {"FINISHED"}
+        assert checks.check_now(face).problems == (), "it is being filled in"
+        settings.controls[0].name = "smile"
+        assert checks.check_now(face).problems[0].startswith("'elbow' has no control 'smile/'")
+        assert bpy.ops.fdda.remove_control() == {"FINISHED"}
+        assert not settings.controls and checks.check_now(face).problems == ()
+        with pytest.raises(RuntimeError, match="No control is chosen; click one of the list"):
+            bpy.ops.fdda.remove_control()
+
+    def test_an_empty_range(self, face):
+        bpy.ops.fdda.add_control(name="thin")
+        control = face.mesh_object.fdda.settings.controls[0]
+        control.has_range, control.low, control.high = True, 1.0, 0.5
+        (problem,) = checks.check_now(face).problems
+        assert problem.startswith("The control 'shape_keys/key_blocks[\"thin\"].value' states no range; give one")
+
+    def test_those_that_drivers_read_are_found(self, tmp_path):
+        controls.custom_property()
+        rig = saved(tmp_path)
+        check = checks.check_now(rig)
+        assert [control.name for control in check.found] == ['armature_object/["flex"]']
+        _, channels = planned_rig(rig, recording_settings(rig))
+        assert channels == check.channels
+
+    def test_shape_keys_are_suggested_and_driven_ones_are_not(self, face):
+        assert suggested_controls(face)[:3] == ["shape_keys", "flexed", "thin"]
+        face.mesh_object.data.shape_keys.key_blocks["thin"].driver_add("value")
+        assert suggested_controls(face)[:2] == ["shape_keys", "flexed"] and "thin" not in suggested_controls(face)
+
+    def test_properties_are_suggested(self, arm):
+        arm.armature_object.pose.bones["fk_upper"]["follow"] = 1.0
+        names = suggested_controls(arm)
+        assert names == [IK, 'armature_object/pose.bones["fk_upper"]["follow"]']
+
+    def test_where_controls_rest(self, arm):
+        arm.armature_object.id_properties_ui("ik").update(default=0.25)
+        arm.armature_object["on"] = True
+        arm.armature_object.pose.bones["fk_upper"]["follow"] = 3
+        bone = 'armature_object/pose.bones["fk_upper"]'
+        assert resting_value(arm, IK) == 0.25
+        assert resting_value(arm, 'armature_object/["on"]') == 0
+        assert resting_value(arm, f"{bone}.scale[1]") == 1 and resting_value(arm, f"{bone}.location[1]") == 0
+        assert resting_value(arm, f'{bone}["follow"]') == 0
