@@ -51,8 +51,8 @@ class FDDA_UL_joints(bpy.types.UIList):
         return flags, []
 
     def draw_item(self, context: bpy.types.Context, layout: bpy.types.UILayout, _data, bone, _icon, _active, _name):
-        from ..scene.armature import is_moved_by_constraints
         from ..scene.motion_range import DEFAULT, rotation_ranges
+        from ..scene.sampling import is_moved_by_constraints
 
         row = layout.split(factor=0.4)
         rig = panel_rig(context)[0]
@@ -145,18 +145,22 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         layout.label(text="Range of motion about X, Y and Z")
         layout.template_list("FDDA_UL_joints", "", rig.armature_object.pose, "bones", session, "joint_index", rows=5)
         if 0 <= session.joint_index < len(bones):
-            _draw_bone(layout.box(), rig, bones[session.joint_index])
+            _draw_bone(layout, rig, bones[session.joint_index])
         sampled.draw_controls(layout, rig)
         _draw_random(layout, context, rig)
         _draw_actions(layout, context, rig)
 
 
-def _draw_bone(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
+def _draw_bone(layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
+    """The active bone; where others are chosen than those that are listed, none."""
     channels = sampled_by_bone(rig)
-    if channels is not None and rig.mesh_object.fdda.settings.sample == "ACTIONS" and bone.name in channels:
-        sampled.draw_channels(box, bone, channels[bone.name])
-    else:
-        _draw_ranges(box, rig, bone)
+    if channels is None:
+        _draw_ranges(layout.box(), rig, bone)
+    elif bone.name in channels:
+        if rig.mesh_object.fdda.settings.sample == "ACTIONS":
+            sampled.draw_channels(layout.box(), bone, channels[bone.name])
+        else:
+            _draw_ranges(layout.box(), rig, bone)
 
 
 def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
@@ -226,10 +230,10 @@ def _draw_actions(layout: bpy.types.UILayout, context: bpy.types.Context, rig: S
     session = context.window_manager.fdda
     layout.template_list("FDDA_UL_actions", "", bpy.data, "actions", session, "action_index", rows=min(4, len(fitting)))
     settings = rig.mesh_object.fdda.settings
-    row = layout.row()
-    row.enabled = any(action.fdda.record for action in fitting)
-    row.prop(settings, "mirror")
-    row.operator("fdda.limits_from_actions", icon="CON_ROTLIMIT")
+    column = layout.column()
+    column.enabled = any(action.fdda.record for action in fitting)
+    column.prop(settings, "mirror")
+    column.operator("fdda.limits_from_actions", icon="CON_ROTLIMIT")
     if not settings.poses and not any(action.fdda.record for action in fitting):
         draw_sentence(
             layout, context, "There is nothing to record: raise the number of poses, or tick an action.", "ERROR"
