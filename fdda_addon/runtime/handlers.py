@@ -11,7 +11,7 @@ from types import ModuleType
 import bpy
 from bpy.app.handlers import persistent
 
-_PLAYBACK = f"{__package__}.playback"
+_PLAYBACK, _RESTING = f"{__package__}.playback", f"{__package__}.resting"
 _count_without_bound = -1
 
 
@@ -31,10 +31,24 @@ def _playback() -> ModuleType | None:
 
 
 @persistent
+def _on_frame_begins(scene: bpy.types.Scene, *_: object) -> None:
+    if _PLAYBACK in sys.modules:
+        sys.modules[_PLAYBACK].rest(scene)
+
+
+@persistent
 def _on_evaluated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     # The graph that is handed in: a render evaluates one of its own.
     if playback := _playback():
         playback.evaluate(depsgraph)
+
+
+@persistent
+def _on_changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    _on_evaluated(scene, depsgraph)
+    if _RESTING in sys.modules:
+        # A simulation may have come.
+        sys.modules[_RESTING].forget()
 
 
 @persistent
@@ -100,8 +114,9 @@ def _pin_outside_renders(playback: ModuleType, pinned: bool) -> None:
 
 
 HANDLERS = {
+    "frame_change_pre": _on_frame_begins,
     "frame_change_post": _on_evaluated,
-    "depsgraph_update_post": _on_evaluated,
+    "depsgraph_update_post": _on_changed,
     "load_post": _on_reloaded,
     "undo_post": _on_reloaded,
     "redo_post": _on_reloaded,

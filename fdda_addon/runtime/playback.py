@@ -17,7 +17,7 @@ from ..core.rig import UNMOVED
 from ..core.skinning import LinearLayer
 from ..scene.controls import ControlReader
 from ..scene.rig import PoseReader, SceneRig, armature_of, is_flat, read_model_rig
-from . import nodes, switch
+from . import nodes, resting, switch
 from .model_files import network_of
 from .network import Network
 
@@ -165,11 +165,21 @@ def playing_objects() -> list[bpy.types.Object]:
     return [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_playing]
 
 
+def rest(scene: bpy.types.Scene) -> None:
+    """Before a frame is evaluated: let the models rest until their pose is known."""
+    resting.rest(scene, [o for o in _bound_objects() if o.fdda.mode != "RIG"])
+
+
+def _bound_objects() -> Iterator[bpy.types.Object]:
+    return (found for live in _live.values() if (found := live.find()) is not None)
+
+
 def evaluate(depsgraph: bpy.types.Depsgraph) -> None:
     """Move the meshes of all bound objects to the pose that a dependency graph has evaluated.
 
     Objects that share a model are evaluated in one call. What cannot play is switched back to its rig and says why.
     """
+    rested = resting.updated(depsgraph, resting.wake(depsgraph.scene, _bound_objects()))
     _scan()
     rendering = depsgraph.mode == "RENDER"
     jobs: dict[Network, list[_Job]] = {}
@@ -187,6 +197,9 @@ def evaluate(depsgraph: bpy.types.Depsgraph) -> None:
             pose = live.read_pose(mesh_object, depsgraph)
             if pose is not None and not live.is_shown((*(part.tobytes() for part in pose), strength)):
                 jobs.setdefault(live.network, []).append((live, mesh_object, pose, strength))
+            elif mesh_object in rested:
+                # The positions are those of this pose already; the mesh has not been given them in this frame.
+                live.find_cache(mesh_object).data.update_tag()
     for network, own in jobs.items():
         _move(network, own)
 
