@@ -24,7 +24,9 @@ class FDDA_UL_controls(bpy.types.UIList):
 
     def draw_item(self, _context: bpy.types.Context, layout: bpy.types.UILayout, _data, control, _icon, _active, _name):
         row = layout.row()
-        text = "All Shape Keys" if control.name == ALL_SHAPE_KEYS else control.name or "not named yet"
+        text = (
+            "All Shape Keys" if control.name == ALL_SHAPE_KEYS else control.name.rpartition("/")[2] or "not named yet"
+        )
         row.label(text=text, icon="SHAPEKEY_DATA" if "/" not in control.name else "DRIVER")
         side = row.row()
         side.alignment = "RIGHT"
@@ -59,10 +61,14 @@ def counted(check: "RigCheck") -> str:
     bones, controls = len({channel.bone for channel in channels}), len(check.channels) - len(channels)
     parts = []
     if bones:
-        parts.append(f"{bones} {'bone' if bones == 1 else 'bones'} in {len(channels)} channels")
+        parts.append(f"{_many(bones, 'bone')} ({_many(len(channels), 'channel')})")
     if controls:
-        parts.append(f"{controls} {'control' if controls == 1 else 'controls'}")
-    return f"{' and '.join(parts)} are sampled."
+        parts.append(_many(controls, "control"))
+    return f"Sampled: {' and '.join(parts)}."
+
+
+def _many(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def draw_channels(box: bpy.types.UILayout, bone: bpy.types.PoseBone, channels: "list[Channel]") -> None:
@@ -86,7 +92,7 @@ def draw_controls(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     """The controls that are listed, and those that were found."""
     settings, check = rig.mesh_object.fdda.settings, checks.known(rig)
     found = check.found if check is not None else ()
-    count = len(settings.controls) + len(found)
+    count = len(check.rig.controls) if check is not None and check.rig else len(settings.controls)
     header, body = layout.panel("fdda_controls", default_closed=True)
     header.label(text=f"Controls ({count})" if count else "Controls")
     if body is None:
@@ -101,7 +107,7 @@ def draw_controls(layout: bpy.types.UILayout, rig: SceneRig) -> None:
         column = body.column(align=True)
         column.prop(control, "name", text="")
         row = column.row(align=True)
-        row.prop(control, "has_range")
+        row.prop(control, "has_range", text="Range")
         fields = row.row(align=True)
         fields.active = control.has_range
         fields.prop(control, "low", text="")

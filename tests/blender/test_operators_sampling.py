@@ -96,7 +96,7 @@ class TestBones:
         check = checks.check_now(arm)
         assert check.problems == () and set(sampled_by_bone(arm)) == CONTROL_BONES
         assert check.rig.joint_names == DEFORMING
-        assert counted(check) == "4 bones in 8 channels and 1 control are sampled."
+        assert counted(check) == "Sampled: 4 bones (8 channels) and 1 control."
         recording = recorded(arm)
         assert recording.rig.joint_names == DEFORMING and sampled_bones(recording) == CONTROL_BONES
         assert [control.name for control in recording.rig.controls] == [IK]
@@ -207,7 +207,7 @@ class TestControls:
         control.has_range, control.low, control.high = True, 0.25, 0.75
         check = checks.check_now(face)
         assert check.problems == () and check.found == ()
-        assert counted(check).endswith(" and 2 controls are sampled.")
+        assert counted(check).endswith(" channels) and 2 controls.")
         recording = recorded(face)
         ranges = {control.path: (control.low, control.high) for control in recording.rig.controls}
         assert ranges == {'key_blocks["flexed"].value': (0.25, 0.75), 'key_blocks["thin"].value': (-0.5, 1.0)}
