@@ -43,7 +43,7 @@ class Row:
     build: Callable[[], object]
     recording: RecordingSettings = field(default_factory=lambda: _recording())
     meshes: tuple[str, ...] = ("elbow",)
-    epochs: int = 100
+    epochs: int = 60
     is_linear: bool = False
     is_linked: bool = False
     unit: float = 1.0

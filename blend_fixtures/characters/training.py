@@ -8,6 +8,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
@@ -37,14 +38,14 @@ class Trainings:
     def __exit__(self, kind: type | None, *_: object) -> None:
         if kind is not None:
             self._process.terminate()
-        try:
+        with suppress(BrokenPipeError):
             self._process.stdin.close()
-        finally:
-            status = self._process.wait()
-            self._errors.seek(0)
-            text = self._errors.read()
-            self._errors.close()
-        if kind is None and status:
+        status = self._process.wait()
+        self._errors.seek(0)
+        text = self._errors.read()
+        self._errors.close()
+        # What is not read any more is not the reason.
+        if status and (kind is None or issubclass(kind, BrokenPipeError)):
             raise RuntimeError(f"the trainings ended with status {status}: {text}")
 
 
