@@ -4,6 +4,7 @@
 Nothing is evaluated and the scene is not touched.
 """
 
+import hashlib
 import re
 from collections.abc import Iterable, Iterator
 
@@ -29,8 +30,28 @@ _REST = {
 }
 """What an action leaves a channel at that it does not key."""
 
+_OF_KEY = (
+    ("co", 2, np.float32),
+    ("handle_left", 2, np.float32),
+    ("handle_right", 2, np.float32),
+    ("interpolation", 1, np.int32),
+    ("easing", 1, np.int32),
+    ("amplitude", 1, np.float32),
+    ("back", 1, np.float32),
+    ("period", 1, np.float32),
+)
+"""What a curve between its keys follows from: property, values a key, type."""
+MOST_MEASURED = 100
+"""So many actions are kept as they were measured."""
+
+Ranges = dict[tuple[str, str, int], tuple[float, float]]
+"""Lowest and highest value by bone, kind and axis."""
+
 Curves = dict[str, dict[int, bpy.types.FCurve]]
 """F-curves of a bone by channel and index."""
+
+_measured: dict[tuple[int, int], tuple[tuple | None, Ranges]] = {}
+"""By session_uid of the armature object and of the action: what was measured, and of which keys."""
 
 
 def action_frames(action: bpy.types.Action) -> range:
@@ -39,9 +60,7 @@ def action_frames(action: bpy.types.Action) -> range:
     return range(first, last + 1)
 
 
-def measured_ranges(
-    armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action]
-) -> dict[tuple[str, str, int], tuple[float, float]]:
+def measured_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action]) -> Ranges:
     """How far actions move the bones of an armature, over all their whole frames.
 
     Args:
@@ -53,14 +72,49 @@ def measured_ranges(
         Euler angles as `armature.Poser` sets them (in the order of the bone, of quaternions and axis angles XYZ, and
         turning on beyond a half turn), `LOCATION` in metres and `SCALE` as factors, relative to the rest pose.
     """
-    found: dict[tuple[str, str, int], tuple[float, float]] = {}
+    found: Ranges = {}
     for action in actions:
-        frames = action_frames(action)
-        for bone, curves in _curves_by_bone(armature_object, action).items():
-            for kind, axis, values in _channels(armature_object.pose.bones[bone], curves, frames):
-                low, high = found.get((bone, kind, axis), (np.inf, -np.inf))
-                found[bone, kind, axis] = min(low, float(values.min())), max(high, float(values.max()))
+        for key, (low, high) in _ranges_of(armature_object, action).items():
+            lowest, highest = found.get(key, (np.inf, -np.inf))
+            found[key] = min(lowest, low), max(highest, high)
     return {key: (low, high) for key, (low, high) in found.items() if high - low > RANGE_TOLERANCE}
+
+
+def _ranges_of(armature_object: bpy.types.Object, action: bpy.types.Action) -> Ranges:
+    """Ranges of an action; measured again when its keys have changed, for one of many bones takes a second."""
+    frames, curves = action_frames(action), _curves_by_bone(armature_object, action)
+    content = _content(armature_object, frames, curves)
+    place = armature_object.session_uid, action.session_uid
+    if content is None or _measured.get(place, (None,))[0] != content:
+        found = {
+            (bone, kind, axis): (float(values.min()), float(values.max()))
+            for bone, own in curves.items()
+            for kind, axis, values in _channels(armature_object.pose.bones[bone], own, frames)
+        }
+        if len(_measured) >= MOST_MEASURED:
+            _measured.clear()
+        _measured[place] = content, found
+    return _measured[place][1]
+
+
+def _content(
+    armature_object: bpy.types.Object, frames: range, curves: dict[str, Curves]
+) -> tuple[range, bytes, tuple] | None:
+    """What ranges follow from; None where that is more than the keys."""
+    digest, places = hashlib.sha256(), []
+    for bone, channels in curves.items():
+        for channel, by_index in channels.items():
+            for index, curve in by_index.items():
+                points = curve.keyframe_points
+                if curve.modifiers or not points:
+                    return None
+                places.append((bone, armature_object.pose.bones[bone].rotation_mode, channel, index, len(points)))
+                places.append((curve.extrapolation, curve.mute))
+                for name, size, kind in _OF_KEY:
+                    values = np.empty(len(points) * size, kind)
+                    points.foreach_get(name, values)
+                    digest.update(values)
+    return frames, digest.digest(), tuple(places)
 
 
 def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> tuple[Control, ...]:

@@ -125,6 +125,30 @@ class TestBones:
         (ik,) = (channel for channel in recording.info.sampling.channels if channel.kind == CONTROL)
         assert (ik.low, ik.high) == pytest.approx((0.0, 0.5))
 
+    def test_the_ranges_follow_the_keys(self, arm):
+        arm.mesh_object.fdda.settings.sample = "ACTIONS"
+        action = wave(arm)
+        bone = arm.armature_object.pose.bones["fk_lower"]
+        bone.constraints.remove(bone.constraints[0])
+        bone.lock_rotation = (False, False, False)
+
+        def turn() -> tuple[float, float]:
+            (channel,) = sampled_by_bone_now(arm)["fk_lower"]
+            return channel.low, channel.high
+
+        assert turn() == pytest.approx((0.0, 0.8))
+        assert turn() == pytest.approx((0.0, 0.8)), "measured once"
+        curve = next(c for c in curves_of(action, arm.armature_object) if c.data_path.endswith("rotation_euler"))
+        curve.keyframe_points[1].co[1] = 0.4
+        curve.update()
+        assert turn() == pytest.approx((0.0, 0.4))
+        for point in curve.keyframe_points:
+            point.interpolation, point.back = "BACK", 3.0
+        assert turn()[0] < -0.01 or turn()[1] > 0.41, "it overshoots between the keys"
+        modifier = curve.modifiers.new("GENERATOR")
+        modifier.coefficients = (0.0, 0.1)
+        assert turn() == pytest.approx((0.1, 1.1)), "a modifier of the curve counts as well"
+
     def test_the_bones_that_were_selected(self, arm):
         settings = arm.mesh_object.fdda.settings
         settings.sample = "SELECTED"
