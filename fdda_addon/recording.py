@@ -1,30 +1,30 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Turns poses of a rig into a recording."""
 
-import contextlib
-from collections.abc import Callable, Container, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
-import numpy as np
 
+from .appender import Appender, append_poses
 from .core.errors import RecordingError
 from .core.output import check_folder_writable
-from .core.partition import GOLDEN_RATIO, INFLUENCE_TOLERANCE, LEAST_VERTICES, merged_partitions
+from .core.partition import GOLDEN_RATIO, INFLUENCE_TOLERANCE, LEAST_VERTICES
 from .core.poses import DEFAULT_SPREAD, Channel, sample_pose
 from .core.progress import Progress
 from .core.recording import RecordingInfo, Sampling, Source
-from .core.recording_extension import RecordingExtension
+from .core.recording_estimate import check_room, recording_bytes
 from .core.recording_index import RANDOM
 from .core.recording_writer import RecordingWriter
 from .core.rig import Rig
 from .core.skinning import LinearLayer
-from .influences import Search, find_influences
-from .residuals import local_residuals
-from .scene.armature import Poser
-from .scene.borrowed_rig import borrowed_rig
+from .influences import Search
+from .mesh_group import common_armature, controls_of_each, in_passes
+from .pose_plan import PosePlan
+from .recorder import Recorder, estimate, in_turn
+from .scene.borrowed_rig import borrowed_rigs
 from .scene.clip import Clip, find_clips
 from .scene.clip_player import ClipPlayer
 from .scene.controls import stated_controls
@@ -32,10 +32,6 @@ from .scene.dependencies import read_dependencies
 from .scene.rig import PoseEvaluator, SceneRig, check_evaluable, read_rig, sampled_channels
 from .scene.sampling import Choice, choose
 from .weight_fitting import check_has_weights, fit_weights, poses_to_fit, recorded_weights
-
-BATCH_BYTES = 6 << 20
-BATCH_POSES = 250
-"""Poses go to the disk in batches of at most this size, so that an interruption loses little."""
 
 INFLUENCE_SEED_OFFSET = 1 << 32
 """Poses of the influence detection are drawn from indices that no pose of a recording reaches."""
@@ -87,73 +83,105 @@ def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iter
 
     Yields:
         Progress of the stages "influences" and "poses", before them "poses to fit" and "fit" where weights are fitted.
+        The first of the poses has a note of what they will take.
 
     Raises:
         RigError: the rig cannot be recorded.
         TrainingError: weights are to be fitted, and the trainer's Python cannot.
         RecordingError: there is a recording already, or the one to resume is of something else.
-        OutputError: the folder cannot be written.
+        OutputError: the folder cannot be written, or the disk lacks the room.
     """
-    clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
+    return record_meshes([(scene_rig, path)], settings)
+
+
+def record_meshes(rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSettings) -> Iterator[Progress]:
+    """As `record`, of several meshes on one armature, each into a folder of its own.
+
+    They share the poses, and each pose is evaluated once for all meshes that can be evaluated together (`in_passes`).
+
+    Raises:
+        RigError: as `record`, or the meshes follow different armatures.
+    """
+    meshes = [scene_rig for scene_rig, _ in rigs]
+    clips = find_clips(common_armature(meshes), settings.actions, settings.strips, settings.mirror)
     if settings.mirror and not clips:
         raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
-    check_evaluable(scene_rig)
-    rig, channels = planned_rig(scene_rig, settings)
-    check_folder_writable(path)
-    sampling = planned_sampling(scene_rig, settings, channels)
-    total = sum(source.poses for source in sampling.sources)
-    if total < 1:
+    controls = [settings.controls] if len(rigs) == 1 else controls_of_each(meshes, settings.controls)
+    recorders = []
+    for (scene_rig, path), own in zip(rigs, controls, strict=True):
+        check_evaluable(scene_rig)
+        rig, channels = planned_rig(scene_rig, replace(settings, controls=own))
+        check_folder_writable(path)
+        recorders.append(Recorder(scene_rig, rig, path, channels))
+    channels = [(recorder.scene_rig, recorder.channels) for recorder in recorders]
+    plan = PosePlan(channels, settings.poses, settings.seed, settings.spread, clips)
+    if plan.total < 1:
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
-    info = RecordingInfo(
-        total, 0, Path(bpy.data.filepath).name, scene_rig.mesh_object.name, bpy.app.version_string, sampling
+    check_room([(recorder.path, recording_bytes(recorder.rig, plan.total)) for recorder in recorders])
+    for number, recorder in enumerate(recorders):
+        recorder.limits = plan.channels_of(number)
+    posed = [recorder.posed for recorder in recorders]
+    with borrowed_rigs(posed, clips) if settings.fit_linear else nullcontext() as player:
+        yield from in_turn(recorders, lambda recorder: _fit(recorder, settings, plan, player))
+    for numbers in in_passes(meshes):
+        together = [recorders[number] for number in numbers]
+        others = [own for number, own in enumerate(posed) if number not in numbers]
+        with borrowed_rigs([recorder.posed for recorder in together], clips, others) as player:
+            yield from in_turn(together, lambda recorder: _find_influences(recorder, settings, clips, player))
+            yield from _record_poses(together, settings, plan, player)
+
+
+def _fit(recorder: Recorder, settings: RecordingSettings, plan: PosePlan, player: ClipPlayer) -> Iterator[Progress]:
+    """Give the rig the weights that its linear layer is to have."""
+    if settings.resume and (recorded := recorded_weights(recorder.path, recorder.rig, settings.fit_linear)):
+        recorder.rig, recorder.fit = recorded
+        return
+    if not settings.fit_linear:
+        check_has_weights(recorder.scene_rig, recorder.rig)
+        return
+    numbers = poses_to_fit(plan.total, recorder.rig.vertex_count)
+    posed = plan.poses(player, frozenset(numbers))
+    evaluator = PoseEvaluator(recorder.scene_rig, recorder.rig)
+    recorder.rig, recorder.fit = yield from fit_weights(
+        recorder.rig, settings.fit_linear, posed, len(numbers), evaluator
     )
 
-    def poses(player: ClipPlayer, wanted: Container[int]) -> Iterator[None]:
-        return _poses(scene_rig, channels, settings, clips, player, wanted)
 
-    rig, fit = yield from _linear_layer(scene_rig, rig, channels, path, settings, poses)
-    with borrowed_rig(scene_rig, rig, channels, clips) as player:
-        evaluator = PoseEvaluator(scene_rig, rig)
-        search = Search(
-            channels,
-            lambda number: sample_pose(channels, settings.seed, INFLUENCE_SEED_OFFSET + number, settings.spread),
-            lambda number: _show_frame(player, clips, number),
-            player.stop,
-            settings.influence_poses,
-            settings.influence_tolerance,
-        )
-        cut = merged_partitions(rig, settings.least_vertices)
-        partitions = yield from find_influences(scene_rig, rig, cut, evaluator, search)
-        layer = LinearLayer(rig, partitions)
-        with RecordingWriter(path, rig, partitions, replace(info, fit=fit), settings.resume) as writer:
-            yield Progress("poses", writer.complete, total)
-            left = poses(player, range(writer.complete, total))
-            # Closed before the writer: what was evaluated is kept when the recording is broken off.
-            with contextlib.closing(append_poses(left, evaluator, layer, writer)) as steps:
-                for done in steps:
-                    yield Progress("poses", done, total)
-
-
-def _linear_layer(
-    scene_rig: SceneRig,
-    rig: Rig,
-    channels: tuple[Channel, ...],
-    path: Path,
-    settings: RecordingSettings,
-    poses: Callable[[ClipPlayer, Container[int]], Iterator[None]],
+def _find_influences(
+    recorder: Recorder, settings: RecordingSettings, clips: tuple[Clip, ...], player: ClipPlayer
 ) -> Iterator[Progress]:
-    """Returns the rig with the weights that its linear layer is to have, and the SkinFit, None for those of the rig."""
-    if settings.resume and (recorded := recorded_weights(path, rig, settings.fit_linear)):
-        return recorded
-    if not settings.fit_linear:
-        check_has_weights(scene_rig, rig)
-        return rig, None
-    sampling = planned_sampling(scene_rig, settings, channels)
-    numbers = poses_to_fit(sum(source.poses for source in sampling.sources), rig.vertex_count)
-    clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
-    with borrowed_rig(scene_rig, rig, channels, clips) as player:
-        posed = poses(player, frozenset(numbers))
-        return (yield from fit_weights(rig, settings.fit_linear, posed, len(numbers), PoseEvaluator(scene_rig, rig)))
+    """Find what influences the partitions of a mesh; what moves it alone is moved, not what moves others."""
+    channels = recorder.channels
+    search = Search(
+        channels,
+        lambda number: sample_pose(channels, settings.seed, INFLUENCE_SEED_OFFSET + number, settings.spread),
+        lambda number: _show_frame(player, clips, number),
+        player.stop,
+        settings.influence_poses,
+        settings.influence_tolerance,
+    )
+    yield from recorder.find_influences(search, settings.least_vertices)
+
+
+def _record_poses(
+    recorders: list[Recorder], settings: RecordingSettings, plan: PosePlan, player: ClipPlayer
+) -> Iterator[Progress]:
+    with ExitStack() as stack:
+        appenders = []
+        for recorder in recorders:
+            sampling = planned_sampling(recorder.scene_rig, settings, recorder.limits)
+            file, version = Path(bpy.data.filepath).name, bpy.app.version_string
+            info = RecordingInfo(plan.total, 0, file, recorder.name, version, sampling, recorder.fit)
+            rig, partitions = recorder.rig, recorder.partitions
+            writer = stack.enter_context(RecordingWriter(recorder.path, rig, partitions, info, settings.resume))
+            appenders.append(Appender(recorder.evaluator, LinearLayer(rig, partitions), writer))
+        first = min(appender.done for appender in appenders)
+        yield Progress("poses", first, plan.total, estimate(recorders, plan.total, plan.total - first))
+        left = plan.poses(player, range(first, plan.total))
+        # Closed before the writers: what was evaluated is kept when the recording is broken off.
+        with closing(append_poses(left, appenders)) as steps:
+            for done in steps:
+                yield Progress("poses", done, plan.total)
 
 
 def planned_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
@@ -194,73 +222,6 @@ def planned_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels:
     clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
     sources += [clip.source for clip in clips]
     return Sampling(settings.seed, settings.spread, channels if settings.poses else (), tuple(sources))
-
-
-def _poses(
-    scene_rig: SceneRig,
-    channels: tuple[Channel, ...],
-    settings: RecordingSettings,
-    clips: tuple[Clip, ...],
-    player: ClipPlayer,
-    wanted: Container[int],
-) -> Iterator[None]:
-    """Pose the rig, one pose an iteration, as in the poses of the recording that are wanted, by their numbers."""
-    poser = Poser(scene_rig, channels)
-    for index in range(settings.poses):
-        if index in wanted:
-            poser.set(sample_pose(channels, settings.seed, index, settings.spread))
-            yield
-    frames = ((clip, frame) for clip in clips for frame in clip.frames)
-    for index, (clip, frame) in enumerate(frames, settings.poses):
-        if index in wanted:
-            player.show(clip, frame)
-            yield
-
-
-def append_poses(
-    poses: Iterator[None],
-    evaluator: PoseEvaluator,
-    layer: LinearLayer,
-    writer: RecordingWriter | RecordingExtension,
-) -> Iterator[int]:
-    """Evaluate poses and append them to the recording in batches, one pose an iteration; how many it has is yielded.
-
-    When it is closed, the poses that were evaluated are appended.
-    """
-    size = max(1, min(BATCH_POSES, BATCH_BYTES // (layer.rig.vertex_count * 12)))
-    done = writer.complete
-    with ThreadPoolExecutor(max_workers=1) as appending:
-        # While a batch is turned into residuals and written, Blender evaluates the next one.
-        previous: Future | None = None
-        batch: list[tuple] = []
-        try:
-            for _ in poses:
-                batch.append(evaluator.evaluate())
-                done += 1
-                if len(batch) == size:
-                    if previous is not None:
-                        previous.result()
-                    previous = appending.submit(_append, writer, layer, batch)
-                    batch = []
-                yield done
-        except GeneratorExit:
-            _append_last(previous, writer, layer, batch)
-            raise
-        _append_last(previous, writer, layer, batch)
-
-
-def _append_last(
-    previous: Future | None, writer: RecordingWriter | RecordingExtension, layer: LinearLayer, batch: list[tuple]
-) -> None:
-    if previous is not None:
-        previous.result()
-    if batch:
-        _append(writer, layer, batch)
-
-
-def _append(writer: RecordingWriter | RecordingExtension, layer: LinearLayer, batch: list[tuple]) -> None:
-    pose_matrices, positions, controls = (np.stack(arrays) for arrays in zip(*batch, strict=True))
-    writer.append(pose_matrices, local_residuals(layer, pose_matrices, positions), controls)
 
 
 def _show_frame(player: ClipPlayer, clips: tuple[Clip, ...], number: int) -> None:

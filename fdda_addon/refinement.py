@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .appender import Appender, append_poses
 from .core.errors import RecordingError
 from .core.features import joint_features
 from .core.metrics import distances
@@ -19,7 +20,6 @@ from .core.recording_extension import RecordingExtension
 from .core.refinement import Probes, choose_poses, nearest_distances
 from .core.rig import Rig, differences
 from .core.skinning import LinearLayer
-from .recording import append_poses
 from .runtime.network import Network
 from .scene.armature import Poser
 from .scene.borrowed_rig import borrowed_rig
@@ -93,7 +93,7 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         with RecordingExtension(recording, model.name) as extension:
             posed = (poser.set(pose) for pose in chosen)
             layer = LinearLayer(recording.rig, recording.partitions)
-            with contextlib.closing(append_poses(posed, evaluator, layer, extension)) as steps:
+            with contextlib.closing(append_poses(posed, [Appender(evaluator, layer, extension)])) as steps:
                 for done in steps:
                     yield Progress("poses", done - first, settings.poses)
 

@@ -13,8 +13,13 @@ from ..scene.rig import SceneRig, find_rig
 
 def add_rig_options(parser: argparse.ArgumentParser) -> None:
     """The rig file and its object."""
-    parser.add_argument("rig", metavar="RIG.blend", type=Path, help="the file with the rig")
+    add_rig(parser)
     parser.add_argument("--object", default="", metavar="NAME", help="the mesh object, when several have a rig")
+
+
+def add_rig(parser: argparse.ArgumentParser) -> None:
+    """The rig file alone."""
+    parser.add_argument("rig", metavar="RIG.blend", type=Path, help="the file with the rig")
 
 
 def open_rig(options: argparse.Namespace) -> SceneRig:
@@ -42,4 +47,4 @@ def open_file(path: Path) -> None:
         raise FDDAError(f"Blender cannot open '{path}' ({reason(error)}); give a .blend file.") from error
 
 
-__all__ = ["add_rig_options", "open_file", "open_rig", "quiet", "save_copy"]
+__all__ = ["add_rig", "add_rig_options", "open_file", "open_rig", "quiet", "save_copy"]

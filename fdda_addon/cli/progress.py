@@ -28,7 +28,7 @@ class ProgressPrinter:
         """
         raise_pending()
         if stage != self._stage:
-            self._end_line()
+            self.end_line()
             self._stage, self._part, self._start = stage, -1, time.monotonic()
         seconds = time.monotonic() - self._start
         note = f"  {note}" if note else ""
@@ -44,11 +44,12 @@ class ProgressPrinter:
 
     def say(self, text: str) -> None:
         """Print a line of its own."""
-        self._end_line()
+        self.end_line()
         self._stream.write(f"{text}\n")
         self._stream.flush()
 
-    def _end_line(self) -> None:
+    def end_line(self) -> None:
+        """End the line of a bar, so that something else can be printed."""
         if self._open:
             self._stream.write("\n")
             self._stream.flush()
@@ -58,4 +59,4 @@ class ProgressPrinter:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._end_line()
+        self.end_line()

@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`record RIG.blend RECORDING`: random poses and their residuals, or more of them where a model is worst."""
+"""`record RIG.blend RECORDING`: random poses and their residuals, or more of them where a model is worst.
+
+With `--all`, or with several `--object`, the meshes share the poses, each with a recording of its own in the folder.
+"""
 
 import argparse
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,9 +19,21 @@ if TYPE_CHECKING:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     from ..core.partition import LEAST_VERTICES
-    from .files import add_rig_options
+    from .files import add_rig
 
-    add_rig_options(parser)
+    add_rig(parser)
+    parser.add_argument(
+        "--object",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="the mesh object, when several have a rig; given several times, each is recorded into a folder of its own",
+    )
+    parser.add_argument(
+        "--all",
+        action="store_true",
+        help="record every mesh that an armature deforms, each into a folder of its own in RECORDING",
+    )
     parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
     parser.add_argument("--poses", type=int, help="number of random poses (default 1000, with --refine 250)")
     parser.add_argument("--seed", type=int, default=0, help="of the random poses (default 0)")
@@ -71,7 +87,7 @@ def run(options: argparse.Namespace) -> None:
     from ..core.recording_check import merges_in_words
     from ..core.recording_index import read_index, read_info
     from ..runtime.binding import true_rig
-    from .files import open_rig
+    from .files import open_file
     from .progress import ProgressPrinter
 
     if (options.poses or 0) < 0 or options.seed < 0 or options.least_vertices < 0:
@@ -93,29 +109,55 @@ def run(options: argparse.Namespace) -> None:
             "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --sample, "
             "--control, --fit-linear and --resume out."
         )
-    scene_rig = open_rig(options)
+    if options.refine and (options.all or len(options.object) > 1):
+        raise WrongUsageError("--refine takes one mesh; give --object NAME once, and the recording and model of it.")
+    if options.all and options.object:
+        raise WrongUsageError("--all records all meshes, and --object those that it names; give one of them.")
+    open_file(options.rig)
+    rigs = _rigs(options)
     start = time.monotonic()
-    with ProgressPrinter() as progress, true_rig(scene_rig.mesh_object):
-        for step in _steps(scene_rig, options):
+    with ProgressPrinter() as progress, ExitStack() as stack:
+        for scene_rig, _ in rigs:
+            stack.enter_context(true_rig(scene_rig.mesh_object))
+        for step in _steps(rigs, options):
+            if step.note:
+                progress.end_line()
+                print(step.note, flush=True)
             progress.show(step.stage, step.done, step.total)
-    if not options.refine:
-        index = read_index(options.recording)
-        if options.fit_linear:
-            print(read_info(index).fit.sentence())
-        if line := merges_in_words(index, options.least_vertices):
-            print(line)
-    added = "added " if options.refine else ""
-    print(f"{options.recording}: {step.total} poses {added}in {time.monotonic() - start:.1f} s")
+    seconds = time.monotonic() - start
+    for _, recording in rigs:
+        if not options.refine:
+            index = read_index(recording)
+            if options.fit_linear:
+                print(read_info(index).fit.sentence())
+            if line := merges_in_words(index, options.least_vertices):
+                print(line)
+        added = "added " if options.refine else ""
+        print(f"{recording}: {step.total} poses {added}in {seconds:.1f} s")
 
 
-def _steps(scene_rig: "SceneRig", options: argparse.Namespace) -> "Iterator[Progress]":
-    from ..recording import RecordingSettings, record
+def _rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":
+    """The meshes to record, each with the folder of its recording."""
+    from ..scene.rig import find_rig
+    from ..scene.scene_rig import find_rigs
+    from .folders import mesh_folders
+
+    names = list(dict.fromkeys(options.object))
+    if options.all:
+        return mesh_folders(find_rigs(), options.recording)
+    if len(names) > 1:
+        return mesh_folders([find_rig(name) for name in names], options.recording)
+    return [(find_rig(*names), options.recording)]
+
+
+def _steps(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> "Iterator[Progress]":
+    from ..recording import RecordingSettings, record_meshes
     from ..refinement import RefinementSettings, refine
 
     given = {} if options.poses is None else {"poses": options.poses}
     if options.refine:
         settings = RefinementSettings(seed=options.seed, **given)
-        return refine(scene_rig, options.recording, options.refine, settings)
+        return refine(rigs[0][0], options.recording, options.refine, settings)
     settings = RecordingSettings(
         seed=options.seed,
         spread=options.spread,
@@ -129,4 +171,4 @@ def _steps(scene_rig: "SceneRig", options: argparse.Namespace) -> "Iterator[Prog
         mirror=options.mirror,
         **given,
     )
-    return record(scene_rig, options.recording, settings)
+    return record_meshes(rigs, settings)

@@ -26,6 +26,8 @@ POSITIONS_OUTPUT = "positions"
 TRUST_OUTPUT = "trust"
 LIMITS = "limits"
 """Key of `ModelInfo.training`."""
+OBJECT = "object"
+"""Key of `ModelInfo.training`."""
 MAX_BYTES = 2 << 30
 
 
@@ -94,6 +96,12 @@ class ModelInfo:
     def limits(self) -> tuple[Channel, ...]:
         """The range of motion that random poses were drawn from; empty where there were none, or nobody knows."""
         return tuple(Channel(**channel) for channel in self.training.get(LIMITS, ()))
+
+    @property
+    def object_name(self) -> str:
+        """Name of the mesh object that was recorded; empty where nobody knows."""
+        name = self.training.get(OBJECT, "")
+        return name if isinstance(name, str) else ""
 
     def to_json(self) -> str:
         """The text of the metadata property."""

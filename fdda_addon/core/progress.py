@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Progress:
-    """`done` of `total` steps of the stage are done."""
+    """`done` of `total` steps of the stage are done; `note` is a sentence for the user, where there is one to say."""
 
     stage: str
     done: int
     total: int
+    note: str = ""

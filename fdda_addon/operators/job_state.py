@@ -73,6 +73,8 @@ class JobState:
         if progress.stage != self.stage:
             self.stage, self._stage_start = progress.stage, (time.monotonic(), progress.done)
         self.done, self.total = progress.done, progress.total
+        if progress.note:
+            self.log.append(progress.note)
 
 
 _states: dict[str, JobState] = {}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""All of a rig that posing it changes, borrowed at once."""
+"""All of a rig that posing it changes, borrowed at once; or of several that follow one armature."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 
 from ..core.poses import CONTROL, Channel
 from ..core.rig import Rig
@@ -14,29 +14,43 @@ from .controls import borrowed_controls
 from .modifier_stack import borrowed_stack
 from .scene_rig import SceneRig
 
+Posed = tuple[SceneRig, Rig, tuple[Channel, ...]]
+"""A rig, and the channels of the random poses that it will be brought to."""
+
 
 @contextmanager
 def borrowed_rig(
     scene_rig: SceneRig, rig: Rig, channels: tuple[Channel, ...] = (), clips: tuple[Clip, ...] = ()
 ) -> Iterator[ClipPlayer]:
-    """Give back the modifiers, the pose, the controls, the animation and the frame. Inside, the rig is at rest.
+    """As `borrowed_rigs`, of one rig."""
+    with borrowed_rigs([(scene_rig, rig, channels)], clips) as player:
+        yield player
+
+
+@contextmanager
+def borrowed_rigs(
+    rigs: Sequence[Posed], clips: tuple[Clip, ...] = (), beside: Sequence[Posed] = ()
+) -> Iterator[ClipPlayer]:
+    """Give back the modifiers, the pose, the controls, the animation and the frame. Inside, the rigs are at rest.
 
     Args:
-        scene_rig, rig: the rig.
-        channels: of the random poses that it will be brought to.
-        clips: that it will be posed by, with the player that is yielded.
+        rigs: of one armature object.
+        clips: that they will be posed by, with the player that is yielded.
+        beside: rigs that the poses move too, whose modifiers stay as they are.
 
     Raises:
-        RigError: a clip is to be mirrored, and the rig is not the same on both sides.
+        RigError: a clip is to be mirrored, and a rig is not the same on both sides.
     """
-    controls = control_names(rig, channels)
-    with (
-        played_clips(scene_rig, clips, controls) as player,
-        borrowed_stack(scene_rig.mesh_object),
-        borrowed_pose(scene_rig.armature_object, clip_actions(scene_rig, clips)),
-        borrowed_controls(scene_rig, controls),
-    ):
-        clear_pose(scene_rig.armature_object)
+    armature_object = rigs[0][0].armature_object
+    controlled = [(scene_rig, control_names(rig, channels)) for scene_rig, rig, channels in (*rigs, *beside)]
+    with ExitStack() as stack:
+        player = stack.enter_context(played_clips(controlled, clips))
+        for scene_rig, _, _ in rigs:
+            stack.enter_context(borrowed_stack(scene_rig.mesh_object))
+        stack.enter_context(borrowed_pose(armature_object, clip_actions(armature_object, clips)))
+        for scene_rig, names in controlled:
+            stack.enter_context(borrowed_controls(scene_rig, names))
+        clear_pose(armature_object)
         yield player
 
 

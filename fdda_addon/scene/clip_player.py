@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Shows the frames of clips: lets an action or the NLA drive all datablocks of a rig, and gives everything back."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 import bpy
@@ -18,6 +18,9 @@ from .scene_rig import SceneRig
 Numbers = dict[tuple[bpy.types.ID, str], object]
 """Values by datablock and RNA path."""
 
+Controlled = Sequence[tuple[SceneRig, Iterable[str]]]
+"""Rigs of one armature, each with the names of the controls that something else sets between frames."""
+
 
 class ClipPlayer:
     """Shows frames of clips; each depends on its clip and number alone, not on what was shown before.
@@ -26,33 +29,33 @@ class ClipPlayer:
     shape keys, the mesh object and the armature's data as well, where it has F-curves for them.
     """
 
-    def __init__(self, scene_rig: SceneRig, clips: tuple[Clip, ...], controls: Iterable[str]):
+    def __init__(self, rigs: Controlled, clips: tuple[Clip, ...]):
         """Args:
-            scene_rig: the rig.
+            rigs: the rigs.
             clips: that will be shown.
-            controls: names of the controls that something else sets in between.
 
         Raises:
             RigError: a clip is to be mirrored, and the rig is not the same on both sides.
         """
-        self._scene_rig, self._clip = scene_rig, None
-        self._others = [d for d in _others(scene_rig) if any(_drives(clip, d) for clip in clips)]
+        self._armature_object, self._clip = rigs[0][0].armature_object, None
+        self._others = [d for d in _others(rigs) if any(_drives(clip, d) for clip in clips)]
         self._idle: list[tuple] | None = None
         animated = {
             (datablock, path): value
-            for datablock in (scene_rig.armature_object, *self._others)
-            for path, value in animated_values(datablock, _actions(scene_rig, clips, datablock)).items()
+            for datablock in (self._armature_object, *self._others)
+            for path, value in animated_values(datablock, _actions(clips, datablock)).items()
             if not _is_channel(path)
         }
         self._mirror = None
         if any(clip.is_mirrored for clip in clips):
-            self._mirror = Mirror(scene_rig.armature_object, animated)
+            self._mirror = Mirror(self._armature_object, animated)
             animated |= {(datablock, path): datablock.path_resolve(path) for datablock, path in self._mirror.numbers}
         self._numbers: Numbers = animated
-        self._controls: dict[str, float] = {}
-        for name in controls:
-            owner, _, path = name.partition("/")
-            self._controls[name] = owner_of(scene_rig, owner).path_resolve(path)
+        self._controls: list[tuple[SceneRig, str, float]] = []
+        for scene_rig, names in rigs:
+            for name in names:
+                owner, _, path = name.partition("/")
+                self._controls.append((scene_rig, name, owner_of(scene_rig, owner).path_resolve(path)))
 
     def show(self, clip: Clip, frame: int) -> None:
         """Go to a frame of a clip. The armature has no animation of its own meanwhile (`borrowed_pose`)."""
@@ -74,7 +77,7 @@ class ClipPlayer:
         """Let nothing drive the rig; it is at rest, its numbers as in the file."""
         if self._clip is not None:
             self._clip = None
-            animation = self._scene_rig.armature_object.animation_data
+            animation = self._armature_object.animation_data
             if animation is not None:
                 animation.use_nla, animation.action = False, None
             for datablock, state in zip(self._others, self._idle, strict=True):
@@ -87,7 +90,7 @@ class ClipPlayer:
             self._idle = [_state(datablock) for datablock in self._others]
         self._clip = clip
         self._reset()
-        driven = [d for d in (self._scene_rig.armature_object, *self._others) if _drives(clip, d)]
+        driven = [d for d in (self._armature_object, *self._others) if _drives(clip, d)]
         for datablock in driven:
             if clip.kind == ACTION:
                 assign_action(datablock, bpy.data.actions[clip.name])
@@ -95,30 +98,30 @@ class ClipPlayer:
                 datablock.animation_data.action, datablock.animation_data.use_nla = None, True
 
     def _reset(self) -> None:
-        clear_pose(self._scene_rig.armature_object)
+        clear_pose(self._armature_object)
         self.give_back_numbers()
 
     def give_back_numbers(self) -> None:
         """Set the numbers to what they are in the file."""
         for (datablock, path), value in self._numbers.items():
             set_value(datablock, path, value)
-        for name, value in self._controls.items():
-            set_control(self._scene_rig, name, value)
+        for scene_rig, name, value in self._controls:
+            set_control(scene_rig, name, value)
         for datablock in {datablock for datablock, _ in self._numbers}:
             datablock.update_tag()
 
 
 @contextmanager
-def played_clips(scene_rig: SceneRig, clips: tuple[Clip, ...], controls: Iterable[str] = ()) -> Iterator[ClipPlayer]:
-    """Play clips, and give back what animates the datablocks of a rig and the numbers that the clips animate.
+def played_clips(rigs: Controlled, clips: tuple[Clip, ...]) -> Iterator[ClipPlayer]:
+    """Play clips, and give back what animates the datablocks of rigs and the numbers that the clips animate.
 
     It is entered before `borrowed_pose`, which gives back the armature object's own animation and the frame.
 
     Raises:
         RigError: as `ClipPlayer`.
     """
-    player = ClipPlayer(scene_rig, clips, controls)
-    states = [(datablock, _state(datablock)) for datablock in _others(scene_rig)]
+    player = ClipPlayer(rigs, clips)
+    states = [(datablock, _state(datablock)) for datablock in _others(rigs)]
     try:
         yield player
     finally:
@@ -130,19 +133,20 @@ def played_clips(scene_rig: SceneRig, clips: tuple[Clip, ...], controls: Iterabl
         bpy.context.view_layer.update()
 
 
-def clip_actions(scene_rig: SceneRig, clips: tuple[Clip, ...]) -> list[bpy.types.Action]:
+def clip_actions(armature_object: bpy.types.Object, clips: tuple[Clip, ...]) -> list[bpy.types.Action]:
     """The actions that drive the armature object while clips are shown, for `borrowed_pose`."""
-    return _actions(scene_rig, clips, scene_rig.armature_object)
+    return _actions(clips, armature_object)
 
 
-def _others(scene_rig: SceneRig) -> list[bpy.types.ID]:
-    """The datablocks of a rig beside the armature object."""
-    mesh_object = scene_rig.mesh_object
-    found = (scene_rig.armature_object.data, mesh_object, mesh_object.data.shape_keys)
-    return [datablock for datablock in found if datablock is not None]
+def _others(rigs: Controlled) -> list[bpy.types.ID]:
+    """The datablocks of rigs beside the armature object, each once."""
+    meshes = [scene_rig.mesh_object for scene_rig, _ in rigs]
+    found = [rigs[0][0].armature_object.data]
+    found += [datablock for mesh_object in meshes for datablock in (mesh_object, mesh_object.data.shape_keys)]
+    return list(dict.fromkeys(datablock for datablock in found if datablock is not None))
 
 
-def _actions(scene_rig: SceneRig, clips: tuple[Clip, ...], datablock: bpy.types.ID) -> list[bpy.types.Action]:
+def _actions(clips: tuple[Clip, ...], datablock: bpy.types.ID) -> list[bpy.types.Action]:
     actions = [bpy.data.actions[clip.name] for clip in clips if clip.kind == ACTION]
     if datablock.animation_data is not None and any(clip.kind != ACTION for clip in clips):
         actions += driving_actions(datablock.animation_data)

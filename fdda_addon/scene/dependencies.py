@@ -66,6 +66,11 @@ def _objects(scene_rig: SceneRig) -> list[bpy.types.Object]:
     return found
 
 
+def read_meshes(scene_rig: SceneRig) -> list[bpy.types.Object]:
+    """The other mesh objects that deform a mesh."""
+    return [found for found in _objects(scene_rig)[1:] if found.type == "MESH"]
+
+
 def _bones_that_move(scene_rig: SceneRig, scene_object: bpy.types.Object) -> set[str]:
     """Bones of the armature that an object follows or is deformed by."""
     armature_object, bones = scene_rig.armature_object, scene_rig.armature_object.data.bones

@@ -55,6 +55,16 @@ def find_rig(name: str = "") -> SceneRig:
     return SceneRig(rigged[0], armature_of(rigged[0]))
 
 
+def find_rigs() -> list[SceneRig]:
+    """Find all rigs of the current scene: the meshes with an Armature modifier, in the order of the scene.
+
+    Raises:
+        RigError: there is none.
+    """
+    rigged = [o for o in bpy.context.scene.objects if o.type == "MESH" and armature_modifier(o) is not None]
+    return [SceneRig(o, armature_of(o)) for o in rigged] or [find_rig()]
+
+
 def is_flat(scene_object: bpy.types.Object) -> bool:
     """Whether an object has a scale of zero along an axis, its own or its parents'."""
     return abs(scene_object.matrix_world.to_3x3().determinant()) < SMALLEST_VOLUME

@@ -84,7 +84,9 @@ def test_an_impossible_setting_fails(elbow, tmp_path, capfd):
 def test_record_prints_lines_where_there_is_no_terminal(elbow, tmp_path, capfd):
     assert run("record", elbow.rig, tmp_path / "r", "--poses", 20, "--seed", 4, "--action", "elbow_wave") == 0
     captured = capfd.readouterr()
-    assert captured.out.startswith(f"{tmp_path / 'r'}: 50 poses in ") and captured.out.count("\n") == 1
+    estimate, done = captured.out.splitlines()
+    assert estimate.startswith("50 poses of 300 vertices: less than 1 MB on the disk, about ")
+    assert done.startswith(f"{tmp_path / 'r'}: 50 poses in ")
     lines = captured.err.splitlines()
     assert lines[0].startswith("influences: 1 of 30, ") and lines[10].startswith("influences: 30 of 30, ")
     assert lines[11].startswith("poses: 0 of 50, ") and lines[-1].startswith("poses: 50 of 50, ")

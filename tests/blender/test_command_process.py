@@ -12,9 +12,9 @@ import pytest
 from conftest import run
 from refusals import files
 
+from fdda_addon.appender import BATCH_POSES
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.recording import read_index
-from fdda_addon.recording import BATCH_POSES
 
 ROOT = Path(__file__).resolve().parents[2]
 

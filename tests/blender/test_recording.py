@@ -2,17 +2,19 @@
 """Recording the elbow: the residuals are those of what Blender shows, from any pose, for any object transform."""
 
 import json
+import re
 
 import bpy
 import numpy as np
 import pytest
 from scene_state import drain, fresh_elbow
 
+from fdda_addon.appender import BATCH_POSES
 from fdda_addon.core.errors import RecordingError, RigError
 from fdda_addon.core.poses import sample_pose
 from fdda_addon.core.recording import Recording, read_index, read_recording
 from fdda_addon.core.skinning import LinearLayer
-from fdda_addon.recording import BATCH_POSES, Progress, RecordingSettings, record
+from fdda_addon.recording import Progress, RecordingSettings, record
 from fdda_addon.scene.armature import Poser
 from fdda_addon.scene.mesh import evaluated_positions
 from fdda_addon.scene.rig import PoseReader, SceneRig, read_rig, sampled_channels
@@ -179,7 +181,10 @@ def test_progress(fresh, tmp_path):
     steps = list(record(fresh, tmp_path / "r", RecordingSettings(poses=poses, influence_poses=4)))
     # 4 times: a base pose, then each of the 2 joints moved.
     assert steps[:12] == [Progress("influences", done, 12) for done in range(1, 13)]
-    assert steps[12:] == [Progress("poses", done, poses) for done in range(poses + 1)]
+    first, *others = steps[12:]
+    assert (first.stage, first.done, first.total) == ("poses", 0, poses)
+    assert re.fullmatch(r"255 poses of 300 vertices: less than 1 MB on the disk, about (a|\d+) seconds?", first.note)
+    assert others == [Progress("poses", done, poses) for done in range(1, poses + 1)]
 
 
 def test_a_recording_that_is_closed_keeps_its_poses(fresh, tmp_path):
