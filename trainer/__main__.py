@@ -24,16 +24,32 @@ def main(arguments: list[str] | None = None) -> int:
 def _train(options: argparse.Namespace, announcer: Announcer, stop: StopRequest) -> None:
     config = config_from_arguments(options)
     try:
+        from fdda_addon.core.recording_folder import recordings_in
+
+        from .several import check_several, train_models
+
+        if recordings := recordings_in(options.recording):
+            check_several(recordings, options.model)
         from .training import train_model
     except ModuleNotFoundError as error:
         raise missing_package("Training", error) from error
-    train_model(options.recording, options.model, config, announcer, stop, options.warm_start, options.strict)
+    settings = (config, announcer, stop, options.warm_start, options.strict)
+    if recordings:
+        train_models(recordings, options.model, *settings)
+    else:
+        train_model(options.recording, options.model, *settings)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("trainer", description="Train a model from a recording.")
-    parser.add_argument("recording", type=Path, help="folder that record made")
-    parser.add_argument("model", type=Path, help="the .onnx file to write; the report is written beside it")
+    parser.add_argument(
+        "recording", type=Path, help="folder that record made, or one with a recording for each of several meshes"
+    )
+    parser.add_argument(
+        "model",
+        type=Path,
+        help="the .onnx file to write, its report beside it; a folder for the models of several meshes",
+    )
     parser.add_argument(
         "--messages", action="store_true", help="JSON messages on stdout, for a program, in place of text"
     )

@@ -6,6 +6,7 @@ from typing import Protocol
 
 from fdda_addon.core.messages import Message, MessageType
 
+WROTE = "Wrote '{model}': held-out error {held_out_mm:.4f} mm, {seconds:.1f} s."
 LINE_EVERY = 0.1
 """Where the output is no terminal, a line of text follows this part of the epochs."""
 
@@ -43,7 +44,8 @@ class Text:
             MessageType.STARTED: "Training {partitions} partitions, {vertices} vertices, {poses} poses, on {device}.",
             MessageType.PARTITION_FINISHED: "  {joint}: {basis} shapes, held-out error {held_out_mm:.4f} mm",
             MessageType.LOG: "{text}",
-            MessageType.FINISHED: "Wrote '{model}': held-out error {held_out_mm:.4f} mm, {seconds:.1f} s.",
+            MessageType.MODEL_FINISHED: WROTE,
+            MessageType.FINISHED: WROTE,
             MessageType.CANCELLED: "Cancelled; nothing was written.",
         }.get(kind)
         if text:

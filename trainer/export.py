@@ -15,6 +15,7 @@ from fdda_addon.core.model import (
     CONTROLS_INPUT,
     LIMITS,
     METADATA_KEY,
+    OBJECT,
     POSE_INPUT,
     POSITIONS_OUTPUT,
     SKIN_KEY,
@@ -195,7 +196,7 @@ def model_info(recording: Recording, deformation: Deformation, held_out: np.ndar
         deformation.trust.controls,
         error_statistics(held_out).to_json(),
         0.0,
-        {**training, LIMITS: recording.info.sampling.to_json()["limits"]},
+        {**training, OBJECT: recording.info.object_name, LIMITS: recording.info.sampling.to_json()["limits"]},
         rig.metres_per_unit,
     )
 

@@ -15,6 +15,7 @@ from fdda_addon.core.messages import MessageType
 from fdda_addon.core.output import check_writable, write_json, write_text
 from fdda_addon.core.recording import Recording, read_recording
 from fdda_addon.core.recording_check import check_recording
+from fdda_addon.core.recording_estimate import sizes_in_words
 from fdda_addon.core.recording_warning import RecordingWarning, refuse
 from fdda_addon.core.rig import UNMOVED_LABEL
 
@@ -78,10 +79,11 @@ def train_model(
         vertices=recording.rig.vertex_count,
         device=str(device),
     )
+    announcer.say(MessageType.LOG, text=sizes_in_words(recording))
     warnings = _check(recording, announcer, strict)
     _check_stop(should_stop)
     inputs = inputs_of_rig(recording.rig, middles(recording.rig, recording.partitions), recording.partitions)
-    prepared = _prepare(recording, inputs, split, config, should_stop)
+    prepared = _prepare(recording, inputs, split, config, announcer, should_stop)
     seen = [columns[partition.columns] for columns, partition in zip(inputs.columns, prepared, strict=True)]
     trained = train(
         prepared,
@@ -208,12 +210,18 @@ def _shorter(config: TrainingConfig) -> TrainingConfig:
 
 
 def _prepare(
-    recording: Recording, inputs: Inputs, split: Split, config: TrainingConfig, should_stop: Callable[[], bool]
+    recording: Recording,
+    inputs: Inputs,
+    split: Split,
+    config: TrainingConfig,
+    announcer: Announcer,
+    should_stop: Callable[[], bool],
 ) -> list[PreparedPartition]:
     prepared, metres_per_unit = [], recording.rig.metres_per_unit
     for partition in partitions_of(recording, inputs):
         _check_stop(should_stop)
         prepared.append(prepare(partition, split, config.tolerance_mm, config.seed, metres_per_unit))
+        announcer.say(MessageType.PREPARING, done=len(prepared), total=len(recording.partitions))
     return prepared
 
 

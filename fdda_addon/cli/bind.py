@@ -1,56 +1,81 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`bind RIG.blend MODEL.onnx OUT.blend`: a file in which the model plays."""
+"""`bind RIG.blend MODEL.onnx OUT.blend`: a file in which the model plays, or each model of a folder of models."""
 
 import argparse
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..scene.rig import SceneRig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     from .files import add_rig_options
 
     add_rig_options(parser)
-    parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model")
+    parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="where to save the bound file")
     parser.add_argument("--use-in-render", action="store_true", help="final renders use the model too, not the rig")
 
 
 def run(options: argparse.Namespace) -> None:
-    import bpy
-
-    from ..core.errors import ModelError, OutputError
-    from ..core.output import check_writable, replacing
-    from ..model_list import bound_entry
-    from ..models import adopt
-    from ..runtime.binding import bind
-    from .files import open_rig, save_copy
+    from ..core.errors import FDDAError
+    from ..core.output import check_writable
+    from .files import save_copy
+    from .folders import open_rigs
 
     check_writable(options.out)
-    scene_rig = open_rig(options)
-    bind(scene_rig, options.model, options.use_in_render)
+    bound = list(open_rigs(options).values())
+    for scene_rig, model in bound:
+        _bind(scene_rig, model, options.use_in_render)
+    copied: dict[Path, Path] = {}
+    try:
+        for scene_rig, model in bound:
+            place = _put_beside(scene_rig, model, options.out)
+            if place != model:
+                copied[place] = model
+        save_copy(options.out)
+    except FDDAError:
+        for place in copied:
+            place.unlink()
+        raise
+    for place, model in copied.items():
+        print(f"{place}: a copy of {model}, beside the file that plays it")
+    for scene_rig, model in bound:
+        print(f"{options.out}: '{scene_rig.mesh_object.name}' plays {model.name}")
+
+
+def _bind(scene_rig: "SceneRig", model: Path, use_in_render: bool) -> None:
+    import bpy
+
+    from ..core.errors import ModelError
+    from ..runtime.binding import bind
+
+    bind(scene_rig, model, use_in_render)
     # What cannot play says so here and not when the file is opened.
     bpy.context.view_layer.update()
     if scene_rig.mesh_object.fdda.status:
         raise ModelError(scene_rig.mesh_object.fdda.status)
-    model = beside(options.model, options.out)
+
+
+def _put_beside(scene_rig: "SceneRig", model: Path, out: Path) -> Path:
+    """Let the bound object find its model from the file; returns the copy if one was made, else the model."""
+    from ..core.output import replacing
+    from ..model_list import bound_entry
+    from ..models import adopt
+
+    place = beside(model, out)
     binding = scene_rig.mesh_object.fdda
     adopt(scene_rig.mesh_object)
     entry = bound_entry(scene_rig.mesh_object)
-    binding.model = "//" + model.resolve().relative_to(options.out.resolve().parent).as_posix()
+    binding.model = "//" + place.resolve().relative_to(out.resolve().parent).as_posix()
     entry.path = binding.model
-    copied = not model.exists()
-    if copied:
-        with replacing(model) as temporary:
-            temporary.write_bytes(options.model.read_bytes())
-    try:
-        save_copy(options.out)
-    except OutputError:
-        if copied:
-            model.unlink()
-        raise
-    if copied:
-        print(f"{model}: a copy of {options.model}, beside the file that plays it")
-    print(f"{options.out}: '{scene_rig.mesh_object.name}' plays {model.name}")
+    if place.exists():
+        return model
+    with replacing(place) as temporary:
+        temporary.write_bytes(model.read_bytes())
+    return place
 
 
 def beside(model: Path, out: Path) -> Path:

@@ -10,13 +10,14 @@ from ..evaluation import Evaluation, EvaluationSettings, evaluate
 from ..recording import Progress
 from ..runtime.binding import true_rig
 from ..scene.rig import SceneRig
-from .files import add_rig_options, open_rig
+from .files import add_rig_options
+from .folders import by_object, headed, open_rigs
 from .progress import ProgressPrinter
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_rig_options(parser)
-    parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model")
+    parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
     parser.add_argument("--json", metavar="OUT.json", type=Path, required=True, help="where to write the errors")
     parser.add_argument(
         "--poses", type=int, default=200, help="number of held-out poses (default 200), 0 for actions alone"
@@ -40,17 +41,23 @@ def run(options: argparse.Namespace) -> None:
     check_writable(options.json)
     if options.heatmap:
         check_writable(options.heatmap)
-    scene_rig = open_rig(options)
+    rigs = open_rigs(options)
+    if options.heatmap and len(rigs) > 1:
+        raise WrongUsageError(
+            f"--heatmap draws one mesh, and '{options.model}' holds models of several; give --object."
+        )
     settings = EvaluationSettings(
         options.poses, options.seed, tuple(options.action), tuple(options.beyond), strips=tuple(options.strip)
     )
-    evaluation = run_evaluation(scene_rig, options.model, settings)
+    evaluations = {name: run_evaluation(*rig_and_model, settings) for name, rig_and_model in rigs.items()}
     if options.heatmap:
         from ..pictures import draw_comparison, worst_poses
 
-        draw_comparison(scene_rig, options.model, worst_poses(evaluation.held_out), options.heatmap, heat=True)
-    write_json(options.json, evaluation.to_json())
-    print(table(evaluation))
+        ((name, (scene_rig, model)),) = rigs.items()
+        draw_comparison(scene_rig, model, worst_poses(evaluations[name].held_out), options.heatmap, heat=True)
+    write_json(options.json, by_object({name: evaluation.to_json() for name, evaluation in evaluations.items()}))
+    for name, evaluation in evaluations.items():
+        print(headed(name, table(evaluation)))
 
 
 def run_evaluation(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> Evaluation:

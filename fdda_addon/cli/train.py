@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """`train RECORDING MODEL.onnx …`: the trainer with its own options, started in the Python that has torch.
 
-With `--refine RIG.blend` it goes on by itself: while the target is missed and more poses help, it adds poses to the
-recording where the model is worst, and trains on.
+RECORDING may be a folder of recordings, and MODEL.onnx is then the folder of their models. With `--refine RIG.blend` it
+goes on by itself: while the target is missed and more poses help, it adds poses to the recording where the model is
+worst, and trains on.
 """
 
 import argparse
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from ..core.errors import WrongUsageError
 from ..core.messages import MessageType
+from ..core.recording_folder import recordings_in
 from ..training import Training, trainer_command
 from .progress import ProgressPrinter
 from .registration import registered
@@ -59,15 +61,28 @@ def _train(arguments: list[str]) -> tuple[int, dict]:
     with Training(arguments) as training, ProgressPrinter() as progress:
         for message in training.messages():
             values = message.values
-            if message.type is MessageType.PROGRESS:
+            if message.type is MessageType.PREPARING:
+                progress.show("preparation", values["done"], values["total"])
+            elif message.type is MessageType.PROGRESS:
                 note = f"validation {values['validation_mm']:.4f} mm"
                 progress.show("training", values["epoch"], values["epochs"], note)
             elif message.type is MessageType.LOG:
                 progress.say(values["text"])
+            elif message.type is MessageType.MODEL_FINISHED:
+                progress.end_line()
+                print(_line(values), flush=True)
             elif message.type is MessageType.CANCELLED:
                 return INTERRUPTED, values
-    print(f"{values['model']}: trained in {values['seconds']:.1f} s, held-out error {values['held_out_mm']:.4f} mm")
+    if models := values.get("models"):
+        print(f"{values['model']}: {models} models in {values['seconds']:.1f} s")
+    else:
+        print(_line(values))
     return 0, values
+
+
+def _line(values: dict) -> str:
+    """About a model that is trained."""
+    return f"{values['model']}: trained in {values['seconds']:.1f} s, held-out error {values['held_out_mm']:.4f} mm"
 
 
 def _train_to_target(arguments: list[str], options: argparse.Namespace) -> int:
@@ -77,6 +92,11 @@ def _train_to_target(arguments: list[str], options: argparse.Namespace) -> int:
     if not any(argument.partition("=")[0] == TARGET for argument in arguments):
         raise WrongUsageError(f"--refine trains until a target is met; say which with {TARGET}.")
     recording, model = map(Path, arguments[:2])
+    if recordings_in(recording):
+        raise WrongUsageError(
+            f"--refine takes one mesh, and '{recording}' holds recordings of several; give one of them, its model and "
+            "--object NAME."
+        )
     with registered():
         # Before the first training: a wrong path or object shows at once.
         _open_rig(options)

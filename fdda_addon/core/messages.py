@@ -16,6 +16,8 @@ class MessageType(enum.Enum):
 
     STARTED = "started"
     """partitions: int, poses: int, vertices: int, device: str."""
+    PREPARING = "preparing"
+    """done: int, total: int (partitions whose residuals have been turned into shapes)."""
     PROGRESS = "progress"
     """epoch: int, epochs: int, training_mm: float, validation_mm: float (mean errors of the training and the validation
     poses). Of a fit of skin weights: done: int, total: int (vertices)."""
@@ -23,9 +25,12 @@ class MessageType(enum.Enum):
     """joint: str, basis: int, held_out_mm: float (mean error of the held-out poses)."""
     LOG = "log"
     """text: str; what begins with `WARNING` is about the recording, "Warning (NAME): …"."""
+    MODEL_FINISHED = "model_finished"
+    """As `FINISHED`, of one of several models that are trained in turn: each has its own `STARTED` before it."""
     FINISHED = "finished"
     """model: str (path), seconds: float, held_out_mm and held_out_p999_mm: float (mean and percentile 99.9);
-    verdict: str, "met", "missed" or "exhausted", where there is a target. Of a fit of skin weights: seconds: float,
+    verdict: str, "met", "missed" or "exhausted", where there is a target. Of several models: model is their folder, the
+    errors are the largest of them, models: int. Of a fit of skin weights: seconds: float,
     fit: dict (`SkinFit.to_json`)."""
     CANCELLED = "cancelled"
     """No keys. The trainer was asked to stop and wrote no model."""

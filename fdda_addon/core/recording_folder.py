@@ -88,6 +88,13 @@ def read_folder(
     return FolderContent(FolderState.INCOMPLETE, *counts)
 
 
+def recordings_in(folder: Path) -> list[Path]:
+    """The recordings that lie in a folder, each in a folder of its own; none where the folder is a recording itself."""
+    if os.path.exists(folder / INDEX) or not os.path.isdir(folder):
+        return []
+    return sorted(path for path in folder.iterdir() if os.path.isfile(path / INDEX))
+
+
 def _as_recorded_first(sampling: dict) -> dict:
     """A sampling without the poses that were added where a model was worst."""
     return {**sampling, "sources": [source for source in sampling["sources"] if source["kind"] != REFINED]}

@@ -85,6 +85,8 @@ class FDDA_OT_train(OnRig, JobOperator, bpy.types.Operator):
                 f"{values['partitions']} partitions, {values['vertices']:,} vertices, {values['poses']:,} poses, "
                 f"on {values['device']}"
             )
+        elif message.type is MessageType.PREPARING:
+            return Progress("partitions prepared", values["done"], values["total"])
         elif message.type is MessageType.PROGRESS:
             for name, curve in state.curves.items():
                 curve.append(float(values[f"{name}_mm"]))

@@ -7,9 +7,11 @@ from fdda_addon.core.messages import Message, MessageType
 
 SAMPLES = [
     Message(MessageType.STARTED, {"partitions": 3, "poses": 100, "vertices": 90, "device": "cpu"}),
+    Message(MessageType.PREPARING, {"done": 1, "total": 3}),
     Message(MessageType.PROGRESS, {"epoch": 1, "epochs": 200, "training_mm": 0.25, "validation_mm": 0.125}),
     Message(MessageType.PARTITION_FINISHED, {"joint": "elbow.L ü", "basis": 24, "held_out_mm": 0.125}),
     Message(MessageType.LOG, {"text": 'two\nlines, "quoted"'}),
+    Message(MessageType.MODEL_FINISHED, {"model": "/a.onnx", "seconds": 1, "held_out_mm": 0.1, "held_out_p999_mm": 1}),
     Message(MessageType.FINISHED, {"model": "/a b.onnx", "seconds": 1.5, "held_out_mm": 0.1, "held_out_p999_mm": 1}),
     Message(MessageType.CANCELLED),
     Message(MessageType.FAILED, {"text": "The disk is full."}),

@@ -32,8 +32,9 @@ WARNINGS = ["duplicate-poses", "hidden-inputs"]
 def test_warnings_are_announced_before_the_training_and_reported(suspicious, tmp_path, capsys):
     assert main([str(suspicious), str(tmp_path / "m.onnx"), "--messages", *QUICK[2:], "--epochs", "2"]) == 0
     messages = [Message.decode(line) for line in capsys.readouterr().out.splitlines()]
-    assert [m.type for m in messages[:4]] == [MessageType.STARTED, *[MessageType.LOG] * 2, MessageType.PROGRESS]
-    texts = [m.values["text"] for m in messages[1:3]]
+    kinds = [MessageType.STARTED, *[MessageType.LOG] * 3, MessageType.PREPARING]
+    assert [m.type for m in messages[:5]] == kinds
+    texts = [m.values["text"] for m in messages[2:4]]
     report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
     assert [w["name"] for w in report["warnings"]] == WARNINGS
     assert texts == [f"Warning ({w['name']}): {w['text']}" for w in report["warnings"]]
@@ -59,5 +60,5 @@ def test_strict_ends_the_training_before_it_begins(suspicious, tmp_path, capsys,
 def test_the_text_for_a_person_has_the_warnings(report, suspicious, tmp_path, capsys):
     assert main([str(suspicious), str(tmp_path / "m.onnx"), *QUICK[2:], "--epochs", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in lines[1:3]] == [f"Warning ({name})" for name in WARNINGS]
+    assert [line.split(":")[0] for line in lines[2:4]] == [f"Warning ({name})" for name in WARNINGS]
     assert report["warnings"] == []
