@@ -172,3 +172,14 @@ def test_the_unit_is_that_of_scene_and_object(system, unit_scale, scale, metres)
     mesh_object.parent.scale, mesh_object.parent.rotation_euler = scale, (1.0, 0.5, -2.0)
     bpy.context.view_layer.update()
     assert metres_per_unit(mesh_object) == metres
+
+
+def test_a_copy_that_is_scaled_up_has_the_figures_of_its_model(characters):
+    character = characters[IN_METRES]
+    bpy.ops.wm.open_mainfile(filepath=str(character.rig))
+    rig = find_rig()
+    rig.armature_object.scale = (3.0, 3.0, 3.0)
+    bpy.context.view_layer.update()
+    assert metres_per_unit(rig.mesh_object) == 3.0
+    *_, evaluation = evaluate(rig, character.model, EvaluationSettings(poses=20, surface=False))
+    assert evaluation.fdda.mean == pytest.approx(character.evaluation["fdda"]["mean"], rel=1e-3)
