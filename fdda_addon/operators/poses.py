@@ -3,12 +3,17 @@
 
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import bpy
 
 from ..core.errors import RigError
+from ..scene.scene_rig import SceneRig
 from .on_pose import OnPose
 from .sampling import recorded_actions, recording_settings
+
+if TYPE_CHECKING:  # Blender starts without numpy.
+    from ..core.controls import Control
 
 
 class FDDA_OT_preview_pose(OnPose, bpy.types.Operator):
@@ -61,17 +66,26 @@ class FDDA_OT_rest_pose(OnPose, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def change(self, context: bpy.types.Context) -> str:
-        from ..recording import planned_choice
         from ..scene.armature import clear_pose
         from ..scene.control_names import resting_value
         from ..scene.controls import is_driven, owner_of, set_control
 
         rig = self.rig(context)
         clear_pose(rig.armature_object)
-        for control in planned_choice(rig, recording_settings(rig))[0].controls:
+        for control in _sampled_controls(rig):
             if not is_driven(owner_of(rig, control.owner), control.path):
                 set_control(rig, control.name, resting_value(rig, control.name))
         return f"'{rig.armature_object.name}' is in its rest pose."
+
+
+def _sampled_controls(rig: SceneRig) -> "tuple[Control, ...]":
+    """The controls that random poses change; none while the choice is not complete, which the section Rig says."""
+    from ..recording import planned_choice
+
+    try:
+        return planned_choice(rig, recording_settings(rig))[0].controls
+    except RigError:
+        return ()
 
 
 class _OnRange(OnPose):

@@ -217,6 +217,12 @@ class TestPreview:
         assert bpy.ops.fdda.rest_pose() == {"FINISHED"}
         assert keys["flexed"].value == keys["thin"].value == 0
 
+    def test_the_rest_pose_needs_no_choice(self, arm):
+        arm.mesh_object.fdda.settings.sample = "SELECTED"
+        arm.armature_object.pose.bones["fk_upper"].rotation_euler[0] = 0.5
+        assert bpy.ops.fdda.rest_pose() == {"FINISHED"}
+        assert arm.armature_object.pose.bones["fk_upper"].rotation_euler[0] == 0
+
     def test_also_where_actions_alone_are_recorded(self, arm):
         settings = arm.mesh_object.fdda.settings
         settings.sample, settings.bone_collection, settings.poses = "COLLECTION", control_rigs.CONTROLS, 0
