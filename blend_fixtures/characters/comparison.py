@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 
 from fdda_addon.cli.files import save_copy
+from fdda_addon.core.metrics import distances
 from fdda_addon.core.poses import Channel
 from fdda_addon.evaluation import EvaluationSettings, evaluate, pose_held_out
 from fdda_addon.recording import record
@@ -18,6 +19,7 @@ from fdda_addon.scene.controls import ControlReader
 from fdda_addon.scene.mesh import evaluated_positions, rest_positions
 from fdda_addon.scene.modifier_stack import read_stack
 from fdda_addon.scene.rig import PoseReader, SceneRig, armature_of, find_rig, model_channels, read_model_rig
+from fdda_addon.scene.unit import metres_per_unit
 
 from .rows import Row
 
@@ -77,7 +79,8 @@ def compare_row(row: Row, folder: Path) -> list[Result]:
     bpy.ops.wm.open_mainfile(filepath=str(folder / "rig.blend"))
     rigs = [find_rig(name) for name in row.meshes]
     networks = [Network(model_path(row, folder, name)) for name in row.meshes]
-    errors = [_errors(row, scene_rig, network) for scene_rig, network in zip(rigs, networks, strict=True)]
+    errors = [_errors(scene_rig, network) for scene_rig, network in zip(rigs, networks, strict=True)]
+    units = [metres_per_unit(scene_rig.mesh_object) for scene_rig in rigs]
     channels = model_channels(rigs[0], read_model_rig(rigs[0], networks[0].info), networks[0].info)
     for scene_rig, network in zip(rigs, networks, strict=True):
         live = read_stack(scene_rig.mesh_object).live
@@ -90,22 +93,25 @@ def compare_row(row: Row, folder: Path) -> list[Result]:
     else:
         differences = _play(rigs, networks, channels)
     return [
-        Result(name, *own, difference / row.unit)
-        for name, own, difference in zip(row.meshes, errors, differences, strict=True)
+        Result(name, *own, difference * unit)
+        for name, own, difference, unit in zip(row.meshes, errors, differences, units, strict=True)
     ]
 
 
-def _errors(row: Row, scene_rig: SceneRig, network: Network) -> tuple[float, float, float]:
+def _errors(scene_rig: SceneRig, network: Network) -> tuple[float, float, float]:
     """`linear_mm`, `fdda_mm` and `moved_mm` of a Result."""
     *_, evaluation = evaluate(scene_rig, network, HELD_OUT)
     held_out = evaluation.held_out
-    moved = np.linalg.norm(held_out.positions - rest_positions(scene_rig.mesh_object.data), axis=-1)
-    moved *= network.info.metres_per_unit
-    return tuple(float(distances.mean()) * 1000 for distances in (held_out.linear, held_out.fdda, moved))
+    rest = rest_positions(scene_rig.mesh_object.data)
+    moved = distances(held_out.positions, rest, metres_per_unit(scene_rig.mesh_object))
+    return tuple(float(metres.mean()) * 1000 for metres in (held_out.linear, held_out.fdda, moved))
 
 
 def _play(rigs: list[SceneRig], networks: list[Network], channels: tuple[Channel, ...]) -> list[float]:
-    """Play bound rigs; the largest difference of each from its model. Each armature takes poses of its own."""
+    """Play bound rigs; the largest difference of each from its model, in units of its mesh.
+
+    Each armature takes poses of its own.
+    """
     armatures = {scene_rig.armature_object: scene_rig for scene_rig in rigs}
     for armature_object in armatures:
         if armature_object.animation_data is not None:

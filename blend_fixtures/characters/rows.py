@@ -34,7 +34,6 @@ class Row:
         epochs: of the training.
         is_linear: the rig does plain linear skinning and nothing else, so there is nothing to learn, only to keep.
         is_linked: bound, then linked into another file and overridden twice, each in a pose of its own.
-        unit: Blender units in a metre.
     """
 
     name: str
@@ -46,7 +45,6 @@ class Row:
     epochs: int = 60
     is_linear: bool = False
     is_linked: bool = False
-    unit: float = 1.0
 
 
 def _recording(**settings: object) -> RecordingSettings:
@@ -144,14 +142,9 @@ ROWS: tuple[Row, ...] = (
     _tube(MESHES, transforms.parented_to_armature, "mesh parented to a turned and scaled armature"),
     _tube(MESHES, transforms.parented_to_empty, "armature parented to a moving empty"),
     _tube(MESHES, transforms.parented_to_bone, "mesh parented to a bone and skinned besides"),
-    _tube(MESHES, transforms.in_centimetres, "a scene in centimetres", unit=transforms.CENTIMETRES),
+    _tube(MESHES, transforms.in_centimetres, "a scene in centimetres"),
     _tube(MESHES, transforms.scaled_armature, "an armature in centimetres, scaled by 0.01"),
-    _tube(
-        MESHES,
-        transforms.scaled_character,
-        "mesh and armature in centimetres, scaled by 0.01",
-        unit=transforms.CENTIMETRES,
-    ),
+    _tube(MESHES, transforms.scaled_character, "mesh and armature in centimetres, scaled by 0.01"),
     _tube(MESHES, transforms.far_away, "hundreds of metres from the origin"),
     Row(
         "linked", MESHES, "a linked character, overridden twice in two poses", stacks.corrective_smooth, is_linked=True
