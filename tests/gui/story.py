@@ -117,6 +117,24 @@ def show_a_random_pose(_folder: Path) -> Iterator[float]:
     check(distance_mm(moved, rest) > 1, "the button shows no other pose")
 
 
+def choose_what_moves(folder: Path) -> Iterator[float]:
+    """Press Use Selected Bones, and look at a random pose: it moves that bone alone. Back to all bones."""
+    bones, settings = bpy.data.objects["arm_rig"].pose.bones, arm().fdda.settings
+    name = next(bone.name for bone in bones if len(bone.children) == 1)
+    for bone in bones:
+        (bone if hasattr(bone, "select") else bone.bone).select = bone.name == name
+    settings.sample = "SELECTED"
+    yield from redraw()
+    yield from sidebar.push("fdda.use_selected_bones")
+    check([bone.name for bone in settings.sampled_bones] == [name], f"not {name} alone is chosen")
+    bpy.ops.fdda.preview_pose(step=1)
+    moved = [bone.name for bone in bones if max(map(abs, bone.rotation_euler)) > 1e-6]
+    check(moved == [name], f"the random pose moves {moved}, not {name} alone")
+    yield from picture(folder / "chosen_bone.png")
+    settings.sample = "WEIGHTS"
+    yield from redraw()
+
+
 def choose_a_hundred_poses(_folder: Path) -> Iterator[float]:
     """Back to the rest pose; type a number into the field of random poses."""
     yield from sidebar.push("fdda.rest_pose", across=0.85)
@@ -342,6 +360,7 @@ STEPS = (
     add_the_arm,
     measure_the_rig,
     show_a_random_pose,
+    choose_what_moves,
     choose_a_hundred_poses,
     record,
     check_the_trainer,
