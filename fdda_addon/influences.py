@@ -26,6 +26,8 @@ from .scene.sampling import is_moved_by_constraints
 
 VARIES = 1e-5
 """A joint whose relative transform changes by less between poses does not move (no unit, or metres)."""
+MOST_MOVES, BATCH_BYTES = 50, 6 << 20
+"""Residuals are computed of so many moves at once, and of fewer where they take more than this."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +61,13 @@ class _Found:
         self._joints: dict[int, set[int]] = {p.joint: set() for p in partitions}
         self._controls: dict[int, set[int]] = {p.joint: set() for p in partitions}
 
-    def note(self, kind: str, index: int, moved: np.ndarray, base: np.ndarray) -> None:
-        """Compare residuals with and without a joint or control moved."""
-        into = self._controls if kind == CONTROL else self._joints
-        for partition, change in zip(self.partitions, residual_changes(self.partitions, moved, base), strict=True):
-            if change > self._threshold:
-                into[partition.joint].add(index)
+    def note(self, moves: list[tuple[str, int]], moved: np.ndarray, base: np.ndarray) -> None:
+        """Compare residuals with and without a joint or control moved: (n, V, 3) of n moves, (1, V, 3) without."""
+        changes = residual_changes(self.partitions, moved, base)
+        for (kind, index), influenced in zip(moves, changes > self._threshold, strict=True):
+            into = self._controls if kind == CONTROL else self._joints
+            for number in np.flatnonzero(influenced):
+                into[self.partitions[number].joint].add(index)
 
     def note_everywhere(self, control: int) -> None:
         """A control that may influence every partition."""
@@ -77,6 +80,37 @@ class _Found:
         )
         merged = {joint: partition.joint for partition in self.partitions for joint in partition.merged}
         return make_partitions(rig, joints, controls, merged)
+
+
+class _Moves:
+    """Moves from a base pose. Residuals of many are computed at once: each partition costs as much for one pose."""
+
+    def __init__(self, rig: Rig, partitions: tuple[Partition, ...], evaluator: PoseEvaluator, found: _Found):
+        self._layer, self._evaluator, self._found = LinearLayer(rig, partitions), evaluator, found
+        self._size = max(1, min(MOST_MOVES, BATCH_BYTES // (12 * rig.vertex_count)))
+        self._base: np.ndarray | None = None
+        self._moves: list[tuple[str, int]] = []
+        self._evaluated: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def begin(self) -> None:
+        """The pose that is set now is the base of those that follow."""
+        self._base = self._residuals([self._evaluator.evaluate()[:2]])
+
+    def add(self, kind: str, index: int) -> None:
+        """The pose that is set now is the base with a joint or control moved."""
+        self._moves.append((kind, index))
+        self._evaluated.append(self._evaluator.evaluate()[:2])
+        if len(self._moves) == self._size:
+            self.end()
+
+    def end(self) -> None:
+        """No move from this base follows."""
+        if self._moves:
+            self._found.note(self._moves, self._residuals(self._evaluated), self._base)
+        self._moves, self._evaluated = [], []
+
+    def _residuals(self, evaluated: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        return local_residuals(self._layer, *(np.stack(arrays) for arrays in zip(*evaluated, strict=True)))
 
 
 def find_influences(
@@ -93,16 +127,11 @@ def find_influences(
         The partitions with what influences them.
     """
     found = _Found(rig, search.tolerance, partitions)
-    layer = LinearLayer(rig, partitions)
-
-    def residuals() -> np.ndarray:
-        pose, positions, _ = evaluator.evaluate()
-        return local_residuals(layer, pose[None], positions[None])
-
+    moves = _Moves(rig, partitions, evaluator, found)
     if _follows_control_bones(scene_rig, rig, search.channels):
-        yield from _take_joints(scene_rig, rig, search, found, residuals)
+        yield from _take_joints(scene_rig, rig, search, found, moves)
     else:
-        yield from _move_channels(scene_rig, rig, search, found, residuals)
+        yield from _move_channels(scene_rig, rig, search, moves)
     clear_pose(scene_rig.armature_object)
     return found.result(rig)
 
@@ -120,9 +149,7 @@ def _follows_control_bones(scene_rig: SceneRig, rig: Rig, channels: tuple[Channe
     return not sampled or any(is_moved_by_constraints(bones[name]) or name in driven for name in others)
 
 
-def _move_channels(
-    scene_rig: SceneRig, rig: Rig, search: Search, found: _Found, residuals: Callable[[], np.ndarray]
-) -> Iterator[Progress]:
+def _move_channels(scene_rig: SceneRig, rig: Rig, search: Search, moves: _Moves) -> Iterator[Progress]:
     """Move the channels of one joint, or one control, at a time, from the rest pose and from random ones."""
     channels, count = search.channels, search.poses
     poser = Poser(scene_rig, channels)
@@ -133,27 +160,26 @@ def _move_channels(
         index = (controls if channel.kind == CONTROL else joints).get(channel.bone)
         if index is not None:
             places.setdefault((CONTROL if channel.kind == CONTROL else "joint", index), []).append(place)
-    moves = dict(sorted(places.items(), key=lambda item: (item[0][0] == CONTROL, item[0][1])))
+    steps = dict(sorted(places.items(), key=lambda item: (item[0][0] == CONTROL, item[0][1])))
     rest = np.array([channel.rest for channel in channels])
     # One base pose serves all joints: the rest pose for half of the moves, a random pose each for the others.
     bases = [rest] * (count - count // 2) + [search.draw(number) for number in range(count // 2)]
-    total = count * (len(moves) + 1)
+    total = count * (len(steps) + 1)
     for number, base in enumerate(bases):
         poser.set(base)
-        base_residuals = residuals()
-        for step, ((kind, index), own) in enumerate(moves.items(), number * (len(moves) + 1) + 1):
+        moves.begin()
+        for step, ((kind, index), own) in enumerate(steps.items(), number * (len(steps) + 1) + 1):
             yield Progress("influences", step, total)
             values = base.copy()
             offset = index if kind != CONTROL else len(joints) + index
             values[own] = search.draw((offset + 1) * count + number)[own]
             poser.set(values)
-            found.note(kind, index, residuals(), base_residuals)
-        yield Progress("influences", (number + 1) * (len(moves) + 1), total)
+            moves.add(kind, index)
+        moves.end()
+        yield Progress("influences", (number + 1) * (len(steps) + 1), total)
 
 
-def _take_joints(
-    scene_rig: SceneRig, rig: Rig, search: Search, found: _Found, residuals: Callable[[], np.ndarray]
-) -> Iterator[Progress]:
+def _take_joints(scene_rig: SceneRig, rig: Rig, search: Search, found: _Found, moves: _Moves) -> Iterator[Progress]:
     """Take one joint, or one control, at a time to where it is in other poses, the others held."""
     count = search.poses
     seen = _seen_states(scene_rig, rig, search, 2 * count)
@@ -167,19 +193,21 @@ def _take_joints(
     steps = [("joint", number) for number in varies] + [(CONTROL, number) for number in movable]
     with held_joints(scene_rig, rig.joints) as held:
 
-        def show(state: _State) -> np.ndarray:
+        def show(state: _State) -> None:
             held.set(state.joints)
             for number in movable:
                 set_control(scene_rig, rig.controls[number].name, float(state.controls[number]))
-            return residuals()
 
         resting = _State(held.rest, seen[0].controls)
         bases = [resting] * (count - count // 2) + seen[: count // 2]
         for number, (base, other) in enumerate(zip(bases, seen[count:], strict=True)):
-            base_residuals = show(base)
+            show(base)
+            moves.begin()
             for step, (kind, index) in enumerate(steps, number * (len(steps) + 1) + 1):
                 yield Progress("influences", step, count * (len(steps) + 1))
-                found.note(kind, index, show(base.with_one_of(other, kind, index)), base_residuals)
+                show(base.with_one_of(other, kind, index))
+                moves.add(kind, index)
+            moves.end()
             yield Progress("influences", (number + 1) * (len(steps) + 1), count * (len(steps) + 1))
 
 

@@ -71,8 +71,11 @@ def make_basis(residuals: np.ndarray, tolerance: float, rng: np.random.Generator
     shapes_needed = min(int(np.argmax(left <= max(tolerance, WORTHWHILE * left[0]))), MOST_SHAPES)
     vectors = vectors[:, :shapes_needed]
     if by_pose:
-        centre = vectors.sum(axis=0)[:, None] * mean
-        vectors = np.linalg.qr((vectors.T @ residuals - centre).T)[0] if shapes_needed else np.zeros((width, 0))
+        shapes = np.empty((width, shapes_needed))
+        for block in _blocks(width):
+            # Block by block: a product with float64 would make a float64 copy of all residuals.
+            shapes[block] = (residuals[:, block].astype(np.float64) - mean[block]).T @ vectors
+        vectors = np.linalg.qr(shapes)[0] if shapes_needed else shapes
     return Basis(mean, np.ascontiguousarray(vectors.T, np.float32), float(left[shapes_needed]))
 
 

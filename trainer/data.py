@@ -22,6 +22,8 @@ BLOCK_FRAMES = 10
 """Frames of animation that are held back together: neighbours are nearly the same pose."""
 LEAST_SPREAD = 1e-5
 """A feature that spreads less than this over the training poses counts as constant (in its unit)."""
+BLOCK_FLOATS = 1 << 22
+"""Residuals are measured in blocks of so many coordinates: all of a partition, in float64, are twice as large."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +226,6 @@ def prepare(
     basis = make_basis(residuals[split.training], tolerance, np.random.default_rng([seed, 2]))
     coefficients = basis.coefficients(residuals)
     held_out = residuals[split.validation] - basis.residuals(coefficients[split.validation])
-    spread = residuals[split.training].std(axis=0, dtype=np.float64)
     return PreparedPartition(
         partition.name,
         partition.vertices,
@@ -235,7 +236,16 @@ def prepare(
         fit,
         basis,
         coefficients,
-        float(np.sqrt((spread**2).sum() / partition.vertices)),
+        float(np.sqrt(_mean_square(residuals, basis.mean, split.training) / partition.vertices)),
         np.sqrt((held_out**2).sum(axis=1) / partition.vertices),
         mm_per_unit,
     )
+
+
+def _mean_square(residuals: np.ndarray, mean: np.ndarray, poses: np.ndarray) -> float:
+    """Mean over some of the (N, W) poses of the squared distance from a mean (W,); a block of them at a time."""
+    total, step = 0.0, max(1, BLOCK_FLOATS // residuals.shape[1])
+    for start in range(0, len(poses), step):
+        apart = residuals[poses[start : start + step]].astype(np.float64) - mean
+        total += float(np.einsum("nw,nw->", apart, apart))
+    return total / len(poses)

@@ -143,13 +143,14 @@ def residual_changes(partitions: tuple[Partition, ...], moved: np.ndarray, base:
 
     Args:
         partitions: P partitions.
-        moved, base: (N, V, 3) float32 local residuals, metres.
+        moved: (N, V, 3) float32 local residuals, metres.
+        base: the same of other poses, or of one for all.
 
     Returns:
-        (P,) float64, metres.
+        (N, P) float64, metres.
     """
-    distances = np.sqrt(np.einsum("nvc,nvc->nv", moved - base, moved - base)).max(axis=0, initial=0)
-    return np.array([distances[p.vertices].max(initial=0) for p in partitions], np.float64)
+    distances = np.linalg.norm(moved - base, axis=2)
+    return np.stack([distances[:, p.vertices].max(axis=1, initial=0) for p in partitions], axis=1).astype(np.float64)
 
 
 def partition_colors(partitions: tuple[Partition, ...], vertex_count: int) -> np.ndarray:
