@@ -113,6 +113,7 @@ def train_model(
         "warm_start": warm_start,
         "seconds": round(time.perf_counter() - started, 2),
     }
+    announcer.say(MessageType.LOG, text=f"Exporting the model, and measuring it on {len(split.held_out)} poses.")
     exported = build_model(recording, deformation, split.held_out, settings)
     _check_stop(should_stop)
     sample = split.training[:: max(1, len(split.training) // len(split.held_out))]

@@ -58,7 +58,7 @@ def sizes_in_words(recording: Recording) -> str:
     return (
         f"{poses:,} poses of {rig.vertex_count:,} vertices: {size_in_words(recording_bytes(rig, poses))} on the disk; "
         f"residuals of the largest partition, '{rig.joints[largest.joint].name or UNMOVED_LABEL}', of "
-        f"{vertices:,} vertices: {size_in_words(12 * poses * vertices)} of memory, some times."
+        f"{vertices:,} vertices: {size_in_words(12 * poses * vertices)}, in memory two or three times."
     )
 
 

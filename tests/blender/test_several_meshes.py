@@ -116,6 +116,31 @@ def test_a_subdivided_body_is_recorded_after_the_sleeve_that_reads_it(two, tmp_p
     assert (sleeve.residuals == alone.residuals).all()
 
 
+def test_each_mesh_has_its_own_shape_keys_as_controls(two, tmp_path):
+    """`shape_keys/…` is another number for each mesh; one that a single mesh has is no input of the other."""
+
+    def add_keys() -> None:
+        for name, keys in ((BODY, ("Basis", "puff")), (SLEEVE, ("Basis", "puff", "fold"))):
+            for key in keys:
+                bpy.data.objects[name].shape_key_add(name=key, from_mix=False)
+            for point in bpy.data.objects[name].data.shape_keys.key_blocks["puff"].data:
+                point.co *= 1.1
+
+    rig = changed(two, tmp_path / "rig.blend", add_keys)
+    options = ("--all", "--poses", 12, "--control", "puff", "--control", "fold=0:0.5")
+    assert run("record", rig, tmp_path / "r", *options) == 0
+    body, sleeve = (read_recording(tmp_path / "r" / name) for name in (BODY, SLEEVE))
+    assert (body.pose_matrices == sleeve.pose_matrices).all()
+    puff, fold = (f'shape_keys/key_blocks["{key}"].value' for key in ("puff", "fold"))
+    assert [control.name for control in body.rig.controls] == [puff]
+    assert [control.name for control in sleeve.rig.controls] == [puff, fold]
+    for recording in (body, sleeve):
+        sampled = [channel.bone for channel in recording.info.sampling.channels if channel.kind == "control"]
+        assert sampled == [control.name for control in recording.rig.controls]
+        assert np.ptp(recording.controls, axis=0).min() > 0.1
+    assert np.abs(body.controls[:, 0] - sleeve.controls[:, 0]).max() > 0.1
+
+
 def test_an_interrupted_recording_goes_on_where_each_mesh_stopped(two, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(two.rig))
     settings = RecordingSettings(poses=POSES, actions=("elbow_wave",))

@@ -42,8 +42,8 @@ def test_what_a_training_takes(tmp_path):
     largest = max(recording.partitions, key=lambda partition: len(partition.vertices))
     assert sizes_in_words(recording) == (
         f"50 poses of {recording.rig.vertex_count} vertices: less than 1 MB on the disk; residuals of the largest "
-        f"partition, '{recording.rig.joint_names[largest.joint]}', of {len(largest.vertices)} vertices: less than 1 MB "
-        "of memory, some times."
+        f"partition, '{recording.rig.joint_names[largest.joint]}', of {len(largest.vertices)} vertices: less than 1 MB, "
+        "in memory two or three times."
     )
 
 
