@@ -13,6 +13,7 @@ import bpy
 import numpy as np
 
 from .core.errors import RigError
+from .core.model import check_rig
 from .core.poses import CONTROL, ROTATION, Channel, sample_pose
 from .core.progress import Progress
 from .runtime import model_files, playback
@@ -121,8 +122,10 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
     """
     check_evaluable(scene_rig)
     mesh_object = scene_rig.mesh_object
-    info = Network(model).info if model else model_files.network_of(mesh_object).info
-    channels = model_channels(scene_rig, read_model_rig(scene_rig, info), info)
+    network = Network(model) if model else model_files.network_of(mesh_object)
+    rig = read_model_rig(scene_rig, network.info)
+    check_rig(network.path, network.info, rig)
+    channels = model_channels(scene_rig, rig, network.info)
     with playing(scene_rig, channels) as played, borrowed_binding(scene_rig, model):
         ways = {"rig": _rig, "linear": armature_alone, "fdda": _fdda, "floor": _floor}
         times: dict[str, list[float]] = {way: [] for way in ways}

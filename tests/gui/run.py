@@ -59,15 +59,18 @@ def end(process: subprocess.Popen) -> None:
             continue
 
 
-def run(command: list[str], environment: dict[str, str], seconds: float) -> int | None:
-    """Exit status of a command, None when it took longer; nothing that it started is left."""
-    process = subprocess.Popen(command, cwd=ROOT, env=environment, start_new_session=True)
-    try:
-        return process.wait(seconds)
-    except subprocess.TimeoutExpired:
-        return None
-    finally:
-        end(process)
+def run(command: list[str], environment: dict[str, str], seconds: float, output: Path) -> int | None:
+    """Exit status of a command, None when it took longer; nothing that it started is left. What it says is kept."""
+    with output.open("wb") as file:
+        process = subprocess.Popen(
+            command, cwd=ROOT, env=environment, start_new_session=True, stdout=file, stderr=subprocess.STDOUT
+        )
+        try:
+            return process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return None
+        finally:
+            end(process)
 
 
 def is_one_color(picture: Path) -> bool:
@@ -87,16 +90,22 @@ def drive(folder: Path, blender: str) -> str:
     user = folder / "user"
     environment = {"FDDA_TRAINER_PYTHON": sys.executable, **os.environ, "BLENDER_USER_RESOURCES": str(user)}
     install = [blender, "--command", "extension", "install-file", "-r", "user_default", "-e", str(PACKAGE)]
-    status = run(install, environment, INSTALL_SECONDS)
+    status = run(install, environment, INSTALL_SECONDS, folder / "install.txt")
     if status != 0:
         return f"Blender did not install {PACKAGE.name} ({status_name(status)})"
     window = ["--window-geometry", "0", "0", str(WIDTH), str(HEIGHT), "--no-window-focus"]
     script = ["--python", str(Path(__file__).with_name("drive.py")), "--", str(folder)]
-    status = run(on_display([blender, *window, *script]), environment, SECONDS)
+    said = folder / "blender.txt"
+    status = run(on_display([blender, *window, *script]), environment, SECONDS, said)
     steps = folder / "steps.json"
     done = json.loads(steps.read_text(encoding="utf-8")) if steps.is_file() else []
     if status != 0:
-        return f"after {len(done)} steps Blender ended ({status_name(status)}); see failed.png in {folder}"
+        return (
+            f"after {len(done)} steps Blender ended ({status_name(status)}); see failed.png and blender.txt in {folder}"
+        )
+    # An error while a panel is drawn ends nothing: the panel is empty from there on.
+    if b"Traceback" in said.read_bytes():
+        return f"Python failed meanwhile; see {said}"
     if not done or done[-1]["step"] != LAST_STEP:
         return f"Blender ended before the last step, {LAST_STEP}"
     for picture in {folder / step["picture"] for step in done} | set(folder.glob("*.png")):
