@@ -46,10 +46,12 @@ def add_modifier(mesh_object: bpy.types.Object, place: int) -> bpy.types.NodesMo
 
 def find_modifier(mesh_object: bpy.types.Object) -> bpy.types.NodesModifier | None:
     """The modifier that plays a model, None when it was removed."""
-    for modifier in mesh_object.modifiers:
-        if modifier.type == "NODES" and modifier.node_group is not None and PLAYBACK_KEY in modifier.node_group:
-            return modifier
-    return None
+    return next((modifier for modifier in mesh_object.modifiers if plays(modifier)), None)
+
+
+def plays(modifier: bpy.types.Modifier) -> bool:
+    """Whether a modifier is one that plays a model."""
+    return modifier.type == "NODES" and modifier.node_group is not None and PLAYBACK_KEY in modifier.node_group
 
 
 def is_inherited(modifier: bpy.types.NodesModifier) -> bool:

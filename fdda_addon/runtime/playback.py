@@ -179,7 +179,7 @@ def evaluate(depsgraph: bpy.types.Depsgraph) -> None:
 
     Objects that share a model are evaluated in one call. What cannot play is switched back to its rig and says why.
     """
-    rested = resting.updated(depsgraph, resting.wake(depsgraph.scene, _bound_objects()))
+    rested = resting.wake(depsgraph.scene, _bound_objects())
     _scan()
     rendering = depsgraph.mode == "RENDER"
     jobs: dict[Network, list[_Job]] = {}
@@ -197,7 +197,7 @@ def evaluate(depsgraph: bpy.types.Depsgraph) -> None:
             pose = live.read_pose(mesh_object, depsgraph)
             if pose is not None and not live.is_shown((*(part.tobytes() for part in pose), strength)):
                 jobs.setdefault(live.network, []).append((live, mesh_object, pose, strength))
-            elif mesh_object in rested:
+            elif mesh_object in rested and resting.is_updated(depsgraph, mesh_object):
                 # The positions are those of this pose already; the mesh has not been given them in this frame.
                 live.find_cache(mesh_object).data.update_tag()
     for network, own in jobs.items():

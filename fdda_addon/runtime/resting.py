@@ -8,7 +8,7 @@ copy of the object alone. Nothing of the user's scene is changed, and the copy i
 Simulations take a step in the first round and need the mesh where it was last: with one in the file nothing rests.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import bpy
 
@@ -16,7 +16,8 @@ from . import nodes
 
 SIMULATING = {"CLOTH", "DYNAMIC_PAINT", "EXPLODE", "FLUID", "PARTICLE_SYSTEM", "SOFT_BODY"}
 
-_resting: set[int] = set()
+_resting: dict[int, str] = {}
+"""Name of the modifier that rests, by session id of the object."""
 _simulates: bool | None = None
 
 
@@ -36,44 +37,50 @@ def rest(scene: bpy.types.Scene, mesh_objects: Iterable[bpy.types.Object]) -> No
         _simulates = _has_simulation(scene)
     if _simulates:
         return
+    graphs = _graphs(scene)
     for mesh_object in mesh_objects:
-        for modifier in _evaluated_modifiers(scene, mesh_object):
-            modifier.show_viewport = False
-            _resting.add(mesh_object.session_uid)
+        for depsgraph in graphs:
+            modifier = _only_modifier(mesh_object.evaluated_get(depsgraph))
+            if modifier is not None:
+                modifier.show_viewport = False
+                _resting[mesh_object.session_uid] = modifier.name
 
 
 def wake(scene: bpy.types.Scene, mesh_objects: Iterable[bpy.types.Object]) -> set[bpy.types.Object]:
     """Let the models of bound objects play again in the next round; gives those that rested."""
-    rested = {mesh_object for mesh_object in mesh_objects if mesh_object.session_uid in _resting} if _resting else set()
-    _resting.clear()
-    for mesh_object in rested:
-        for depsgraph in _graphs(scene):
+    if not _resting:
+        return set()
+    graphs = _graphs(scene)
+    rested = set()
+    for mesh_object in mesh_objects:
+        name = _resting.get(mesh_object.session_uid)
+        if name is None:
+            continue
+        rested.add(mesh_object)
+        for depsgraph in graphs:
             evaluated = mesh_object.evaluated_get(depsgraph)
-            modifier = nodes.find_modifier(evaluated) if evaluated.is_evaluated else None
+            modifier = evaluated.modifiers.get(name) if evaluated.is_evaluated else None
             if modifier is not None:
                 modifier.show_viewport = True
+    _resting.clear()
     return rested
 
 
-def updated(depsgraph: bpy.types.Depsgraph, rested: set[bpy.types.Object]) -> set[bpy.types.Object]:
-    """Those of the objects that rested whose meshes were evaluated meanwhile, and have to be once more."""
-    if not rested:
-        return rested
-    return {update.id.original for update in depsgraph.updates if update.is_updated_geometry} & rested
+def is_updated(depsgraph: bpy.types.Depsgraph, mesh_object: bpy.types.Object) -> bool:
+    """Whether the mesh of an object that rested was evaluated meanwhile, and has to be once more."""
+    return any(update.is_updated_geometry and update.id.original == mesh_object for update in depsgraph.updates)
 
 
-def _graphs(scene: bpy.types.Scene) -> Iterator[bpy.types.Depsgraph]:
-    return (layer.depsgraph for layer in scene.view_layers if layer.depsgraph is not None)
+def _graphs(scene: bpy.types.Scene) -> list[bpy.types.Depsgraph]:
+    return [graph for layer in scene.view_layers if (graph := layer.depsgraph) is not None]
 
 
-def _evaluated_modifiers(scene: bpy.types.Scene, mesh_object: bpy.types.Object) -> Iterator[bpy.types.Modifier]:
-    """The modifier that plays, in each evaluated copy of an object in which it alone is on."""
-    for depsgraph in _graphs(scene):
-        evaluated = mesh_object.evaluated_get(depsgraph)
-        if evaluated.is_evaluated:
-            shown = [modifier for modifier in evaluated.modifiers if modifier.show_viewport]
-            if len(shown) == 1 and nodes.find_modifier(evaluated) == shown[0]:
-                yield shown[0]
+def _only_modifier(evaluated: bpy.types.Object) -> bpy.types.Modifier | None:
+    """The modifier that plays, of an evaluated object in which it alone is on."""
+    if not evaluated.is_evaluated:
+        return None
+    shown = [modifier for modifier in evaluated.modifiers if modifier.show_viewport]
+    return shown[0] if len(shown) == 1 and nodes.plays(shown[0]) else None
 
 
 def _has_simulation(scene: bpy.types.Scene) -> bool:
