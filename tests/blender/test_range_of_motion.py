@@ -159,9 +159,7 @@ def test_nothing_to_sample(fresh):
 def test_posing_in_every_rotation_mode(fresh, lower, mode):
     lower.rotation_mode = mode
     angles = (0.3, -0.5, 0.8)
-    Poser(fresh, tuple(Channel("lower", "rotation", axis, -1, 1) for axis in range(3))).set(
-        np.array(angles)
-    )
+    Poser(fresh, tuple(Channel("lower", "rotation", axis, -1, 1) for axis in range(3))).set(np.array(angles))
     bpy.context.view_layer.update()
     found = np.array(lower.matrix_basis)
     np.testing.assert_allclose(found, np.array(Euler(angles).to_matrix().to_4x4()), atol=1e-6)

@@ -40,10 +40,10 @@ def test_what_a_training_takes(tmp_path):
     record_limb(tmp_path / "r", poses=50)
     recording = read_recording(tmp_path / "r")
     largest = max(recording.partitions, key=lambda partition: len(partition.vertices))
+    name = recording.rig.joint_names[largest.joint]
     assert sizes_in_words(recording) == (
         f"50 poses of {recording.rig.vertex_count} vertices: less than 1 MB on the disk; residuals of the largest "
-        f"partition, '{recording.rig.joint_names[largest.joint]}', of {len(largest.vertices)} vertices: less than 1 MB, "
-        "in memory two or three times."
+        f"partition, '{name}', of {len(largest.vertices)} vertices: less than 1 MB, in memory two or three times."
     )
 
 
