@@ -18,13 +18,13 @@ SIMULATING = {"CLOTH", "DYNAMIC_PAINT", "EXPLODE", "FLUID", "PARTICLE_SYSTEM", "
 
 _resting: dict[int, str] = {}
 """Name of the modifier that rests, by session id of the object."""
-_simulates: bool | None = None
+_simulates: dict[int, bool] = {}
+"""Whether a scene has a simulation, by its session id."""
 
 
 def forget() -> None:
     """Look for simulations anew before the next frame."""
-    global _simulates
-    _simulates = None
+    _simulates.clear()
 
 
 def rest(scene: bpy.types.Scene, mesh_objects: Iterable[bpy.types.Object]) -> None:
@@ -32,10 +32,9 @@ def rest(scene: bpy.types.Scene, mesh_objects: Iterable[bpy.types.Object]) -> No
 
     An object on which other modifiers work does not rest: they would be evaluated on a mesh that is not deformed.
     """
-    global _simulates
-    if _simulates is None:
-        _simulates = _has_simulation(scene)
-    if _simulates:
+    if scene.session_uid not in _simulates:
+        _simulates[scene.session_uid] = _has_simulation(scene)
+    if _simulates[scene.session_uid]:
         return
     graphs = _graphs(scene)
     for mesh_object in mesh_objects:

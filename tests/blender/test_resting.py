@@ -86,6 +86,22 @@ def test_nothing_rests_beside_a_simulation(animated, elbow):
     assert not any(is_at_rest(positions, animated) for positions in seen)
 
 
+def test_another_scene_may_simulate(animated):
+    """What is known of one scene says nothing of another that shows the character too."""
+    other = bpy.data.scenes.new("other")
+    for shared in (animated, bpy.data.objects[ELBOW_RIG]):
+        other.collection.objects.link(shared)
+    cloth = bpy.data.objects.new("cloth", bpy.data.meshes.new("cloth"))
+    cloth.modifiers.new("Cloth", "CLOTH")
+    other.collection.objects.link(cloth)
+    other.view_layers[0].update()
+    bpy.context.view_layer.update()
+    with seen_at_first(animated) as seen:
+        bpy.context.scene.frame_set(2)
+        other.frame_set(4)
+    assert [is_at_rest(positions, animated) for positions in seen] == [True, False]
+
+
 def test_nothing_rests_under_other_modifiers(animated, elbow):
     animated.modifiers.new("Wave", "WAVE").height = 0.0
     bpy.context.view_layer.update()
