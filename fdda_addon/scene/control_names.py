@@ -4,7 +4,7 @@
 import bpy
 
 from ..core.controls import ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS
-from .controls import is_driven, is_number, owner_of, parent_and_name
+from .controls import custom_key, is_custom, is_driven, is_number, owner_of, parent_and_name
 from .scene_rig import SceneRig
 
 
@@ -36,8 +36,9 @@ def resting_value(scene_rig: SceneRig, name: str) -> float:
     struct, attribute, index = parent_and_name(owner_of(scene_rig, owner), path)
     if isinstance(struct, bpy.types.ShapeKey):
         return 0.0
-    if attribute.startswith("["):
-        own = bpy.utils.unescape_identifier(attribute[2:-2])
-        return 0.0 if isinstance(struct[own], bool) else float(struct.id_properties_ui(own).as_dict()["default"])
+    if is_custom(attribute):
+        own = custom_key(attribute)
+        default = False if isinstance(struct[own], bool) else struct.id_properties_ui(own).as_dict()["default"]
+        return float(default[index] if hasattr(default, "__len__") else default)
     prop = struct.bl_rna.properties[attribute]
     return float(prop.default if index is None else prop.default_array[index])

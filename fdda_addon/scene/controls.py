@@ -17,7 +17,7 @@ WIDEST_RANGE = 1e4
 
 _STATED = re.compile(r"(?P<name>.+?)(?:=(?P<low>[-+.\deE]+):(?P<high>[-+.\deE]+))?", re.DOTALL)
 _CUSTOM = re.compile(r'(?P<owner>.*)\["(?P<name>(?:[^"\\]|\\.)*)"\]')
-_ELEMENT = re.compile(r"(?P<array>.*[^\"\]])\[(?P<index>\d+)\]")
+_ELEMENT = re.compile(r"(?P<array>.+)\[(?P<index>\d+)\]")
 
 
 def owner_of(scene_rig: SceneRig, owner: str) -> bpy.types.ID | None:
@@ -132,6 +132,27 @@ def parent_and_name(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.bpy_s
     return datablock.path_resolve(owner) if owner else datablock, name, index
 
 
+def is_custom(name: str) -> bool:
+    """Whether a name of `parent_and_name` is that of a custom property."""
+    return name.startswith('["')
+
+
+def custom_key(name: str) -> str:
+    """The key of a custom property by such a name."""
+    return bpy.utils.unescape_identifier(name[2:-2])
+
+
+def write_value(datablock: bpy.types.ID, path: str, value: object) -> None:
+    """Set what `path_resolve` reads; the graph is not told of custom properties."""
+    struct, name, index = parent_and_name(datablock, path)
+    if index is not None:
+        datablock.path_resolve(_element(path)[0])[index] = value
+    elif is_custom(name):
+        struct[custom_key(name)] = value
+    else:
+        setattr(struct, name, value)
+
+
 def _value(datablock: bpy.types.ID, path: str) -> float | None:
     """The number at a path, None when there is none."""
     try:
@@ -142,19 +163,16 @@ def _value(datablock: bpy.types.ID, path: str) -> float | None:
 
 
 def _property_range(datablock: bpy.types.ID, path: str) -> tuple[float, float]:
-    array, _ = _element(path)
-    if match := _CUSTOM.fullmatch(array):
-        struct = datablock.path_resolve(match["owner"]) if match["owner"] else datablock
-        name = bpy.utils.unescape_identifier(match["name"])
-        if isinstance(struct[name], bool):
+    struct, name, _ = parent_and_name(datablock, path)
+    if is_custom(name):
+        key = custom_key(name)
+        if isinstance(struct[key], bool):
             return 0.0, 1.0
-        settings = struct.id_properties_ui(name).as_dict()
+        settings = struct.id_properties_ui(key).as_dict()
         return _narrower(*((settings[f"{kind}min"], settings[f"{kind}max"]) for kind in ("soft_", "")))
-    struct, _, attribute = array.rpartition(".")
-    owner = datablock.path_resolve(struct) if struct else datablock
-    if isinstance(owner, bpy.types.ShapeKey) and attribute == "value":
-        return owner.slider_min, owner.slider_max
-    prop = owner.bl_rna.properties[attribute]
+    if isinstance(struct, bpy.types.ShapeKey) and name == "value":
+        return struct.slider_min, struct.slider_max
+    prop = struct.bl_rna.properties[name]
     if prop.type == "BOOLEAN":
         return 0.0, 1.0
     return _narrower((prop.soft_min, prop.soft_max), (prop.hard_min, prop.hard_max))
@@ -203,17 +221,8 @@ def set_control(scene_rig: SceneRig, name: str, value: float) -> None:
     """Set a control by its name; a number that counts is rounded. The graph is not evaluated."""
     owner, _, path = name.partition("/")
     datablock = owner_of(scene_rig, owner)
-    array, index = _element(path)
     old = datablock.path_resolve(path)
-    new = type(old)(round(value)) if isinstance(old, bool | int) else value
-    if index is not None:
-        datablock.path_resolve(array)[index] = new
-    elif match := _CUSTOM.fullmatch(path):
-        struct = datablock.path_resolve(match["owner"]) if match["owner"] else datablock
-        struct[bpy.utils.unescape_identifier(match["name"])] = new
-    else:
-        struct, _, attribute = path.rpartition(".")
-        setattr(datablock.path_resolve(struct) if struct else datablock, attribute, new)
+    write_value(datablock, path, type(old)(round(value)) if isinstance(old, bool | int) else value)
     # Custom properties do not tell the graph by themselves.
     datablock.update_tag()
 

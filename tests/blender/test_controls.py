@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Controls are read and set by their paths, whatever kind of property they are."""
+
+import bpy
+import pytest
+from conftest import ELBOW_RIG
+
+from fdda_addon.core.errors import RigError
+from fdda_addon.scene.control_names import resting_value
+from fdda_addon.scene.controls import ControlReader, is_driven, set_control, stated_controls
+
+
+@pytest.fixture
+def armature_object(rig) -> bpy.types.Object:
+    """The elbow's armature object with custom properties of every kind."""
+    found = bpy.data.objects[ELBOW_RIG]
+    found["dial"], found["count"], found["is_on"], found["odd [name]"] = 0.5, 3, True, 0.1
+    found["many"] = [0.1, 0.2, 0.3]
+    for name in ("dial", "count", "odd [name]", "many"):
+        found.id_properties_ui(name).update(min=-2, max=4, soft_min=-1, soft_max=2)
+    found.pose.bones["lower"]["fist"] = 0.25
+    found.pose.bones["lower"].id_properties_ui("fist").update(min=0, max=1)
+    bpy.context.view_layer.update()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("path", "limits", "value"),
+    [
+        ('["dial"]', (-1, 2), 1.5),
+        ('["count"]', (-1, 2), 2),
+        ('["is_on"]', (0, 1), False),
+        ('["odd [name]"]', (-1, 2), -0.5),
+        ('["many"][1]', (-1, 2), 0.75),
+        ('pose.bones["lower"]["fist"]', (0, 1), 0.5),
+        ('pose.bones["lower"].bbone_curveinx', None, 0.125),
+        ("location[2]", None, 0.25),
+    ],
+)
+def test_a_control_is_read_and_set(rig, armature_object, path, limits, value):
+    text = f"armature_object/{path}" + ("" if limits else "=-1:1")
+    (control,) = stated_controls(rig, [text])
+    assert (control.low, control.high) == (limits or (-1, 1)) and not is_driven(armature_object, path)
+    reader = ControlReader(rig, (control,))
+    set_control(rig, control.name, value)
+    assert type(armature_object.path_resolve(path)) is type(value) or not isinstance(value, bool | int)
+    assert reader.read(rig, bpy.context.evaluated_depsgraph_get()).tolist() == [value]
+    assert isinstance(resting_value(rig, control.name), float)
+
+
+def test_only_the_named_element_is_set(rig, armature_object):
+    set_control(rig, 'armature_object/["many"][1]', 0.75)
+    assert list(armature_object["many"]) == pytest.approx([0.1, 0.75, 0.3])
+
+
+@pytest.mark.parametrize("name", ['armature_object/["none"]', 'armature_object/["many"]', "elsewhere/location[0]", "x"])
+def test_what_is_no_number_is_refused(rig, armature_object, name):
+    with pytest.raises(RigError, match=r"'elbow' has no control '.*'; give the name of a shape key, or OWNER/PATH"):
+        stated_controls(rig, [name])
+
+
+def test_a_number_without_a_range_is_refused(rig, armature_object):
+    with pytest.raises(RigError, match=r"states no range; give one: 'armature_object/location\[0\]=LOW:HIGH'"):
+        stated_controls(rig, ["armature_object/location[0]"])
