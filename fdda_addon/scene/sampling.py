@@ -11,6 +11,8 @@ from ..core.errors import RigError
 from ..core.model import ModelInfo
 from ..core.poses import CONTROL, KINDS, LOCATION, ROTATION, SCALE, Channel
 from ..core.rig import Rig
+from .action_range import measured_controls, measured_ranges
+from .clip import find_action
 from .compatibility import is_selected
 from .controls import is_driven, is_number, owner_of
 from .motion_range import DEFAULT, location_ranges, rotation_ranges, scale_ranges
@@ -54,33 +56,26 @@ def choose(scene_rig: SceneRig, texts: Iterable[str], controls: tuple[Control, .
     Raises:
         RigError: there is no such collection, action or bone, or it chooses nothing.
     """
-    from .action_range import measured_controls, measured_ranges
-
     texts = list(texts)
     if not texts:
         return Choice(controls=controls)
     chosen: set[str] = set()
-    keyed: set[str] = set()
     actions = []
     for text in texts:
-        found = _bones_of(scene_rig, text)
         if text.startswith(ACTION):
-            actions.append(bpy.data.actions[text.removeprefix(ACTION)])
-            keyed |= found
+            actions.append(find_action(text.removeprefix(ACTION)))
         else:
-            chosen |= found
+            chosen |= _bones_of(scene_rig, text)
     measured = measured_ranges(scene_rig.armature_object, actions)
     own = {control.name: control for control in measured_controls(scene_rig, actions)}
     own |= {control.name: control for control in controls}
-    keyed = {bone for bone, _, _ in measured} & keyed
+    keyed = {bone for bone, _, _ in measured}
     if not chosen | keyed and not own:
         raise RigError(f"Nothing is chosen to sample by {', '.join(texts)}; choose bones that an animator poses.")
     return Choice(frozenset(chosen | keyed), tuple(measured.items()), frozenset(keyed - chosen), tuple(own.values()))
 
 
 def _bones_of(scene_rig: SceneRig, text: str) -> set[str]:
-    from .action_range import measured_ranges
-
     armature_object = scene_rig.armature_object
     bones, data = armature_object.pose.bones, armature_object.data
     if text == SELECTED:
@@ -91,12 +86,6 @@ def _bones_of(scene_rig: SceneRig, text: str) -> set[str]:
             known = ", ".join(f"'{c.name}'" for c in data.collections_all) or "none"
             raise RigError(f"'{armature_object.name}' has no bone collection '{name}'; its collections: {known}.")
         return {bone.name for bone in data.collections_all[name].bones_recursive}
-    if text.startswith(ACTION):
-        name = text.removeprefix(ACTION)
-        if name not in bpy.data.actions:
-            known = ", ".join(f"'{a.name}'" for a in bpy.data.actions) or "none"
-            raise RigError(f"The file has no action '{name}'; its actions: {known}.")
-        return {bone for bone, _, _ in measured_ranges(armature_object, [bpy.data.actions[name]])}
     name = text.removeprefix(BONE)
     if not text.startswith(BONE) or name not in bones:
         raise RigError(
