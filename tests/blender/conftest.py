@@ -74,6 +74,23 @@ def bound(elbow: ElbowFiles) -> bpy.types.Object:
     return bpy.data.objects[ELBOW]
 
 
+@pytest.fixture
+def library(elbow: ElbowFiles, tmp_path: Path):
+    """A library with the bound elbow (`linked.Library`), and a new shot that is open."""
+    from linked import make_library
+
+    return make_library(elbow, tmp_path)
+
+
+@pytest.fixture
+def pair(library) -> list[bpy.types.Object]:
+    """Two overrides of the library's elbow in two poses."""
+    from linked import ANGLES, link, override
+
+    collection = link(library.path)
+    return [override(collection, angle) for angle in ANGLES]
+
+
 def pose(armature_name: str = ELBOW_RIG, angle: float = 1.0, bone: str = "lower") -> None:
     """Bend a bone about X and evaluate."""
     bpy.data.objects[armature_name].pose.bones[bone].rotation_euler[0] = angle

@@ -14,7 +14,6 @@ from linked import (
     cache_name,
     elsewhere,
     link,
-    make_library,
     override,
     own_characters,
     save_and_open,
@@ -25,18 +24,6 @@ from test_renders import render_positions, rig_pixels, set_camera, still
 from fdda_addon.runtime import nodes, playback
 
 CROWD = 20
-
-
-@pytest.fixture
-def library(elbow, tmp_path):
-    return make_library(elbow, tmp_path)
-
-
-@pytest.fixture
-def pair(library):
-    """Two overrides of the elbow in two poses."""
-    collection = link(library.path)
-    return [override(collection, angle) for angle in ANGLES]
 
 
 def test_overrides_play_their_own_poses(pair, library):

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-import pytest
 from conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated
 from linked import (
     ANGLES,
@@ -16,7 +15,6 @@ from linked import (
     cache_name,
     elsewhere,
     link,
-    make_library,
     new_shot,
     override,
     own_characters,
@@ -30,18 +28,6 @@ from fdda_addon.runtime import model_files
 
 OWN = {"parent", 'modifiers["Armature"].object', 'modifiers["FDDA"].properties.inputs.Socket_1.value'}
 """What an override of the elbow's mesh differs in anyway: it follows its own armature and has its own positions."""
-
-
-@pytest.fixture
-def library(elbow, tmp_path):
-    return make_library(elbow, tmp_path)
-
-
-@pytest.fixture
-def pair(library):
-    """Two overrides of the elbow in two poses."""
-    collection = link(library.path)
-    return [override(collection, angle) for angle in ANGLES]
 
 
 def test_overrides_keep_mode_strength_and_use_in_render(pair, library, tmp_path):

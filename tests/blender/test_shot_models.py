@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 from conftest import assert_plays, evaluated
 from linked import (
-    ANGLES,
     assert_play,
     elsewhere,
     link,
-    make_library,
     new_shot,
     override,
     own_characters,
@@ -27,18 +25,6 @@ from fdda_addon import models
 from fdda_addon.core.errors import ModelError, RigError
 from fdda_addon.runtime import model_files
 from fdda_addon.runtime.binding import bind, unbind
-
-
-@pytest.fixture
-def library(elbow, tmp_path):
-    return make_library(elbow, tmp_path)
-
-
-@pytest.fixture
-def pair(library):
-    """Two overrides of the elbow in two poses."""
-    collection = link(library.path)
-    return [override(collection, angle) for angle in ANGLES]
 
 
 def test_binding_to_an_override(elbow, tmp_path):

@@ -10,6 +10,7 @@ from fdda_addon.core.controls import Control
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.poses import Channel
 from fdda_addon.core.recording import Recording, RecordingInfo, Sampling, Source
+from fdda_addon.core.recording_check import check_recording
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from fdda_addon.core.skinning import LinearLayer
 
@@ -91,3 +92,18 @@ def recorded_positions(recording: Recording, positions: np.ndarray) -> Recording
     """The recording as it is when the rig evaluates to these (N, V, 3) positions."""
     layer = LinearLayer(recording.rig, recording.partitions)
     return replace(recording, residuals=layer.local_residuals(recording.pose_matrices, positions))
+
+
+def warned(recording: Recording) -> dict[str, str]:
+    return {warning.name: warning.text for warning in check_recording(recording)}
+
+
+def only(recording: Recording, name: str) -> str:
+    """The text of the one warning of a recording."""
+    found = warned(recording)
+    assert list(found) == [name]
+    return found[name]
+
+
+def with_partitions(recording: Recording, **changes) -> Recording:
+    return replace(recording, partitions=tuple(replace(p, **changes) for p in recording.partitions))
