@@ -19,7 +19,7 @@ help:  ## show this list
 	@setup/environment .venv everything
 
 demo: .venv  ## the arm from rig to playback, into out/demo
-	.venv/bin/python -m fdda_addon.demo out/demo
+	.venv/bin/python benchmarks/demo.py out/demo
 
 test: test-core test-trainer test-blender  ## all three tiers of tests, on one Blender LTS line
 
@@ -34,6 +34,15 @@ test-blender: .venv  ## the tests that run in Blender
 
 test-examples: .venv  ## the examples of docs/elsewhere.md, in Python and in Chromium (CHROMIUM=/path/to/chromium)
 	.venv/bin/python -m pytest tests/examples
+
+farm: .venv-farm  ## what characters.toml says, on this machine or a cluster (PLAN=characters.toml, OPTIONS="--workers 2")
+	.venv-farm/bin/python -m fdda_addon farm $(or $(PLAN),$(error PLAN=characters.toml names the characters, see docs/farm.md)) $(OPTIONS)
+
+.venv-farm:
+	@setup/environment .venv-farm farm
+
+test-farm: .venv-farm  ## the tests of the farm: its graph on a cluster, and what render farms take
+	.venv-farm/bin/python -m pytest tests/farm
 
 test-gui: package  ## press the buttons of the sidebar in a Blender with a window (BLENDER=/path/to/blender), into out/gui
 	.venv/bin/python tests/gui/run.py out/gui $(BLENDER)
@@ -65,6 +74,9 @@ characters: .venv  ## record, train, bind and compare every kind of character on
 pictures: demo  ## make the README's pictures again, from those of the demo
 	.venv/bin/python docs/pictures/make_pictures.py out/demo/pictures
 
+map: .venv  ## draw the floors of the code again, for docs/development.md
+	.venv/bin/python docs/pictures/make_map.py docs/pictures/map.svg
+
 fixtures:  ## build the rigs in blend_fixtures again, with the oldest Blender under test
 	@$(MAKE) .venv-line LINE=4.5
 	.venv-4.5/bin/python blend_fixtures/make_fixtures.py
@@ -79,10 +91,10 @@ package: .venv  ## dist/fdda_addon-VERSION.zip, to install in Blender (PLATFORM=
 requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
 	for version in 3.11 3.13; do .venv/bin/uv pip compile --quiet --no-annotate \
 		--python-version $$version --python-platform x86_64-manylinux_2_28 --custom-compile-command 'make requirements' \
-		--group blender --group trainer --group test --group lint --group setup \
+		--group blender --group trainer --group test --group farm --group lint --group setup \
 		--output-file requirements/python-$$version.txt || exit; done
 
 clean:  ## remove what was built and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-line demo test test-core test-trainer test-blender test-examples test-gui test-all test-line bench sampling study characters fixtures lint package requirements clean
+.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-examples test-gui test-all test-line bench sampling study characters pictures map fixtures lint package requirements clean

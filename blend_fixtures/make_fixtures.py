@@ -14,8 +14,8 @@ import bpy
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
-from fdda_addon.arm import build_arm  # noqa: E402
-from fdda_addon.elbow import build_elbow  # noqa: E402
+from blend_fixtures.elbow import build_elbow  # noqa: E402
+from fdda_addon.arm.rig import build_arm  # noqa: E402
 
 FIXTURES: dict[str, Callable[[], object]] = {"arm.blend": build_arm, "elbow.blend": build_elbow}
 OLDEST_LINE = (4, 5)

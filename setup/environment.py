@@ -22,6 +22,7 @@ SYSTEM_LIBRARIES = ROOT / "setup" / "system-libraries.txt"
 # The dependency groups of pyproject.toml that an environment holds, and the imports that prove that it works.
 CONTENTS = {
     "everything": (("setup", "blender", "trainer", "test", "lint"), ("bpy", "onnxruntime", "torch")),
+    "farm": (("setup", "blender", "trainer", "test", "farm"), ("bpy", "onnxruntime", "torch", "distributed")),
     "blender": (("setup", "blender", "test"), ("bpy", "onnxruntime")),
 }
 
@@ -62,6 +63,19 @@ def is_current(folder: Path, contents: str, python: str) -> bool:
         return False
     stamp = folder / STAMP
     return stamp.is_file() and stamp.read_text() == fingerprint(contents)
+
+
+def check_own(folder: Path) -> None:
+    """Refuse to make an environment anew that lies elsewhere: `venv --clear` empties what a link leads to.
+
+    Raises:
+        SetupError: the folder is a link, as in a second working tree that shares an environment.
+    """
+    if folder.is_symlink():
+        raise SetupError(
+            f"{folder.name} is a link to '{os.readlink(folder)}' and is not up to date; make it anew there, or remove "
+            "the link to have one here."
+        )
 
 
 def check_system_libraries(listing: Path = SYSTEM_LIBRARIES) -> None:
@@ -116,6 +130,7 @@ def make(folder: Path, contents: str) -> None:
         SetupError: a library is missing or a step failed; `folder` then has no stamp.
     """
     groups, imports = CONTENTS[contents]
+    check_own(folder)
     check_system_libraries()
     print(f"Setting up {folder.name} with Python {sys.version.split()[0]}: {', '.join(groups)} …", flush=True)
     python = folder / "bin" / "python"
@@ -144,7 +159,7 @@ def main() -> int:
         with open(f"{folder}.lock", "w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)  # two makes in one tree take turns
             check = [folder / "bin" / "python", __file__, "is-current", folder, arguments.contents]
-            if not folder.is_dir() or subprocess.run(check, stderr=subprocess.DEVNULL, check=False).returncode:
+            if not check[0].exists() or subprocess.run(check, stderr=subprocess.DEVNULL, check=False).returncode:
                 make(folder, arguments.contents)
     except SetupError as error:
         print(error, file=sys.stderr)

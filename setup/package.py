@@ -28,7 +28,7 @@ PLATFORMS = {
     "windows-x64": ("win_amd64",),
 }
 ALL = "all"
-# Blender 4.2 to 5.0 run on Python 3.11, later ones on 3.13.
+# Blender 4.5 and 5.0 run on Python 3.11, later ones on 3.13.
 PYTHONS = ("3.11", "3.13")
 # What a zip may have at most: it is downloaded by hand, and kept a second time where it is installed.
 LARGEST_MB = 60
@@ -92,6 +92,9 @@ def stage(name: str, wheels: list[Path]) -> None:
     shutil.rmtree(STAGE, ignore_errors=True)
     for folder in ("fdda_addon", "trainer", "requirements"):
         shutil.copytree(ROOT / folder, STAGE / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    # The help buttons open the manual.
+    (STAGE / "docs").mkdir()
+    shutil.copy(ROOT / "docs" / "manual.md", STAGE / "docs")
     (STAGE / "__init__.py").write_text(INIT)
     shutil.copy(ROOT / "LICENSE", STAGE)
     (STAGE / "wheels").mkdir()

@@ -1,20 +1,25 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The command line of the trainer: `python -m trainer RECORDING MODEL.onnx`.
 
-Exit status: 0 done, 1 failed with one sentence on stderr, 2 wrong usage, 130 interrupted.
+Exit status: 0 done, 1 failed with one sentence on stderr, 2 wrong usage, 75 failed for lack of disk
+or memory, 130 interrupted.
 """
 
 import argparse
 import sys
 from pathlib import Path
 
+from fdda_addon.core.terminal import show_all_names
+
 from .announcements import Announcer, MessageLines, Text
 from .config import add_options, config_from_arguments
+from .outputs import check_training_outputs
 from .process import StopRequest, missing_package, run_announced
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Train as the arguments say; returns the exit status."""
+    show_all_names()
     options = _parser().parse_args(arguments)
     announcer: Announcer = MessageLines() if options.messages else Text()
     stop = StopRequest()
@@ -24,16 +29,19 @@ def main(arguments: list[str] | None = None) -> int:
 def _train(options: argparse.Namespace, announcer: Announcer, stop: StopRequest) -> None:
     config = config_from_arguments(options)
     try:
-        from fdda_addon.core.recording_folder import recordings_in
+        from fdda_addon.core.recording.folder import recordings_in
 
         from .several import check_several, train_models
 
+        # What is wrong with the files is said before torch is loaded, which takes seconds.
         if recordings := recordings_in(options.recording):
             check_several(recordings, options.model)
+        else:
+            check_training_outputs(options.model, options.overwrite)
         from .training import train_model
     except ModuleNotFoundError as error:
         raise missing_package("Training", error) from error
-    settings = (config, announcer, stop, options.warm_start, options.strict)
+    settings = (config, announcer, stop, options.warm_start, options.strict, options.overwrite)
     if recordings:
         train_models(recordings, options.model, *settings)
     else:
@@ -57,6 +65,9 @@ def _parser() -> argparse.ArgumentParser:
         "--warm-start", action="store_true", help="start from the last weights of the model, on a recording that grew"
     )
     parser.add_argument("--strict", action="store_true", help="let warnings about the recording be errors")
+    parser.add_argument(
+        "--overwrite", action="store_true", help="write over files of another kind; without it that is refused"
+    )
     add_options(parser)
     return parser
 

@@ -4,7 +4,7 @@
 import sys
 from typing import Protocol
 
-from fdda_addon.core.messages import Message, MessageType
+from fdda_addon.core.messages import WARNING_LINE, Message, MessageType
 
 WROTE = "Wrote '{model}': held-out error {held_out_mm:.4f} mm, {seconds:.1f} s."
 LINE_EVERY = 0.1
@@ -44,6 +44,7 @@ class Text:
             MessageType.STARTED: "Training {partitions} partitions, {vertices} vertices, {poses} poses, on {device}.",
             MessageType.PARTITION_FINISHED: "  {joint}: {basis} shapes, held-out error {held_out_mm:.4f} mm",
             MessageType.LOG: "{text}",
+            MessageType.WARNING: WARNING_LINE,
             MessageType.MODEL_FINISHED: WROTE,
             MessageType.FINISHED: WROTE,
             MessageType.CANCELLED: "Cancelled; nothing was written.",

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MOST_POSES = 1000
+MAX_POSES = 1000
 """The components come from at most this many poses; the coefficients from all."""
-MOST_SHAPES = 128
-WORTHWHILE = 0.01
-"""Shapes stop here too, as a part of the rms residual: below it networks err far more than the shapes leave."""
+MAX_SHAPES = 128
+NEGLIGIBLE = 0.01
+"""Part of the rms residual that shapes need not hold, whatever the tolerance: networks err far more than that."""
 COLUMN_BLOCK = 1 << 14
 """The Gram matrix is summed up over blocks of this many columns, so that float64 costs little memory."""
 
@@ -19,10 +19,10 @@ class Basis:
     """Residuals as mean + coefficients @ shapes.
 
     Attributes:
-        mean: (3 Vp,) float32, metres.
+        mean: (3 Vp,) float32, mesh units.
         shapes: (K, 3 Vp) float32, orthonormal rows, no unit. K is 0 when the mean alone is within the tolerance.
         truncation: rms distance over poses and vertices that the shapes leave of the residuals they were made of,
-            metres.
+            mesh units.
     """
 
     mean: np.ndarray
@@ -30,7 +30,7 @@ class Basis:
     truncation: float
 
     def coefficients(self, residuals: np.ndarray) -> np.ndarray:
-        """(N, 3 Vp) residuals to (N, K) float32 coefficients, both in metres.
+        """(N, 3 Vp) residuals to (N, K) float32 coefficients, both in mesh units.
 
         The distance of two rows of coefficients is the distance of the residuals that they stand for.
         """
@@ -38,7 +38,7 @@ class Basis:
         return (residuals @ self.shapes.T - self.mean @ self.shapes.T).astype(np.float32)
 
     def residuals(self, coefficients: np.ndarray) -> np.ndarray:
-        """(N, K) coefficients to (N, 3 Vp) float32 residuals, both in metres."""
+        """(N, K) coefficients to (N, 3 Vp) float32 residuals, both in mesh units."""
         return (coefficients @ self.shapes + self.mean).astype(np.float32)
 
 
@@ -49,15 +49,15 @@ def make_basis(residuals: np.ndarray, tolerance: float, rng: np.random.Generator
     those are fewer; a singular value decomposition of the residuals costs more than the training.
 
     Args:
-        residuals: (N, 3 Vp) float32, the training poses of one partition, metres.
-        tolerance: rms distance over poses and vertices that may remain, metres.
-        rng: chooses the poses when there are more than `MOST_POSES`.
+        residuals: (N, 3 Vp) float32, the training poses of one partition, mesh units.
+        tolerance: rms distance over poses and vertices that may remain, mesh units.
+        rng: chooses the poses when there are more than `MAX_POSES`.
     """
     mean = residuals.mean(axis=0, dtype=np.float64).astype(np.float32)
     count, width = residuals.shape
-    if count > MOST_POSES and width > MOST_POSES:
-        rows = np.sort(rng.choice(count, MOST_POSES, replace=False))
-        residuals, count = residuals[rows], MOST_POSES
+    if count > MAX_POSES and width > MAX_POSES:
+        rows = np.sort(rng.choice(count, MAX_POSES, replace=False))
+        residuals, count = residuals[rows], MAX_POSES
     by_pose = count <= width
     products = np.zeros((min(count, width),) * 2)
     for block in _blocks(width if by_pose else count):
@@ -68,7 +68,7 @@ def make_basis(residuals: np.ndarray, tolerance: float, rng: np.random.Generator
     values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1]
     # What is left after the first k components, as an rms over poses and vertices.
     left = np.sqrt(np.append(np.cumsum(values[::-1])[::-1], 0) / (count * width / 3))
-    shapes_needed = min(int(np.argmax(left <= max(tolerance, WORTHWHILE * left[0]))), MOST_SHAPES)
+    shapes_needed = min(int(np.argmax(left <= max(tolerance, NEGLIGIBLE * left[0]))), MAX_SHAPES)
     vectors = vectors[:, :shapes_needed]
     if by_pose:
         shapes = np.empty((width, shapes_needed))

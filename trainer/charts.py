@@ -7,6 +7,8 @@ from html import escape
 
 import numpy as np
 
+SMALLEST = 1e-12
+"""Where a logarithmic axis begins at the earliest, mm."""
 CURVE_POINTS = 120
 """A curve with more epochs is thinned out to this many points."""
 
@@ -105,7 +107,8 @@ def curve_limits(curves: Sequence[Sequence[float]]) -> tuple[float, float]:
 
 
 def _decades(values: Sequence[float]) -> tuple[float, float]:
-    low, high = math.floor(math.log10(min(values))), math.ceil(math.log10(max(values)))
+    low, high = (math.log10(max(value, SMALLEST)) for value in (min(values), max(values)))
+    low, high = math.floor(low), math.ceil(high)
     return 10.0**low, 10.0 ** max(high, low + 1)
 
 

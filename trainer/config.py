@@ -5,6 +5,7 @@ import argparse
 import math
 from dataclasses import asdict, dataclass, fields
 
+from fdda_addon.core.defaults import EPOCHS, TARGET_MM, TOLERANCE_MM
 from fdda_addon.core.errors import TrainingError
 
 ACTIVATIONS = ("silu", "gelu", "tanh", "relu")
@@ -35,10 +36,10 @@ class TrainingConfig:
     """
 
     seed: int = 0
-    tolerance_mm: float = 0.05
+    tolerance_mm: float = TOLERANCE_MM
     hidden: tuple[int, ...] = (64, 64)
     activation: str = "silu"
-    epochs: int = 200
+    epochs: int = EPOCHS
     batch_size: int = 64
     learning_rate: float = 1e-2
     weight_decay: float = 0.2
@@ -48,7 +49,7 @@ class TrainingConfig:
     averaging: float = 0.99
     validation_fraction: float = 0.05
     held_out_fraction: float = 0.1
-    target_mm: float = 0.0
+    target_mm: float = TARGET_MM
     patience: int = 0
 
     def __post_init__(self):

@@ -7,21 +7,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.recording import Recording
-from fdda_addon.core.recording_index import RANDOM, REFINED, Source
+from fdda_addon.core.features import rounding
+from fdda_addon.core.recording.index import RANDOM, REFINED, Source
+from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Fingerprint
 from fdda_addon.core.skinning import skin_matrices
 
 from .basis import Basis, make_basis
 from .config import TrainingConfig
 from .inputs import Inputs
-from .linear_fit import LinearFit, Surroundings, surroundings_of_rig
+from .joint_fit import JointFit, Surroundings, surroundings_of_rig
 
-LEAST_POSES = 10
+MIN_POSES = 10
 BLOCK_FRAMES = 10
 """Frames of animation that are held back together: neighbours are nearly the same pose."""
-LEAST_SPREAD = 1e-5
-"""A feature that spreads less than this over the training poses counts as constant (in its unit)."""
+MIN_SPREAD = 1e-5
+"""A feature that spreads less than this over the training poses counts as constant: mesh units, or no unit."""
 BLOCK_FLOATS = 1 << 22
 """Residuals are measured in blocks of so many coordinates: all of a partition, in float64, are twice as large."""
 
@@ -33,11 +34,12 @@ class PartitionData:
     Attributes:
         name: of the main joint.
         features: (N, F) float32, what the network sees of each pose; F may be 0.
-        read_residuals: gives the (N, Vp, 3) float32 local residuals, metres; called once, so that not all
+        read_residuals: gives the (N, Vp, 3) float32 local residuals, mesh units; called once, so that not all
             partitions need to be in memory at a time.
         vertices: Vp.
         read_surroundings: gives what the residuals are fitted to first; called once. None when nothing is known of the
             joints.
+        least_spread: (F,) float64, what a feature spreads at least that counts as varying, or one for all.
     """
 
     name: str
@@ -45,6 +47,7 @@ class PartitionData:
     read_residuals: Callable[[], np.ndarray]
     vertices: int
     read_surroundings: Callable[[], Surroundings] | None = None
+    least_spread: np.ndarray | float = MIN_SPREAD
 
 
 @dataclass(frozen=True)
@@ -74,10 +77,10 @@ class PreparedPartition:
         inputs: (N, F') float32, standardised features of all poses.
         fit: the part of the residuals that follows from the joints around.
         basis: of what the fit leaves of the residuals of the training poses.
-        coefficients: (N, K) float32, of all poses, metres.
-        residual_rms: rms distance over training poses and vertices that the fit leaves, about the mean, metres.
+        coefficients: (N, K) float32, of all poses, mesh units.
+        residual_rms: rms distance over training poses and vertices that the fit leaves, about the mean, mesh units.
         validation_truncation: (n,) rms distance over the vertices that the basis leaves of each validation pose,
-            metres.
+            mesh units.
         mm_per_unit: what lengths above have to be multiplied by to be in mm, as in `Rig.metres_per_unit`.
     """
 
@@ -87,7 +90,7 @@ class PreparedPartition:
     feature_mean: np.ndarray
     feature_scale: np.ndarray
     inputs: np.ndarray
-    fit: LinearFit
+    fit: JointFit
     basis: Basis
     coefficients: np.ndarray
     residual_rms: float
@@ -110,8 +113,8 @@ def split_poses(poses: np.ndarray, validation_fraction: float, seed: int, held_o
 
 
 def _check_count(count: int) -> None:
-    if count < LEAST_POSES:
-        raise TrainingError(f"The recording has {count} poses and training takes at least {LEAST_POSES}; record more.")
+    if count < MIN_POSES:
+        raise TrainingError(f"The recording has {count} poses and training takes at least {MIN_POSES}; record more.")
 
 
 def _split(items: np.ndarray, validation_fraction: float, seed: int, held_out_fraction: float) -> Split:
@@ -157,7 +160,7 @@ def _blocks(sources: tuple[Source, ...]) -> list[list[int]]:
     """
     animated = [source for source in sources if source.kind not in (RANDOM, REFINED)]
     frames = sum({source.name: source.poses for source in animated}.values())
-    length = max(1, min(BLOCK_FRAMES, frames // LEAST_POSES))
+    length = max(1, min(BLOCK_FRAMES, frames // MIN_POSES))
     blocks: dict[tuple[str, int], list[int]] = {}
     pose = 0
     for source in sources:
@@ -188,6 +191,8 @@ def partitions_of(recording: Recording, inputs: Inputs) -> list[PartitionData]:
     rig = recording.rig
     features = inputs.features(recording.pose_matrices, rig.rest_matrices, recording.controls)
     skin = skin_matrices(recording.pose_matrices, rig.rest_matrices)
+    of_lengths = max(MIN_SPREAD / rig.metres_per_unit, rounding(recording.pose_matrices))
+    least = np.where(inputs.are_lengths(), of_lengths, MIN_SPREAD)
     return [
         PartitionData(
             rig.joints[partition.joint].name,
@@ -195,6 +200,7 @@ def partitions_of(recording: Recording, inputs: Inputs) -> list[PartitionData]:
             lambda vertices=partition.vertices: recording.residuals[:, vertices],
             len(partition.vertices),
             lambda partition=partition: surroundings_of_rig(rig, partition, skin),
+            least[inputs.columns[number]],
         )
         for number, partition in enumerate(recording.partitions)
     ]
@@ -211,11 +217,11 @@ def prepare(
     features = partition.features
     training = features[split.training].astype(np.float64)
     scale = training.std(axis=0)
-    columns = np.flatnonzero(scale > LEAST_SPREAD).astype(np.int32)
+    columns = np.flatnonzero(scale > partition.least_spread).astype(np.int32)
     mean = training[:, columns].mean(axis=0).astype(np.float32)
     scale = scale[columns].astype(np.float32)
     residuals = np.asarray(partition.read_residuals(), np.float32)
-    fit = LinearFit(np.zeros(0, np.int64), np.zeros((0, partition.vertices), np.float32))
+    fit = JointFit(np.zeros(0, np.int64), np.zeros((0, partition.vertices), np.float32))
     if partition.read_surroundings:
         surroundings = partition.read_surroundings()
         seen = surroundings if len(columns) else surroundings.alone()
@@ -225,7 +231,7 @@ def prepare(
     tolerance = tolerance_mm / mm_per_unit if len(columns) else np.inf
     basis = make_basis(residuals[split.training], tolerance, np.random.default_rng([seed, 2]))
     coefficients = basis.coefficients(residuals)
-    held_out = residuals[split.validation] - basis.residuals(coefficients[split.validation])
+    truncated = residuals[split.validation] - basis.residuals(coefficients[split.validation])
     return PreparedPartition(
         partition.name,
         partition.vertices,
@@ -237,7 +243,7 @@ def prepare(
         basis,
         coefficients,
         float(np.sqrt(_mean_square(residuals, basis.mean, split.training) / partition.vertices)),
-        np.sqrt((held_out**2).sum(axis=1) / partition.vertices),
+        np.sqrt((truncated**2).sum(axis=1) / partition.vertices),
         mm_per_unit,
     )
 

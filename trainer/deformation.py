@@ -13,6 +13,10 @@ from .inputs import Inputs
 from .model import Network
 from .trust import TrustRange
 
+ORTHOGONAL = 1e-5
+"""Cosine of two columns of a pose matrix from which on it is sheared; float32 alone makes a tenth of it."""
+BLOCK_POSES = 256
+
 
 @dataclass(frozen=True)
 class Deformation:
@@ -24,6 +28,7 @@ class Deformation:
         inputs: what the networks see.
         trust: range of the training poses.
         activation: of the networks.
+        sheared: whether the columns of some recorded pose matrix are not orthogonal to each other.
     """
 
     rig: Rig
@@ -33,6 +38,7 @@ class Deformation:
     networks: tuple[Network, ...]
     trust: TrustRange
     activation: str
+    sheared: bool
 
     def standardisation(self) -> tuple[np.ndarray, np.ndarray]:
         """(F,) float64 mean and scale of each feature; 0 and 1 where no network looks at it."""
@@ -50,3 +56,18 @@ class Deformation:
     def shape_counts(self) -> list[int]:
         """K of each partition."""
         return [len(prepared.basis.shapes) for prepared in self.prepared]
+
+
+def is_sheared(pose_matrices: np.ndarray) -> bool:
+    """Whether some matrix has columns that are not orthogonal, to `ORTHOGONAL`; scaled ones may well be.
+
+    Args:
+        pose_matrices: (N, J, 4, 4).
+    """
+    for start in range(0, len(pose_matrices), BLOCK_POSES):
+        axes = np.asarray(pose_matrices[start : start + BLOCK_POSES], np.float64)[:, :, :3, :3]
+        lengths = np.linalg.norm(axes, axis=2)
+        products = np.abs(axes.transpose(0, 1, 3, 2) @ axes)[:, :, [0, 0, 1], [1, 2, 2]]
+        if (products > ORTHOGONAL * lengths[:, :, [0, 0, 1]] * lengths[:, :, [1, 2, 2]]).any():
+            return True
+    return False

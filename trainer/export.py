@@ -9,9 +9,10 @@ import onnx
 import onnxruntime
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.features import FEATURES_PER_JOINT
+from fdda_addon.core.features import FEATURES_PER_JOINT, ROUNDING
 from fdda_addon.core.metrics import distances, error_statistics
 from fdda_addon.core.model import (
+    CHECKSUM_KEY,
     CONTROLS_INPUT,
     LIMITS,
     METADATA_KEY,
@@ -23,8 +24,8 @@ from fdda_addon.core.model import (
     ModelPartition,
     read_model_info,
 )
-from fdda_addon.core.output import replacing
-from fdda_addon.core.recording import Recording
+from fdda_addon.core.onnx_file import read_onnx
+from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.skin_fit import skin_to_text
 from fdda_addon.core.skinning import LinearLayer, skin_matrices
 from fdda_addon.core.surface import Surface, SurfaceComparison, surface_errors, surface_json
@@ -32,9 +33,10 @@ from fdda_addon.core.surface import Surface, SurfaceComparison, surface_errors, 
 from .deformation import Deformation
 from .graph import build_graph
 
-MOST_DIFFERENCE = 1e-5
-"""Units of the mesh. An export that differs more from the reference fails; scaled up for rigs larger than a unit."""
-MOST_SURFACES = 50
+MAX_DIFFERENCE = 1e-5
+"""Metres. An export that differs more from the reference fails; scaled up for rigs larger than a metre, and what
+rounding makes far from the origin comes on top."""
+MAX_SURFACES = 50
 """Normals are compared in so many poses: at 50,000 vertices a pose takes a tenth of a second."""
 BLOCK_FLOATS = 1 << 24
 """Poses are evaluated in blocks of so many coordinates."""
@@ -59,11 +61,11 @@ def reference_positions(
 
     Args:
         deformation: what was trained.
-        pose_matrices: (N, J, 4, 4), mesh-object space, metres.
+        pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
         controls: (N, C).
 
     Returns:
-        (N, V, 3) float32 positions, mesh-object space, metres, and (N, P) float32 trust.
+        (N, V, 3) float32 positions, mesh-object space, mesh units, and (N, P) float32 trust.
     """
     rig, trust_range = deformation.rig, deformation.trust
     features = deformation.inputs.features(pose_matrices, rig.rest_matrices, controls)
@@ -125,7 +127,7 @@ def measure(
 def measure_surface(
     session: onnxruntime.InferenceSession, recording: Recording, deformation: Deformation, poses: np.ndarray
 ) -> dict:
-    """What `surface_json` gives, of the exported model, on at most `MOST_SURFACES` of the poses."""
+    """What `surface_json` gives, of the exported model, on at most `MAX_SURFACES` of the poses."""
     rig, rows = recording.rig, []
     if not len(rig.face_starts):
         return surface_json(None, None)
@@ -133,7 +135,7 @@ def measure_surface(
     comparison = SurfaceComparison(
         Surface(rig.face_starts, rig.face_vertices), rig.rest_positions, deformation.partitions
     )
-    for pose in poses[:: -(-len(poses) // MOST_SURFACES)]:
+    for pose in poses[:: -(-len(poses) // MAX_SURFACES)]:
         inputs = _inputs(recording, np.array([pose]))
         matrices = inputs[POSE_INPUT]
         truth = layer.complex_positions(matrices, np.array(recording.residuals[pose, None]))
@@ -165,7 +167,8 @@ def check_parity(
         if np.abs(trust - expected_trust).max(initial=0) > 1e-3:
             raise TrainingError("The trust of the exported model differs from PyTorch; this is a defect, report it.")
         largest = max(largest, difference)
-    allowed = MOST_DIFFERENCE * max(1.0, recording.rig.size) * metres_per_unit
+    reach = float(np.abs(recording.rig.rest_positions).max() + np.abs(recording.pose_matrices[..., :3, 3]).max())
+    allowed = MAX_DIFFERENCE * max(1.0, recording.rig.size * metres_per_unit) + 2 * ROUNDING * reach * metres_per_unit
     if largest > allowed:
         raise TrainingError(
             f"The exported model differs from PyTorch by {largest * 1000:.3g} mm, more than the allowed "
@@ -227,7 +230,13 @@ def build_model(recording: Recording, deformation: Deformation, validation: np.n
     session = open_session(model.SerializeToString())
     parity = check_parity(session, recording, deformation, validation)
     measured = measure(session, recording, deformation, validation)
-    info = replace(model_info(recording, deformation, measured.fdda, training), parity_mm=parity * 1000)
+    info = replace(
+        model_info(recording, deformation, measured.fdda, training),
+        parity_mm=parity * 1000,
+        constant_bytes=sum(onnx.numpy_helper.to_array(tensor).nbytes for tensor in model.graph.initializer),
+    )
+    # The first of them: what is cut off a file that is not complete is not the checksum.
+    model.metadata_props.add(key=CHECKSUM_KEY, value=read_onnx(model.SerializeToString()).checksum)
     model.metadata_props.add(key=METADATA_KEY, value=info.to_json())
     if recording.info.fit:
         skin = skin_to_text(recording.rig.skin_joints, recording.rig.skin_weights)
@@ -236,14 +245,9 @@ def build_model(recording: Recording, deformation: Deformation, validation: np.n
 
 
 def write_model(path: Path, content: bytes) -> None:
-    """Write the model, and read it back as the add-on will, before it replaces what is there.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    with replacing(path) as temporary:
-        temporary.write_bytes(content)
-        read_model_info(temporary)
+    """Write the model, and read it back as the add-on will. OSError when the file cannot be written."""
+    path.write_bytes(content)
+    read_model_info(path)
 
 
 def _blocks(poses: int, vertices: int) -> list[slice]:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fdda_addon.core.fit_folder import FitPoses, read_fit_poses, write_fitted
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.metrics import distances
+from fdda_addon.core.recording.fit_folder import FitPoses, read_fit_poses, write_fitted
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skin_fit import INFLUENCES, Gain, SkinFit
 from fdda_addon.core.skinning import LinearLayer

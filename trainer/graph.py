@@ -13,8 +13,9 @@ from onnx import TensorProto, helper
 from fdda_addon.core.model import CONTROLS_INPUT, POSE_INPUT, POSITIONS_OUTPUT, TRUST_OUTPUT
 
 from .deformation import Deformation
+from .network_nodes import add_networks
 from .nodes import Graph
-from .playback_nodes import add_playback, make_groups
+from .playback_nodes import add_playback
 from .pose_nodes import add_features, add_range
 
 OPSET = 17
@@ -25,10 +26,10 @@ IR_VERSION = 8
 def build_graph(deformation: Deformation) -> onnx.ModelProto:
     """Build the model, without metadata."""
     graph = Graph()
-    groups = make_groups(deformation)
-    features = add_features(graph, deformation.rig, deformation.inputs)
-    clamped, trust = add_range(graph, features, deformation, [number for group in groups for number in group])
-    add_playback(graph, clamped, trust, deformation, groups)
+    features = add_features(graph, deformation)
+    clamped, trust = add_range(graph, features, deformation)
+    coefficients, places = add_networks(graph, features, clamped, deformation)
+    add_playback(graph, features, coefficients, places, trust, deformation)
     inputs = [helper.make_tensor_value_info(POSE_INPUT, TensorProto.FLOAT, ["N", len(deformation.rig.joints), 4, 4])]
     if count := deformation.inputs.control_count:
         inputs.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", count]))

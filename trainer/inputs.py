@@ -23,12 +23,12 @@ class Inputs:
     """All features that networks see, F = 12 J + C + 3 Q of them in a row, and which of them each network sees.
 
     First the J joints relative to their parents (`core.features`); then the C controls, each in its own unit; then Q
-    points y of joints b as seen from joints a, P_a^-1 P_b y, in metres.
+    points y of joints b as seen from joints a, P_a^-1 P_b y, in mesh units.
 
     Attributes:
         parents: (J,) int32, parent of each joint, -1 for a root.
         control_count: C.
-        points: (M, 3) float32, points that move with joints, each in its joint's own frame, metres.
+        points: (M, 3) float32, points that move with joints, each in its joint's own frame, mesh units.
         point_joints: (M,) int64, their joints b.
         pair_references, pair_points: (Q,) int64, joints a and points y of each pair.
         columns: for each partition, (F_p,) int64 indices of the features that its network is offered.
@@ -52,14 +52,20 @@ class Inputs:
         """12 J + C, where the pairs begin; they follow from what stands before them."""
         return self.joint_columns + self.control_count
 
+    def are_lengths(self) -> np.ndarray:
+        """(F,) bool, the features that are in the unit of length of mesh-object space."""
+        own, pairs = self.own_columns, FEATURES_PER_PAIR * len(self.pair_points)
+        number = np.arange(own + pairs)
+        return (number >= own) | ((number < self.joint_columns) & (number % 4 == 3))
+
     def features(
         self, pose_matrices: np.ndarray, rest_matrices: np.ndarray, controls: np.ndarray | None = None
     ) -> np.ndarray:
         """What there is to see of poses.
 
         Args:
-            pose_matrices: (N, J, 4, 4), mesh-object space, metres.
-            rest_matrices: (J, 4, 4), mesh-object space, metres.
+            pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
+            rest_matrices: (J, 4, 4), mesh-object space, mesh units.
             controls: (N, C) values; may be left out where C is 0.
 
         Returns:
@@ -99,7 +105,7 @@ def make_inputs(
 
     Args:
         parents: (J,) parent index of each joint, -1 for a root.
-        points: (J, S, 3) some of each joint, in its own frame, metres; `middles` makes one each of a rig.
+        points: (J, S, 3) some of each joint, in its own frame, mesh units; `middles` makes one each of a rig.
         partitions: with their main joints, and the joints and controls that influence them.
         control_count: C.
         unmoved: joints that never move.
@@ -129,7 +135,7 @@ def make_inputs(
 
 
 def middles(rig: Rig, partitions: Sequence[Partition]) -> np.ndarray:
-    """(J, 1, 3) float64 middle of each joint's partition, in its own frame, metres; 0 for one without vertices."""
+    """(J, 1, 3) float64 middle of each joint's partition, in its own frame, mesh units; 0 for one without vertices."""
     points = np.zeros((len(rig.joints), 1, 3))
     for partition in partitions:
         middle = np.append(rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64), 1)

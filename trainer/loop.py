@@ -107,7 +107,9 @@ class _Loop:
         inputs = [p.inputs for p in partitions]
         targets = [p.coefficients / scale for p, scale in zip(partitions, self.scales, strict=True)]
         self.x, self.y = (_padded(arrays, split.training, device) for arrays in (inputs, targets))
-        self.x_held, self.y_held = (_padded(arrays, split.validation, device) for arrays in (inputs, targets))
+        self.x_validation, self.y_validation = (
+            _padded(arrays, split.validation, device) for arrays in (inputs, targets)
+        )
         self.to_mm = torch.tensor([p.residual_rms * p.mm_per_unit for p in partitions], device=device)[:, None]
         self.truncation_mm = torch.tensor(
             np.stack([p.validation_truncation * p.mm_per_unit for p in partitions]),
@@ -173,22 +175,22 @@ class _Loop:
                 schedule.step()
                 self._average((epoch - 1) * steps + step)
                 training_mm += (errors * self.to_mm.square() + self.left_mm.square()).sqrt().sum(dim=1)
-            held_mm = self._validate()
-            self._keep_best(held_mm, epoch, curves)
-            held = held_mm.cpu().numpy()
-            if not np.isfinite(held).all():
+            validation_mm = self._validate()
+            self._keep_best(validation_mm, epoch, curves)
+            validation = validation_mm.cpu().numpy()
+            if not np.isfinite(validation).all():
                 raise TrainingError(
                     f"The training diverged in epoch {epoch}: errors are not numbers; use a smaller learning rate than "
                     f"{config.learning_rate:g}."
                 )
             learned = (training_mm / poses).tolist()
-            for curve, train_mm, validation_mm in zip(curves, learned, held, strict=True):
+            for curve, train_mm, own_mm in zip(curves, learned, validation, strict=True):
                 curve.training_mm.append(train_mm)
-                curve.validation_mm.append(float(validation_mm))
+                curve.validation_mm.append(float(own_mm))
             if progress:
                 means = [
                     (float(errors @ learning_vertices) + constant_mm) / vertices.sum()
-                    for errors in (np.array(learned), held)
+                    for errors in (np.array(learned), validation)
                 ]
                 progress(Progress(epoch, config.epochs, *means))
             if config.patience and epoch - max(curve.best_epoch for curve in curves) >= config.patience:
@@ -222,21 +224,21 @@ class _Loop:
         own = [parameter.data for parameter in self.model.parameters()]
         for parameter, average in zip(self.model.parameters(), self.averaged, strict=True):
             parameter.data = average
-        squared = (self.model(self.x_held) - self.y_held).square().sum(dim=2) * self.to_mm.square()
+        squared = (self.model(self.x_validation) - self.y_validation).square().sum(dim=2) * self.to_mm.square()
         for parameter, data in zip(self.model.parameters(), own, strict=True):
             parameter.data = data
         return (squared + self.truncation_mm.square()).sqrt().mean(dim=1)
 
-    def _keep_best(self, held_mm: torch.Tensor, epoch: int, curves: list[Curves]) -> None:
-        better = held_mm < self.best_mm
-        self.best_mm = torch.where(better, held_mm, self.best_mm)
+    def _keep_best(self, validation_mm: torch.Tensor, epoch: int, curves: list[Curves]) -> None:
+        better = validation_mm < self.best_mm
+        self.best_mm = torch.where(better, validation_mm, self.best_mm)
         for best, average in zip(self.best, self.averaged, strict=True):
             best[better] = average[better]
         for number in torch.nonzero(better).flatten().tolist():
             curves[number].best_epoch = epoch
 
     def best_networks(self) -> list[Network]:
-        """The best weights of each partition without padding, the coefficients in metres again."""
+        """The best weights of each partition without padding, the coefficients in mesh units again."""
         layers = len(self.model.weights)
         weights, biases = ([t.cpu().numpy() for t in self.best[i * layers : (i + 1) * layers]] for i in range(2))
         networks = []

@@ -23,9 +23,17 @@ class Graph:
     def integers(self, name: str, value: np.ndarray) -> str:
         return self._constant(name, np.asarray(value, np.int64))
 
+    def short_integers(self, name: str, value: np.ndarray) -> str:
+        """For long indices: a frame reads them all."""
+        return self._constant(name, np.asarray(value, np.int32))
+
     def add(self, operator: str, inputs: list[str], output: str, **attributes) -> str:
         self.nodes.append(helper.make_node(operator, inputs, [output], name=output, **attributes))
         return output
+
+    def join(self, values: list[str], output: str, axis: int) -> str:
+        """Concat; a single value is itself."""
+        return self.add("Concat", values, output, axis=axis) if len(values) > 1 else values[0]
 
     def split(self, value: str, sizes: list[int], outputs: list[str], axis: int) -> list[str]:
         """Split; a single part is the value itself."""

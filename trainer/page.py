@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
+from fdda_addon.core.input_file import read_input
 from fdda_addon.core.rig import UNMOVED_LABEL
 
 from .charts import curve_limits, error_bars, histogram, learning_curves
 
+MAX_PICTURE_BYTES = 256 << 20
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c1f24; --soft: #666d78; --paper: #fff; --card: #f5f6f8; --line: #dfe2e7;
   --fdda: #e2711d; --linear: #b9c0cb; --train: #7b93b8; }
@@ -112,7 +114,7 @@ def _pictures(pictures: Sequence[Path]) -> str:
     figures = []
     for path in pictures:
         kind = "jpeg" if path.suffix.lower() in (".jpg", ".jpeg") else "png"
-        data = base64.b64encode(path.read_bytes()).decode("ascii")
+        data = base64.b64encode(read_input(path, MAX_PICTURE_BYTES)).decode("ascii")
         name = escape(path.stem.replace("_", " "))
         figures.append(
             f'<figure><img alt="{name}" src="data:image/{kind};base64,{data}"><figcaption>{name}</figcaption></figure>'
@@ -226,6 +228,8 @@ def _joint(partition: dict) -> str:
 
 def _settings(report: dict) -> str:
     values = {**report["training"], "largest difference to PyTorch": f"{report['parity']:.2g} mm"}
+    if "constant_bytes" in report:
+        values["bytes that a frame reads"] = f"{report['constant_bytes']:,}"
     rows = "".join(
         f"<dt>{escape(str(key).replace('_', ' '))}</dt><dd>{escape(_shown(value))}</dd>"
         for key, value in values.items()

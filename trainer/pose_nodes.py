@@ -1,51 +1,178 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The part of the graph that looks at the pose: features, their range, and trust."""
+"""The part of the graph that looks at the pose: features, their range, and trust.
+
+Every three features are one vector as a frame sees it, R^-1 (d - t): the columns of a joint's matrix as the joint sees
+them that its parent carries along, and the points of other joints as a main joint sees them. So all are one gather of
+frames, one of vectors and a product. Where no recorded bone is sheared the columns of R are orthogonal, whatever the
+scale, and R^-1 is its transpose, each row divided by its squared length: a third of the nodes of an inverse.
+"""
+
+from dataclasses import dataclass
 
 import numpy as np
 
+from fdda_addon.core.features import FEATURES_PER_JOINT
 from fdda_addon.core.model import CONTROLS_INPUT, POSE_INPUT, TRUST_OUTPUT
-from fdda_addon.core.rig import Rig
 
 from .deformation import Deformation
-from .inputs import FEATURES_PER_PAIR, Inputs
+from .inputs import FEATURES_PER_PAIR
 from .nodes import Graph
 
-SMALLEST_DETERMINANT = 1e-18
-"""Added to determinants: a joint that is scaled to nothing gives large features, not NaN, and so no trust."""
+SMALLEST = 1e-18
+"""Added to what is divided by: a joint that is scaled to nothing gives numbers, not NaN."""
+VECTOR = 3
+"""Features are gathered by so many."""
+COLUMNS, ZERO, WHOLE, INVERSE = 4, 4, 5, 6
+"""Rows of the table for a frame: four for its columns, each thrice; a zero; its columns one after the other; and its
+transpose."""
 
 
-def add_features(graph: Graph, rig: Rig, inputs: Inputs) -> str:
-    """(N, F) features, as `Inputs.features` has them.
+@dataclass(frozen=True)
+class Features:
+    """The features in the graph.
 
-    Those of a joint are Q^-1 P_j, where Q = P_p B_p^-1 B_j is the joint carried along by its parent.
+    Attributes:
+        name: (N, B, 3), of the controls first, then of the joints, then of the pairs.
+        own: how many of the B vectors are of controls and joints; the others follow from these.
+        size: 3 B.
+        place: (F,) int64, where each feature of `Inputs` is among the 3 B; -1 where it is not needed.
+        table: (N, ·, 12), in which also the poses are, by columns of three numbers.
+        pose_rows: (J,) int64, where they are in it.
     """
-    parents, rest = rig.parents, rig.rest_matrices.astype(np.float64)
+
+    name: str
+    own: int
+    size: int
+    place: np.ndarray
+    table: str
+    pose_rows: np.ndarray
+
+    def constant(self, values: np.ndarray, missing: float) -> np.ndarray:
+        """(F,) values in the order of the graph, (B, 3) float64."""
+        ordered = np.full(self.size, missing, np.float64)
+        ordered[self.place[self.place >= 0]] = values[self.place >= 0]
+        return ordered.reshape(-1, VECTOR)
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """Frames from which or of which something is seen: joints carried by their parents, points, and joints.
+
+    Attributes:
+        joints: (Ju,) those whose features are needed, the first Ju frames.
+        points: (M,) indices of the points that are seen; the next M frames stand on them.
+        first_joint: where the frames of all J joints begin.
+    """
+
+    joints: np.ndarray
+    points: np.ndarray
+    first_joint: int
+
+
+def add_features(graph: Graph, deformation: Deformation) -> Features:
+    """Add the features that networks or trust look at."""
+    inputs, joints = deformation.inputs, _joints_needed(deformation)
+    points = np.unique(inputs.pair_points)
+    frames = _Frames(joints, points, len(joints) + len(points))
+    stack = _add_frames(graph, deformation, frames)
+    seen_from, there, origin = _vectors(deformation, frames)
+    rows = INVERSE + (not deformation.sheared)
+    flat = graph.reshape(stack, [0, frames.first_joint + len(inputs.parents), 16], "flat_frames")
+    table = graph.add("MatMul", [flat, graph.floats("table_picks", _table_picks(rows))], "table_rows")
+    table = graph.reshape(table, [0, -1, 12], "table")
+    source = _inverses(graph, flat) if deformation.sheared else table
+    turned = graph.add("Gather", [source, graph.integers("seen_from", seen_from)], "frames_of_vectors", axis=1)
+    ends = [graph.add("Gather", [table, graph.integers("vector_there", there)], "vectors_there", axis=1)]
+    ends.append(graph.add("Gather", [table, graph.integers("vector_origin", origin)], "vectors_origin", axis=1))
+    apart = graph.add("Sub", ends, "apart")
+    sums = graph.floats("row_sums", np.kron(np.eye(3), [[1], [1], [1], [0]]))
+    name = graph.add("MatMul", [graph.add("Mul", [turned, apart], "terms"), sums], "vectors")
+    if not deformation.sheared:
+        squared = graph.add("Mul", [turned, turned], "frames_squared")
+        lengths = graph.add("MatMul", [squared, sums], "lengths")
+        safe = graph.add("Add", [lengths, graph.floats("smallest_length", SMALLEST)], "safe_lengths")
+        name = graph.add("Div", [name, safe], "seen_vectors")
+    place = np.full(inputs.own_columns + FEATURES_PER_PAIR * len(inputs.pair_points), -1, np.int64)
+    if count := inputs.control_count:
+        # Three times, to fill vectors; only the first is looked at.
+        thrice = graph.add("Concat", [CONTROLS_INPUT] * VECTOR, "controls_thrice", axis=1)
+        name = graph.add(
+            "Concat", [graph.reshape(thrice, [0, count, VECTOR], "controls_in_vectors"), name], "features", axis=1
+        )
+        place[inputs.joint_columns : inputs.own_columns] = np.arange(count)
+    own, by_column = count + COLUMNS * len(joints), np.arange(FEATURES_PER_JOINT).reshape(VECTOR, COLUMNS).T.ravel()
+    place[(FEATURES_PER_JOINT * joints[:, None] + by_column).ravel()] = np.arange(VECTOR * count, VECTOR * own)
+    pairs = VECTOR * len(inputs.pair_points)
+    place[inputs.own_columns :] = np.arange(VECTOR * own, VECTOR * own + pairs)
+    itself = frames.first_joint + np.arange(len(inputs.parents))
+    return Features(name, own, VECTOR * own + pairs, place, table, rows * itself + WHOLE)
+
+
+def _joints_needed(deformation: Deformation) -> np.ndarray:
+    """(Ju,) joints whose features some network sees, or that count for some partition's trust."""
+    inputs = deformation.inputs
+    needed = deformation.trust.counts[:, : inputs.joint_columns].any(axis=0)
+    for number in range(len(deformation.partitions)):
+        columns = deformation.seen_columns(number)
+        needed[columns[columns < inputs.joint_columns]] = True
+    joints = np.flatnonzero(needed.reshape(-1, FEATURES_PER_JOINT).any(axis=1))
+    # Something has to be there to be looked at.
+    return joints if len(joints) else np.zeros(1, np.int64)
+
+
+def _add_frames(graph: Graph, deformation: Deformation, frames: _Frames) -> str:
+    """(N, Ju + M + J, 4, 4) frames: Q_j = P_p B_p^-1 B_j, the joint carried along by its parent; points; all joints."""
+    rig, inputs = deformation.rig, deformation.inputs
+    parents, rest = rig.parents[frames.joints], rig.rest_matrices.astype(np.float64)
     above, is_root = np.maximum(parents, 0), (parents < 0)[:, None, None]
-    to_child = np.where(is_root, 0, np.linalg.inv(rest[above]) @ rest)
-    parent_poses = graph.add("Gather", [POSE_INPUT, graph.integers("parents", above)], "parent_poses", axis=1)
-    moved = graph.add("MatMul", [parent_poses, graph.floats("rest_to_parent", to_child)], "moved")
-    carried = graph.add("Add", [moved, graph.floats("rest_of_roots", np.where(is_root, rest, 0))], "carried")
-    has_pairs = len(inputs.pair_points) > 0
-    # The pairs need the inverses of the poses themselves: one more half of the same stack.
-    stack = graph.add("Concat", [carried, POSE_INPUT], "stack", axis=1) if has_pairs else carried
-    inverses = _inverses(graph, stack, len(parents) * (2 if has_pairs else 1))
-    halves = graph.split(inverses, [len(parents)] * (2 if has_pairs else 1), ["carried_inverse", "pose_inverse"], 1)
-    mask = np.zeros((4, 4))
-    mask[:3, 3] = 1
-    origins = graph.add("Mul", [carried, graph.floats("translation", mask)], "origins")
-    offsets = graph.add("Sub", [POSE_INPUT, origins], "offsets")
-    square = graph.reshape(halves[0], [0, len(parents), 3, 4], "carried_inverse_rows")
-    relative = graph.add("MatMul", [square, offsets], "relative")
-    features = graph.reshape(relative, [0, inputs.joint_columns], "joint_features")
-    parts = [features, *([CONTROLS_INPUT] if inputs.control_count else [])]
-    if has_pairs:
-        parts.append(_pair_features(graph, halves[1], inputs))
-    return graph.add("Concat", parts, "features", axis=1) if len(parts) > 1 else features
+    to_child = np.where(is_root, 0, np.linalg.inv(rest[above]) @ rest[frames.joints])
+    at_points = np.tile(np.eye(4), (len(frames.points), 1, 1))
+    at_points[:, :3, 3] = inputs.points[frames.points]
+    sources = np.concatenate([above, inputs.point_joints[frames.points]]).astype(np.int64)
+    moved = graph.add("Gather", [POSE_INPUT, graph.integers("frame_joints", sources)], "frame_poses", axis=1)
+    places = graph.floats("frame_places", np.concatenate([to_child, at_points]))
+    moved = graph.add("MatMul", [moved, places], "moved")
+    if is_root.any():
+        roots = np.concatenate([np.where(is_root, rest[frames.joints], 0), 0 * at_points])
+        moved = graph.add("Add", [moved, graph.floats("frames_of_roots", roots)], "carried")
+    return graph.add("Concat", [moved, POSE_INPUT], "frames", axis=1)
 
 
-def _inverses(graph: Graph, matrices: str, count: int) -> str:
-    """(N, count, 4, 4) to (N, count, 12): inverses of the upper left 3x3, row by row with a zero behind each row."""
-    flat = graph.reshape(matrices, [0, count, 16], "flat_stack")
+def _table_picks(rows: int) -> np.ndarray:
+    """(16, 12 rows) that picks what the table holds of a matrix; three times as the three rows of a product want it."""
+    picks = np.zeros((16, rows, VECTOR, 4))
+    for row, inner in np.ndindex(VECTOR, 3):
+        for column in range(COLUMNS):
+            picks[4 * inner + column, column, row, inner] = 1
+        if rows > INVERSE:
+            picks[4 * inner + row, INVERSE, row, inner] = 1
+    for column, row in np.ndindex(COLUMNS, 3):
+        picks.reshape(16, rows, -1)[4 * row + column, WHOLE, 3 * column + row] = 1
+    return picks.reshape(16, -1)
+
+
+def _vectors(deformation: Deformation, frames: _Frames) -> tuple[np.ndarray, ...]:
+    """Of each vector where the inverse of the frame is that sees it, and in the table where it ends and begins.
+
+    The inverses of sheared frames are a table of their own, one row each.
+    """
+    inputs, rows = deformation.inputs, INVERSE + (not deformation.sheared)
+    carried, itself = np.arange(len(frames.joints)), frames.first_joint + frames.joints
+    columns = np.arange(COLUMNS)
+    # Directions begin nowhere, the place of a joint at that of the joint carried along.
+    origin = np.where(columns == COLUMNS - 1, rows * carried[:, None] + COLUMNS - 1, ZERO).ravel()
+    references = frames.first_joint + inputs.pair_references
+    points = len(frames.joints) + np.searchsorted(frames.points, inputs.pair_points)
+    seen_from = np.append(np.repeat(carried, COLUMNS), references)
+    return (
+        seen_from if deformation.sheared else rows * seen_from + INVERSE,
+        np.append((rows * itself[:, None] + columns).ravel(), rows * points + COLUMNS - 1),
+        np.append(origin, rows * references + COLUMNS - 1),
+    )
+
+
+def _inverses(graph: Graph, flat: str) -> str:
+    """(N, G, 16) to (N, G, 12): inverses of the upper left 3x3, row by row with a zero behind each row."""
     # Adjugate: differences of two products of elements each. A product with ones and zeros is exact.
     picks, signs = np.zeros((16, 39)), np.zeros((18, 12))
     for i, j in np.ndindex(3, 3):
@@ -62,69 +189,30 @@ def _inverses(graph: Graph, matrices: str, count: int) -> str:
     adjugate = graph.add("MatMul", [products, graph.floats("minor_signs", signs)], "adjugate")
     expansion = graph.add("Mul", [graph.slice(adjugate, 0, 3, 2, "adjugate_row"), column], "expansion")
     determinant = graph.add("ReduceSum", [expansion, graph.integers("last_axis", [2])], "determinant", keepdims=1)
-    safe = graph.add("Add", [determinant, graph.floats("smallest", SMALLEST_DETERMINANT)], "safe_determinant")
+    safe = graph.add("Add", [determinant, graph.floats("smallest", SMALLEST)], "safe_determinant")
     return graph.add("Div", [adjugate, safe], "inverses")
 
 
-def _pair_features(graph: Graph, inverses: str, inputs: Inputs) -> str:
-    """(N, Q * 3) P_a^-1 P_b y_b, as sums of nine products each; tiny matrix products cost far more."""
-    poses = graph.reshape(POSE_INPUT, [0, len(inputs.parents), 16], "flat_poses")
-    # Every coordinate of a point three times, and every origin, as the nine products of the inverse want them.
-    to_points, to_origins, sums = np.zeros((16, 12)), np.zeros((16, 12)), np.zeros((12, 3))
-    for row, inner in np.ndindex(3, 3):
-        to_points[4 * inner : 4 * inner + 4, 4 * row + inner] = 1
-        to_origins[4 * inner + 3, 4 * row + inner] = 1
-        sums[4 * row + inner, row] = 1
-    moved = poses
-    if not np.array_equal(inputs.point_joints, np.arange(len(inputs.parents))):
-        moved = graph.add(
-            "Gather", [poses, graph.integers("point_joints", inputs.point_joints)], "moved_points", axis=1
-        )
-    scales = np.tile(np.append(inputs.points, np.ones((len(inputs.points), 1)), axis=1), 4)
-    terms = graph.add("Mul", [moved, graph.floats("points", scales)], "point_terms")
-    there = graph.add("MatMul", [terms, graph.floats("to_points", to_points)], "there")
-    here = graph.add("MatMul", [poses, graph.floats("to_origins", to_origins)], "here")
-    references, points = (
-        graph.integers(name, chosen)
-        for name, chosen in (("pair_references", inputs.pair_references), ("pair_points", inputs.pair_points))
-    )
-    ends = [
-        graph.add("Gather", [there, points], "pair_there", axis=1),
-        graph.add("Gather", [here, references], "pair_here", axis=1),
-    ]
-    turned = [graph.add("Gather", [inverses, references], "pair_inverse", axis=1), graph.add("Sub", ends, "apart")]
-    products = graph.add("Mul", turned, "pair_products")
-    pairs = graph.add("MatMul", [products, graph.floats("pair_sums", sums)], "pairs")
-    return graph.reshape(pairs, [0, len(inputs.pair_points) * FEATURES_PER_PAIR], "pair_features")
-
-
-def add_range(graph: Graph, features: str, deformation: Deformation, order: list[int]) -> tuple[str, str]:
+def add_range(graph: Graph, features: Features, deformation: Deformation) -> tuple[str, str]:
     """Clamp the features to the training range, and add the output `trust`.
 
-    Args:
-        features: (N, F).
-        order: in which the rest of the graph wants the partitions.
-
     Returns:
-        (N, F) standardised features, clamped, and (N, P + 1) trust in `order`, after it a 1 for what needs no trust.
+        (N, B, 3) features, clamped, and (N, P + 1) trust, behind it a 1 for what needs no trust.
     """
-    trust, count, own = deformation.trust, len(order), deformation.inputs.own_columns
-    mean, scale = deformation.standardisation()
-    low, high = ((bound - mean) / scale for bound in (trust.low, trust.high))
-    centred = graph.add("Sub", [features, graph.floats("feature_mean", mean)], "centred")
-    standard = graph.add("Mul", [centred, graph.floats("feature_scale", 1 / scale)], "standard")
-    raised = graph.add("Max", [standard, graph.floats("range_low", low)], "raised")
+    trust, size = deformation.trust, VECTOR * features.own
+    low, high = (features.constant(bound, 0) for bound in (trust.low, trust.high))
+    raised = graph.add("Max", [features.name, graph.floats("range_low", low)], "raised")
     clamped = graph.add("Min", [raised, graph.floats("range_high", high)], "clamped")
-    outside = graph.add("Sub", [standard, clamped], "outside")
-    if len(mean) > own:
-        outside = graph.slice(outside, 0, own, 1, "joints_outside")
-    excess = graph.add("Mul", [outside, graph.floats("per_fade_width", scale[:own] / trust.width)], "excess")
-    squared = graph.add("Mul", [excess, excess], "excess_squared")
-    # Every partition twice: as the graph wants them, and as the output lists them. Between them one that nothing takes
-    # trust from.
-    certain = np.zeros_like(trust.counts[:1])
-    counts = np.concatenate([trust.counts[order], certain, trust.counts])
-    summed = graph.add("MatMul", [squared, graph.floats("counts", counts.T)], "partition_excess")
-    root = graph.add("Relu", [graph.add("Sub", [graph.floats("one", 1.0), summed], "trust_left")], "trust_root")
-    both = graph.add("Mul", [root, root], "trusts")
-    return clamped, graph.split(both, [count + 1, count], ["partition_trust", TRUST_OUTPUT], axis=1)[0]
+    outside = graph.add("Sub", [features.name, clamped], "outside")
+    if features.size > size:
+        outside = graph.slice(outside, 0, features.own, 1, "own_outside")
+    outside = graph.reshape(outside, [0, size], "outside_row")
+    squared = graph.add("Mul", [outside, outside], "outside_squared")
+    counts = np.zeros((size, len(trust.counts) + 1))
+    own = features.place[: len(trust.width)]
+    counts[own[own >= 0], :-1] = (trust.counts / trust.width.astype(np.float64) ** 2).T[own >= 0]
+    left = [squared, graph.floats("counts", counts), graph.floats("one", np.ones(1))]
+    root = graph.add("Relu", [graph.add("Gemm", left, "trust_left", alpha=-1.0)], "trust_root")
+    both = graph.add("Mul", [root, root], "trust_and_one")
+    graph.slice(both, 0, len(trust.counts), 1, TRUST_OUTPUT)
+    return clamped, both

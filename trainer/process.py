@@ -7,7 +7,7 @@ import sys
 import traceback
 from collections.abc import Callable
 
-from fdda_addon.core.errors import FDDAError, TrainingError
+from fdda_addon.core.errors import TRY_AGAIN, FDDAError, TrainingError, exit_status
 from fdda_addon.core.messages import MessageType
 
 from .announcements import Announcer
@@ -53,10 +53,13 @@ def run_announced(work: Callable[[], None], announcer: Announcer) -> int:
             announcer.say(MessageType.CANCELLED)
             return INTERRUPTED
         except FDDAError as error:
-            return _failed(str(error), announcer)
+            return _failed(str(error), announcer, exit_status(error))
         except BrokenPipeError:
             raise
         except Exception as error:  # The boundary: the add-on waits for a last message, whatever happened.
+            if _lacks_memory(error):
+                text = f"The training lacks memory ({error}); free some, or train on a larger machine."
+                return _failed(" ".join(text.split()), announcer, TRY_AGAIN)
             traceback.print_exc()
             return _failed(f"The trainer stopped on an error of its own ({error!r}); please report it.", announcer)
     except BrokenPipeError:
@@ -66,10 +69,16 @@ def run_announced(work: Callable[[], None], announcer: Announcer) -> int:
     return 0
 
 
-def _failed(text: str, announcer: Announcer) -> int:
-    announcer.say(MessageType.FAILED, text=text)
+def _lacks_memory(error: Exception) -> bool:
+    """Whether numpy or torch found no memory. torch is not imported here: it may be what is missing."""
+    kinds = {kind.__name__ for kind in type(error).__mro__}
+    return bool(kinds & {"MemoryError", "OutOfMemoryError"}) or "can't allocate memory" in str(error)
+
+
+def _failed(text: str, announcer: Announcer, status: int = 1) -> int:
+    announcer.say(MessageType.FAILED, text=text, **({"try_again": True} if status == TRY_AGAIN else {}))
     print(text, file=sys.stderr)
-    return 1
+    return status
 
 
 def missing_package(work: str, error: ModuleNotFoundError) -> TrainingError:

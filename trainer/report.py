@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,21 +11,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fdda_addon.core.errors import FDDAError, TrainingError
+from fdda_addon.core.errors import FDDAError
+from fdda_addon.core.file_kind import PAGE
 from fdda_addon.core.metrics import error_statistics
-from fdda_addon.core.output import write_text
+from fdda_addon.core.output import check_outputs, write_text
+from fdda_addon.core.report import page_path, read_report
+from fdda_addon.core.terminal import show_all_names
 
 from .page import render_html
+from .report_file import check_drawable, read_evaluation
 
 if TYPE_CHECKING:  # The page can be written again where torch is not installed.
-    from fdda_addon.core.recording import Recording
+    from fdda_addon.core.recording.reader import Recording
 
     from .deformation import Deformation
     from .export import Exported, Measured
     from .loop import Curves
 
-FORMAT = "fdda-report"
-VERSION = 1
 HISTOGRAM_EDGES_MM = np.concatenate([[0.0], np.geomspace(1e-4, 1e3, 71)])
 """Ten bins a decade; the first one holds everything below a ten-thousandth of a millimetre."""
 
@@ -40,7 +41,7 @@ def make_report(
     curves: Sequence[Curves],
     model_name: str,
 ) -> dict:
-    """What `report.json` holds. docs/training.md describes the keys; errors are in mm.
+    """What `report.json` holds (`core.report`). docs/training.md describes the keys; errors are in mm.
 
     Args:
         recording, deformation, exported, curves: of the training.
@@ -75,8 +76,6 @@ def make_report(
             }
         )
     return {
-        "format": FORMAT,
-        "version": VERSION,
         "unit": "mm",
         "model": model_name,
         "model_bytes": len(exported.content),
@@ -88,6 +87,7 @@ def make_report(
         "poses": len(recording.pose_matrices),
         "training": exported.info.training,
         "parity": exported.info.parity_mm,
+        "constant_bytes": exported.info.constant_bytes,
         "fdda": {
             "training": error_statistics(on_training.fdda).to_json(),
             "held_out": exported.info.held_out_mm,
@@ -122,40 +122,30 @@ def write_html(report: dict, path: Path, pictures: Sequence[Path] = (), evaluati
     write_text(path, render_html(report, pictures, evaluation))
 
 
-def read_report(path: Path) -> dict:
-    """Read `report.json`.
-
-    Raises:
-        TrainingError: it is not one.
-    """
-    try:
-        report = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise TrainingError(f"The report '{path}' cannot be read ({error}); train again.") from error
-    if not isinstance(report, dict) or (report.get("format"), report.get("version")) != (FORMAT, VERSION):
-        raise TrainingError(f"'{path}' is not a training report of this version; train again.")
-    return report
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Write the page again: `python -m trainer.report REPORT.json`; returns the exit status."""
+    show_all_names()
     parser = argparse.ArgumentParser("trainer.report", description="Write the page of a training report again.")
     parser.add_argument("report", type=Path, help="report.json; the page is written beside it")
     parser.add_argument("--pictures", type=Path, help="folder of PNG or JPEG files to show, in order of their names")
     parser.add_argument("--evaluation", type=Path, help="JSON that evaluate wrote")
+    parser.add_argument("--overwrite", action="store_true", help="write over a page that is no report")
     options = parser.parse_args(arguments)
     try:
+        page = page_path(options.report)
+        check_outputs({page: PAGE}, [options.report], options.overwrite)
         report = read_report(options.report)
+        check_drawable(report, options.report)
         pictures = []
         if options.pictures:
             pictures = sorted(p for p in options.pictures.glob("*") if p.suffix.lower() in (".png", ".jpg", ".jpeg"))
-        evaluation = json.loads(options.evaluation.read_text(encoding="utf-8")) if options.evaluation else None
-        write_html(report, options.report.with_suffix(".html"), pictures, evaluation)
+        evaluation = read_evaluation(options.evaluation) if options.evaluation else None
+        write_html(report, page, pictures, evaluation)
     except FDDAError as error:
         print(error, file=sys.stderr)
         return 1
-    except (OSError, ValueError) as error:
-        print(f"The evaluation or a picture cannot be read: {error}.", file=sys.stderr)
+    except OSError as error:
+        print(f"A picture cannot be read: {error}.", file=sys.stderr)
         return 1
     return 0
 

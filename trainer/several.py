@@ -9,7 +9,7 @@ from pathlib import Path
 from fdda_addon.core.errors import OutputError, RecordingError
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.output import check_folder_writable
-from fdda_addon.core.recording_index import read_index
+from fdda_addon.core.recording.index import read_index
 
 from .announcements import Announcer
 from .config import TrainingConfig
@@ -59,6 +59,7 @@ def train_models(
     should_stop: Callable[[], bool] = lambda: False,
     warm_start: bool = False,
     strict: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Train a model on each recording, in a folder of its own: FOLDER/NAME/NAME.onnx, by the name of its recording.
 
@@ -77,7 +78,9 @@ def train_models(
         own = folder / recording.name
         own.mkdir(parents=True, exist_ok=True)
         try:
-            train_model(recording, own / f"{recording.name}.onnx", config, each, should_stop, warm_start, strict)
+            train_model(
+                recording, own / f"{recording.name}.onnx", config, each, should_stop, warm_start, strict, overwrite
+            )
         finally:
             for empty in (own, folder):
                 with suppress(OSError):

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Fits skin weights to poses that `record` has evaluated: `python -m trainer.skin_fit FOLDER hard|smooth`.
 
-FOLDER is one that `core.fit_folder` wrote; the fitted weights are written into it. Speaks in messages, and exits as
-`python -m trainer` does.
+FOLDER is one that `core.recording.fit_folder` wrote; the fitted weights are written into it. Speaks in messages, and
+exits as `python -m trainer` does.
 """
 
 import argparse
 import sys
 from pathlib import Path
+
+from fdda_addon.core.terminal import show_all_names
 
 from .announcements import Announcer, MessageLines
 from .process import StopRequest, missing_package, run_announced
@@ -15,6 +17,7 @@ from .process import StopRequest, missing_package, run_announced
 
 def main(arguments: list[str] | None = None) -> int:
     """Fit as the arguments say; returns the exit status."""
+    show_all_names()
     parser = argparse.ArgumentParser("trainer.skin_fit", description="Fit skin weights to the poses in a folder.")
     parser.add_argument("folder", type=Path, help="folder that record made")
     parser.add_argument("kind", choices=("hard", "smooth"), help="one joint a vertex, or at most four")

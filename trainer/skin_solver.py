@@ -11,24 +11,24 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.optimize import nnls
 
-from fdda_addon.core.fit_folder import FitPoses
+from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.skin_fit import INFLUENCES
 from fdda_addon.core.skinning import skin_matrices
 
-OWN = 4
-"""So many of the joints that the rig's own weights give a vertex are tried, the heaviest first."""
-BEST = 8
-"""So many joints are tried that would explain a vertex best alone."""
-ADDED = 4
-"""So many are tried that improve most on the weights found so far, in the place of those that got none."""
+RIG_CANDIDATES = 4
+"""How many of the joints that the rig's own weights give a vertex are candidates, the heaviest first."""
+SINGLE_CANDIDATES = 8
+"""How many joints are candidates because each would explain the vertex best alone."""
+ADDED_CANDIDATES = 4
+"""How many joints take the places of candidates without weight in each round: those that improve the fit most."""
 ROUNDS = 2
-"""As often as this."""
+"""How often candidates are exchanged."""
 TIE = 1e-5
 """Joints whose errors for a vertex differ by less than this part of the character's size count as equally good."""
-WORTHWHILE = 0.1
-"""A weight is left out where the others leave no larger part more of the error. Every joint that moves a partition a
-little is one more input to learn from: docs/training.md, Fitted skin weights."""
-LEAST = 1e-3
+MAX_PRUNING_LOSS = 0.1
+"""A weight is left out where the error grows by no larger part without it. Every joint that moves a partition a little
+is one more input to learn from: docs/training.md, Fitted skin weights."""
+MIN_WEIGHT = 1e-3
 """Smaller weights are left out in any case."""
 ROUNDING = 1e-12
 """The least ridge, as a part of the errors: less would drown in the rounding of the products."""
@@ -67,7 +67,7 @@ class SkinSolver:
             The vertices of the block, (B, 4) int32 joints, the heaviest first, and (B, 4) float32 weights. Each row
             sums to 1; unused places hold 0.
         """
-        tried = OWN + BEST + ADDED
+        tried = RIG_CANDIDATES + SINGLE_CANDIDATES + ADDED_CANDIDATES
         step = max(1, BLOCK_FLOATS // max(16 * tried**2, 4 * self._joints, 3 * self._count))
         vertices = self._poses.rig.vertex_count
         for start in range(0, vertices, step):
@@ -79,10 +79,10 @@ class _Block:
     """Some vertices, their moments with all joints, and what is known of single joints.
 
     Attributes:
-        rest: (B, 4) float64, homogeneous rest positions about the middle of the mesh, metres.
+        rest: (B, 4) float64, homogeneous rest positions about the middle of the mesh, mesh units.
         moments: (4 J, B), of the recorded positions. linear: (B, J), of each joint's skinned position with them.
         squares: (B,), of the recorded positions. alone: (B, J), squared error of each joint alone. All are sums over
-            the poses, in square metres.
+            the poses, in square mesh units.
         preference: (B, J), which joint to take where several are as good: lower is better, below 0 for the rig's own.
     """
 
@@ -112,7 +112,7 @@ class _Block:
 
     @property
     def _rank(self) -> np.ndarray:
-        """(B, J) rms error of each joint alone, metres, with a step for the preference that decides ties."""
+        """(B, J) rms error of each joint alone, mesh units, with a step for the preference that decides ties."""
         return np.sqrt(self.alone / self._solver._count) + TIE * self._solver._size * self.preference
 
     def fit(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
@@ -121,10 +121,10 @@ class _Block:
         if kind == "hard":
             return _padded(rank.argmin(axis=1)[:, None], np.ones((len(rank), 1)))
         rank[self._own_places()] = self.preference[self._own_places()] - 2
-        tried = np.argsort(rank, axis=1, kind="stable")[:, : OWN + BEST]
+        tried = np.argsort(rank, axis=1, kind="stable")[:, : RIG_CANDIDATES + SINGLE_CANDIDATES]
         weights, squares = self._solve(tried)
         for _ in range(ROUNDS if tried.shape[1] < self._solver._joints else 0):
-            kept = np.sort(np.argsort(-weights, axis=1, kind="stable")[:, : OWN + BEST], axis=1)
+            kept = np.sort(np.argsort(-weights, axis=1, kind="stable")[:, : RIG_CANDIDATES + SINGLE_CANDIDATES], axis=1)
             tried, weights = (np.take_along_axis(array, kept, axis=1) for array in (tried, weights))
             tried = np.concatenate([tried, self._improving(tried, weights)], axis=1)
             weights, squares = self._solve(tried)
@@ -132,7 +132,7 @@ class _Block:
 
     def _own_places(self) -> np.ndarray:
         """(B, J) bool, where a joint is one of the heaviest of the rig's own weights of a vertex."""
-        heaviest = np.argsort(-self._own, axis=1, kind="stable")[:, :OWN]
+        heaviest = np.argsort(-self._own, axis=1, kind="stable")[:, :RIG_CANDIDATES]
         places = np.zeros(self._own.shape, bool)
         np.put_along_axis(places, heaviest, True, axis=1)
         return places & (self._own > 0)
@@ -144,16 +144,18 @@ class _Block:
         combined = (dense[:, :, None] * self.rest[:, None]).reshape(len(dense), -1).T
         slopes = self._by_joint(self._solver._products @ combined - self.moments)
         np.put_along_axis(slopes, tried, np.inf, axis=1)
-        return np.argsort(slopes, axis=1, kind="stable")[:, : min(ADDED, self._solver._joints - tried.shape[1])]
+        return np.argsort(slopes, axis=1, kind="stable")[
+            :, : min(ADDED_CANDIDATES, self._solver._joints - tried.shape[1])
+        ]
 
     def _pruned(self, tried: np.ndarray, weights: np.ndarray, squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Joints and weights, at most four a vertex, and none without which the others do nearly as well.
 
         The smallest weight goes first, and the others are solved again. `squares` is what the weights leave.
         """
-        order = np.argsort(-weights, axis=1, kind="stable")[:, : (weights > LEAST).sum(axis=1).max()]
+        order = np.argsort(-weights, axis=1, kind="stable")[:, : (weights > MIN_WEIGHT).sum(axis=1).max()]
         tried, weights = (np.take_along_axis(array, order, axis=1) for array in (tried, weights))
-        allowed, limits = weights > LEAST, self._limits(squares)
+        allowed, limits = weights > MIN_WEIGHT, self._limits(squares)
         left = np.arange(len(weights))
         while len(left := left[allowed[left].sum(axis=1) > 1]):
             fewer = allowed[left]
@@ -162,14 +164,14 @@ class _Block:
             must = allowed[left].sum(axis=1) > INFLUENCES
             good = must | (squares <= limits[left])
             left, solved, squares, fewer = left[good], solved[good], squares[good], fewer[good]
-            weights[left], allowed[left] = solved, fewer & (solved > LEAST)
+            weights[left], allowed[left] = solved, fewer & (solved > MIN_WEIGHT)
             # What four weights leave is what fewer are measured by.
             limits[left] = np.where(must[good], self._limits(squares), limits[left])
         return tried, np.where(allowed, weights, 0)
 
     def _limits(self, squares: np.ndarray) -> np.ndarray:
         """Squared errors that fewer weights may leave where more leave `squares`."""
-        return squares * (1 + WORTHWHILE) ** 2 + self._solver.tie
+        return squares * (1 + MAX_PRUNING_LOSS) ** 2 + self._solver.tie
 
     def _solve(
         self, tried: np.ndarray, allowed: np.ndarray | None = None, chosen: np.ndarray | None = None
@@ -192,7 +194,7 @@ class _Block:
         return weights, np.maximum(np.einsum("vj,vjk,vk->v", weights, errors, weights), 0)
 
     def _errors(self, tried: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """(B, C, C): with e_nj = S_nj x - y_n, sum_n e_nj . e_nk of the joints that are tried, square metres.
+        """(B, C, C): with e_nj = S_nj x - y_n, sum_n e_nj . e_nk of the joints that are tried, square mesh units.
 
         Where weights sum to 1, w' E w is the squared error of their linear layer.
         """

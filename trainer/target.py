@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The error that the user asks for, and what to do when a training misses it."""
 
-import enum
 from dataclasses import dataclass
 from pathlib import Path
+
+from fdda_addon.core.report import Verdict
 
 HELPS = 0.97
 """More poses help when they bring the error to less than this part of the best before."""
@@ -12,16 +13,6 @@ PATIENCE = 2
 SMALL_GAP = 0.8
 """Where the error on the training poses is above this part of the held-out one, more poses bring little: the networks
 cannot follow even those that they have seen."""
-
-
-class Verdict(enum.Enum):
-    """What a training says of its target."""
-
-    MET = "met"
-    MISSED = "missed"
-    """More poses may help."""
-    EXHAUSTED = "exhausted"
-    """More poses no longer help."""
 
 
 @dataclass(frozen=True)

@@ -10,31 +10,31 @@ import numpy as np
 import onnxruntime
 import torch
 
+from fdda_addon.core.checks.recording import check_recording
+from fdda_addon.core.checks.warning import RecordingWarning, refuse
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.messages import MessageType
-from fdda_addon.core.output import check_writable, write_json, write_text
-from fdda_addon.core.recording import Recording, read_recording
-from fdda_addon.core.recording_check import check_recording
-from fdda_addon.core.recording_estimate import sizes_in_words
-from fdda_addon.core.recording_warning import RecordingWarning, refuse
+from fdda_addon.core.output import replacing_all
+from fdda_addon.core.recording.estimate import sizes_in_words
+from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.core.report import report_text, weights_path
 from fdda_addon.core.rig import UNMOVED_LABEL
 
 from . import report
 from .announcements import Announcer
 from .config import TrainingConfig
 from .data import PreparedPartition, Split, held_back_digest, partitions_of, prepare, split_recording
-from .deformation import Deformation
+from .deformation import Deformation, is_sheared
 from .export import build_model, measure, measure_surface, write_model
 from .inputs import Inputs, inputs_of_rig, middles
 from .loop import Trained, choose_device, train
+from .outputs import check_training_outputs, training_outputs
 from .page import render_html
 from .process import Cancelled
 from .target import Outcome, judge
 from .trust import make_trust_range
-from .weights import LastWeights, initial_networks, read_weights, weights_path, write_weights
+from .weights import LastWeights, initial_networks, read_weights, write_weights
 
-REPORT_JSON = "report.json"
-REPORT_HTML = "report.html"
 WARM_EPOCHS, WARM_RATE = 0.5, 0.3
 """A warm start takes this part of the epochs and of the learning rate: most is learned already."""
 
@@ -47,6 +47,7 @@ def train_model(
     should_stop: Callable[[], bool] = lambda: False,
     warm_start: bool = False,
     strict: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Train a model, and write it with its report and its last weights beside it.
 
@@ -58,15 +59,14 @@ def train_model(
         should_stop: asked often; nothing has been written when it is heeded.
         warm_start: start from the last weights of the model, on a recording that may have grown since.
         strict: warnings about the recording are errors.
+        overwrite: write over files of another kind.
 
     Raises:
         Cancelled: `should_stop` said so.
         FDDAError: the recording, the settings or the output path are no good.
     """
     started = time.perf_counter()
-    report_json, report_html = (model_path.with_name(name) for name in (REPORT_JSON, REPORT_HTML))
-    for path in (model_path, report_json, report_html, weights_path(model_path)):
-        check_writable(path)
+    check_training_outputs(model_path, overwrite)
     recording = read_recording(recording_path)
     split = split_recording(recording, config)
     held_back = held_back_digest(recording, split)
@@ -111,7 +111,7 @@ def train_model(
         "validation_poses": len(split.validation),
         "held_out_poses": len(split.held_out),
         "warm_start": warm_start,
-        "seconds": round(time.perf_counter() - started, 2),
+        "sheared": deformation.sheared,
     }
     announcer.say(MessageType.LOG, text=f"Exporting the model, and measuring it on {len(split.held_out)} poses.")
     exported = build_model(recording, deformation, split.held_out, settings)
@@ -122,6 +122,8 @@ def train_model(
     content = report.make_report(
         recording, deformation, exported, on_training, surface, trained.curves, model_path.name
     )
+    # Not in the model: the same recording and settings give the same bytes.
+    content["training"] = {**content["training"], "seconds": round(time.perf_counter() - started, 2)}
     content["warnings"] = [warning.to_json() for warning in warnings]
     poses, p999 = len(recording.pose_matrices), exported.info.held_out_mm["p999"]
     history = [*(last.history if last else ()), {"poses": poses, "p999": p999}]
@@ -133,10 +135,11 @@ def train_model(
     page = render_html(content)
     _check_stop(should_stop)
     # From here on nothing stops: the model and what lies beside it belong together.
-    write_model(model_path, exported.content)
-    write_weights(weights_path(model_path), deformation, held_back, config.hidden, history)
-    write_json(report_json, content)
-    write_text(report_html, page)
+    with replacing_all(*training_outputs(model_path)) as (model, weights, report_file, page_file):
+        write_model(model, exported.content)
+        write_weights(weights, deformation, held_back, config.hidden, history)
+        report_file.write_text(report_text(content), encoding="utf-8")
+        page_file.write_text(page, encoding="utf-8", errors="backslashreplace")
     _announce_end(announcer, model_path, content, outcome, time.perf_counter() - started)
 
 
@@ -148,7 +151,7 @@ def _check(recording: Recording, announcer: Announcer, strict: bool) -> list[Rec
     """
     warnings = check_recording(recording)
     for warning in warnings:
-        announcer.say(MessageType.LOG, text=str(warning))
+        announcer.say(MessageType.WARNING, **warning.to_json())
     if strict:
         refuse(warnings)
     return warnings
@@ -245,6 +248,7 @@ def _deformation(
         trained.networks,
         make_trust_range(features, rig, recording.partitions),
         config.activation,
+        is_sheared(recording.pose_matrices),
     )
 
 

@@ -24,14 +24,14 @@ FADE = 6.0
 
 Measured on the arm, before there was a linear fit: at 3 times the range of motion the mean error is 51 % of the linear
 layer's, with a fade width of 0.15 it was 92 %."""
-LEAST_MARGIN = (0.01, 0.001)
-LEAST_FADE = (4.0, 0.2)
+MIN_MARGIN = (0.01, 0.001)
+MIN_FADE = (4.0, 0.2)
 """Least margin and fade width: of rotation elements, no unit, and of translations, as a part of the character's size.
 
 A locked axis has no range of its own; these are what it may turn before it counts, and what takes all trust away. Those
 of a control are the first of each, as a part of the range that it was recorded for."""
 LOCKED = 1e-4
-"""A joint whose features spread less than this was locked in the recording (no unit, or metres)."""
+"""A joint whose features spread less than this was locked in the recording (no unit, or mesh units)."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def make_trust_range(features: np.ndarray, rig: Rig, partitions: tuple[Partition
 
     Args:
         features: (n, F) float32 of the training poses: 12 J of the joints relative to their parents, C controls, and
-            what follows from these, metres.
+            what follows from these, mesh units.
         rig, partitions: of the recording.
     """
     low, high = features.min(axis=0), features.max(axis=0)
@@ -73,9 +73,9 @@ def make_trust_range(features: np.ndarray, rig: Rig, partitions: tuple[Partition
     own = joints + len(rig.controls)
     translation = (np.arange(len(low)) % 4 == 3) | (np.arange(len(low)) >= own)
     least_margin, least_fade = (
-        np.where(translation, least[1] * rig.size, least[0]) for least in (LEAST_MARGIN, LEAST_FADE)
+        np.where(translation, least[1] * rig.size, least[0]) for least in (MIN_MARGIN, MIN_FADE)
     )
-    for least, part in ((least_margin, LEAST_MARGIN[0]), (least_fade, LEAST_FADE[0])):
+    for least, part in ((least_margin, MIN_MARGIN[0]), (least_fade, MIN_FADE[0])):
         least[joints:own] = [part * _unit(control) for control in rig.controls]
     margin = np.maximum(MARGIN * spread, least_margin)
     width = np.maximum(FADE * spread, least_fade)[:own]
@@ -91,7 +91,8 @@ def _joints_that_count(spread: np.ndarray, rig: Rig, partitions: tuple[Partition
     """(P, 12 J) bool."""
     counts = np.zeros((len(partitions), len(rig.joints)), bool)
     by_joint = spread[: len(rig.joints) * FEATURES_PER_JOINT].reshape(-1, FEATURES_PER_JOINT)
-    locked = (by_joint < LOCKED).all(axis=1)
+    least = np.where(np.arange(FEATURES_PER_JOINT) % 4 == 3, LOCKED / rig.metres_per_unit, LOCKED)
+    locked = (by_joint < least).all(axis=1)
     for number, partition in enumerate(partitions):
         beside = {partition.joint, rig.joints[partition.joint].parent, *SkinBlock(rig, partition).joints.tolist()}
         beside |= {child for child, joint in enumerate(rig.joints) if joint.parent == partition.joint}

@@ -6,7 +6,9 @@ take up what changed of the last three, so that a network starts with nearly the
 """
 
 import json
+import os
 import zipfile
+import zlib
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -14,15 +16,20 @@ from pathlib import Path
 import numpy as np
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.output import replacing
+from fdda_addon.core.input_file import open_input
+from fdda_addon.core.recording.arrays import HEADER_ERRORS, LARGEST
 from fdda_addon.core.rig import Fingerprint
 
 from .data import PreparedPartition
 from .deformation import Deformation
 from .model import Network
 
-SUFFIX = ".weights.npz"
 VERSION = 2
+DAMAGE = (
+    *(OSError, ValueError, KeyError, AttributeError, OverflowError, EOFError, zipfile.BadZipFile, zlib.error),
+    *(RuntimeError, IndexError, *HEADER_ERRORS),
+)
+"""What numpy and zipfile raise for a damaged file: a RuntimeError where it asks for a password."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +39,8 @@ class LastPartition:
     Attributes:
         columns: (F',) int64, the features that it saw, among all features of `Inputs`.
         feature_mean, feature_scale: (F',) float32.
-        basis_mean: (3 Vp,) float32, metres. basis_shapes: (K, 3 Vp) float32, orthonormal rows.
-        network: of standardised features, coefficients in metres.
+        basis_mean: (3 Vp,) float32, mesh units. basis_shapes: (K, 3 Vp) float32, orthonormal rows.
+        network: of standardised features, coefficients in mesh units.
     """
 
     columns: np.ndarray
@@ -66,18 +73,12 @@ class LastWeights:
     partitions: tuple[LastPartition, ...]
 
 
-def weights_path(model_path: Path) -> Path:
-    """Where the last weights of a model are."""
-    return model_path.with_suffix(SUFFIX)
-
-
 def write_weights(
     path: Path, deformation: Deformation, held_back: str, hidden: tuple[int, ...], history: list[dict]
 ) -> None:
     """Keep the weights of a training; `held_back`, `hidden` and `history` as in `LastWeights`.
 
-    Raises:
-        OutputError: the file cannot be written.
+    OSError when the file cannot be written.
     """
     about = {
         "version": VERSION,
@@ -101,7 +102,7 @@ def write_weights(
             **{f"bias_{layer}": bias for layer, bias in enumerate(network.biases)},
         }
         arrays |= {f"{number}/{name}": array for name, array in own.items()}
-    with replacing(path) as temporary, open(temporary, "wb") as file:
+    with open(path, "wb") as file:
         np.savez(file, **arrays)
 
 
@@ -112,18 +113,20 @@ def read_weights(path: Path) -> LastWeights:
         TrainingError: there are none, or the file is damaged.
     """
     try:
-        size = path.stat().st_size
-        with zipfile.ZipFile(path) as archive:
-            # Nothing is allocated that is larger than the file.
-            if any(member.file_size > size for member in archive.infolist()):
-                raise ValueError("it is packed")
-        with np.load(path, allow_pickle=False) as arrays:
-            return _read(arrays)
+        with open_input(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            with zipfile.ZipFile(file) as archive:
+                # Nothing is allocated that is larger than the file.
+                if any(member.file_size > size for member in archive.infolist()):
+                    raise ValueError("it is packed")
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as arrays:
+                return _read(arrays)
     except FileNotFoundError as error:
         raise TrainingError(
             f"There are no last weights '{path}' to start from; train without --warm-start first."
         ) from error
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         raise TrainingError(
             f"The last weights '{path}' cannot be used ({error}); train without --warm-start."
         ) from error
@@ -139,16 +142,13 @@ def _read(arrays: np.lib.npyio.NpzFile) -> LastWeights:
         own = {name: arrays[f"{number}/{name}"] for name in ("columns", "feature_mean", "feature_scale")}
         own |= {name: arrays[f"{number}/{name}"] for name in ("basis_mean", "basis_shapes")}
         layers = range(1 if not len(own["basis_shapes"]) else len(hidden) + 1)
-        weights, biases = (
-            tuple(arrays[f"{number}/{kind}_{layer}"].astype(np.float32) for layer in layers)
-            for kind in ("weight", "bias")
-        )
+        weights, biases = (tuple(arrays[f"{number}/{kind}_{layer}"] for layer in layers) for kind in ("weight", "bias"))
         partition = LastPartition(**own, network=Network(weights, biases))
-        _check_shapes(partition, hidden)
+        _check(partition, hidden)
         partitions.append(partition)
     history = tuple({"poses": int(entry["poses"]), "p999": float(entry["p999"])} for entry in about["history"])
     return LastWeights(
-        Fingerprint(**about["fingerprint"]),
+        Fingerprint.from_json(about["fingerprint"]),
         tuple(str(name) for name in about.get("controls", ())),
         str(about["held_back"]),
         hidden,
@@ -158,7 +158,15 @@ def _read(arrays: np.lib.npyio.NpzFile) -> LastWeights:
     )
 
 
-def _check_shapes(partition: LastPartition, hidden: tuple[int, ...]) -> None:
+def _check(partition: LastPartition, hidden: tuple[int, ...]) -> None:
+    """ValueError where arrays contradict each other, or hold what is no number."""
+    network = partition.network
+    numbers = [partition.feature_mean, partition.feature_scale, partition.basis_mean, partition.basis_shapes]
+    for array in (*numbers, *network.weights, *network.biases):
+        if array.dtype != np.float32 or not (np.abs(array) <= LARGEST).all():
+            raise ValueError("its arrays hold values that are not numbers")
+    if partition.columns.dtype != np.int64 or partition.columns.ndim != 1:
+        raise ValueError("its arrays contradict each other")
     features, shapes = len(partition.columns), len(partition.basis_shapes)
     sizes = (features, *hidden, shapes) if shapes else (features, 0)
     found = [weight.shape for weight in partition.network.weights]

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import bpy
 import numpy as np
 
-from fdda_addon.elbow import JOINT, build_elbow, elbow_surface, lower_weights
+from blend_fixtures.elbow import JOINT, build_elbow, elbow_surface, lower_weights
 
 
 def tube() -> tuple[bpy.types.Object, bpy.types.Object]:

@@ -7,8 +7,8 @@ from math import radians
 import bpy
 import numpy as np
 
-from fdda_addon.elbow import END, START, elbow_surface
-from fdda_addon.scene.motion_range import set_limit
+from blend_fixtures.elbow import END, START, elbow_surface
+from fdda_addon.poses.motion_range import set_limit
 
 from .base import link
 

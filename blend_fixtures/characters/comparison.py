@@ -8,17 +8,19 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from fdda_addon.cli.files import save_copy
 from fdda_addon.core.metrics import distances
 from fdda_addon.core.poses import Channel
-from fdda_addon.evaluation import EvaluationSettings, evaluate, pose_held_out
-from fdda_addon.recording import record
+from fdda_addon.evaluation.run import EvaluationSettings, evaluate, pose_held_out
+from fdda_addon.poses.sampling import model_channels
+from fdda_addon.recording.run import record
+from fdda_addon.rig.modifier_stack import read_stack
+from fdda_addon.rig.reading import PoseReader, read_model_rig
 from fdda_addon.runtime.binding import bind
 from fdda_addon.runtime.network import Network
+from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.controls import ControlReader
 from fdda_addon.scene.mesh import evaluated_positions, rest_positions
-from fdda_addon.scene.modifier_stack import read_stack
-from fdda_addon.scene.rig import PoseReader, SceneRig, armature_of, find_rig, model_channels, read_model_rig
+from fdda_addon.scene.scene_rig import SceneRig, armature_of, find_rig
 from fdda_addon.scene.unit import metres_per_unit
 
 from .rows import Row

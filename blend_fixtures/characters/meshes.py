@@ -6,7 +6,7 @@ from collections.abc import Callable
 import bpy
 import numpy as np
 
-from fdda_addon.elbow import END, START
+from blend_fixtures.elbow import END, START
 
 from .base import cage, link, skin, tube
 from .bones import NewBone, add_bones, limit, mush

@@ -4,7 +4,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from fdda_addon.recording import RecordingSettings
+from fdda_addon.recording.plan import RecordingSettings
 
 from . import control_rigs, controls, meshes, skinning, stacks, transforms
 
@@ -143,6 +143,9 @@ ROWS: tuple[Row, ...] = (
     _tube(MESHES, transforms.parented_to_empty, "armature parented to a moving empty"),
     _tube(MESHES, transforms.parented_to_bone, "mesh parented to a bone and skinned besides"),
     _tube(MESHES, transforms.in_centimetres, "a scene in centimetres"),
+    _tube(MESHES, transforms.in_millimetres, "a scene in millimetres"),
+    _tube(MESHES, transforms.in_kilometres, "a scene in kilometres"),
+    _tube(MESHES, transforms.far_from_its_origin, "vertices 100 m from the origin of their object"),
     _tube(MESHES, transforms.scaled_armature, "an armature in centimetres, scaled by 0.01"),
     _tube(MESHES, transforms.scaled_character, "mesh and armature in centimetres, scaled by 0.01"),
     _tube(MESHES, transforms.far_away, "hundreds of metres from the origin"),

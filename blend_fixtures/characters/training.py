@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
-from fdda_addon.training import trainer_command
+from fdda_addon.training.process import trainer_command
 
 MODULE = "blend_fixtures.characters.training"
 HIDDEN, BATCH = (32, 32), 16

@@ -8,14 +8,14 @@ from collections.abc import Callable
 from math import radians
 
 import bpy
-from mathutils import Euler, Matrix
+from mathutils import Euler, Matrix, Vector
 
-from fdda_addon.elbow import build_elbow
+from blend_fixtures.elbow import build_elbow
 
 from .base import link
 
-CENTIMETRES = 100.0
-"""Blender units in a metre where a unit is a centimetre."""
+CENTIMETRES, MILLIMETRES, KILOMETRES = 100.0, 1000.0, 0.001
+"""Blender units in a metre where a unit is a centimetre, a millimetre, a kilometre."""
 
 
 def moved() -> None:
@@ -62,9 +62,26 @@ def parented_to_bone() -> None:
 
 def in_centimetres() -> None:
     """A scene whose unit is a centimetre: positions in tens, unit scale 0.01."""
-    for scene_object in build_elbow():
-        _enlarge(scene_object)
-    bpy.context.scene.unit_settings.scale_length = 1.0 / CENTIMETRES
+    _in_unit(CENTIMETRES)
+
+
+def in_millimetres() -> None:
+    """A scene whose unit is a millimetre: positions in hundreds, unit scale 0.001."""
+    _in_unit(MILLIMETRES)
+
+
+def in_kilometres() -> None:
+    """A scene whose unit is a kilometre: positions in ten-thousandths, unit scale 1000."""
+    _in_unit(KILOMETRES)
+
+
+def far_from_its_origin() -> None:
+    """Mesh and bones 100 metres from the origins of their objects, which stand as far on the other side."""
+    away = Vector((60.0, -80.0, 0.0))
+    mesh_object, armature_object = build_elbow()
+    for scene_object in (mesh_object, armature_object):
+        scene_object.data.transform(Matrix.Translation(away))
+    _place(armature_object, tuple(-away), (0, 0, 0), (1.0, 1.0, 1.0))
 
 
 def scaled_armature() -> None:
@@ -92,8 +109,14 @@ def far_away() -> None:
 
 TRANSFORMS: tuple[Callable[[], None], ...] = (
     moved, parented_to_armature, parented_to_empty, parented_to_bone, in_centimetres, scaled_armature, scaled_character,
-    far_away,
+    far_away, in_millimetres, in_kilometres, far_from_its_origin,
 )  # fmt: skip
+
+
+def _in_unit(units_in_a_metre: float) -> None:
+    for scene_object in build_elbow():
+        _enlarge(scene_object, units_in_a_metre)
+    bpy.context.scene.unit_settings.scale_length = 1.0 / units_in_a_metre
 
 
 def _place(
@@ -108,6 +131,6 @@ def _place(
     bpy.context.view_layer.update()
 
 
-def _enlarge(scene_object: bpy.types.Object) -> None:
-    """Build the data of an object in centimetres."""
-    scene_object.data.transform(Matrix.Scale(CENTIMETRES, 4))
+def _enlarge(scene_object: bpy.types.Object, units_in_a_metre: float = CENTIMETRES) -> None:
+    """Build the data of an object in another unit."""
+    scene_object.data.transform(Matrix.Scale(units_in_a_metre, 4))

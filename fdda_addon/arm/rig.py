@@ -6,6 +6,7 @@ import math
 import bpy
 import numpy as np
 
+from ..scene.arrays import COORDINATE, MATERIAL_INDEX, write
 from .action import assign_drive_action
 from .joints import ARM_OBJECT, BICEPS_KEY, ELBOW_FLEXION, JOINT_NAMES, JOINTS, LOCKED, RIG_OBJECT, ROTATION_MODE
 from .surface import Surface, sculpt_arm
@@ -82,10 +83,10 @@ def _limit_motion(rig: bpy.types.Object):
 def _mesh_object(surface: Surface) -> bpy.types.Object:
     mesh = bpy.data.meshes.new(ARM_OBJECT)
     mesh.from_pydata(surface.points.tolist(), [], surface.faces.tolist())
-    mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), bool))
+    mesh.shade_smooth()
     for name, look in (("arm_skin", _SKIN), ("arm_nail", _NAIL)):
         mesh.materials.append(_material(name, *look))
-    mesh.polygons.foreach_set("material_index", surface.nails.astype(np.int32))
+    write(mesh.polygons, MATERIAL_INDEX, surface.nails.astype(np.int32))
     mesh.update()
     arm = bpy.data.objects.new(ARM_OBJECT, mesh)
     bpy.context.scene.collection.objects.link(arm)
@@ -121,7 +122,7 @@ def _add_biceps(arm: bpy.types.Object, rig: bpy.types.Object, surface: Surface):
     basis = arm.shape_key_add(name="Basis", from_mix=False)
     key = arm.shape_key_add(name=BICEPS_KEY, from_mix=False)
     key.relative_key = basis
-    key.data.foreach_set("co", (surface.points + surface.biceps).astype(np.float32).ravel())
+    write(key.data, COORDINATE, (surface.points + surface.biceps).astype(np.float32))
     driver = key.driver_add("value").driver
     driver.type = "SCRIPTED"
     variable = driver.variables.new()

@@ -4,9 +4,10 @@
 import argparse
 from pathlib import Path
 
-from ..baking import BakeSettings, bake, output_files
+from ..baking.run import BakeSettings, bake, output_files
 from ..core.progress import Progress
 from .files import add_rig_options, open_rig
+from .outputs import add_overwrite
 from .progress import ProgressPrinter
 
 
@@ -31,14 +32,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--shape-keys", action="store_true", help="keep the positions in the .blend file, a shape key each frame"
     )
+    add_overwrite(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     # Before a file is opened, which may take long.
-    output_files(options.out, options.shape_keys)
-    scene_rig = open_rig(options)
     frames = tuple(options.frames) if options.frames else None
-    settings = BakeSettings(options.action, frames, options.shape_keys)
+    settings = BakeSettings(options.action, frames, options.shape_keys, options.overwrite)
+    output_files(options.out, settings, (options.rig, options.model))
+    scene_rig = open_rig(options)
     with ProgressPrinter() as progress:
         for step in bake(scene_rig, options.model, options.out, settings):
             if isinstance(step, Progress):

@@ -4,13 +4,15 @@
 import argparse
 from pathlib import Path
 
-from ..benchmark import benchmark
 from ..core.errors import WrongUsageError
-from ..core.output import check_writable, write_json
-from ..recording import Progress
+from ..core.file_kind import BENCHMARK
+from ..core.output import check_outputs, write_json
+from ..core.progress import Progress
 from ..runtime.binding import true_rig
+from ..timing.benchmark import benchmark
 from .files import add_rig_options
 from .folders import by_object, headed, open_rigs
+from .outputs import add_overwrite
 from .progress import ProgressPrinter
 
 
@@ -19,12 +21,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
     parser.add_argument("--json", metavar="OUT.json", type=Path, required=True, help="where to write the times")
     parser.add_argument("--frames", type=int, default=100, help="frames to time, each way (default 100)")
+    add_overwrite(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     if options.frames < 1:
         raise WrongUsageError("--frames must be 1 or more.")
-    check_writable(options.json)
+    check_outputs({options.json: BENCHMARK}, (options.rig, options.model), options.overwrite)
     benchmarks = {}
     for name, (scene_rig, model) in open_rigs(options).items():
         with ProgressPrinter() as progress, true_rig(scene_rig.mesh_object):

@@ -7,25 +7,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ..scene.rig import SceneRig
+    from ..scene.scene_rig import SceneRig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     from .files import add_rig_options
+    from .outputs import add_overwrite
 
     add_rig_options(parser)
     parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="where to save the bound file")
     parser.add_argument("--use-in-render", action="store_true", help="final renders use the model too, not the rig")
+    add_overwrite(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..core.errors import FDDAError
-    from ..core.output import check_writable
-    from .files import save_copy
+    from ..core.file_kind import BLEND
+    from ..core.output import check_outputs
+    from ..scene.blend_file import save_copy
     from .folders import open_rigs
 
-    check_writable(options.out)
+    check_outputs({options.out: BLEND}, (options.rig, options.model), options.overwrite)
     bound = list(open_rigs(options).values())
     for scene_rig, model in bound:
         _bind(scene_rig, model, options.use_in_render)
@@ -36,7 +38,7 @@ def run(options: argparse.Namespace) -> None:
             if place != model:
                 copied[place] = model
         save_copy(options.out)
-    except FDDAError:
+    except BaseException:
         for place in copied:
             place.unlink()
         raise
@@ -62,8 +64,8 @@ def _bind(scene_rig: "SceneRig", model: Path, use_in_render: bool) -> None:
 def _put_beside(scene_rig: "SceneRig", model: Path, out: Path) -> Path:
     """Let the bound object find its model from the file; returns the copy if one was made, else the model."""
     from ..core.output import replacing
-    from ..model_list import bound_entry
-    from ..models import adopt
+    from ..models.entries import bound_entry
+    from ..models.model_list import adopt
 
     place = beside(model, out)
     binding = scene_rig.mesh_object.fdda
@@ -92,6 +94,8 @@ def beside(model: Path, out: Path) -> Path:
     if model.resolve().is_relative_to(out.resolve().parent):
         return model
     copy = out.parent / model.name
+    if copy.name == out.name:
+        raise OutputError(f"Cannot write '{out}': the copy of the model beside it has that name; give another name.")
     if os.path.lexists(copy) and not (copy.is_file() and copy.read_bytes() == model.read_bytes()):
         raise OutputError(
             f"Cannot put the model beside '{out}': there is another '{copy.name}'; remove it or choose another folder."

@@ -6,21 +6,27 @@ from pathlib import Path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
+    from .outputs import add_overwrite
+
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="where to save the rig")
     parser.add_argument(
         "--density", type=int, choices=(1, 2, 3), default=1, help="about 1,450, 10,000 or 50,000 vertices (default 1)"
     )
+    add_overwrite(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     import bpy
 
-    from ..arm import build_arm
-    from ..core.output import check_writable
-    from .files import save_copy
+    from ..arm.rig import build_arm
+    from ..core.file_kind import BLEND
+    from ..core.output import check_outputs
+    from ..scene.blend_file import save_copy
+    from ..scene.viewport import frame_objects
 
-    check_writable(options.out)
+    check_outputs({options.out: BLEND}, overwrite=options.overwrite)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh_object, _ = build_arm(options.density)
+    frame_objects([mesh_object])
     save_copy(options.out)
     print(f"{options.out}: an arm of {len(mesh_object.data.vertices)} vertices")

@@ -6,9 +6,12 @@ from pathlib import Path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
+    from .outputs import add_overwrite
+
     parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
     parser.add_argument("--strict", action="store_true", help="let warnings be errors")
     parser.add_argument("--json", metavar="OUT.json", type=Path, help="write the warnings")
+    add_overwrite(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -18,13 +21,14 @@ def run(options: argparse.Namespace) -> None:
         RecordingError: the recording cannot be read, or there are warnings and they are errors.
         OutputError: the file cannot be written.
     """
-    from ..core.output import check_writable, write_json
-    from ..core.recording import read_recording
-    from ..core.recording_check import check_recording
-    from ..core.recording_warning import refuse
+    from ..core.checks.recording import check_recording
+    from ..core.checks.warning import refuse
+    from ..core.file_kind import WARNINGS
+    from ..core.output import check_outputs, write_json
+    from ..core.recording.reader import read_recording
 
     if options.json:
-        check_writable(options.json)
+        check_outputs({options.json: WARNINGS}, overwrite=options.overwrite)
     warnings = check_recording(read_recording(options.recording))
     for warning in warnings:
         print(warning)

@@ -4,7 +4,7 @@
 import argparse
 
 from ..core.errors import TrainerEnvironmentError
-from ..trainer_environment.choice import ping
+from ..training.environment.choice import ping
 
 
 def add_options(_parser: argparse.ArgumentParser) -> None:

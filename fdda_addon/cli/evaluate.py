@@ -4,14 +4,17 @@
 import argparse
 from pathlib import Path
 
+from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED
 from ..core.errors import WrongUsageError
-from ..core.output import check_writable, write_json
-from ..evaluation import Evaluation, EvaluationSettings, evaluate
-from ..recording import Progress
+from ..core.file_kind import EVALUATION, PICTURE
+from ..core.output import check_outputs, json_text, replacing_all
+from ..core.progress import Progress
+from ..evaluation.run import Evaluation, EvaluationSettings, evaluate
 from ..runtime.binding import true_rig
-from ..scene.rig import SceneRig
+from ..scene.scene_rig import SceneRig
 from .files import add_rig_options
 from .folders import by_object, headed, open_rigs
+from .outputs import add_overwrite
 from .progress import ProgressPrinter
 
 
@@ -20,9 +23,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
     parser.add_argument("--json", metavar="OUT.json", type=Path, required=True, help="where to write the errors")
     parser.add_argument(
-        "--poses", type=int, default=200, help="number of held-out poses (default 200), 0 for actions alone"
+        "--poses",
+        type=int,
+        default=EVALUATION_POSES,
+        help=f"number of held-out poses (default {EVALUATION_POSES}), 0 for actions alone",
     )
-    parser.add_argument("--seed", type=int, default=1, help="of the held-out poses (default 1)")
+    parser.add_argument(
+        "--seed", type=int, default=EVALUATION_SEED, help=f"of the held-out poses (default {EVALUATION_SEED})"
+    )
     parser.add_argument("--action", action="append", default=[], metavar="NAME", help="compare its frames as well")
     parser.add_argument(
         "--strip", action="append", default=[], metavar="NAME", help="compare the frames of a strip of the NLA as well"
@@ -31,6 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--beyond", type=float, action="append", default=[], metavar="X", help="compare at X times the range as well"
     )
     parser.add_argument("--heatmap", metavar="OUT.png", type=Path, help="draw rig, linear layer and model as heat maps")
+    add_overwrite(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -38,9 +47,8 @@ def run(options: argparse.Namespace) -> None:
         raise WrongUsageError("--poses and --seed must be 0 or more, and --beyond more than 0.")
     if not options.poses and (options.beyond or not (options.action or options.strip)):
         raise WrongUsageError("With --poses 0 only actions and strips are compared; give --action and no --beyond.")
-    check_writable(options.json)
-    if options.heatmap:
-        check_writable(options.heatmap)
+    outputs = [(options.json, EVALUATION), *([(options.heatmap, PICTURE)] if options.heatmap else [])]
+    check_outputs(outputs, (options.rig, options.model), options.overwrite)
     rigs = open_rigs(options)
     if options.heatmap and len(rigs) > 1:
         raise WrongUsageError(
@@ -50,12 +58,14 @@ def run(options: argparse.Namespace) -> None:
         options.poses, options.seed, tuple(options.action), tuple(options.beyond), strips=tuple(options.strip)
     )
     evaluations = {name: run_evaluation(*rig_and_model, settings) for name, rig_and_model in rigs.items()}
-    if options.heatmap:
-        from ..pictures import draw_comparison, worst_poses
+    with replacing_all(*(path for path, _ in outputs)) as (errors, *pictures):
+        for picture in pictures:
+            from ..evaluation.pictures import draw_comparison, worst_poses
 
-        ((name, (scene_rig, model)),) = rigs.items()
-        draw_comparison(scene_rig, model, worst_poses(evaluations[name].held_out), options.heatmap, heat=True)
-    write_json(options.json, by_object({name: evaluation.to_json() for name, evaluation in evaluations.items()}))
+            ((name, (scene_rig, model)),) = rigs.items()
+            draw_comparison(scene_rig, model, worst_poses(evaluations[name].held_out), picture, heat=True)
+        content = by_object({name: evaluation.to_json() for name, evaluation in evaluations.items()})
+        errors.write_text(json_text(content), encoding="utf-8")
     for name, evaluation in evaluations.items():
         print(headed(name, table(evaluation)))
 

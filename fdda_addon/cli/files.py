@@ -7,8 +7,8 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError
-from ..scene.blend_file import quiet, reason, save_copy
-from ..scene.rig import SceneRig, find_rig
+from ..scene.blend_file import quiet, reason
+from ..scene.scene_rig import SceneRig, find_rig
 
 
 def add_rig_options(parser: argparse.ArgumentParser) -> None:
@@ -45,6 +45,3 @@ def open_file(path: Path) -> None:
             bpy.ops.wm.open_mainfile(filepath=str(path.absolute()), load_ui=False)
     except RuntimeError as error:
         raise FDDAError(f"Blender cannot open '{path}' ({reason(error)}); give a .blend file.") from error
-
-
-__all__ = ["add_rig", "add_rig_options", "open_file", "open_rig", "quiet", "save_copy"]

@@ -9,7 +9,7 @@ import bpy
 
 from ..core.errors import FDDAError, ModelError, OutputError
 from ..core.model import read_model_info
-from ..scene.rig import SceneRig, find_rig
+from ..scene.scene_rig import SceneRig, find_rig
 from .files import open_file
 
 

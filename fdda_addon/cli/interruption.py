@@ -12,20 +12,22 @@ from contextlib import contextmanager
 from types import FrameType
 
 _ADDON = __name__.rsplit(".", 2)[0]
-CALLED_BY_BLENDER = {
-    f"{_ADDON}.{module}"
-    for module in ("runtime.handlers", "properties", "overlay", "operators.job_state", "panels.checks")
-}
-"""Modules whose functions Blender calls."""
+_UPDATES_AND_DRAWING = {f"{_ADDON}.properties.binding", f"{_ADDON}.evaluation.overlay"}
 
+_called_by_blender: set[str] = set()
+"""Modules whose functions Blender calls."""
 _pending = False
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
     """Inside, Ctrl-C raises KeyboardInterrupt, at once or from the next `raise_pending`."""
-    global _pending
+    global _pending, _called_by_blender
+    # Not above: verbs that need no Blender show progress too.
+    from ..registration import handler_table
+
     _pending = False
+    _called_by_blender = {handler.__module__ for _, handler in handler_table()} | _UPDATES_AND_DRAWING
     if threading.current_thread() is not threading.main_thread():
         # Only the main thread may say what a signal does; it is not this job that Ctrl-C ends.
         yield
@@ -48,7 +50,7 @@ def raise_pending() -> None:
 def _on_interrupt(_number: int, frame: FrameType | None) -> None:
     global _pending
     while frame is not None:
-        if frame.f_globals.get("__name__") in CALLED_BY_BLENDER:
+        if frame.f_globals.get("__name__") in _called_by_blender:
             _pending = True
             return
         frame = frame.f_back

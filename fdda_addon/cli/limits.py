@@ -7,8 +7,9 @@ from pathlib import Path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    from ..scene.measured_limits import DEFAULT_MARGIN
+    from ..poses.measured_limits import DEFAULT_MARGIN
     from .files import add_rig_options
+    from .outputs import add_overwrite
 
     add_rig_options(parser)
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="where to save the file with the limits")
@@ -19,18 +20,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default=DEFAULT_MARGIN,
         help=f"part of the width of a range that is added at each end (default {DEFAULT_MARGIN})",
     )
+    add_overwrite(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     from ..core.errors import WrongUsageError
-    from ..core.output import check_writable
-    from ..scene.clip import find_action
-    from ..scene.measured_limits import limit_lines, state_measured_limits
-    from .files import open_rig, save_copy
+    from ..core.file_kind import BLEND
+    from ..core.output import check_outputs
+    from ..poses.clip import find_action
+    from ..poses.measured_limits import limit_lines, state_measured_limits
+    from ..scene.blend_file import save_copy
+    from .files import open_rig
 
     if not 0 <= options.margin <= 10 or math.isnan(options.margin):
         raise WrongUsageError("--margin must be 0 to 10.")
-    check_writable(options.out)
+    check_outputs({options.out: BLEND}, (options.rig,), options.overwrite)
     scene_rig = open_rig(options)
     limits = state_measured_limits(scene_rig, [find_action(name) for name in options.action], options.margin)
     save_copy(options.out)

@@ -10,15 +10,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.defaults import MIN_VERTICES, POSES, REFINEMENT_POSES, SPREAD
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ..core.progress import Progress
-    from ..scene.rig import SceneRig
+    from ..scene.scene_rig import SceneRig
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    from ..core.partition import LEAST_VERTICES
     from .files import add_rig
 
     add_rig(parser)
@@ -35,10 +36,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="record every mesh that an armature deforms, each into a folder of its own in RECORDING",
     )
     parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
-    parser.add_argument("--poses", type=int, help="number of random poses (default 1000, with --refine 250)")
+    parser.add_argument(
+        "--poses", type=int, help=f"number of random poses (default {POSES}, with --refine {REFINEMENT_POSES})"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the random poses (default 0)")
     parser.add_argument(
-        "--spread", type=float, default=1.0, help="standard deviation as a part of half the range (default 1.0)"
+        "--spread",
+        type=float,
+        default=SPREAD,
+        help=f"standard deviation as a part of half the range (default {SPREAD})",
     )
     parser.add_argument("--action", action="append", default=[], metavar="NAME", help="record its frames as well")
     parser.add_argument(
@@ -72,20 +78,46 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--least-vertices",
         type=int,
-        default=LEAST_VERTICES,
+        default=MIN_VERTICES,
         metavar="N",
-        help=f"merge partitions of fewer vertices into others, 0 for none (default {LEAST_VERTICES})",
+        help=f"merge partitions of fewer vertices into others, 0 for none (default {MIN_VERTICES})",
     )
-    parser.add_argument("--resume", action="store_true", help="continue a recording that was interrupted")
+    parser.add_argument("--resume", action="store_true", help="continue what was interrupted; nothing is done twice")
+    parser.add_argument(
+        "--shard",
+        type=_shard,
+        metavar="K/N",
+        help="record part K of N of the poses; all parts, joined by merge-recordings, are the recording of one run",
+    )
+    parser.add_argument(
+        "--influences-only", action="store_true", help="find which joints move what, once for all shards; no poses"
+    )
+    parser.add_argument(
+        "--influences", metavar="FOLDER", type=Path, help="take them from what --influences-only made of the same rig"
+    )
     parser.add_argument(
         "--refine", metavar="MODEL.onnx", type=Path, help="add poses to the recording where this model is worst"
     )
 
 
+def _shard(text: str) -> tuple[int, int]:
+    """Number and count of "2/8".
+
+    Raises:
+        argparse.ArgumentTypeError: it is something else.
+    """
+    from ..core.recording.shard import MAX_SHARDS
+
+    number, _, count = text.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count) <= MAX_SHARDS):
+        raise argparse.ArgumentTypeError(f"a shard is K/N, part K of N, with K from 1 to N and not {text!r}")
+    return int(number), int(count)
+
+
 def run(options: argparse.Namespace) -> None:
+    from ..core.checks.recording import merges_in_words
     from ..core.errors import WrongUsageError
-    from ..core.recording_check import merges_in_words
-    from ..core.recording_index import read_index, read_info
+    from ..core.recording.index import read_index, read_info
     from ..runtime.binding import true_rig
     from .files import open_file
     from .progress import ProgressPrinter
@@ -99,16 +131,20 @@ def run(options: argparse.Namespace) -> None:
         options.action,
         options.strip,
         options.mirror,
-        options.resume,
         options.sample,
         options.control,
         options.fit_linear,
+        options.shard,
+        options.influences_only,
+        options.influences,
     )
     if options.refine and (any(of_new) or options.poses == 0):
         raise WrongUsageError(
             "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --sample, "
-            "--control, --fit-linear and --resume out."
+            "--control, --fit-linear, --shard and --influences out."
         )
+    if options.influences_only and (options.shard or options.influences):
+        raise WrongUsageError("--influences-only finds influences for all shards; leave --shard and --influences out.")
     if options.refine and (options.all or len(options.object) > 1):
         raise WrongUsageError("--refine takes one mesh; give --object NAME once, and the recording and model of it.")
     if options.all and options.object:
@@ -132,14 +168,13 @@ def run(options: argparse.Namespace) -> None:
                 print(read_info(index).fit.sentence())
             if line := merges_in_words(index, options.least_vertices):
                 print(line)
-        added = "added " if options.refine else ""
-        print(f"{recording}: {step.total} poses {added}in {seconds:.1f} s")
+        done = "influences" if options.influences_only else f"{step.total} poses{' added' if options.refine else ''}"
+        print(f"{recording}: {done} in {seconds:.1f} s")
 
 
 def _rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":
     """The meshes to record, each with the folder of its recording."""
-    from ..scene.rig import find_rig
-    from ..scene.scene_rig import find_rigs
+    from ..scene.scene_rig import find_rig, find_rigs
     from .folders import mesh_folders
 
     names = list(dict.fromkeys(options.object))
@@ -151,12 +186,13 @@ def _rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":
 
 
 def _steps(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> "Iterator[Progress]":
-    from ..recording import RecordingSettings, record_meshes
-    from ..refinement import RefinementSettings, refine
+    from ..recording.plan import RecordingSettings
+    from ..recording.refinement import RefinementSettings, refine
+    from ..recording.run import record_meshes
 
     given = {} if options.poses is None else {"poses": options.poses}
     if options.refine:
-        settings = RefinementSettings(seed=options.seed, **given)
+        settings = RefinementSettings(seed=options.seed, resume=options.resume, **given)
         return refine(rigs[0][0], options.recording, options.refine, settings)
     settings = RecordingSettings(
         seed=options.seed,
@@ -169,6 +205,9 @@ def _steps(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> 
         least_vertices=options.least_vertices,
         strips=tuple(options.strip),
         mirror=options.mirror,
+        shard=options.shard,
+        influences_only=options.influences_only,
+        influences=options.influences,
         **given,
     )
     return record_meshes(rigs, settings)

@@ -11,20 +11,21 @@ import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.defaults import REFINEMENT_POSES
 from ..core.errors import WrongUsageError
-from ..core.messages import MessageType
-from ..core.recording_folder import recordings_in
-from ..training import Training, trainer_command
+from ..core.messages import WARNING_LINE, MessageType
+from ..core.recording.folder import recordings_in
+from ..core.report import Verdict
+from ..training.process import Training, trainer_command
 from .progress import ProgressPrinter
-from .registration import registered
+from .registered import registered
 
 if TYPE_CHECKING:
-    from ..scene.rig import SceneRig
+    from ..scene.scene_rig import SceneRig
 
 INTERRUPTED = 130
-MISSED = "missed"
 WARM_START, TARGET = "--warm-start", "--target-mm"
-MOST_ROUNDS = 20
+MAX_ROUNDS = 20
 
 
 def run(arguments: list[str]) -> int:
@@ -51,7 +52,7 @@ def _refinement_parser() -> argparse.ArgumentParser:
         "--refine", metavar="RIG.blend", type=Path, help="add poses of this rig where the model is worst, and train on"
     )
     group.add_argument("--object", default="", metavar="NAME", help="the mesh object, when several have a rig")
-    group.add_argument("--poses", type=int, metavar="N", help="poses to add each time (default 250)")
+    group.add_argument("--poses", type=int, metavar="N", help=f"poses to add each time (default {REFINEMENT_POSES})")
     return parser
 
 
@@ -68,6 +69,8 @@ def _train(arguments: list[str]) -> tuple[int, dict]:
                 progress.show("training", values["epoch"], values["epochs"], note)
             elif message.type is MessageType.LOG:
                 progress.say(values["text"])
+            elif message.type is MessageType.WARNING:
+                progress.say(WARNING_LINE.format(**values))
             elif message.type is MessageType.MODEL_FINISHED:
                 progress.end_line()
                 print(_line(values), flush=True)
@@ -100,19 +103,19 @@ def _train_to_target(arguments: list[str], options: argparse.Namespace) -> int:
     with registered():
         # Before the first training: a wrong path or object shows at once.
         _open_rig(options)
-        for number in range(MOST_ROUNDS):
+        for number in range(MAX_ROUNDS):
             if number:
                 _refine(recording, model, options, number)
             warm = [WARM_START] if number and WARM_START not in arguments else []
             status, values = _train([*arguments, *warm])
-            if status or values.get("verdict") != MISSED:
+            if status or values.get("verdict") != Verdict.MISSED.value:
                 return status
-    print(f"The target is not met after {MOST_ROUNDS} rounds; run the command again with {WARM_START} to go on.")
+    print(f"The target is not met after {MAX_ROUNDS} rounds; run the command again with {WARM_START} to go on.")
     return 0
 
 
 def _open_rig(options: argparse.Namespace) -> "SceneRig":
-    from ..scene.rig import find_rig
+    from ..scene.scene_rig import find_rig
     from .files import open_file
 
     open_file(options.refine)
@@ -120,7 +123,7 @@ def _open_rig(options: argparse.Namespace) -> "SceneRig":
 
 
 def _refine(recording: Path, model: Path, options: argparse.Namespace, number: int) -> None:
-    from ..refinement import RefinementSettings, refine
+    from ..recording.refinement import RefinementSettings, refine
     from ..runtime.binding import true_rig
 
     scene_rig = _open_rig(options)

@@ -48,6 +48,9 @@ class Control:
         for text in (control.owner, control.path):
             if not isinstance(text, str) or not 0 < len(text) <= LONGEST_PATH:
                 raise ValueError(f"a control is called {text!r}")
+        for end in (value["low"], value["high"]):
+            if type(end) not in (int, float):
+                raise TypeError(f"the range of the control {control.name!r} ends at {end!r}")
         if control.owner not in OWNERS and not control.owner.startswith(OTHER_OBJECT):
             raise ValueError(f"a control belongs to {control.owner!r}")
         if not (np.isfinite([control.low, control.high]).all() and control.low <= control.high):

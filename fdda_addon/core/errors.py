@@ -2,8 +2,36 @@
 """The errors that users read.
 
 Each carries one sentence: what is wrong, with names and numbers, and what to do about it. The command line prints
-it and exits with status 1; an operator reports it and is cancelled. Any other exception is a bug and propagates.
+it and exits with status 1, or with `TRY_AGAIN` where the machine is to blame; an operator reports it and is cancelled.
+Any other exception is a bug and propagates.
 """
+
+import errno
+import re
+
+TRY_AGAIN = 75
+"""Exit status of what may work when it is run again, as it is or on another machine: EX_TEMPFAIL of sysexits.h."""
+MACHINE = {
+    getattr(errno, name)
+    for name in (
+        *("ENOSPC", "EDQUOT", "EIO", "ENOMEM", "EAGAIN", "EBUSY", "EINTR", "EMFILE", "ENFILE", "ENXIO", "ENODEV"),
+        *("ESTALE", "ENOLCK", "ENOTCONN", "ETIMEDOUT", "EHOSTDOWN", "EHOSTUNREACH", "ENETDOWN", "ENETUNREACH"),
+        *("ECONNREFUSED", "ECONNRESET", "EREMOTEIO"),
+    )
+    if hasattr(errno, name)
+}
+"""What the system says when a disk, the memory or a shared folder gave out, and not when a path is wrong."""
+LONGEST = 1000
+"""Letters of a sentence. What a file of somebody else's says is quoted in it, and may be a million letters long."""
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+
+
+def one_line(text: str) -> str:
+    """A text of a readable length that a terminal shows as one line: what would steer it is written out."""
+    if len(text) > LONGEST:
+        half = LONGEST // 2
+        text = f"{text[:half]} […] {text[-half:]}"
+    return _CONTROL.sub(lambda found: repr(found.group())[1:-1], text)
 
 
 class FDDAError(Exception):
@@ -11,11 +39,28 @@ class FDDAError(Exception):
 
     exit_status = 1
 
+    def __str__(self) -> str:
+        return one_line(super().__str__())
+
+
+def exit_status(error: BaseException) -> int:
+    """Exit status of the command line for an error: `TRY_AGAIN` where the machine caused it."""
+    status = getattr(error, "exit_status", FDDAError.exit_status)
+    if status != FDDAError.exit_status:
+        return status
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in MACHINE):
+            return TRY_AGAIN
+        cause = cause.__cause__
+    return status
+
 
 class WrongUsageError(FDDAError):
-    """Options that make no sense."""
+    """Options that make no sense. The text may be that of the parser, several lines."""
 
     exit_status = 2
+    __str__ = Exception.__str__
 
 
 class RigError(FDDAError):
@@ -26,6 +71,12 @@ class RecordingError(FDDAError):
     """A recording cannot be read, resumed or written."""
 
 
+class BusyError(RecordingError):
+    """Another process is at it."""
+
+    exit_status = TRY_AGAIN
+
+
 class ModelError(FDDAError):
     """A model cannot be read, or was trained for another rig."""
 
@@ -34,12 +85,24 @@ class TrainingError(FDDAError):
     """The training could not start, died, or reported a failure."""
 
 
+class TrainingDiedError(TrainingError):
+    """The training was ended from outside, or lacked memory or disk."""
+
+    exit_status = TRY_AGAIN
+
+
 class TrainerEnvironmentError(FDDAError):
     """The Python environment of the trainer cannot be made, removed or used."""
 
 
 class OutputError(FDDAError):
     """An output path cannot be written."""
+
+
+class NoRoomError(OutputError):
+    """The disk lacks the room."""
+
+    exit_status = TRY_AGAIN
 
 
 class PointCacheError(FDDAError):

@@ -3,7 +3,11 @@
 
 import numpy as np
 
+from .rig import Rig
+
 FEATURES_PER_JOINT = 12
+ROUNDING = 2.0**-21
+"""Part of the largest coordinate by which the rounding of float32 moves what stays where it is: a few steps."""
 
 
 def joint_features(pose_matrices: np.ndarray, rest_matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:
@@ -12,12 +16,12 @@ def joint_features(pose_matrices: np.ndarray, rest_matrices: np.ndarray, parents
     The identity in the rest pose. The parent of a root is mesh-object space itself.
 
     Args:
-        pose_matrices: (N, J, 4, 4), mesh-object space, metres.
-        rest_matrices: (J, 4, 4), mesh-object space, metres.
+        pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
+        rest_matrices: (J, 4, 4), mesh-object space, mesh units.
         parents: (J,) parent index, -1 for a root; every parent before its children.
 
     Returns:
-        (N, J, 12) float32: the upper three rows of F_j, row by row; rotations without unit, translations in metres.
+        (N, J, 12) float32: the upper three rows of F_j, row by row; rotations without unit, translations in mesh units.
     """
     pose = pose_matrices.astype(np.float64)
     rest = rest_matrices.astype(np.float64)
@@ -31,3 +35,21 @@ def relative_to_parent(matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:
     children = np.flatnonzero(parents >= 0)
     relative[:, children] = np.linalg.inv(matrices[:, parents[children]]) @ matrices[:, children]
     return relative
+
+
+def rounding(pose_matrices: np.ndarray) -> float:
+    """By how much (N, J, 4, 4) pose matrices may seem to move a joint that does not move, in their unit of length."""
+    return ROUNDING * float(np.abs(pose_matrices[..., :3, 3]).max(initial=0))
+
+
+def steady_features(pose_matrices: np.ndarray, rig: Rig) -> np.ndarray:
+    """As `joint_features`, lengths in true mesh units, and what nothing but rounding moves exactly at its mean.
+
+    Returns:
+        (N, J, 12) float32.
+    """
+    features = joint_features(pose_matrices, rig.rest_matrices, rig.parents)
+    translations = features[:, :, 3::4]
+    still = np.ptp(translations, axis=0) <= rounding(pose_matrices)
+    features[:, :, 3::4] = rig.metres_per_unit * np.where(still, translations.mean(axis=0), translations)
+    return features

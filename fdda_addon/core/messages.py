@@ -8,7 +8,8 @@ import enum
 import json
 from dataclasses import dataclass, field
 
-WARNING = "Warning ("
+WARNING_LINE = "Warning ({name}): {text}"
+"""A warning for people, from its values."""
 
 
 class MessageType(enum.Enum):
@@ -24,7 +25,9 @@ class MessageType(enum.Enum):
     PARTITION_FINISHED = "partition_finished"
     """joint: str, basis: int, held_out_mm: float (mean error of the held-out poses)."""
     LOG = "log"
-    """text: str; what begins with `WARNING` is about the recording, "Warning (NAME): …"."""
+    """text: str."""
+    WARNING = "warning"
+    """name: str, text: str: something about the recording that makes a bad model likely (`core.checks.warning`)."""
     MODEL_FINISHED = "model_finished"
     """As `FINISHED`, of one of several models that are trained in turn: each has its own `STARTED` before it."""
     FINISHED = "finished"

@@ -9,10 +9,12 @@ import numpy as np
 
 from .controls import Control, read_controls
 from .errors import ModelError
+from .input_file import read_input
+from .model_graph import Explained, check_ends, check_graph, explain
 from .onnx_file import read_onnx
 from .partition import Partition, make_partitions
 from .poses import Channel
-from .rig import Fingerprint, Joint, Rig, differences
+from .rig import Fingerprint, Joint, Rig, differences, read_joints
 from .skin_fit import skin_from_text
 from .unit import read_unit, unit_json
 
@@ -28,7 +30,10 @@ LIMITS = "limits"
 """Key of `ModelInfo.training`."""
 OBJECT = "object"
 """Key of `ModelInfo.training`."""
-MAX_BYTES = 2 << 30
+MAX_BYTES = 768 << 20
+MAX_METADATA = 16 << 20  # letters
+CHECKSUM_KEY = "fdda_checksum"
+"""Metadata property with the SHA-256 of the graph; models of earlier versions have none."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,7 @@ class ModelInfo:
 
     Attributes:
         joints: the joints that `pose_matrices` lists, every parent before its children.
-        rest_matrices: (J, 4, 4) float32, mesh-object space, metres.
+        rest_matrices: (J, 4, 4) float32, mesh-object space, mesh units.
         vertex_count: of the mesh.
         fingerprint: of the rig that was recorded.
         partitions: in ascending order of their main joints, the order of the output `trust`.
@@ -62,6 +67,7 @@ class ModelInfo:
         held_out_mm: error over the poses that were held out of the training, in mm, by the names of
             `metrics.ErrorStatistics`.
         parity_mm: largest difference between ONNX Runtime and PyTorch, in mm.
+        constant_bytes: of the graph, all of which a call reads; 0 where nobody knows.
         training: settings and seed of the training.
         metres_per_unit: length of one unit of mesh-object space, as in `Rig`.
     """
@@ -78,6 +84,7 @@ class ModelInfo:
     parity_mm: float = 0.0
     training: dict = field(default_factory=dict)
     metres_per_unit: float = 1.0
+    constant_bytes: int = 0
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -92,10 +99,21 @@ class ModelInfo:
             {joint: p.joint for p in self.partitions for joint in p.merged},
         )
 
+    def explained(self) -> Explained:
+        """What its graph may cost."""
+        partitions = [(p.vertices, p.basis, len(p.influencing) + len(p.controls)) for p in self.partitions]
+        return explain(len(self.joints), len(self.controls), partitions, self.training)
+
     @property
     def limits(self) -> tuple[Channel, ...]:
         """The range of motion that random poses were drawn from; empty where there were none, or nobody knows."""
-        return tuple(Channel(**channel) for channel in self.training.get(LIMITS, ()))
+        return tuple(Channel.from_json(channel) for channel in self.training.get(LIMITS, ()))
+
+    @property
+    def trained_poses(self) -> int:
+        """How many poses the recording had that the model was trained on, held-out ones included; 0 if nobody knows."""
+        counts = [self.training.get(f"{part}_poses") for part in ("training", "validation", "held_out")]
+        return sum(counts) if all(type(count) is int for count in counts) else 0
 
     @property
     def object_name(self) -> str:
@@ -118,6 +136,7 @@ class ModelInfo:
             "parity_mm": self.parity_mm,
             "training": self.training,
             **unit_json(self.metres_per_unit),
+            **({"constant_bytes": self.constant_bytes} if self.constant_bytes else {}),
         }
         return json.dumps(value, allow_nan=False)
 
@@ -129,6 +148,8 @@ class ModelInfo:
             ValueError: it is damaged or of another version; the text is a clause about the model.
         """
         try:
+            if len(text) > MAX_METADATA:
+                raise ValueError(f"its metadata has {len(text)} letters")
             return _read_info(json.loads(text))
         except json.JSONDecodeError as error:
             raise ValueError(f"its metadata is not JSON ({error})") from error
@@ -141,7 +162,7 @@ class ModelInfo:
 def _read_info(value: dict) -> ModelInfo:
     if value["version"] != VERSION:
         raise ValueError(f"it is of version {value['version']!r} and this add-on reads version {VERSION}")
-    joints = tuple(Joint(str(j["name"]), int(j["parent"])) for j in value["joints"])
+    joints = read_joints(value["joints"])
     partitions = tuple(
         ModelPartition(
             *(int(p["joint"]), tuple(map(int, p["influencing"])), int(p["vertices"]), int(p["basis"])),
@@ -151,12 +172,12 @@ def _read_info(value: dict) -> ModelInfo:
     )
     controls = read_controls(value.get("controls", []))
     count = len(joints)
-    if not all(-1 <= joint.parent < number for number, joint in enumerate(joints)):
-        raise ValueError("a joint stands before its parent")
     if not all(0 <= joint < count for p in partitions for joint in (p.joint, *p.influencing, *p.merged)):
         raise ValueError("a partition names a joint that is none of its joints")
     if not all(0 <= control < len(controls) for p in partitions for control in p.controls):
         raise ValueError("a partition names a control that is none of its controls")
+    if not partitions or not all(p.vertices > 0 and p.basis >= 0 for p in partitions):
+        raise ValueError("it has no partitions, or one without vertices")
     if sum(p.vertices for p in partitions) != int(value["vertices"]):
         raise ValueError("the partitions do not add up to the vertices")
     rest_matrices = np.array(value["rest_matrices"], np.float32).reshape(count, 4, 4)
@@ -166,18 +187,23 @@ def _read_info(value: dict) -> ModelInfo:
         joints,
         rest_matrices,
         int(value["vertices"]),
-        Fingerprint(**value["fingerprint"]),
+        Fingerprint.from_json(value["fingerprint"]),
         partitions,
         np.array(value["training_ranges"]["low"], np.float32).reshape(count, 12),
         np.array(value["training_ranges"]["high"], np.float32).reshape(count, 12),
         controls,
-        dict(value["held_out_mm"]),
+        {str(name): float(error) for name, error in value["held_out_mm"].items()},
         float(value["parity_mm"]),
         dict(value["training"]),
         read_unit(value),
+        int(value.get("constant_bytes", 0)),
     )
-    if not all(isinstance(c.bone, str) and np.isfinite([c.low, c.high]).all() for c in info.limits):
+    if info.constant_bytes < 0:
+        raise ValueError(f"its constants are said to take {info.constant_bytes} bytes")
+    if not isinstance(info.training.get(LIMITS, []), list) or not all(info.limits):
         raise ValueError("its range of motion cannot be read")
+    if not np.isfinite([*info.held_out_mm.values()]).all():
+        raise ValueError("its errors are not numbers")
     return info
 
 
@@ -185,21 +211,17 @@ def read_model(path: Path) -> tuple[ModelInfo, bytes]:
     """Read and check a model without executing it.
 
     Returns:
-        What it says of itself, and the bytes that were checked: executing those, and not the file, leaves no moment
-        in which another file could take its place.
+        What it says of itself, and the bytes that were checked: only those are executed, whatever the file is by then.
 
     Raises:
         ModelError: no file, or as `check_model`.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ModelError(f"'{path}' is larger than 2 GB and cannot be a model.")
-        if not path.is_file():
-            # A device or a pipe might never end.
-            raise ModelError(f"'{path}' is not a model: it is no file; give an .onnx file that train made.")
-        data = path.read_bytes()
+        data = read_input(path, MAX_BYTES)
     except OSError as error:
-        raise ModelError(f"The model '{path}' cannot be read: {error.strerror}; train it first.") from error
+        raise ModelError(
+            f"The model '{path}' cannot be read: {error.strerror}; give one that train made, or train it first."
+        ) from error
     return check_model(data, path), data
 
 
@@ -211,9 +233,11 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
         name: what errors call the model.
 
     Raises:
-        ModelError: no ONNX file, not a model of ours, or one that asks for more than a model may: other inputs,
-            custom operators, external data.
+        ModelError: no ONNX file, not a model of ours, damaged, or one that asks for more than a model may: other
+            inputs and operators than train writes, external data, more memory or work than its metadata explains.
     """
+    if len(data) > MAX_BYTES:
+        raise ModelError(f"'{name}' is larger than {MAX_BYTES >> 20} MB and cannot be a model.")
     try:
         contents = read_onnx(data)
     except ValueError as error:
@@ -229,20 +253,18 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
         info = ModelInfo.from_json(contents.metadata[METADATA_KEY])
     except ValueError as error:
         raise ModelError(f"The model '{name}' cannot be used: {error}; train it again.") from error
-    wanted = {
-        POSE_INPUT: (len(info.joints), 4, 4),
-        **({CONTROLS_INPUT: (len(info.controls),)} if info.controls else {}),
-    }
-    if extra := sorted(set(contents.inputs) - set(wanted)):
+    controls = {CONTROLS_INPUT: (len(info.controls),)} if info.controls else {}
+    inputs = {POSE_INPUT: (len(info.joints), 4, 4), **controls}
+    outputs = {POSITIONS_OUTPUT: (info.vertex_count, 3), TRUST_OUTPUT: (len(info.partitions),)}
+    if extra := sorted(set(contents.inputs) - set(inputs)):
         raise ModelError(f"'{name}' asks for inputs that no rig gives ({', '.join(extra)}); train it again.")
-    for key, shape in wanted.items():
-        if contents.inputs.get(key, ())[1:] != shape:
-            what = f"{shape[0]} {'joints' if key == POSE_INPUT else 'controls'}"
-            raise ModelError(f"The input '{key}' of '{name}' does not fit its {what}; train again.")
-    if contents.outputs.get(POSITIONS_OUTPUT, ())[1:] != (info.vertex_count, 3):
-        raise ModelError(
-            f"The output '{POSITIONS_OUTPUT}' of '{name}' does not fit its {info.vertex_count} vertices; train again."
-        )
+    try:
+        check_ends(contents, inputs, outputs)
+        check_graph(contents, info.explained(), len(data), outputs)
+    except ValueError as error:
+        raise ModelError(f"The model '{name}' is refused: {error}; give one that train made.") from error
+    if contents.metadata.get(CHECKSUM_KEY, contents.checksum) != contents.checksum:
+        raise ModelError(f"The model '{name}' is damaged: its checksum is not that of its weights; copy it again.")
     return info
 
 

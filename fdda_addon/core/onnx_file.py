@@ -6,12 +6,52 @@ model, and the `onnx` package is not at hand inside Blender, so the few protobuf
 (https://onnx.ai/onnx/repo-docs/IR.html, onnx.proto; wire format: https://protobuf.dev/programming-guides/encoding/).
 """
 
+import hashlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
+ITEM_BYTES = {1: 4, 2: 1, 3: 1, 6: 4, 7: 8, 10: 2}
+"""Bytes of an element by ONNX's number of its type: float, uint8, int8, int32, int64, float16."""
+INT64 = 7
+MAX_DIMENSIONS = 8
+MAX_INTEGERS = 1 << 16
+"""Of a constant that is read: the longest has the sizes of all partitions."""
+LONGEST_ATTRIBUTE = 16
 STANDARD_DOMAINS = ("", "ai.onnx")
+KNOWN_OPSETS = range(13, 24)
+"""Versions in which the operators of models mean the same."""
 MAX_DEPTH = 8
 """Deepest nesting of subgraphs that is followed."""
+
+
+@dataclass(frozen=True)
+class OnnxConstant:
+    """A constant of a graph: its type as ONNX numbers it, its dimensions, and its bytes."""
+
+    type: int
+    shape: tuple[int, ...]
+    data: memoryview
+
+    def integers(self) -> tuple[int, ...]:
+        """The elements of a short constant of int64; ValueError where it is long or of another type."""
+        if self.type != INT64 or math.prod(self.shape) > MAX_INTEGERS:
+            raise ValueError("a shape is no list of whole numbers")
+        size = ITEM_BYTES[INT64]
+        return tuple(
+            int.from_bytes(self.data[start : start + size], "little", signed=True)
+            for start in range(0, len(self.data), size)
+        )
+
+
+@dataclass(frozen=True)
+class OnnxNode:
+    """A node of a graph. Attributes are whole numbers, lists of them, or None for what is neither."""
+
+    operator: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    attributes: dict[str, int | tuple[int, ...] | None]
 
 
 @dataclass
@@ -23,6 +63,9 @@ class OnnxContents:
         metadata: the metadata properties.
         custom_operators: operators outside the standard domains, "domain::name".
         external_files: files that tensors refer to; "" for one that says its data lies outside and not where.
+        nodes, constants: of the graph itself, in their order and by name.
+        oddities: what no model needs, clauses: graphs inside of nodes, tensors in odd forms.
+        checksum: SHA-256 of the graph, hexadecimal.
     """
 
     inputs: dict[str, tuple] = field(default_factory=dict)
@@ -30,6 +73,10 @@ class OnnxContents:
     metadata: dict[str, str] = field(default_factory=dict)
     custom_operators: set[str] = field(default_factory=set)
     external_files: set[str] = field(default_factory=set)
+    nodes: list[OnnxNode] = field(default_factory=list)
+    constants: dict[str, OnnxConstant] = field(default_factory=dict)
+    oddities: list[str] = field(default_factory=list)
+    checksum: str = ""
     has_graph: bool = False
 
 
@@ -39,12 +86,19 @@ def read_onnx(data: bytes) -> OnnxContents:
     Raises:
         ValueError: they are not those of an ONNX file.
     """
-    contents = OnnxContents()
+    contents, digest = OnnxContents(), hashlib.sha256()
     try:
         for number, value in _fields(memoryview(data)):
             if number == 7:
                 contents.has_graph = True
+                digest.update(value)
                 _read_graph(value, contents, top=True)
+            elif number == 8:
+                opset = dict(_fields(value))
+                if _text(opset.get(1, b"")) in STANDARD_DOMAINS and opset.get(2) not in KNOWN_OPSETS:
+                    contents.oddities.append(f"operators of version {opset.get(2)!r}")
+            elif number == 20:
+                contents.oddities.append("a training of its own")
             elif number == 14:
                 prop = dict(_fields(value))
                 contents.metadata[_text(prop.get(1, b""))] = _text(prop.get(2, b""))
@@ -54,6 +108,7 @@ def read_onnx(data: bytes) -> OnnxContents:
         raise ValueError("not an ONNX file") from error
     if not contents.has_graph:
         raise ValueError("not an ONNX file")
+    contents.checksum = digest.hexdigest()
     return contents
 
 
@@ -104,8 +159,13 @@ def _read_graph(data: memoryview, contents: OnnxContents, top: bool = False, dep
         if number == 1:
             _read_node(value, contents, depth)
         elif number == 5:
-            _read_tensor(value, contents)
+            name, constant = _read_tensor(value, contents)
+            if name in contents.constants:
+                contents.oddities.append(f"two constants '{name}'")
+            elif top:
+                contents.constants[name] = constant
         elif number == 15:
+            contents.oddities.append("sparse tensors")
             _read_sparse_tensor(value, contents)
         elif top and number in (11, 12):
             name, shape = _read_value_info(value)
@@ -114,26 +174,81 @@ def _read_graph(data: memoryview, contents: OnnxContents, top: bool = False, dep
 
 def _read_node(data: memoryview, contents: OnnxContents, depth: int) -> None:
     operator = domain = ""
+    inputs, outputs, attributes = [], [], {}
     for number, value in _fields(data):
-        if number == 4:
+        if number in (1, 2):
+            (inputs if number == 1 else outputs).append(_text(value))
+        elif number == 4:
             operator = _text(value)
         elif number == 7:
             domain = _text(value)
         elif number == 5:
-            for attribute, content in _fields(value):
-                if attribute in (5, 10):
-                    _read_tensor(content, contents)
-                elif attribute in (6, 11):
-                    _read_graph(content, contents, depth=depth + 1)
-                elif attribute in (22, 23):
-                    _read_sparse_tensor(content, contents)
+            name, attribute = _read_attribute(value, contents, depth)
+            attributes[name] = attribute
     if domain not in STANDARD_DOMAINS:
         contents.custom_operators.add(f"{domain}::{operator}")
+    if depth == 0:
+        contents.nodes.append(OnnxNode(operator, tuple(inputs), tuple(outputs), attributes))
 
 
-def _read_tensor(data: memoryview, contents: OnnxContents) -> None:
-    is_external, location = False, ""
+def _read_attribute(data: memoryview, contents: OnnxContents, depth: int) -> tuple[str, int | tuple[int, ...] | None]:
+    name, single, several, is_other = "", None, [], False
     for number, value in _fields(data):
+        if number == 1:
+            name = _text(value)
+        elif number == 3:
+            single = _signed(value)
+        elif number == 8:
+            several += _numbers(value)
+        elif number in (5, 10):
+            contents.oddities.append("tensors inside of nodes")
+            _read_tensor(value, contents)
+        elif number in (6, 11):
+            contents.oddities.append("graphs inside of nodes")
+            _read_graph(value, contents, depth=depth + 1)
+        elif number in (22, 23):
+            contents.oddities.append("sparse tensors")
+            _read_sparse_tensor(value, contents)
+        elif number not in (2, 13, 20, 21):
+            is_other = True
+    if len(several) > LONGEST_ATTRIBUTE:
+        contents.oddities.append("a node with a long list")
+    return name, None if is_other else tuple(several) or single
+
+
+def _signed(value: int) -> int:
+    """A number of 64 bits as protobuf writes it."""
+    if not isinstance(value, int):
+        raise TypeError("text where a number belongs")
+    return value - (1 << 64) if value >> 63 else value
+
+
+def _numbers(value: int | memoryview) -> list[int]:
+    """One of a list of numbers, or all of them in one piece."""
+    if isinstance(value, int):
+        return [_signed(value)]
+    found, position = [], 0
+    while position < len(value):
+        number, position = _varint(value, position)
+        found.append(_signed(number))
+    return found
+
+
+def _read_tensor(data: memoryview, contents: OnnxContents) -> tuple[str, OnnxConstant]:
+    is_external, location = False, ""
+    name, kind, shape, content, is_odd = "", 0, [], [], False
+    for number, value in _fields(data):
+        if number == 1:
+            shape += _numbers(value)
+        elif number == 2:
+            kind = value
+        elif number == 8:
+            name = _text(value)
+        elif number == 9:
+            content.append(value)
+        elif number in (3, 4, 5, 6, 7, 10, 11):
+            # A segment, or elements one by one: train writes neither.
+            is_odd = True
         if number == 13:
             is_external = True
             entry = dict(_fields(value))
@@ -143,6 +258,13 @@ def _read_tensor(data: memoryview, contents: OnnxContents) -> None:
             is_external = True
     if is_external:
         contents.external_files.add(location)
+    raw = content[0] if len(content) == 1 and not isinstance(content[0], int) else memoryview(b"")
+    is_shape = len(shape) <= MAX_DIMENSIONS and min(shape, default=0) >= 0
+    if is_odd or len(content) > 1 or not is_shape or math.prod(shape) * ITEM_BYTES.get(kind, 0) != len(raw):
+        contents.oddities.append(f"a constant '{name}' that is not of the size that it says")
+    elif kind not in ITEM_BYTES:
+        contents.oddities.append(f"a constant '{name}' of another type than numbers")
+    return name, OnnxConstant(kind, tuple(shape), raw)
 
 
 def _read_sparse_tensor(data: memoryview, contents: OnnxContents) -> None:

@@ -3,12 +3,63 @@
 
 import json
 import os
+import re
+import secrets
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from .errors import OutputError
+from .file_kind import FileKind
+
+TEMPORARY = ".fdda-"
+_LEFT_OVER = re.compile(r"\.fdda-[0-9a-f]{12}(\..*)?|\.\d+-recording\.json", re.DOTALL)
+"""Names that `replacing` gives, and those that earlier versions gave to the index of a recording."""
+
+
+def check_outputs(
+    outputs: Mapping[Path, FileKind] | Iterable[tuple[Path, FileKind]],
+    inputs: Iterable[Path] = (),
+    overwrite: bool = False,
+) -> None:
+    """Fail before the work when what a verb writes could not be written, or would take something away.
+
+    Args:
+        outputs: the files that it writes, and of which kind each is.
+        inputs: the files that it reads.
+        overwrite: the user said that it may write over what it reads, and over files of another kind.
+
+    Raises:
+        OutputError: as `check_writable`; two outputs are one file; or, unless `overwrite`, one is read, or holds
+            something of another kind.
+    """
+    outputs = list(outputs.items() if isinstance(outputs, Mapping) else outputs)
+    inputs, places = list(inputs), {}
+    for path, kind in outputs:
+        check_writable(path)
+        place = os.path.realpath(path)
+        if place in places:
+            raise OutputError(f"Cannot write '{path}': it would be {places[place]} and {kind.name}; give two names.")
+        places[place] = kind.name
+        if overwrite or not os.path.exists(path):
+            continue
+        if any(os.path.exists(other) and os.path.samefile(path, other) for other in inputs):
+            raise OutputError(f"Cannot write '{path}': it is read for this; give another name, or --overwrite.")
+        if not _is_of(path, kind):
+            raise OutputError(
+                f"Cannot write '{path}': another file is there, which is not {kind.name}; give another name, or "
+                "--overwrite."
+            )
+
+
+def _is_of(path: Path, kind: FileKind) -> bool:
+    try:
+        return kind.is_of(path)
+    except OSError as error:
+        raise OutputError(
+            f"Cannot write '{path}': another file is there, {error.strerror}; give another name."
+        ) from error
 
 
 def check_writable(path: Path) -> None:
@@ -45,7 +96,7 @@ def check_folder_writable(path: Path) -> None:
 
 def _probe(path: Path, folder: Path) -> None:
     try:
-        handle, probe = tempfile.mkstemp(prefix=".fdda-", dir=folder)
+        handle, probe = tempfile.mkstemp(prefix=TEMPORARY, dir=folder)
     except OSError as error:
         raise OutputError(f"Cannot write '{path}': {error.strerror}; choose a folder that you may write.") from error
     os.close(handle)
@@ -54,32 +105,67 @@ def _probe(path: Path, folder: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside `path`, and rename it to `path` when the block ends without an error.
+    """Give a temporary file beside `path`, and rename it to `path` when the block ends without an error.
 
     Raises:
         OutputError: the file cannot be written or renamed, for instance because the disk is full.
     """
-    temporary = path.with_name(f".{os.getpid()}-{path.name}")
-    try:
+    with replacing_all(path) as (temporary,):
         yield temporary
-        with open(temporary, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+
+
+@contextmanager
+def replacing_all(*paths: Path) -> Iterator[tuple[Path, ...]]:
+    """As `replacing`, of files that belong together: when one cannot be written, none is changed.
+
+    Raises:
+        OutputError: one cannot be written or renamed.
+    """
+    temporaries: list[Path] = []
+    renamed: list[str] = []
+    try:
+        for path in paths:
+            temporaries.append(_new_file(path))
+        yield tuple(temporaries)
+        for temporary in temporaries:
+            with open(temporary, "rb") as file:
+                os.fsync(file.fileno())
+        for temporary, path in zip(temporaries, paths, strict=True):
+            os.replace(temporary, path)
+            renamed.append(f"'{path.name}'")
     except OSError as error:
-        raise OutputError(f"Cannot write '{path}': {error.strerror or error}; nothing was changed.") from error
+        beside = f" with {', '.join(repr(path.name) for path in paths[1:])}" if len(paths) > 1 else ""
+        changed = f"{', '.join(renamed)} was replaced, and no other" if renamed else "nothing was changed"
+        raise OutputError(f"Cannot write '{paths[0]}'{beside}: {error.strerror or error}; {changed}.") from error
     finally:
-        with suppress(OSError):
-            temporary.unlink()
+        for temporary in temporaries:
+            with suppress(OSError):
+                temporary.unlink()
+
+
+def _new_file(path: Path) -> Path:
+    """An empty file beside a path, which nobody could foresee or put a link in the place of.
+
+    As `tempfile.mkstemp` makes them, but with the permissions of any other new file.
+    """
+    temporary = path.with_name(f"{TEMPORARY}{secrets.token_hex(6)}{path.suffix}")
+    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666))
+    return temporary
+
+
+def is_left_over(name: str) -> bool:
+    """Whether a file of this name was left by a process that was ended while it wrote."""
+    return _LEFT_OVER.fullmatch(name) is not None
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace a file with text, UTF-8.
+    """Replace a file with text, UTF-8; parts of file names that are none are escaped.
 
     Raises:
         OutputError: as `replacing`.
     """
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_json(path: Path, value: object) -> None:
@@ -88,4 +174,9 @@ def write_json(path: Path, value: object) -> None:
     Raises:
         OutputError: as `replacing`.
     """
-    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+    write_text(path, json_text(value))
+
+
+def json_text(value: object) -> str:
+    """A value as `write_json` writes it; ValueError for NaN and infinity."""
+    return json.dumps(value, indent=1, allow_nan=False) + "\n"

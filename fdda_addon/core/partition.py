@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .defaults import MIN_VERTICES
 from .rig import Rig
 
 INFLUENCE_TOLERANCE = 1e-4
 """A joint influences a partition when it moves a local residual by more than this part of the character's size."""
-LEAST_VERTICES = 8
-"""Partitions of fewer vertices are merged into others."""
 GOLDEN_RATIO = 0.618034
 
 
@@ -79,12 +78,12 @@ def make_partitions(
     )
 
 
-def merged_partitions(rig: Rig, least: int = LEAST_VERTICES) -> tuple[Partition, ...]:
+def merged_partitions(rig: Rig, least: int = MIN_VERTICES) -> tuple[Partition, ...]:
     """Cut the mesh by main joint, and merge what has fewer than `least` vertices as `small_partition_merges` says."""
     return make_partitions(rig, merged=small_partition_merges(rig, least))
 
 
-def small_partition_merges(rig: Rig, least: int = LEAST_VERTICES) -> dict[int, int]:
+def small_partition_merges(rig: Rig, least: int = MIN_VERTICES) -> dict[int, int]:
     """Choose where the vertices of small partitions go.
 
     The smallest goes first: to the partition whose joint has the most weight on its vertices, else to that of the
@@ -143,11 +142,11 @@ def residual_changes(partitions: tuple[Partition, ...], moved: np.ndarray, base:
 
     Args:
         partitions: P partitions.
-        moved: (N, V, 3) float32 local residuals, metres.
+        moved: (N, V, 3) float32 local residuals, mesh units.
         base: the same of other poses, or of one for all.
 
     Returns:
-        (N, P) float64, metres.
+        (N, P) float64, mesh units.
     """
     distances = np.linalg.norm(moved - base, axis=2)
     return np.stack([distances[:, p.vertices].max(axis=1, initial=0) for p in partitions], axis=1).astype(np.float64)

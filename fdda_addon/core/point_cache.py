@@ -48,7 +48,7 @@ class PointCacheWriter:
         file.write(HEADER.pack(SIGNATURE, VERSION, points, start, 1.0, samples))
 
     def append(self, positions: np.ndarray) -> None:
-        """Write samples: (N, points, 3), metres. ValueError when they are of another shape or too many."""
+        """Write samples: (N, points, 3), mesh units. ValueError when they are of another shape or too many."""
         if positions.shape[1:] != (self._points, 3) or len(positions) > self._missing:
             raise ValueError(f"samples of shape {positions.shape} where {self._missing} of {self._points} points fit")
         self._missing -= len(positions)

@@ -5,15 +5,16 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from .defaults import SPREAD
+
 ROTATION, LOCATION, SCALE, CONTROL = "rotation", "location", "scale", "control"
 KINDS = (ROTATION, LOCATION, SCALE, CONTROL)
 """Kinds of channels."""
 DEFAULT_RANGE = (-np.pi / 4, np.pi / 4)
 """Range of a rotation axis that the rig neither limits nor locks, radians."""
 
-DEFAULT_SPREAD = 1.0
-"""Standard deviation of the poses, as a part of half the range."""
-
+LONGEST_BONE = 2100
+"""Letters of what a channel is called in a file: a control has an owner and a path."""
 RANGE_TOLERANCE = 1e-4
 """Radians or metres. Ranges that differ by less count as the same: Blender keeps them as float32."""
 
@@ -23,14 +24,14 @@ class Channel:
     """One number of a pose that may be sampled.
 
     Attributes:
-        bone: name of the bone, or of the control (`Control.name`).
+        name: of the bone, or of the control (`Control.name`).
         kind: `ROTATION` (Euler angle, radians), `LOCATION` (metres) or `SCALE` (factor) of a bone, relative to the rest
             pose, or `CONTROL` (the unit of its property).
         axis: 0, 1 or 2; 0 for a control.
         low, high: the range of motion.
     """
 
-    bone: str
+    name: str
     kind: str
     axis: int
     low: float
@@ -42,10 +43,32 @@ class Channel:
         return min(max(1.0 if self.kind == SCALE else 0.0, self.low), self.high)
 
     def to_json(self) -> dict:
-        return asdict(self)
+        """As files have it: there the name is called `bone`, also that of a control."""
+        values = asdict(self)
+        return {"bone": values.pop("name"), **values}
+
+    @staticmethod
+    def from_json(value: dict) -> "Channel":
+        """Read a channel from a file.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is damaged.
+        """
+        values = dict(value)
+        channel = Channel(values.pop("bone"), **values)
+        if not isinstance(channel.name, str) or not 0 < len(channel.name) <= LONGEST_BONE:
+            raise ValueError(f"its range of motion is of a bone called {channel.name!r}")
+        if channel.kind not in KINDS or type(channel.axis) is not int or channel.axis not in range(3):
+            raise ValueError(f"its range of motion of {channel.name!r} is of {channel.kind!r}, axis {channel.axis!r}")
+        for end in (channel.low, channel.high):
+            if type(end) not in (int, float) or not np.isfinite(float(end)):
+                raise ValueError(f"its range of motion of {channel.name!r} ends at {end!r}")
+        if channel.low > channel.high:
+            raise ValueError(f"its range of motion of {channel.name!r} is {channel.low} to {channel.high}")
+        return channel
 
 
-def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: float = DEFAULT_SPREAD) -> np.ndarray:
+def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: float = SPREAD) -> np.ndarray:
     """Draw one pose: a normal distribution centred on the middle of each range, redrawn until inside.
 
     The pose depends on seed and index alone, so a recording that is resumed continues with the same poses.
@@ -83,7 +106,7 @@ def range_changes(before: tuple[Channel, ...], after: tuple[Channel, ...]) -> li
     def by_bone(channels: tuple[Channel, ...]) -> dict[str, dict[tuple[str, int], tuple[float, float]]]:
         found: dict[str, dict] = {}
         for channel in channels:
-            found.setdefault(channel.bone, {})[channel.kind, channel.axis] = (channel.low, channel.high)
+            found.setdefault(channel.name, {})[channel.kind, channel.axis] = (channel.low, channel.high)
         return found
 
     old, new = by_bone(before), by_bone(after)

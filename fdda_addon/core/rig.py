@@ -15,10 +15,24 @@ Its rest and its pose matrix are the identity, its parent is -1."""
 UNMOVED_LABEL = "no bone"
 """What people read in place of that name."""
 
+LONGEST_HASH = 128
 REST_TOLERANCE = 1e-4
 """Largest difference of a rest matrix element (metres, or no unit) at which two rest poses count as the same.
 
 Blender's versions compute a bone's matrix a few float32 steps apart, so the comparison cannot be exact."""
+
+
+LONGEST_NAME = 1000
+"""Letters of a name in a file; Blender's are at most a quarter of it."""
+
+
+def read_name(value: object) -> str:
+    """A name from a file; TypeError or ValueError where it is none."""
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} stands where a name belongs")
+    if len(value) > LONGEST_NAME:
+        raise ValueError(f"a name has {len(value)} letters")
+    return value
 
 
 @dataclass(frozen=True)
@@ -29,6 +43,25 @@ class Joint:
     parent: int
 
 
+def read_joints(values: list) -> tuple[Joint, ...]:
+    """Read the joints of a recording or model.
+
+    Raises:
+        KeyError, TypeError, ValueError: they are damaged, two have one name, or one stands before its parent.
+    """
+    if not isinstance(values, list):
+        raise TypeError("its joints are no list")
+    joints = tuple(Joint(read_name(value["name"]), value["parent"]) for value in values)
+    if not joints or len({joint.name for joint in joints}) != len(joints):
+        raise ValueError("it has no joints, or two of one name")
+    for number, joint in enumerate(joints):
+        if type(joint.parent) is not int or not -1 <= joint.parent < number:
+            raise ValueError(
+                f"a joint stands before its parent: the parent of joint {joint.name!r} is {joint.parent!r}"
+            )
+    return joints
+
+
 @dataclass(frozen=True)
 class Fingerprint:
     """Hashes that tell two rigs apart and say in what they differ. Equal for equal topology, rest and weights."""
@@ -36,6 +69,14 @@ class Fingerprint:
     topology: str
     rest_positions: str
     skin_weights: str
+
+    @staticmethod
+    def from_json(value: dict) -> "Fingerprint":
+        """Read a fingerprint from a file; KeyError, TypeError or ValueError where it is damaged."""
+        parts = [value[name] for name in ("topology", "rest_positions", "skin_weights")]
+        if not all(isinstance(part, str) and len(part) <= LONGEST_HASH for part in parts):
+            raise ValueError("its fingerprint holds no hashes")
+        return Fingerprint(*parts)
 
     @staticmethod
     def digest(*arrays: np.ndarray) -> str:
@@ -54,7 +95,7 @@ class Rig:
 
     Attributes:
         joints: J joints, every parent before its children.
-        rest_positions: (V, 3) float32, mesh-object space, metres (see `metres_per_unit`).
+        rest_positions: (V, 3) float32, mesh-object space, mesh units (see `metres_per_unit`).
         rest_matrices: (J, 4, 4) float32, rest pose of the joints in mesh-object space, column vectors.
         skin_joints: (V, I) int32, indices of the joints that a vertex follows; unused places hold 0.
         skin_weights: (V, I) float32, their weights; each row sums to 1, unused places hold 0.
@@ -96,6 +137,13 @@ class Rig:
         return float(np.linalg.norm(np.ptp(self.rest_positions, axis=0)))
 
 
+def are_same_rest(rest_matrices: np.ndarray, rig: Rig) -> bool:
+    """Whether (J, 4, 4) rest matrices are those of a rig, to `REST_TOLERANCE`."""
+    apart = np.abs(rest_matrices - rig.rest_matrices)
+    apart[:, :3, 3] *= rig.metres_per_unit
+    return bool(apart.max(initial=0) <= REST_TOLERANCE)
+
+
 def differences(
     joints: tuple[Joint, ...], rest_matrices: np.ndarray, vertex_count: int, fingerprint: Fingerprint, rig: Rig
 ) -> list[str]:
@@ -119,9 +167,7 @@ def differences(
             found.append(f"it does not know {_names(extra)}")
     elif joints != rig.joints:
         found.append("its joints have other parents")
-    elif rest_matrices.shape != rig.rest_matrices.shape or (
-        np.abs(rest_matrices - rig.rest_matrices).max(initial=0) > REST_TOLERANCE
-    ):
+    elif rest_matrices.shape != rig.rest_matrices.shape or (not are_same_rest(rest_matrices, rig)):
         found.append("the rest pose of the armature differs")
     if not found:
         for part, name in (

@@ -14,7 +14,7 @@ import numpy as np
 KINDS = ("hard", "smooth")
 """One joint a vertex, or at most `INFLUENCES`."""
 INFLUENCES = 4
-MOST_INFLUENCES = 64
+MAX_INFLUENCES = 64
 
 
 @dataclass(frozen=True)
@@ -109,9 +109,11 @@ def skin_from_text(text: str, vertex_count: int, joint_count: int) -> tuple[np.n
         ValueError: it is damaged, or not for so many vertices and joints; the text is a clause about the model.
     """
     try:
+        if len(text) > 2 * (-(-4 * vertex_count * MAX_INFLUENCES // 3) * 4) + (1 << 20):
+            raise ValueError(f"they have {len(text)} letters")
         value = json.loads(text)
         influences = value["influences"]
-        if type(influences) is not int or not 1 <= influences <= MOST_INFLUENCES:
+        if type(influences) is not int or not 1 <= influences <= MAX_INFLUENCES:
             raise ValueError(f"they have {influences!r} places a vertex")
         # Before anything is decoded: four bytes a number, four characters for three bytes.
         length = -(-4 * vertex_count * influences // 3) * 4

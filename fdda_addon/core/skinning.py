@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from .errors import RigError
 from .partition import Partition, make_partitions
 from .rig import Rig
 
@@ -17,13 +18,29 @@ def skin_matrices(pose_matrices: np.ndarray, rest_matrices: np.ndarray) -> np.nd
     """Skin matrices S_j = P_j B_j^-1.
 
     Args:
-        pose_matrices: (N, J, 4, 4), mesh-object space, metres.
-        rest_matrices: (J, 4, 4), mesh-object space, metres.
+        pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
+        rest_matrices: (J, 4, 4), mesh-object space, mesh units.
 
     Returns:
         (N, J, 4, 4) float32.
     """
     return (pose_matrices @ np.linalg.inv(rest_matrices.astype(np.float64))).astype(np.float32)
+
+
+MIN_LENGTH = 1e-12
+MIN_VOLUME = 1e-6
+"""Of the box that three columns of length 1 span."""
+
+
+def have_inverse(matrices: np.ndarray) -> np.ndarray:
+    """Which of (..., 4, 4) matrices can be inverted: their columns have a length and a volume, the last row is that of
+    an affine transform. (...,) bool."""
+    columns = matrices[..., :3, :3].astype(np.float64)
+    lengths = np.linalg.norm(columns, axis=-2)
+    unit = columns / np.maximum(lengths, MIN_LENGTH)[..., None, :]
+    volume = np.abs(np.einsum("...a,...a->...", np.cross(unit[..., 0], unit[..., 1]), unit[..., 2]))
+    affine = np.abs(matrices[..., 3, :] - np.array([0, 0, 0, 1])).max(axis=-1) <= 1e-3
+    return (lengths > MIN_LENGTH).all(axis=-1) & (volume > MIN_VOLUME) & affine
 
 
 class SkinBlock:
@@ -34,7 +51,7 @@ class SkinBlock:
 
     Attributes:
         joints: (Jp,) int32, the joints that skin the partition.
-        weighted_rest: (4 Jp, Vp) float32, w_vj (x_v, 1), metres.
+        weighted_rest: (4 Jp, Vp) float32, w_vj (x_v, 1), mesh units.
     """
 
     def __init__(self, rig: Rig, partition: Partition):
@@ -66,10 +83,10 @@ class LinearLayer:
         """Skin the mesh.
 
         Args:
-            pose_matrices: (N, J, 4, 4), mesh-object space, metres.
+            pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
 
         Returns:
-            (N, V, 3) float32, mesh-object space, metres.
+            (N, V, 3) float32, mesh-object space, mesh units.
         """
         skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
         ordered = np.empty((len(skin), self.rig.vertex_count, 3), np.float32)
@@ -81,17 +98,24 @@ class LinearLayer:
         """Residuals in the frames of the main joints, l_v = R_m^-1 (complex_v - lin_v).
 
         Args:
-            pose_matrices: (N, J, 4, 4), mesh-object space, metres.
-            positions: (N, V, 3), what the rig evaluates to, mesh-object space, metres.
+            pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
+            positions: (N, V, 3), what the rig evaluates to, mesh-object space, mesh units.
 
         Returns:
-            (N, V, 3) float32, metres.
+            (N, V, 3) float32, mesh units.
 
         Raises:
-            numpy.linalg.LinAlgError: a joint's matrix is singular (a scale of zero).
+            RigError: a joint is without extent in some pose (a scale of zero).
         """
         skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
-        inverse = np.linalg.inv(skin[:, :, :, :3])
+        try:
+            inverse = np.linalg.inv(skin[:, :, :, :3])
+        except np.linalg.LinAlgError as error:
+            flat = np.abs(np.linalg.det(pose_matrices[:, :, :3, :3].astype(np.float64))).min(axis=0)
+            raise RigError(
+                f"Bone '{self.rig.joint_names[int(flat.argmin())]}' has a scale of zero in some pose; "
+                "look for a constraint or driver that sets it."
+            ) from error
         ordered = np.take(np.asarray(positions, np.float32), self._order, axis=1)
         for partition, block, own in self._parts(ordered):
             own -= _moved(skin, block)
@@ -119,7 +143,8 @@ class LinearLayer:
 
 
 def _moved(skin: np.ndarray, block: SkinBlock) -> np.ndarray:
-    """(N, J, 3, 4) skin matrices to the (N, Vp, 3) skinned vertices of a partition, metres."""
-    # All rows of all poses in one product: many small ones cost more than what they compute.
-    rows = skin[:, block.joints].transpose(0, 2, 1, 3).reshape(len(skin) * 3, -1)
-    return (rows @ block.weighted_rest).reshape(len(skin), 3, -1).transpose(0, 2, 1)
+    """(N, J, 3, 4) skin matrices to the (N, Vp, 3) skinned vertices of a partition, mesh units."""
+    # A product for each pose: in one product of all, the last bits of a pose would depend on how many others there are,
+    # and a recording that was resumed must have the bytes of one that was not.
+    rows = skin[:, block.joints].transpose(0, 2, 1, 3).reshape(len(skin), 3, -1)
+    return (rows @ block.weighted_rest).transpose(0, 2, 1)

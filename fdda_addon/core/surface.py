@@ -7,8 +7,8 @@ import numpy as np
 
 from .partition import Partition
 
-LEAST_CORNERS = 3
-"""Of a face."""
+MIN_CORNERS = 3
+"""A face has at least this number of vertices."""
 
 
 def are_faces(face_starts: np.ndarray, face_vertices: np.ndarray, vertex_count: int) -> bool:
@@ -18,7 +18,7 @@ def are_faces(face_starts: np.ndarray, face_vertices: np.ndarray, vertex_count: 
     corners = np.diff(face_starts.astype(np.int64), append=len(face_vertices))
     return bool(
         face_starts[0] == 0
-        and corners.min() >= LEAST_CORNERS
+        and corners.min() >= MIN_CORNERS
         and face_vertices.min() >= 0
         and face_vertices.max() < vertex_count
     )
@@ -139,7 +139,7 @@ class SurfaceComparison:
     def __init__(self, surface: Surface, rest_positions: np.ndarray, partitions: tuple[Partition, ...]):
         """Args:
         surface: of the mesh.
-        rest_positions: (V, 3), metres.
+        rest_positions: (V, 3), mesh units.
         partitions: of the mesh.
         """
         self._surface = surface
@@ -157,7 +157,7 @@ class SurfaceComparison:
         """Compare other positions of a pose with the true ones.
 
         Args:
-            true: (V, 3), metres.
+            true: (V, 3), mesh units.
             others: one or more of the same.
 
         Returns:

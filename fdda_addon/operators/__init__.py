@@ -4,15 +4,20 @@
 MODULES: tuple[str, ...] = (
     "job",
     "trainer_environment",
+    "trusted_folders",
     "rig",
     "sampling",
     "poses",
+    "ranges",
     "recording",
     "training",
     "playback",
+    "one_go",
     "baking",
     "evaluation",
     "worst_poses",
     "models",
+    "help",
+    "meshes",
 )
 """The modules of this package; each lists its classes in `CLASSES`."""

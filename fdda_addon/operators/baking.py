@@ -6,12 +6,12 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import OutputError
-from .job import JobOperator
+from ..core.errors import FDDAError, OutputError
+from .asking import AsksFirst
 from .playback import OnModel
 
 
-class FDDA_OT_bake(OnModel, JobOperator, bpy.types.Operator):
+class FDDA_OT_bake(OnModel, AsksFirst, bpy.types.Operator):
     bl_idname = "fdda.bake"
     bl_label = "Bake…"
     bl_description = (
@@ -22,16 +22,19 @@ class FDDA_OT_bake(OnModel, JobOperator, bpy.types.Operator):
     verb, title = "bake", "Bake"
 
     filepath: bpy.props.StringProperty(
-        name="File", description="Where to write, a .pc2 or a .blend file", subtype="FILE_PATH"
+        name="File", description="Where to write, a .pc2 or a .blend file", subtype="FILE_PATH", options={"SKIP_SAVE"}
     )
     filter_glob: bpy.props.StringProperty(default="*.pc2;*.blend", options={"HIDDEN"})
     check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
     action: bpy.props.StringProperty(
-        name="Action", description="Name of the action; empty for the frames of the scene as it is animated"
+        name="Action",
+        description="Name of the action; empty for the frames of the scene as it is animated",
+        options={"SKIP_SAVE"},
     )
     shape_keys: bpy.props.BoolProperty(
         name="Shape Keys",
         description="Keep the positions in the .blend file, a shape key each frame, and not in a .pc2 file beside it",
+        options={"SKIP_SAVE"},
     )
 
     @classmethod
@@ -40,33 +43,36 @@ class FDDA_OT_bake(OnModel, JobOperator, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if self.filepath:
-            return JobOperator.invoke(self, context, event)
-        name = Path(bpy.data.filepath).stem or "character"
-        self.filepath = bpy.path.abspath(f"//{name}_baked.blend")
-        self._is_browsing = True
+            return AsksFirst.invoke(self, context, event)
+        try:
+            name = bpy.path.clean_name(self.bound_rig(context).mesh_object.name)
+        except FDDAError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        file = Path(bpy.data.filepath).stem or "character"
+        self.filepath = bpy.path.abspath(f"//{file}_{name}_baked.blend")
+        self._is_asking = True
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        if getattr(self, "_is_browsing", False):
-            # The file browser executes; the job is to run in ticks.
-            return bpy.ops.fdda.bake(
-                "INVOKE_DEFAULT", filepath=self.filepath, action=self.action, shape_keys=self.shape_keys
-            )
-        return JobOperator.execute(self, context)
+    execute = AsksFirst.execute
+
+    def answer(self) -> dict[str, object]:
+        return {name: getattr(self, name) for name in ("object", "filepath", "action", "shape_keys")}
 
     def draw(self, _context: bpy.types.Context) -> None:
         self.layout.prop_search(self, "action", bpy.data, "actions")
         self.layout.prop(self, "shape_keys")
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..baking import BakeSettings, bake
+        from ..baking.run import BakeSettings, bake
         from ..runtime.model_files import network_of
 
         scene_rig = self.bound_rig(context)
         if not self.filepath:
             raise OutputError("No file was chosen; give the name of a .pc2 or .blend file.")
-        settings = BakeSettings(self.action, shape_keys=self.shape_keys)
+        strength = 0.0 if scene_rig.mesh_object.fdda.mode == "LINEAR" else None
+        settings = BakeSettings(self.action, shape_keys=self.shape_keys, strength=strength)
         out = Path(bpy.path.abspath(self.filepath))
         yield from bake(scene_rig, network_of(scene_rig.mesh_object), out, settings)
 

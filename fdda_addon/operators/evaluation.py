@@ -1,19 +1,24 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators of the section Evaluation: compare, colour the mesh, open the report."""
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
 
-from .. import last_evaluation
+from ..core.defaults import EVALUATION_SEED, SIDEBAR_EVALUATION_POSES
 from ..core.errors import ModelError, RigError
-from ..model_list import bound_entry, bound_name
+from ..core.progress import Progress
+from ..core.report import REPORT_HTML, page_path
+from ..evaluation import last_evaluation
+from ..evaluation.loaded import loaded_heat_map
+from ..models.entries import bound_entry, bound_name
+from ..properties.view import show_graph
+from ..scene.active_rig import any_mesh
 from .job import JobOperator
+from .on_rig import OnRig
 from .playback import OnModel
 
-REPORT = "report.html"
 """Name of the page that a training writes beside its model."""
 
 
@@ -32,9 +37,13 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
             ("RANDOM", "Random Poses", "Random poses inside the range of motion that no recording has"),
         ),
     )
-    action: bpy.props.StringProperty(name="Action", description="Name of the action; empty for the armature's own")
-    poses: bpy.props.IntProperty(name="Poses", description="Number of random poses", default=100, min=1)
-    seed: bpy.props.IntProperty(name="Seed", description="Of the random poses", default=1, min=0)
+    action: bpy.props.StringProperty(
+        name="Action", description="Name of the action; empty for the armature's own", options={"SKIP_SAVE"}
+    )
+    poses: bpy.props.IntProperty(
+        name="Poses", description="Number of random poses", default=SIDEBAR_EVALUATION_POSES, min=1
+    )
+    seed: bpy.props.IntProperty(name="Seed", description="Of the random poses", default=EVALUATION_SEED, min=0)
 
     execute = JobOperator.execute
 
@@ -43,33 +52,51 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_bound(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..evaluation import EvaluationSettings, evaluate, evaluate_action
+        from ..evaluation.run import EvaluationSettings, evaluate, evaluate_action
         from ..runtime.binding import true_rig
         from ..runtime.model_files import network_of
 
-        scene_rig = self.bound_rig(context)
-        self._action = self._action_name(scene_rig.armature_object) if self.source == "ACTION" else ""
-        network = network_of(scene_rig.mesh_object)
-        with true_rig(scene_rig.mesh_object):
-            if self._action:
-                yield from evaluate_action(scene_rig, network, self._action)
-            else:
-                yield from evaluate(scene_rig, network, EvaluationSettings(self.poses, self.seed, surface=False))
+        rigs = self.bound_rigs(context)
+        self._action = self._action_name(rigs[0].armature_object) if self.source == "ACTION" else ""
+        self._evaluations: list[tuple[int, object]] = []
+        for scene_rig in rigs:
+            mesh_object = scene_rig.mesh_object
+            self.state.begin_part(mesh_object.name if len(rigs) > 1 else "")
+            network, uid = network_of(mesh_object), mesh_object.session_uid
+            with true_rig(mesh_object):
+                if self._action:
+                    steps = evaluate_action(scene_rig, network, self._action)
+                else:
+                    steps = evaluate(scene_rig, network, EvaluationSettings(self.poses, self.seed, surface=False))
+                for step in steps:
+                    if isinstance(step, Progress):
+                        yield step
+                    else:
+                        self._evaluations.append((uid, step))
+        yield self._evaluations
 
-    def finish(self, context: bpy.types.Context, result: object) -> str:
-        from ..evaluation_view import redraw_views
-        from ..scene.action_range import action_frames
+    def finish(self, context: bpy.types.Context, result: list[tuple[int, object]]) -> str:
+        from ..poses.action_range import action_frames
+        from ..scene.viewport import redraw_views
 
-        mesh_object = self.bound_rig(context).mesh_object
         first = action_frames(bpy.data.actions[self._action]).start if self._action else 0
-        last = last_evaluation.keep(mesh_object, result, bound_name(mesh_object), self._action, first, self.seed)
+        sentences = []
+        for uid, evaluation in result:
+            mesh_object = next(o for o in bpy.data.objects if o.session_uid == uid)
+            last = last_evaluation.keep(
+                mesh_object, evaluation, bound_name(mesh_object), self._action, first, self.seed
+            )
+            fdda, linear = last.total["fdda"], last.total["linear"]
+            of = f" of '{mesh_object.name}'" if len(result) > 1 else ""
+            sentences.append(
+                f"FDDA{of} is {fdda.mean:.2f} mm from the rig on average and {fdda.max:.1f} mm at most; "
+                f"the linear layer {linear.mean:.2f} and {linear.max:.1f} mm."
+            )
         context.window_manager.fdda_view.pose = -1
+        if self._action:
+            show_graph(context.window_manager.fdda_view.graph)
         redraw_views()
-        fdda, linear = last.total["fdda"], last.total["linear"]
-        return (
-            f"FDDA is {fdda.mean:.2f} mm from the rig on average and {fdda.max:.1f} mm at most; "
-            f"the linear layer {linear.mean:.2f} and {linear.max:.1f} mm."
-        )
+        return " ".join(sentences)
 
     def _action_name(self, armature_object: bpy.types.Object) -> str:
         animation = armature_object.animation_data
@@ -86,7 +113,7 @@ class OnEvaluation(OnModel):
         """Whether a mesh of the scene was evaluated; sets the poll message otherwise. For `poll`."""
         if not cls.is_free(context):
             return False
-        if not any(o.type == "MESH" and last_evaluation.of(o) for o in context.scene.objects):
+        if not any_mesh(context, last_evaluation.of):
             cls.poll_message_set("Nothing was evaluated since Blender was started; evaluate first")
             return False
         return True
@@ -128,7 +155,7 @@ class FDDA_OT_paint(OnEvaluation, bpy.types.Operator):
         return cls.is_free(context)
 
     def work(self, context: bpy.types.Context) -> str:
-        from .. import heat_map
+        from ..evaluation import heat_map
 
         if self.colors == "ERRORS":
             scene_rig, _ = self.last(context)
@@ -157,7 +184,7 @@ class FDDA_OT_fit_range(OnEvaluation, bpy.types.Operator):
         return cls.has_evaluation(context)
 
     def work(self, context: bpy.types.Context) -> str:
-        from .. import heat_map
+        from ..evaluation import heat_map
 
         scene_rig, _ = self.last(context)
         fitting = heat_map.fitting_range_mm(scene_rig.mesh_object)
@@ -171,7 +198,7 @@ class FDDA_OT_fit_range(OnEvaluation, bpy.types.Operator):
 class FDDA_OT_open_report(OnModel, bpy.types.Operator):
     bl_idname = "fdda.open_report"
     bl_label = "Open Report"
-    bl_description = f"Open the page {REPORT} that the training wrote beside the model, in the web browser"
+    bl_description = f"Open the page {REPORT_HTML} that the training wrote beside the model, in the web browser"
     bl_options = {"REGISTER"}
 
     @classmethod
@@ -190,17 +217,51 @@ class FDDA_OT_open_report(OnModel, bpy.types.Operator):
 
     def _page(self, mesh_object: bpy.types.Object) -> Path:
         """Where the report of the bound model is."""
-        from .. import models
+        from ..models import model_list
 
         entry = bound_entry(mesh_object)
         if entry is None:
-            models.adopt(mesh_object)
+            model_list.adopt(mesh_object)
             entry = bound_entry(mesh_object)
-        return models.entry_path(mesh_object, entry).resolve().parent / REPORT
+        return page_path(model_list.entry_path(mesh_object, entry).resolve())
+
+
+class FDDA_OT_show_bone(OnRig, bpy.types.Operator):
+    bl_idname = "fdda.show_bone"
+    bl_label = "Show Bone"
+    bl_description = "Select this bone in pose mode; a bone that is clicked in the view has its partition on top here"
+    bl_options = {"REGISTER", "UNDO"}
+
+    bone: bpy.props.StringProperty(name="Bone", description="Name of the bone", options={"SKIP_SAVE"})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.has_rig(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        from ..scene.compatibility import select_bone
+
+        armature_object = self.rig(context).armature_object
+        bone = armature_object.pose.bones.get(self.bone)
+        if bone is None:
+            self.report({"ERROR"}, f"'{armature_object.name}' has no bone '{self.bone}'.")
+            return {"CANCELLED"}
+        shown = self.rig(context).mesh_object
+        if context.mode != "POSE":
+            if context.mode != "OBJECT":
+                bpy.ops.object.mode_set(mode="OBJECT")
+            context.view_layer.objects.active = armature_object
+            bpy.ops.object.mode_set(mode="POSE")
+            context.window_manager.fdda.mesh = shown.name
+        for other in armature_object.pose.bones:
+            select_bone(other, other == bone)
+        armature_object.data.bones.active = bone.bone
+        return {"FINISHED"}
 
 
 CLASSES = (
     FDDA_OT_evaluate,
+    FDDA_OT_show_bone,
     FDDA_OT_paint,
     FDDA_OT_fit_range,
     FDDA_OT_open_report,
@@ -209,6 +270,7 @@ CLASSES = (
 
 def unregister() -> None:
     """Paint nothing any more."""
-    heat_map = sys.modules.get(f"{__package__.rpartition('.')[0]}.heat_map")
+    show_graph(False)
+    heat_map = loaded_heat_map()
     if heat_map is not None:
         heat_map.clear_all()

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 import bpy
 
 from ..core.errors import FDDAError
-from .job_state import JobState, Run, current, redraw, register, request_cancel, state_of, stop, unregister
+from ..jobs.job import JobState, Run, current, redraw, request_cancel, stop, unregister
 
-TICK_BUDGET, MOST_BUDGET = 0.03, 0.2
+TICK_BUDGET, MAX_BUDGET = 0.03, 0.2
 """Seconds that a job may work at a tick; a step that is begun is finished, so steps must be short.
 
 A job that borrows the scene has each of its poses drawn. Where drawing takes longer than the budget, it may work as
@@ -50,9 +50,9 @@ class JobOperator:
         """
         raise NotImplementedError
 
-    def subject(self, context: bpy.types.Context) -> str:
-        """Name of the object that the job is about."""
-        return ""
+    def subject(self, context: bpy.types.Context) -> int:
+        """session_uid of the object that the job is about."""
+        return 0
 
     def finish(self, context: bpy.types.Context, result: object) -> str:
         """What remains to do with the last result of `steps`; returns the sentence that is reported."""
@@ -78,10 +78,10 @@ class JobOperator:
     def execute(self, context: bpy.types.Context) -> set[str]:
         if not self._begin(context):
             return {"CANCELLED"}
-        while (result := self._advance(context, BLOCKING_SECONDS)) is None:
+        while not self._run.work(BLOCKING_SECONDS):
             if self._run.is_waiting:
                 time.sleep(BLOCKING_SECONDS)
-        return result
+        return self._end()
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if bpy.app.background or context.window is None:
@@ -128,56 +128,43 @@ class JobOperator:
             self.report({"ERROR"}, str(error))
             return False
         self._timer, self._shown, self._redrawn, self._worked = None, None, 0.0, time.monotonic()
-        self._run = Run(state, self.steps(context))
+        self._run = Run(
+            state,
+            self.steps(context),
+            lambda result: self.finish(bpy.context, result),
+            lambda: self.cancelled(bpy.context),
+            self.ends_itself,
+        )
         return True
 
     def _tick(self, context: bpy.types.Context) -> set[str] | None:
         """Work a little; returns the operator's result once the job has ended."""
         budget = TICK_BUDGET
         if self.borrows_scene:
-            budget = min(max(budget, time.monotonic() - self._worked), MOST_BUDGET)
-        result = self._advance(context, budget)
-        self._worked = time.monotonic()
-        if result is not None:
+            budget = min(max(budget, time.monotonic() - self._worked), MAX_BUDGET)
+        try:
+            has_ended = self._run.work(budget)
+        except BaseException:
             self._leave(context)
-            return result
+            raise
+        self._worked = time.monotonic()
+        if has_ended:
+            self._leave(context)
+            return self._end()
         state, now = self._run.state, time.monotonic()
-        shown = (state.stage, state.done, len(state.log), state.cancel_requested)
+        shown = (state.stage, state.done, len(state.log) + len(state.warnings), state.cancel_requested)
         if shown != self._shown and now - self._redrawn >= REDRAW_SECONDS:
             self._shown, self._redrawn = shown, now
             if self.borrows_scene:
-                context.workspace.status_text_set(
-                    f"{self.title}: {state.done} of {state.total} {state.stage} (ESC: cancel)"
-                )
+                context.workspace.status_text_set(f"{self.title}: {state.sentence} (ESC: cancel)")
             redraw()
         return None
 
-    def _advance(self, context: bpy.types.Context, seconds: float) -> set[str] | None:
-        run = self._run
-        try:
-            cancelled = run.state.cancel_requested
-            if cancelled and not self.ends_itself:
-                run.close()
-            elif not run.advance(seconds):
-                return None
-            if cancelled and run.result is None:
-                return self._end(self.cancelled(context), "WARNING")
-            return self._end(self.finish(context, run.result), "INFO")
-        except FDDAError as error:
-            return self._end(str(error), "ERROR")
-        except ReferenceError:
-            return self._end(f"{self.title} ended: what it worked on was removed.", "ERROR")
-        except BaseException:
-            # Ctrl-C or a bug: it propagates, but what was borrowed is given back and another job may begin.
-            run.close()
-            self._leave(context)
-            run.end(f"{self.title} broke off; the system console says why.", "ERROR")
-            raise
-
-    def _end(self, sentence: str, level: str) -> set[str]:
-        self._run.end(sentence, level)
-        self.report({level}, sentence)
-        return {"FINISHED"} if level == "INFO" else {"CANCELLED"}
+    def _end(self) -> set[str]:
+        """Report how the job ended; returns the operator's result."""
+        state = self._run.state
+        self.report({state.outcome_level}, state.outcome)
+        return {"FINISHED"} if state.outcome_level == "INFO" else {"CANCELLED"}
 
     def _leave(self, context: bpy.types.Context) -> None:
         if self._timer is not None:
@@ -224,7 +211,4 @@ class FDDA_OT_cancel(bpy.types.Operator):
 
 CLASSES = (FDDA_OT_cancel,)
 
-__all__ = [
-    "CLASSES", "JobOperator", "JobState", "current", "redraw", "register", "request_cancel", "state_of", "stop",
-    "unregister",
-]  # fmt: skip
+__all__ = ["CLASSES", "JobOperator", "unregister"]

@@ -4,15 +4,24 @@
 import bpy
 
 from ..core.errors import ModelError
-from ..model_list import megabytes
+from ..models.entries import megabytes
+from ..scene.active_rig import any_mesh
 from .playback import ChoosesModel, OnModel
+
+
+def _has_models(mesh_object: bpy.types.Object) -> bool:
+    return bool(mesh_object.fdda.models) or mesh_object.fdda.is_bound
 
 
 class OnEntry(OnModel):
     """Mixin for an operator on an entry of the list of models."""
 
     index: bpy.props.IntProperty(
-        name="Index", description="Place in the list, from 0; -1 for the entry that is chosen", default=-1, min=-1
+        name="Index",
+        description="Place in the list, from 0; -1 for the entry that is chosen",
+        default=-1,
+        min=-1,
+        options={"SKIP_SAVE"},
     )
 
     @classmethod
@@ -20,7 +29,7 @@ class OnEntry(OnModel):
         """Whether a mesh of the scene has models; sets the poll message otherwise. For `poll`."""
         if not cls.is_free(context):
             return False
-        if not any(o.type == "MESH" and (o.fdda.models or o.fdda.is_bound) for o in context.scene.objects):
+        if not any_mesh(context, _has_models):
             cls.poll_message_set("The list of models is empty; train one, or add a file")
             return False
         return True
@@ -31,15 +40,15 @@ class OnEntry(OnModel):
         Raises:
             FDDAError: there is none.
         """
-        from .. import models
+        from ..models import model_list
 
         scene_rig = self.rig(context)
         mesh_object = scene_rig.mesh_object
-        models.adopt(mesh_object)
+        model_list.adopt(mesh_object)
         count = len(mesh_object.fdda.models)
         if self.index >= count:
             raise ModelError(f"'{mesh_object.name}' has {count} models and none with index {self.index}.")
-        return scene_rig, models.chosen(mesh_object) if self.index < 0 else mesh_object.fdda.models[self.index]
+        return scene_rig, model_list.chosen(mesh_object) if self.index < 0 else mesh_object.fdda.models[self.index]
 
 
 class FDDA_OT_add_model(OnModel, ChoosesModel, bpy.types.Operator):
@@ -56,14 +65,14 @@ class FDDA_OT_add_model(OnModel, ChoosesModel, bpy.types.Operator):
         return self.execute(context) if self.filepath else self.choose(context)
 
     def work(self, context: bpy.types.Context) -> str:
-        from .. import models
+        from ..models import model_list
 
         scene_rig = self.rig(context)
         if not self.filepath:
             raise ModelError("No file was chosen; give the model's file.")
-        models.check(scene_rig, self.path())
-        models.adopt(scene_rig.mesh_object)
-        entry = models.remember(scene_rig.mesh_object, self.path())
+        model_list.check(scene_rig, self.path())
+        model_list.adopt(scene_rig.mesh_object)
+        entry = model_list.remember(scene_rig.mesh_object, self.path())
         return f"{entry.name} is in the list of '{scene_rig.mesh_object.name}'; bind it to play it."
 
 
@@ -80,11 +89,11 @@ class FDDA_OT_remove_model(OnEntry, bpy.types.Operator):
         return cls.has_entry(context)
 
     def work(self, context: bpy.types.Context) -> str:
-        from .. import models
+        from ..models import model_list
 
         scene_rig, entry = self.entry(context)
         mesh_object = scene_rig.mesh_object
-        name = models.forget_entry(mesh_object, list(mesh_object.fdda.models).index(entry))
+        name = model_list.forget_entry(mesh_object, list(mesh_object.fdda.models).index(entry))
         return f"{name} is no longer in the list of '{mesh_object.name}'."
 
 
@@ -99,12 +108,12 @@ class FDDA_OT_pack_model(OnEntry, bpy.types.Operator):
         return cls.has_entry(context)
 
     def work(self, context: bpy.types.Context) -> str:
-        from .. import models
+        from ..models import model_list
 
         scene_rig, entry = self.entry(context)
         if entry.packed:
             raise ModelError(f"{entry.name} is packed already.")
-        size = models.pack_entry(scene_rig.mesh_object, entry)
+        size = model_list.pack_entry(scene_rig.mesh_object, entry)
         return f"{entry.name} is inside the .blend file, {megabytes(size)}; save the file to keep it."
 
 
@@ -115,7 +124,10 @@ class FDDA_OT_unpack_model(OnEntry, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(
-        name="File", description="Where to write it; empty for NAME.onnx beside the .blend file", subtype="FILE_PATH"
+        name="File",
+        description="Where to write it; empty for NAME.onnx beside the .blend file",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
     )
 
     @classmethod
@@ -125,7 +137,7 @@ class FDDA_OT_unpack_model(OnEntry, bpy.types.Operator):
     def work(self, context: bpy.types.Context) -> str:
         from pathlib import Path
 
-        from .. import models
+        from ..models import model_list
 
         scene_rig, entry = self.entry(context)
         if not entry.packed:
@@ -134,7 +146,7 @@ class FDDA_OT_unpack_model(OnEntry, bpy.types.Operator):
             raise ModelError("The .blend file has not been saved, so there is no place beside it; save it first.")
         name = bpy.path.clean_name(entry.name) + ".onnx"
         path = Path(bpy.path.abspath(self.filepath or f"//{name}"))
-        models.unpack_entry(scene_rig.mesh_object, entry, path)
+        model_list.unpack_entry(scene_rig.mesh_object, entry, path)
         return f"{entry.name} is now the file {path}."
 
 
@@ -149,7 +161,7 @@ class FDDA_OT_check_model(OnEntry, bpy.types.Operator):
         return cls.has_entry(context)
 
     def work(self, context: bpy.types.Context) -> str:
-        from ..model_changes import changes_since
+        from ..models.changes import changes_since
 
         scene_rig, entry = self.entry(context)
         found = changes_since(scene_rig, entry)

@@ -4,7 +4,7 @@
 import bpy
 
 from ..core.errors import FDDAError
-from .job import current
+from ..jobs.job import current
 from .on_rig import OnRig
 
 

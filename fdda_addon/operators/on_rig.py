@@ -4,7 +4,7 @@
 import bpy
 
 from ..core.errors import RigError
-from ..scene.active_rig import active_rig
+from ..scene.active_rig import active_rig, any_mesh, rigs_together, shown_rig
 from ..scene.scene_rig import SceneRig, armature_of
 
 
@@ -16,6 +16,11 @@ class OnRig:
         description="Name of the mesh object; empty for the active object",
         options={"SKIP_SAVE"},
     )
+    all_meshes: bpy.props.BoolProperty(
+        name="All Meshes",
+        description="Work on all meshes that follow the active armature, and not on one of them",
+        options={"SKIP_SAVE"},
+    )
 
     @classmethod
     def has_rig(cls, context: bpy.types.Context) -> bool:
@@ -23,23 +28,31 @@ class OnRig:
 
         A rig anywhere in the scene will do: a script may name its object.
         """
+        if shown_rig(context) is not None or any_mesh(context, armature_of):
+            return True
         try:
             active_rig(context)
         except RigError as error:
-            if any(o.type == "MESH" and armature_of(o) is not None for o in context.scene.objects):
-                return True
             cls.poll_message_set(str(error).rstrip("."))
-            return False
-        return True
+        return False
 
     def rig(self, context: bpy.types.Context) -> SceneRig:
         """The rig that is meant.
 
         Raises:
-            RigError: there is none, or it is not clear which is meant.
+            RigError: there is none.
         """
         return active_rig(context, self.object)
 
-    def subject(self, context: bpy.types.Context) -> str:
-        """Name of the mesh object, for the state of a job."""
-        return self.rig(context).mesh_object.name
+    def rigs(self, context: bpy.types.Context) -> list[SceneRig]:
+        """The rigs that are meant: of all meshes of the active armature where `all_meshes` says so, else the one.
+
+        Raises:
+            RigError: there is none.
+        """
+        together = rigs_together(context) if self.all_meshes and not self.object else []
+        return together or [self.rig(context)]
+
+    def subject(self, context: bpy.types.Context) -> int:
+        """session_uid of the mesh object, for the state of a job."""
+        return self.rig(context).mesh_object.session_uid

@@ -7,11 +7,22 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError, ModelError
-from ..model_list import bound_name, chosen_entry
-from .job import JobOperator, current
+from ..jobs.job import current
+from ..models.entries import bound_name, chosen_entry, megabytes
+from ..properties.character import trained_file
+from ..properties.preferences import packs_models
+from ..scene.active_rig import any_mesh
+from ..scene.scene_rig import SceneRig
+from .job import JobOperator
 from .on_rig import OnRig
 
+LARGE_BYTES = 32_000_000
+"""From this size on a model is not packed without being asked: every save writes it again."""
 MODE_NAMES = {"RIG": "the rig", "LINEAR": "the linear layer", "FDDA": "the model"}
+
+
+def _is_bound(mesh_object: bpy.types.Object) -> bool:
+    return mesh_object.fdda.is_bound
 
 
 class OnModel(OnRig):
@@ -31,7 +42,7 @@ class OnModel(OnRig):
         """As `is_free`, and the active rig, or some other, has a model that is bound."""
         if not cls.is_free(context):
             return False
-        if not any(o.type == "MESH" and o.fdda.is_bound for o in context.scene.objects):
+        if not any_mesh(context, _is_bound):
             cls.poll_message_set("No model is bound; bind one first")
             return False
         return True
@@ -46,6 +57,15 @@ class OnModel(OnRig):
         if not scene_rig.mesh_object.fdda.is_bound:
             raise ModelError(f"No model is bound to '{scene_rig.mesh_object.name}'; bind one first.")
         return scene_rig
+
+    def bound_rigs(self, context: bpy.types.Context) -> list[SceneRig]:
+        """The rigs that are meant and have a model.
+
+        Raises:
+            FDDAError: none has.
+        """
+        bound = [rig for rig in self.rigs(context) if rig.mesh_object.fdda.is_bound]
+        return bound or [self.bound_rig(context)]
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
@@ -67,7 +87,9 @@ class OnModel(OnRig):
 class ChoosesModel:
     """Mixin for an operator that takes the path of a model, and asks for it when it is invoked without."""
 
-    filepath: bpy.props.StringProperty(name="Model", description="The model, an .onnx file", subtype="FILE_PATH")
+    filepath: bpy.props.StringProperty(
+        name="Model", description="The model, an .onnx file", subtype="FILE_PATH", options={"SKIP_SAVE"}
+    )
     filter_glob: bpy.props.StringProperty(default="*.onnx", options={"HIDDEN"})
     check_existing: bpy.props.BoolProperty(default=False, options={"HIDDEN"})
 
@@ -86,6 +108,61 @@ class ChoosesModel:
         return Path(bpy.path.abspath(self.filepath))
 
 
+def _model_of(mesh_object: bpy.types.Object) -> bool:
+    """Whether there is a model to bind: in the list, or where the training writes it."""
+    return chosen_entry(mesh_object) is not None or trained_file(mesh_object) is not None
+
+
+def _unpacked_file(mesh_object: bpy.types.Object) -> Path | None:
+    """The file of the model that would be bound, None for one that is packed."""
+    from ..models import model_list
+
+    entry = chosen_entry(mesh_object)
+    if entry is None:
+        return trained_file(mesh_object)
+    return None if entry.packed else model_list.entry_path(mesh_object, entry)
+
+
+def bind_model(scene_rig: SceneRig, path: Path | None = None, pack_large: bool = False) -> str:
+    """Bind a model and pack it, as the preferences say; returns the sentence that says so.
+
+    Args:
+        scene_rig: the rig.
+        path: of the model; None for the one that is chosen in the list, or that was trained.
+        pack_large: pack it also where it is large.
+
+    Raises:
+        FDDAError: it is no model of this rig, or cannot play.
+    """
+    from ..models import model_list
+
+    mesh_object = scene_rig.mesh_object
+    model_list.adopt(mesh_object)
+    if path is None and chosen_entry(mesh_object) is None:
+        path = trained_file(mesh_object)
+    if path is not None:
+        # Before it is put into the list: what is no model of this rig does not belong there.
+        model_list.check(scene_rig, path)
+        entry = model_list.remember(mesh_object, path)
+    else:
+        entry = model_list.chosen(mesh_object)
+    model_list.bind_entry(scene_rig, entry)
+    return f"'{mesh_object.name}' plays {entry.name}.{pack_by_default(mesh_object, entry, pack_large)}"
+
+
+def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pack_large: bool = False) -> str:
+    """Put a model into the .blend file, unless the preferences say otherwise or it is large; returns what to say."""
+    from ..models import model_list
+
+    if entry.packed or not packs_models():
+        return ""
+    size = model_list.entry_path(mesh_object, entry).stat().st_size
+    if size > LARGE_BYTES and not pack_large:
+        return f" It has {megabytes(size)} and stays beside the .blend file; the section Models packs it."
+    model_list.pack_entry(mesh_object, entry)
+    return ""
+
+
 class FDDA_OT_bind(OnModel, ChoosesModel, bpy.types.Operator):
     bl_idname = "fdda.bind"
     bl_label = "Bind"
@@ -95,7 +172,15 @@ class FDDA_OT_bind(OnModel, ChoosesModel, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(
-        name="Model", description="The model, an .onnx file; empty for the one chosen in the list", subtype="FILE_PATH"
+        name="Model",
+        description="The model, an .onnx file; empty for the one chosen in the list",
+        subtype="FILE_PATH",
+        options={"SKIP_SAVE"},
+    )
+    pack_large: bpy.props.BoolProperty(
+        name="Pack into the .blend File",
+        description="Take the model into the .blend file although it is large",
+        options={"SKIP_SAVE"},
     )
 
     @classmethod
@@ -104,27 +189,36 @@ class FDDA_OT_bind(OnModel, ChoosesModel, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         try:
-            listed = chosen_entry(self.rig(context).mesh_object)
+            known = any(_model_of(rig.mesh_object) for rig in self.rigs(context))
         except FDDAError:
-            listed = None
-        if self.filepath or listed:
-            return self.execute(context)
-        return self.choose(context)
+            known = None
+        if not (self.filepath or known):
+            return self.choose(context)
+        self._size = self._outside_bytes(context)
+        if self._size > LARGE_BYTES and packs_models() and context.window is not None:
+            return context.window_manager.invoke_props_dialog(self, title="A Large Model", confirm_text="Bind")
+        return self.execute(context)
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        if size := getattr(self, "_size", 0):
+            self.layout.label(text=f"The model has {megabytes(size)}, which every save of the file writes again.")
+            self.layout.prop(self, "pack_large")
+
+    def _outside_bytes(self, context: bpy.types.Context) -> int:
+        """Size of the largest model that would be bound and is not packed; 0 where that cannot be said."""
+        try:
+            rigs = self.rigs(context)
+        except FDDAError:
+            return 0
+        paths = [self.path() if self.filepath else _unpacked_file(rig.mesh_object) for rig in rigs]
+        return max((path.stat().st_size for path in paths if path is not None and path.is_file()), default=0)
 
     def work(self, context: bpy.types.Context) -> str:
-        from .. import models
-
-        scene_rig = self.rig(context)
-        mesh_object = scene_rig.mesh_object
-        models.adopt(mesh_object)
-        if self.filepath:
-            # Before it is put into the list: what is no model of this rig does not belong there.
-            models.check(scene_rig, self.path())
-            entry = models.remember(mesh_object, self.path())
-        else:
-            entry = models.chosen(mesh_object)
-        models.bind_entry(scene_rig, entry)
-        return f"'{mesh_object.name}' plays {entry.name}."
+        rigs = self.rigs(context)
+        if len(rigs) > 1:
+            rigs = [rig for rig in rigs if _model_of(rig.mesh_object)] or rigs[:1]
+        path = self.path() if self.filepath else None
+        return " ".join(bind_model(rig, path, self.pack_large) for rig in rigs)
 
 
 class FDDA_OT_unbind(OnModel, bpy.types.Operator):
@@ -138,14 +232,16 @@ class FDDA_OT_unbind(OnModel, bpy.types.Operator):
         return cls.has_bound(context)
 
     def work(self, context: bpy.types.Context) -> str:
-        from .. import models
+        from ..models import model_list
         from ..runtime.binding import unbind
 
-        mesh_object = self.bound_rig(context).mesh_object
-        models.adopt(mesh_object)
-        name = bound_name(mesh_object)
-        unbind(mesh_object)
-        return f"'{mesh_object.name}' is deformed by its rig again; {name} is unbound."
+        names = []
+        for scene_rig in self.bound_rigs(context):
+            mesh_object = scene_rig.mesh_object
+            model_list.adopt(mesh_object)
+            names.append(bound_name(mesh_object))
+            unbind(mesh_object)
+        return f"The rig deforms again; {' and '.join(names)} {'is' if len(names) == 1 else 'are'} unbound."
 
 
 class FDDA_OT_switch(OnModel, bpy.types.Operator):
@@ -170,14 +266,17 @@ class FDDA_OT_switch(OnModel, bpy.types.Operator):
         return cls.has_bound(context)
 
     def work(self, context: bpy.types.Context) -> str:
-        mesh_object = self.bound_rig(context).mesh_object
-        binding = mesh_object.fdda
-        mode = self.mode if self.mode != "NEXT" else ("FDDA" if binding.mode == "RIG" else "RIG")
-        binding.mode = mode
+        rigs = self.bound_rigs(context)
+        bindings = [rig.mesh_object.fdda for rig in rigs]
+        mode = self.mode if self.mode != "NEXT" else ("FDDA" if bindings[0].mode == "RIG" else "RIG")
+        for binding in bindings:
+            binding.mode = mode
         context.view_layer.update()
-        if binding.status:
-            raise ModelError(binding.status)
-        return f"'{mesh_object.name}' is deformed by {MODE_NAMES[mode]}."
+        for binding in bindings:
+            if binding.status:
+                raise ModelError(binding.status)
+        names = " and ".join(f"'{rig.mesh_object.name}'" for rig in rigs)
+        return f"{names} {'is' if len(rigs) == 1 else 'are'} deformed by {MODE_NAMES[mode]}."
 
 
 class FDDA_OT_relink(OnModel, ChoosesModel, bpy.types.Operator):
@@ -194,14 +293,15 @@ class FDDA_OT_relink(OnModel, ChoosesModel, bpy.types.Operator):
         return self.execute(context) if self.filepath else self.choose(context)
 
     def work(self, context: bpy.types.Context) -> str:
-        from .. import models
+        from ..models import model_list
 
         scene_rig = self.bound_rig(context)
         if not self.filepath:
             raise ModelError("No file was chosen; give the model's file.")
-        models.adopt(scene_rig.mesh_object)
-        models.relink(scene_rig, self.path())
-        return f"'{scene_rig.mesh_object.name}' plays {self.path()}."
+        model_list.adopt(scene_rig.mesh_object)
+        model_list.relink(scene_rig, self.path())
+        said = pack_by_default(scene_rig.mesh_object, chosen_entry(scene_rig.mesh_object))
+        return f"'{scene_rig.mesh_object.name}' plays {self.path()}.{said}"
 
 
 class FDDA_OT_measure_model(OnModel, JobOperator, bpy.types.Operator):
@@ -220,15 +320,15 @@ class FDDA_OT_measure_model(OnModel, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_bound(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..benchmark import benchmark
         from ..runtime.binding import true_rig
+        from ..timing.benchmark import benchmark
 
         scene_rig = self.bound_rig(context)
         with true_rig(scene_rig.mesh_object):
             yield from benchmark(scene_rig, None, self.frames)
 
     def finish(self, context: bpy.types.Context, result: object) -> str:
-        from .. import frame_times
+        from ..timing import frame_times
 
         mesh_object = self.bound_rig(context).mesh_object
         times = frame_times.keep(mesh_object, result)

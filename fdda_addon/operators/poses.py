@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..core.errors import RigError
+from ..properties.choices import recorded_actions, recording_settings
 from ..scene.scene_rig import SceneRig
 from .on_pose import OnPose
-from .sampling import recorded_actions, recording_settings
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.controls import Control
@@ -41,7 +41,7 @@ class FDDA_OT_preview_pose(OnPose, bpy.types.Operator):
 
     def change(self, context: bpy.types.Context) -> str:
         from ..core.poses import sample_pose
-        from ..recording import planned_rig
+        from ..recording.plan import planned_rig
         from ..scene.armature import Poser, clear_pose
 
         rig = self.rig(context)
@@ -80,7 +80,7 @@ class FDDA_OT_rest_pose(OnPose, bpy.types.Operator):
 
 def _sampled_controls(rig: SceneRig) -> "tuple[Control, ...]":
     """The controls that random poses change; none while the choice is not complete, which the section Rig says."""
-    from ..recording import planned_choice
+    from ..recording.plan import planned_choice
 
     try:
         return planned_choice(rig, recording_settings(rig))[0].controls
@@ -129,7 +129,7 @@ class FDDA_OT_state_range(_OnRange, bpy.types.Operator):
     )
 
     def change(self, context: bpy.types.Context) -> str:
-        from ..scene.motion_range import state_rotation_range
+        from ..poses.motion_range import state_rotation_range
 
         bone = self.pose_bone(context)
         state_rotation_range(bone, self.axis_index, self.low, self.high)
@@ -144,7 +144,7 @@ class FDDA_OT_unstate_range(_OnRange, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def change(self, context: bpy.types.Context) -> str:
-        from ..scene.motion_range import unstate_rotation_range
+        from ..poses.motion_range import unstate_rotation_range
 
         bone = self.pose_bone(context)
         unstate_rotation_range(bone, self.axis_index)
@@ -169,7 +169,7 @@ class FDDA_OT_limits_from_actions(OnPose, bpy.types.Operator):
     )
 
     def change(self, context: bpy.types.Context) -> str:
-        from ..scene.measured_limits import state_measured_limits
+        from ..poses.measured_limits import state_measured_limits
 
         rig = self.rig(context)
         names = recorded_actions(rig.armature_object)

@@ -2,15 +2,49 @@
 """The recording: evaluate the poses of a character and keep them in a folder."""
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import bpy
 
+from ..core.defaults import REFINEMENT_POSES
 from ..core.errors import FDDAError
-from ..settings import model_file, recording_folder
-from .job import JobOperator, current
+from ..jobs.job import current
+from ..models.entries import megabytes
+from ..properties.character import model_file, recording_folder
+from ..properties.choices import recording_settings, take_over_sampling
+from ..scene.scene_rig import SceneRig
+from .job import JobOperator
 from .on_rig import OnRig
-from .sampling import recording_settings
+
+
+def record_rigs(shown: SceneRig, rigs: list[tuple[SceneRig, Path]], resume: bool = False) -> Iterator[object]:
+    """Record meshes of one armature together, as the settings of the one that is shown say; the others take these over.
+
+    Raises:
+        FDDAError: as `recording.run.record_meshes`.
+    """
+    from ..recording.run import record_meshes
+    from ..runtime.binding import true_rig
+
+    with ExitStack() as borrowed:
+        for rig, _ in rigs:
+            borrowed.enter_context(true_rig(rig.mesh_object))
+            if rig.mesh_object != shown.mesh_object:
+                take_over_sampling(rig.mesh_object.fdda.settings, shown.mesh_object.fdda.settings)
+        # The one that is shown may be recorded already, and its settings still count.
+        yield from record_meshes(rigs, recording_settings(shown, resume))
+
+
+def is_recorded(path: Path) -> bool:
+    """Whether there is a complete recording in a folder."""
+    from ..core.recording.index import read_index
+
+    try:
+        index = read_index(path)
+    except FDDAError:
+        return False
+    return index["complete"] >= index["poses"]
 
 
 class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
@@ -41,16 +75,16 @@ class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_rig(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..recording import record
-        from ..runtime.binding import true_rig
-
-        rig = self.rig(context)
-        self._path = Path(bpy.path.abspath(self.folder)) if self.folder else recording_folder(rig.mesh_object)
-        with true_rig(rig.mesh_object):
-            yield from record(rig, self._path, recording_settings(rig, self.resume))
+        rigs = self.rigs(context)
+        if self.folder:
+            self._paths = [Path(bpy.path.abspath(self.folder))]
+        else:
+            self._paths = [recording_folder(rig.mesh_object) for rig in rigs]
+        yield from record_rigs(self.rig(context), list(zip(rigs, self._paths, strict=True)), self.resume)
 
     def finish(self, _context: bpy.types.Context, _result: object) -> str:
-        return f"Recorded {self.state.total:,} poses into '{self._path.name}'."
+        names = " and ".join(f"'{path.name}'" for path in self._paths)
+        return f"Recorded {self.state.total:,} poses into {names}."
 
     def cancelled(self, _context: bpy.types.Context) -> str:
         if self.state.stage != "poses" or not self.state.done:
@@ -66,7 +100,7 @@ class FDDA_OT_refine(OnRig, JobOperator, bpy.types.Operator):
     verb, title = "refine", "Refinement"
 
     poses: bpy.props.IntProperty(
-        name="Poses", description="How many poses are added", default=250, min=1, options={"SKIP_SAVE"}
+        name="Poses", description="How many poses are added", default=REFINEMENT_POSES, min=1, options={"SKIP_SAVE"}
     )
 
     @classmethod
@@ -74,7 +108,7 @@ class FDDA_OT_refine(OnRig, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_rig(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..refinement import RefinementSettings, refine
+        from ..recording.refinement import RefinementSettings, refine
         from ..runtime.binding import true_rig
 
         rig = self.rig(context)
@@ -109,10 +143,29 @@ class FDDA_OT_remove_recording(OnRig, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if bpy.app.background or context.window is None:
             return self.execute(context)
-        return context.window_manager.invoke_confirm(self, event)
+        return context.window_manager.invoke_confirm(
+            self,
+            event,
+            title="Remove the Recording?",
+            message=self._what(context),
+            confirm_text="Remove",
+            icon="WARNING",
+        )
+
+    def _what(self, context: bpy.types.Context) -> str:
+        """What would be removed, a sentence."""
+        from ..core.recording.index import read_index
+
+        try:
+            path = recording_folder(self.rig(context).mesh_object)
+            count = read_index(path)["complete"]
+        except FDDAError as error:
+            return str(error)
+        size = sum(file.stat().st_size for file in path.glob("*.npy"))
+        return f"{count:,} poses, {megabytes(size)}, in '{path}'. This cannot be undone; models stay."
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        from ..core.recording_folder import remove_recording
+        from ..core.recording.folder import remove_recording
 
         try:
             path = recording_folder(self.rig(context).mesh_object)

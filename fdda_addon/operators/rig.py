@@ -5,12 +5,13 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import bpy
+from mathutils import Matrix
 
 from .job import JobOperator
 from .on_rig import OnRig
 
 if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..rig_cost import RigCost
+    from ..timing.rig_cost import RigCost
 
 _costs: "dict[int, RigCost]" = {}
 """What was measured in this session, by session_uid of the mesh object."""
@@ -33,10 +34,10 @@ class FDDA_OT_add_arm(bpy.types.Operator):
         description="How many vertices the arm has",
         items=(
             ("1", "1,476 Vertices", "Quick to record and train; so cheap that a model does not pay"),
-            ("2", "9,960 Vertices", "A model is about four times as fast as the rig"),
+            ("2", "9,960 Vertices", "A model is about four times as fast as the rig, and is made in some minutes"),
             ("3", "50,618 Vertices", "A model is about eleven times as fast as the rig; recording takes a while"),
         ),
-        default="1",
+        default="2",
     )
 
     @classmethod
@@ -47,9 +48,11 @@ class FDDA_OT_add_arm(bpy.types.Operator):
         return True
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        from ..arm import build_arm
+        from ..arm.rig import build_arm
+        from ..scene.viewport import frame_objects
 
         scene = context.scene
+        hidden = _hide_startup_cube(context)
         frames = (scene.frame_start, scene.frame_end, scene.frame_current)
         has_animation = len(bpy.data.actions) > 0
         mesh_object, armature_object = build_arm(int(self.density))
@@ -61,9 +64,31 @@ class FDDA_OT_add_arm(bpy.types.Operator):
             selected.select_set(False)
         mesh_object.select_set(True)
         context.view_layer.objects.active = mesh_object
+        frame_objects([mesh_object])
         count = len(mesh_object.data.vertices)
-        self.report({"INFO"}, f"Added '{mesh_object.name}' with {count:,} vertices on '{armature_object.name}'.")
+        others = " Blender's cube is hidden." if hidden else ""
+        self.report(
+            {"INFO"}, f"Added '{mesh_object.name}' with {count:,} vertices on '{armature_object.name}'.{others}"
+        )
         return {"FINISHED"}
+
+
+def _hide_startup_cube(context: bpy.types.Context) -> bool:
+    """Hide the cube that a new file of Blender's has where the arm goes; returns whether there was one."""
+    cube = context.scene.objects.get("Cube")
+    is_untouched = (
+        cube is not None
+        and cube.type == "MESH"
+        and len(cube.data.vertices) == 8
+        and not cube.modifiers
+        and cube.animation_data is None
+        and cube.matrix_world == Matrix.Identity(4)
+        and cube.visible_get()
+    )
+    if is_untouched:
+        cube.hide_set(True)
+        cube.hide_render = True
+    return is_untouched
 
 
 class FDDA_OT_measure(OnRig, JobOperator, bpy.types.Operator):
@@ -78,7 +103,7 @@ class FDDA_OT_measure(OnRig, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_rig(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..rig_cost import measure
+        from ..timing.rig_cost import measure
 
         yield from measure(self.rig(context))
 

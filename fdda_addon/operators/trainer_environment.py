@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The operators of the trainer's Python: check it, create the add-on's own environment, cancel that, remove it.
 
-Pressed in a window they work in a thread and a timer looks after it: unlike a modal operator it does not end with the
-preferences' window. Executed, or without a window, they work to their end.
+Pressed in a window they go on by themselves (`jobs.background`). Executed, or without a window, they work to their end.
 """
 
-from collections.abc import Callable, Generator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import bpy
@@ -13,23 +13,26 @@ from bpy.props import StringProperty
 
 from ..core.errors import FDDAError, TrainerEnvironmentError
 from ..core.progress import Progress
-from ..preferences import wheels_folder
-from ..trainer_environment import choice, folder, session
-from ..trainer_environment.answer import Answer
+from ..jobs.background import in_thread, look_after, unregister
+from ..jobs.job import ENVIRONMENT, JobState, Run, current, request_cancel
+from ..properties.preferences import wheels_folder
+from ..training.environment import choice, folder, session
+from ..training.environment.answer import Answer
 
-TICK_SECONDS = 0.2
-_Work = tuple[Generator[Progress | Answer], Callable[[], None] | None]
+WAIT_SECONDS = 0.05
+_Work = tuple[Iterator[Progress | Answer], Callable[[], None] | None]
 """The steps, and what has them end soon."""
 
 
-class _Task:
-    """Mixin: one task at a time, in a thread when a window waits for it."""
+class _OnEnvironment:
+    """Mixin: a job on the trainer's environment, in a thread; a timer looks after it where there is a window."""
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        if session.task is not None:
-            cls.poll_message_set(f"{session.task.title} is under way; wait for it or cancel it")
-        return session.task is None
+        if (state := current(ENVIRONMENT)) is not None:
+            cls.poll_message_set(f"{state.title} is under way; wait for it or cancel it")
+            return False
+        return True
 
     def steps(self) -> _Work:
         """The work. FDDAError: it cannot begin."""
@@ -43,36 +46,68 @@ class _Task:
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if bpy.app.background or context.window is None:
             return self.execute(context)
-        try:
-            steps, cancel = self.steps()
-        except FDDAError as error:
-            return self._end(Answer("ERROR", str(error)))
-        # The class's: the operator is gone when the task ends.
-        session.start(session.Task(self.bl_label, steps, cancel, type(self).keep))
-        if not bpy.app.timers.is_registered(_watch):
-            bpy.app.timers.register(_watch, first_interval=TICK_SECONDS, persistent=True)
+        run = self._begin()
+        if run.work(0):
+            return self._end(run.state)
+        # The operator is gone when the job ends: of it the run has nothing but its class.
+        look_after(run)
         return {"FINISHED"}
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        outcome = Answer("ERROR", f"{self.bl_label} ended without a word.")
+        run, shown = self._begin(), ""
+        while not run.work(WAIT_SECONDS):
+            if run.state.stage != shown:
+                shown = run.state.stage
+                print(f"{self.bl_label}: {shown}")
+            time.sleep(WAIT_SECONDS)
+        return self._end(run.state)
+
+    def _begin(self) -> Run:
         try:
-            steps, _cancel = self.steps()
-            for step in steps:
-                if isinstance(step, Answer):
-                    outcome = step
-                else:
-                    print(f"{self.bl_label}: {step.stage}")
+            steps, cancel = self.steps()
         except FDDAError as error:
-            outcome = Answer("ERROR", str(error))
-        return self._end(outcome)
+            steps, cancel = iter([Answer("ERROR", str(error))]), None
+        return begin(self.bl_idname.partition("_OT_")[2], self.bl_label, steps, cancel, type(self).keep)
 
-    def _end(self, outcome: Answer) -> set[str]:
-        self.keep(outcome)
-        self.report({outcome.level}, outcome.message)
-        return {"CANCELLED"} if outcome.level == "ERROR" else {"FINISHED"}
+    def _end(self, state: JobState) -> set[str]:
+        self.report({state.outcome_level}, state.outcome)
+        return {"FINISHED"} if state.outcome_level == "INFO" else {"CANCELLED"}
 
 
-class FDDA_OT_check_trainer(_Task, bpy.types.Operator):
+def begin(
+    verb: str,
+    title: str,
+    steps: Iterator[Progress | Answer],
+    cancel: Callable[[], None] | None,
+    keep: Callable[[Answer], None],
+) -> Run:
+    """Begin a job on the trainer's environment.
+
+    Args:
+        verb, title: of its `JobState`.
+        steps: yields how far it is, and last its outcome; iterated in a thread.
+        cancel: has `steps` end soon, called from another thread; None where that is not possible.
+        keep: takes the outcome, in the main thread.
+    """
+    state = JobState(verb, title, works_on=ENVIRONMENT, can_cancel=cancel is not None)
+
+    def answered() -> Iterator[object]:
+        try:
+            yield from in_thread(steps, state, cancel)
+        except FDDAError as error:
+            yield Answer("WARNING" if state.cancel_requested else "ERROR", str(error))
+
+    def finish(outcome: Answer | None) -> str:
+        outcome = outcome or Answer("ERROR", f"{title} ended without a word.")
+        keep(outcome)
+        if outcome.level != "INFO":
+            raise TrainerEnvironmentError(outcome.message)
+        return outcome.message
+
+    return Run(state, answered(), finish, lambda: f"{title} was cancelled.", ends_itself=True)
+
+
+class FDDA_OT_check_trainer(_OnEnvironment, bpy.types.Operator):
     bl_idname = "fdda.check_trainer"
     bl_label = "Check the Trainer's Python"
     bl_description = "Ask the Python that trains for its version, torch and the device that it would train on"
@@ -85,12 +120,12 @@ class FDDA_OT_check_trainer(_Task, bpy.types.Operator):
         session.remember(outcome)
 
 
-def _check(python: choice.TrainerPython) -> Generator[Progress | Answer]:
+def _check(python: choice.TrainerPython) -> Iterator[Progress | Answer]:
     yield Progress(f"asking '{python.path}'", 0, 0)
     yield choice.ping(python)
 
 
-class FDDA_OT_create_trainer_environment(_Task, bpy.types.Operator):
+class FDDA_OT_create_trainer_environment(_OnEnvironment, bpy.types.Operator):
     bl_idname = "fdda.create_trainer_environment"
     bl_label = "Create Trainer Environment"
     bl_description = (
@@ -108,7 +143,7 @@ class FDDA_OT_create_trainer_environment(_Task, bpy.types.Operator):
     )
 
     def steps(self) -> _Work:
-        from ..trainer_environment.creation import Creation
+        from ..training.environment.creation import Creation
 
         wheels = self.wheels or wheels_folder()
         if reason := folder.obstacle(wheels):
@@ -130,7 +165,7 @@ class FDDA_OT_create_trainer_environment(_Task, bpy.types.Operator):
             session.remember(None, Answer("WARNING", text))
 
 
-class FDDA_OT_remove_trainer_environment(_Task, bpy.types.Operator):
+class FDDA_OT_remove_trainer_environment(_OnEnvironment, bpy.types.Operator):
     bl_idname = "fdda.remove_trainer_environment"
     bl_label = "Remove Trainer Environment"
     bl_description = "Remove the Python environment that the add-on has made, some gigabytes"
@@ -144,7 +179,7 @@ class FDDA_OT_remove_trainer_environment(_Task, bpy.types.Operator):
         return _remove(folder.own_folder()), None
 
 
-def _remove(path: Path) -> Generator[Progress | Answer]:
+def _remove(path: Path) -> Iterator[Progress | Answer]:
     yield Progress(f"removing '{path}'", 0, 0)
     with folder.claimed(path):
         existed = path.exists()
@@ -160,13 +195,14 @@ class FDDA_OT_cancel_trainer_environment(bpy.types.Operator):
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        if session.task is None or not session.task.can_cancel:
+        state = current(ENVIRONMENT)
+        if state is None or not state.can_cancel:
             cls.poll_message_set("Nothing is under way")
             return False
         return True
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        session.task.cancel()
+        request_cancel(ENVIRONMENT)
         return {"FINISHED"}
 
 
@@ -184,18 +220,6 @@ class FDDA_OT_open_trainer_log(bpy.types.Operator):
         return bpy.ops.wm.path_open(filepath=str(log))
 
 
-def _watch() -> float | None:
-    """Timer: have the task drawn while it runs, and keep its outcome."""
-    outcome = session.end_task()
-    if outcome is not None:
-        print(f"FDDA: {outcome.message}")
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type in ("PREFERENCES", "VIEW_3D"):
-                area.tag_redraw()
-    return TICK_SECONDS if session.task is not None else None
-
-
 CLASSES = (
     FDDA_OT_check_trainer,
     FDDA_OT_create_trainer_environment,
@@ -203,3 +227,5 @@ CLASSES = (
     FDDA_OT_cancel_trainer_environment,
     FDDA_OT_open_trainer_log,
 )
+
+__all__ = ["CLASSES", "begin", "unregister"]

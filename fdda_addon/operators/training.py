@@ -1,23 +1,124 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The training: start the trainer on a character's recording and follow it."""
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
+from bpy.app.handlers import persistent
 
-from ..core.errors import OutputError, RecordingError
+from ..core.errors import FDDAError, OutputError, RecordingError
 from ..core.progress import Progress
-from ..settings import model_file, recording_folder
-from .job import JobOperator
+from ..jobs.job import current
+from ..properties.character import model_file, recording_folder
+from ..scene.scene_rig import armature_of
+from .asking import AsksFirst
 from .on_rig import OnRig
 
+STARTING = "starting"
+LOOK_SECONDS = 0.5
 
-class FDDA_OT_train(OnRig, JobOperator, bpy.types.Operator):
+
+class TrainsModels(OnRig):
+    """Mixin for the operator of a job that trains. A training goes on when Blender is closed (`training.lasting`)."""
+
+    def train(
+        self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool = False
+    ) -> Iterator[object]:
+        """Train a model, or follow its training where one was left; yields as `steps` does, at last the seconds.
+
+        Raises:
+            FDDAError: the recording is not complete, or the training fails.
+        """
+        # Nothing of Blender's data is used after this: the user may do as they like.
+        uid, began = mesh_object.session_uid, time.monotonic()
+        state = self.state
+        state.curves.update(training=[], validation=[])
+        with self._training(mesh_object, recording, model, warm_start) as training:
+            try:
+                for message in training.messages(wait=False):
+                    if state.cancel_requested:
+                        training.cancel()
+                    if message is not None:
+                        yield self._note(message)
+                        continue
+                    if not state.total:
+                        # It says nothing for some seconds: that it works is all that can be shown.
+                        yield Progress(STARTING, int(time.monotonic() - began), 0)
+                    yield None
+            except GeneratorExit:
+                if not bpy.app.background:
+                    # Another file is opened, or Blender is closed.
+                    training.leave()
+                raise
+        if not state.cancel_requested:
+            self.trained.append((uid, model))
+
+    def _training(self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool) -> object:
+        from ..training.lasting import FollowedTraining, LastingTraining, is_known
+        from ..training.process import Training
+
+        if not bpy.app.background and is_known(model):
+            return FollowedTraining(model)
+        _check_recording(recording)
+        _make_folder(model)
+        settings = mesh_object.fdda.settings
+        arguments = [str(recording), str(model), "--seed", str(settings.training_seed)]
+        arguments += ["--tolerance-mm", f"{settings.tolerance_mm:.6g}", "--epochs", str(settings.epochs)]
+        if settings.target_mm:
+            arguments += ["--target-mm", f"{settings.target_mm:.6g}"]
+        if warm_start:
+            arguments += ["--warm-start"]
+        return Training(arguments) if bpy.app.background else LastingTraining(arguments, model)
+
+    def _note(self, message: object) -> object:
+        """What a message of the trainer is to a job: progress, a line of its log, or the result."""
+        from ..core.messages import WARNING_LINE, MessageType
+
+        values, state = message.values, self.state
+        if message.type is MessageType.STARTED:
+            state.log.append(
+                f"{values['partitions']} partitions, {values['vertices']:,} vertices, {values['poses']:,} poses, "
+                f"on {values['device']}"
+            )
+        elif message.type is MessageType.PREPARING:
+            return Progress("partitions prepared", values["done"], values["total"])
+        elif message.type is MessageType.PROGRESS:
+            for name, curve in state.curves.items():
+                curve.append(float(values[f"{name}_mm"]))
+            return Progress("epochs", values["epoch"], values["epochs"])
+        elif message.type is MessageType.LOG:
+            state.log.append(str(values["text"]))
+        elif message.type is MessageType.WARNING:
+            state.warnings.append(WARNING_LINE.format(**values))
+        elif message.type is MessageType.FINISHED:
+            return float(values["seconds"])
+        return None
+
+    def list_models(self) -> None:
+        """Put what was trained into the lists of the meshes, as far as these are there still."""
+        from ..models.model_list import remember
+
+        for uid, model in self.trained:
+            mesh_object = next((o for o in bpy.data.objects if o.session_uid == uid), None)
+            if mesh_object is not None:
+                remember(mesh_object, model)
+
+    @property
+    def trained(self) -> list[tuple[int, Path]]:
+        """session_uid of the mesh and file of the model of each training that is done."""
+        if not hasattr(self, "_trained"):
+            self._trained: list[tuple[int, Path]] = []
+        return self._trained
+
+
+class FDDA_OT_train(TrainsModels, AsksFirst, bpy.types.Operator):
     bl_idname = "fdda.train"
     bl_label = "Train"
-    bl_description = "Train a model on the recording, in another process; Blender can be used meanwhile"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_description = "Train a model on the recording, in another process; Blender can be used meanwhile, and closed"
+    # Not UNDO: Adjust Last Operation would train once more at each change, in the foreground.
+    bl_options = {"REGISTER"}
     verb, title = "train", "Training"
     borrows_scene = False
     ends_itself = True
@@ -40,6 +141,7 @@ class FDDA_OT_train(OnRig, JobOperator, bpy.types.Operator):
         description="Start from the last weights of the model, on a recording that has grown",
         options={"SKIP_SAVE"},
     )
+    replace: bpy.props.BoolProperty(options={"SKIP_SAVE", "HIDDEN"})
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
@@ -51,68 +153,58 @@ class FDDA_OT_train(OnRig, JobOperator, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.is_idle() and cls.has_rig(context)
 
-    def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..training import Training
-
-        mesh_object = self.rig(context).mesh_object
-        settings = mesh_object.fdda.settings
-        recording = Path(bpy.path.abspath(self.recording)) if self.recording else recording_folder(mesh_object)
-        model = Path(bpy.path.abspath(self.model)) if self.model else model_file(mesh_object)
-        _check_recording(recording)
-        _make_folder(model)
-        self._model = model
-        arguments = [str(recording), str(model), "--seed", str(settings.training_seed)]
-        arguments += ["--tolerance-mm", f"{settings.tolerance_mm:.6g}", "--epochs", str(settings.epochs)]
-        if settings.target_mm:
-            arguments += ["--target-mm", f"{settings.target_mm:.6g}"]
-        if self.warm_start:
-            arguments += ["--warm-start"]
-        self.state.curves.update(training=[], validation=[])
-        # Nothing of Blender's data is used from here on: the user may do as they like.
-        with Training(arguments) as training:
-            for message in training.messages(wait=False):
-                if self.state.cancel_requested:
-                    training.cancel()
-                yield self._note(message) if message is not None else None
-
-    def _note(self, message: object) -> object:
-        """What a message of the trainer is to a job: progress, a line of its log, or the result."""
-        from ..core.messages import MessageType
-
-        values, state = message.values, self.state
-        if message.type is MessageType.STARTED:
-            state.log.append(
-                f"{values['partitions']} partitions, {values['vertices']:,} vertices, {values['poses']:,} poses, "
-                f"on {values['device']}"
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if not (self.replace or bpy.app.background) and (foreign := self._foreign_models(context)):
+            self._is_asking = True
+            return context.window_manager.invoke_confirm(
+                self, event, title="Replace Another Model?", message=foreign, confirm_text="Replace", icon="WARNING"
             )
-        elif message.type is MessageType.PREPARING:
-            return Progress("partitions prepared", values["done"], values["total"])
-        elif message.type is MessageType.PROGRESS:
-            for name, curve in state.curves.items():
-                curve.append(float(values[f"{name}_mm"]))
-            return Progress("epochs", values["epoch"], values["epochs"])
-        elif message.type is MessageType.LOG:
-            state.log.append(str(values["text"]))
-        elif message.type is MessageType.FINISHED:
-            return float(values["seconds"])
-        return None
+        return AsksFirst.invoke(self, context, event)
+
+    def answer(self) -> dict[str, object]:
+        given = {name: getattr(self, name) for name in ("object", "all_meshes", "recording", "model", "warm_start")}
+        return {**given, "replace": True}
+
+    def _foreign_models(self, context: bpy.types.Context) -> str:
+        """Which models a training would replace that are of another rig: a sentence, empty for none."""
+        from ..models.model_list import check
+        from ..training.lasting import is_known
+
+        try:
+            for rig in self.rigs(context):
+                model = self._files(rig.mesh_object)[1]
+                if model.is_file() and not is_known(model):
+                    check(rig, model)
+        except FDDAError as error:
+            return f"{error} Training writes over it; to keep it, name another file under Model."
+        return ""
+
+    def _files(self, mesh_object: bpy.types.Object) -> tuple[Path, Path]:
+        """Folder of the recording and file of the model."""
+        recording = Path(bpy.path.abspath(self.recording)) if self.recording else recording_folder(mesh_object)
+        return recording, Path(bpy.path.abspath(self.model)) if self.model else model_file(mesh_object)
+
+    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+        files = [(rig.mesh_object, *self._files(rig.mesh_object)) for rig in self.rigs(context)]
+        for mesh_object, recording, model in files:
+            self.state.begin_part(mesh_object.name if len(files) > 1 else "")
+            yield from self.train(mesh_object, recording, model, self.warm_start)
+            if self.state.cancel_requested:
+                return
 
     def finish(self, _context: bpy.types.Context, result: float) -> str:
-        # By its name: the user may have removed it meanwhile.
-        mesh_object = bpy.data.objects.get(self.state.subject)
-        if mesh_object is not None:
-            from ..models import remember
-
-            remember(mesh_object, self._model)
-        return f"Trained '{self._model.name}' in {result:.0f} s."
+        self.list_models()
+        names = " and ".join(f"'{model.name}'" for _, model in self.trained)
+        return f"Trained {names} in {result:.0f} s."
 
     def cancelled(self, _context: bpy.types.Context) -> str:
+        self.list_models()
         return "Training cancelled; no model was written."
 
 
 def _check_recording(path: Path) -> None:
     """Say at once what the trainer would say after it has started."""
-    from ..core.recording import read_index
+    from ..core.recording.index import read_index
 
     index = read_index(path)
     if index["complete"] < index["poses"]:
@@ -128,4 +220,44 @@ def _make_folder(model: Path) -> None:
         raise OutputError(f"Cannot make the folder '{model.parent}': {error.strerror}; choose another.") from error
 
 
+def _follow_left_training() -> None:
+    """Follow a training of the open file that was left when Blender was closed or another file opened."""
+    from ..training.lasting import is_known
+
+    windows = bpy.context.window_manager.windows
+    if current() is not None or not windows:
+        return
+    for mesh_object in bpy.data.objects:
+        if mesh_object.type != "MESH" or mesh_object.library or armature_of(mesh_object) is None:
+            continue
+        try:
+            is_left = is_known(model_file(mesh_object))
+        except FDDAError:
+            continue
+        if is_left and mesh_object.name in bpy.context.scene.objects:
+            with bpy.context.temp_override(window=windows[0]):
+                bpy.ops.fdda.train("INVOKE_DEFAULT", object=mesh_object.name, replace=True)
+            return
+
+
+@persistent
+def _on_loaded(*_: object) -> None:
+    if not bpy.app.background and not bpy.app.timers.is_registered(_follow_left_training):
+        bpy.app.timers.register(_follow_left_training, first_interval=LOOK_SECONDS)
+
+
 CLASSES = (FDDA_OT_train,)
+
+
+HANDLERS = {"load_post": _on_loaded}
+
+
+def register() -> None:
+    """Follow what was left of a file that is open already."""
+    _on_loaded()
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    if bpy.app.timers.is_registered(_follow_left_training):
+        bpy.app.timers.unregister(_follow_left_training)

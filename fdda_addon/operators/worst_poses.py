@@ -3,8 +3,9 @@
 
 import bpy
 
-from .. import markers
+from ..core.defaults import MARKERS
 from ..core.errors import ModelError
+from ..evaluation import markers
 from .evaluation import OnEvaluation
 from .playback import OnModel
 
@@ -31,7 +32,7 @@ class FDDA_OT_mark_worst(OnWorst, bpy.types.Operator):
     bl_description = "Put timeline markers at the frames with the largest errors, in place of those put there before"
     bl_options = {"REGISTER", "UNDO"}
 
-    count: bpy.props.IntProperty(name="Markers", description="How many at most", default=5, min=1, max=50)
+    count: bpy.props.IntProperty(name="Markers", description="How many at most", default=MARKERS, min=1, max=50)
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -81,7 +82,7 @@ class FDDA_OT_jump_to_worst(OnWorst, bpy.types.Operator):
         if last.name:
             context.scene.frame_set(last.first_frame + index)
             return f"Frame {last.first_frame + index}: at most {error_mm:.2f} mm."
-        from ..evaluation import pose_held_out
+        from ..evaluation.run import pose_held_out
 
         pose_held_out(scene_rig, last.channels, last.seed, index)
         context.view_layer.update()

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Checks of rigs that panels may draw: a check runs when something has changed, in a timer, never while drawing."""
 
-import array
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -9,12 +8,13 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..core.errors import RigError
-from ..operators import job
-from ..operators.sampling import recording_settings
+from ..jobs import job
+from ..properties.choices import recording_settings
+from ..scene import kept
 from ..scene.scene_rig import SceneRig, armature_of
 
 if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..rig_check import RigCheck
+    from ..recording.rig_check import RigCheck
 
 PAUSE_SECONDS = 0.3
 """While something changes all the time, a rig is checked this often."""
@@ -28,6 +28,7 @@ _rest_changed: set[str] = set()
 """Names of meshes whose data has changed."""
 
 
+@kept.kept
 def known(scene_rig: SceneRig) -> "RigCheck | None":
     """The last check of a rig, None before the first. When something has changed since, another is on its way."""
     uid = scene_rig.mesh_object.session_uid
@@ -41,8 +42,8 @@ def known(scene_rig: SceneRig) -> "RigCheck | None":
 
 def check_now(scene_rig: SceneRig) -> "RigCheck":
     """Check a rig, as far as it has changed."""
-    from ..recording import RecordingSettings
-    from ..rig_check import check
+    from ..recording.plan import RecordingSettings
+    from ..recording.rig_check import check
 
     try:
         settings, problems = recording_settings(scene_rig), ()
@@ -84,17 +85,17 @@ def _shown() -> dict[int, tuple]:
 
 def _counters(scene_rig: SceneRig) -> tuple:
     """What is cheap to read and changes when a check may come out differently: (rest pose, the rest)."""
+    from ..scene.arrays import REST_MATRIX, read
+
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
     mesh, bones = mesh_object.data, armature_object.data.bones
-    rest_matrices = array.array("f", bytes(64 * len(bones)))
-    bones.foreach_get("matrix_local", rest_matrices)
     rest = (
         mesh.name,
         len(mesh.vertices),
         len(mesh_object.vertex_groups),
         armature_object.name,
         len(bones),
-        rest_matrices.tobytes(),
+        read(bones, REST_MATRIX).tobytes(),
         tuple(mesh_object.scale),
         tuple(armature_object.scale),
     )
@@ -122,6 +123,7 @@ def _is_rest_changed(scene_rig: SceneRig) -> bool:
 
 @persistent
 def _on_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    kept.forget()
     if not _checks:
         return
     _outdated.update(_checks)
@@ -133,12 +135,14 @@ def _on_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
 
 @persistent
 def _on_undone(*_: object) -> None:
+    kept.forget()
     _outdated.update(_checks)
     _rest_changed.update(mesh.name for mesh in bpy.data.meshes)
 
 
 @persistent
 def _on_loaded(*_: object) -> None:
+    kept.forget()
     for known_things in (_checks, _wanted, _outdated, _rest_changed):
         known_things.clear()
 
@@ -151,18 +155,8 @@ HANDLERS = {
 }
 
 
-def register() -> None:
-    """Watch for changes."""
-    for name, handler in HANDLERS.items():
-        if handler not in getattr(bpy.app.handlers, name):
-            getattr(bpy.app.handlers, name).append(handler)
-
-
 def unregister() -> None:
-    """Undo `register` and forget all checks."""
-    for name, handler in HANDLERS.items():
-        if handler in getattr(bpy.app.handlers, name):
-            getattr(bpy.app.handlers, name).remove(handler)
+    """Forget all checks."""
     if bpy.app.timers.is_registered(_check_wanted):
         bpy.app.timers.unregister(_check_wanted)
     _on_loaded()

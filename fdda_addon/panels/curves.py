@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The curves of a training, drawn into a panel as a preview that lives in memory alone."""
 
+import math
 from typing import TYPE_CHECKING
 
 import bpy
@@ -8,7 +9,9 @@ import bpy
 if TYPE_CHECKING:  # Blender starts without numpy.
     import numpy as np
 
-WIDTH, HEIGHT = 192, 192
+WIDTH, HEIGHT = 224, 224
+LEFT, BOTTOM = 34, 16
+"""Room for the numbers of the axes, pixels."""
 LINE = 1.6
 """Half the width of a line, pixels."""
 LEGEND = {
@@ -16,6 +19,14 @@ LEGEND = {
     "validation": ("Validation", "COLORSET_02_VEC", (1.0, 0.55, 0.2)),
 }
 BACKGROUND, GRID = (0.10, 0.10, 0.10, 1.0), (0.20, 0.20, 0.20, 1.0)
+INK = (0.75, 0.75, 0.75)
+MARKS = (1, 2, 5)
+"""Of each decade, the errors that have a line and a number."""
+DIGITS = {
+    "0": "757555557", "1": "262222227", "2": "711744447", "3": "711711117", "4": "555711111", "5": "744711117",
+    "6": "744755557", "7": "711111111", "8": "757557557", "9": "757711117", ".": "000000002",
+}  # fmt: skip
+"""Glyphs of 3 by 9 pixels, a row a digit, bits from the left."""
 
 _previews: object = None
 _drawn: tuple = ()
@@ -26,6 +37,7 @@ def draw(layout: bpy.types.UILayout, curves: dict[str, list[float]]) -> None:
     lengths = [len(curves.get(name, ())) for name in LEGEND]
     if min(lengths) < 2:
         return
+    layout.label(text="Error in mm by epoch")
     layout.template_icon(icon_value=_icon(curves), scale=9)
     column = layout.column(align=True)
     for name, (label, icon, _) in LEGEND.items():
@@ -36,6 +48,8 @@ def _icon(curves: dict[str, list[float]]) -> int:
     """Icon of the picture of the curves; it is painted again when they have grown."""
     import bpy.utils.previews
 
+    from ..scene.arrays import write_pixels
+
     global _previews, _drawn
     if _previews is None:
         _previews = bpy.utils.previews.new()
@@ -44,12 +58,12 @@ def _icon(curves: dict[str, list[float]]) -> int:
     preview = _previews["curves"]
     if key != _drawn:
         _drawn = key
-        preview.image_pixels_float.foreach_set(paint(curves).ravel())
+        write_pixels(preview, paint(curves))
     return preview.icon_id
 
 
 def paint(curves: "dict[str, list[float]]") -> "np.ndarray":
-    """(HEIGHT, WIDTH, 4) float32, rows from the bottom: the curves in their colours, a line a decade."""
+    """(HEIGHT, WIDTH, 4) float32, rows from the bottom: the curves in their colours, with axes."""
     import numpy as np
 
     pixels = np.empty((HEIGHT, WIDTH, 4), np.float32)
@@ -58,22 +72,56 @@ def paint(curves: "dict[str, list[float]]") -> "np.ndarray":
     low, high = min(log.min() for log in logs.values()), max(log.max() for log in logs.values())
     margin = max(0.05 * (high - low), 0.02)
     low, high = low - margin, high + margin
+    inside = pixels[BOTTOM:, LEFT:]
+    height, width = inside.shape[:2]
 
     def place(log: "np.ndarray | float") -> "np.ndarray | float":
-        return (log - low) / (high - low) * (HEIGHT - 1)
+        return (log - low) / (high - low) * (height - 1)
 
-    for decade in range(int(np.ceil(low)), int(np.floor(high)) + 1):
-        pixels[round(place(decade))] = GRID
-    rows = np.arange(HEIGHT)[:, None]
+    _paint_errors(pixels, {error: round(place(float(np.log10(error)))) for error in _marked(10**low, 10**high)})
+    count = len(logs["training"])
+    _write(pixels, "1", LEFT, 3)
+    _write(pixels, str(count), WIDTH - 8 * len(str(count)), 3)
+    rows = np.arange(height)[:, None]
     for name, (_, _, colour) in LEGEND.items():
-        columns = np.linspace(0, len(logs[name]) - 1, WIDTH)
-        heights = place(np.interp(columns, np.arange(len(logs[name])), logs[name]))
+        columns = np.linspace(0, count - 1, width)
+        heights = place(np.interp(columns, np.arange(count), logs[name]))
         after = np.append(heights[1:], heights[-1])
         bottom, top = np.minimum(heights, after) - LINE, np.maximum(heights, after) + LINE
         # Soft edges, half a pixel to either side.
         cover = np.clip(np.minimum(rows - bottom, top - rows) + 0.5, 0, 1)[..., None]
-        pixels[..., :3] += cover * (np.float32(colour) - pixels[..., :3])
+        inside[..., :3] += cover * (np.float32(colour) - inside[..., :3])
     return pixels
+
+
+def _marked(low: float, high: float) -> list[float]:
+    """The round errors from `low` to `high` that have a line, mm; at least one when the range is not tiny."""
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    marks = [mark * 10.0**decade for decade in decades for mark in MARKS if low <= mark * 10.0**decade <= high]
+    decadic = [mark for mark in marks if round(math.log10(mark), 6) % 1 == 0]
+    return decadic if len(decadic) > 2 else marks
+
+
+def _paint_errors(pixels: "np.ndarray", marks: dict[float, int]) -> None:
+    """A line and a number for each marked error; numbers that would touch the one below are left out."""
+    above = -1
+    for error, row in sorted(marks.items()):
+        pixels[BOTTOM + row, LEFT:] = GRID
+        bottom = max(0, min(BOTTOM + row - 4, HEIGHT - 9))
+        if bottom > above:
+            text = f"{error:.10f}".rstrip("0").rstrip(".")
+            _write(pixels, text, max(0, LEFT - 4 - 8 * len(text)), bottom)
+            above = bottom + 11
+
+
+def _write(pixels: "np.ndarray", text: str, left: int, bottom: int) -> None:
+    """Write a number into a picture, twice as wide as its glyphs."""
+    for place, character in enumerate(text):
+        for row, bits in enumerate(DIGITS[character]):
+            for column in range(3):
+                x, y = left + 8 * place + 2 * column, bottom + 8 - row
+                if int(bits) >> (2 - column) & 1 and x + 2 <= WIDTH:
+                    pixels[y, x : x + 2, :3] = INK
 
 
 def release() -> None:

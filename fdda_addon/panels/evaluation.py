@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The section Evaluation: how far the model is from the rig, in figures, in colours and on the timeline."""
 
-import sys
-
 import bpy
 
-from .. import last_evaluation, markers
-from ..model_list import bound_name
-from ..operators import job
-from .section import Section, draw_job, draw_sentence, panel_rig
+from ..evaluation import last_evaluation, markers
+from ..evaluation.loaded import loaded_heat_map
+from ..jobs import job
+from ..models.entries import bound_name
+from ..scene.scene_rig import SceneRig
+from .names import shown_name
+from .section import Section, draw_button, draw_job, draw_sentence, panel_rig
 
 FEW_PARTITIONS = 5
 FIGURES = (("Mean", "mean"), ("99 %", "p99"), ("Largest", "max"))
@@ -39,7 +40,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
             self._draw_start(context, scene_rig)
         last = last_evaluation.of(scene_rig.mesh_object)
         if last is not None:
-            _draw_figures(layout, context, view, last, bound_name(scene_rig.mesh_object))
+            _draw_figures(layout, context, view, last, scene_rig)
         _draw_colors(layout, context, view, scene_rig.mesh_object, last)
         if last is not None:
             _draw_worst(layout, context, view, last)
@@ -50,7 +51,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         layout, view = self.usable_layout(), context.window_manager.fdda_view
         state = job.state_of("evaluate")
         if state is not None and state.is_running:
-            draw_job(layout, context, "evaluate", "poses")
+            draw_job(layout, context, "evaluate")
             return
         layout.row().prop(view, "source", expand=True)
         column = layout.column()
@@ -68,10 +69,10 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         row = layout.row()
         row.scale_y = 1.4
         row.enabled = view.source == "RANDOM" or action is not None
-        button = row.operator("fdda.evaluate", icon="PLAY")
+        button = draw_button(row, context, "fdda.evaluate", "Evaluate", "PLAY")
         button.source, button.poses, button.seed = view.source, view.poses, view.seed
         if state is not None and state.outcome_level != "INFO":
-            draw_job(layout, context, "evaluate", "poses")
+            draw_job(layout, context, "evaluate")
 
 
 def _draw_figures(
@@ -79,8 +80,9 @@ def _draw_figures(
     context: bpy.types.Context,
     view: object,
     last: last_evaluation.LastEvaluation,
-    bound: str,
+    rig: SceneRig,
 ) -> None:
+    bound = bound_name(rig.mesh_object)
     what = f"{last.poses} frames of {last.name}" if last.name else f"{last.poses} random poses"
     header, body = layout.panel("fdda_figures", default_closed=False)
     header.label(text="Distance from the Rig, mm")
@@ -98,9 +100,29 @@ def _draw_figures(
     row.label(text="Partitions, worst first")
     if len(last.partitions) > FEW_PARTITIONS:
         row.prop(view, "show_partitions", text="All", toggle=True)
+    active = active_bone_name(context, rig)
+    chosen = [partition for partition in last.partitions if partition.joint == active]
+    if context.mode == "POSE" and not chosen:
+        draw_sentence(
+            body, context, "Click a bone to see its partition on top; click a name to select its bone.", "INFO"
+        )
+    shown = last.partitions[: None if view.show_partitions else FEW_PARTITIONS]
     column = body.column(align=True)
-    for partition in last.partitions[: None if view.show_partitions else FEW_PARTITIONS]:
-        _row(column, partition.joint, [_millimetres(getattr(partition.fdda, name)) for _, name in FIGURES])
+    for partition in (*chosen, *(p for p in shown if p not in chosen)):
+        row = column.split(factor=0.4, align=True)
+        name = row.row(align=True)
+        name.alignment = "LEFT"
+        text = shown_name(rig.armature_object, partition.joint)
+        icon = "BONE_DATA" if partition.joint == active else "NONE"
+        name.operator("fdda.show_bone", text=text, icon=icon, emboss=False).bone = partition.joint
+        for _, figure in FIGURES:
+            row.label(text=_millimetres(getattr(partition.fdda, figure)))
+
+
+def active_bone_name(context: bpy.types.Context, rig: SceneRig) -> str:
+    """Name of the bone that was clicked last in pose mode; empty outside of it."""
+    bone = rig.armature_object.data.bones.active if context.mode == "POSE" else None
+    return bone.name if bone is not None else ""
 
 
 def _draw_colors(
@@ -114,14 +136,14 @@ def _draw_colors(
     header.label(text="Colours in the Viewport")
     if body is None:
         return
-    heat_map = sys.modules.get(f"{__package__.rpartition('.')[0]}.heat_map")
+    heat_map = loaded_heat_map()
     shown = heat_map.painted(mesh_object) if heat_map else ""
     row = body.row(align=True)
     for colors, text in (("NONE", "None"), ("ERRORS", "Heat Map"), ("PARTITIONS", "Partitions")):
         button = row.row(align=True)
         button.enabled = colors != "ERRORS" or last is not None
         button.operator("fdda.paint", text=text, depress=shown == ("" if colors == "NONE" else colors)).colors = colors
-    if not shown and last is None:
+    if last is None:
         draw_sentence(body, context, "The heat map is there once the model was evaluated.", "INFO")
     if shown and heat_map.is_hidden(mesh_object):
         text = "The colours show outside edit mode, while no modifier changes the topology in the viewport."
@@ -154,6 +176,7 @@ def _draw_worst(
         button.rank = rank
     if not last.name:
         return
+    body.prop(view, "graph")
     row = body.row(align=True)
     row.prop(view, "markers")
     row.operator("fdda.mark_worst", text="Mark", icon="MARKER_HLT").count = view.markers
@@ -166,7 +189,8 @@ _worst_of: dict[int, tuple[object, int, list[tuple[int, float]]]] = {}
 
 def _worst(last: last_evaluation.LastEvaluation, count: int) -> list[tuple[int, float]]:
     """The worst poses, found once for an evaluation: drawing computes nothing twice."""
-    if _worst_of.get(0, (None, 0))[:2] != (last, count):
+    kept = _worst_of.get(0)
+    if kept is None or kept[0] is not last or kept[1] != count:
         _worst_of[0] = (last, count, last.worst(count))
     return _worst_of[0][2]
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..core.errors import FDDAError
-from ..model_list import chosen_entry, is_bound, megabytes
+from ..models.entries import chosen_entry, is_bound, megabytes
 from . import checks
 from .section import Section, draw_sentence, panel_rig
 from .watch import Watch
@@ -18,9 +18,9 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 _rigs: dict[tuple, object] = {}
 
 
-def _rig_of_model(scene_rig: object, rig: object, info: object) -> object:
+def rig_of_model(scene_rig: object, rig: object, info: object) -> object:
     """The rig with the joints of a model, read once for each rig that was checked: panels are drawn often."""
-    from ..scene.rig import read_model_rig
+    from ..rig.reading import read_model_rig
 
     if set(rig.joint_names) == set(info.joint_names):
         return rig
@@ -34,8 +34,8 @@ def _rig_of_model(scene_rig: object, rig: object, info: object) -> object:
 
 def _states(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
     """What is wrong with the models of a mesh: icon and sentence by path and name; all is well with those left out."""
-    from ..model_changes import changes
-    from ..models import info_of
+    from ..models.changes import changes
+    from ..models.model_list import info_of
     from ..scene.scene_rig import SceneRig, armature_of
 
     armature_object = armature_of(mesh_object)
@@ -46,7 +46,7 @@ def _states(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
         try:
             info = info_of(mesh_object, entry)
             if check is not None and check.rig is not None:
-                rig = _rig_of_model(scene_rig, check.rig, info)
+                rig = rig_of_model(scene_rig, check.rig, info)
                 changed = changes(entry.name, info, rig, _compared_channels(mesh_object, check.channels, info))
                 if changed.sentence:
                     found[_key(entry)] = ("ERROR" if changed.prevents else "INFO", changed.sentence)

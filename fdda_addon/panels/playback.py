@@ -1,20 +1,36 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The section Playback: bind a model, choose what deforms the mesh, and see what a frame costs."""
 
+from pathlib import Path
+
 import bpy
 
-from .. import frame_times
-from ..model_list import bound_name, chosen_entry
-from ..operators import job
-from .section import Section, draw_job, draw_sentence, panel_rig
+from ..jobs import job
+from ..models.entries import bound_name, chosen_entry
+from ..scene.kept import kept
+from ..scene.model_trust import is_trusted
+from ..scene.scene_rig import SceneRig, armature_of
+from ..timing import frame_times
+from .names import shown_name
+from .section import Section, draw_button, draw_job, draw_sentence, panel_rig, together
+from .trained import trained
 from .watch import Watch
 
 FULL_TRUST = 0.995
-MOST_SHOWN = 6
+MAX_SHOWN = 6
+MODES = (("RIG", "Rig"), ("LINEAR", "Linear Layer"), ("FDDA", "FDDA"))
+
+
+@kept
+def lies_outside(mesh_object: bpy.types.Object) -> bool:
+    """Whether the bound model plays in this session only, as its file may not be followed from this one."""
+    path = Path(bpy.path.abspath(mesh_object.fdda.model, library=mesh_object.library)).resolve()
+    file = Path(bpy.data.filepath).resolve()
+    return bool(bpy.data.filepath) and not path.is_relative_to(file.parent) and not is_trusted(path)
 
 
 def _trust(mesh_object: bpy.types.Object) -> object:
-    from ..trust import partition_trust
+    from ..runtime.trust import partition_trust
 
     return partition_trust(mesh_object) or "This model does not say how far it is believed."
 
@@ -40,31 +56,38 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             return
         mesh_object = scene_rig.mesh_object
         if not mesh_object.fdda.is_bound:
-            self._draw_unbound(context, mesh_object)
+            self._draw_unbound(context, scene_rig)
             return
         self._draw_bound(context, mesh_object)
         if not mesh_object.fdda.status:
             self._draw_times(context, mesh_object)
             self._draw_trust(context, mesh_object)
             self._draw_bake(context)
-        layout.operator("fdda.unbind", icon="UNLINKED")
+        draw_button(layout, context, "fdda.unbind", "Unbind", "UNLINKED")
 
-    def _draw_unbound(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
-        layout, entry = self.layout, chosen_entry(mesh_object)
+    def _draw_unbound(self, context: bpy.types.Context, rig: SceneRig) -> None:
+        mesh_object = rig.mesh_object
+        layout, entry, found = self.layout, chosen_entry(mesh_object), trained(rig)
         if mesh_object.fdda.status:
             draw_sentence(layout, context, mesh_object.fdda.status, "ERROR")
-        if entry is None:
+        if entry is None and (found is None or found.foreign):
             draw_sentence(layout, context, "No model yet: train one above, or choose a file.", "INFO")
             layout.operator("fdda.bind", text="Choose Model and Bind…", icon="FILEBROWSER")
             return
         column = layout.column()
         column.scale_y = 1.4
-        column.operator("fdda.bind", text=f"Bind {entry.name}", icon="LINKED").filepath = ""
+        name = entry.name if entry is not None else found.path.stem
+        draw_button(column, context, "fdda.bind", f"Bind {name}", "LINKED")
 
     def _draw_bound(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
         layout, binding = self.layout, mesh_object.fdda
         verb, icon = ("cannot play", "ERROR") if binding.status else ("is bound", "LINKED")
-        layout.label(text=f"{bound_name(mesh_object)} {verb}", icon=icon)
+        where = ", packed" if binding.packed else ""
+        layout.label(text=f"{bound_name(mesh_object)} {verb}{where}", icon=icon)
+        if not binding.packed and not binding.status and lies_outside(mesh_object):
+            text = "The model is not packed and lies outside the folder of this file: opened again, it is not followed."
+            draw_sentence(layout, context, text, "ERROR")
+            layout.operator("fdda.pack_model", text="Pack into the .blend File", icon="PACKAGE")
         if binding.status:
             box = layout.box()
             box.alert = True
@@ -75,7 +98,12 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             return
         row = layout.row(align=True)
         row.scale_y = 1.4
-        row.prop(binding, "mode", expand=True)
+        if together(context):
+            for mode, text in MODES:
+                properties = row.operator("fdda.switch", text=text, depress=binding.mode == mode)
+                properties.mode, properties.all_meshes = mode, True
+        else:
+            row.prop(binding, "mode", expand=True)
         column = layout.column()
         column.use_property_split, column.use_property_decorate = True, False
         strength = column.row()
@@ -91,7 +119,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             return
         state = job.state_of("measure_model")
         if state is not None and state.outcome_level != "INFO":
-            draw_job(body, context, "measure_model", "rounds")
+            draw_job(body, context, "measure_model")
         times = frame_times.of(mesh_object)
         if times is not None:
             grid = body.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
@@ -119,15 +147,15 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             return
         draw_sentence(body, context, f"{len(doubtful)} of {len(trust)} partitions leave what the model was trained on:")
         column = body.column(align=True)
-        for name, value in doubtful[:MOST_SHOWN]:
+        for name, value in doubtful[:MAX_SHOWN]:
             row = column.split(factor=0.5, align=True)
-            row.label(text=name)
+            row.label(text=shown_name(armature_of(mesh_object), name))
             row.progress(factor=value, text=f"{100 * value:.0f} %")
-        if len(doubtful) > MOST_SHOWN:
-            column.label(text=f"and {len(doubtful) - MOST_SHOWN} more")
+        if len(doubtful) > MAX_SHOWN:
+            column.label(text=f"and {len(doubtful) - MAX_SHOWN} more")
 
     def _draw_bake(self, context: bpy.types.Context) -> None:
-        if not draw_job(self.layout, context, "bake", "frames"):
+        if not draw_job(self.layout, context, "bake"):
             self.layout.operator("fdda.bake", icon="EXPORT")
 
 

@@ -2,15 +2,17 @@
 """Section "Poses": the range of motion, the random poses that are drawn from it, and the actions to record."""
 
 import math
-import time
 from typing import TYPE_CHECKING
 
 import bpy
 
 from ..operators.poses import FDDA_OT_state_range
-from ..operators.sampling import fits
+from ..properties.choices import moves_a_bone, recorded_actions
+from ..scene.compatibility import is_selected, selection_owner
+from ..scene.kept import kept
 from ..scene.scene_rig import SceneRig
 from . import checks, sampled
+from .names import shown_name
 from .section import Section, draw_sentence, panel_rig
 
 if TYPE_CHECKING:  # Blender starts without numpy.
@@ -19,18 +21,6 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 AXES = "xyz"
 WIDE = 380
 """From this width of the sidebar on the table has both ends of a range, pixels at a scale of 1."""
-FITTING_SECONDS = 2.0
-
-_fitting: dict[tuple[int, int], tuple[float, bool]] = {}
-"""Whether an action fits an armature, by session_uid of both, and when that was found out."""
-
-
-def fits_now(action: bpy.types.Action, armature_object: bpy.types.Object) -> bool:
-    """As `fits`, which looks at every curve, but not at each redraw."""
-    key, now = (action.session_uid, armature_object.session_uid), time.monotonic()
-    if key not in _fitting or now - _fitting[key][0] > FITTING_SECONDS:
-        _fitting[key] = (now, fits(action, armature_object))
-    return _fitting[key][1]
 
 
 class FDDA_UL_joints(bpy.types.UIList):
@@ -38,43 +28,70 @@ class FDDA_UL_joints(bpy.types.UIList):
 
     def filter_items(self, context: bpy.types.Context, data: object, name: str) -> tuple[list[int], list[int]]:
         rig = panel_rig(context)[0]
-        check = checks.known(rig) if rig else None
-        channels = sampled_by_bone(rig) if rig else None
-        listed = set(check.rig.joint_names) if check and check.rig else set()
-        if channels is not None:
-            listed = set(channels)
-        text = self.filter_name.lower()
-        flags = [
-            self.bitflag_filter_item if (not listed or bone.name in listed) and text in bone.name.lower() else 0
-            for bone in getattr(data, name)
-        ]
-        return flags, []
+        return (list(_flags(rig, self.filter_name.lower(), self.bitflag_filter_item)) if rig else []), []
 
     def draw_item(self, context: bpy.types.Context, layout: bpy.types.UILayout, _data, bone, _icon, _active, _name):
-        from ..scene.motion_range import DEFAULT, rotation_ranges
-        from ..scene.sampling import is_moved_by_constraints
-
-        row = layout.split(factor=0.4)
         rig = panel_rig(context)[0]
-        channels = sampled_by_bone(rig) if rig else None
+        if rig is None:
+            return
         region = context.region
-        is_wide = region is not None and region.width / context.preferences.system.ui_scale >= WIDE
-        if channels is not None:
-            row.label(text=bone.name, icon="BONE_DATA")
-            _draw_sampled(row.row(align=True), channels.get(bone.name, ()), is_wide)
-            return
-        if is_moved_by_constraints(bone):
-            row.label(text=bone.name, icon="CONSTRAINT_BONE")
-            row.label(text="constrained")
-            return
-        row.label(text=bone.name, icon="BONE_DATA")
-        row = row.row(align=True)
-        for r in rotation_ranges(bone):
-            cell = row.row()
-            cell.active = r.moves and r.source != DEFAULT
-            cell.label(text=_degrees(r.low, r.high, is_wide) if r.moves else "fixed")
+        is_wide = region is not None and region.width >= WIDE * _scale(context.preferences)
+        icon, name, ranges, is_stated = _line(rig, bone, is_wide)
+        row = layout.split(factor=0.5)
+        left = row.row(align=True)
+        # The selection in the view: who ticks a box here selects the bone there.
+        box = "CHECKBOX_HLT" if is_selected(bone) else "CHECKBOX_DEHLT"
+        left.prop(selection_owner(bone), "select", text="", icon=box, emboss=False)
+        left.label(text=name, icon=icon)
+        if not is_stated:
+            row = row.row()
+            row.active = False
+        row.label(text=ranges)
 
 
+@kept
+def _scale(preferences: bpy.types.Preferences) -> float:
+    return preferences.system.ui_scale
+
+
+@kept
+def _flags(rig: SceneRig, text: str, flag: int) -> tuple[int, ...]:
+    """Which bones the list shows: the joints of the mesh, or those that were chosen, as far as they are looked for."""
+    check, channels = checks.known(rig), sampled_by_bone(rig)
+    listed = set(check.rig.joint_names) if check and check.rig else set()
+    if channels is not None:
+        listed = set(channels)
+    names = [bone.name for bone in rig.armature_object.pose.bones]
+    return tuple(flag if (not listed or name in listed) and text in name.lower() else 0 for name in names)
+
+
+@kept
+def _line(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[str, str, str, bool]:
+    """Icon, name and ranges of a bone in the list, and whether it states any of them."""
+    from ..poses.motion_range import DEFAULT, rotation_ranges
+    from ..poses.sampling import is_moved_by_constraints
+
+    name = shown_name(rig.armature_object, bone.name)
+    channels = sampled_by_bone(rig)
+    if channels is not None:
+        return "NONE", name, _sampled_text(channels.get(bone.name, ()), is_wide), True
+    if is_moved_by_constraints(bone):
+        return "CONSTRAINT_BONE", name, "constrained", False
+    ranges = rotation_ranges(bone)
+    texts = [_degrees(r.low, r.high, is_wide) if r.moves else "fixed" for r in ranges]
+    return "NONE", name, "  ".join(texts), any(r.moves and r.source != DEFAULT for r in ranges)
+
+
+@kept
+def states_limits(rig: SceneRig) -> bool:
+    """Whether any bone of the armature states a range of motion, or locks an axis."""
+    from ..poses.motion_range import DEFAULT, rotation_ranges
+
+    bones = rig.armature_object.pose.bones
+    return any(r.source != DEFAULT or r.is_locked for bone in bones for r in rotation_ranges(bone))
+
+
+@kept
 def sampled_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None":
     """Channels of the bones that a user has chosen to sample, by bone; None where none were chosen, or not known."""
     check = checks.known(rig)
@@ -85,20 +102,22 @@ def sampled_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None":
     found: dict[str, list[Channel]] = {}
     for channel in check.channels:
         if channel.kind != CONTROL:
-            found.setdefault(channel.bone, []).append(channel)
+            found.setdefault(channel.name, []).append(channel)
     return found
 
 
-def _draw_sampled(row: bpy.types.UILayout, channels: "list[Channel]", is_wide: bool) -> None:
+def _sampled_text(channels: "list[Channel]", is_wide: bool) -> str:
     """The ranges about the axes, and by which other channels the bone is moved."""
     from ..core.poses import LOCATION, ROTATION
 
     turns = {channel.axis: channel for channel in channels if channel.kind == ROTATION}
     moves = "".join("XYZ"[channel.axis] for channel in channels if channel.kind == LOCATION)
-    for axis in range(3) if turns else ():
-        row.label(text=_degrees(turns[axis].low, turns[axis].high, is_wide) if axis in turns else "fixed")
+    texts = [
+        _degrees(turns[axis].low, turns[axis].high, is_wide) if axis in turns else "fixed" for axis in range(3) if turns
+    ]
     if moves:
-        row.label(text=f"moves {moves}" if not turns else f"+{moves}")
+        texts.append(f"+{moves}" if turns else f"moves {moves}")
+    return "  ".join(texts)
 
 
 def _degrees(low: float, high: float, is_wide: bool) -> str:
@@ -114,9 +133,7 @@ class FDDA_UL_actions(bpy.types.UIList):
         rig = panel_rig(context)[0]
         text = self.filter_name.lower()
         flags = [
-            self.bitflag_filter_item
-            if rig and text in action.name.lower() and fits_now(action, rig.armature_object)
-            else 0
+            self.bitflag_filter_item if rig and text in action.name.lower() and action in _fitting_actions(rig) else 0
             for action in getattr(data, name)
         ]
         return flags, []
@@ -134,6 +151,7 @@ class FDDA_UL_actions(bpy.types.UIList):
 class FDDA_PT_poses(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_poses"
     bl_label = "Poses"
+    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.usable_layout()
@@ -143,12 +161,41 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         session, bones = context.window_manager.fdda, rig.armature_object.pose.bones
         sampled.draw_choice(layout, context, rig)
         layout.label(text="Range of motion about X, Y and Z")
+        if not states_limits(rig):
+            text = "This rig states no limits: each joint turns ±45° about each axis, more than a body does or less."
+            draw_sentence(layout, context, text, "ERROR")
         layout.template_list("FDDA_UL_joints", "", rig.armature_object.pose, "bones", session, "joint_index", rows=5)
         if 0 <= session.joint_index < len(bones):
             _draw_bone(layout, rig, bones[session.joint_index])
+        _draw_many(layout, context, rig)
         sampled.draw_controls(layout, rig)
         _draw_random(layout, context, rig)
         _draw_actions(layout, context, rig)
+
+
+def _draw_many(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
+    """What works on many bones: those that are ticked, which are those that are selected in the view."""
+    header, body = layout.panel("fdda_many_bones", default_closed=states_limits(rig))
+    header.label(text=f"Selected Bones ({_selected(rig)})")
+    if body is None:
+        return
+    column = body.column(align=True)
+    column.operator("fdda.edit_ranges", text="Set Ranges…", icon="DRIVER_ROTATIONAL_DIFFERENCE")
+    row = column.row(align=True)
+    row.operator("fdda.copy_ranges", text="Copy to Selected", icon="COPYDOWN")
+    row.operator("fdda.mirror_ranges", text="Mirror", icon="MOD_MIRROR")
+    column.operator("fdda.forget_ranges", text="Forget Ranges", icon="X")
+    column = body.column(align=True)
+    column.operator("fdda.limits_preset", text="Human Ranges", icon="OUTLINER_OB_ARMATURE")
+    column.operator("fdda.limits_from_actions", icon="CON_ROTLIMIT")
+    if not recorded_actions(rig.armature_object):
+        text = "It measures how far actions move the bones: give the armature one and tick it below."
+        draw_sentence(body, context, text, "INFO")
+
+
+@kept
+def _selected(rig: SceneRig) -> int:
+    return sum(map(is_selected, rig.armature_object.pose.bones))
 
 
 def _draw_bone(layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
@@ -165,7 +212,7 @@ def _draw_bone(layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBo
 
 def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
     """The ranges of a bone as the fields in which Blender keeps them."""
-    from ..scene.motion_range import CONSTRAINT, DEFAULT, IK, local_limit, location_ranges, rotation_ranges
+    from ..poses.motion_range import CONSTRAINT, DEFAULT, IK, local_limit, location_ranges, rotation_ranges
 
     ranges = rotation_ranges(bone)
     where = {CONSTRAINT: "Limit Rotation", IK: "IK limits", DEFAULT: "default"}
@@ -222,18 +269,23 @@ def _draw_random(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     row.operator("fdda.rest_pose", text="Rest Pose", icon="LOOP_BACK")
 
 
+@kept
+def _fitting_actions(rig: SceneRig) -> "tuple[bpy.types.Action, ...]":
+    return tuple(action for action in bpy.data.actions if moves_a_bone(action, rig.armature_object))
+
+
 def _draw_actions(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    fitting = [action for action in bpy.data.actions if fits_now(action, rig.armature_object)]
+    fitting = _fitting_actions(rig)
     if not fitting:
         return
     layout.label(text="Actions to record as well")
     session = context.window_manager.fdda
     layout.template_list("FDDA_UL_actions", "", bpy.data, "actions", session, "action_index", rows=min(4, len(fitting)))
     settings = rig.mesh_object.fdda.settings
-    column = layout.column()
-    column.enabled = any(action.fdda.record for action in fitting)
-    column.prop(settings, "mirror")
-    column.operator("fdda.limits_from_actions", icon="CON_ROTLIMIT")
+    row = layout.row()
+    # Mirrored are the frames of ticked actions.
+    row.active = any(action.fdda.record for action in fitting)
+    row.prop(settings, "mirror")
     if not settings.poses and not any(action.fdda.record for action in fitting):
         draw_sentence(
             layout, context, "There is nothing to record: raise the number of poses, or tick an action.", "ERROR"

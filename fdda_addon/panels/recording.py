@@ -9,27 +9,36 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..core.errors import FDDAError
-from ..operators import job
-from ..operators.sampling import recorded_actions, recording_settings
+from ..jobs import job
+from ..properties.character import recording_folder
+from ..properties.choices import recorded_actions, recording_settings
+from ..scene.kept import kept
 from ..scene.scene_rig import SceneRig
-from ..settings import recording_folder
 from . import checks
-from .section import Section, draw_job, draw_path, draw_sentence, panel_rig
+from .section import Section, draw_button, draw_job, draw_path, draw_sentence, panel_rig
 
 if TYPE_CHECKING:  # Blender starts without numpy.
-    from ..core.recording_folder import FolderContent
-
-UNITS = {"influences": "joint tests", "fit": "vertices fitted"}
+    from ..core.recording.folder import FolderContent
 
 _contents: "dict[int, tuple[tuple, FolderContent]]" = {}
 """What was found in the folder of a character, by session_uid of its mesh object, and for which question."""
 
 
+@kept
+def shown_content(rig: SceneRig) -> "tuple[Path, FolderContent] | str":
+    """The folder of a character and what is in it; a sentence where that cannot be said."""
+    try:
+        path = recording_folder(rig.mesh_object)
+        return path, content_of(rig, path)
+    except FDDAError as error:
+        return str(error)
+
+
 def content_of(rig: SceneRig, path: Path) -> "FolderContent":
     """What is in the folder of a recording; it is read again when it, the rig or the settings have changed."""
-    from ..core.recording import INDEX
-    from ..core.recording_folder import read_folder
-    from ..recording import planned_sampling
+    from ..core.recording.folder import read_folder
+    from ..core.recording.index import INDEX
+    from ..recording.plan import planned_sampling
 
     check, wanted = checks.known(rig), recording_settings(rig)
     try:
@@ -49,60 +58,57 @@ def content_of(rig: SceneRig, path: Path) -> "FolderContent":
 class FDDA_PT_recording(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_recording"
     bl_label = "Recording"
+    bl_options = {"DEFAULT_CLOSED"}
     verbs = ("record",)
 
     @classmethod
     def is_done(cls, context: bpy.types.Context) -> bool:
-        from ..core.recording_folder import FolderState
+        from ..core.recording.folder import FolderState
 
         rig = panel_rig(context)[0]
         running = job.current()
         if rig is None or (running and running.verb == "record"):
             return False
-        try:
-            return content_of(rig, recording_folder(rig.mesh_object)).state is FolderState.COMPLETE
-        except FDDAError:
-            return False
+        found = shown_content(rig)
+        return not isinstance(found, str) and found[1].state is FolderState.COMPLETE
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.usable_layout()
         running = job.current()
         if running and running.verb == "record":
-            draw_job(layout, context, "record", UNITS.get(running.stage, running.stage))
+            draw_job(layout, context, "record")
             draw_sentence(layout, context, "ESC cancels as well; what is recorded is kept.", "INFO")
             return
         rig = panel_rig(context)[0]
         if rig is None:
             return
         _draw_folder(layout, context, rig)
-        draw_job(layout, context, "record", "poses", ("ERROR",))
+        draw_job(layout, context, "record", ("ERROR",))
 
 
 def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    from ..core.recording_folder import FolderState
+    from ..core.recording.folder import FolderState
 
     settings = rig.mesh_object.fdda.settings
     draw_path(layout, settings, "recording")
     layout.prop(settings, "fit_linear")
     layout.prop(settings, "least_vertices")
-    try:
-        path = recording_folder(rig.mesh_object)
-        content = content_of(rig, path)
-    except FDDAError as error:
-        draw_sentence(layout, context, str(error), "ERROR")
-        _draw_record(layout, "Record", False)
+    found = shown_content(rig)
+    if isinstance(found, str):
+        draw_sentence(layout, context, found, "ERROR")
         return
+    path, content = found
     check = checks.known(rig)
     ready = check is not None and not check.problems
     if check is not None and check.problems:
         draw_sentence(layout, context, "The rig cannot be recorded yet; see the section Rig.", "ERROR")
     if content.state is FolderState.FREE:
         draw_sentence(layout, context, f"{_plan(rig)} will go into '{path.name}'.")
-        _draw_record(layout, "Record", ready)
+        _draw_record(layout, context, "Record", ready)
     elif content.state is FolderState.INCOMPLETE:
         text = f"'{path.name}' has {content.complete:,} of {content.poses:,} poses."
         draw_sentence(layout, context, text, "INFO")
-        _draw_record(layout, "Resume", ready, resume=True)
+        _draw_record(layout, context, "Resume", ready, resume=True)
     elif content.state is FolderState.COMPLETE:
         draw_sentence(
             layout, context, f"'{path.name}' is complete: {content.poses:,} poses. Train on it next.", "CHECKMARK"
@@ -117,15 +123,18 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         layout.operator("fdda.remove_recording", text="Remove Recording", icon="TRASH").object = rig.mesh_object.name
 
 
-def _draw_record(layout: bpy.types.UILayout, text: str, enabled: bool, resume: bool = False) -> None:
+def _draw_record(
+    layout: bpy.types.UILayout, context: bpy.types.Context, text: str, enabled: bool, resume: bool = False
+) -> None:
     row = layout.row()
     row.enabled = enabled
     row.scale_y = 1.3
-    row.operator("fdda.record", text=text, icon="REC").resume = resume
+    draw_button(row, context, "fdda.record", text, "REC").resume = resume
 
 
+@kept
 def _plan(rig: SceneRig) -> str:
-    from ..scene.action_range import action_frames
+    from ..poses.action_range import action_frames
 
     settings = rig.mesh_object.fdda.settings
     frames = [len(action_frames(bpy.data.actions[name])) for name in recorded_actions(rig.armature_object)]

@@ -3,12 +3,14 @@
 
 import bpy
 
-from ..operators import job
+from ..jobs import job
 from ..operators.rig import cost_of
+from ..scene.active_rig import shown_together
 from ..scene.scene_rig import SceneRig
-from . import checks
-from .section import Section, draw_job, draw_sentence, panel_rig
+from . import checks, curves
+from .section import Section, draw_button, draw_job, draw_sentence, panel_rig
 
+MAX_MESHES = 8
 MODIFIER_ICONS = {
     "ARMATURE": "MOD_ARMATURE", "CORRECTIVE_SMOOTH": "MOD_SMOOTH", "SMOOTH": "MOD_SMOOTH", "LATTICE": "MOD_LATTICE",
     "NODES": "GEOMETRY_NODES", "SURFACE_DEFORM": "MOD_MESHDEFORM", "MESH_DEFORM": "MOD_MESHDEFORM",
@@ -18,7 +20,7 @@ MODIFIER_ICONS = {
 class FDDA_PT_rig(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_rig"
     bl_label = "Rig"
-    verbs = ("measure",)
+    verbs = ("measure", "make_model")
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -37,6 +39,8 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
             draw_sentence(layout, context, sentence, "INFO")
             layout.operator("fdda.add_arm", text="Add Sample Arm", icon="ADD")
             return
+        _draw_one_go(layout, context)
+        _draw_meshes(layout, context, rig)
         _draw_counts(layout, rig)
         check = checks.known(rig)
         for problem in check.problems if check else ():
@@ -44,6 +48,27 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
         if check:
             _draw_replaced(layout, rig.mesh_object, check.replaced)
         _draw_cost(layout, context, rig)
+
+
+def _draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
+    """The meshes of the active armature, where there are several: which is shown, and whether buttons are about all."""
+    rigs = shown_together(context)
+    if not rigs:
+        return
+    box = layout.box().column(align=True)
+    box.label(text=f"{len(rigs)} meshes follow {rig.armature_object.name}")
+    for other in rigs[:MAX_MESHES]:
+        is_shown = other.mesh_object == rig.mesh_object
+        row = box.row(align=True)
+        row.alignment = "LEFT"
+        icon = "RADIOBUT_ON" if is_shown else "RADIOBUT_OFF"
+        button = row.operator("fdda.choose_mesh", text=other.mesh_object.name, icon=icon, emboss=False)
+        button.object = other.mesh_object.name
+        if other.mesh_object.fdda.is_bound:
+            row.label(text="", icon="LINKED")
+    if len(rigs) > MAX_MESHES:
+        box.label(text=f"and {len(rigs) - MAX_MESHES} more; select one to see it")
+    box.prop(context.window_manager.fdda, "all_meshes", text=f"Buttons Work on All {len(rigs)}")
 
 
 def _draw_counts(layout: bpy.types.UILayout, rig: SceneRig) -> None:
@@ -68,11 +93,23 @@ def _draw_replaced(layout: bpy.types.UILayout, mesh_object: bpy.types.Object, re
         column.label(text=f"{count} shape {'key' if count == 1 else 'keys'}", icon="SHAPEKEY_DATA")
 
 
+def _draw_one_go(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """All steps below in one, for the impatient."""
+    if draw_job(layout, context, "make_model"):
+        state = job.state_of("make_model")
+        if not state.borrows_scene:
+            curves.draw(layout, state.curves)
+        return
+    row = layout.row()
+    row.scale_y = 1.3
+    draw_button(row, context, "fdda.make_model", "Prepare, Train, Bind", "PLAY")
+
+
 def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
     cost = cost_of(rig.mesh_object)
     state = job.state_of("measure")
     if state is not None and (state.is_running or state.outcome_level != "INFO"):
-        draw_job(layout, context, "measure", "frames")
+        draw_job(layout, context, "measure")
     if cost is not None:
         column = layout.column(align=True)
         for name, milliseconds in (
@@ -91,11 +128,6 @@ def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Scen
 CLASSES = (FDDA_PT_rig,)
 
 
-def register() -> None:
-    """Watch the rigs that are drawn."""
-    checks.register()
-
-
 def unregister() -> None:
-    """Undo `register`."""
+    """Forget what was found out about the rigs that were drawn."""
     checks.unregister()

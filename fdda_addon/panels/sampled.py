@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ..operators.sampling import ALL_SHAPE_KEYS, recorded_actions
+from ..properties.choices import ALL_SHAPE_KEYS, recorded_actions
 from ..scene.scene_rig import SceneRig
 from . import checks
 from .section import draw_sentence
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.poses import Channel
-    from ..rig_check import RigCheck
+    from ..recording.rig_check import RigCheck
 
-MOST_LINES = 8
-"""So many of the controls that were found are listed."""
+MAX_LINES = 8
+"""The panel lists at most this number of the controls that were found."""
 
 
 class FDDA_UL_controls(bpy.types.UIList):
@@ -58,7 +58,7 @@ def counted(check: "RigCheck") -> str:
     from ..core.poses import CONTROL
 
     channels = [channel for channel in check.channels if channel.kind != CONTROL]
-    bones, controls = len({channel.bone for channel in channels}), len(check.channels) - len(channels)
+    bones, controls = len({channel.name for channel in channels}), len(check.channels) - len(channels)
     parts = []
     if bones:
         parts.append(f"{_many(bones, 'bone')} ({_many(len(channels), 'channel')})")
@@ -118,7 +118,7 @@ def draw_controls(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     if found:
         column = body.column(align=True)
         column.label(text="Found: drivers or ticked actions use them")
-        for control in found[:MOST_LINES]:
+        for control in found[:MAX_LINES]:
             column.label(text=f"{control.name} {control.low:g}…{control.high:g}", icon="DOT")
-        if len(found) > MOST_LINES:
-            column.label(text=f"and {len(found) - MOST_LINES} more", icon="BLANK1")
+        if len(found) > MAX_LINES:
+            column.label(text=f"and {len(found) - MAX_LINES} more", icon="BLANK1")

@@ -7,13 +7,14 @@ import blf
 import bpy
 
 from ..core.errors import RigError
-from ..operators import job
-from ..scene.active_rig import active_rig
+from ..jobs import job
+from ..scene.active_rig import active_rig, shown_rig, shown_together
+from ..scene.kept import kept
 from ..scene.scene_rig import SceneRig
 
 MARGIN, ICON = 74, 22
 """Width of what is left and right of text in a box, and of an icon, pixels at a scale of 1."""
-LEAST_WIDTH = 60
+MIN_WIDTH = 60
 OUTCOME_ICONS = {"INFO": "CHECKMARK", "WARNING": "INFO", "ERROR": "ERROR"}
 
 
@@ -29,7 +30,7 @@ class Section:
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         running = job.current()
-        return panel_rig(context)[0] is not None or (running is not None and running.verb in cls.verbs)
+        return shown_rig(context) is not None or (running is not None and running.verb in cls.verbs)
 
     def usable_layout(self) -> bpy.types.UILayout:
         """The layout of the panel; nothing in it can be changed while the job of another section borrows the scene."""
@@ -45,25 +46,55 @@ class Section:
     def draw_header_preset(self, context: bpy.types.Context) -> None:
         if self.is_done(context):
             self.layout.label(text="", icon="CHECKMARK")
+        self.layout.operator("fdda.help", text="", icon="QUESTION", emboss=False).section = self.bl_label
 
 
 def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
     """The rig that the sidebar is about, or None and the sentence that says why there is none."""
+    if (rig := shown_rig(context)) is not None:
+        return rig, ""
     try:
         return active_rig(context), ""
     except RigError as error:
         return None, str(error)
 
 
+def together(context: bpy.types.Context) -> int:
+    """How many meshes the buttons work on at once; 0 where they work on the one that is shown."""
+    rigs = shown_together(context)
+    return len(rigs) if rigs and context.window_manager.fdda.all_meshes else 0
+
+
+def draw_button(
+    layout: bpy.types.UILayout, context: bpy.types.Context, name: str, text: str, icon: str
+) -> bpy.types.OperatorProperties:
+    """Draw the button of an operator that may work on all meshes of an armature; it says of how many."""
+    count = together(context)
+    properties = layout.operator(name, text=f"{text} ({count} Meshes)" if count else text, icon=icon)
+    if count:
+        properties.all_meshes = True
+    return properties
+
+
 def draw_sentence(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
     """Draw text in as many lines as the width of the sidebar takes."""
-    scale = context.preferences.system.ui_scale
+    scale, points = _text_size(context.preferences)
     width = context.region.width - (MARGIN + (ICON if icon != "NONE" else 0)) * scale
-    points = context.preferences.ui_styles[0].widget.points * scale
+    lines = _lines(text, max(width, MIN_WIDTH * scale), points)
+    if len(lines) == 1:
+        layout.label(text=text, icon=icon)
+        return
     column = layout.column(align=True)
     column.scale_y = 0.8
-    for number, line in enumerate(_lines(text, max(width, LEAST_WIDTH * scale), points)):
+    for number, line in enumerate(lines):
         column.label(text=line, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+
+
+@kept
+def _text_size(preferences: bpy.types.Preferences) -> tuple[float, float]:
+    """Scale of the interface, and height of its text in points."""
+    scale = preferences.system.ui_scale
+    return scale, preferences.ui_styles[0].widget.points * scale
 
 
 @functools.lru_cache(maxsize=256)
@@ -90,7 +121,6 @@ def draw_job(
     layout: bpy.types.UILayout,
     context: bpy.types.Context,
     verb: str,
-    unit: str,
     levels: tuple[str, ...] = ("INFO", "WARNING", "ERROR"),
 ) -> bool:
     """Draw how far the job of this verb is with a button to cancel it, or how it ended.
@@ -98,7 +128,6 @@ def draw_job(
     Args:
         layout, context: as in `draw`.
         verb: of the job.
-        unit: what it counts, "poses".
         levels: ends of these levels are drawn; others, the section says itself.
 
     Returns:
@@ -109,12 +138,16 @@ def draw_job(
         return False
     if not state.is_running:
         rig = panel_rig(context)[0]
-        is_own = not state.subject or (rig is not None and rig.mesh_object.name == state.subject)
+        is_own = not state.subject or (rig is not None and rig.mesh_object.session_uid == state.subject)
         if is_own and state.outcome_level in levels:
             draw_sentence(layout, context, state.outcome, OUTCOME_ICONS[state.outcome_level])
         return False
     column = layout.column(align=True)
-    column.progress(factor=state.fraction, text=f"{state.done} of {state.total} {unit}" if state.total else "Starting…")
+    if state.total:
+        column.progress(factor=state.fraction, text=state.sentence)
+    else:
+        # A bar that stands still would look as if nothing happened.
+        draw_sentence(column, context, state.sentence, "SORTTIME")
     row = column.row(align=True)
     row.enabled = not state.cancel_requested
     row.operator("fdda.cancel", text="Cancelling…" if state.cancel_requested else "Cancel", icon="X")

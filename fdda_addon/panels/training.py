@@ -1,27 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Section "Training": which Python trains, the curves while it does, and the partitions when it has."""
 
-import json
 import os
 from pathlib import Path
 
 import bpy
 
-from ..core.errors import FDDAError
-from ..core.messages import WARNING
-from ..operators import job
-from ..preferences import MODULE, preferences
+from ..core.errors import TrainingError
+from ..core.report import Verdict, read_report, report_path, weights_path
+from ..jobs import job
+from ..properties.preferences import MODULE, preferences
 from ..scene.scene_rig import SceneRig
-from ..settings import model_file, recording_folder
-from ..trainer_environment import choice, session
+from ..training.environment import choice, session
 from . import curves
-from .recording import content_of
-from .section import Section, draw_job, draw_path, draw_sentence, panel_rig
+from .names import shown_name
+from .recording import shown_content
+from .section import Section, draw_button, draw_job, draw_path, draw_sentence, panel_rig
+from .trained import Trained, trained
 
-REPORT = "report.json"
-WEIGHTS = ".weights.npz"
-"""Ending of the file of a model's last weights, beside it."""
-UNITS = {"probes": "poses compared", "poses": "poses added"}
 SHOWN_PARTITIONS = 8
 
 _reports: dict[Path, tuple[int, dict | None]] = {}
@@ -31,6 +27,7 @@ _reports: dict[Path, tuple[int, dict | None]] = {}
 class FDDA_PT_training(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_training"
     bl_label = "Training"
+    bl_options = {"DEFAULT_CLOSED"}
     verbs = ("train", "refine")
 
     @classmethod
@@ -39,39 +36,36 @@ class FDDA_PT_training(Section, bpy.types.Panel):
         running = job.current()
         if rig is None or (running and running.verb == "train"):
             return False
-        try:
-            return model_file(rig.mesh_object).is_file()
-        except FDDAError:
-            return False
+        found = trained(rig)
+        return found is not None and not found.foreign
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.usable_layout()
         running = job.current()
         if running and running.verb == "train":
-            draw_job(layout, context, "train", "epochs")
-            if not running.total:
-                draw_sentence(layout, context, "The trainer starts and reads the recording.")
+            draw_job(layout, context, "train")
             curves.draw(layout, running.curves)
-            for line in running.log:
-                if line.startswith(WARNING):
-                    draw_sentence(layout, context, line, "INFO")
-            draw_sentence(layout, context, "You can go on working meanwhile.", "INFO")
+            for warning in running.warnings:
+                draw_sentence(layout, context, warning, "INFO")
+            draw_sentence(layout, context, "You can go on working meanwhile, and close Blender.", "INFO")
             return
         if running and running.verb == "refine":
-            draw_job(layout, context, "refine", UNITS.get(running.stage, running.stage))
+            draw_job(layout, context, "refine")
             draw_sentence(layout, context, "ESC cancels as well; the poses that were added are kept.", "INFO")
             return
         rig = panel_rig(context)[0]
         if rig is None:
             return
         ready = _draw_python(layout, context)
-        _draw_settings(layout, context, rig, ready)
-        draw_job(layout, context, "refine", "poses")
-        draw_job(layout, context, "train", "epochs")
+        found = trained(rig)
+        _draw_settings(layout, context, rig, found, ready)
+        draw_job(layout, context, "refine")
+        draw_job(layout, context, "train")
         ended = job.state_of("train")
-        if ended is not None and ended.subject == rig.mesh_object.name:
+        if ended is not None and ended.subject == rig.mesh_object.session_uid:
             curves.draw(layout, ended.curves)
-        _draw_report(layout, context, rig)
+        if found is not None and not found.foreign:
+            _draw_report(layout, context, rig, found.path)
 
 
 def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
@@ -81,8 +75,8 @@ def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool
         draw_sentence(layout, context, answer.message, "CHECKMARK")
         return True
     box = layout.box()
-    if session.task is not None:
-        draw_sentence(box, context, f"{session.task.title}: {session.task.progress.stage}", "SORTTIME")
+    if (checking := job.current(job.ENVIRONMENT)) is not None:
+        draw_sentence(box, context, f"{checking.title}: {checking.stage}", "SORTTIME")
     elif answer is not None:
         draw_sentence(box, context, answer.message, "ERROR" if answer.level == "ERROR" else "INFO")
     elif choice.chosen_python().origin is choice.Origin.THIS:
@@ -97,54 +91,53 @@ def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool
     return answer is None or answer.level != "ERROR"
 
 
-def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, ready: bool) -> None:
-    from ..core.recording_folder import FolderState
+def _draw_settings(
+    layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, found: Trained | None, ready: bool
+) -> None:
+    from ..core.recording.folder import FolderState
 
     settings = rig.mesh_object.fdda.settings
     column = layout.column()
     column.use_property_split = True
     column.use_property_decorate = False
-    column.prop(settings, "target_mm")
-    column.prop(settings, "tolerance_mm")
-    column.prop(settings, "epochs")
-    column.prop(settings, "training_seed")
+    for name in ("target_mm", "tolerance_mm", "epochs", "training_seed"):
+        column.prop(settings, name)
     draw_path(layout, settings, "model")
-    try:
-        model = model_file(rig.mesh_object)
-        recording = recording_folder(rig.mesh_object)
-        content = content_of(rig, recording)
-    except FDDAError as error:
-        draw_sentence(layout, context, str(error), "ERROR")
-        ready, model = False, None
-    else:
-        if content.state is not FolderState.COMPLETE:
-            draw_sentence(layout, context, "There is no complete recording of this rig yet; record first.", "INFO")
-            ready = False
-        elif model.is_file():
-            draw_sentence(layout, context, f"'{model.name}' is there; training again replaces it.", "CHECKMARK")
+    content = shown_content(rig)
+    if isinstance(content, str):
+        draw_sentence(layout, context, content, "ERROR")
+        ready = False
+    elif content[1].state is not FolderState.COMPLETE:
+        draw_sentence(layout, context, "There is no complete recording of this rig yet; record first.", "INFO")
+        ready = False
+    if found is not None and found.foreign:
+        text = (
+            f"'{found.path.name}' is there and not of this rig: {found.foreign}. Training asks before it replaces it."
+        )
+        draw_sentence(layout, context, text, "ERROR")
+    elif found is not None:
+        draw_sentence(layout, context, f"'{found.path.name}' is there; training again replaces it.", "CHECKMARK")
     row = layout.row()
     row.enabled = ready
     row.scale_y = 1.3
-    row.operator("fdda.train", text="Train", icon="PLAY")
-    if model is not None and model.is_file():
-        # What a better model takes, in the order of the work.
-        on = layout.column(align=True)
-        on.enabled = ready
-        on.operator("fdda.refine", text="Add Poses Where It Is Worst", icon="ADD")
-        train = on.row(align=True)
-        train.enabled = model.with_suffix(WEIGHTS).is_file()
-        train.operator("fdda.train", text="Train On", icon="FF").warm_start = True
-    if model is not None and model.is_file() and not rig.mesh_object.fdda.is_bound:
-        bind = layout.operator("fdda.bind", text=f"Bind '{model.name}'", icon="LINKED")
-        bind.object, bind.filepath = rig.mesh_object.name, str(model)
-
-
-def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    try:
-        model = model_file(rig.mesh_object)
-    except FDDAError:
+    draw_button(row, context, "fdda.train", "Train", "PLAY")
+    if found is None or found.foreign:
         return
-    report = _report(model.with_name(REPORT))
+    # What a better model takes, in the order of the work.
+    on = layout.column(align=True)
+    on.enabled = ready
+    on.operator("fdda.refine", text="Add Poses Where It Is Worst", icon="ADD")
+    if weights_path(found.path).is_file():
+        on.operator("fdda.train", text="Train On", icon="FF").warm_start = True
+    else:
+        draw_sentence(layout, context, "Its last weights are gone, so it cannot be trained on.", "INFO")
+    if not rig.mesh_object.fdda.is_bound:
+        bind = layout.operator("fdda.bind", text=f"Bind '{found.path.name}'", icon="LINKED")
+        bind.object, bind.filepath = rig.mesh_object.name, str(found.path)
+
+
+def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, model: Path) -> None:
+    report = _report(report_path(model))
     if report is None or report["model"] != model.name:
         return
     if target := report.get("target"):
@@ -152,39 +145,44 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     for warning in report.get("warnings", ()):
         draw_sentence(layout, context, f"Warning: {warning['name']}; the report says what to do.", "INFO")
     everything = report["fdda"]["held_out"]
-    layout.label(text="Held-out error in mm, worst first")
-    table = layout.box().column(align=True)
-    _draw_row(table, ("Partition", "Shapes", "Mean", "Max"))
+    header, body = layout.panel("fdda_held_out", default_closed=True)
+    header.label(text=f"Held-out error: mean {everything['mean']:.3f}, max {everything['max']:.2f} mm")
+    if body is None:
+        return
+    body.label(text="By partition, worst first")
     partitions = sorted(report["partitions"], key=lambda p: -p["held_out"]["max"])
     shown = partitions if context.window_manager.fdda.show_all_partitions else partitions[:SHOWN_PARTITIONS]
+    names, means, largest = _columns(body.box())
+    for column, text in ((names, "Partition"), (means, "Mean"), (largest, "Max")):
+        column.label(text=text)
     for p in shown:
-        _draw_row(table, (p["joint"], str(p["basis"]), f"{p['held_out']['mean']:.3f}", f"{p['held_out']['max']:.2f}"))
-    shapes = str(sum(p["basis"] for p in partitions))
-    _draw_row(table, ("All", shapes, f"{everything['mean']:.3f}", f"{everything['max']:.2f}"))
+        names.label(text=shown_name(rig.armature_object, p["joint"]))
+        means.label(text=f"{p['held_out']['mean']:.3f}")
+        largest.label(text=f"{p['held_out']['max']:.2f}")
     if len(partitions) > SHOWN_PARTITIONS:
         text = f"Show All {len(partitions)} Partitions"
-        layout.prop(context.window_manager.fdda, "show_all_partitions", text=text, toggle=True)
+        body.prop(context.window_manager.fdda, "show_all_partitions", text=text, toggle=True)
+
+
+def _columns(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
+    """A column for names, and two for numbers at the right."""
+    left = layout.split(factor=0.5)
+    columns = [left.column(align=True)]
+    right = left.split(factor=0.5)
+    for _ in range(2):
+        columns.append(right.column(align=True))
+        columns[-1].alignment = "RIGHT"
+    return columns
 
 
 def _target(target: dict) -> tuple[str, str]:
     """A sentence and an icon for what the report says of the target."""
     reached = f"99.9 % within {target['p999']:.2f} mm, target {target['target']:g} mm"
     return {
-        "met": (f"{reached}: met.", "CHECKMARK"),
-        "missed": (f"{reached}: missed. Add poses where the model is worst, and train on.", "INFO"),
-        "exhausted": (f"{reached}: missed, and more poses no longer help.", "INFO"),
-    }[target["verdict"]]
-
-
-def _draw_row(table: bpy.types.UILayout, cells: tuple[str, str, str, str]) -> None:
-    rest = table
-    for cell, factor in zip(cells, (0.36, 0.38, 0.5), strict=False):
-        rest = rest.split(factor=factor)
-        own = rest.row()
-        own.alignment = "LEFT" if cell is cells[0] else "RIGHT"
-        own.label(text=cell)
-    rest.alignment = "RIGHT"
-    rest.label(text=cells[-1])
+        Verdict.MET: (f"{reached}: met.", "CHECKMARK"),
+        Verdict.MISSED: (f"{reached}: missed. Add poses where the model is worst, and train on.", "INFO"),
+        Verdict.EXHAUSTED: (f"{reached}: missed, and more poses no longer help.", "INFO"),
+    }[Verdict(target["verdict"])]
 
 
 def _report(path: Path) -> dict | None:
@@ -195,17 +193,8 @@ def _report(path: Path) -> dict | None:
         return None
     if path not in _reports or _reports[path][0] != stamp:
         try:
-            report = json.loads(path.read_text(encoding="utf-8"))
-            for errors in (report["fdda"], *report["partitions"]):
-                float(errors["held_out"]["mean"]), float(errors["held_out"]["max"])
-            for partition in report["partitions"]:
-                str(partition["joint"]), int(partition["basis"])
-            str(report["model"])
-            for warning in report.get("warnings", ()):
-                str(warning["name"])
-            if target := report.get("target"):
-                _target(target)
-        except (OSError, ValueError, KeyError, TypeError):
+            report = read_report(path)
+        except TrainingError:
             report = None
         _reports[path] = (stamp, report)
     return _reports[path][1]

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import bpy
 
-from ..operators.job_state import current, redraw
+from ..jobs.job import current, redraw
 
 SECOND_DRAWING = 0.1
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Plays a model in place of a rig.
+"""Plays a model in place of a rig, inside Blender's evaluation.
 
-`network` executes a model, `binding` ties it to a mesh object, `playback` keeps the live bindings and moves their
-meshes, `handlers` calls it when Blender has evaluated a pose.
+`network` executes a model, `binding` ties it to a mesh object. `cache` makes the object whose driver asks for
+positions, `live_binding` answers it, `crowd` for several at once; `playback` keeps them, and `handlers` is what Blender
+calls.
 """

@@ -8,10 +8,11 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import RigError
-from ..core.model import check_rig
-from ..scene.modifier_stack import check_stack
-from ..scene.rig import SceneRig, read_model_rig
+from ..rig.modifier_stack import check_stack
+from ..scene.scene_rig import SceneRig
+from . import cache as caches
 from . import model_files, nodes, packed, playback, switch
+from .opened_model import open_model
 
 
 def bind(
@@ -34,8 +35,7 @@ def bind(
     if mesh_object.mode == "EDIT":
         raise RigError(f"'{mesh_object.name}' is in edit mode; leave it first.")
     model = model.absolute()
-    network = model_files.load_network(model) if packed_model is None else packed.load(packed_model)
-    check_rig(model, network.info, read_model_rig(scene_rig, network.info))
+    open_model(scene_rig, model_files.load_network(model) if packed_model is None else packed.load(packed_model))
     with true_rig(mesh_object):
         stack = check_stack(mesh_object)
     if mesh_object.fdda.is_bound:
@@ -71,7 +71,8 @@ def unbind(mesh_object: bpy.types.Object) -> None:
         nodes.set_cache(modifier, None)
         if not nodes.is_inherited(modifier):
             mesh_object.modifiers.remove(modifier)
-        nodes.remove_cache(cache)
+        if cache is not None and cache not in nodes.used_caches():
+            caches.remove(cache)
     for name in ("is_bound", "model", "packed", "use_in_render", "status"):
         binding.property_unset(name)
     playback.forget()
@@ -89,8 +90,11 @@ def _check_editable(mesh_object: bpy.types.Object) -> None:
 def apply(mesh_object: bpy.types.Object) -> None:
     """Bring a bound object in line with its properties; the next evaluation shows it."""
     if mesh_object.fdda.is_bound:
+        was_playing = mesh_object.fdda.is_playing
         switch.switch_modifiers(mesh_object)
-        playback.refresh(mesh_object)
+        if mesh_object.fdda.is_playing != was_playing:
+            playback.make_anew(mesh_object)
+        mesh_object.update_tag()
 
 
 @contextmanager

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The handlers: when Blender has evaluated a pose, the models play.
+"""What Blender calls: the getter that plays, inside an evaluation, and the handlers, after it.
 
-All in one table; `register` adds exactly these, `unregister` removes exactly these. numpy and the modules that play are
-imported with the first bound object, not when Blender starts.
+`registration.handler_table` adds and removes the handlers. numpy and the modules that play are imported with the first
+bound object, not when Blender starts.
 """
 
 import sys
@@ -11,7 +11,8 @@ from types import ModuleType
 import bpy
 from bpy.app.handlers import persistent
 
-_PLAYBACK, _RESTING = f"{__package__}.playback", f"{__package__}.resting"
+_PLAYBACK = f"{__package__}.playback"
+_MODEL_FILES = f"{__package__}.model_files"
 _count_without_bound = -1
 
 
@@ -30,40 +31,56 @@ def _playback() -> ModuleType | None:
     return playback
 
 
-@persistent
-def _on_frame_begins(scene: bpy.types.Scene, *_: object) -> None:
-    if _PLAYBACK in sys.modules:
-        sys.modules[_PLAYBACK].rest(scene)
+def _play(cache: bpy.types.Object) -> float:
+    """The getter that the driver of a cache object reads: what it is for is that it is called."""
+    if cache.is_evaluated and _PLAYBACK in sys.modules:
+        sys.modules[_PLAYBACK].play(cache)
+    return 0.0
 
 
 @persistent
-def _on_evaluated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    # The graph that is handed in: a render evaluates one of its own.
+def _on_frame(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     if playback := _playback():
-        playback.evaluate(depsgraph)
+        playback.follow(depsgraph)
+        playback.gather(frame_changed=True)
 
 
 @persistent
-def _on_changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    _on_evaluated(scene, depsgraph)
-    if _RESTING in sys.modules:
-        # A simulation may have come.
-        sys.modules[_RESTING].forget()
+def _on_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    if playback := _playback():
+        playback.note_changes(depsgraph)
+        playback.follow(depsgraph)
+        playback.gather(frame_changed=False)
 
 
-@persistent
-def _on_reloaded(*_: object) -> None:
+def _play_anew() -> None:
     global _count_without_bound
     _count_without_bound = -1
     if playback := _playback():
-        from .saved_rig import resume
+        playback.resume()
 
-        playback.forget()
-        # A file holds the true rig, whatever plays in it.
-        resume()
-        if playback.playing_objects():
-            # Without a window nothing evaluates a file that was loaded; here it is safe, no evaluation is under way.
-            playback.evaluate(bpy.context.evaluated_depsgraph_get())
+
+@persistent
+def _on_loaded(*_: object) -> None:
+    if _PLAYBACK in sys.modules:
+        sys.modules[_PLAYBACK].forget()
+    # A file holds the true rig, whatever plays in it.
+    _play_anew()
+    if _MODEL_FILES in sys.modules:
+        sys.modules[_MODEL_FILES].release_unused()
+
+
+@persistent
+def _on_undo_begins(*_: object) -> None:
+    if playback := _playback():
+        playback.remove_caches()
+
+
+@persistent
+def _on_undone(*_: object) -> None:
+    # The step that was read may have brought cache objects back, of which evaluated copies are left from before.
+    _on_undo_begins()
+    _play_anew()
 
 
 @persistent
@@ -74,72 +91,37 @@ def _on_linking(*_: object) -> None:
 
 
 @persistent
-def _on_render_begins(*_: object) -> None:
-    # A render that shows the rig needs its shape keys; pinning them is not a matter of viewport or render.
-    if playback := _playback():
-        _pin_outside_renders(playback, False)
-
-
-@persistent
-def _on_render_ended(*_: object) -> None:
-    if playback := _playback():
-        _pin_outside_renders(playback, True)
-        # The cache objects hold the last frame of the render.
-        for mesh_object in playback.playing_objects():
-            playback.refresh(mesh_object)
-
-
-@persistent
 def _on_save_begins(*_: object) -> None:
-    if _playback():
-        from .saved_rig import give_back_rigs
-
-        give_back_rigs()
+    if playback := _playback():
+        playback.give_back_rigs()
 
 
 @persistent
 def _on_save_ended(*_: object) -> None:
-    if _playback():
-        from .saved_rig import resume
-
-        resume()
-
-
-def _pin_outside_renders(playback: ModuleType, pinned: bool) -> None:
-    from .switch import pin_shape_keys
-
-    for mesh_object in playback.playing_objects():
-        if not mesh_object.fdda.use_in_render:
-            pin_shape_keys(mesh_object, pinned)
+    if playback := _playback():
+        playback.resume()
 
 
 HANDLERS = {
-    "frame_change_pre": _on_frame_begins,
-    "frame_change_post": _on_evaluated,
+    "frame_change_post": _on_frame,
     "depsgraph_update_post": _on_changed,
-    "load_post": _on_reloaded,
-    "undo_post": _on_reloaded,
-    "redo_post": _on_reloaded,
-    "render_init": _on_render_begins,
-    "render_complete": _on_render_ended,
-    "render_cancel": _on_render_ended,
+    "load_post": _on_loaded,
+    "undo_pre": _on_undo_begins,
+    "redo_pre": _on_undo_begins,
+    "undo_post": _on_undone,
+    "redo_post": _on_undone,
+    "blend_import_pre": _on_linking,
     "save_pre": _on_save_begins,
     "save_post": _on_save_ended,
     "save_post_fail": _on_save_ended,
 }
-if hasattr(bpy.app.handlers, "blend_import_pre"):
-    # 4.3 and later. Before, a library that was reloaded is noticed with the next object that comes or goes.
-    HANDLERS["blend_import_pre"] = _on_linking
 
 
 def register() -> None:
-    """Add the handlers; a second call adds nothing."""
+    """Add the getter, and let what is bound in the open file play."""
     global _count_without_bound
     _count_without_bound = -1
-    for name, handler in HANDLERS.items():
-        handlers = getattr(bpy.app.handlers, name)
-        if handler not in handlers:
-            handlers.append(handler)
+    bpy.types.Object.fdda_playback = bpy.props.FloatProperty(get=_play, options={"HIDDEN", "SKIP_SAVE"})
     if hasattr(bpy.data, "objects"):
         _resume_open_file()
     else:
@@ -149,23 +131,16 @@ def register() -> None:
 
 def _resume_open_file() -> None:
     """Let the models of a file play that was open before the add-on was there."""
-    if _playback():
-        from .saved_rig import resume
-
-        resume()
+    if playback := _playback():
+        playback.resume()
 
 
 def unregister() -> None:
-    """Remove the handlers and forget all bindings; rigs are given back. Left registered they hang the 4.5 module."""
+    """Remove getter and cache objects; rigs are given back."""
     if bpy.app.timers.is_registered(_resume_open_file):
         bpy.app.timers.unregister(_resume_open_file)
-    for name, handler in HANDLERS.items():
-        handlers = getattr(bpy.app.handlers, name)
-        if handler in handlers:
-            handlers.remove(handler)
     if _PLAYBACK in sys.modules:
-        from .saved_rig import give_back_rigs
-
         # Nothing would move their meshes any more.
-        give_back_rigs()
-        sys.modules[_PLAYBACK].forget()
+        sys.modules[_PLAYBACK].give_back_rigs()
+        sys.modules[_PLAYBACK].remove_caches()
+    del bpy.types.Object.fdda_playback

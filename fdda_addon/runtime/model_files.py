@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import ModelError
+from ..scene.model_trust import is_trusted
 from . import packed
 from .network import Network
 
@@ -40,6 +41,15 @@ def load_network(path: Path) -> Network:
     return _networks[path][1]
 
 
+def release_unused() -> None:
+    """Let go of the networks that no object of the open file is bound to: those of files that were open before."""
+    bound = [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]
+    used = {absolute_path(o, o.fdda.model) for o in bound if o.fdda.packed is None}
+    for path in _networks.keys() - used:
+        del _networks[path]
+    packed.release_unused({o.fdda.packed.session_uid for o in bound if o.fdda.packed is not None})
+
+
 def model_path(mesh_object: bpy.types.Object) -> Path:
     """Where the model of a binding is.
 
@@ -59,10 +69,11 @@ def allowed_path(mesh_object: bpy.types.Object, stored: str) -> Path:
     library = _origin(mesh_object, stored).library
     file = bpy.path.abspath(library.filepath) if library else bpy.data.filepath
     # Resolved: the way from the open file to the model leads through "..".
-    if path.resolve() not in _chosen and file and not path.resolve().is_relative_to(Path(file).resolve().parent):
+    in_folder = not file or path.resolve().is_relative_to(Path(file).resolve().parent)
+    if not (in_folder or path.resolve() in _chosen or is_trusted(path)):
         raise ModelError(
             f"The model '{path}' lies outside the folder of '{Path(file).name}' and is not followed; "
-            "move it beside the file and bind it again, or choose it again."
+            "choose it again and pack it, move it beside the file, or trust its folder in the preferences."
         )
     return path
 

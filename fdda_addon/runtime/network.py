@@ -63,36 +63,32 @@ class Network:
             raise ModelError(
                 f"ONNX Runtime refuses the model '{path}' ({_first_line(error)}); train it again."
             ) from error
-        self._bound: dict[int, tuple] = {}
+        self._executions: dict[int, Execution] = {}
 
     def positions(self, pose_matrices: np.ndarray, controls: np.ndarray | None = None) -> np.ndarray:
         """Deform the mesh.
 
         Args:
-            pose_matrices: (N, J, 4, 4) float32, mesh-object space, metres.
+            pose_matrices: (N, J, 4, 4) float32, mesh-object space, mesh units.
             controls: (N, C) float32, values in the order of `info.controls`; a model without controls looks at none.
 
         Returns:
-            (N, V, 3) float32, mesh-object space, metres. The array is the network's own: the next call with as many
+            (N, V, 3) float32, mesh-object space, mesh units. The array is the network's own: the next call with as many
             poses writes into it, so that a frame needs no new memory.
 
         Raises:
             ModelError: the model fails, or values of its controls are missing.
         """
         count = len(pose_matrices)
-        if count not in self._bound:
-            if len(self._bound) >= MAX_BOUND:
-                self._bound.clear()
-            self._bound[count] = self._bind(count)
-        binding, poses, values, positions = self._bound[count]
-        poses[:] = pose_matrices
-        if values is not None:
-            values[:] = self._controls(controls, count)
-        try:
-            self._session.run_with_iobinding(binding)
-        except Exception as error:  # As above.
-            raise ModelError(f"The model '{self.path}' failed ({_first_line(error)}); train it again.") from error
-        return positions
+        if count not in self._executions:
+            if len(self._executions) >= MAX_BOUND:
+                self._executions.clear()
+            self._executions[count] = Execution(self, count)
+        execution = self._executions[count]
+        execution.poses[:] = pose_matrices
+        if self.info.controls:
+            execution.controls[:] = self._controls(controls, count)
+        return execution.run()
 
     def trust(self, pose_matrices: np.ndarray, controls: np.ndarray | None = None) -> np.ndarray | None:
         """How far the networks are believed; costs as much as the positions, so not for every frame.
@@ -136,18 +132,41 @@ class Network:
             )
         return controls
 
-    def _bind(self, count: int) -> tuple[object, np.ndarray, np.ndarray | None, np.ndarray]:
-        """The binding, and the arrays that the session reads from and writes into: poses, controls, positions."""
-        poses = np.zeros((count, len(self.info.joints), 4, 4), np.float32)
-        positions = np.empty((count, self.info.vertex_count, 3), np.float32)
-        binding = self._session.io_binding()
-        binding.bind_input(POSE_INPUT, "cpu", 0, np.float32, poses.shape, poses.ctypes.data)
-        values = None
-        if self.info.controls:
-            values = np.zeros((count, len(self.info.controls)), np.float32)
-            binding.bind_input(CONTROLS_INPUT, "cpu", 0, np.float32, values.shape, values.ctypes.data)
-        binding.bind_output(POSITIONS_OUTPUT, "cpu", 0, np.float32, positions.shape, positions.ctypes.data)
-        return binding, poses, values, positions
+
+class Execution:
+    """Executes a network with arrays of its own, so that several threads may execute one network at a time.
+
+    Attributes:
+        poses: (N, J, 4, 4) float32, to be written before `run`: pose matrices, mesh-object space, mesh units.
+        controls: (N, C) float32, likewise: values in the order of `info.controls`.
+        positions: (N, V, 3) float32, mesh-object space, mesh units: what the last `run` gave.
+    """
+
+    def __init__(self, network: Network, count: int):
+        info = network.info
+        self._path, self._session = network.path, network._session
+        self.poses = np.zeros((count, len(info.joints), 4, 4), np.float32)
+        self.controls = np.zeros((count, len(info.controls)), np.float32)
+        self.positions = np.empty((count, info.vertex_count, 3), np.float32)
+        self._binding = self._session.io_binding()
+        self._binding.bind_input(POSE_INPUT, "cpu", 0, np.float32, self.poses.shape, self.poses.ctypes.data)
+        if info.controls:
+            address = self.controls.ctypes.data
+            self._binding.bind_input(CONTROLS_INPUT, "cpu", 0, np.float32, self.controls.shape, address)
+        address = self.positions.ctypes.data
+        self._binding.bind_output(POSITIONS_OUTPUT, "cpu", 0, np.float32, self.positions.shape, address)
+
+    def run(self) -> np.ndarray:
+        """Deform the mesh; gives `positions`.
+
+        Raises:
+            ModelError: the model fails.
+        """
+        try:
+            self._session.run_with_iobinding(self._binding)
+        except Exception as error:  # As above.
+            raise ModelError(f"The model '{self._path}' failed ({_first_line(error)}); train it again.") from error
+        return self.positions
 
 
 def _first_line(error: Exception) -> str:

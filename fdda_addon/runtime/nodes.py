@@ -6,41 +6,35 @@ share one mesh datablock can still have different positions.
 """
 
 import bpy
-import numpy as np
 
+from ..rig.modifier_stack import PLAYBACK_KEY
 from ..scene.compatibility import node_input, set_node_input
-from ..scene.modifier_stack import PLAYBACK_KEY
 from ..scene.scene_rig import MODIFIER_NAME
 
 GROUP_NAME = "FDDA Playback"
-GROUP_VERSION = 1
+GROUP_VERSION = 2
 
 
 def add_modifier(mesh_object: bpy.types.Object, place: int) -> bpy.types.NodesModifier:
-    """Add the modifier at a place of the stack, with a new cache object that holds the mesh's own positions.
+    """Add the modifier at a place of the stack; it is given a cache object when it plays.
 
     A library override may have one of its library, which cannot be removed; that one serves again. So does one that is
     left from a binding that is gone: an override forgets its binding when it is saved where the add-on is missing.
     """
     modifier = find_modifier(mesh_object)
     if modifier is not None:
-        before = cache_of(modifier)
-        set_cache(modifier, new_cache(mesh_object))
-        remove_cache(before)
         if not is_inherited(modifier):
             now = mesh_object.modifiers.find(modifier.name)
             mesh_object.modifiers.move(now, place - (now < place))
         return modifier
-    group = _node_group()
     modifier = mesh_object.modifiers.new(MODIFIER_NAME, "NODES")
-    modifier.node_group = group
-    modifier.show_render = False
+    modifier.node_group = _node_group()
+    modifier.show_viewport = modifier.show_render = False
     modifier.show_in_editmode = True
     modifier.show_on_cage = False
     modifier.show_expanded = False
     # Not the last where another modifier is pinned to the end.
     mesh_object.modifiers.move(mesh_object.modifiers.find(modifier.name), place)
-    set_node_input(modifier, _cache_socket(group), new_cache(mesh_object))
     return modifier
 
 
@@ -59,21 +53,6 @@ def is_inherited(modifier: bpy.types.NodesModifier) -> bool:
     return modifier.id_data.override_library is not None and modifier.is_override_data
 
 
-def new_cache(mesh_object: bpy.types.Object) -> bpy.types.Object:
-    """A cache object with the vertices of a mesh; it is in no scene."""
-    name = f"{mesh_object.name} {MODIFIER_NAME} positions"
-    mesh = bpy.data.meshes.new(name)
-    mesh.vertices.add(len(mesh_object.data.vertices))
-    positions = np.empty(len(mesh.vertices) * 3, np.float32)
-    mesh_object.data.vertices.foreach_get("co", positions)
-    mesh.vertices.foreach_set("co", positions)
-    cache = bpy.data.objects.new(name, mesh)
-    if mesh_object.library is not None:
-        # Saved, it would stay behind in the file: that a linked object uses it is not saved.
-        mesh.is_runtime_data = cache.is_runtime_data = True
-    return cache
-
-
 def cache_of(modifier: bpy.types.NodesModifier) -> bpy.types.Object | None:
     """The cache object of a modifier."""
     return node_input(modifier, _cache_socket(modifier.node_group))
@@ -86,20 +65,10 @@ def set_cache(modifier: bpy.types.NodesModifier, cache: bpy.types.Object | None)
     modifier.node_group = modifier.node_group
 
 
-def write_cache(cache: bpy.types.Object, positions: np.ndarray) -> None:
-    """Give a cache object positions, (V, 3) float32, and have everything that reads it evaluated again."""
-    # Through the attribute: `vertices.foreach_set` is some hundred times slower.
-    cache.data.attributes["position"].data.foreach_set("vector", positions.reshape(-1))
-    cache.data.update_tag()
-
-
-def remove_cache(cache: bpy.types.Object | None) -> None:
-    """Delete a cache object and its mesh, unless something else uses them."""
-    if cache is not None and cache.users == 0 and cache.library is None:
-        mesh = cache.data
-        bpy.data.objects.remove(cache)
-        if mesh.users == 0:
-            bpy.data.meshes.remove(mesh)
+def used_caches() -> set[bpy.types.Object]:
+    """The cache objects that modifiers read."""
+    modifiers = (m for o in bpy.data.objects if o.type == "MESH" for m in o.modifiers if plays(m))
+    return {cache for modifier in modifiers if (cache := cache_of(modifier)) is not None}
 
 
 def _cache_socket(group: bpy.types.NodeTree) -> str:
@@ -109,8 +78,20 @@ def _cache_socket(group: bpy.types.NodeTree) -> str:
     raise KeyError(f"the node group '{group.name}' has no input for the positions")
 
 
+def update_group(modifier: bpy.types.NodesModifier) -> None:
+    """Give a modifier of this file the node group of this version; an older one goes with its last user."""
+    group = modifier.node_group
+    if group.library is None and group[PLAYBACK_KEY] != GROUP_VERSION:
+        modifier.node_group = _node_group()
+        if group.users == 0:
+            bpy.data.node_groups.remove(group)
+
+
 def _node_group() -> bpy.types.NodeTree:
-    """Object Info → Sample Index → Set Position; one group serves all bindings of a file."""
+    """Object Info → Sample Index → Set Position; one group serves all bindings of a file.
+
+    Where the cache object is missing or has another number of vertices, the mesh stays as it is.
+    """
     for group in bpy.data.node_groups:
         if group.get(PLAYBACK_KEY) == GROUP_VERSION and group.library is None:
             return group
@@ -132,8 +113,12 @@ def _node_group() -> bpy.types.NodeTree:
     position = node("GeometryNodeInputPosition", 1, 2)
     index = node("GeometryNodeInputIndex", 1, 3)
     sample = node("GeometryNodeSampleIndex", 2, 1, data_type="FLOAT_VECTOR", domain="POINT")
+    own, cached = (node("GeometryNodeAttributeDomainSize", 2, row) for row in (2, 3))
     set_position = node("GeometryNodeSetPosition", 3, 0)
-    outputs = node("NodeGroupOutput", 4, 0)
+    equal = node("FunctionNodeCompare", 3, 2, data_type="INT", operation="EQUAL")
+    first, second = (socket for socket in equal.inputs if socket.type == "INT")
+    switch = node("GeometryNodeSwitch", 4, 0, input_type="GEOMETRY")
+    outputs = node("NodeGroupOutput", 5, 0)
     for source, target in (
         (inputs.outputs["Geometry"], set_position.inputs["Geometry"]),
         (inputs.outputs["Positions"], info.inputs["Object"]),
@@ -141,7 +126,14 @@ def _node_group() -> bpy.types.NodeTree:
         (position.outputs["Position"], sample.inputs["Value"]),
         (index.outputs["Index"], sample.inputs["Index"]),
         (sample.outputs["Value"], set_position.inputs["Position"]),
-        (set_position.outputs["Geometry"], outputs.inputs["Geometry"]),
+        (inputs.outputs["Geometry"], own.inputs["Geometry"]),
+        (info.outputs["Geometry"], cached.inputs["Geometry"]),
+        (own.outputs["Point Count"], first),
+        (cached.outputs["Point Count"], second),
+        (equal.outputs["Result"], switch.inputs["Switch"]),
+        (inputs.outputs["Geometry"], switch.inputs["False"]),
+        (set_position.outputs["Geometry"], switch.inputs["True"]),
+        (switch.outputs["Output"], outputs.inputs["Geometry"]),
     ):
         group.links.new(source, target)
     return group

@@ -15,7 +15,7 @@ from ..core.model import MAX_BYTES, check_model
 from .network import Network
 
 KEY = "fdda_model"
-MOST_BYTES = (1 << 31) - 1
+MAX_PROPERTY_BYTES = (1 << 31) - 1
 """A custom property holds no more."""
 
 _networks: dict[int, Network] = {}
@@ -32,7 +32,7 @@ def pack(name: str, data: bytes) -> bpy.types.Text:
         ModelError: it is no model, or too large.
     """
     check_model(data, name)
-    if len(data) > min(MAX_BYTES, MOST_BYTES):
+    if len(data) > min(MAX_BYTES, MAX_PROPERTY_BYTES):
         raise ModelError(f"'{name}' is larger than 2 GB and cannot be packed; leave it beside the file.")
     text = bpy.data.texts.new(name)
     text.use_fake_user = False
@@ -61,11 +61,15 @@ def load(text: bpy.types.Text) -> Network:
     """
     if text.session_uid not in _networks:
         network = Network(Path(text.name), read(text))
-        alive = {other.session_uid for other in bpy.data.texts}
-        for uid in _networks.keys() - alive:
-            del _networks[uid]
+        release_unused({other.session_uid for other in bpy.data.texts})
         _networks[text.session_uid] = network
     return _networks[text.session_uid]
+
+
+def release_unused(used: set[int]) -> None:
+    """Let go of the networks of all texts but those of some session ids."""
+    for uid in _networks.keys() - used:
+        del _networks[uid]
 
 
 def remove_unused() -> None:

@@ -3,12 +3,12 @@
 
 import bpy
 
-from ..scene.modifier_stack import deforming_modifiers
+from ..rig.modifier_stack import deforming_modifiers
 from . import nodes
 
 
-def switch_modifiers(mesh_object: bpy.types.Object) -> None:
-    """Bring the modifiers of a bound object in line with its mode.
+def switch_modifiers(mesh_object: bpy.types.Object, playing: bool | None = None) -> None:
+    """Bring the modifiers of a bound object in line with its mode, or let its model play or not, whatever the mode.
 
     While a model plays, the modifiers of the rig are off in the viewport, and in renders when the user asked for it;
     how they were is kept in the object's properties and comes back with mode RIG.
@@ -19,7 +19,8 @@ def switch_modifiers(mesh_object: bpy.types.Object) -> None:
         binding.status = "The FDDA modifier was removed; bind the model again."
         binding.mode = "RIG"
         return
-    playing = binding.mode != "RIG"
+    if playing is None:
+        playing = binding.mode != "RIG"
     if playing and not binding.is_playing:
         _store(mesh_object)
     elif not playing and binding.is_playing:
@@ -32,7 +33,6 @@ def switch_modifiers(mesh_object: bpy.types.Object) -> None:
         for saved, rig_modifier in _saved_modifiers(mesh_object):
             rig_modifier.show_viewport = False
             rig_modifier.show_render = saved.show_render and not binding.use_in_render
-        pin_shape_keys(mesh_object, True)
 
 
 def give_back(mesh_object: bpy.types.Object) -> None:
@@ -44,21 +44,15 @@ def give_back(mesh_object: bpy.types.Object) -> None:
         modifier.show_viewport = modifier.show_render = False
 
 
-def pin_shape_keys(mesh_object: bpy.types.Object, pinned: bool) -> None:
-    """Show the reference key alone, or what was shown before.
-
-    Blender evaluates shape keys before the first modifier, also when nothing reads the result; a pinned reference key
-    is merely copied.
-    """
-    keys, binding = mesh_object.data.shape_keys, mesh_object.fdda
-    if keys is None:
-        return
-    if pinned:
-        mesh_object.active_shape_key_index = keys.key_blocks.find(keys.reference_key.name)
-        mesh_object.show_only_shape_key = True
-    else:
-        mesh_object.active_shape_key_index = binding.active_shape_key_index
-        mesh_object.show_only_shape_key = binding.show_only_shape_key
+def unpin_shape_keys(mesh_object: bpy.types.Object) -> None:
+    """Show the shape keys that an older version of the add-on hid while it played, in a file that was saved so."""
+    binding = mesh_object.fdda
+    if binding.is_property_set("active_shape_key_index"):
+        if binding.is_playing and mesh_object.data.shape_keys is not None:
+            mesh_object.show_only_shape_key = binding.show_only_shape_key
+            mesh_object.active_shape_key_index = binding.active_shape_key_index
+        for name in ("active_shape_key_index", "show_only_shape_key"):
+            binding.property_unset(name)
 
 
 def _store(mesh_object: bpy.types.Object) -> None:
@@ -68,17 +62,17 @@ def _store(mesh_object: bpy.types.Object) -> None:
         saved = binding.modifiers.add()
         saved.uid = modifier.persistent_uid
         saved.show_viewport, saved.show_render = modifier.show_viewport, modifier.show_render
-    binding.show_only_shape_key = mesh_object.show_only_shape_key
-    binding.active_shape_key_index = mesh_object.active_shape_key_index
     binding.is_playing = True
 
 
 def _restore(mesh_object: bpy.types.Object) -> None:
     for saved, modifier in _saved_modifiers(mesh_object):
         modifier.show_viewport, modifier.show_render = saved.show_viewport, saved.show_render
-    pin_shape_keys(mesh_object, False)
     mesh_object.fdda.modifiers.clear()
     mesh_object.fdda.is_playing = False
+    if mesh_object.data.shape_keys is not None:
+        # The playback has muted the evaluated ones.
+        mesh_object.data.shape_keys.update_tag()
 
 
 def _saved_modifiers(mesh_object: bpy.types.Object) -> list[tuple]:

@@ -7,15 +7,20 @@ from mathutils import Euler
 
 from ..core.poses import CONTROL, LOCATION, ROTATION, SCALE, Channel
 from ..core.rig import UNMOVED
+from .arrays import POSE_CHANNELS, POSE_MATRIX, Reader, write
 from .controls import set_control
 from .scene_rig import SceneRig
 
 
 def rest_matrices(armature: bpy.types.Armature, names: tuple[str, ...]) -> np.ndarray:
-    """Rest matrices of bones, (J, 4, 4) float64, armature space, metres; the identity for the unmoved joint."""
+    """Rest matrices of bones, (J, 4, 4) float64, armature space, its units; the identity for the unmoved joint."""
     identity = np.eye(4)
     matrices = [identity if name == UNMOVED else armature.bones[name].matrix_local for name in names]
     return np.array(matrices, np.float64).reshape(-1, 4, 4)
+
+
+_REST_POSE = ((0, 0, 0), (0, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0), (1, 1, 1))
+"""Values of `POSE_CHANNELS`."""
 
 
 class PoseMatrices:
@@ -34,18 +39,18 @@ class PoseMatrices:
         self._order = slice(0, len(order)) if in_a_row else order
         self._matrices = np.empty((self._count + 1, 4, 4), np.float32)
         self._matrices[-1] = np.eye(4)
-        self._of_bones = self._matrices[:-1].reshape(-1)
+        self._of_bones = Reader(POSE_MATRIX, self._matrices[:-1])
 
     def fits(self, armature_object: bpy.types.Object) -> bool:
         """Whether the armature still has as many bones."""
         return len(armature_object.pose.bones) == self._count
 
     def read(self, armature_object: bpy.types.Object) -> np.ndarray:
-        """Pose matrices of an evaluated armature object, (J, 4, 4) float32, armature space, metres.
+        """Pose matrices of an evaluated armature object, (J, 4, 4) float32, armature space, its units.
 
         A view of memory that the next call writes into. Bones must not have come or gone (`fits`).
         """
-        armature_object.pose.bones.foreach_get("matrix", self._of_bones)
+        self._of_bones.read(armature_object.pose.bones)
         # Blender keeps matrices column by column.
         return self._matrices[self._order].transpose(0, 2, 1)
 
@@ -53,12 +58,8 @@ class PoseMatrices:
 def clear_pose(armature_object: bpy.types.Object) -> None:
     """Bring every bone to its rest pose."""
     bones = armature_object.pose.bones
-    count = len(bones)
-    bones.foreach_set("location", np.zeros(count * 3, np.float32))
-    bones.foreach_set("rotation_euler", np.zeros(count * 3, np.float32))
-    bones.foreach_set("rotation_quaternion", np.tile(np.float32([1, 0, 0, 0]), count))
-    bones.foreach_set("rotation_axis_angle", np.tile(np.float32([0, 0, 1, 0]), count))
-    bones.foreach_set("scale", np.ones(count * 3, np.float32))
+    for channel, values in zip(POSE_CHANNELS, _REST_POSE, strict=True):
+        write(bones, channel, np.tile(np.float32(values), (len(bones), 1)))
     armature_object.update_tag(refresh={"DATA"})
 
 
@@ -69,7 +70,7 @@ class Poser:
         self._scene_rig = scene_rig
         self._places: dict[str, dict[str, list[tuple[int, int]]]] = {}
         for place, channel in enumerate(channels):
-            self._places.setdefault(channel.kind, {}).setdefault(channel.bone, []).append((place, channel.axis))
+            self._places.setdefault(channel.kind, {}).setdefault(channel.name, []).append((place, channel.axis))
 
     def set(self, values: np.ndarray) -> None:
         """Pose the rig: (C,) values in the order of the channels, each in its unit. The graph is not evaluated."""

@@ -23,6 +23,8 @@ def save_copy(path: Path) -> None:
     """
     check_writable(path)
     with replacing(path) as temporary:
+        # Blender keeps a second copy of a file that it saves over.
+        temporary.unlink()
         try:
             with quiet():
                 bpy.ops.wm.save_as_mainfile(

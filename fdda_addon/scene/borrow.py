@@ -5,18 +5,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 
 import bpy
-import numpy as np
 
+from .arrays import POSE_CHANNELS, read, write
 from .compatibility import animation_curves, slot_of
-
-POSE_CHANNELS = {
-    "location": 3,
-    "rotation_euler": 3,
-    "rotation_quaternion": 4,
-    "rotation_axis_angle": 4,
-    "scale": 3,
-}
-"""Channels of a bone and how many numbers each has."""
 
 
 @contextmanager
@@ -36,9 +27,7 @@ def borrowed_pose(
     scene = bpy.context.scene
     bones = armature_object.pose.bones
     frame, subframe = scene.frame_current, scene.frame_subframe
-    pose = {name: np.empty(len(bones) * size, np.float32) for name, size in POSE_CHANNELS.items()}
-    for name, values in pose.items():
-        bones.foreach_get(name, values)
+    pose = {channel: read(bones, channel) for channel in POSE_CHANNELS}
     animation = armature_object.animation_data
     own = driving_actions(animation) if keep_animation and animation is not None else ()
     animated = animated_values(armature_object, [*actions, *own])
@@ -64,8 +53,8 @@ def borrowed_pose(
         scene.frame_set(frame, subframe=subframe)
         for path, value in animated.items():
             set_value(armature_object, path, value)
-        for name, values in pose.items():
-            bones.foreach_set(name, values)
+        for channel, values in pose.items():
+            write(bones, channel, values)
         armature_object.update_tag(refresh={"DATA"})
         bpy.context.view_layer.update()
 

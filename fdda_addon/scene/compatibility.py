@@ -3,9 +3,6 @@
 
 import bpy
 
-BLEND_RELATIVE_PATH = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
-"""Option of a path property that may begin with `//`; older versions take such paths without being told."""
-
 
 def animation_curves(action: bpy.types.Action) -> list[bpy.types.FCurve]:
     """All F-curves of an action, of all its slots (4.4 and later have layers and slots)."""
@@ -62,4 +59,22 @@ def node_input(modifier: bpy.types.NodesModifier, identifier: str) -> object:
 
 def is_selected(bone: bpy.types.PoseBone) -> bool:
     """Whether a bone is selected (5.0 and later keep that with the pose)."""
-    return bone.select if hasattr(bone, "select") else bone.bone.select
+    return selection_owner(bone).select
+
+
+def select_bone(bone: bpy.types.PoseBone, selected: bool) -> None:
+    """Select a bone, or not."""
+    selection_owner(bone).select = selected
+
+
+def selection_owner(bone: bpy.types.PoseBone) -> "bpy.types.PoseBone | bpy.types.Bone":
+    """What has the property `select` of a bone."""
+    return bone if hasattr(bone, "select") else bone.bone
+
+
+def is_bone_hidden(bone: bpy.types.PoseBone) -> bool:
+    """Whether a bone is hidden in pose mode, by itself or with its collections (5.0 and later: by its pose)."""
+    return (bone.hide if hasattr(bone, "hide") else bone.bone.hide) or (
+        not any(collection.is_visible_effectively for collection in bone.bone.collections)
+        and bool(bone.bone.collections)
+    )

@@ -2,7 +2,7 @@
 """Controls in and out: which numbers there are, their ranges, their values."""
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 import bpy
@@ -206,14 +206,14 @@ class ControlReader:
 
         A control that is gone reads as 0.
         """
+        owners = [owner_of(scene_rig, control.owner) for control in self._controls]
+        return self.values([owner and owner.evaluated_get(depsgraph) for owner in owners])
+
+    def values(self, owners: Sequence[bpy.types.ID | None]) -> np.ndarray:
+        """As `read`, of the evaluated owner of each control."""
         values = np.zeros(len(self._controls), np.float32)
-        evaluated: dict[str, bpy.types.ID] = {}
-        for place, control in enumerate(self._controls):
-            if control.owner not in evaluated:
-                datablock = owner_of(scene_rig, control.owner)
-                evaluated[control.owner] = datablock and datablock.evaluated_get(depsgraph)
-            datablock = evaluated[control.owner]
-            values[place] = (datablock and _value(datablock, control.path)) or 0.0
+        for place, (owner, control) in enumerate(zip(owners, self._controls, strict=True)):
+            values[place] = (owner and _value(owner, control.path)) or 0.0
         return values
 
 

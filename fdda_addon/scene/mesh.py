@@ -5,18 +5,17 @@ import bpy
 import numpy as np
 
 from ..core.errors import RigError
+from .arrays import COORDINATE, LOOP_START, VECTOR, VERTEX_INDEX, read, write
 
 
 def rest_positions(mesh: bpy.types.Mesh) -> np.ndarray:
     """Positions before anything deforms the mesh: the reference shape key where there are keys.
 
     Returns:
-        (V, 3) float32, mesh-object space, metres.
+        (V, 3) float32, mesh-object space, mesh units.
     """
     source = mesh.shape_keys.reference_key.data if mesh.shape_keys else mesh.vertices
-    positions = np.empty((len(mesh.vertices), 3), np.float32)
-    source.foreach_get("co", positions.reshape(-1))
-    return positions
+    return read(source, COORDINATE)
 
 
 def topology(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray]:
@@ -26,18 +25,14 @@ def topology(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray]:
         loop_starts: (F,) int32, where each face starts in `loop_vertices`.
         loop_vertices: (L,) int32, vertex indices, face by face.
     """
-    loop_starts = np.empty(len(mesh.polygons), np.int32)
-    mesh.polygons.foreach_get("loop_start", loop_starts)
-    loop_vertices = np.empty(len(mesh.loops), np.int32)
-    mesh.loops.foreach_get("vertex_index", loop_vertices)
-    return loop_starts, loop_vertices
+    return read(mesh.polygons, LOOP_START), read(mesh.loops, VERTEX_INDEX)
 
 
 def evaluated_positions(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
     """What the dependency graph evaluates the mesh to.
 
     Returns:
-        (V, 3) float32, mesh-object space, metres.
+        (V, 3) float32, mesh-object space, mesh units.
 
     Raises:
         RigError: it has other vertices than the mesh object's own mesh.
@@ -48,6 +43,15 @@ def evaluated_positions(mesh_object: bpy.types.Object, depsgraph: bpy.types.Deps
             f"In some pose the modifiers of '{mesh_object.name}' turn {count} vertices into {len(mesh.vertices)}; look "
             "for Geometry Nodes that make or remove vertices depending on the pose, and switch them off."
         )
-    positions = np.empty((len(mesh.vertices), 3), np.float32)
-    mesh.attributes["position"].data.foreach_get("vector", positions.reshape(-1))
-    return positions
+    return mesh_positions(mesh)
+
+
+def mesh_positions(mesh: bpy.types.Mesh) -> np.ndarray:
+    """Positions of the vertices of a mesh, original or evaluated: (V, 3) float32, its object's space, metres."""
+    # Through the attribute: reading or writing the vertices themselves is some hundred times slower.
+    return read(mesh.attributes["position"].data, VECTOR)
+
+
+def set_mesh_positions(mesh: bpy.types.Mesh, positions: np.ndarray) -> None:
+    """Move the vertices of a mesh: (V, 3) float32, its object's space, metres. Nothing is tagged."""
+    write(mesh.attributes["position"].data, VECTOR, positions)

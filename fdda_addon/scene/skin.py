@@ -17,7 +17,7 @@ from .mesh import rest_positions
 
 MIN_INFLUENCES = 4
 """Skin weights have at least this many places a vertex (docs/recording.md)."""
-LEAST_SUM = 1e-4
+MIN_SUM = 1e-4
 """A vertex whose weights sum to less is not moved by the modifier."""
 
 
@@ -78,7 +78,7 @@ def read_skin(
             entries = entries.joined(_of_envelopes(mesh_object, armature_object, bones, np.flatnonzero(~grouped)))
     kept = _moved_parts(mesh_object, modifier, count)
     sums = np.bincount(entries.vertices, entries.weights, count)
-    kept[sums <= LEAST_SUM] = 0
+    kept[sums <= MIN_SUM] = 0
     entries = entries.chosen((entries.weights > 0) & (kept[entries.vertices] > 0))
     weights = (
         entries.weights / np.bincount(entries.vertices, entries.weights, count).astype(np.float32)[entries.vertices]
@@ -170,7 +170,7 @@ def _envelope(bone: bpy.types.Bone, points: np.ndarray) -> np.ndarray:
 
     Args:
         bone: the bone.
-        points: (n, 3) float64, armature space, metres.
+        points: (n, 3) float64, armature space, its units.
 
     Returns:
         (n,) float64, 0 to 1.
@@ -185,7 +185,7 @@ def _envelope(bone: bpy.types.Bone, points: np.ndarray) -> np.ndarray:
 
 
 def _rest_points(mesh_object: bpy.types.Object, armature_object: bpy.types.Object, vertices: np.ndarray) -> np.ndarray:
-    """(n, 3) float64 rest positions of some vertices in armature space, metres."""
+    """(n, 3) float64 rest positions of some vertices in armature space, its units."""
     to_armature = np.array(armature_object.matrix_world.inverted_safe() @ mesh_object.matrix_world, np.float64)
     points = rest_positions(mesh_object.data)[vertices].astype(np.float64)
     return points @ to_armature[:3, :3].T + to_armature[:3, 3]

@@ -1,0 +1,25 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""`merge-recordings SHARD… RECORDING`: what `record --shard` made, joined; Blender is not needed for it."""
+
+import argparse
+import time
+from pathlib import Path
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "shards", metavar="SHARD", type=Path, nargs="+", help="folders that record --shard made, in any order"
+    )
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording that they make")
+
+
+def run(options: argparse.Namespace) -> None:
+    from ..core.recording.merge import merge_recordings
+    from .progress import ProgressPrinter
+
+    start = time.monotonic()
+    with ProgressPrinter() as progress:
+        for step in merge_recordings(options.shards, options.recording):
+            progress.show(step.stage, step.done, step.total)
+    seconds = time.monotonic() - start
+    print(f"{options.recording}: {step.total} poses of {len(options.shards)} shards in {seconds:.1f} s")

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Whether poses of a recording repeat one another, contradict one another, or collapse joints."""
+
+import hashlib
+
+import numpy as np
+
+from ..recording.index import ACTION, MIRRORED, STRIP
+from ..recording.reader import Recording
+from ..skinning import skin_matrices
+from .warning import RecordingWarning, counted, length
+
+_ANIMATED = {ACTION: "the action", STRIP: "the strip", MIRRORED: "the mirrored"}
+"""How the frames of animation are called."""
+SAME = 1e-5
+"""Poses whose elements (metres, no unit, or those of a control) round to the same multiple of this are the same."""
+MAX_REPEATED = 0.05
+"""Part of the poses that may repeat others: the last frame of a loop is its first."""
+MAX_COMPARED = 200
+"""The largest number of pairs of equal poses that are compared."""
+CONTRADICTION = 1e-4
+"""Residuals of equal poses that differ by more than this part of the character's size contradict each other."""
+MIN_VOLUME, LARGEST_VOLUME = 1e-3, 1e3
+"""Factors by which a joint may change volumes."""
+BATCH = 100
+
+
+def check_poses(recording: Recording) -> list[RecordingWarning]:
+    """Warnings "duplicate-poses", "hidden-inputs" and "degenerate-poses"."""
+    pairs = repeated_poses(recording)
+    return [*_check_repeated(recording, pairs), *_check_contradictions(recording, pairs), *_check_collapsed(recording)]
+
+
+def repeated_poses(recording: Recording) -> np.ndarray:
+    """(n, 2) int64: poses that have the same joints and controls as an earlier one, and that earlier one."""
+    first: dict[bytes, int] = {}
+    pairs = []
+    for start in range(0, len(recording.pose_matrices), BATCH):
+        part = slice(start, start + BATCH)
+        matrices, controls = np.array(recording.pose_matrices[part], np.float64), recording.controls[part]
+        matrices[..., :3, 3] *= recording.rig.metres_per_unit
+        rows = np.concatenate([matrices.reshape(len(matrices), -1), controls], axis=1)
+        for pose, row in enumerate(np.round(rows / SAME).astype(np.int64), start):
+            earlier = first.setdefault(hashlib.sha256(row.tobytes()).digest(), pose)
+            if earlier != pose:
+                pairs.append((pose, earlier))
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+def _check_repeated(recording: Recording, pairs: np.ndarray) -> list[RecordingWarning]:
+    count = len(recording.pose_matrices)
+    if len(pairs) <= MAX_REPEATED * count:
+        return []
+    text = (
+        f"{len(pairs)} of {count} poses repeat an earlier one, such as pose {pairs[0, 0]} pose {pairs[0, 1]}"
+        f"{_sources(recording, pairs[:, 0])}: they count twice in the training, and make the held-out error too good; "
+        "record actions without holds, once each, or more random poses."
+    )
+    return [RecordingWarning("duplicate-poses", text)]
+
+
+def _sources(recording: Recording, poses: np.ndarray) -> str:
+    """Which actions some poses are of: ", 30 of them of the action 'idle'"; empty when they are of none."""
+    sources = recording.info.sampling.sources
+    of_pose = np.searchsorted(np.cumsum([source.poses for source in sources]), poses, side="right")
+    counts = np.bincount(of_pose, minlength=len(sources))
+    parts = [
+        f"{count} of them of {_ANIMATED[source.kind]} '{source.name}'"
+        for count, source in zip(counts, sources, strict=True)
+        if count and source.kind in _ANIMATED
+    ]
+    return "".join(f", {part}" for part in parts[:2])
+
+
+def _check_contradictions(recording: Recording, pairs: np.ndarray) -> list[RecordingWarning]:
+    tolerance, worst, found = CONTRADICTION * recording.rig.size, (0.0, 0, 0), 0
+    for pose, earlier in pairs[:: max(1, len(pairs) // MAX_COMPARED)].tolist():
+        apart = np.asarray(recording.residuals[pose]) - recording.residuals[earlier]
+        farthest = float(np.sqrt(np.einsum("vc,vc->v", apart, apart).max(initial=0)))
+        found += farthest > tolerance
+        worst = max(worst, (farthest, pose, earlier))
+    if not found:
+        return []
+    text = (
+        f"Poses {worst[2]} and {worst[1]} have the same joints and controls and yet vertices lie up to "
+        f"{length(recording.rig, worst[0])} apart: something else moves the mesh, a property without a control, the "
+        "frame or a simulation; list it as a control, or switch it off, and record again."
+    )
+    return [RecordingWarning("hidden-inputs", text)]
+
+
+def _check_collapsed(recording: Recording) -> list[RecordingWarning]:
+    rig = recording.rig
+    used = np.unique(np.concatenate([rig.skin_joints[rig.skin_weights > 0], [p.joint for p in recording.partitions]]))
+    bad_poses, worst = [], np.ones(len(used))
+    for start in range(0, len(recording.pose_matrices), BATCH):
+        matrices = np.asarray(recording.pose_matrices[start : start + BATCH])[:, used]
+        skin = skin_matrices(matrices, rig.rest_matrices[used])
+        volumes = np.linalg.det(skin[:, :, :3, :3].astype(np.float64))
+        bad = (volumes < MIN_VOLUME) | (volumes > LARGEST_VOLUME)
+        bad_poses += (start + np.flatnonzero(bad.any(axis=1))).tolist()
+        distance = np.abs(np.log10(np.maximum(volumes, 1e-30)))
+        extreme = np.take_along_axis(volumes, distance.argmax(axis=0)[None], axis=0)[0]
+        worst = np.where(bad.any(axis=0) & (worst == 1), extreme, worst)
+    if not bad_poses:
+        return []
+    joints = np.flatnonzero(worst != 1)
+    names = [rig.joints[used[i]].name for i in joints]
+    text = (
+        f"{counted(names, 'joint')} {'has' if len(names) == 1 else 'have'} a scale near zero, huge or negative in "
+        f"{counted(bad_poses, 'pose')}, volumes by a factor of {worst[joints[0]]:.2g}: look for a constraint or driver "
+        "that sets it, limit it and record again."
+    )
+    return [RecordingWarning("degenerate-poses", text[0].upper() + text[1:])]

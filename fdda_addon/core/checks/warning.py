@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A warning about a recording, and the words that such sentences share."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+from ..errors import RecordingError
+from ..messages import WARNING_LINE
+from ..rig import UNMOVED_LABEL, Rig
+
+MAX_LISTED = 3
+
+
+@dataclass(frozen=True)
+class RecordingWarning:
+    """Something about a recording that makes a bad model likely.
+
+    Attributes:
+        name: which kind, the heading in docs/checks.md.
+        text: one sentence for the user: what was found, with names and numbers, and what to do.
+    """
+
+    name: str
+    text: str
+
+    def __str__(self) -> str:
+        return WARNING_LINE.format(name=self.name, text=self.text)
+
+    def to_json(self) -> dict:
+        return asdict(self)
+
+
+def refuse(warnings: Sequence[RecordingWarning]) -> None:
+    """Make an error of warnings: the sentence of the first, with its name and those of the others.
+
+    Raises:
+        RecordingError: there are some.
+    """
+    if not warnings:
+        return
+    others = [warning.name for warning in warnings[1:]]
+    more = f"; {len(others)} more: {', '.join(others)}" if others else ""
+    raise RecordingError(f"{warnings[0].text.removesuffix('.')} ({warnings[0].name}{more}).")
+
+
+def listed(names: Sequence[object], most: int = MAX_LISTED) -> str:
+    """The first of some names or numbers: "'a', 'b', 'c' and 4 more"; texts are quoted."""
+    shown = [f"'{name}'" if isinstance(name, str) else str(name) for name in names[:most]]
+    if len(names) > most:
+        return f"{', '.join(shown)} and {len(names) - most} more"
+    return f"{', '.join(shown[:-1])} and {shown[-1]}" if len(shown) > 1 else "".join(shown)
+
+
+def counted(names: Sequence[object], noun: str, plural: str = "") -> str:
+    """How many and which: "the joint 'a'", "the 7 joints 'a', 'b', 'c' and 4 more"."""
+    if len(names) == 1:
+        return f"the {noun} {listed(names)}"
+    return f"the {len(names)} {plural or noun + 's'} {listed(names)}"
+
+
+def joint_name(rig: Rig, joint: int) -> str:
+    """Name of a joint for people, also of the one that never moves."""
+    return rig.joints[joint].name or UNMOVED_LABEL
+
+
+def length(rig: Rig, units: float) -> str:
+    """A length in the space of a rig for people: "0.04 mm", "87 mm", "1.2 m"."""
+    metres = units * rig.metres_per_unit
+    if metres < 1:
+        return f"{metres * 1000:.2g} mm" if metres < 0.1 else f"{metres * 1000:.0f} mm"
+    return f"{metres:.3g} m"

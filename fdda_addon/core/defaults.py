@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Settings that hold where nobody states others: the same in the sidebar, on the command line, in the trainer and in
+scripts. What only one of them has stands there.
+"""
+
+POSES = 1000
+"""Random poses of a recording."""
+SPREAD = 1.0
+"""Standard deviation of random poses, as a part of half the range."""
+INFLUENCE_POSES = 10
+"""How often each joint is moved alone to find the partitions that it influences."""
+MIN_VERTICES = 8
+"""Partitions of fewer vertices are merged into others."""
+REFINEMENT_POSES = 250
+"""Poses that are added where a model is worst."""
+
+TOLERANCE_MM = 0.05
+"""What the basis shapes of a partition may leave."""
+EPOCHS = 200
+TARGET_MM = 0.0
+"""What 99.9 % of the held-out vertices are to be within; 0 for no target."""
+
+EVALUATION_POSES, SIDEBAR_EVALUATION_POSES = 200, 100
+"""Random poses that a model is compared on; fewer where a user waits for them."""
+EVALUATION_SEED = 1
+"""Of these poses: not that of a recording."""
+MARKERS = 5
+"""So many of the worst frames are marked."""

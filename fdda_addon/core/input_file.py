@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Opening files that come from elsewhere: ordinary ones only, so that none blocks, never ends, or leads away."""
+
+import errno
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+NOT_ORDINARY = "it is no ordinary file"
+LINK = "it is a link to another place"
+# A pipe that took the place of the file meanwhile must not block. Windows has neither flag, nor pipes in folders.
+_FLAGS = getattr(os, "O_NONBLOCK", 0)
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+
+
+def open_input(path: Path, mode: str = "rb", follow: bool = True) -> BinaryIO:
+    """Open an ordinary file.
+
+    Args:
+        path: the file.
+        mode: of `open`; "x+b" makes a new file where nothing is.
+        follow: whether the path itself may be a symbolic link; not inside of folders that come from elsewhere.
+
+    Raises:
+        OSError: it cannot be opened, or is a pipe, a device, a folder or, unless `follow`, a link; `strerror` says so.
+    """
+    if "x" not in mode:
+        _check(os.stat(path, follow_symlinks=follow), path)
+    flags = _FLAGS | (0 if follow else _NO_LINK)
+    file = open(path, mode, opener=lambda name, own: os.open(name, own | flags))  # noqa: SIM115 - the caller closes it
+    try:
+        _check(os.fstat(file.fileno()), path)
+    except OSError:
+        file.close()
+        raise
+    return file
+
+
+def read_input(path: Path, most: int, follow: bool = True) -> bytes:
+    """The bytes of an ordinary file; all else as `open_input`.
+
+    Raises:
+        OSError: as `open_input`, or it has more than `most` bytes.
+    """
+    with open_input(path, follow=follow) as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"it is larger than {most >> 20} MB")
+    return data
+
+
+def _check(status: os.stat_result, path: Path) -> None:
+    if stat.S_ISLNK(status.st_mode):
+        raise OSError(errno.ELOOP, LINK, str(path))
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, NOT_ORDINARY, str(path))

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Whether the graph of a model is one that `train` writes, of a size that its metadata explains.
+
+What a graph may cost to load and to run is bounded before any runtime sees it. The bounds leave room for other ways to
+write the same deformation: they are several times what the largest of those costs that are known.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from .features import FEATURES_PER_JOINT
+from .onnx_file import ITEM_BYTES, OnnxContents
+from .onnx_work import Shape, Work, measure_work
+
+WHAT_COUNTS = {3: "joints", 1: "controls"}
+"""What the first number of an input's shape counts, by how many there are."""
+ROOM = 8
+"""How many times what is explained is allowed."""
+SMALL = 1 << 16
+"""Elements that need no explanation."""
+MAX_NODES = 20_000
+NODES, NODES_PER_PARTITION = 256, 32
+SEVERAL = 32
+"""Poses for which the work is measured too: more poses may not cost more than so many times one."""
+DEFAULT_HIDDEN = [128, 128]
+MAX_HIDDEN = 16
+MAX_UNITS = 1 << 16
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What the metadata of a model explains, elements for one pose.
+
+    Attributes:
+        values: of the values of all nodes.
+        constants: of the constants.
+    """
+
+    values: int
+    constants: int
+
+
+def explain(joints: int, controls: int, partitions: Sequence[tuple[int, int, int]], training: dict) -> Explained:
+    """What there is to compute and to keep for a character.
+
+    Args:
+        joints, controls: how many.
+        partitions: of each the vertices, the basis shapes, and the joints and controls that influence it.
+        training: settings of the training, as the metadata has them.
+
+    Raises:
+        ValueError: the settings are none; a clause about the model.
+    """
+    vertices, shapes, seen = map(list, zip(*partitions, strict=True))
+    # Joints as their parents see them, and as main joints see them.
+    features = 16 * joints + 3 * controls + 3 * sum(seen)
+    widths = [(FEATURES_PER_JOINT + 3) * max(seen), *_hidden(training), max(shapes)]
+    network = sum(one * other for one, other in pairwise(widths))
+    rows = 4 * (joints + sum(own + 2 * joints for own in shapes))
+    values = 3 * sum(vertices) + 4 * features + len(shapes) * (sum(widths) + 9 * max(shapes)) + 3 * rows
+    matrices = sum(own * (8 * joints + 3 * basis) for own, basis, _ in partitions)
+    constants = matrices + len(shapes) * (network + sum(widths) + 2 * features) + 4 * features
+    return Explained(values, constants)
+
+
+def _hidden(training: dict) -> list[int]:
+    """Units of the hidden layers of its networks."""
+    units = training.get("hidden", DEFAULT_HIDDEN)
+    if not isinstance(units, list) or len(units) > MAX_HIDDEN:
+        raise ValueError("its networks have hidden layers that are none")
+    if not all(type(own) is int and 0 < own <= MAX_UNITS for own in units):
+        raise ValueError("its networks have hidden layers that are none")
+    return units
+
+
+def check_ends(contents: OnnxContents, inputs: dict[str, Shape], outputs: dict[str, Shape]) -> None:
+    """Fail where a graph does not take and give what its metadata says.
+
+    Args:
+        contents: of the file.
+        inputs, outputs: their shapes without the poses; an output may be missing, but not the first.
+
+    Raises:
+        ValueError: a clause about the graph.
+    """
+    for name, shape in inputs.items():
+        if contents.inputs.get(name, ())[1:] != shape:
+            raise ValueError(f"its input '{name}' does not fit its {shape[0]} {WHAT_COUNTS[len(shape)]}")
+    positions, shape = next(iter(outputs.items()))
+    if contents.outputs.get(positions, ())[1:] != shape:
+        raise ValueError(f"its output '{positions}' does not fit its {shape[0]} vertices")
+
+
+def check_graph(contents: OnnxContents, explained: Explained, size: int, outputs: dict[str, Shape]) -> None:
+    """Fail where a graph is none that `train` writes, or costs more than its metadata explains.
+
+    Args:
+        contents: of the file.
+        explained: by its metadata.
+        size: of the file, bytes.
+        outputs: shapes that the outputs have for one pose, without the poses.
+
+    Raises:
+        ValueError: a clause about the graph.
+    """
+    if contents.oddities:
+        raise ValueError(f"it has {contents.oddities[0]}, which train does not write")
+    if explained.values > 2 * size + 16 * SMALL:
+        raise ValueError(f"its metadata tells of a character that {size} bytes cannot hold")
+    partitions = outputs.get("trust", (1,))[0]
+    if len(contents.nodes) > min(MAX_NODES, NODES + NODES_PER_PARTITION * partitions):
+        raise ValueError(f"it has {len(contents.nodes)} nodes, more than its {partitions} partitions explain")
+    held = sum(len(constant.data) for constant in contents.constants.values())
+    if held > ITEM_BYTES[1] * ROOM * (explained.constants + SMALL):
+        raise ValueError(f"its constants have {held} bytes, more than its joints, vertices and shapes explain")
+    single, several = (measure_work(contents, poses) for poses in (1, SEVERAL))
+    _check_work(single, explained, size, 1)
+    _check_work(several, explained, size, SEVERAL)
+    for name, shape in outputs.items():
+        for work, poses in ((single, 1), (several, SEVERAL)):
+            if name in contents.outputs and work.shapes.get(name) != (poses, *shape):
+                raise ValueError(f"its output '{name}' comes out as {work.shapes.get(name)}, not as {(poses, *shape)}")
+
+
+def _check_work(work: Work, explained: Explained, size: int, poses: int) -> None:
+    if work.elements > ROOM * poses * (explained.values + SMALL):
+        raise ValueError(
+            f"it computes {work.elements} numbers for {poses} poses, more than its joints, vertices and shapes explain"
+        )
+    # A constant is used once for each pose and axis.
+    if work.products > ROOM * poses * (size + 64 * (explained.values + SMALL)):
+        raise ValueError(f"it multiplies {work.products} numbers for {poses} poses, more than its size explains")
+    if work.folded > 2 * size + SMALL:
+        raise ValueError(f"it unpacks {work.folded} numbers, more than its size explains")

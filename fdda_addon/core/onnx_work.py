@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What it takes to run a graph, found without running it: the shapes of all its values, node by node.
+
+`RULES` is the list of the operators that a model may have: those that `train` writes, now and in earlier versions. An
+exporter that needs another adds it here, with the rule of its shape (https://onnx.ai/onnx/operators/).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from .onnx_file import INT64, ITEM_BYTES, OnnxConstant, OnnxContents, OnnxNode
+
+Shape = tuple[int, ...]
+MOST = 1 << 40
+"""No value has so many elements."""
+
+
+@dataclass
+class Work:
+    """What running a graph takes.
+
+    Attributes:
+        elements: of all values that nodes give.
+        products: multiplications of matrix products.
+        folded: elements that follow from constants alone, made when the graph is loaded.
+        shapes: of the values, by name.
+    """
+
+    elements: int
+    products: int
+    folded: int
+    shapes: dict[str, Shape]
+
+
+@dataclass
+class _Call:
+    """A node with what is known of its inputs: their shapes, and which of them are constants."""
+
+    node: OnnxNode
+    shapes: list[Shape]
+    constants: list[OnnxConstant | None]
+
+    def attribute(self, name: str, default: int) -> int:
+        value = self.node.attributes.get(name, default)
+        if not isinstance(value, int):
+            raise ValueError(f"a {self.node.operator} whose {name} is no whole number")
+        return value
+
+    def integers(self, number: int) -> tuple[int, ...]:
+        """The elements of an input that must be a short constant."""
+        if number >= len(self.constants) or self.constants[number] is None:
+            raise ValueError(f"a {self.node.operator} whose sizes are no constants")
+        return self.constants[number].integers()
+
+    def axis(self, rank: int, name: str = "axis", default: int = 0) -> int:
+        return _axis(self.attribute(name, default), rank)
+
+
+def _axis(axis: int, rank: int) -> int:
+    if not -rank <= axis < rank:
+        raise ValueError(f"a value of {rank} dimensions has no axis {axis}")
+    return axis % rank
+
+
+def _broadcast(shapes: Sequence[Shape]) -> Shape:
+    result: Shape = ()
+    for shape in shapes:
+        rank = max(len(result), len(shape))
+        pairs = zip((1,) * (rank - len(result)) + result, (1,) * (rank - len(shape)) + shape, strict=True)
+        joined = []
+        for one, other in pairs:
+            if one != other and 1 not in (one, other):
+                raise ValueError(f"values of the shapes {' and '.join(map(str, shapes))} do not fit")
+            joined.append(other if one == 1 else one)
+        result = tuple(joined)
+    return result
+
+
+def _same(call: _Call) -> list[Shape]:
+    return [call.shapes[0]]
+
+
+def _elementwise(call: _Call) -> list[Shape]:
+    return [_broadcast(call.shapes)]
+
+
+def _cast(call: _Call) -> list[Shape]:
+    if call.attribute("to", 0) not in ITEM_BYTES:
+        raise ValueError("a Cast to what is no number")
+    return [call.shapes[0]]
+
+
+def _matmul(call: _Call) -> list[Shape]:
+    left, right = call.shapes[:2]
+    if min(len(left), len(right)) < 2 or left[-1] != right[-2]:
+        raise ValueError(f"matrices of {left} and {right} have no product")
+    return [(*_broadcast((left[:-2], right[:-2])), left[-2], right[-1])]
+
+
+def _gemm(call: _Call) -> list[Shape]:
+    left, right = call.shapes[:2]
+    left, right = (
+        shape[::-1] if call.attribute(name, 0) else shape for name, shape in (("transA", left), ("transB", right))
+    )
+    if len(left) != 2 or len(right) != 2 or left[1] != right[0]:
+        raise ValueError(f"matrices of {left} and {right} have no product")
+    shape = (left[0], right[1])
+    if _broadcast((shape, *call.shapes[2:])) != shape:
+        raise ValueError("a Gemm adds what is larger than its product")
+    return [shape]
+
+
+def _transpose(call: _Call) -> list[Shape]:
+    shape = call.shapes[0]
+    order = call.node.attributes.get("perm") or tuple(reversed(range(len(shape))))
+    if not isinstance(order, tuple) or sorted(order) != list(range(len(shape))):
+        raise ValueError("a Transpose whose axes are none")
+    return [tuple(shape[axis] for axis in order)]
+
+
+def _reshape(call: _Call) -> list[Shape]:
+    shape, wanted = call.shapes[0], list(call.integers(1))
+    if call.attribute("allowzero", 0) == 0:
+        wanted = [shape[i] if size == 0 and i < len(shape) else size for i, size in enumerate(wanted)]
+    if wanted.count(-1) == 1:
+        rest = math.prod(size for size in wanted if size != -1)
+        wanted[wanted.index(-1)] = math.prod(shape) // rest if rest > 0 else 0
+    if min(wanted, default=0) < 0 or math.prod(wanted) != math.prod(shape):
+        raise ValueError(f"a value of {shape} cannot be given the shape {tuple(wanted)}")
+    return [tuple(wanted)]
+
+
+def _concat(call: _Call) -> list[Shape]:
+    first = call.shapes[0]
+    axis = call.axis(len(first))
+    if any(
+        len(s) != len(first) or (*s[:axis], *s[axis + 1 :]) != (*first[:axis], *first[axis + 1 :]) for s in call.shapes
+    ):
+        raise ValueError("values of different shapes are joined")
+    return [(*first[:axis], sum(shape[axis] for shape in call.shapes), *first[axis + 1 :])]
+
+
+def _split(call: _Call) -> list[Shape]:
+    shape, sizes = call.shapes[0], call.integers(1)
+    axis = call.axis(len(shape))
+    if min(sizes, default=-1) < 0 or sum(sizes) != shape[axis] or len(sizes) != len(call.node.outputs):
+        raise ValueError("a value is split into parts that it does not have")
+    return [(*shape[:axis], size, *shape[axis + 1 :]) for size in sizes]
+
+
+def _slice(call: _Call) -> list[Shape]:
+    shape = list(call.shapes[0])
+    starts, ends = call.integers(1), call.integers(2)
+    axes = call.integers(3) if len(call.shapes) > 3 else tuple(range(len(starts)))
+    steps = call.integers(4) if len(call.shapes) > 4 else (1,) * len(starts)
+    if not len(starts) == len(ends) == len(axes) == len(steps) or 0 in steps:
+        raise ValueError("a Slice whose bounds are none")
+    for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
+        place = _axis(axis, len(shape))
+        shape[place] = len(range(*slice(start, end, step).indices(shape[place])))
+    return [tuple(shape)]
+
+
+def _gather(call: _Call) -> list[Shape]:
+    shape, chosen = call.shapes[:2]
+    axis = call.axis(len(shape))
+    return [(*shape[:axis], *chosen, *shape[axis + 1 :])]
+
+
+def _unsqueeze(call: _Call) -> list[Shape]:
+    shape, axes = list(call.shapes[0]), call.integers(1)
+    places = sorted({_axis(axis, len(shape) + len(axes)) for axis in axes})
+    if len(places) != len(axes):
+        raise ValueError("an Unsqueeze that names an axis twice")
+    for axis in places:
+        shape.insert(axis, 1)
+    return [tuple(shape)]
+
+
+def _reduce(call: _Call) -> list[Shape]:
+    shape = call.shapes[0]
+    axes = {_axis(axis, len(shape)) for axis in call.integers(1)}
+    if call.attribute("keepdims", 1):
+        return [tuple(1 if axis in axes else size for axis, size in enumerate(shape))]
+    return [tuple(size for axis, size in enumerate(shape) if axis not in axes)]
+
+
+def _quantize(call: _Call) -> list[Shape]:
+    return [call.shapes[0], (), ()]
+
+
+RULES: dict[str, Callable[[_Call], list[Shape]]] = {
+    **dict.fromkeys(("Add", "Sub", "Mul", "Div", "Max", "Min"), _elementwise),
+    **dict.fromkeys(("Relu", "Sigmoid", "Tanh", "Erf"), _same),
+    **dict.fromkeys(("MatMul", "MatMulInteger"), _matmul),
+    **{"Gemm": _gemm, "Cast": _cast, "DequantizeLinear": _same, "DynamicQuantizeLinear": _quantize},
+    **{"Transpose": _transpose, "Reshape": _reshape, "Concat": _concat, "Split": _split, "Slice": _slice},
+    **{"Gather": _gather, "Unsqueeze": _unsqueeze, "ReduceSum": _reduce},
+}
+OPERATORS = tuple(RULES)
+PRODUCTS = ("MatMul", "MatMulInteger", "Gemm")
+UNFOLDED = ("Cast", "DequantizeLinear")
+"""Operators whose inputs may all be constants; of others the result would be the constant."""
+
+
+def measure_work(contents: OnnxContents, poses: int) -> Work:
+    """Follow the shapes of all values of a graph.
+
+    Args:
+        contents: of a file, its inputs with the number of poses as their first dimension.
+        poses: how many.
+
+    Raises:
+        ValueError: an operator is not one of `OPERATORS`, or values do not fit; the text is a clause about the graph.
+    """
+    shapes = {name: (poses, *shape[1:]) for name, shape in contents.inputs.items()}
+    fixed = {name: constant.shape for name, constant in contents.constants.items()}
+    work = Work(0, 0, 0, {**shapes, **fixed})
+    if len(work.shapes) != len(shapes) + len(fixed):
+        raise ValueError("an input and a constant have one name")
+    constant_names = set(fixed)
+    for node in contents.nodes:
+        _add_node(node, contents.constants, constant_names, work)
+    return work
+
+
+def _add_node(node: OnnxNode, constants: dict[str, OnnxConstant], known: set[str], work: Work) -> None:
+    if node.operator not in RULES:
+        raise ValueError(f"it has the operator {node.operator!r}, which train does not write")
+    inputs = [name for name in node.inputs if name]
+    if not inputs or (missing := [name for name in inputs if name not in work.shapes]):
+        raise ValueError(
+            f"a {node.operator} takes {missing[0]!r}, which nothing gives" if inputs else "a node takes nothing"
+        )
+    call = _Call(node, [work.shapes[name] for name in inputs], [constants.get(name) for name in inputs])
+    try:
+        found = RULES[node.operator](call)
+    except IndexError as error:
+        raise ValueError(f"a {node.operator} has too few inputs") from error
+    if len(node.outputs) > len(found):
+        raise ValueError(f"a {node.operator} gives too many values")
+    elements = sum(math.prod(shape) for shape in found)
+    if elements > MOST:
+        raise ValueError(
+            f"a {node.operator} gives {elements} numbers, more than its joints, vertices and shapes explain"
+        )
+    work.elements += elements
+    if node.operator in PRODUCTS:
+        work.products += math.prod(found[0]) * call.shapes[0][-1 if not call.attribute("transA", 0) else -2]
+    if known.issuperset(inputs):
+        if node.operator not in UNFOLDED:
+            raise ValueError(f"a {node.operator} of constants alone")
+        work.folded += elements
+        known.update(node.outputs)
+    for name, shape in zip(node.outputs, found, strict=False):
+        if name in work.shapes:
+            raise ValueError(f"two values are called {name!r}")
+        work.shapes[name] = shape
+
+
+def constant_elements(contents: OnnxContents) -> int:
+    """Elements of the constants of a graph; of indices none."""
+    return sum(math.prod(c.shape) for c in contents.constants.values() if c.type != INT64)

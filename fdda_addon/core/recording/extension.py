@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Appends refined poses to a complete recording, which stays complete at every moment (docs/recording.md)."""
+
+import math
+import os
+from dataclasses import asdict
+
+import numpy as np
+
+from ..errors import BusyError, OutputError, RecordingError
+from ..input_file import open_input
+from ..output import write_json
+from .arrays import STREAMED, array_shapes, streamed_arrays
+from .index import INDEX, REFINED, Source, read_index
+from .lock import RecordingLock
+from .reader import Recording
+from .writer import array_header, check_finite
+
+
+class RecordingExtension:
+    """Appends poses to a recording; use as a context manager.
+
+    Poses are written behind those that the recording has, then the headers of the arrays, which may say more than the
+    index, and the index last: an interruption at any moment leaves a complete recording, with the poses of every
+    `append` that ended.
+    """
+
+    def __init__(self, recording: Recording, name: str, added: int = 0):
+        """Args:
+            recording: complete.
+            name: of the model that the poses refine, its file name.
+            added: how many of the last poses of the recording were chosen for the same model, and count with those that
+                are appended now.
+
+        Raises:
+            RecordingError: another process writes the recording.
+            OutputError: the files cannot be opened for writing.
+        """
+        self.path = recording.path
+        self.complete = len(recording.pose_matrices)
+        self._start, self._is_continued = self.complete - added, added > 0
+        self._name = name
+        self._files = {}
+        self._lock = RecordingLock(self.path)
+        try:
+            self._lock.acquire()
+            self._index = self._read_index()
+            index = self._index
+            shapes = array_shapes(
+                *(0, len(index["joints"]), index["vertices"], index["influences"]), controls=len(index["controls"])
+            )
+            self._shapes = {name: shapes[name] for name in STREAMED if name in shapes}
+            for streamed in self._shapes:
+                self._files[streamed] = open_input(self.path / f"{streamed}.npy", "r+b", follow=False)
+        except OSError as error:
+            self._close()
+            raise self._failed(error) from error
+        except RecordingError:
+            self._close()
+            raise
+
+    def _read_index(self) -> dict:
+        """The index as it is now that no other process can change it."""
+        index = read_index(self.path)
+        if index["poses"] != self.complete:
+            raise BusyError(
+                f"The recording '{self.path}' had {self.complete} poses when it was read and has {index['poses']} now: "
+                "another process added to it; try again."
+            )
+        return index
+
+    def append(self, pose_matrices: np.ndarray, residuals: np.ndarray, controls: np.ndarray | None = None) -> None:
+        """Add poses.
+
+        Args:
+            pose_matrices: (n, J, 4, 4), mesh-object space, mesh units.
+            residuals: (n, V, 3), local residuals, mesh units.
+            controls: (n, C), where the rig has controls.
+
+        Raises:
+            OutputError: the disk is full or went away; the poses before stay complete.
+            RecordingError: a value is not finite.
+        """
+        arrays = streamed_arrays(pose_matrices, residuals, controls, len(self._index["controls"]))
+        check_finite(arrays, self.complete)
+        total = self.complete + len(pose_matrices)
+        try:
+            for name, array in arrays.items():
+                self._write(name, array)
+            for name in arrays:
+                self._write_header(name, total)
+            self.complete = total
+            self._write_index()
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def _write(self, name: str, array: np.ndarray) -> None:
+        shape, dtype = self._shapes[name]
+        row = math.prod(shape[1:]) * np.dtype(dtype).itemsize
+        file = self._files[name]
+        file.seek(len(self._header(name, self.complete)) + self.complete * row)
+        file.write(np.ascontiguousarray(array, dtype).data)
+        file.flush()
+        os.fsync(file.fileno())
+
+    def _write_header(self, name: str, poses: int) -> None:
+        header, file = self._header(name, poses), self._files[name]
+        if len(header) != len(self._header(name, self._start)):
+            raise RecordingError(f"'{self.path / name}.npy' has no room for {poses} poses; record again.")
+        file.seek(0)
+        file.write(header)
+        file.flush()
+        os.fsync(file.fileno())
+
+    def _header(self, name: str, poses: int) -> bytes:
+        shape, dtype = self._shapes[name]
+        return array_header((poses, *shape[1:]), dtype)
+
+    def _write_index(self) -> None:
+        source = Source(REFINED, self.complete - self._start, self._name)
+        before = self._index["sampling"]["sources"]
+        sources = [*(before[:-1] if self._is_continued else before), asdict(source)]
+        sampling = {**self._index["sampling"], "sources": sources}
+        index = {**self._index, "poses": self.complete, "complete": self.complete, "sampling": sampling}
+        write_json(self.path / INDEX, index)
+
+    def _failed(self, error: OSError) -> OutputError:
+        return OutputError(
+            f"Cannot add poses to the recording '{self.path}': {error.strerror or error}; it holds {self.complete} "
+            "poses and can be trained on as it is."
+        )
+
+    def __enter__(self) -> "RecordingExtension":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        for file in self._files.values():
+            file.close()
+        self._lock.release()

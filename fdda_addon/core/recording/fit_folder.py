@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What `record` hands to the trainer to fit skin weights to, and what it gets back: a folder of arrays.
+
+It lives as long as the fit. Whatever is read here is checked as if it came from elsewhere.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from ..errors import OutputError, RecordingError
+from ..input_file import open_input
+from ..rig import Fingerprint, Joint, Rig
+from ..skin_fit import INFLUENCES, are_skin_weights
+from ..skinning import have_inverse
+from .arrays import HEADER_ERRORS
+from .writer import array_header, check_finite
+
+MIN_POSES = 10
+"""Fewer say too little of the weights, as half of them are held out."""
+SHAPES = {
+    "pose_matrices": ("n", "J", 4, 4),
+    "positions": ("n", "V", 3),
+    "rest_matrices": ("J", 4, 4),
+    "rest_positions": ("V", 3),
+    "skin_joints": ("V", "I"),
+    "skin_weights": ("V", "I"),
+    "parents": ("J",),
+}
+INTEGERS = ("skin_joints", "parents")
+STREAMED = ("pose_matrices", "positions")
+
+
+@dataclass(frozen=True)
+class FitPoses:
+    """Poses to fit skin weights to.
+
+    Attributes:
+        rig: with the weights of its own. Its joints have no names here.
+        pose_matrices: (n, J, 4, 4) float32, mesh-object space, mesh units.
+        positions: (n, V, 3) float32, what the rig evaluates to, mesh-object space, mesh units; may be a memory map.
+    """
+
+    rig: Rig
+    pose_matrices: np.ndarray
+    positions: np.ndarray
+
+    def part(self, poses: slice) -> "FitPoses":
+        """Some of the poses."""
+        return FitPoses(self.rig, self.pose_matrices[poses], self.positions[poses])
+
+
+class FitPosesWriter:
+    """Writes poses into a folder, one by one; use as a context manager. All that were announced must be appended."""
+
+    def __init__(self, folder: Path, rig: Rig, count: int):
+        """Args:
+            folder: empty.
+            rig: with the weights of its own.
+            count: number of poses.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        self._folder, self._done = folder, 0
+        self._shapes = {"pose_matrices": (len(rig.joints), 4, 4), "positions": (rig.vertex_count, 3)}
+        self._files = {}
+        try:
+            for name in SHAPES.keys() - set(STREAMED):
+                np.save(folder / f"{name}.npy", getattr(rig, name).astype(_dtype(name)), allow_pickle=False)
+            for name, shape in self._shapes.items():
+                self._files[name] = open(folder / f"{name}.npy", "wb")  # noqa: SIM115 - __exit__
+                self._files[name].write(array_header((count, *shape), np.float32))
+        except OSError as error:
+            self.close()
+            raise self._failed(error) from error
+
+    def append(self, pose_matrices: np.ndarray, positions: np.ndarray) -> None:
+        """Add a pose: (J, 4, 4) and (V, 3), as in `FitPoses`.
+
+        Raises:
+            OutputError: the disk is full.
+            RecordingError: a value is not finite.
+        """
+        arrays = {"pose_matrices": pose_matrices[None], "positions": positions[None]}
+        check_finite(arrays, self._done)
+        self._done += 1
+        try:
+            for name, array in arrays.items():
+                self._files[name].write(np.ascontiguousarray(array, np.float32).data)
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def _failed(self, error: OSError) -> OutputError:
+        return OutputError(
+            f"Cannot write the poses to fit into '{self._folder}': {error.strerror or error}; make room there."
+        )
+
+    def close(self) -> None:
+        """Close the files.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        for file in self._files.values():
+            file.close()
+
+    def __enter__(self) -> "FitPosesWriter":
+        return self
+
+    def __exit__(self, kind: type | None, _error: BaseException | None, _trace: TracebackType | None) -> None:
+        try:
+            self.close()
+        except OSError as error:
+            if kind is None:
+                raise self._failed(error) from error
+
+
+def read_fit_poses(folder: Path) -> FitPoses:
+    """Read what `FitPosesWriter` wrote; the positions are a memory map.
+
+    Raises:
+        RecordingError: something is missing, damaged, or contradicts the rest.
+    """
+    arrays = {name: _read_array(folder / f"{name}.npy", len(shape), _dtype(name)) for name, shape in SHAPES.items()}
+    sizes: dict[str, int] = {}
+    for name, shape in SHAPES.items():
+        for expected, found in zip(shape, arrays[name].shape, strict=True):
+            wanted = sizes.setdefault(expected, found) if isinstance(expected, str) else expected
+            if found != wanted or not found:
+                raise _damaged(folder, f"{name} has the shape {arrays[name].shape}")
+    if sizes["n"] < MIN_POSES:
+        raise _damaged(folder, f"they are {sizes['n']}, and a fit takes {MIN_POSES}")
+    for name in SHAPES.keys() - {"positions"}:
+        arrays[name] = np.array(arrays[name])
+    for name, array in arrays.items():
+        if not all(np.isfinite(row).all() for row in array):
+            raise _damaged(folder, f"{name} holds values that are not numbers")
+    parents, joints, weights = arrays["parents"], arrays["skin_joints"], arrays["skin_weights"]
+    if (parents < -1).any() or (parents >= np.arange(sizes["J"])).any():
+        raise _damaged(folder, "a joint stands before its parent")
+    if joints.min() < 0 or joints.max() >= sizes["J"] or weights.min() < 0:
+        raise _damaged(folder, "the skin weights name no joints")
+    if not have_inverse(arrays["rest_matrices"]).all():
+        raise _damaged(folder, "a rest matrix is singular")
+    rig = Rig(
+        tuple(Joint(str(number), int(parent)) for number, parent in enumerate(parents)),
+        *(arrays[name] for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights")),
+        Fingerprint("", "", ""),
+    )
+    return FitPoses(rig, arrays["pose_matrices"], arrays["positions"])
+
+
+def write_fitted(folder: Path, joints: np.ndarray, weights: np.ndarray) -> None:
+    """Put fitted weights in the place of the rig's own: (V, 4) int32 joints and (V, 4) float32 weights.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    try:
+        np.save(folder / "fitted_joints.npy", joints, allow_pickle=False)
+        np.save(folder / "fitted_weights.npy", weights, allow_pickle=False)
+    except OSError as error:
+        raise OutputError(f"Cannot write the fitted weights into '{folder}': {error.strerror or error}.") from error
+
+
+def read_fitted(folder: Path, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+    """The fitted weights: (V, 4) int32 joints and (V, 4) float32 weights, each row summing to 1.
+
+    Raises:
+        RecordingError: they are missing, damaged, or not of this rig.
+    """
+    joints, weights = (
+        np.array(_read_array(folder / f"fitted_{name}.npy", 2, dtype))
+        for name, dtype in (("joints", np.int32), ("weights", np.float32))
+    )
+    if not joints.shape == weights.shape == (rig.vertex_count, INFLUENCES):
+        raise _damaged(folder, f"the fitted weights have the shapes {joints.shape} and {weights.shape}")
+    if not are_skin_weights(joints, weights, len(rig.joints)):
+        raise _damaged(folder, "the fitted weights are no weights")
+    return joints, weights
+
+
+def _dtype(name: str) -> type:
+    return np.int32 if name in INTEGERS else np.float32
+
+
+def _read_array(path: Path, dimensions: int, dtype: type) -> np.ndarray:
+    """Map an array; numpy checks the file's size against its header."""
+    try:
+        # A pipe in its place would block.
+        open_input(path, follow=False).close()
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except OSError as error:
+        raise _damaged(path.parent, f"'{path.name}' cannot be read ({error.strerror or error})") from error
+    except (ValueError, *HEADER_ERRORS) as error:
+        raise _damaged(path.parent, f"'{path.name}' is no array, or truncated") from error
+    # A zip file of arrays is none either.
+    if not isinstance(array, np.ndarray) or array.ndim != dimensions or array.dtype != dtype:
+        raise _damaged(path.parent, f"'{path.name}' holds something else")
+    return array
+
+
+def _damaged(folder: Path, what: str) -> RecordingError:
+    return RecordingError(f"The poses in '{folder}' cannot be fitted: {what}; record again.")

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The index of a recording, `recording.json`: what it says beside the arrays, read and checked."""
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from ..controls import read_controls
+from ..errors import RecordingError
+from ..input_file import read_input
+from ..poses import Channel
+from ..rig import Fingerprint, read_joints, read_name
+from ..skin_fit import SkinFit
+from ..surface import MIN_CORNERS
+from ..unit import read_unit
+from .shard import Shard
+
+FORMAT = "fdda-recording"
+VERSION = 1
+INDEX = "recording.json"
+MAX_INDEX_BYTES = 16 << 20
+MAX_INFLUENCES = 1000
+"""Places for skin weights of a vertex."""
+RANDOM, ACTION, STRIP, MIRRORED = "random", "action", "strip", "mirrored"
+"""Kinds of the poses that a recording is made of: drawn at random, frames of an action, frames of a strip of the NLA,
+and the frames of the source before, left and right exchanged."""
+REFINED = "refined"
+"""Kind of the poses that were added where a model was worst: no sample of the range of motion, so never held out."""
+KINDS = (RANDOM, ACTION, STRIP, MIRRORED, REFINED)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where poses of a recording came from.
+
+    Attributes:
+        kind: `RANDOM`, `ACTION`, `STRIP`, `MIRRORED` or `REFINED`.
+        poses: how many.
+        name: of the action or strip, mirrored or not; file name of the model that refined poses were chosen for; empty
+            for random poses.
+        frames: first frame of the action or strip and the step between poses, (0, 0) for other poses.
+    """
+
+    kind: str
+    poses: int
+    name: str = ""
+    frames: tuple[int, int] = (0, 0)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How the poses were chosen."""
+
+    seed: int
+    spread: float
+    channels: tuple[Channel, ...]
+    sources: tuple[Source, ...]
+
+    def to_json(self) -> dict:
+        return {
+            "seed": self.seed,
+            "spread": self.spread,
+            "limits": [channel.to_json() for channel in self.channels],
+            "sources": [asdict(source) for source in self.sources],
+        }
+
+
+@dataclass(frozen=True)
+class RecordingInfo:
+    """What `recording.json` says beside the arrays.
+
+    `fit` is there where the skin weights are not the rig's own, `shard` where the poses are a part of those of a plan:
+    `sampling` is that of the whole plan then.
+    """
+
+    poses: int
+    complete: int
+    rig_file: str
+    object_name: str
+    blender: str
+    sampling: Sampling
+    fit: SkinFit | None = None
+    shard: Shard | None = None
+
+
+def read_index(path: Path) -> dict:
+    """Read `recording.json` of a recording, complete or not, and check the types of its values.
+
+    Raises:
+        RecordingError: it is missing, damaged, or of another version.
+    """
+    index_path = path / INDEX
+    try:
+        # JSON has no infinity, but Python reads it.
+        constants: list[str] = []
+        data = read_input(index_path, MAX_INDEX_BYTES, follow=False)
+        index = json.loads(data, parse_constant=lambda name: constants.append(name) or float(name.lower()))
+    except FileNotFoundError as error:
+        raise RecordingError(f"'{path}' is not a recording: it has no {INDEX}; make one with record.") from error
+    except OSError as error:
+        raise RecordingError(f"'{index_path}' cannot be read ({error.strerror or error}); record again.") from error
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f"'{index_path}' cannot be read ({error}); record again.") from error
+    if not isinstance(index, dict) or index.get("format") != FORMAT:
+        raise RecordingError(f"'{index_path}' is not the index of a recording; give a folder that record made.")
+    if index.get("version") != VERSION:
+        raise RecordingError(
+            f"'{path}' is a recording of version {index.get('version')!r} and this add-on reads version {VERSION}; "
+            "record again."
+        )
+    try:
+        _check_index(index)
+        if constants:
+            raise ValueError(f"it holds {constants[0]}, which is no number")
+    except KeyError as error:
+        raise RecordingError(f"'{index_path}' is damaged: it lacks {error}; record again.") from error
+    except (TypeError, AttributeError, ValueError, OverflowError) as error:
+        raise RecordingError(f"'{index_path}' is damaged: {error}; record again.") from error
+    return index
+
+
+def _check_index(index: dict) -> None:
+    for key in ("poses", "complete", "vertices", "influences"):
+        if type(index[key]) is not int or index[key] < 0:
+            raise ValueError(f"'{key}' is {index[key]!r}")
+    if index["complete"] > index["poses"] or not index["vertices"] or not index["influences"]:
+        raise ValueError("its counts contradict each other")
+    if index["influences"] > MAX_INFLUENCES:
+        raise ValueError(f"its vertices have {index['influences']} skin weights each, and {MAX_INFLUENCES} is the most")
+    for key in ("faces", "corners"):
+        if type(index.get(key, 0)) is not int or index.get(key, 0) < 0:
+            raise ValueError(f"'{key}' is {index[key]!r}")
+    if index.get("corners", 0) < MIN_CORNERS * index.get("faces", 0):
+        raise ValueError(f"{index['faces']} faces cannot have {index.get('corners', 0)} corners")
+    controls = read_controls(index["controls"])
+    for text in (index["blender"], index["rig"]["file"], index["rig"]["object"]):
+        if not isinstance(text, str):
+            raise TypeError(f"{text!r} stands where text belongs")
+    joints = len(read_joints(index["joints"]))
+    if not isinstance(index["partitions"], list):
+        raise TypeError("its partitions are no list")
+    for partition in index["partitions"]:
+        _check_numbers([partition["joint"]], "joint", joints)
+        _check_numbers(partition["influencing"], "joint", joints)
+        _check_numbers(partition.get("merged", []), "joint", joints)
+        _check_numbers(partition.get("controls", []), "control", len(controls))
+    Fingerprint.from_json(index["rig"]["fingerprint"])
+    read_unit(index)
+    if "fit" in index:
+        SkinFit.from_json(index["fit"])
+    if "shard" in index:
+        Shard.from_json(index["shard"], index["poses"])
+    _sampling(index["sampling"])
+
+
+def _check_numbers(values: list, what: str, count: int) -> None:
+    """Fail where values are no list of different indices below a count."""
+    if not isinstance(values, list):
+        raise TypeError(f"a partition has {what}s that are no list")
+    for value in values:
+        if type(value) is not int or not 0 <= value < count:
+            raise ValueError(f"a partition has {what} {value!r} of {count}")
+    if len(set(values)) != len(values):
+        raise ValueError(f"a partition has a {what} twice")
+
+
+def _sampling(value: dict) -> Sampling:
+    seed, spread = value["seed"], value["spread"]
+    if type(seed) is not int or seed < 0:
+        raise ValueError(f"its seed is {seed!r}")
+    if type(spread) not in (int, float) or not 0 < spread < math.inf:
+        raise ValueError(f"its spread is {spread!r}")
+    if not isinstance(value["limits"], list) or not isinstance(value["sources"], list):
+        raise TypeError("its range of motion or its sources are no list")
+    return Sampling(
+        seed,
+        float(spread),
+        tuple(Channel.from_json(channel) for channel in value["limits"]),
+        tuple(_source(source) for source in value["sources"]),
+    )
+
+
+def _source(value: dict) -> Source:
+    source = Source(value["kind"], value["poses"], read_name(value["name"]), tuple(value["frames"]))
+    if source.kind not in KINDS:
+        raise ValueError(f"a source is of the kind {source.kind!r}")
+    if type(source.poses) is not int or source.poses < 0:
+        raise ValueError(f"a source has {source.poses!r} poses")
+    if len(source.frames) != 2 or not all(type(frame) is int for frame in source.frames):
+        raise ValueError(f"a source has the frames {source.frames!r}")
+    return source
+
+
+def read_info(index: dict) -> RecordingInfo:
+    """What an index says beside the arrays."""
+    return RecordingInfo(
+        index["poses"],
+        index["complete"],
+        index["rig"]["file"],
+        index["rig"]["object"],
+        index["blender"],
+        _sampling(index["sampling"]),
+        SkinFit.from_json(index["fit"]) if "fit" in index else None,
+        Shard.from_json(index["shard"], index["poses"]) if "shard" in index else None,
+    )

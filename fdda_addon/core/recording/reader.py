@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The recording: a folder of poses and local residuals. docs/recording.md describes the format.
+
+`recording.json` says how many poses are complete: an array file may be longer than that, and what lies behind it is
+never read. `writer` writes it.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..controls import read_controls
+from ..errors import RecordingError
+from ..partition import Partition, make_partitions
+from ..rig import Fingerprint, Rig, read_joints
+from ..skin_fit import are_skin_weights
+from ..skinning import have_inverse
+from ..surface import are_faces
+from ..unit import read_unit
+from .arrays import LARGEST, STREAMED, array_shapes, bad_pose, open_array
+from .index import RecordingInfo, read_index, read_info
+
+BLOCK_VERTICES = 1 << 16
+"""Skin weights are checked so many vertices at a time, before they take memory."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A complete recording, its large arrays mapped from disk.
+
+    Attributes:
+        path: the folder.
+        info: counts and where it came from.
+        rig: the rig it was made of.
+        partitions: with their influencing joints.
+        pose_matrices: (N, J, 4, 4) float32, mesh-object space, mesh units.
+        residuals: (N, V, 3) float32, local residuals, mesh units.
+        controls: (N, C) float32, values of the controls of the rig, each in the unit of its property.
+    """
+
+    path: Path
+    info: RecordingInfo
+    rig: Rig
+    partitions: tuple[Partition, ...]
+    pose_matrices: np.ndarray
+    residuals: np.ndarray
+    controls: np.ndarray
+
+
+def read_recording(path: Path) -> Recording:
+    """Open a complete recording; the large arrays are memory maps.
+
+    Raises:
+        RecordingError: it is incomplete, truncated, of another version, holds values that are not numbers, or its
+            files contradict each other.
+    """
+    recording = open_recording(path)
+    poses, shard = recording.info.poses, recording.info.shard
+    if shard:
+        raise RecordingError(
+            f"'{path}' is a shard of a recording ({shard.in_words(poses)}); give all shards to merge-recordings, and "
+            "go on with the recording that it makes."
+        )
+    if not poses:
+        raise _incomplete(path, 0, 0)
+    for name in STREAMED:
+        check_poses(path, name, getattr(recording, name))
+    if sum(source.poses for source in recording.info.sampling.sources) != poses:
+        raise RecordingError(
+            f"The index of '{path}' is damaged: its sources do not add up to its {poses} poses; record again."
+        )
+    return recording
+
+
+def open_recording(path: Path) -> Recording:
+    """As `read_recording`, also of a shard, and one without poses; the large arrays are not read.
+
+    Raises:
+        RecordingError: as `read_recording`, except that poses may be none that can be trained on.
+    """
+    index = read_index(path)
+    if index["complete"] < index["poses"]:
+        raise _incomplete(path, index["complete"], index["poses"])
+    arrays = {name: open_array(path / f"{name}.npy", *what) for name, what in _shapes(index).items()}
+    joints = read_joints(index["joints"])
+    _check_rest(path, arrays, len(joints))
+    rig = Rig(
+        joints,
+        *(np.array(arrays[name]) for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights")),
+        Fingerprint.from_json(index["rig"]["fingerprint"]),
+        *(np.array(arrays.get(name, np.zeros(0, np.int32))) for name in ("face_starts", "face_vertices")),
+        read_controls(index["controls"]),
+        read_unit(index),
+    )
+    if not are_faces(rig.face_starts, rig.face_vertices, rig.vertex_count):
+        raise RecordingError(f"The faces of '{path}' are damaged; record again.")
+    arrays.setdefault("controls", np.zeros((index["poses"], 0), np.float32))
+    partitions = read_partitions(rig, index["partitions"])
+    if [p.joint for p in partitions] != [p["joint"] for p in index["partitions"]]:
+        raise RecordingError(f"The partitions of '{path}' contradict its skin weights; record again.")
+    return Recording(path, read_info(index), rig, partitions, *(arrays[name] for name in STREAMED))
+
+
+def _incomplete(path: Path, complete: int, poses: int) -> RecordingError:
+    return RecordingError(
+        f"The recording '{path}' is incomplete: {complete} of {poses} poses; finish it with record --resume."
+    )
+
+
+def read_recorded_skin(path: Path, index: dict) -> tuple[np.ndarray, np.ndarray]:
+    """The skin weights of a recording, complete or not; `index` is what `read_index` gave.
+
+    Returns:
+        (V, I) int32 joints and (V, I) float32 weights.
+
+    Raises:
+        RecordingError: they are missing or damaged.
+    """
+    shape = index["vertices"], index["influences"]
+    joints, weights = (
+        np.array(open_array(path / f"{name}.npy", shape, dtype))
+        for name, dtype in (("skin_joints", np.int32), ("skin_weights", np.float32))
+    )
+    if not are_skin_weights(joints, weights, len(index["joints"])):
+        raise RecordingError(f"The skin weights of '{path}' are damaged; record again.")
+    return joints, weights
+
+
+def partitions_json(partitions: tuple[Partition, ...]) -> list[dict]:
+    """Partitions as `recording.json` has them."""
+    return [
+        {
+            "joint": partition.joint,
+            "influencing": list(partition.influencing),
+            **({"controls": list(partition.controls)} if partition.controls else {}),
+            **({"merged": list(partition.merged)} if partition.merged else {}),
+        }
+        for partition in partitions
+    ]
+
+
+def read_partitions(rig: Rig, values: list[dict]) -> tuple[Partition, ...]:
+    """The partitions of a rig with what `partitions_json` says of them."""
+    return make_partitions(
+        rig,
+        {value["joint"]: tuple(value["influencing"]) for value in values},
+        {value["joint"]: tuple(value.get("controls", ())) for value in values},
+        {joint: value["joint"] for value in values for joint in value.get("merged", ())},
+    )
+
+
+def check_poses(path: Path, name: str, array: np.ndarray) -> None:
+    """Fail where poses of a recording cannot be trained on; `name` and `array` as for `bad_pose`.
+
+    Raises:
+        RecordingError: names the first of them.
+    """
+    if (bad := bad_pose(name, array)) is not None:
+        pose, words = bad
+        raise RecordingError(f"The recording '{path}' holds {words} ({name}, pose {pose}); record again.")
+
+
+def check_resumable(path: Path) -> None:
+    """Fail before the work where a recording cannot be gone on with, complete or not.
+
+    Raises:
+        RecordingError: as `read_recording`, of what is complete of it.
+    """
+    index = read_index(path)
+    if not index["complete"]:
+        return
+    for name, (shape, dtype) in _shapes(index).items():
+        if name in STREAMED:
+            check_poses(path, name, open_array(path / f"{name}.npy", shape, dtype, index["complete"]))
+        else:
+            open_array(path / f"{name}.npy", shape, dtype)
+
+
+def _shapes(index: dict) -> dict[str, tuple[tuple, type]]:
+    return array_shapes(
+        *(index["poses"], len(index["joints"]), index["vertices"], index["influences"]),
+        *(index.get(key, 0) for key in ("faces", "corners")),
+        len(index["controls"]),
+    )
+
+
+def _check_rest(path: Path, arrays: dict[str, np.ndarray], joints: int) -> None:
+    """Fail where rest pose and skin weights are none."""
+    rest, positions = arrays["rest_matrices"], arrays["rest_positions"]
+    good = bool((np.abs(rest) <= LARGEST).all()) and bool(have_inverse(rest).all())
+    for start in range(0, len(positions), BLOCK_VERTICES):
+        block = slice(start, start + BLOCK_VERTICES)
+        good = good and bool((np.abs(positions[block]) <= LARGEST).all())
+        good = good and are_skin_weights(arrays["skin_joints"][block], arrays["skin_weights"][block], joints)
+    if not good:
+        raise RecordingError(f"The rest pose or skin weights of '{path}' are damaged; record again.")

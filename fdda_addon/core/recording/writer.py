@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Writes a recording (docs/recording.md) so that an interruption at any moment leaves one that resumes."""
+
+import contextlib
+import io
+import json
+import math
+import os
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import OutputError, RecordingError
+from ..input_file import open_input
+from ..output import is_left_over, write_json
+from ..partition import Partition
+from ..rig import Rig, are_same_rest
+from ..unit import read_unit, unit_json
+from .arrays import ARRAYS, STREAMED, array_shapes, bad_pose, open_array, streamed_arrays
+from .index import FORMAT, INDEX, VERSION, RecordingInfo, read_index
+from .lock import LOCK, RecordingLock
+from .reader import check_poses, check_resumable, partitions_json
+
+
+class RecordingWriter:
+    """Writes a recording pose by pose; use as a context manager.
+
+    Every `append` first brings the arrays to the disk, then the count of complete poses: an interruption at any
+    moment leaves a recording that resumes and holds no torn pose. Plain writes, not memory maps: a full disk is then
+    an error that can be reported. A new recording that fails before its first pose is complete leaves nothing.
+    """
+
+    def __init__(
+        self, path: Path, rig: Rig, partitions: tuple[Partition, ...], info: RecordingInfo, resume: bool = False
+    ):
+        """Start or resume a recording.
+
+        Args:
+            path: the folder; created when missing.
+            rig, partitions: what is recorded.
+            info: `complete` is ignored.
+            resume: continue the recording at `path` where it stopped.
+
+        Raises:
+            RecordingError: there is a recording already and `resume` is not set, it is of something else, or another
+                process writes it.
+            OutputError: the folder cannot be written.
+        """
+        self.path, self.rig, self.partitions, self.info = path, rig, partitions, info
+        self.complete = 0
+        self._faces, self._corners = len(rig.face_starts), len(rig.face_vertices)
+        self._files: dict[str, io.BufferedRandom] = {}
+        self._is_new = False
+        self._new_folders = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
+        _check_place(path, resume)
+        self._lock = RecordingLock(path)
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire()
+            # Once more: before it was locked, another process may have recorded.
+            _check_place(path, resume)
+            self._is_new = not os.path.exists(path / INDEX)
+            _remove_left_over(path)
+            if not self._is_new:
+                self.complete = self._check_resumable()
+            # The index first: a folder with arrays and no index could be neither resumed nor recorded into.
+            self._write_index()
+            self._open_arrays()
+        except BaseException as error:
+            self._close()
+            self._remove_if_empty()
+            self._lock.release()
+            if isinstance(error, OSError):
+                raise self._failed(error) from error
+            raise
+
+    def _check_resumable(self) -> int:
+        """How many poses of the recording at `path` are complete, once it is sure that it is one of this rig."""
+        previous = read_index(self.path)
+        # A recording of a version that did not write the faces stays without them.
+        if "faces" not in previous:
+            self._faces = self._corners = 0
+        # The scale of an object may be animated; no array depends on it.
+        self.rig = replace(self.rig, metres_per_unit=read_unit(previous))
+        own = self._index()
+        if different := [key for key in different_keys(previous, own) if key != "complete"]:
+            raise RecordingError(
+                f"Cannot resume '{self.path}': it was recorded with another {', '.join(different)}; "
+                "record with the same rig and options, or into another folder."
+            )
+        return previous["complete"]
+
+    def _open_arrays(self) -> None:
+        rig = self.rig
+        shapes = array_shapes(
+            *(self.info.poses, len(rig.joints), rig.vertex_count, rig.skin_joints.shape[1]),
+            *(self._faces, self._corners),
+            len(rig.controls),
+        )
+        for name, (shape, dtype) in shapes.items():
+            path = self.path / f"{name}.npy"
+            if not self.complete:
+                # Not written through what might be a link.
+                path.unlink(missing_ok=True)
+            if name not in STREAMED:
+                array = getattr(self.rig, name).astype(dtype)
+                if not self.complete:
+                    np.save(path, array, allow_pickle=False)
+                elif not self._is_own(name, open_array(path, shape, dtype), array):
+                    raise RecordingError(
+                        f"Cannot resume '{self.path}': '{path.name}' is not of this rig; remove the recording and "
+                        "record again."
+                    )
+                continue
+            header = array_header(shape, dtype)
+            row = math.prod(shape[1:]) * np.dtype(dtype).itemsize
+            end = len(header) + self.complete * row
+            if self.complete:
+                self._check_array(path, header, end)
+                check_poses(self.path, name, open_array(path, shape, dtype, self.complete))
+            self._files[name] = file = open_input(path, "r+b" if self.complete else "x+b", follow=False)
+            file.write(header)
+            file.truncate(end)
+            file.seek(0, os.SEEK_END)
+            # Ask for the whole space at once: a disk that is too small shows now, not an hour later.
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, len(header) + self.info.poses * row)
+
+    def _is_own(self, name: str, found: np.ndarray, own: np.ndarray) -> bool:
+        """Whether an array that does not grow is that of the rig."""
+        return are_same_rest(found, self.rig) if name == "rest_matrices" else np.array_equal(found, own)
+
+    def _check_array(self, path: Path, header: bytes, end: int) -> None:
+        """Fail when an array lacks what the index calls complete; to fill it up with zeros would make poses up."""
+        try:
+            with open_input(path, follow=False) as file:
+                good = file.read(len(header)) == header and file.seek(0, os.SEEK_END) >= end
+        except OSError:
+            good = False
+        if not good:
+            raise RecordingError(
+                f"Cannot resume '{self.path}': '{path.name}' does not hold the {self.complete} poses that are said to "
+                "be complete; remove the recording and record again."
+            )
+
+    def _index(self) -> dict:
+        info = self.info
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "poses": info.poses,
+            "complete": self.complete,
+            **({"shard": info.shard.to_json()} if info.shard else {}),
+            "vertices": self.rig.vertex_count,
+            "influences": int(self.rig.skin_joints.shape[1]),
+            **({"faces": self._faces, "corners": self._corners} if self._faces else {}),
+            "units": {"length": "m", "angle": "rad"},
+            **unit_json(self.rig.metres_per_unit),
+            "blender": info.blender,
+            "rig": {
+                "file": info.rig_file,
+                "object": info.object_name,
+                "fingerprint": asdict(self.rig.fingerprint),
+            },
+            "joints": [asdict(joint) for joint in self.rig.joints],
+            "controls": [control.to_json() for control in self.rig.controls],
+            "partitions": partitions_json(self.partitions),
+            **({"fit": info.fit.to_json()} if info.fit else {}),
+            # Through JSON and back, so that it compares equal with what was read.
+            "sampling": json.loads(json.dumps(info.sampling.to_json())),
+        }
+
+    def _write_index(self) -> None:
+        write_json(self.path / INDEX, self._index())
+
+    def append(self, pose_matrices: np.ndarray, residuals: np.ndarray, controls: np.ndarray | None = None) -> None:
+        """Add poses.
+
+        Args:
+            pose_matrices: (n, J, 4, 4), mesh-object space, mesh units.
+            residuals: (n, V, 3), local residuals, mesh units.
+            controls: (n, C), where the rig has controls.
+
+        Raises:
+            OutputError: the disk is full or went away; the poses before stay complete.
+            RecordingError: a value is not finite.
+        """
+        arrays = streamed_arrays(pose_matrices, residuals, controls, len(self.rig.controls))
+        check_finite(arrays, self.complete)
+        try:
+            for name, array in arrays.items():
+                self._files[name].write(np.ascontiguousarray(array, np.float32).data)
+                self._files[name].flush()
+                os.fsync(self._files[name].fileno())
+        except OSError as error:
+            raise self._failed(error) from error
+        self.complete += len(pose_matrices)
+        self._write_index()
+
+    def _failed(self, error: OSError) -> OutputError:
+        kept = f"{self.complete} of {self.info.poses} poses are complete, continue with --resume"
+        return OutputError(
+            f"Cannot write the recording '{self.path}': {error.strerror or error}; "
+            f"{kept if self.complete else 'make room or choose another folder'}."
+        )
+
+    def __enter__(self) -> "RecordingWriter":
+        return self
+
+    def __exit__(self, kind: type | None, *_: object) -> None:
+        self._close()
+        if kind is not None:
+            self._remove_if_empty()
+        self._lock.release()
+
+    def _close(self) -> None:
+        for file in self._files.values():
+            # On a full disk closing tries once more to write what `append` could not, and has reported.
+            with contextlib.suppress(OSError):
+                file.close()
+
+    def _remove_if_empty(self) -> None:
+        """Remove a new recording without a pose, and the folders that were made for it."""
+        if not self._is_new or self.complete or not self._lock.is_held:
+            return
+        for path in (self.path / INDEX, *(self.path / f"{name}.npy" for name in ARRAYS)):
+            with contextlib.suppress(OSError):
+                path.unlink()
+        self._lock.release()
+        for folder in self._new_folders:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+
+def check_recordable(path: Path, resume: bool) -> None:
+    """Fail before the work where a recording cannot be begun, or what is to be resumed is damaged.
+
+    Raises:
+        OutputError: the folder holds something else.
+        RecordingError: there is a recording and `resume` is not set, it is damaged, or another process writes it.
+    """
+    _check_place(path, resume)
+    if os.path.lexists(path / LOCK):
+        lock = RecordingLock(path)
+        try:
+            lock.acquire()
+        except OSError as error:
+            raise OutputError(f"Cannot record into '{path}': {error.strerror or error}; choose another.") from error
+        lock.release()
+    if os.path.exists(path / INDEX):
+        check_resumable(path)
+
+
+def _check_place(path: Path, resume: bool) -> None:
+    if not os.path.exists(path / INDEX):
+        if not is_free(path):
+            raise OutputError(f"Cannot record into '{path}': it is not an empty folder; choose another.")
+    elif not resume:
+        raise RecordingError(f"'{path}' holds a recording already; continue it with --resume or choose another folder.")
+
+
+def is_free(path: Path) -> bool:
+    """Whether a folder can be recorded into: it is not there, or holds nothing but what an interruption has left."""
+    if not os.path.exists(path):
+        return True
+    return os.path.isdir(path) and all(name == LOCK or is_left_over(name) for name in os.listdir(path))
+
+
+def _remove_left_over(path: Path) -> None:
+    """Remove what a process has left that was ended while it wrote the index."""
+    for name in os.listdir(path):
+        if is_left_over(name):
+            (path / name).unlink()
+
+
+def check_finite(arrays: dict[str, np.ndarray], first: int) -> None:
+    """Fail when arrays of poses, by name, hold what `bad_pose` finds; `first` is the number of their first pose.
+
+    Raises:
+        RecordingError: names the pose.
+    """
+    for name, array in arrays.items():
+        if (bad := bad_pose(name, array)) is not None:
+            pose, words = bad
+            raise RecordingError(
+                f"Pose {first + pose} of the rig evaluates to {words} ({name}); look for a scale of zero or a broken "
+                "driver."
+            )
+
+
+def array_header(shape: tuple, dtype: type) -> bytes:
+    """First bytes of a `.npy` file of version 1.0; as long for any number of rows, so that rows can be added."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape})
+    return header.getvalue()
+
+
+def different_keys(first: dict, second: dict, prefix: str = "") -> list[str]:
+    """Dotted names of the keys whose values differ between two dictionaries."""
+    found = []
+    for key in sorted(first.keys() | second.keys()):
+        values = first.get(key), second.get(key)
+        if all(isinstance(value, dict) for value in values):
+            found += different_keys(*values, f"{prefix}{key}.")
+        elif key not in first or key not in second or values[0] != values[1]:
+            found.append(f"{prefix}{key}")
+    return found

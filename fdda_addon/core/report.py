@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The report of a training, `report.json` beside its model (docs/training.md): its names, and reading what has them.
+
+The trainer writes it, its page and the sidebar show it.
+"""
+
+import enum
+import json
+from pathlib import Path
+
+from .errors import TrainingError
+from .input_file import read_input
+from .output import json_text, write_text
+
+REPORT_JSON, REPORT_HTML = "report.json", "report.html"
+WEIGHTS_SUFFIX = ".weights.npz"
+FORMAT, VERSION = "fdda-report", 1
+MAX_BYTES = 1 << 27
+"""Fifty times the report of 100 partitions and 1000 epochs."""
+MOST = 1e300
+"""No number of a report is larger: it can be shown."""
+
+
+class Verdict(enum.Enum):
+    """What a training says of its target."""
+
+    MET = "met"
+    MISSED = "missed"
+    """More poses may help."""
+    EXHAUSTED = "exhausted"
+    """More poses no longer help."""
+
+
+class _OrNull:
+    def __init__(self, kind: object):
+        self.kind = kind
+
+
+_ERRORS = dict.fromkeys(("mean", "rms", "p99", "p999", "max"), float)
+_ANGLES = dict.fromkeys(("mean", "p99", "max"), float)
+_LENGTHS = dict.fromkeys(("inside", "beside", "across"), _OrNull(float))
+_PARTITION = {
+    "joint": str,
+    "vertices": int,
+    "influencing": [str],
+    "controls?": [str],
+    "merged?": [str],
+    "features": int,
+    "basis": int,
+    "truncation": float,
+    "training": _ERRORS,
+    "held_out": _ERRORS,
+    "linear": _ERRORS,
+    "histogram": [int],
+    "curve": {"training": [float], "validation": [float], "best_epoch": int},
+}
+_REPORT = {
+    "unit": str,
+    "model": str,
+    "model_bytes": int,
+    "recording": str,
+    "object": str,
+    "vertices": int,
+    "joints": int,
+    "controls?": [str],
+    "poses": int,
+    "training": {"seconds": float, "device": str, "epochs": int, "training_poses": int, "held_out_poses": int},
+    "parity": float,
+    "constant_bytes?": int,
+    "fdda": {"training": _ERRORS, "held_out": _ERRORS},
+    "linear": {"held_out": _ERRORS},
+    "normals?": _OrNull({"fdda": _ANGLES, "linear": _ANGLES}),
+    "edges?": _OrNull({"fdda": _LENGTHS, "linear": _LENGTHS}),
+    "histogram": {"edges": [float], "fdda": [int], "linear": [int]},
+    "partitions": [_PARTITION],
+    "warnings?": [{"name": str, "text": str}],
+    "target?": {"target": float, "p999": float, "verdict": Verdict},
+}
+"""Keys and the kinds of their values; `?` ends one that may be missing, and further keys may come."""
+
+
+def report_path(model: Path) -> Path:
+    """Where the report of a model lies."""
+    return model.with_name(REPORT_JSON)
+
+
+def page_path(model: Path) -> Path:
+    """Where the page made of the report of a model lies."""
+    return model.with_name(REPORT_HTML)
+
+
+def weights_path(model: Path) -> Path:
+    """Where the last weights of a model lie, which a training goes on from."""
+    return model.with_suffix(WEIGHTS_SUFFIX)
+
+
+def write_report(path: Path, report: dict) -> None:
+    """Write a report; `format` and `version` come first.
+
+    Raises:
+        ValueError: it is not what `read_report` takes; a bug.
+        OutputError: it cannot be written.
+    """
+    write_text(path, report_text(report))
+
+
+def report_text(report: dict) -> str:
+    """What `write_report` writes; raises its ValueError."""
+    _check(report, _REPORT, "")
+    return json_text({"format": FORMAT, "version": VERSION, **report})
+
+
+def read_report(path: Path) -> dict:
+    """Read a report.
+
+    Returns:
+        It, with all keys of docs/training.md and values of their kinds.
+
+    Raises:
+        TrainingError: there is none that can be read, or it is none of this version, or damaged.
+    """
+    try:
+        report = json.loads(read_input(path, MAX_BYTES))
+    except OSError as error:
+        raise TrainingError(f"The report '{path}' cannot be read ({error.strerror or error}); train again.") from error
+    except (ValueError, RecursionError) as error:
+        raise TrainingError(f"The report '{path}' cannot be read ({error}); train again.") from error
+    if not isinstance(report, dict) or (report.get("format"), report.get("version")) != (FORMAT, VERSION):
+        raise TrainingError(f"'{path}' is not a training report of this version; train again.")
+    try:
+        _check(report, _REPORT, "")
+    except ValueError as error:
+        raise TrainingError(f"The report '{path}' is damaged: {error}; train again.") from error
+    return report
+
+
+def _check(value: object, kind: object, place: str) -> None:
+    """ValueError, which names the place: the value is not of its kind."""
+    if isinstance(kind, _OrNull):
+        if value is not None:
+            _check(value, kind.kind, place)
+    elif isinstance(kind, dict):
+        if not isinstance(value, dict):
+            raise ValueError(f"{place or 'it'} is no object")
+        for key, inner in kind.items():
+            name = key.removesuffix("?")
+            if name in value:
+                _check(value[name], inner, f"{place}.{name}".lstrip("."))
+            elif name == key:
+                raise ValueError(f"{place or 'it'} has no {name}")
+    elif isinstance(kind, list):
+        if not isinstance(value, list):
+            raise ValueError(f"{place} is no list")
+        for number, entry in enumerate(value):
+            _check(entry, kind[0], f"{place}[{number}]")
+    elif kind is Verdict:
+        if value not in [verdict.value for verdict in Verdict]:
+            raise ValueError(f"{place} is no verdict")
+    elif kind is str:
+        if not isinstance(value, str):
+            raise ValueError(f"{place} is no text")
+    elif isinstance(value, bool) or not isinstance(value, int if kind is int else int | float):
+        raise ValueError(f"{place} is no {'whole ' * (kind is int)}number")
+    elif not -MOST <= value <= MOST:
+        raise ValueError(f"{place} is out of all bounds")

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The pictures of an evaluation: partitions in colour; rig, linear layer and model side by side, plain or as heat."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..core.metrics import distances, heat_colors
+from ..core.partition import merged_partitions, partition_colors
+from ..core.skinning import LinearLayer
+from ..rig.reading import read_rig
+from ..runtime.opened_model import open_model
+from ..scene.scene_rig import SceneRig
+from .drawing import Cell, View, draw
+from .run import PoseErrors
+
+PLAIN = (0.78, 0.64, 0.55)
+
+
+@dataclass(frozen=True)
+class PicturedPose:
+    """A pose of a picture: its name, (J, 4, 4) pose matrices and the (V, 3) positions of the true rig."""
+
+    name: str
+    pose_matrices: np.ndarray
+    positions: np.ndarray
+    controls: np.ndarray
+
+
+def pictured(errors: PoseErrors, index: int, name: str = "") -> PicturedPose:
+    """One of the poses that were evaluated."""
+    return PicturedPose(
+        name or f"{errors.name} {index}", errors.pose_matrices[index], errors.positions[index], errors.controls[index]
+    )
+
+
+def worst_poses(errors: PoseErrors) -> list[PicturedPose]:
+    """The poses with the median, the 90th percentile and the largest of the mean errors of a pose."""
+    order = np.argsort(errors.fdda.mean(axis=1))
+    places = {"median pose": len(order) // 2, "90th percentile": int(len(order) * 0.9), "worst pose": len(order) - 1}
+    return [pictured(errors, int(order[place]), name) for name, place in places.items()]
+
+
+def draw_partitions(scene_rig: SceneRig, path: Path, view: View = View()) -> None:  # noqa: B008 - frozen
+    """Draw the rest pose with a colour for each partition.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    rig = read_rig(scene_rig)
+    partitions = merged_partitions(rig)
+    colors = partition_colors(partitions, rig.vertex_count)
+    cell = Cell(rig.rest_positions, colors, f"{len(partitions)} partitions, {rig.vertex_count} vertices")
+    draw(scene_rig.mesh_object.data, [[cell]], path, "Partitions by main joint", view)
+
+
+def draw_comparison(
+    scene_rig: SceneRig,
+    model: Path,
+    poses: list[PicturedPose],
+    path: Path,
+    heat: bool,
+    title: str = "",
+    view: View = View(),  # noqa: B008 - frozen
+) -> None:
+    """Draw true rig, linear layer and model side by side, a row a pose.
+
+    Args:
+        scene_rig: the rig. model: bound or not.
+        poses: what to draw.
+        path: of the PNG file.
+        heat: colour each vertex by its distance from the true rig.
+
+    Raises:
+        ModelError: the model cannot be read, or is of another rig.
+        OutputError: the file cannot be written.
+    """
+    opened = open_model(scene_rig, model)
+    network, layer = opened.network, LinearLayer(opened.linear_rig)
+    rows = []
+    for pose in poses:
+        linear = layer.positions(pose.pose_matrices[None])[0]
+        fdda = network.positions(pose.pose_matrices[None], pose.controls[None])[0].copy()
+        cells = [(pose.positions, f"{pose.name}: true rig"), (linear, "linear layer"), (fdda, "FDDA")]
+        rows.append(
+            [_cell(positions, pose.positions, label, heat, network.info.metres_per_unit) for positions, label in cells]
+        )
+    title = title or ("Distance from the true rig" if heat else "True rig, linear layer and FDDA")
+    draw(scene_rig.mesh_object.data, rows, path, title, view, heat_scale=heat, sculpted=not heat)
+
+
+def _cell(positions: np.ndarray, true: np.ndarray, label: str, heat: bool, metres_per_unit: float) -> Cell:
+    errors = distances(positions, true, metres_per_unit)
+    if errors.any():
+        label += f"  mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.1f} mm"
+    colors = heat_colors(errors) if heat else np.tile(np.float32(PLAIN), (len(positions), 1))
+    return Cell(positions, colors, label)

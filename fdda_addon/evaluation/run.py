@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Compares a model and the linear layer with the true rig, on poses that training never saw."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED
+from ..core.errors import FDDAError, RigError
+from ..core.metrics import ErrorStatistics, distances, error_statistics
+from ..core.partition import Partition
+from ..core.poses import Channel, beyond_range, sample_pose
+from ..core.progress import Progress
+from ..core.skinning import LinearLayer
+from ..core.surface import Surface, SurfaceComparison, SurfaceErrors, surface_errors, surface_json
+from ..poses.clip import find_clips
+from ..poses.sampling import model_channels
+from ..rig.borrowed_rig import borrowed_rig
+from ..rig.modifier_stack import check_evaluable
+from ..rig.reading import PoseEvaluator
+from ..runtime.network import Network
+from ..runtime.opened_model import open_model
+from ..scene.armature import Poser, clear_pose
+from ..scene.scene_rig import SceneRig
+
+HELD_OUT_INDEX = 1 << 33
+"""Held-out poses are drawn from indices that no recording reaches, so that they differ from the poses of any recording
+even when it was made with the same seed."""
+
+
+@dataclass(frozen=True)
+class NamedPose:
+    """A pose given by hand: Euler angles of bones in radians, in the order of the bone; other bones are at rest."""
+
+    name: str
+    rotations: dict[str, tuple[float, float, float]]
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What to compare on.
+
+    Attributes:
+        poses: number of random held-out poses; with 0 of them the first action or strip stands in their place.
+        seed: of the random poses.
+        actions, strips: names of actions, and of strips of the NLA, whose frames are compared as well.
+        beyond: factors by which the range of motion is widened for further poses, a quarter as many for each.
+        named: poses that are compared as well, each on its own.
+        surface: compare normals and edges too, which takes longer than all else.
+    """
+
+    poses: int = EVALUATION_POSES
+    seed: int = EVALUATION_SEED
+    actions: tuple[str, ...] = ()
+    beyond: tuple[float, ...] = ()
+    named: tuple[NamedPose, ...] = ()
+    surface: bool = True
+    strips: tuple[str, ...] = ()
+
+
+@dataclass
+class PoseErrors:
+    """Errors of one set of poses.
+
+    Attributes:
+        name: what the poses are.
+        pose_matrices: (N, J, 4, 4) float32, mesh-object space, mesh units.
+        positions: (N, V, 3) float32, the true rig, mesh-object space, mesh units.
+        controls: (N, C) float32, values of the controls.
+        fdda, linear: (N, V) float32, distances from the true rig, metres.
+        fdda_surface, linear_surface: errors of normals and edges, None for a mesh without faces, or where
+            they were not compared.
+    """
+
+    name: str
+    pose_matrices: np.ndarray
+    positions: np.ndarray
+    controls: np.ndarray
+    fdda: np.ndarray
+    linear: np.ndarray
+    fdda_surface: SurfaceErrors | None = None
+    linear_surface: SurfaceErrors | None = None
+
+    def to_json(self) -> dict:
+        return {
+            "name": self.name,
+            "poses": len(self.fdda),
+            "fdda": error_statistics(self.fdda).to_json(),
+            "linear": error_statistics(self.linear).to_json(),
+            **surface_json(self.fdda_surface, self.linear_surface),
+        }
+
+
+@dataclass
+class Evaluation:
+    """How well a model stands in for its rig.
+
+    Attributes:
+        partitions: of the rig. joints: names by joint index.
+        held_out: errors of the random poses, or of the first action or strip where there are none.
+        actions, beyond, named: errors of the actions and strips, of the poses beyond the range of motion by factor,
+            and of the poses given by hand.
+        channels: that the random poses were drawn from.
+    """
+
+    partitions: tuple[Partition, ...]
+    joints: tuple[str, ...]
+    held_out: PoseErrors
+    actions: list[PoseErrors] = field(default_factory=list)
+    beyond: list[PoseErrors] = field(default_factory=list)
+    named: list[PoseErrors] = field(default_factory=list)
+    channels: tuple[Channel, ...] = ()
+
+    @property
+    def fdda(self) -> ErrorStatistics:
+        return error_statistics(self.held_out.fdda)
+
+    @property
+    def linear(self) -> ErrorStatistics:
+        return error_statistics(self.held_out.linear)
+
+    def to_json(self) -> dict:
+        """docs/evaluation.md describes it; lengths in mm, angles in degrees."""
+        return {
+            "unit": "mm",
+            "poses": len(self.held_out.fdda),
+            "vertices": self.held_out.fdda.shape[1],
+            "fdda": self.fdda.to_json(),
+            "linear": self.linear.to_json(),
+            "partitions": [
+                {
+                    "joint": self.joints[partition.joint],
+                    "vertices": len(partition.vertices),
+                    "fdda": error_statistics(self.held_out.fdda[:, partition.vertices]).to_json(),
+                    "linear": error_statistics(self.held_out.linear[:, partition.vertices]).to_json(),
+                }
+                for partition in self.partitions
+            ],
+            "actions": [errors.to_json() for errors in self.actions],
+            "beyond": [errors.to_json() for errors in self.beyond],
+            "named": [errors.to_json() for errors in self.named],
+            **surface_json(self.held_out.fdda_surface, self.held_out.linear_surface),
+        }
+
+
+def evaluate(
+    scene_rig: SceneRig, model: Path | Network, settings: EvaluationSettings
+) -> Iterator[Progress | Evaluation]:
+    """Compare a model with its rig; a generator that does the work while it is iterated.
+
+    The scene is as before when the generator ends, is closed, or raises.
+
+    Yields:
+        Progress, and as the last thing the Evaluation.
+
+    Raises:
+        RigError: the rig cannot be evaluated.
+        ModelError: the model cannot be read, or is of another rig.
+    """
+    clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips)
+    if not settings.poses and not clips:
+        raise RigError("There is nothing to evaluate: 0 poses and no action; give --poses or --action.")
+    network, layer = _prepare(scene_rig, model)
+    rig = layer.rig
+    # A rig that is posed by actions alone may have nothing to sample.
+    channels = model_channels(scene_rig, rig, network.info) if settings.poses or settings.beyond else ()
+    extra = max(1, settings.poses // 4)
+    total = settings.poses + extra * len(settings.beyond) + len(settings.named)
+    total += sum(len(clip.frames) for clip in clips)
+    with borrowed_rig(scene_rig, rig, channels, clips) as player:
+        comparison = _Comparison(PoseEvaluator(scene_rig, rig), network, layer, total, settings.surface)
+        held_out = None
+        if settings.poses:
+            poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses)
+            held_out = yield from comparison.compare("held-out poses", poses)
+        beyond = []
+        for number, factor in enumerate(settings.beyond, 1):
+            first = HELD_OUT_INDEX * (1 + number)
+            poses = _random_poses(scene_rig, beyond_range(channels, factor), settings.seed, first, extra)
+            beyond.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
+        named = []
+        for pose in settings.named:
+            named.append((yield from comparison.compare(pose.name, _named_pose(scene_rig, pose))))
+        actions = []
+        for clip in clips:
+            actions.append((yield from comparison.compare(clip.title, player.frames(clip))))
+    yield Evaluation(layer.partitions, rig.joint_names, held_out or actions[0], actions, beyond, named, channels)
+
+
+def evaluate_action(scene_rig: SceneRig, model: Path | Network, name: str) -> Iterator[Progress | Evaluation]:
+    """Compare positions on the frames of one action alone, which stand in the place of held-out poses.
+
+    As `evaluate` in all else.
+    """
+    clips = find_clips(scene_rig.armature_object, [name])
+    network, layer = _prepare(scene_rig, model)
+    with borrowed_rig(scene_rig, layer.rig, (), clips) as player:
+        evaluator = PoseEvaluator(scene_rig, layer.rig)
+        comparison = _Comparison(evaluator, network, layer, len(clips[0].frames), surface=False)
+        errors = yield from comparison.compare(name, player.frames(clips[0]))
+    yield Evaluation(layer.partitions, layer.rig.joint_names, errors)
+
+
+def _prepare(scene_rig: SceneRig, model: Path | Network) -> tuple[Network, LinearLayer]:
+    check_evaluable(scene_rig)
+    opened = open_model(scene_rig, model)
+    rig = opened.linear_rig
+    return opened.network, LinearLayer(rig, opened.network.info.partitions_of(rig))
+
+
+def pose_held_out(scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, index: int) -> None:
+    """Pose a rig as for one of the random poses that `evaluate` compares, with the channels of that evaluation."""
+    clear_pose(scene_rig.armature_object)
+    next(_random_poses(scene_rig, channels, seed, HELD_OUT_INDEX + index, 1))
+
+
+def _random_poses(
+    scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, first: int, count: int
+) -> Iterator[None]:
+    poser = Poser(scene_rig, channels)
+    for index in range(first, first + count):
+        poser.set(sample_pose(channels, seed, index))
+        yield
+
+
+def _named_pose(scene_rig: SceneRig, pose: NamedPose) -> Iterator[None]:
+    clear_pose(scene_rig.armature_object)
+    Poser(
+        scene_rig,
+        tuple(Channel(bone, "rotation", axis, 0, 0) for bone in pose.rotations for axis in range(3)),
+    ).set(np.array([angle for angles in pose.rotations.values() for angle in angles]))
+    yield
+
+
+class _Comparison:
+    """Evaluates poses three ways and counts them."""
+
+    def __init__(self, evaluator: PoseEvaluator, network: Network, layer: LinearLayer, total: int, surface: bool):
+        self._evaluator, self._network, self._layer = evaluator, network, layer
+        self._done, self._total = 0, total
+        rig, self._surface = layer.rig, None
+        self._metres_per_unit = rig.metres_per_unit
+        if surface and len(rig.face_starts):
+            faces = Surface(rig.face_starts, rig.face_vertices)
+            self._surface = SurfaceComparison(faces, rig.rest_positions, layer.partitions)
+
+    def compare(self, name: str, poses: Iterator[None]) -> Iterator[Progress]:
+        """Yields progress, returns PoseErrors."""
+        matrices, positions, values, fdda, linear, surface = [], [], [], [], [], []
+        for _ in poses:
+            pose, true, controls = self._evaluator.evaluate()
+            moved = self._network.positions(pose[None], controls[None])[0]
+            for points, what in ((true, "The rig"), (moved, f"The model '{self._network.path}'")):
+                if not np.isfinite(points).all():
+                    raise FDDAError(
+                        f"{what} gives positions that are not numbers ({name}, pose {len(fdda)}); "
+                        "look for a scale of zero or a broken driver in the rig, else train again."
+                    )
+            matrices.append(pose)
+            positions.append(true)
+            values.append(controls)
+            fdda.append(distances(moved, true, self._metres_per_unit))
+            skinned = self._layer.positions(pose[None])[0]
+            linear.append(distances(skinned, true, self._metres_per_unit))
+            if self._surface:
+                surface.append(self._surface.compare(true, (moved, skinned)))
+            self._done += 1
+            yield Progress("evaluation", self._done, self._total)
+        stacked = (np.stack(arrays) for arrays in (matrices, positions, values, fdda, linear))
+        return PoseErrors(name, *stacked, *(surface_errors(rows) for rows in zip(*surface, strict=True)))

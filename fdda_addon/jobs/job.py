@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The jobs under way and those that have ended: what panels draw, and what ends a job from outside.
+
+A job is a generator that works while it is iterated: it yields `Progress`, None when there is nothing to do at the
+moment, and at most one other value, its result. One job at a time works on a character, and one beside it on the
+trainer's environment. `operators.job` iterates the one, `background` the other.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..core.errors import FDDAError
+from ..core.progress import Progress
+from ..scene import kept
+
+LOG_LINES = 2000
+CHARACTER, ENVIRONMENT = "character", "environment"
+"""What jobs work on. That on a character ends with the file; that on the trainer's environment touches no data of
+Blender's, and goes on when its window is closed and another file is opened.
+"""
+UNITS = {
+    "influences": "joint tests",
+    "fit": "vertices fitted",
+    "probes": "poses compared with the rig",
+    "starting": "the trainer starts and reads the recording",
+}
+"""What the stages of jobs count, where their names do not say it."""
+
+
+@dataclass
+class JobState:
+    """A job as panels draw it, under way or ended.
+
+    Attributes:
+        verb: which job, the name in the operator's bl_idname ("record").
+        title: what it does, for people ("Recording").
+        subject: session_uid of the object that it is about, 0 for none.
+        works_on: `CHARACTER` or `ENVIRONMENT`.
+        can_cancel: whether it can be cancelled.
+        borrows_scene: it changes the scene and gives it back when it ends.
+        is_running: under way.
+        cancel_requested: the user wants it to end.
+        part: name of the object that it works on now, of several; empty for one.
+        stage, done, total: how far it is; total is 0 as long as nothing is known, and done counts seconds then.
+        started, ended: `time.monotonic` seconds.
+        outcome: how it ended, a sentence; empty while it runs.
+        outcome_level: 'INFO', 'WARNING' (cancelled) or 'ERROR'.
+        log: lines of text that the job wrote, the last `LOG_LINES`.
+        warnings: sentences about what the job works on, for jobs that have some.
+        curves: values by name, one for each step, for jobs that have some ("training", "validation").
+    """
+
+    verb: str
+    title: str
+    subject: int = 0
+    borrows_scene: bool = False
+    works_on: str = CHARACTER
+    can_cancel: bool = True
+    is_running: bool = True
+    cancel_requested: bool = False
+    part: str = ""
+    stage: str = ""
+    done: int = 0
+    total: int = 0
+    started: float = field(default_factory=time.monotonic)
+    ended: float = 0.0
+    outcome: str = ""
+    outcome_level: str = "INFO"
+    log: deque[str] = field(default_factory=lambda: deque(maxlen=LOG_LINES))
+    warnings: list[str] = field(default_factory=list)
+    curves: dict[str, list[float]] = field(default_factory=dict)
+    _stage_start: tuple[float, int] = (0.0, 0)
+
+    @property
+    def fraction(self) -> float:
+        """Part of the stage that is done, 0 to 1."""
+        return self.done / self.total if self.total else 0.0
+
+    @property
+    def remaining_seconds(self) -> float | None:
+        """How long the stage will still take at its speed so far, None when that cannot be said."""
+        began, first = self._stage_start
+        if self.done <= first or not self.is_running:
+            return None
+        return (time.monotonic() - began) / (self.done - first) * (self.total - self.done)
+
+    @property
+    def sentence(self) -> str:
+        """How far it is: "212 of 1,000 poses"."""
+        unit = UNITS.get(self.stage, self.stage)
+        if not self.stage:
+            text = "Starting…"
+        elif not self.total:
+            text = f"{unit[:1].upper()}{unit[1:]}: {self.done} s"
+        else:
+            text = f"{self.done:,} of {self.total:,} {unit}"
+        return f"{self.part}: {text}" if self.part else text
+
+    def begin_part(self, name: str) -> None:
+        """Note that the work on another of several objects begins."""
+        self.part, self.stage, self.done, self.total = name, "", 0, 0
+        self.curves.clear()
+
+    def show(self, progress: Progress) -> None:
+        """Note how far the job is."""
+        if progress.stage != self.stage:
+            self.stage, self._stage_start = progress.stage, (time.monotonic(), progress.done)
+        self.done, self.total = progress.done, progress.total
+        if progress.note:
+            self.log.append(progress.note)
+
+
+_states: dict[str, JobState] = {}
+_running: "dict[str, Run]" = {}
+
+
+def current(works_on: str = CHARACTER) -> JobState | None:
+    """The job that runs, None when there is none."""
+    run = _running.get(works_on)
+    return run.state if run else None
+
+
+def state_of(verb: str) -> JobState | None:
+    """The job of this verb that runs or was the last to run in this session, None when there was none."""
+    return _states.get(verb)
+
+
+def request_cancel(works_on: str = CHARACTER) -> None:
+    """Ask the job to end; what it has kept stays."""
+    if state := current(works_on):
+        state.cancel_requested = True
+
+
+def stop(reason: str, works_on: str = CHARACTER) -> None:
+    """End the job now, if one runs: its generator is closed, so what it borrowed is given back and its process ends.
+
+    Args:
+        reason: the sentence that panels show.
+        works_on: which job.
+    """
+    if run := _running.get(works_on):
+        try:
+            run.close()
+        except FDDAError as error:
+            reason = f"{reason} {error}"
+        run.end(reason, "WARNING")
+
+
+class Run:
+    """A job under way: its state, its generator, and what is said at its end."""
+
+    def __init__(
+        self,
+        state: JobState,
+        steps: Iterator,
+        finish: Callable[[object], str],
+        cancelled: Callable[[], str],
+        ends_itself: bool = False,
+    ):
+        """Begin it.
+
+        Args:
+            state: of the job.
+            steps: the generator.
+            finish: what remains to do with its result; returns the outcome. FDDAErrors are the outcome as well.
+            cancelled: the outcome when it was cancelled and has no result.
+            ends_itself: `steps` watches `state.cancel_requested` and ends soon; otherwise it is closed.
+        """
+        self.state, self.steps = state, steps
+        self.result: object = None
+        self.is_waiting = False
+        self._finish, self._cancelled, self._ends_itself = finish, cancelled, ends_itself
+        _states[state.verb] = state
+        _running[state.works_on] = self
+
+    def work(self, seconds: float) -> bool:
+        """Work for about so long, or until the job waits; returns whether it has ended. Its state says how.
+
+        What is no error for the user propagates: Ctrl-C or a bug. What was borrowed is given back all the same, and
+        another job may begin.
+        """
+        title = self.state.title
+        try:
+            cancelled = self.state.cancel_requested
+            if cancelled and not self._ends_itself:
+                self.close()
+            elif not self.advance(seconds):
+                return False
+            if cancelled and self.result is None:
+                self.end(self._cancelled(), "WARNING")
+            else:
+                self.end(self._finish(self.result), "INFO")
+        except FDDAError as error:
+            self.end(str(error), "WARNING" if cancelled and self._ends_itself else "ERROR")
+        except ReferenceError:
+            self.end(f"{title} ended: what it worked on was removed.", "ERROR")
+        except BaseException:
+            self.close()
+            self.end(f"{title} broke off; the system console says why.", "ERROR")
+            raise
+        return True
+
+    def advance(self, seconds: float) -> bool:
+        """Work for about so long, or until the job waits; returns whether it is done."""
+        until = time.monotonic() + seconds
+        self.is_waiting = False
+        while True:
+            try:
+                step = next(self.steps)
+            except StopIteration:
+                return True
+            if step is None:
+                self.is_waiting = True
+                return False
+            if isinstance(step, Progress):
+                self.state.show(step)
+            else:
+                self.result = step
+            if self.state.cancel_requested or time.monotonic() >= until:
+                return False
+
+    def close(self) -> None:
+        """End the generator where it is.
+
+        Raises:
+            FDDAError: what it still had to do failed.
+        """
+        self.steps.close()
+
+    def end(self, outcome: str, level: str) -> None:
+        """Note how the job ended; another may begin."""
+        state = self.state
+        state.is_running, state.ended, state.outcome, state.outcome_level = False, time.monotonic(), outcome, level
+        if _running.get(state.works_on) is self:
+            del _running[state.works_on]
+        redraw()
+
+
+def redraw() -> None:
+    """Draw the sidebars and the preferences again, and have them look again at what they show."""
+    kept.forget()
+    for window in getattr(bpy.context.window_manager, "windows", ()):
+        for area in window.screen.areas:
+            if area.type in {"VIEW_3D", "PREFERENCES"}:
+                for region in area.regions:
+                    if region.type == "UI" or area.type == "PREFERENCES":
+                        region.tag_redraw()
+
+
+def _stop(reason: str, works_on: str = CHARACTER) -> None:
+    if state := current(works_on):
+        stop(f"{state.title} ended because {reason}.", works_on)
+
+
+@persistent
+def _on_load(*_: object) -> None:
+    _stop("another file was opened")
+    # What ended is about objects of the file that is left.
+    _states.clear()
+
+
+@persistent
+def _on_undo(*_: object) -> None:
+    if (state := current()) and state.borrows_scene:
+        _stop("the scene was undone")
+
+
+HANDLERS = {"load_pre": _on_load, "undo_pre": _on_undo, "redo_pre": _on_undo}
+
+
+def unregister() -> None:
+    """End all jobs. Blender does this when it is closed."""
+    for works_on in (CHARACTER, ENVIRONMENT):
+        _stop("the add-on was disabled", works_on)

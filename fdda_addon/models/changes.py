@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What has changed of a rig since a model of it was trained."""
+
+from dataclasses import dataclass
+
+import bpy
+
+from ..core.model import ModelInfo
+from ..core.poses import Channel, range_changes
+from ..core.rig import Rig, differences
+from ..poses.sampling import sampled_channels
+from ..rig.reading import read_model_rig
+from ..scene.scene_rig import SceneRig
+from .model_list import info_of
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What has changed of a rig since a model of it was trained.
+
+    Attributes:
+        model: what the model is called.
+        clauses: changes that keep it from playing ("the skin weights differ").
+        limits: bones whose range of motion is another; there the model plays, but leaves what it was trained on.
+    """
+
+    model: str
+    clauses: tuple[str, ...] = ()
+    limits: tuple[str, ...] = ()
+
+    @property
+    def prevents(self) -> bool:
+        """Whether the model cannot play any more."""
+        return bool(self.clauses)
+
+    @property
+    def sentence(self) -> str:
+        """Says what has changed and what to do; empty when nothing has."""
+        if self.clauses:
+            return (
+                f"{self.model} is of this rig as it was before: {'; '.join(self.clauses)}. Undo the change, or record "
+                "and train again."
+            )
+        if not self.limits:
+            return ""
+        bones = ", ".join(f"'{bone}'" for bone in self.limits[:3])
+        more = f" and {len(self.limits) - 3} more" if len(self.limits) > 3 else ""
+        return (
+            f"The range of motion of {bones}{more} has changed since {self.model} was trained: it plays, but may be "
+            "less exact there. Record and train again."
+        )
+
+
+def changes(name: str, info: ModelInfo, rig: Rig, channels: tuple[Channel, ...]) -> Changes:
+    """Compare a rig, and the range of motion of its poses, with what a model was trained for.
+
+    Args:
+        name, info: the model.
+        rig: with the joints of the model (`rig.reading.read_model_rig`).
+        channels: of the rig as it stands. The ranges of control bones were chosen by the user and are not compared.
+    """
+    clauses = differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
+    is_own = all(channel.name in rig.joint_names for channel in info.limits)
+    return Changes(name, tuple(clauses), tuple(range_changes(info.limits, channels)) if info.limits and is_own else ())
+
+
+def changes_since(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> Changes:
+    """What has changed of a rig since a model of its list was trained.
+
+    Raises:
+        FDDAError: the rig or the model cannot be read.
+    """
+    info = info_of(scene_rig.mesh_object, entry)
+    rig = read_model_rig(scene_rig, info)
+    return changes(entry.name, info, rig, sampled_channels(scene_rig, rig))

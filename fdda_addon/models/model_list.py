@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The models of a mesh object: the list that it keeps, and which of them is bound."""
+
+import os
+from pathlib import Path
+
+import bpy
+
+from ..core.errors import ModelError, OutputError
+from ..core.model import MAX_BYTES, ModelInfo, check_model, read_model, read_model_info
+from ..core.output import check_writable, replacing
+from ..evaluation import last_evaluation
+from ..runtime import model_files, packed, playback
+from ..runtime.binding import bind, unbind
+from ..runtime.model_files import absolute_path, path_for
+from ..runtime.opened_model import fitting_rig
+from ..scene.scene_rig import SceneRig
+from .entries import bound_entry, bound_name, chosen_entry, is_bound
+
+_infos: dict[tuple, ModelInfo] = {}
+
+
+def remember(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGroup:
+    """Put a model that the user has chosen or trained into the list of its mesh; it becomes the chosen entry.
+
+    Returns:
+        Its entry, the one that is there already for the same file. Where that is bound, the file is loaded anew, and
+        packed anew where it is packed.
+
+    Raises:
+        ModelError: a packed model is to be replaced, and the file cannot be read or is no model.
+    """
+    binding = mesh_object.fdda
+    model_files.choose(path)
+    for index, entry in enumerate(binding.models):
+        if absolute_path(mesh_object, entry.path) == Path(os.path.normpath(path.absolute())):
+            binding.model_index = index
+            was_bound = is_bound(mesh_object, entry)
+            is_other = _pack_anew(mesh_object, entry, path) if entry.packed else playback.is_outdated(mesh_object)
+            if was_bound and is_other:
+                last_evaluation.forget(mesh_object)
+                playback.forget()
+                mesh_object.update_tag()
+            return entry
+    entry = binding.models.add()
+    entry.name = path.stem
+    entry.path = path_for(mesh_object, path)
+    binding.model_index = len(binding.models) - 1
+    return entry
+
+
+def adopt(mesh_object: bpy.types.Object) -> None:
+    """Put the model that is bound into the list, where a script or the command line has bound it."""
+    binding = mesh_object.fdda
+    if binding.is_bound and bound_entry(mesh_object) is None:
+        entry = binding.models.add()
+        entry.name, entry.path, entry.packed = bound_name(mesh_object), binding.model, binding.packed
+        entry.packed_bytes = len(packed.read(binding.packed)) if binding.packed else 0
+
+
+def chosen(mesh_object: bpy.types.Object) -> bpy.types.PropertyGroup:
+    """The entry that is chosen in the list.
+
+    Raises:
+        ModelError: the list is empty.
+    """
+    entry = chosen_entry(mesh_object)
+    if entry is None:
+        raise ModelError(f"'{mesh_object.name}' has no model yet; train one, or choose a file.")
+    return entry
+
+
+def check(scene_rig: SceneRig, path: Path) -> None:
+    """Fail when a file is no model, or was trained for another rig.
+
+    Raises:
+        FDDAError: says why.
+    """
+    fitting_rig(scene_rig, path, read_model_info(path))
+
+
+def bind_entry(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> None:
+    """Bind a model of the list and play it, in place of the one that is bound.
+
+    Raises:
+        FDDAError: as `bind`, or it cannot play; what was bound is bound again.
+    """
+    mesh_object = scene_rig.mesh_object
+    binding = mesh_object.fdda
+    previous = bound_entry(mesh_object)
+    mode, use_in_render = binding.mode, binding.use_in_render
+    path = entry_path(mesh_object, entry)
+    bind(scene_rig, path, use_in_render, entry.packed)
+    entry.path = binding.model = path_for(mesh_object, path)
+    binding.model_index = list(binding.models).index(entry)
+    # Evaluated here, so that what cannot play is told now and not at the next frame.
+    bpy.context.view_layer.update()
+    if problem := binding.status:
+        unbind(mesh_object)
+        if previous is not None and previous != entry:
+            bind(scene_rig, entry_path(mesh_object, previous), use_in_render, previous.packed)
+            binding.model = previous.path
+            binding.mode = mode
+        raise ModelError(problem)
+
+
+def relink(scene_rig: SceneRig, path: Path) -> None:
+    """Bind the file that the bound model has moved to; its entry in the list follows.
+
+    Raises:
+        FDDAError: as `bind_entry`.
+    """
+    mesh_object = scene_rig.mesh_object
+    read_model(path)
+    entry = bound_entry(mesh_object)
+    if entry is None:
+        entry = remember(mesh_object, path)
+    entry.path, entry.packed, entry.packed_bytes = path_for(mesh_object, path), None, 0
+    model_files.choose(path)
+    bind_entry(scene_rig, entry)
+    packed.remove_unused()
+
+
+def forget_entry(mesh_object: bpy.types.Object, index: int) -> str:
+    """Take a model off the list and unbind it if it is bound; returns its name. Its file stays, a packed one goes.
+
+    Raises:
+        ModelError: a library override has the entry from its library.
+    """
+    binding = mesh_object.fdda
+    entry = binding.models[index]
+    name = entry.name
+    override = mesh_object.override_library
+    if override is not None and override.reference is not None and index < len(override.reference.fdda.models):
+        file = Path(override.reference.library.filepath).name
+        raise ModelError(f"The model '{name}' is in the list of '{file}'; remove it there, or unbind it here.")
+    if is_bound(mesh_object, entry):
+        unbind(mesh_object)
+    binding.models.remove(index)
+    binding.model_index = max(0, min(binding.model_index, len(binding.models) - 1))
+    packed.remove_unused()
+    return name
+
+
+def pack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path | None = None) -> int:
+    """Put a model of the list into the .blend file; returns its size in bytes.
+
+    Args:
+        mesh_object, entry: the model.
+        path: of its file, where that was chosen just now; None to follow the entry.
+
+    Raises:
+        ModelError: its file cannot be read or is no model.
+    """
+    path = path or entry_path(mesh_object, entry)
+    bound = is_bound(mesh_object, entry)
+    data = read_model(path)[1]
+    entry.packed, entry.packed_bytes = packed.pack(path.name, data), len(data)
+    if bound:
+        mesh_object.fdda.packed = entry.packed
+        playback.forget()
+    return len(data)
+
+
+def _pack_anew(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path) -> bool:
+    """Pack the file of a packed model where it is another now; returns whether it was."""
+    if entry.packed.get(packed.KEY) == read_model(path)[1]:
+        return False
+    pack_entry(mesh_object, entry, path)
+    packed.remove_unused()
+    return True
+
+
+def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path) -> None:
+    """Write a packed model to a file and play that from now on.
+
+    Raises:
+        ModelError: what is packed is no model any more.
+        OutputError: the file cannot be written, or another is there.
+    """
+    data = packed.read(entry.packed)
+    check_model(data, entry.packed.name)
+    check_writable(path)
+    if not (os.path.lexists(path) and path.is_file() and _same(path, data)):
+        if os.path.lexists(path):
+            raise OutputError(f"There is another file '{path}'; choose another name.")
+        with replacing(path) as temporary:
+            temporary.write_bytes(data)
+    bound = is_bound(mesh_object, entry)
+    entry.path, entry.packed, entry.packed_bytes = path_for(mesh_object, path), None, 0
+    model_files.choose(path)
+    if bound:
+        mesh_object.fdda.model, mesh_object.fdda.packed = entry.path, None
+        playback.forget()
+    packed.remove_unused()
+
+
+def entry_path(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> Path:
+    """Where the model of an entry is, or was before it was packed.
+
+    Raises:
+        ModelError: the path of a saved file leads out of the file's folder.
+    """
+    return absolute_path(mesh_object, entry.path) if entry.packed else model_files.allowed_path(mesh_object, entry.path)
+
+
+def info_of(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> ModelInfo:
+    """What a model of the list says of itself; read once.
+
+    Raises:
+        ModelError: it cannot be read or is no model.
+    """
+    if entry.packed:
+        key = (entry.packed.session_uid,)
+        if key not in _infos:
+            _infos[key] = check_model(packed.read(entry.packed), entry.packed.name)
+        return _infos[key]
+    path = entry_path(mesh_object, entry)
+    try:
+        status = os.stat(path)
+    except OSError as error:
+        raise ModelError(f"The model '{path}' cannot be read: {error.strerror}; find it, or choose another.") from error
+    key = (path, status.st_mtime_ns, status.st_size)
+    if key not in _infos:
+        for old in [old for old in _infos if old[0] == path]:
+            del _infos[old]
+        _infos[key] = read_model_info(path)
+    return _infos[key]
+
+
+def _same(path: Path, data: bytes) -> bool:
+    return path.stat().st_size == len(data) <= MAX_BYTES and path.read_bytes() == data

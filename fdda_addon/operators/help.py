@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The manual, opened in the web browser at the section of a button. It comes with the add-on: no network is needed."""
+
+import tempfile
+from pathlib import Path
+
+import bpy
+
+from ..core.errors import OutputError
+from ..core.manual_page import anchor, page
+from ..core.output import write_text
+
+MANUAL = Path(__file__).resolve().parents[2] / "docs" / "manual.md"
+
+
+class FDDA_OT_help(bpy.types.Operator):
+    bl_idname = "fdda.help"
+    bl_label = "Manual"
+    bl_description = "Open the manual in the web browser, at this section"
+    bl_options = {"REGISTER"}
+
+    section: bpy.props.StringProperty(
+        name="Section", description="Heading in the manual; empty for its beginning", options={"SKIP_SAVE"}
+    )
+
+    def execute(self, _context: bpy.types.Context) -> set[str]:
+        try:
+            path = manual_file()
+        except (OSError, OutputError) as error:
+            self.report({"ERROR"}, f"The manual cannot be opened ({error}).")
+            return {"CANCELLED"}
+        address = path.as_uri() + (f"#{anchor(self.section)}" if self.section else "")
+        try:
+            bpy.ops.wm.url_open(url=address)
+        except RuntimeError:
+            self.report({"ERROR"}, f"No web browser could be started; open '{path}' yourself.")
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{address} opens in the web browser.")
+        return {"FINISHED"}
+
+
+def manual_file() -> Path:
+    """The manual as a page for browsers, written anew; its pictures are those of the add-on.
+
+    Raises:
+        OSError, OutputError: it cannot be read or written.
+    """
+    text = MANUAL.read_text(encoding="utf-8")
+    folder = Path(bpy.app.tempdir or tempfile.gettempdir())
+    path = folder / "fdda_manual.html"
+    write_text(path, page(text, MANUAL.parent.as_uri()))
+    return path
+
+
+CLASSES = (FDDA_OT_help,)

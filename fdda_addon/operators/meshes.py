@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The meshes of one armature: which of them the sidebar shows, and Blender's menus with all buttons of the add-on.
+
+Blender's search (F3) finds what is in a menu, so all of them are.
+"""
+
+import bpy
+
+from ..core.errors import RigError
+from ..jobs.job import redraw
+from ..scene.active_rig import rigs_together, shown_rig, shown_together
+from .on_rig import OnRig
+
+BUTTONS = (
+    ("fdda.add_arm", "fdda.make_model"),
+    ("fdda.measure",),
+    ("fdda.preview_pose", "fdda.rest_pose", "fdda.use_selected_bones", "fdda.limits_from_actions"),
+    ("fdda.limits_preset", "fdda.copy_ranges", "fdda.mirror_ranges", "fdda.edit_ranges", "fdda.forget_ranges"),
+    ("fdda.add_control", "fdda.remove_control"),
+    ("fdda.record", "fdda.remove_recording"),
+    ("fdda.check_trainer", "fdda.train", "fdda.refine", "fdda.create_trainer_environment"),
+    ("fdda.bind", "fdda.switch", "fdda.measure_model", "fdda.bake", "fdda.relink", "fdda.unbind"),
+    ("fdda.evaluate", "fdda.paint", "fdda.fit_range", "fdda.mark_worst", "fdda.jump_to_worst"),
+    ("fdda.remove_markers", "fdda.open_report"),
+    ("fdda.add_model", "fdda.remove_model", "fdda.pack_model", "fdda.unpack_model", "fdda.check_model"),
+    ("fdda.help",),
+)
+"""The operators of the menu, in groups."""
+
+
+class FDDA_OT_choose_mesh(OnRig, bpy.types.Operator):
+    bl_idname = "fdda.choose_mesh"
+    bl_label = "Show Mesh"
+    bl_description = "Show this mesh of the armature in the sidebar"
+    bl_options = {"INTERNAL"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.has_rig(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            shown = self.rig(context).mesh_object
+        except RigError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        context.window_manager.fdda.mesh = shown.name
+        # A mesh that is selected beside the armature would be shown in its place.
+        for rig in rigs_together(context):
+            if rig.mesh_object.select_get():
+                rig.mesh_object.select_set(False)
+        redraw()
+        return {"FINISHED"}
+
+
+class FDDA_MT_all(bpy.types.Menu):
+    bl_idname = "FDDA_MT_all"
+    bl_label = "FDDA"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        together = context.window_manager.fdda.all_meshes and bool(shown_together(context))
+        for number, group in enumerate(BUTTONS):
+            if number:
+                self.layout.separator()
+            for name in group:
+                properties = self.layout.operator(name)
+                if together and "all_meshes" in properties.bl_rna.properties:
+                    properties.all_meshes = True
+
+
+def _draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
+    if shown_rig(context) is not None or context.mode == "OBJECT":
+        self.layout.separator()
+        self.layout.menu(FDDA_MT_all.bl_idname)
+
+
+CLASSES = (FDDA_OT_choose_mesh, FDDA_MT_all)
+MENUS = ("VIEW3D_MT_object", "VIEW3D_MT_pose")
+
+
+def register() -> None:
+    """Put the menu into those of object mode and pose mode."""
+    for name in MENUS:
+        getattr(bpy.types, name).append(_draw_menu)
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    for name in MENUS:
+        getattr(bpy.types, name).remove(_draw_menu)

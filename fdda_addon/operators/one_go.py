@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""All steps from the rig to a model that plays, with one button: record, train, bind."""
+
+from collections.abc import Iterator
+
+import bpy
+
+from ..core.errors import RigError
+from ..properties.character import model_file, recording_folder
+from .job import JobOperator
+from .playback import bind_model
+from .recording import is_recorded, record_rigs
+from .training import TrainsModels
+
+
+class FDDA_OT_make_model(TrainsModels, JobOperator, bpy.types.Operator):
+    bl_idname = "fdda.make_model"
+    bl_label = "Prepare, Train, Bind"
+    bl_description = (
+        "Record with the settings below, train, and bind the model, one after the other; what is recorded already is "
+        "trained on. ESC cancels while it records, and Cancel always"
+    )
+    bl_options = {"REGISTER"}
+    verb, title = "make_model", "Prepare, Train, Bind"
+    ends_itself = True
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.is_idle() and cls.has_rig(context)
+
+    def steps(self, context: bpy.types.Context) -> Iterator[object]:
+        rigs = self.rigs(context)
+        for rig in rigs:
+            if rig.mesh_object.library is not None:
+                raise RigError(f"'{rig.mesh_object.name}' is linked; make its model in the file that it comes from.")
+        files = [(rig, recording_folder(rig.mesh_object), model_file(rig.mesh_object)) for rig in rigs]
+        missing = [(rig, recording) for rig, recording, _ in files if not is_recorded(recording)]
+        if missing:
+            # One that was broken off is resumed.
+            resume = any((recording / "recording.json").exists() for _, recording in missing)
+            for step in record_rigs(self.rig(context), missing, resume):
+                yield step
+                if self.state.cancel_requested:
+                    return
+        self.borrows_scene = self.state.borrows_scene = False
+        meshes = [(rig.mesh_object, recording, model) for rig, recording, model in files]
+        for mesh_object, recording, model in meshes:
+            self.state.begin_part(mesh_object.name if len(meshes) > 1 else "")
+            yield from self.train(mesh_object, recording, model)
+            if self.state.cancel_requested:
+                return
+
+    def finish(self, _context: bpy.types.Context, result: float) -> str:
+        from ..scene.scene_rig import SceneRig, armature_of
+
+        self.list_models()
+        sentences = []
+        for uid, model in self.trained:
+            mesh_object = next((o for o in bpy.data.objects if o.session_uid == uid), None)
+            if mesh_object is not None and (armature_object := armature_of(mesh_object)) is not None:
+                sentences.append(bind_model(SceneRig(mesh_object, armature_object), model))
+        return f"Trained in {result:.0f} s. {' '.join(sentences)}"
+
+    def cancelled(self, _context: bpy.types.Context) -> str:
+        self.list_models()
+        return "Cancelled; what was recorded is kept, and the next time goes on from there."
+
+
+CLASSES = (FDDA_OT_make_model,)

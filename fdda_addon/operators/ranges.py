@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The range of motion of many bones at once: those that are selected, in the list and in the view alike."""
+
+import math
+
+import bpy
+
+from ..core.errors import RigError
+from ..scene.compatibility import is_selected
+from .on_pose import OnPose
+
+AXES = "XYZ"
+
+
+class _OnSelected(OnPose):
+    """Mixin for an operator on the ranges of the selected bones."""
+
+    def selected(self, context: bpy.types.Context) -> list[bpy.types.PoseBone]:
+        """The selected bones.
+
+        Raises:
+            RigError: there is none.
+        """
+        armature_object = self.rig(context).armature_object
+        found = [bone for bone in armature_object.pose.bones if is_selected(bone)]
+        if not found:
+            raise RigError(
+                f"No bone of '{armature_object.name}' is selected; tick bones in the list, or select them in pose mode."
+            )
+        return found
+
+
+def _copy(source: bpy.types.PoseBone, target: bpy.types.PoseBone, mirrored: bool = False) -> None:
+    """State the ranges of one bone for another; those of one on the other side turn round about Y and Z."""
+    from ..poses.motion_range import DEFAULT, rotation_ranges, state_rotation_range, unstate_rotation_range
+
+    for axis, found in enumerate(rotation_ranges(source)):
+        turned = mirrored and axis > 0
+        low, high = (-found.high, -found.low) if turned else (found.low, found.high)
+        if found.source == DEFAULT:
+            unstate_rotation_range(target, axis)
+        elif low < high:
+            state_rotation_range(target, axis, low, high)
+        target.lock_rotation[axis] = found.is_locked or low >= high
+
+
+class FDDA_OT_edit_ranges(_OnSelected, bpy.types.Operator):
+    bl_idname = "fdda.edit_ranges"
+    bl_label = "Set Ranges of Selected"
+    bl_description = "Give the selected bones one range of motion about each axis that is ticked"
+    bl_options = {"REGISTER", "UNDO"}
+
+    axes: bpy.props.BoolVectorProperty(name="Axes", description="Axes that are set", default=(True, True, True))
+    low: bpy.props.FloatVectorProperty(
+        name="Minimum", subtype="EULER", default=(-math.pi / 4,) * 3, min=-math.pi, max=math.pi
+    )
+    high: bpy.props.FloatVectorProperty(
+        name="Maximum", subtype="EULER", default=(math.pi / 4,) * 3, min=-math.pi, max=math.pi
+    )
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        from ..poses.motion_range import rotation_ranges
+
+        try:
+            ranges = rotation_ranges(self.selected(context)[0])
+        except RigError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.low, self.high = [r.low for r in ranges], [r.high for r in ranges]
+        self.axes = [r.moves for r in ranges]
+        return context.window_manager.invoke_props_dialog(
+            self, title="Ranges of the Selected Bones", confirm_text="Set"
+        )
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        for axis, letter in enumerate(AXES):
+            row = self.layout.row(align=True)
+            row.prop(self, "axes", index=axis, text=letter, toggle=True)
+            fields = row.row(align=True)
+            fields.active = self.axes[axis]
+            fields.prop(self, "low", index=axis, text="")
+            fields.prop(self, "high", index=axis, text="")
+
+    def change(self, context: bpy.types.Context) -> str:
+        from ..poses.motion_range import state_rotation_range
+
+        bones = self.selected(context)
+        for axis in (axis for axis in range(3) if self.axes[axis]):
+            if not self.low[axis] < self.high[axis]:
+                raise RigError(f"The range about {AXES[axis]} is empty; give a larger maximum.")
+        for bone in bones:
+            for axis in (axis for axis in range(3) if self.axes[axis]):
+                state_rotation_range(bone, axis, self.low[axis], self.high[axis])
+        return f"{len(bones)} bones have these ranges."
+
+
+class FDDA_OT_copy_ranges(_OnSelected, bpy.types.Operator):
+    bl_idname = "fdda.copy_ranges"
+    bl_label = "Copy to Selected"
+    bl_description = "Give the selected bones the range of motion of the one that is shown below the list"
+    bl_options = {"REGISTER", "UNDO"}
+
+    bone: bpy.props.StringProperty(
+        name="Bone", description="Whose ranges; empty for the one that is shown", options={"SKIP_SAVE"}
+    )
+
+    def change(self, context: bpy.types.Context) -> str:
+        bones = self.rig(context).armature_object.pose.bones
+        index = context.window_manager.fdda.joint_index
+        source = bones.get(self.bone) if self.bone else (bones[index] if 0 <= index < len(bones) else None)
+        if source is None:
+            raise RigError(f"There is no bone '{self.bone}' to copy from; click one in the list.")
+        targets = [bone for bone in self.selected(context) if bone != source]
+        for target in targets:
+            _copy(source, target)
+        return f"{len(targets)} bones have the ranges of '{source.name}'."
+
+
+class FDDA_OT_mirror_ranges(_OnSelected, bpy.types.Operator):
+    bl_idname = "fdda.mirror_ranges"
+    bl_label = "Mirror"
+    bl_description = "Give the bones of the other side the range of motion of the selected ones, mirrored"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def change(self, context: bpy.types.Context) -> str:
+        from ..poses.mirror import flipped_name
+
+        bones = self.rig(context).armature_object.pose.bones
+        pairs = [(bone, bones.get(flipped_name(bone.name))) for bone in self.selected(context)]
+        pairs = [(bone, other) for bone, other in pairs if other is not None and other != bone]
+        if not pairs:
+            raise RigError("None of the selected bones has one on the other side by its name; select arm.L or LeftArm.")
+        for bone, other in pairs:
+            _copy(bone, other, mirrored=True)
+        return f"{len(pairs)} bones of the other side have mirrored ranges."
+
+
+class FDDA_OT_limits_preset(OnPose, bpy.types.Operator):
+    bl_idname = "fdda.limits_preset"
+    bl_label = "Human Ranges"
+    bl_description = (
+        "Give the bones that are named as parts of a body (arm, forearm, thigh, spine, index1 …) the range of motion "
+        "of a person; the character stands upright and looks along -Y"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    only_selected: bpy.props.BoolProperty(
+        name="Only Selected", description="Leave the bones alone that are not selected"
+    )
+    replace: bpy.props.BoolProperty(
+        name="Replace", description="Also where a bone states a range already, and not only where it states none"
+    )
+
+    def change(self, context: bpy.types.Context) -> str:
+        from ..poses.human_ranges import human_ranges
+        from ..poses.motion_range import DEFAULT, rotation_ranges, state_rotation_range
+
+        armature_object = self.rig(context).armature_object
+        done = 0
+        for bone in armature_object.pose.bones:
+            if self.only_selected and not is_selected(bone):
+                continue
+            stated = rotation_ranges(bone)
+            found = human_ranges(armature_object, bone.bone)
+            if found is None or not (self.replace or all(r.source == DEFAULT for r in stated)):
+                continue
+            for axis, (low, high) in enumerate(found):
+                if low < high:
+                    state_rotation_range(bone, axis, low, high)
+                else:
+                    bone.lock_rotation[axis] = True
+            done += 1
+        if not done:
+            raise RigError(
+                f"No bone of '{armature_object.name}' that states no range is named as a part of a body; set the "
+                "ranges by hand, or from actions."
+            )
+        return f"{done} bones have the range of motion of a person."
+
+
+class FDDA_OT_forget_ranges(_OnSelected, bpy.types.Operator):
+    bl_idname = "fdda.forget_ranges"
+    bl_label = "Forget Ranges of Selected"
+    bl_description = "Remove the ranges of motion that the selected bones state; they then have the default of ±45°"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def change(self, context: bpy.types.Context) -> str:
+        from ..poses.motion_range import unstate_rotation_range
+
+        bones = self.selected(context)
+        for bone in bones:
+            for axis in range(3):
+                unstate_rotation_range(bone, axis)
+        return f"{len(bones)} bones state no range any more."
+
+
+CLASSES = (
+    FDDA_OT_edit_ranges,
+    FDDA_OT_copy_ranges,
+    FDDA_OT_mirror_ranges,
+    FDDA_OT_limits_preset,
+    FDDA_OT_forget_ranges,
+)

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Adds folders to those that the preferences trust, and takes them off."""
+
+import bpy
+
+from ..properties.preferences import preferences
+
+
+class _OnFolders:
+    """Mixin for an operator on the folders in the preferences."""
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if preferences() is None:
+            cls.poll_message_set("The add-on was started from a script and has no preferences; install the extension")
+            return False
+        return True
+
+
+class FDDA_OT_add_trusted_folder(_OnFolders, bpy.types.Operator):
+    bl_idname = "fdda.add_trusted_folder"
+    bl_label = "Trust a Folder…"
+    bl_description = "Choose a folder of your own whose models any .blend file may use"
+    bl_options = {"REGISTER"}
+
+    directory: bpy.props.StringProperty(
+        name="Folder", description="The folder", subtype="DIR_PATH", options={"SKIP_SAVE"}
+    )
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        if self.directory:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        if not self.directory:
+            self.report({"ERROR"}, "No folder was chosen; give one.")
+            return {"CANCELLED"}
+        preferences().folders.add().path = self.directory
+        context.preferences.is_dirty = True
+        return {"FINISHED"}
+
+
+class FDDA_OT_remove_trusted_folder(_OnFolders, bpy.types.Operator):
+    bl_idname = "fdda.remove_trusted_folder"
+    bl_label = "Trust No More"
+    bl_description = "Take the folder off the list; what lies in it stays"
+    bl_options = {"REGISTER"}
+
+    index: bpy.props.IntProperty(name="Index", description="Place in the list, from 0", min=0, options={"SKIP_SAVE"})
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        folders = preferences().folders
+        if self.index >= len(folders):
+            self.report({"ERROR"}, f"There are {len(folders)} trusted folders and none with index {self.index}.")
+            return {"CANCELLED"}
+        folders.remove(self.index)
+        context.preferences.is_dirty = True
+        return {"FINISHED"}
+
+
+CLASSES = (FDDA_OT_add_trusted_folder, FDDA_OT_remove_trusted_folder)

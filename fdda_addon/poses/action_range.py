@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How far actions move a rig: ranges of the channels of its bones and of its controls, measured from the F-curves.
+
+Nothing is evaluated and the scene is not touched.
+"""
+
+import hashlib
+import re
+from collections.abc import Iterable, Iterator
+
+import bpy
+import numpy as np
+from mathutils import Euler, Quaternion, Vector
+
+from ..core.controls import ARMATURE, ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS, Control
+from ..core.errors import RigError
+from ..core.poses import LOCATION, RANGE_TOLERANCE, ROTATION, SCALE
+from ..scene.arrays import KEYFRAME, read
+from ..scene.compatibility import curves_of
+from ..scene.controls import make_control, owner_of
+from ..scene.scene_rig import SceneRig
+
+_OF_BONE = re.compile(r'pose\.bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]\.(?P<channel>\w+)')
+_CONTROL = re.compile(r'.*(?:\]\.influence|key_blocks\["(?:[^"\\]|\\.)*"\]\.value|\["(?:[^"\\]|\\.)*"\])')
+_REST = {
+    "rotation_euler": (0.0, 0.0, 0.0),
+    "rotation_quaternion": (1.0, 0.0, 0.0, 0.0),
+    "rotation_axis_angle": (0.0, 0.0, 1.0, 0.0),
+    LOCATION: (0.0, 0.0, 0.0),
+    SCALE: (1.0, 1.0, 1.0),
+}
+"""What an action leaves a channel at that it does not key."""
+
+MAX_MEASURED = 100
+"""The number of actions whose measured ranges are kept."""
+
+Ranges = dict[tuple[str, str, int], tuple[float, float]]
+"""Lowest and highest value by bone, kind and axis."""
+
+Curves = dict[str, dict[int, bpy.types.FCurve]]
+"""F-curves of a bone by channel and index."""
+
+_measured: dict[tuple[int, int], tuple[tuple | None, Ranges]] = {}
+"""By session_uid of the armature object and of the action: what was measured, and of which keys."""
+
+
+def action_frames(action: bpy.types.Action) -> range:
+    """The whole frames of an action."""
+    first, last = (round(frame) for frame in action.frame_range)
+    return range(first, last + 1)
+
+
+def measured_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action]) -> Ranges:
+    """How far actions move the bones of an armature, over all their whole frames.
+
+    Args:
+        armature_object: the armature object.
+        actions: the actions.
+
+    Returns:
+        Lowest and highest value by bone, kind and axis, of what the actions key and move: `ROTATION` in radians, the
+        Euler angles as `armature.Poser` sets them (in the order of the bone, of quaternions and axis angles XYZ, and
+        turning on beyond a half turn), `LOCATION` in metres and `SCALE` as factors, relative to the rest pose.
+    """
+    found: Ranges = {}
+    for action in actions:
+        for key, (low, high) in _ranges_of(armature_object, action).items():
+            lowest, highest = found.get(key, (np.inf, -np.inf))
+            found[key] = min(lowest, low), max(highest, high)
+    return {key: (low, high) for key, (low, high) in found.items() if high - low > RANGE_TOLERANCE}
+
+
+def _ranges_of(armature_object: bpy.types.Object, action: bpy.types.Action) -> Ranges:
+    """Ranges of an action; measured again when its keys have changed, for one of many bones takes a second."""
+    frames, curves = action_frames(action), _curves_by_bone(armature_object, action)
+    content = _content(armature_object, frames, curves)
+    place = armature_object.session_uid, action.session_uid
+    if content is None or _measured.get(place, (None,))[0] != content:
+        found = {
+            (bone, kind, axis): (float(values.min()), float(values.max()))
+            for bone, own in curves.items()
+            for kind, axis, values in _channels(armature_object.pose.bones[bone], own, frames)
+        }
+        if len(_measured) >= MAX_MEASURED:
+            _measured.clear()
+        _measured[place] = content, found
+    return _measured[place][1]
+
+
+def _content(
+    armature_object: bpy.types.Object, frames: range, curves: dict[str, Curves]
+) -> tuple[range, bytes, tuple] | None:
+    """What ranges follow from; None where that is more than the keys."""
+    digest, places = hashlib.sha256(), []
+    for bone, channels in curves.items():
+        for channel, by_index in channels.items():
+            for index, curve in by_index.items():
+                points = curve.keyframe_points
+                if curve.modifiers or not points:
+                    return None
+                places.append((bone, armature_object.pose.bones[bone].rotation_mode, channel, index, len(points)))
+                places.append((curve.extrapolation, curve.mute))
+                for element in KEYFRAME:
+                    digest.update(read(points, element))
+    return frames, digest.digest(), tuple(places)
+
+
+def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> tuple[Control, ...]:
+    """The numbers of a rig that actions key and move, beside its bones, with the ranges they move in.
+
+    Custom properties, influences of constraints and values of shape keys count. What a file lacks, or what is wider
+    than any control, is left out.
+
+    Args:
+        scene_rig: the rig.
+        actions: the actions.
+    """
+    found: dict[tuple[str, str], tuple[float, float]] = {}
+    for action in actions:
+        frames = action_frames(action)
+        for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
+            datablock = owner_of(scene_rig, owner)
+            for curve in curves_of(action, datablock) if datablock else ():
+                if _CONTROL.fullmatch(curve.data_path):
+                    values = [curve.evaluate(frame) for frame in frames]
+                    low, high = found.get((owner, curve.data_path), (np.inf, -np.inf))
+                    found[owner, curve.data_path] = min(low, *values), max(high, *values)
+    controls = []
+    for (owner, path), (low, high) in found.items():
+        if high - low > RANGE_TOLERANCE:
+            try:
+                controls.append(make_control(scene_rig, owner, path, (low, high)))
+            except RigError:
+                continue
+    return tuple(controls)
+
+
+def _curves_by_bone(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, Curves]:
+    found: dict[str, Curves] = {}
+    for curve in curves_of(action, armature_object):
+        match = _OF_BONE.fullmatch(curve.data_path)
+        name = bpy.utils.unescape_identifier(match["bone"]) if match else ""
+        if match and match["channel"] in _REST and name in armature_object.pose.bones:
+            found.setdefault(name, {}).setdefault(match["channel"], {})[curve.array_index] = curve
+    return found
+
+
+def _channels(bone: bpy.types.PoseBone, curves: Curves, frames: range) -> Iterator[tuple[str, int, np.ndarray]]:
+    """Kind, axis and (F,) values over the frames of what is keyed."""
+    for kind in (LOCATION, SCALE):
+        for axis in curves.get(kind, {}):
+            yield kind, axis, _values(curves[kind], kind, frames)[:, axis]
+    channel = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}.get(bone.rotation_mode)
+    channel = channel or "rotation_euler"
+    keyed = curves.get(channel)
+    if keyed:
+        angles = _continuous_angles(channel, bone.rotation_mode, _values(keyed, channel, frames))
+        for axis in keyed if channel == "rotation_euler" else range(3):
+            yield ROTATION, axis, angles[:, axis]
+
+
+def _values(curves: dict[int, bpy.types.FCurve], channel: str, frames: range) -> np.ndarray:
+    """(F, 3 or 4) float64 values of a channel over the frames."""
+    values = np.tile(np.float64(_REST[channel]), (len(frames), 1))
+    for index, curve in curves.items():
+        values[:, index] = [curve.evaluate(frame) for frame in frames]
+    return values
+
+
+def _continuous_angles(channel: str, mode: str, values: np.ndarray) -> np.ndarray:
+    """(F, 3) Euler angles in radians that do not jump by a turn from one frame to the next."""
+    angles, previous = np.empty((len(values), 3)), Euler((0.0, 0.0, 0.0), "XYZ")
+    for place, value in enumerate(values):
+        if channel == "rotation_euler":
+            previous = Euler(value, mode)
+            if place:
+                previous.make_compatible(Euler(angles[place - 1], mode))
+        else:
+            turned = Quaternion(value) if channel == "rotation_quaternion" else _of_axis_angle(value)
+            # A quaternion of length 0 turns nothing, in Blender as well.
+            previous = (turned.normalized() if turned.magnitude else Quaternion()).to_euler("XYZ", previous)
+        angles[place] = previous
+    return angles
+
+
+def _of_axis_angle(value: np.ndarray) -> Quaternion:
+    axis = Vector(value[1:])
+    return Quaternion(axis, value[0]) if axis.length else Quaternion()

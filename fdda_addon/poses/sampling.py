@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What of a rig random poses move: bones in their ranges of motion, and controls."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import bpy
+
+from ..core.controls import Control
+from ..core.errors import RigError
+from ..core.model import ModelInfo
+from ..core.poses import CONTROL, KINDS, LOCATION, ROTATION, SCALE, Channel
+from ..core.rig import Rig
+from ..scene.compatibility import is_selected
+from ..scene.controls import is_driven, is_number, owner_of
+from ..scene.scene_rig import SceneRig
+from .action_range import measured_controls, measured_ranges
+from .clip import find_action
+from .motion_range import DEFAULT, location_ranges, rotation_ranges, scale_ranges
+
+LIMITS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
+SELECTED, COLLECTION, ACTION, BONE = "selected", "collection:", "action:", "bone:"
+"""How a user chooses the control bones that are sampled."""
+
+Measured = dict[tuple[str, str, int], tuple[float, float]]
+"""Ranges by bone, kind and axis."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a user chose to sample.
+
+    Attributes:
+        bones: names of the control bones; None for the bones of the rig as it stands (`own_channels`).
+        measured: ranges of actions, for what the rig states no range of; of the bones that are chosen by action, only
+            what is in here is sampled.
+        by_action: names of the bones that are chosen by action alone.
+        controls: the controls, stated or keyed.
+    """
+
+    bones: frozenset[str] | None = None
+    measured: tuple[tuple[tuple[str, str, int], tuple[float, float]], ...] = ()
+    by_action: frozenset[str] = frozenset()
+    controls: tuple[Control, ...] = ()
+
+
+def choose(scene_rig: SceneRig, texts: Iterable[str], controls: tuple[Control, ...] = ()) -> Choice:
+    """Read what a user chose.
+
+    Args:
+        scene_rig: the rig.
+        texts: `selected` for the selected bones, `collection:NAME` for those of a bone collection and of the ones below
+            it, `action:NAME` for what an action keys, `bone:NAME`; none for the bones of the rig as it stands.
+        controls: that are sampled too.
+
+    Raises:
+        RigError: there is no such collection, action or bone, or it chooses nothing.
+    """
+    texts = list(texts)
+    if not texts:
+        return Choice(controls=controls)
+    chosen: set[str] = set()
+    actions = []
+    for text in texts:
+        if text.startswith(ACTION):
+            actions.append(find_action(text.removeprefix(ACTION)))
+        else:
+            chosen |= _bones_of(scene_rig, text)
+    measured = measured_ranges(scene_rig.armature_object, actions)
+    own = {control.name: control for control in measured_controls(scene_rig, actions)}
+    own |= {control.name: control for control in controls}
+    keyed = {bone for bone, _, _ in measured}
+    if not chosen | keyed and not own:
+        raise RigError(f"Nothing is chosen to sample by {', '.join(texts)}; choose bones that an animator poses.")
+    return Choice(frozenset(chosen | keyed), tuple(measured.items()), frozenset(keyed - chosen), tuple(own.values()))
+
+
+def _bones_of(scene_rig: SceneRig, text: str) -> set[str]:
+    armature_object = scene_rig.armature_object
+    bones, data = armature_object.pose.bones, armature_object.data
+    if text == SELECTED:
+        return {bone.name for bone in bones if is_selected(bone)}
+    if text.startswith(COLLECTION):
+        name = text.removeprefix(COLLECTION)
+        if name not in data.collections_all:
+            known = ", ".join(f"'{c.name}'" for c in data.collections_all) or "none"
+            raise RigError(f"'{armature_object.name}' has no bone collection '{name}'; its collections: {known}.")
+        return {bone.name for bone in data.collections_all[name].bones_recursive}
+    name = text.removeprefix(BONE)
+    if not text.startswith(BONE) or name not in bones:
+        raise RigError(
+            f"'{text}' chooses nothing of '{armature_object.name}'; give {SELECTED}, {COLLECTION}NAME, {ACTION}NAME or "
+            f"{BONE}NAME of what is there."
+        )
+    return {name}
+
+
+def sampled_channels(scene_rig: SceneRig, rig: Rig, choice: Choice = Choice()) -> tuple[Channel, ...]:
+    """The channels of a random pose.
+
+    Args:
+        scene_rig, rig: the rig.
+        choice: what the user chose.
+
+    Raises:
+        RigError: nothing may be sampled.
+    """
+    armature_object = scene_rig.armature_object
+    if choice.bones is None:
+        found = own_channels(armature_object, set(rig.joint_names))
+    else:
+        found = chosen_channels(armature_object, choice)
+    found += tuple(
+        Channel(control.name, CONTROL, 0, control.low, control.high)
+        for control in choice.controls
+        if not is_driven(owner_of(scene_rig, control.owner), control.path)
+    )
+    if not found:
+        raise RigError(
+            f"No bone of '{armature_object.name}' may be sampled: all {len(rig.joints)} are locked or moved by "
+            "constraints; unlock an axis, give it a Limit Rotation, choose the bones that an animator poses "
+            "(--sample), or record actions alone, with 0 random poses (--action NAME --poses 0)."
+        )
+    return found
+
+
+def model_channels(scene_rig: SceneRig, rig: Rig, info: ModelInfo) -> tuple[Channel, ...]:
+    """The channels that a model's random poses were drawn from; those of the rig where there were none.
+
+    Raises:
+        RigError: the rig lacks one of them, or nothing may be sampled.
+    """
+    bones = scene_rig.armature_object.pose.bones
+    for channel in info.limits:
+        owner, _, path = channel.name.partition("/")
+        if channel.kind == CONTROL:
+            there = is_number(owner_of(scene_rig, owner), path)
+        else:
+            there = channel.name in bones and channel.kind in KINDS
+        if not there or channel.axis not in range(3):
+            raise RigError(
+                f"'{scene_rig.armature_object.name}' lacks '{channel.name}', which the random poses of the model "
+                "moved; name it as before, or record and train this rig."
+            )
+    return info.limits or sampled_channels(scene_rig, rig)
+
+
+def states_channels(scene_rig: SceneRig, channels: tuple[Channel, ...]) -> bool:
+    """Whether a rig still has the ranges that channels have, as far as it states them."""
+    bones = frozenset(channel.name for channel in channels)
+    now = {(c.name, c.kind, c.axis): c for c in chosen_channels(scene_rig.armature_object, Choice(bones))}
+    stated = [c for c in channels if (c.name, c.kind, c.axis) in now]
+    locked = [c for c in channels if c.kind == ROTATION and (c.name, c.kind, c.axis) not in now]
+    return not locked and all(now[c.name, c.kind, c.axis] == c for c in stated)
+
+
+def own_channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Channel, ...]:
+    """What of a pose may be sampled, and its range of motion.
+
+    The range is that of Limit constraints in local space, for rotations else of the bone's IK limits, else the default;
+    locked axes are left out. A bone that another constraint moves is left out: sampling it would change nothing.
+
+    Args:
+        armature_object: the armature object.
+        names: bones that are sampled even when the rig states no range for them.
+    """
+    found = []
+    for bone in armature_object.pose.bones:
+        if is_moved_by_constraints(bone):
+            continue
+        ranges = rotation_ranges(bone)
+        if bone.name in names or any(r.source != DEFAULT for r in ranges):
+            found += _rotations(bone, {axis: (r.low, r.high) for axis, r in enumerate(ranges) if r.moves})
+        found += _stated_others(bone)
+    return tuple(found)
+
+
+def chosen_channels(armature_object: bpy.types.Object, choice: Choice) -> tuple[Channel, ...]:
+    """As `own_channels`, of the bones that a user chose, whatever constraints they have."""
+    measured, found = dict(choice.measured), []
+    for bone in armature_object.pose.bones:
+        if bone.name not in choice.bones:
+            continue
+        rotations: dict[int, tuple[float, float]] = {}
+        for axis, stated in enumerate(rotation_ranges(bone)):
+            own = measured.get((bone.name, ROTATION, axis))
+            if not stated.is_locked and stated.source == DEFAULT and own:
+                rotations[axis] = own
+            elif stated.moves and not (bone.name in choice.by_action and own is None):
+                rotations[axis] = (stated.low, stated.high)
+        found += _rotations(bone, rotations)
+        stated_others = {(c.kind, c.axis): c for c in _stated_others(bone)}
+        locks = {LOCATION: bone.lock_location, SCALE: bone.lock_scale}
+        for (name, kind, axis), (low, high) in measured.items():
+            if name == bone.name and kind in locks and not locks[kind][axis]:
+                stated_others.setdefault((kind, axis), Channel(name, kind, axis, low, high))
+        found += stated_others.values()
+    return tuple(found)
+
+
+def _rotations(bone: bpy.types.PoseBone, ranges: dict[int, tuple[float, float]]) -> list[Channel]:
+    return [Channel(bone.name, ROTATION, axis, *bounds) for axis, bounds in ranges.items()]
+
+
+def _stated_others(bone: bpy.types.PoseBone) -> list[Channel]:
+    """Channels of the locations and scales that a bone states a range of."""
+    locations = {} if bone.bone.use_connect else location_ranges(bone)
+    kinds = ((LOCATION, locations, bone.lock_location), (SCALE, scale_ranges(bone), bone.lock_scale))
+    return [
+        Channel(bone.name, kind, axis, low, high)
+        for kind, ranges, locks in kinds
+        for axis, (low, high) in ranges.items()
+        if not locks[axis] and low < high
+    ]
+
+
+def is_moved_by_constraints(bone: bpy.types.PoseBone) -> bool:
+    """Whether a constraint other than a limit moves a bone."""
+    return any(c.type not in LIMITS and not c.mute and c.influence > 0 for c in bone.constraints)

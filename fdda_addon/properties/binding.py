@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a bound object keeps in the .blend file: `Object.fdda`."""
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+from .character import FDDA_PG_character
+
+OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}
+"""A linked character keeps in the shot what is set there: Blender resets everything else of a library override."""
+INSERTABLE = OVERRIDABLE | {"USE_INSERTION"}
+"""As `OVERRIDABLE`, and a library override may have entries besides those of its library."""
+
+
+def _apply(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
+    from ..runtime.binding import apply
+
+    apply(binding.id_data)
+
+
+class FDDA_PG_modifier(bpy.types.PropertyGroup):
+    """A modifier of the rig and how it was shown before a model took its place."""
+
+    uid: IntProperty(override=OVERRIDABLE)
+    show_viewport: BoolProperty(override=OVERRIDABLE)
+    show_render: BoolProperty(override=OVERRIDABLE)
+
+
+class FDDA_PG_model(bpy.types.PropertyGroup):
+    """A model of a mesh: its file, or the text that holds it."""
+
+    name: StringProperty(name="Name", description="What the model is called", override=OVERRIDABLE)
+    path: StringProperty(
+        name="File",
+        description="The model, an .onnx file; where it came from when it is packed",
+        subtype="FILE_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+        override=OVERRIDABLE,
+    )
+    packed: PointerProperty(
+        name="Packed Model",
+        description="The text that holds the model inside this file",
+        type=bpy.types.Text,
+        override=OVERRIDABLE,
+    )
+    packed_bytes: IntProperty(name="Size", description="Size of the packed model in bytes", override=OVERRIDABLE)
+
+
+class FDDA_PG_binding(bpy.types.PropertyGroup):
+    """A model bound to a mesh object."""
+
+    is_bound: BoolProperty(name="Bound", description="A model is bound to this object", override=OVERRIDABLE)
+    model: StringProperty(
+        name="Model",
+        description="The model, an .onnx file",
+        subtype="FILE_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+        override=OVERRIDABLE,
+    )
+    packed: PointerProperty(
+        name="Packed Model",
+        description="The text that holds the model inside this file",
+        type=bpy.types.Text,
+        override=OVERRIDABLE,
+    )
+    mode: EnumProperty(
+        name="Mode",
+        description="What deforms the mesh",
+        items=(
+            ("RIG", "Rig", "The modifiers of the rig"),
+            ("LINEAR", "Linear Layer", "Linear skinning alone"),
+            ("FDDA", "FDDA", "The model"),
+        ),
+        default="RIG",
+        update=_apply,
+        override=OVERRIDABLE,
+    )
+    strength: FloatProperty(
+        name="Strength",
+        description="0 is the linear layer, 1 the model",
+        min=0,
+        max=1,
+        default=1,
+        subtype="FACTOR",
+        update=_apply,
+        override=OVERRIDABLE,
+    )
+    use_in_render: BoolProperty(
+        name="Use in Render",
+        description="Final renders use the model as well, not the rig",
+        update=_apply,
+        override=OVERRIDABLE,
+    )
+    status: StringProperty(
+        name="Status", description="Why the model was switched off, empty when all is well", override=OVERRIDABLE
+    )
+
+    is_playing: BoolProperty(
+        description="The modifiers of the rig are switched off and `modifiers` says how they were", override=OVERRIDABLE
+    )
+    modifiers: CollectionProperty(type=FDDA_PG_modifier, override=INSERTABLE)
+    show_only_shape_key: BoolProperty(override=OVERRIDABLE)
+    active_shape_key_index: IntProperty(override=OVERRIDABLE)
+
+    models: CollectionProperty(type=FDDA_PG_model, override=INSERTABLE)
+    model_index: IntProperty(
+        name="Model", description="The model that the buttons below are about", override=OVERRIDABLE
+    )
+
+    settings: PointerProperty(type=FDDA_PG_character, override=OVERRIDABLE)
+
+
+CLASSES = (FDDA_PG_modifier, FDDA_PG_model, FDDA_PG_binding)
+
+
+def register() -> None:
+    """Give objects their property."""
+    bpy.types.Object.fdda = PointerProperty(type=FDDA_PG_binding, override=OVERRIDABLE)
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    del bpy.types.Object.fdda

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the choices of the sidebar come to: the settings of a recording."""
+
+from typing import TYPE_CHECKING
+
+import bpy
+
+from ..core.errors import RigError
+from ..scene.scene_rig import SceneRig
+from .character import FDDA_PG_character, wanted_fit
+
+if TYPE_CHECKING:  # Blender starts without numpy.
+    from ..recording.plan import RecordingSettings
+
+ALL_SHAPE_KEYS = "shape_keys"
+"""Stands for all shape keys that no driver moves (`scene.controls.stated_controls`)."""
+
+
+def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingSettings":
+    """The settings of a recording of a character.
+
+    Raises:
+        RigError: what random poses are to move has not been chosen.
+    """
+    from ..recording.plan import RecordingSettings
+
+    settings = scene_rig.mesh_object.fdda.settings
+    actions = recorded_actions(scene_rig.armature_object)
+    return RecordingSettings(
+        poses=settings.poses,
+        seed=settings.seed,
+        spread=settings.spread,
+        actions=actions,
+        resume=resume,
+        sample=_sample(settings, actions),
+        controls=_controls(settings),
+        fit_linear=wanted_fit(settings),
+        least_vertices=settings.least_vertices,
+        mirror=settings.mirror and bool(actions),
+    )
+
+
+def take_over_sampling(settings: FDDA_PG_character, other: FDDA_PG_character) -> None:
+    """Give a mesh what another on the same armature is recorded with; its files and its training stay its own."""
+    for name in ("poses", "seed", "spread", "sample", "bone_collection", "fit_linear", "mirror", "least_vertices"):
+        setattr(settings, name, getattr(other, name))
+    for name, values in (("sampled_bones", ("name",)), ("controls", ("name", "has_range", "low", "high"))):
+        own = getattr(settings, name)
+        own.clear()
+        for entry in getattr(other, name):
+            new = own.add()
+            for value in values:
+                setattr(new, value, getattr(entry, value))
+
+
+def _sample(settings: FDDA_PG_character, actions: tuple[str, ...]) -> tuple[str, ...]:
+    """What random poses move, as `poses.sampling.choose` reads it."""
+    if settings.sample == "COLLECTION":
+        if not settings.bone_collection:
+            raise RigError("Random poses are to move a bone collection, and none is chosen; choose it under Poses.")
+        return (f"collection:{settings.bone_collection}",)
+    if settings.sample == "ACTIONS":
+        if not actions:
+            raise RigError("Random poses are to move what the ticked actions key, and none is ticked; tick one.")
+        return tuple(f"action:{name}" for name in actions)
+    if settings.sample == "SELECTED":
+        if not settings.sampled_bones:
+            raise RigError(
+                "Random poses are to move selected bones, and none is chosen; select them and press Use Selected Bones."
+            )
+        return tuple(f"bone:{bone.name}" for bone in settings.sampled_bones)
+    return ()
+
+
+def _controls(settings: FDDA_PG_character) -> tuple[str, ...]:
+    """The listed controls as `scene.controls.stated_controls` reads them; those without a name yet are left out."""
+    return tuple(
+        f"{control.name}={control.low!r}:{control.high!r}" if control.has_range else control.name
+        for control in settings.controls
+        if control.name
+    )
+
+
+def recorded_actions(armature_object: bpy.types.Object) -> tuple[str, ...]:
+    """Names of the actions that the user has chosen for recording and that move a bone of this armature."""
+    return tuple(
+        action.name for action in bpy.data.actions if action.fdda.record and moves_a_bone(action, armature_object)
+    )
+
+
+def moves_a_bone(action: bpy.types.Action, armature_object: bpy.types.Object) -> bool:
+    """Whether an action moves a bone of this armature."""
+    from ..scene.compatibility import animation_curves
+
+    bones = armature_object.pose.bones
+    for curve in animation_curves(action):
+        path = curve.data_path
+        if path.startswith('pose.bones["') and path[12 : path.find('"]', 12)] in bones:
+            return True
+    return False

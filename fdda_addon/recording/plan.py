@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a recording will hold, before a pose is evaluated: the settings, and what they come to for a rig."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ..core.defaults import INFLUENCE_POSES, MIN_VERTICES, POSES, SPREAD
+from ..core.partition import INFLUENCE_TOLERANCE
+from ..core.poses import Channel
+from ..core.recording.index import RANDOM, Sampling, Source
+from ..core.rig import Rig
+from ..poses.clip import find_clips
+from ..poses.sampling import Choice, choose, sampled_channels
+from ..rig.dependencies import read_dependencies
+from ..rig.reading import read_rig
+from ..scene.controls import stated_controls
+from ..scene.scene_rig import SceneRig
+
+
+@dataclass(frozen=True)
+class RecordingSettings:
+    """What to record.
+
+    Attributes:
+        poses: number of random poses.
+        seed: of the random poses.
+        spread: standard deviation of the random poses as a part of half the range of motion.
+        actions, strips: names of actions, and of strips of the NLA, whose frames are recorded after the random poses.
+        mirror: record each of these frames a second time, mirrored.
+        influence_poses: how often each joint is moved alone to find the partitions that it influences.
+        influence_tolerance: part of the character's size by which a joint moves the residuals that it influences.
+        resume: continue a recording that was interrupted.
+        sample: which control bones the random poses move, as `sampling.choose` reads it; empty for those of the rig.
+        fit_linear: kind of the skin weights that are fitted (`core.skin_fit.KINDS`); empty for those of the rig.
+        controls: which numbers are inputs and are sampled beside those that are found, as `stated_controls` reads it.
+        least_vertices: partitions of fewer vertices are merged into others; 0 merges none.
+        shard: record this part of the poses, its number from 1 and how many parts there are; None for all.
+        influences_only: find what a recording needs before its first pose, and record none.
+        influences: folder with what `influences_only` found, of the same rig and settings; found anew when left out.
+            Where several meshes are recorded, it has a folder of the same name for each.
+    """
+
+    poses: int = POSES
+    seed: int = 0
+    spread: float = SPREAD
+    actions: tuple[str, ...] = ()
+    influence_poses: int = INFLUENCE_POSES
+    influence_tolerance: float = INFLUENCE_TOLERANCE
+    resume: bool = False
+    sample: tuple[str, ...] = ()
+    controls: tuple[str, ...] = ()
+    fit_linear: str = ""
+    least_vertices: int = MIN_VERTICES
+    strips: tuple[str, ...] = ()
+    mirror: bool = False
+    shard: tuple[int, int] | None = None
+    influences_only: bool = False
+    influences: Path | None = None
+
+
+def planned_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
+    """The rig with its controls, and the channels of its random poses, as these settings record it.
+
+    Raises:
+        RigError: the rig cannot be read, or nothing may be sampled.
+    """
+    choice, besides = planned_choice(scene_rig, settings)
+    rig = read_rig(scene_rig, besides)
+    channels = sampled_channels(scene_rig, rig, choice) if settings.poses else ()
+    return replace(rig, controls=choice.controls), channels
+
+
+def planned_choice(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Choice, frozenset[str] | None]:
+    """What these settings sample, and which joints the rig has beside the bones that have weights (`read_rig`).
+
+    The joints of a rig whose control bones are sampled are the bones that have weights, and those that the mesh depends
+    on otherwise: what animators pose is no input of a model, what follows from it is.
+
+    Raises:
+        RigError: the rig lacks what the settings name.
+    """
+    dependencies = read_dependencies(scene_rig)
+    controls = {control.name: control for control in dependencies.controls}
+    controls |= {control.name: control for control in stated_controls(scene_rig, settings.controls)}
+    choice = choose(scene_rig, settings.sample, tuple(controls.values()))
+    return choice, None if choice.bones is None else dependencies.bones
+
+
+def planned_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]) -> Sampling:
+    """How the poses of a recording with these settings are chosen.
+
+    Raises:
+        RigError: there is no action or strip of a name that the settings have.
+    """
+    sources = [Source(RANDOM, settings.poses)] if settings.poses else []
+    clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
+    sources += [clip.source for clip in clips]
+    return Sampling(settings.seed, settings.spread, channels if settings.poses else (), tuple(sources))

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Adds poses to a recording where a model that was trained on it is worst."""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..core.defaults import REFINEMENT_POSES, SPREAD
+from ..core.errors import RecordingError
+from ..core.features import joint_features
+from ..core.metrics import distances
+from ..core.model import ModelInfo
+from ..core.poses import Channel, sample_pose
+from ..core.progress import Progress
+from ..core.recording.extension import RecordingExtension
+from ..core.recording.index import REFINED
+from ..core.recording.reader import Recording, read_recording
+from ..core.refinement import Probes, choose_poses, nearest_distances
+from ..core.rig import Rig, differences
+from ..core.skinning import LinearLayer
+from ..poses.sampling import model_channels, states_channels
+from ..rig.borrowed_rig import borrowed_rig
+from ..rig.modifier_stack import check_evaluable
+from ..rig.reading import PoseEvaluator
+from ..runtime.opened_model import open_model
+from ..scene.armature import Poser
+from ..scene.scene_rig import SceneRig
+from .appender import Appender, append_poses
+
+PROBE_INDEX, BASE_INDEX = 1 << 34, 1 << 35
+"""Poses are drawn from indices that neither a recording nor an evaluation reaches."""
+MIN_PROBES = 200
+WIDE_SPREAD = 10.0
+"""Every other probe is drawn almost evenly: the corners of the range are rare in a recording, not in an animation."""
+
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """What to add.
+
+    Attributes:
+        poses: how many.
+        seed: of the choices; others with every recording that is longer.
+        resume: count the poses that were added since the model was trained; add what is missing of `poses`.
+    """
+
+    poses: int = REFINEMENT_POSES
+    seed: int = 0
+    resume: bool = False
+
+
+def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSettings) -> Iterator[Progress]:
+    """Add poses to a complete recording; a generator that does the work while it is iterated.
+
+    The scene is as before when the generator ends, is closed, or raises; the recording is complete at every moment.
+
+    Args:
+        scene_rig: the rig that was recorded.
+        path: folder of the recording.
+        model: trained on it.
+        settings: what to add.
+
+    Yields:
+        Progress of the stages "probes" and "poses".
+
+    Raises:
+        RigError: the rig cannot be recorded.
+        RecordingError: the recording is not complete, or of another rig or range of motion.
+        ModelError: the model cannot be read, or is of another rig.
+        OutputError: the recording cannot be written.
+    """
+    recording = read_recording(path)
+    check_evaluable(scene_rig)
+    opened = open_model(scene_rig, model)
+    network, rig = opened.network, opened.rig
+    channels = model_channels(scene_rig, rig, network.info)
+    _check_recording(scene_rig, recording, rig, channels)
+    added = _added_since(recording, model, network.info) if settings.resume else 0
+    if settings.resume and added >= settings.poses:
+        yield Progress("poses", settings.poses, settings.poses)
+        return
+    first = len(recording.pose_matrices) - added
+    with borrowed_rig(scene_rig, rig, channels):
+        evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig, channels)
+        count = max(MIN_PROBES, settings.poses)
+        values = np.stack([_probe(channels, settings.seed, PROBE_INDEX + first + i) for i in range(count)])
+        matrices, errors = [], []
+        for number, pose in enumerate(values):
+            poser.set(pose)
+            pose_matrices, true, controls = evaluator.evaluate()
+            moved = distances(network.positions(pose_matrices[None], controls[None])[0], true)
+            matrices.append(pose_matrices)
+            errors.append([moved[partition.vertices].max() for partition in recording.partitions])
+            yield Progress("probes", number + 1, count)
+        probes = Probes(values, np.array(errors), _thinness(recording, first, np.stack(matrices)))
+        base = np.stack([sample_pose(channels, settings.seed, BASE_INDEX + first + i) for i in range(settings.poses)])
+        rng = np.random.default_rng([settings.seed, first])
+        chosen = choose_poses(probes, channels, _owned(recording, channels), base, rng)
+        with RecordingExtension(recording, model.name, added) as extension:
+            posed = (poser.set(pose) for pose in chosen[added:])
+            layer = LinearLayer(recording.rig, recording.partitions)
+            with contextlib.closing(append_poses(posed, [Appender(evaluator, layer, extension)])) as steps:
+                for done in steps:
+                    yield Progress("poses", done - first, settings.poses)
+
+
+def _probe(channels: tuple[Channel, ...], seed: int, index: int) -> np.ndarray:
+    return sample_pose(channels, seed, index, WIDE_SPREAD if index % 2 else SPREAD)
+
+
+def _check_recording(scene_rig: SceneRig, recording: Recording, rig: Rig, channels: tuple[Channel, ...]) -> None:
+    own = recording.rig
+    found = differences(own.joints, own.rest_matrices, own.vertex_count, own.fingerprint, rig)
+    if found:
+        raise RecordingError(f"'{recording.path}' is a recording of another rig: {'; '.join(found)}. Record this rig.")
+    if not recording.info.sampling.channels:
+        raise RecordingError(
+            f"'{recording.path}' has no random poses, so there is no range of motion to choose from; record with "
+            "--poses."
+        )
+    if recording.info.sampling.channels != channels or not states_channels(scene_rig, channels):
+        raise RecordingError(
+            f"The range of motion of the rig is not that of '{recording.path}' any more; record anew into another "
+            "folder."
+        )
+
+
+def _added_since(recording: Recording, model: Path, info: ModelInfo) -> int:
+    """How many poses a recording got since a model was trained on it.
+
+    Raises:
+        RecordingError: they were not chosen for this model.
+    """
+    more = len(recording.pose_matrices) - info.trained_poses
+    last = recording.info.sampling.sources[-1]
+    if more == 0 or (last.kind == REFINED and (last.name, last.poses) == (model.name, more)):
+        return more
+    raise RecordingError(
+        f"Cannot resume: '{model}' was trained on {info.trained_poses} poses, and the other "
+        f"{more} of '{recording.path}' were not chosen for it; refine without --resume, or with the last model."
+    )
+
+
+def _thinness(recording: Recording, first: int, pose_matrices: np.ndarray) -> np.ndarray:
+    """(M, P) how far each pose is from the first recorded ones, as the joints that influence each partition go."""
+    rig = recording.rig
+    probes, recorded = (
+        joint_features(matrices, rig.rest_matrices, rig.parents)
+        for matrices in (pose_matrices, np.array(recording.pose_matrices[:first]))
+    )
+    return np.stack(
+        [
+            nearest_distances(*(f[:, list(p.influencing)].reshape(len(f), -1) for f in (probes, recorded)))
+            for p in recording.partitions
+        ],
+        axis=1,
+    )
+
+
+def _owned(recording: Recording, channels: tuple[Channel, ...]) -> list[np.ndarray]:
+    """For each partition the channels of the joints that influence it."""
+    names, controls = recording.rig.joint_names, recording.rig.controls
+    influencing = [
+        {names[joint] for joint in partition.influencing} | {controls[control].name for control in partition.controls}
+        for partition in recording.partitions
+    ]
+    return [np.array([i for i, c in enumerate(channels) if c.name in own], int) for own in influencing]

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Checks a rig as a recording would, and says all that is wrong at once."""
+
+from dataclasses import dataclass, replace
+
+from ..core.controls import Control
+from ..core.errors import RigError
+from ..core.poses import Channel
+from ..core.rig import Rig
+from ..poses.sampling import sampled_channels
+from ..rig.modifier_stack import check_evaluable, deforming_modifiers
+from ..rig.reading import read_rig
+from ..scene.controls import stated_controls
+from ..scene.scene_rig import SceneRig
+from .plan import RecordingSettings, planned_choice
+
+DEFAULTS = RecordingSettings()
+
+
+@dataclass(frozen=True)
+class RigCheck:
+    """What is known about a rig.
+
+    Attributes:
+        problems: why it cannot be recorded, a sentence each; empty when it can.
+        rig: its arrays, None when they cannot be read.
+        channels: what a random pose may move, empty when nothing.
+        replaced: names of the modifiers that a model takes the place of.
+        found: the controls that nobody listed: drivers of the mesh read them, or the actions that are sampled key them.
+        besides: joints that the rig was read with (`read_rig`).
+    """
+
+    problems: tuple[str, ...]
+    rig: Rig | None
+    channels: tuple[Channel, ...]
+    replaced: tuple[str, ...] = ()
+    found: tuple[Control, ...] = ()
+    besides: frozenset[str] | None = None
+
+    def checked_again(self, scene_rig: SceneRig, settings: RecordingSettings = DEFAULTS) -> "RigCheck":
+        """The check without reading the mesh again: for changes of modifiers, modes, ranges of motion and choices."""
+        return _check(scene_rig, settings, self)
+
+
+def check(scene_rig: SceneRig, settings: RecordingSettings = DEFAULTS) -> RigCheck:
+    """Check a rig. While a model plays, the modifiers of the rig are off, so what they evaluate to is not checked."""
+    return _check(scene_rig, settings, None)
+
+
+def _check(scene_rig: SceneRig, settings: RecordingSettings, before: RigCheck | None) -> RigCheck:
+    result = RigCheck((), None, ())
+    problems: list[str] = []
+    if not scene_rig.mesh_object.fdda.is_playing:
+        try:
+            check_evaluable(scene_rig)
+        except RigError as error:
+            problems.append(str(error))
+    try:
+        result = replace(result, replaced=tuple(m.name for m in deforming_modifiers(scene_rig.mesh_object)))
+        choice, besides = planned_choice(scene_rig, settings)
+        if before is not None and before.rig is not None and before.besides == besides:
+            rig = before.rig
+        else:
+            rig = read_rig(scene_rig, besides)
+        if rig.controls != choice.controls:
+            rig = replace(rig, controls=choice.controls)
+        listed = stated_controls(scene_rig, settings.controls)
+        found = tuple(control for control in choice.controls if control not in listed)
+        result = replace(result, rig=rig, found=found, besides=besides)
+        result = replace(result, channels=sampled_channels(scene_rig, rig, choice))
+    except RigError as error:
+        # A rig of which nothing may be sampled is recorded by its actions alone.
+        if str(error) not in problems and (result.rig is None or settings.poses):
+            problems.append(str(error))
+    return replace(result, problems=tuple(problems))

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Records a rig: the phases of a recording, one after the other."""
+
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+import bpy
+
+from ..core.errors import RecordingError
+from ..core.output import check_folder_writable
+from ..core.partition import GOLDEN_RATIO, merged_partitions
+from ..core.poses import sample_pose
+from ..core.progress import Progress
+from ..core.recording.estimate import check_room, recording_bytes
+from ..core.recording.index import INDEX, RecordingInfo
+from ..core.recording.shard import Shard, shard_poses
+from ..core.recording.writer import RecordingWriter, check_recordable
+from ..core.skinning import LinearLayer
+from ..poses.clip import Clip, find_clips
+from ..poses.clip_player import ClipPlayer
+from ..rig.borrowed_rig import borrowed_rigs
+from ..rig.modifier_stack import check_evaluable
+from ..rig.reading import PoseEvaluator
+from ..scene.scene_rig import SceneRig
+from .appender import Appender, append_poses
+from .influences import Search, find_influences
+from .known import check_found_for, recorded_partitions, recorded_weights
+from .mesh_group import common_armature, controls_of_each, in_passes
+from .phases import Fitted, Found, Planned, TimedEvaluator, estimate
+from .plan import RecordingSettings, planned_rig, planned_sampling
+from .pose_plan import PosePlan
+from .weight_fitting import check_has_weights, fit_weights, poses_to_fit
+
+Before, After = TypeVar("Before", Planned, Fitted), TypeVar("After")
+INFLUENCE_SEED_OFFSET = 1 << 32
+"""Poses of the influence detection are drawn from indices that no pose of a recording reaches."""
+
+
+def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iterator[Progress]:
+    """Record a rig; a generator that does the work while it is iterated.
+
+    The scene is as before when the generator ends, is closed, or raises.
+
+    Args:
+        scene_rig: the rig.
+        path: folder of the recording.
+        settings: what to record.
+
+    Yields:
+        Progress of the stages "influences" and "poses", before them "poses to fit" and "fit" where weights are fitted.
+        The first of the poses has a note of what they will take.
+
+    Raises:
+        RigError: the rig cannot be recorded.
+        TrainingError: weights are to be fitted, and the trainer's Python cannot.
+        RecordingError: there is a recording already, or the one to resume is of something else.
+        OutputError: the folder cannot be written, or the disk lacks the room.
+    """
+    return record_meshes([(scene_rig, path)], settings)
+
+
+def record_meshes(rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSettings) -> Iterator[Progress]:
+    """As `record`, of several meshes on one armature, each into a folder of its own.
+
+    They share the poses, and each pose is evaluated once for all meshes that can be evaluated together (`in_passes`).
+
+    Raises:
+        RigError: as `record`, or the meshes follow different armatures.
+    """
+    meshes = [scene_rig for scene_rig, _ in rigs]
+    clips = find_clips(common_armature(meshes), settings.actions, settings.strips, settings.mirror)
+    planned, plan = _plan(rigs, settings, clips)
+    posed = [mesh.posed for mesh in planned]
+    with borrowed_rigs(posed, clips) if settings.fit_linear else nullcontext() as player:
+        fitted = yield from _in_turn(planned, lambda mesh: _fit(mesh, settings, plan, player))
+    for numbers in in_passes(meshes):
+        together = [fitted[number] for number in numbers]
+        others = [own for number, own in enumerate(posed) if number not in numbers]
+        with borrowed_rigs([posed[number] for number in numbers], clips, others) as player:
+            found = yield from _in_turn(together, lambda mesh: _find_influences(mesh, settings, clips, player))
+            yield from _record_poses(found, settings, plan, player)
+
+
+def _plan(
+    rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSettings, clips: tuple[Clip, ...]
+) -> tuple[list[Planned], PosePlan]:
+    """The meshes with what moves them, and the poses that they share; all that can be refused is refused here."""
+    if settings.mirror and not clips:
+        raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
+    meshes = [scene_rig for scene_rig, _ in rigs]
+    controls = [settings.controls] if len(rigs) == 1 else controls_of_each(meshes, settings.controls)
+    read = []
+    for (scene_rig, path), own in zip(rigs, controls, strict=True):
+        check_evaluable(scene_rig)
+        read.append(planned_rig(scene_rig, replace(settings, controls=own)))
+        check_folder_writable(path)
+        check_recordable(path, settings.resume)
+    channels = [(scene_rig, own) for scene_rig, (_, own) in zip(meshes, read, strict=True)]
+    plan = PosePlan(channels, settings.poses, settings.seed, settings.spread, clips)
+    if plan.total < 1:
+        raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
+    wanted = len(_wanted(settings, plan.total))
+    check_room([(path, recording_bytes(rig, wanted)) for (_, path), (rig, _) in zip(rigs, read, strict=True)])
+    known = [_known(path, settings, len(rigs) > 1) for _, path in rigs]
+    planned = [
+        Planned(scene_rig, rig, path, own, plan.channels_of(number), known[number])
+        for number, ((scene_rig, path), (rig, own)) in enumerate(zip(rigs, read, strict=True))
+    ]
+    return planned, plan
+
+
+def _known(path: Path, settings: RecordingSettings, is_one_of_several: bool) -> Path | None:
+    """Where the weights and influences of the recording at `path` are known already, if they are."""
+    if settings.resume and (path / INDEX).exists():
+        return path
+    if settings.influences is None:
+        return None
+    return settings.influences / path.name if is_one_of_several else settings.influences
+
+
+def _wanted(settings: RecordingSettings, total: int) -> range:
+    """Numbers of the poses to record."""
+    if settings.influences_only:
+        return range(0)
+    return shard_poses(*settings.shard, total) if settings.shard else range(total)
+
+
+def _in_turn(
+    meshes: Sequence[Before], phase: Callable[[Before], Generator[Progress, None, After]]
+) -> Generator[Progress, None, list[After]]:
+    """A phase of each mesh; where there are several, the stages say of which. Returns what the phases give."""
+    results = []
+
+    def keep(mesh: Before) -> Iterator[Progress]:
+        results.append((yield from phase(mesh)))
+
+    for mesh in meshes:
+        with closing(keep(mesh)) as steps:
+            for step in steps:
+                yield step if len(meshes) == 1 else replace(step, stage=f"{step.stage} of '{mesh.name}'")
+    return results
+
+
+def _fit(
+    mesh: Planned, settings: RecordingSettings, plan: PosePlan, player: ClipPlayer | None
+) -> Generator[Progress, None, Fitted]:
+    """Give a mesh the weights that its linear layer is to have."""
+    if mesh.known:
+        return Fitted(mesh, *recorded_weights(mesh.known, mesh.rig, settings.fit_linear))
+    if not settings.fit_linear:
+        check_has_weights(mesh.scene_rig, mesh.rig)
+        return Fitted(mesh, mesh.rig, None)
+    numbers = poses_to_fit(plan.total, mesh.rig.vertex_count)
+    posed = plan.poses(player, frozenset(numbers))
+    evaluator = PoseEvaluator(mesh.scene_rig, mesh.rig)
+    fitted = yield from fit_weights(mesh.rig, settings.fit_linear, posed, len(numbers), evaluator)
+    return Fitted(mesh, *fitted)
+
+
+def _find_influences(
+    mesh: Fitted, settings: RecordingSettings, clips: tuple[Clip, ...], player: ClipPlayer
+) -> Generator[Progress, None, Found]:
+    """Find what influences the partitions of a mesh; what moves it alone is moved, not what moves others."""
+    scene_rig, channels = mesh.planned.scene_rig, mesh.planned.channels
+    search = Search(
+        channels,
+        lambda number: sample_pose(channels, settings.seed, INFLUENCE_SEED_OFFSET + number, settings.spread),
+        lambda number: _show_frame(player, clips, number),
+        player.stop,
+        settings.influence_poses,
+        settings.influence_tolerance,
+    )
+    evaluator = TimedEvaluator(PoseEvaluator(scene_rig, mesh.rig))
+    known = mesh.planned.known
+    if known and (partitions := recorded_partitions(known, mesh.rig, settings.least_vertices)):
+        return Found(mesh, partitions, evaluator)
+    if known and known != mesh.planned.path:
+        raise RecordingError(
+            f"The influences in '{known}' are of other partitions than those of '{mesh.name}'; find them with the same "
+            "rig and options (record --influences-only)."
+        )
+    cut = merged_partitions(mesh.rig, settings.least_vertices)
+    partitions = yield from find_influences(scene_rig, mesh.rig, cut, evaluator, search)
+    return Found(mesh, partitions, evaluator)
+
+
+def _record_poses(
+    meshes: list[Found], settings: RecordingSettings, plan: PosePlan, player: ClipPlayer
+) -> Iterator[Progress]:
+    wanted = _wanted(settings, plan.total)
+    with ExitStack() as stack:
+        appenders = []
+        for mesh in meshes:
+            info = _info(mesh, settings, plan, wanted)
+            writer = RecordingWriter(mesh.fitted.planned.path, mesh.fitted.rig, mesh.partitions, info, settings.resume)
+            layer = LinearLayer(mesh.fitted.rig, mesh.partitions)
+            appenders.append(Appender(mesh.evaluator, layer, stack.enter_context(writer)))
+        first = min(appender.done for appender in appenders)
+        yield Progress("poses", first, len(wanted), estimate(meshes, len(wanted), len(wanted) - first))
+        left = plan.poses(player, wanted[first:])
+        # Closed before the writers: what was evaluated is kept when the recording is broken off.
+        with closing(append_poses(left, appenders)) as steps:
+            for done in steps:
+                yield Progress("poses", done, len(wanted))
+
+
+def _info(mesh: Found, settings: RecordingSettings, plan: PosePlan, wanted: range) -> RecordingInfo:
+    """What the recording of a mesh will say of itself."""
+    planned = mesh.fitted.planned
+    sampling = planned_sampling(planned.scene_rig, settings, planned.limits)
+    file, version = Path(bpy.data.filepath).name, bpy.app.version_string
+    is_part = settings.shard is not None or settings.influences_only
+    shard = Shard(wanted.start, plan.total) if is_part else None
+    info = RecordingInfo(len(wanted), 0, file, planned.name, version, sampling, mesh.fitted.fit, shard)
+    if planned.known and planned.known != planned.path:
+        check_found_for(planned.known, mesh.fitted.rig, info)
+    return info
+
+
+def _show_frame(player: ClipPlayer, clips: tuple[Clip, ...], number: int) -> None:
+    """Pose the rig as on one of the frames of some clips, far apart for numbers that follow each other."""
+    frames = [(clip, frame) for clip in clips for frame in clip.frames]
+    player.show(*frames[int(number * GOLDEN_RATIO * len(frames)) % len(frames)])

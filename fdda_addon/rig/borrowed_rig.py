@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""All of a rig that posing it changes, borrowed at once; or of several that follow one armature."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+
+from ..core.poses import CONTROL, Channel
+from ..core.rig import Rig
+from ..poses.clip import Clip
+from ..poses.clip_player import ClipPlayer, clip_actions, played_clips
+from ..scene.armature import clear_pose
+from ..scene.borrow import borrowed_pose
+from ..scene.controls import borrowed_controls
+from ..scene.scene_rig import SceneRig
+from .modifier_stack import borrowed_stack
+
+Posed = tuple[SceneRig, Rig, tuple[Channel, ...]]
+"""A rig, and the channels of the random poses that it will be brought to."""
+
+
+@contextmanager
+def borrowed_rig(
+    scene_rig: SceneRig, rig: Rig, channels: tuple[Channel, ...] = (), clips: tuple[Clip, ...] = ()
+) -> Iterator[ClipPlayer]:
+    """As `borrowed_rigs`, of one rig."""
+    with borrowed_rigs([(scene_rig, rig, channels)], clips) as player:
+        yield player
+
+
+@contextmanager
+def borrowed_rigs(
+    rigs: Sequence[Posed], clips: tuple[Clip, ...] = (), beside: Sequence[Posed] = ()
+) -> Iterator[ClipPlayer]:
+    """Give back the modifiers, the pose, the controls, the animation and the frame. Inside, the rigs are at rest.
+
+    Args:
+        rigs: of one armature object.
+        clips: that they will be posed by, with the player that is yielded.
+        beside: rigs that the poses move too, whose modifiers stay as they are.
+
+    Raises:
+        RigError: a clip is to be mirrored, and a rig is not the same on both sides.
+    """
+    armature_object = rigs[0][0].armature_object
+    controlled = [(scene_rig, control_names(rig, channels)) for scene_rig, rig, channels in (*rigs, *beside)]
+    with ExitStack() as stack:
+        player = stack.enter_context(played_clips(controlled, clips))
+        for scene_rig, _, _ in rigs:
+            stack.enter_context(borrowed_stack(scene_rig.mesh_object))
+        stack.enter_context(borrowed_pose(armature_object, clip_actions(armature_object, clips)))
+        for scene_rig, names in controlled:
+            stack.enter_context(borrowed_controls(scene_rig, names))
+        clear_pose(armature_object)
+        yield player
+
+
+def control_names(rig: Rig, channels: tuple[Channel, ...]) -> list[str]:
+    """Names of the controls that a rig has or that are sampled."""
+    sampled = [channel.name for channel in channels if channel.kind == CONTROL]
+    return list(dict.fromkeys([*(control.name for control in rig.controls), *sampled]))

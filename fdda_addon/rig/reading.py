@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Checks the rig of a scene and reads it into arrays."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ..core.errors import RigError
+from ..core.model import ModelInfo
+from ..core.rig import UNMOVED, Fingerprint, Rig
+from ..poses.sampling import model_channels, sampled_channels
+from ..scene import armature as armature_io
+from ..scene import mesh as mesh_io
+from ..scene.controls import ControlReader
+from ..scene.scene_rig import MODIFIER_NAME, SceneRig, armature_modifier, armature_of, find_rig, is_flat
+from ..scene.skin import read_skin
+from ..scene.unit import metres_per_unit
+from .joints import choose_joints
+from .modifier_stack import check_evaluable, deforming_modifiers
+
+IDENTITY_TOLERANCE = 1e-6
+"""Mesh and armature count as unmoved, one against the other, when no matrix element differs by more."""
+
+
+def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None) -> Rig:
+    """Read a rig.
+
+    Args:
+        scene_rig: the rig.
+        besides: names of joints beside the bones that have weights, as of a model or a recording; when it is not given,
+            the bones that have a range of motion, those that the mesh depends on otherwise, and all above a joint.
+
+    Raises:
+        RigError: there is no vertex, or an object has a scale of zero.
+    """
+    mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
+    for scene_object in (mesh_object, armature_object):
+        if is_flat(scene_object):
+            raise RigError(f"'{scene_object.name}' has a scale of zero; give it another.")
+    if not len(mesh_object.data.vertices):
+        raise RigError(f"The mesh of '{mesh_object.name}' has no vertices; choose another object.")
+    skin = read_skin(mesh_object, armature_object, armature_modifier(mesh_object))
+    joints = choose_joints(scene_rig, skin.bones, besides)
+    names = tuple(joint.name for joint in joints)
+    skin_joints, skin_weights = skin.arrays({name: number for number, name in enumerate(names)})
+    rest_positions = mesh_io.rest_positions(mesh_object.data)
+    rest = joint_rest_matrices(scene_rig, names)
+    faces = mesh_io.topology(mesh_object.data)
+    fingerprint = Fingerprint(
+        Fingerprint.digest(*faces),
+        Fingerprint.digest(rest_positions),
+        Fingerprint.digest(skin_joints, skin_weights),
+    )
+    return Rig(
+        joints,
+        rest_positions,
+        rest.astype(np.float32),
+        skin_joints,
+        skin_weights,
+        fingerprint,
+        *faces,
+        metres_per_unit=metres_per_unit(mesh_object),
+    )
+
+
+def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
+    """Read a rig with joints, controls and unit of a model; `core.model.check_rig` says in what they differ.
+
+    Raises:
+        RigError: as `read_rig`.
+    """
+    rig = read_rig(scene_rig, info.joint_names)
+    return replace(rig, controls=info.controls, metres_per_unit=info.metres_per_unit)
+
+
+def joint_rest_matrices(scene_rig: SceneRig, names: tuple[str, ...]) -> np.ndarray:
+    """(J, 4, 4) float64 rest pose of joints, mesh-object space, mesh units; the identity for the unmoved joint."""
+    rest = armature_io.rest_matrices(scene_rig.armature_object.data, names)
+    moved = np.array([name != UNMOVED for name in names], bool)
+    rest[moved] = mesh_from_armature(scene_rig.mesh_object, scene_rig.armature_object) @ rest[moved]
+    return rest
+
+
+def mesh_from_armature(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
+    """(4, 4) float64, armature space to mesh-object space. Pass evaluated objects for an evaluated answer."""
+    return np.array(_relation(mesh_object, armature_object), np.float64)
+
+
+def _relation(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> Matrix:
+    return mesh_object.matrix_world.inverted_safe() @ armature_object.matrix_world
+
+
+class PoseReader:
+    """Reads the pose of a rig as a recording and a model want it.
+
+    A pose matrix is P_j = S_j B_j with S_j the skin matrix as Blender's Armature modifier computes it: the same as
+    the pose matrix in mesh-object space as long as mesh and armature keep the relation of the rest pose, and still
+    right when either object is moved on its own.
+    """
+
+    def __init__(self, scene_rig: SceneRig, names: tuple[str, ...], rest_matrices: np.ndarray):
+        """Args:
+        scene_rig: the rig.
+        names: J joints. KeyError when the armature lacks one.
+        rest_matrices: (J, 4, 4), the joints' rest pose in mesh-object space.
+        """
+        self._matrices = armature_io.PoseMatrices(scene_rig.armature_object, names)
+        self._rest = rest_matrices.astype(np.float64)
+        self._from_bone_rest = np.linalg.inv(armature_io.rest_matrices(scene_rig.armature_object.data, names))
+        self._relation: Matrix | None = None
+        self._left: np.ndarray | None = None
+        self._right: np.ndarray | None = None
+
+    def fits(self, armature_object: bpy.types.Object) -> bool:
+        """Whether the armature still has as many bones as when this reader was made."""
+        return self._matrices.fits(armature_object)
+
+    def read(self, mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
+        """Pose matrices of evaluated objects: (J, 4, 4) float32, mesh-object space, mesh units.
+
+        Raises:
+            RigError: an object has a scale of zero.
+        """
+        relation = _relation(mesh_object, armature_object)
+        if relation != self._relation:
+            for scene_object in (mesh_object, armature_object):
+                if is_flat(scene_object):
+                    raise RigError(f"'{scene_object.name}' has a scale of zero in some pose; give it another there.")
+            self._set_relation(relation)
+        pose = self._matrices.read(armature_object)
+        if self._left is not None:
+            pose = self._left @ pose
+        if self._right is not None:
+            pose = pose @ self._right
+        return np.array(pose, np.float32, order="C")
+
+    def _set_relation(self, relation: Matrix) -> None:
+        """Prepare P = T pose inv(T bone_rest) rest; a factor that is the identity is None."""
+        self._relation = relation
+        left = np.array(relation, np.float64)
+        # One inverse a frame, not one a joint: where an animated parent moves both, rounding changes T each time.
+        right = self._from_bone_rest @ (np.linalg.inv(left) @ self._rest)
+        self._left, self._right = (
+            None if np.abs(factor - np.eye(4)).max() < IDENTITY_TOLERANCE else factor for factor in (left, right)
+        )
+
+
+class PoseEvaluator:
+    """Evaluates the scene as it is posed and reads pose matrices, positions and controls."""
+
+    def __init__(self, scene_rig: SceneRig, rig: Rig):
+        """Args:
+            scene_rig, rig: the rig.
+
+        Raises:
+            RigError: the rig lacks one of its controls.
+        """
+        self._scene_rig = scene_rig
+        self._reader = PoseReader(scene_rig, rig.joint_names, rig.rest_matrices)
+        self._controls = ControlReader(scene_rig, rig.controls)
+
+    def evaluate(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Evaluate the pose that is set now.
+
+        Returns:
+            pose_matrices (J, 4, 4) and positions (V, 3), both float32, mesh-object space, mesh units, and the values of
+            the controls (C,) float32.
+        """
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        mesh_object = self._scene_rig.mesh_object.evaluated_get(depsgraph)
+        armature_object = self._scene_rig.armature_object.evaluated_get(depsgraph)
+        positions = mesh_io.evaluated_positions(self._scene_rig.mesh_object, depsgraph)
+        controls = self._controls.read(self._scene_rig, depsgraph)
+        return self._reader.read(mesh_object, armature_object), positions, controls
+
+
+__all__ = [
+    "MODIFIER_NAME",
+    "PoseEvaluator",
+    "PoseReader",
+    "SceneRig",
+    "armature_modifier",
+    "armature_of",
+    "check_evaluable",
+    "deforming_modifiers",
+    "find_rig",
+    "is_flat",
+    "mesh_from_armature",
+    "model_channels",
+    "read_model_rig",
+    "read_rig",
+    "sampled_channels",
+]  # fmt: skip

@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One bound object that plays: reads its evaluated pose, runs its model, writes its positions."""
+
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import bpy
+import numpy as np
+
+from ..core.errors import FDDAError, ModelError, RigError
+from ..core.rig import UNMOVED
+from ..core.skinning import LinearLayer
+from ..rig.reading import PoseReader, read_model_rig
+from ..scene.arrays import MUTE, write
+from ..scene.controls import ControlReader
+from ..scene.mesh import set_mesh_positions
+from ..scene.scene_rig import SceneRig, armature_of, is_flat
+from . import cache as caches
+from .model_files import network_of
+from .network import Execution
+
+
+@dataclass(frozen=True)
+class Job:
+    """A pose to execute: pose matrices (J, 4, 4) and controls (C,), float32; strength, 0 for the linear layer alone."""
+
+    pose: np.ndarray
+    controls: np.ndarray
+    strength: float
+    scene_rig: SceneRig
+
+
+class LiveBinding:
+    """One bound object, ready to play.
+
+    Attributes:
+        uid: session id of the object.
+        network: its model.
+        error: why it cannot play any more, noted while it was evaluated.
+        is_outdated: it has to be made anew: its armature has other bones.
+        job: what has to be executed for the pose that was read last.
+        was_executed: it had a job, since whoever asked set it back.
+        execution: where its positions lie.
+        graphs: addresses of the dependency graphs that know of it.
+        lock: to be held from `read` to `write`.
+    """
+
+    is_constant = False
+    """No model is executed: what was shown last stays (`playback.constant_positions`)."""
+
+    def __init__(self, mesh_object: bpy.types.Object, cache: bpy.types.Object):
+        """Args:
+            mesh_object: bound.
+            cache: its cache object.
+
+        Raises:
+            FDDAError: the model cannot be loaded, or does not fit the object any more.
+        """
+        self._name, self.uid = mesh_object.name, mesh_object.session_uid
+        self.network = network_of(mesh_object)
+        self.error: FDDAError | None = None
+        self.is_outdated = False
+        info = self.network.info
+        scene_rig = self._scene_rig(mesh_object)
+        self._armature_uid = scene_rig.armature_object.session_uid
+        self._check_vertices(mesh_object)
+        self._reader = self._make_reader(scene_rig)
+        self._controls = ControlReader(scene_rig, info.controls)
+        self._linear_layer: LinearLayer | None = None
+        self.execution = self._own_execution = Execution(self.network, 1)
+        self.job: Job | None = None
+        self.was_executed = False
+        self.graphs: set[int] = set()
+        # A render may evaluate on another thread while the window does.
+        self.lock = threading.Lock()
+        self._shown: tuple | None = None
+        self._positions: np.ndarray | None = None
+        self._sentence = self._news = self._rest_sentence()
+        self.connect(mesh_object, cache)
+
+    def connect(self, mesh_object: bpy.types.Object, cache: bpy.types.Object) -> None:
+        """Have the cache object evaluated whenever what the model reads has been."""
+        caches.connect(cache, [caches.getter(cache), *self.sources(mesh_object, cache), *self.inputs(mesh_object)])
+
+    @property
+    def source_count(self) -> int:
+        """How many `sources` there are."""
+        return 3 + len(self.network.info.controls)
+
+    def sources(self, mesh_object: bpy.types.Object, cache: bpy.types.Object) -> list[caches.Variable]:
+        """What is read in `play`."""
+        return caches.sources_of(cache, self._scene_rig(mesh_object), self.network.info.controls)
+
+    def inputs(self, mesh_object: bpy.types.Object) -> list[caches.Variable]:
+        """What the positions follow from besides."""
+        return caches.further_inputs(self._scene_rig(mesh_object), self.network.info.joint_names)
+
+    def find(self) -> bpy.types.Object | None:
+        """The object, under whatever name it has now; None when it is gone or no longer bound."""
+        found = bpy.data.objects.get(self._name)
+        if found is None or found.session_uid != self.uid:
+            found = next((o for o in bpy.data.objects if o.session_uid == self.uid), None)
+            if found is None:
+                return None
+            self._name = found.name
+        return found if found.fdda.is_bound else None
+
+    def fits(self, mesh_object: bpy.types.Object) -> bool:
+        """Whether the object still has the armature, the vertices and the modifier that it had."""
+        try:
+            self._check_vertices(mesh_object)
+        except ModelError:
+            return False
+        armature_object = armature_of(mesh_object)
+        return armature_object is not None and armature_object.session_uid == self._armature_uid
+
+    @property
+    def has_news(self) -> bool:
+        """Whether `take_news` would say another thing than the last time."""
+        return self._news != self._sentence
+
+    def take_news(self) -> str:
+        """What is odd about the playback, empty when all is well."""
+        self._sentence = self._news
+        return self._news
+
+    def play(self, cache: bpy.types.Object) -> None:
+        """Give an evaluated cache object the positions of the evaluated pose; what goes wrong is noted in `error`."""
+        with self.lock, self.noting_errors():
+            _, mesh_object, armature_object, *owners = caches.sources(cache, self.source_count)
+            if self.read(mesh_object, armature_object, owners):
+                if self.job is not None:
+                    self.execute()
+                self.write(cache, mesh_object)
+
+    @contextmanager
+    def noting_errors(self) -> Iterator[None]:
+        """Nothing leaves the block: it would be lost in a getter, or, as SystemExit does, end Blender."""
+        try:
+            yield
+        except FDDAError as error:
+            self.error = error
+        except BaseException as error:  # As above.
+            self.error = ModelError(f"The model '{self.network.path}' cannot be played ({error!r}); bind it again.")
+
+    def read(
+        self,
+        mesh_object: bpy.types.Object | None,
+        armature_object: bpy.types.Object | None,
+        owners: Sequence[bpy.types.ID | None],
+    ) -> bool:
+        """Read the pose of evaluated objects; `job` is what has to be executed for it, None where it is as before.
+
+        Returns:
+            Whether there is something to show.
+        """
+        self.job = None
+        if armature_object is None or mesh_object is None or is_flat(mesh_object) or is_flat(armature_object):
+            # Animators hide a character with a scale of zero.
+            return False
+        if not self._reader.fits(armature_object):
+            self.is_outdated = True
+            return False
+        self._check_vertices(mesh_object.original)
+        binding = mesh_object.fdda
+        pose = self._reader.read(mesh_object, armature_object)
+        controls = self._controls.values(owners)
+        # Where its mode says the rig, it is about to be switched, or has just been.
+        strength = 0.0 if binding.mode == "LINEAR" else binding.strength
+        shown = pose.tobytes(), controls.tobytes(), strength
+        if shown != self._shown and not (LiveBinding.is_constant and self._positions is not None):
+            self._news = ""
+            if not np.isfinite(pose).all():
+                pose = self._mended(pose, armature_object.name)
+            self._shown = shown
+            self.job = Job(pose, controls, strength, SceneRig(mesh_object.original, armature_object.original))
+            self.was_executed = True
+        return True
+
+    def execute(self) -> None:
+        """Execute `job` alone."""
+        self._shown, shown = None, self._shown
+        self.execution = self._own_execution
+        if self.job.strength > 0:
+            self.execution.poses[0], self.execution.controls[0] = self.job.pose, self.job.controls
+            self.execution.run()
+        self.accept(self.execution, 0)
+        self._shown = shown
+
+    def accept(self, execution: Execution, place: int) -> None:
+        """Take the positions of `job` from an execution of several poses; they stay there while they are shown."""
+        self.execution, self._positions = execution, execution.positions[place]
+        if self.job.strength < 1:
+            linear = self._linear_positions(self.job.scene_rig, self.job.pose)
+            difference = self._positions - linear if self.job.strength > 0 else np.float32(0)
+            self._positions = linear + np.float32(self.job.strength) * difference
+
+    def write(self, cache: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
+        """Give an evaluated cache object the positions, also those it had: it may show those of the rest pose again."""
+        set_mesh_positions(cache.data, self._positions)
+        _mute_shape_keys(mesh_object)
+
+    def _mended(self, pose: np.ndarray, armature: str) -> np.ndarray:
+        """A pose in which every joint is a number: one that is none moves as the next above it does."""
+        info = self.network.info
+        skin = pose @ np.linalg.inv(info.rest_matrices)
+        is_finite = np.isfinite(skin).all(axis=(1, 2))
+        for joint in np.flatnonzero(~is_finite):
+            above = info.joints[joint].parent  # Mended already: parents come before their children.
+            skin[joint] = skin[above] if above >= 0 else np.eye(4)
+        lost = info.joints[int(np.argmin(is_finite))].name
+        self._news = (
+            f"The pose of the joint '{lost}' of '{armature}' is not a number; what it moves follows the joint above."
+        )
+        return (skin @ info.rest_matrices).astype(np.float32)
+
+    def _linear_positions(self, scene_rig: SceneRig, pose_matrices: np.ndarray) -> np.ndarray:
+        """(V, 3) float32 of the linear layer alone, mesh-object space, mesh units."""
+        if self._linear_layer is None:
+            rig = self.network.linear_rig(read_model_rig(scene_rig, self.network.info))
+            # The rest pose of the model: the objects may have moved since, and pose matrices refer to it.
+            self._linear_layer = LinearLayer(replace(rig, rest_matrices=self.network.info.rest_matrices))
+        return self._linear_layer.positions(pose_matrices[None])[0]
+
+    def _rest_sentence(self) -> str:
+        self.execution.poses[0] = self.network.info.rest_matrices
+        if np.isfinite(self.execution.run()).all():
+            return ""
+        return f"The model '{self.network.path.name}' gives positions that are not numbers; train it again."
+
+    def _check_vertices(self, mesh_object: bpy.types.Object) -> None:
+        count, expected = len(mesh_object.data.vertices), self.network.info.vertex_count
+        if count != expected and mesh_object.mode != "EDIT":
+            raise ModelError(
+                f"'{mesh_object.name}' has {count} vertices and its model was trained for {expected}; "
+                "undo the change, or record and train again."
+            )
+
+    def _scene_rig(self, mesh_object: bpy.types.Object) -> SceneRig:
+        armature_object = armature_of(mesh_object)
+        if armature_object is None:
+            raise RigError(f"The armature of '{mesh_object.name}' is gone; give its Armature modifier an armature.")
+        return SceneRig(mesh_object, armature_object)
+
+    def _make_reader(self, scene_rig: SceneRig) -> PoseReader:
+        info, armature_object = self.network.info, scene_rig.armature_object
+        known = armature_object.data.bones
+        if missing := [name for name in info.joint_names if name not in known and name != UNMOVED]:
+            raise ModelError(
+                f"The armature '{armature_object.name}' lacks the joint '{missing[0]}' of the model "
+                f"'{self.network.path.name}'; name it as before, or bind a model of this rig."
+            )
+        return PoseReader(scene_rig, info.joint_names, info.rest_matrices)
+
+
+def _mute_shape_keys(mesh_object: bpy.types.Object) -> None:
+    """Spare an evaluated object the mixing of its shape keys, which Blender does whether anything reads them or not.
+
+    Only evaluations in which the model is on come here, so one that shows the rig has its shape keys. What the user set
+    comes back when Blender copies the shape keys anew. Shape keys that another object has too stay as they are.
+    """
+    keys = mesh_object.data.shape_keys
+    if keys is not None and mesh_object.original.data.users == 1:
+        write(keys.key_blocks, MUTE, np.ones(len(keys.key_blocks), bool))

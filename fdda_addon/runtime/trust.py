@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How far a bound model is believed in the current pose, by partition."""
+
+import bpy
+
+from ..core.errors import FDDAError
+from ..core.rig import UNMOVED
+from ..rig.reading import PoseReader
+from ..scene.controls import ControlReader
+from ..scene.scene_rig import SceneRig, armature_of
+from . import model_files
+
+_last: dict[int, tuple[object, bytes, list[tuple[str, float]] | None]] = {}
+
+
+def partition_trust(mesh_object: bpy.types.Object) -> list[tuple[str, float]] | None:
+    """Name of the main joint and trust, 0 to 1, of each partition in the pose that Blender has evaluated.
+
+    The model is executed once for a pose, however often this is asked.
+
+    Returns:
+        The least trusted first; None when the model does not say, or the pose cannot be read.
+    """
+    armature_object = armature_of(mesh_object)
+    if armature_object is None or not mesh_object.fdda.is_bound:
+        return None
+    try:
+        network = model_files.network_of(mesh_object)
+        names = tuple(joint.name for joint in network.info.joints)
+        if any(name not in armature_object.data.bones for name in names if name != UNMOVED):
+            return None
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        evaluated = [o.evaluated_get(depsgraph) for o in (mesh_object, armature_object)]
+        if not all(o.is_evaluated for o in evaluated):
+            return None
+        scene_rig = SceneRig(mesh_object, armature_object)
+        pose = PoseReader(scene_rig, names, network.info.rest_matrices).read(*evaluated)
+        controls = ControlReader(scene_rig, network.info.controls).read(scene_rig, depsgraph)
+        shown = pose.tobytes() + controls.tobytes()
+        kept = _last.get(mesh_object.session_uid)
+        if kept is None or kept[0] is not network or kept[1] != shown:
+            trust = network.trust(pose[None], controls[None])
+            values = None
+            if trust is not None:
+                partitions = zip(network.info.partitions, trust[0].tolist(), strict=True)
+                values = sorted(((names[p.joint], value) for p, value in partitions), key=lambda pair: pair[1])
+            _last.clear()
+            kept = _last[mesh_object.session_uid] = (network, shown, values)
+        return kept[2]
+    except FDDAError:
+        # The playback itself says what is wrong.
+        return None

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Where the add-on's own trainer environment lies, and what state it is in.
+
+It is complete when its mark is there, and the mark is written last: whatever was interrupted is recognised. Blender
+leaves the folder alone when it updates the extension and removes it when it uninstalls the extension.
+"""
+
+import enum
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ...core.errors import TrainerEnvironmentError
+
+EXTENSION = __package__.rpartition(".fdda_addon")[0]
+"""The extension's module, "bl_ext.REPOSITORY.fdda"; empty where the add-on was imported and not installed."""
+PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "scipy", "matplotlib")
+"""What the trainer imports."""
+MARK = "fdda-complete"
+ROOT = Path(__file__).parents[3]
+"""What holds the packages `fdda_addon` and `trainer`: the checkout, or the installed extension."""
+REQUIREMENTS = ROOT / "requirements"
+PINS = {(3, 11): "python-3.11.txt", (3, 12): "python-3.11.txt", (3, 13): "python-3.13.txt"}
+"""Versions of Python that an environment can be made from, and the file of pinned versions for each."""
+OFFLINE = (
+    "Blender's online access is off: allow it in Preferences > System > Network, choose a folder of wheels, or choose "
+    "an existing Python that has torch"
+)
+
+
+class FolderState(enum.Enum):
+    """State of the environment."""
+
+    MISSING = "missing"
+    HALF_MADE = "half-made"
+    """Its creation was interrupted."""
+    BROKEN = "broken"
+    """Its Python is gone, or what that was made from."""
+    OUTDATED = "outdated"
+    """It was made with other versions than this add-on asks for; it can train all the same."""
+    READY = "ready"
+
+
+def user_folder() -> Path:
+    """The folder of the add-on's own files for this user."""
+    import bpy
+
+    if EXTENSION.startswith("bl_ext."):
+        return Path(bpy.utils.extension_path_user(EXTENSION))
+    return Path(bpy.utils.user_resource("DATAFILES", path="fdda"))
+
+
+def own_folder() -> Path:
+    """The folder of the environment. A short name: on Windows the paths inside torch are nearly too long as it is."""
+    return user_folder() / "trainer"
+
+
+def log_path() -> Path:
+    """What the last creation printed."""
+    return user_folder() / "trainer.log"
+
+
+def python_in(folder: Path) -> Path:
+    """The interpreter of a virtual environment."""
+    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def pins(version: tuple[int, int]) -> Path:
+    """The file that pins every package for a version of Python that `PINS` has."""
+    return REQUIREMENTS / PINS[version]
+
+
+def obstacle(wheels: str) -> str:
+    """Why the environment cannot be created now, empty when it can; `wheels` is the folder to install from, if any."""
+    import bpy
+
+    return "" if wheels or bpy.app.online_access else OFFLINE
+
+
+def folder_state(folder: Path) -> FolderState:
+    """The state of the environment in a folder, from its files alone."""
+    if not folder.is_dir():
+        return FolderState.MISSING
+    try:
+        mark = (folder / MARK).read_text(encoding="utf-8").split()
+    except (OSError, UnicodeDecodeError):
+        return FolderState.HALF_MADE
+    if not python_in(folder).is_file():
+        return FolderState.BROKEN
+    current = {_fingerprint(path) for path in set(map(pins, PINS)) if path.is_file()}
+    return FolderState.READY if mark and mark[0] in current else FolderState.OUTDATED
+
+
+def own_python() -> str | None:
+    """The Python of the add-on's own environment, None when there is none that is complete."""
+    folder = own_folder()
+    complete = folder_state(folder) not in (FolderState.MISSING, FolderState.HALF_MADE)
+    return str(python_in(folder)) if complete else None
+
+
+def write_mark(folder: Path, version: tuple[int, int]) -> None:
+    """Mark an environment as complete."""
+    (folder / MARK).write_text(_fingerprint(pins(version)) + "\n", encoding="utf-8")
+
+
+def remove(folder: Path) -> None:
+    """Remove an environment, its mark first: a removal that is interrupted leaves it half-made.
+
+    Raises:
+        TrainerEnvironmentError: something cannot be removed.
+    """
+    import shutil
+
+    try:
+        (folder / MARK).unlink(missing_ok=True)
+        if folder.is_dir():
+            shutil.rmtree(folder)
+    except OSError as error:
+        raise TrainerEnvironmentError(
+            f"The trainer environment cannot be removed ({error.strerror}: '{error.filename}'); end what uses it, a "
+            f"training perhaps, or remove the folder '{folder}' yourself."
+        ) from error
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Keep other Blenders from making or removing the environment meanwhile; the claim ends with the process.
+
+    Raises:
+        TrainerEnvironmentError: another one is at it, or the folder cannot be written.
+    """
+    lock = folder.with_name(folder.name + ".lock")
+    try:
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        file = lock.open("a+b")
+    except OSError as error:
+        raise TrainerEnvironmentError(
+            f"The folder '{folder.parent}' cannot be written ({error.strerror}); see to its permissions, or choose an "
+            "existing Python that has torch."
+        ) from error
+    with file:
+        try:
+            _lock(file.fileno())
+        except OSError as error:
+            raise TrainerEnvironmentError(
+                "Another Blender is making or removing the trainer environment; wait until it is done."
+            ) from error
+        yield
+
+
+def _lock(descriptor: int) -> None:
+    if os.name == "nt":
+        import msvcrt
+
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _fingerprint(requirements: Path) -> str:
+    import hashlib
+
+    text = requirements.read_text(encoding="utf-8") + repr(PACKAGES)
+    return hashlib.sha256(text.encode()).hexdigest()

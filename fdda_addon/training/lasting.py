@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Trainings that outlast the Blender that has started them.
+
+What such a training says goes into a file among the add-on's own, by the path of its model. So another file may be
+opened and Blender closed, or crash: whoever opens the character again follows the training from its first message, also
+where it has ended meanwhile. No file beside a model, which may be anyone's, is trusted to name a process.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import BinaryIO
+
+from ..core.errors import OutputError
+from ..core.output import write_json
+from .environment.folder import user_folder
+from .process import Training
+
+POLL_SECONDS = 0.1
+_started: dict[int, subprocess.Popen] = {}
+"""Processes of this Blender, by their number: somebody has to ask for their status once they have ended."""
+
+
+class LastingTraining(Training):
+    """A training that goes on when `leave` was called before the block ends; otherwise its process is gone then."""
+
+    lost = "no model was written, train again"
+
+    def __init__(self, arguments: list[str], model: Path):
+        """Start the trainer.
+
+        Args:
+            arguments: of `python -m trainer`.
+            model: the file that it writes; one training of it at a time.
+
+        Raises:
+            TrainingError: the interpreter cannot be started.
+            OutputError: the folder for what it says cannot be written.
+        """
+        self._record, self._is_left = _Record(model), False
+        super().__init__(arguments)
+        _started[self._process.pid] = self._process
+        self._record.name(self._process.pid)
+
+    def _start(self, command: list[str], environment: dict[str, str]) -> subprocess.Popen:
+        own: dict[str, object] = {"start_new_session": True}
+        if sys.platform == "win32":
+            own = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
+        with self._record.new_messages() as file:
+            return subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=file, stderr=self._errors, env=environment, **own
+            )
+
+    def _read(self) -> None:
+        place, rest = 0, b""
+        while not self._is_left:
+            # Asked before reading: what was written before it ended is read.
+            is_alive = self._process.poll() is None
+            with self._record.messages.open("rb") as file:
+                file.seek(place)
+                read = file.read()
+            place += len(read)
+            *lines, rest = (rest + read).split(b"\n")
+            for line in lines:
+                self._lines.put(line.decode("utf-8", "replace"))
+            if not is_alive and not read:
+                break
+            time.sleep(0 if lines else POLL_SECONDS)
+        self._lines.put(None)
+
+    def leave(self) -> None:
+        """Let it go on when the block ends."""
+        self._is_left = True
+
+    def __exit__(self, *error: object) -> None:
+        if self._is_left:
+            self._reader.join()
+            self._errors.close()
+            return
+        super().__exit__(*error)
+        self._record.remove()
+
+
+class FollowedTraining(LastingTraining):
+    """A training that was left, followed from its first message."""
+
+    def __init__(self, model: Path):
+        """Follow the training of a model; `is_known` has to be true."""
+        self._record, self._is_left = _Record(model), False
+        self._errors = open(os.devnull, "w+", encoding="utf-8")  # noqa: SIM115 - __exit__ closes it
+        pid = self._record.process
+        self._process = _started.get(pid) or _OtherProcess(pid, self._record)
+        self._follow()
+
+
+def is_known(model: Path) -> bool:
+    """Whether a training of a model was left and nobody has seen its end yet."""
+    return _Record(model).process > 0
+
+
+class _Record:
+    """What is known of the training of a model, on the disk: its process, and what that has said."""
+
+    def __init__(self, model: Path):
+        name = hashlib.sha256(str(model.resolve()).encode()).hexdigest()[:24]
+        self._path = user_folder() / "trainings" / f"{name}.json"
+        self.messages = self._path.with_suffix(".messages")
+
+    def new_messages(self) -> BinaryIO:
+        """The file for what a process says, which holds it locked as long as it lives.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            file = self.messages.open("wb")
+        except OSError as error:
+            raise OutputError(f"Cannot write '{self.messages}': {error.strerror}; make room there.") from error
+        if sys.platform != "win32":
+            import fcntl
+
+            with contextlib.suppress(OSError):
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return file
+
+    def name(self, process: int) -> None:
+        """Keep the number of the process."""
+        write_json(self._path, {"process": process})
+
+    @property
+    def process(self) -> int:
+        """Number of the process, 0 when there is none."""
+        try:
+            return int(json.loads(self._path.read_text(encoding="utf-8"))["process"]) * self.messages.is_file()
+        except (OSError, ValueError, KeyError, TypeError):
+            return 0
+
+    def is_written(self) -> bool:
+        """Whether a process still has the file of the messages. Its number alone may be another's by now."""
+        if sys.platform == "win32":
+            # There a file that is open cannot be renamed.
+            try:
+                os.replace(self.messages, self.messages)
+            except OSError:
+                return self.messages.exists()
+            return False
+        import fcntl
+
+        try:
+            with self.messages.open("rb") as file:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:
+            pass
+        return False
+
+    def remove(self) -> None:
+        for path in (self._path, self.messages):
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+
+
+class _OtherProcess:
+    """A process that another Blender has started, as far as `Training` uses one."""
+
+    stdout = None
+
+    def __init__(self, pid: int, record: _Record):
+        self.pid, self._record = pid, record
+
+    def poll(self) -> int | None:
+        return None if self._record.is_written() else 0
+
+    def wait(self, seconds: float = float("inf")) -> int:
+        end = time.monotonic() + seconds
+        while self.poll() is None:
+            if time.monotonic() > end:
+                raise subprocess.TimeoutExpired(str(self.pid), seconds)
+            time.sleep(POLL_SECONDS)
+        return 0
+
+    def terminate(self) -> None:
+        self._send(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self._send(getattr(signal, "SIGKILL", signal.SIGTERM))
+
+    def _send(self, number: int) -> None:
+        if self.poll() is None:
+            with contextlib.suppress(OSError):
+                os.kill(self.pid, number)

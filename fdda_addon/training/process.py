@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Starts the trainer in a Python of its own, reads its messages and cancels it.
+
+torch never enters Blender's process: it would bring its own threads and libraries, and Blender's Python has none.
+"""
+
+import os
+import queue
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from typing import Self
+
+from ..core.errors import TrainingDiedError, TrainingError, WrongUsageError
+from ..core.messages import Message, MessageType
+from .environment.choice import chosen_python
+from .environment.folder import ROOT
+
+CANCEL_SECONDS = 20.0
+"""A trainer that was asked to stop is killed after so long."""
+READER_SECONDS = 1.0
+
+
+def trainer_python() -> str:
+    """Path of the Python that runs the trainer; `training.environment.choice` says how it is chosen."""
+    return chosen_python().path
+
+
+def trainer_command(
+    arguments: list[str], python: str | None = None, module: str = "trainer"
+) -> tuple[list[str], dict[str, str]]:
+    """Command line and environment of the trainer, for `subprocess`.
+
+    Args:
+        arguments: of `python -m trainer`.
+        python: the interpreter, `trainer_python()` when left out.
+        module: another one of the trainer's that can be run.
+    """
+    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    # -P: a folder `trainer` in the current folder must not be run in place of ours.
+    command = [python or trainer_python(), "-P", "-m", module, *arguments]
+    return command, {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+
+
+class TrainerProcess:
+    """A process of the trainer; use as a context manager: the process is gone when the block ends.
+
+    Attributes:
+        module: what `python -m` runs.
+        failed, lost: what errors say where the process does not.
+    """
+
+    module = "trainer"
+    failed = "The training failed."
+    lost = "no model was written, train again"
+
+    def __init__(self, arguments: list[str], python: str | None = None):
+        """Start the process.
+
+        Args:
+            arguments: of the module.
+            python: the interpreter, `trainer_python()` when left out.
+
+        Raises:
+            TrainingError: the interpreter cannot be started.
+        """
+        advice = chosen_python().origin.value if python is None else "name a Python that has torch"
+        command, environment = trainer_command(arguments, python, self.module)
+        self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - __exit__ closes it
+        try:
+            self._process = self._start(command, environment)
+        except OSError as error:
+            self._errors.close()
+            raise TrainingError(
+                f"The trainer's Python '{command[0]}' cannot be started ({error.strerror}); {advice}."
+            ) from error
+        self._follow()
+
+    def _start(self, command: list[str], environment: dict[str, str]) -> subprocess.Popen:
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            env=environment,
+            text=True,
+            encoding="utf-8",
+        )
+
+    def _follow(self) -> None:
+        self._cancelled_at: float | None = None
+        # A thread of its own: Blender must never wait for a line.
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        for line in self._process.stdout:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    def cancel(self) -> None:
+        """Ask the trainer to stop; `messages` ends when it has. Does not wait."""
+        if self._cancelled_at is None:
+            self._cancelled_at = time.monotonic()
+            self._process.terminate()
+
+    def messages(self, wait: bool = True) -> Iterator[Message | None]:
+        """What the trainer says, until it is finished or cancelled.
+
+        Args:
+            wait: for the next message. Otherwise None is given at once when there is none yet.
+
+        Raises:
+            WrongUsageError: it does not understand its options.
+            TrainingError: it failed, or died without a last message, unless it was cancelled.
+        """
+        last = None
+        while True:
+            try:
+                line = self._lines.get(block=wait)
+            except queue.Empty:
+                if self._cancelled_at is not None and time.monotonic() > self._cancelled_at + CANCEL_SECONDS:
+                    self._process.kill()
+                yield None
+                continue
+            if line is None:
+                break
+            try:
+                message = Message.decode(line)
+            except ValueError:
+                # A library that prints; not worth losing a training.
+                continue
+            if message.type is MessageType.FAILED:
+                kind = TrainingDiedError if message.values.get("try_again") is True else TrainingError
+                raise kind(str(message.values.get("text", self.failed)))
+            yield message
+            last = message
+        while not wait and self._process.poll() is None:
+            yield None
+        status = self._process.wait()
+        if self._cancelled_at is not None:
+            return
+        if status == WrongUsageError.exit_status and last is None:
+            raise WrongUsageError(self._error_text().strip())
+        if last is None or not last.type.is_last:
+            raise (TrainingDiedError if status < 0 else TrainingError)(self._death(status))
+
+    def _death(self, status: int) -> str:
+        text = self._error_text().strip().splitlines()
+        reason = f" ({text[-1].strip()})" if text else ""
+        how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
+        return f"The trainer {how} before it was done{reason}; {self.lost}."
+
+    def _error_text(self) -> str:
+        self._errors.seek(0)
+        return self._errors.read()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:
+            self._process.terminate()
+            try:
+                self._process.wait(CANCEL_SECONDS)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        # A process that the trainer has started may hold its output open: then it is left to the thread.
+        self._reader.join(READER_SECONDS)
+        if not self._reader.is_alive() and self._process.stdout is not None:
+            self._process.stdout.close()
+        self._errors.close()
+
+
+class Training(TrainerProcess):
+    """A training in a process of its own."""
+
+    def __init__(self, arguments: list[str], python: str | None = None):
+        """Start the trainer; `arguments` are recording, model and settings, all else as in `TrainerProcess`."""
+        super().__init__(["--messages", *arguments], python)
