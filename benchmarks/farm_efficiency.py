@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Six characters through a farm: the verbs one after the other, on two workers of a cluster, and on one.
+
+    .venv-farm/bin/python benchmarks/farm_efficiency.py out/efficiency
+
+Efficiency is the time of the verbs one after the other over twice the time of two workers; what the engine costs is the
+part of the time of one worker in which no verb runs. Processor time says how much else the machine did, and how many
+cores the verbs use by themselves.
+"""
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from farm.characters import read_plan  # noqa: E402
+from farm.run import GOOD, run_task  # noqa: E402
+from farm.stamps import read_stamp  # noqa: E402
+from farm.tasks import make_tasks  # noqa: E402
+
+HUMANS = ("BASIC_HUMAN", "HUMAN")
+HEAD = """
+[farm]
+work = "{work}"
+pictures = false
+[defaults]
+poses = {poses}
+shards = {shards}
+evaluate_poses = 20
+train = {{ epochs = {epochs}, hidden = [32, 32] }}
+"""
+ARM = '[characters.arm{n}]\nrig = "arm{density}.blend"\noutput = "{out}/arm{n}"\nseed = {n}\n'
+HUMAN = '[characters.{name}]\nrig = "{name}.blend"\noutput = "{out}/{name}"\nsample = ["action:rehearsal"]\n'
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--poses", type=int, default=300)
+    parser.add_argument("--epochs", type=int, default=20)
+    parser.add_argument("--densities", type=int, nargs="+", default=[1, 1, 2, 3], help="of the arms")
+    parser.add_argument("--shards", type=int, default=2)
+    parser.add_argument("--without-one", action="store_true", help="leave the run on one worker out")
+    options = parser.parse_args()
+    out = options.out.absolute()
+    out.mkdir(parents=True, exist_ok=True)
+    build_rigs(out)
+    results = {"cores": os.cpu_count(), "load": os.getloadavg()[0]}
+    for name, workers in (("verbs", 0), ("two workers", 2), ("one worker", 1)):
+        if workers == 1 and options.without_one:
+            continue
+        results[name] = measure(out, name.replace(" ", "_"), workers, options)
+        print(name, json.dumps(results[name]), flush=True)
+    verbs, two = results["verbs"], results["two workers"]
+    results["efficiency of two workers"] = round(verbs["seconds"] / (2 * two["seconds"]), 3)
+    for name, workers in (("one worker", 1), ("two workers", 2)):
+        if own := results.get(name):
+            part = 1 - own["seconds of verbs"] / (workers * own["seconds"])
+            results[f"part of the time of {name} without a verb"] = round(part, 3)
+    results["cores that verbs use one after the other"] = round(verbs["processor seconds"] / verbs["seconds"], 2)
+    (out / "efficiency.json").write_text(json.dumps(results, indent=1) + "\n")
+    print(json.dumps(results, indent=1))
+    return 0
+
+
+def build_rigs(out: Path) -> None:
+    for density in (1, 2, 3):
+        if not (path := out / f"arm{density}.blend").exists():
+            command = [sys.executable, "-m", "fdda_addon", "build-arm", path, "--density", str(density)]
+            subprocess.run(command, cwd=ROOT, check=True)
+    for name in HUMANS:
+        if not (path := out / f"{name.lower()}.blend").exists():
+            subprocess.run([sys.executable, "-m", "blend_fixtures.characters.rigify", name, path], cwd=ROOT, check=True)
+
+
+def measure(out: Path, name: str, workers: int, options: argparse.Namespace) -> dict:
+    """Bring the farm from nothing to its end; with 0 workers by itself, else on a cluster."""
+    work = out / f"work_{name}"
+    shutil.rmtree(work, ignore_errors=True)
+    parts = [HEAD.format(work=work, poses=options.poses, epochs=options.epochs, shards=options.shards)]
+    parts += [ARM.format(n=n, density=density, out=f"out_{name}") for n, density in enumerate(options.densities)]
+    parts += [HUMAN.format(name=human.lower(), out=f"out_{name}") for human in HUMANS]
+    path = out / f"{name}.toml"
+    path.write_text("".join(parts))
+    plan = read_plan(path)
+    tasks = make_tasks(plan)
+    before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    if workers:
+        command = [sys.executable, "-m", "farm", path, "--workers", str(workers), "--dashboard-port", "0"]
+        subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    else:
+        for task in tasks:
+            outcome = run_task(plan.farm, tasks, task)
+            assert outcome.state in GOOD, outcome
+    seconds, after = time.monotonic() - started, resource.getrusage(resource.RUSAGE_CHILDREN)
+    stamps = [read_stamp(task) for task in tasks.values()]
+    return {
+        "seconds": round(seconds, 1),
+        "seconds of verbs": round(sum(stamp.seconds for stamp in stamps), 1),
+        "processor seconds": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
+        "peak MB of a process": max(stamp.peak_mb for stamp in stamps),
+        "tasks": len(tasks),
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The command line of the farm: `python -m fdda_addon farm characters.toml`, or `python -m farm characters.toml`.
+
+Exit status: 0 all characters are done, 1 one failed, each with a sentence, 2 wrong usage, 75 it ended for a reason of
+the machines', so that the same command goes on, 130 interrupted.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from fdda_addon.core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status
+
+INTERRUPTED = 130
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Do as the arguments say; returns the exit status."""
+    try:
+        return _run(_parser().parse_args(arguments))
+    except FDDAError as error:
+        status = exit_status(error)
+        print(f"Error: {error}" if status != WrongUsageError.exit_status else error, file=sys.stderr)
+        return status
+    except KeyboardInterrupt:
+        print("Interrupted; run the same command to go on.", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("farm", description="Record, train and bind many characters on many machines.")
+    parser.add_argument("plan", metavar="characters.toml", type=Path, help="the characters (docs/farm.md)")
+    parser.add_argument(
+        "--report", metavar="OUT.html", type=Path, help="the page (default: report.html beside the plan)"
+    )
+    parser.add_argument(
+        "--only", action="append", default=[], metavar="NAME", help="this character alone; may be given again"
+    )
+    what = parser.add_argument_group("in place of running it").add_mutually_exclusive_group()
+    what.add_argument("--task", metavar="NAME", help="do one task, for engines that have the graph from below")
+    what.add_argument("--list", action="store_true", help="list the tasks, and which are up to date")
+    what.add_argument("--dry-run", action="store_true", help="say how long it will take, by what was measured so far")
+    what.add_argument("--report-only", action="store_true", help="write the page of what is there")
+    what.add_argument("--openjd", metavar="OUT.json", type=Path, help="write the graph as an OpenJD job template")
+    what.add_argument("--flamenco", metavar="OUT.json", type=Path, help="write it as a job for Flamenco's job type")
+    cluster = parser.add_argument_group("cluster")
+    cluster.add_argument(
+        "--scheduler",
+        default="",
+        metavar="tcp://…",
+        help="use the cluster that is there; dask for the one that Dask's configuration names",
+    )
+    cluster.add_argument(
+        "--workers", default="", metavar="N", help="of the local cluster; with --dry-run a list, 1,8,64"
+    )
+    cluster.add_argument("--host", default="127.0.0.1", help="what the local scheduler listens on (default 127.0.0.1)")
+    cluster.add_argument("--dashboard-port", type=int, default=8787, metavar="N", help="default 8787; 0 for any")
+    return parser
+
+
+def _run(options: argparse.Namespace) -> int:
+    from .characters import read_plan
+    from .tasks import make_tasks
+
+    plan = read_plan(options.plan)
+    tasks = make_tasks(plan)
+    if options.task:
+        return _one(plan.farm, tasks, options.task)
+    if unknown := sorted(set(options.only) - {character.name for character in plan.characters}):
+        raise WrongUsageError(f"The plan has no character '{unknown[0]}'.")
+    if options.only:
+        tasks = {name: task for name, task in tasks.items() if task.character in options.only}
+    if options.openjd:
+        from .openjd import write_template
+
+        return write_template(plan, tasks, options.openjd)
+    if options.flamenco:
+        from .flamenco import write_job
+
+        return write_job(plan, tasks, options.flamenco)
+    if options.dry_run:
+        from .simulation import print_estimate
+
+        return print_estimate(plan.farm, tasks, _counts(options.workers))
+    page = options.report or plan.path.with_name("report.html")
+    if options.report_only:
+        from .report import write_report
+
+        write_report(plan, tasks, {}, page)
+        print(f"{page}: the report")
+        return 0
+    return _all(options, plan, tasks, page)
+
+
+def _counts(text: str) -> list[int]:
+    counts = [int(part) for part in (text or "1,8,64,512").split(",") if part.strip().isdecimal()]
+    if not counts or min(counts) < 1 or max(counts) > 100_000:
+        raise WrongUsageError("--workers is a list of numbers from 1 to 100,000, such as 1,8,64.")
+    return counts
+
+
+def _one(farm, tasks: dict, name: str) -> int:
+    """Do one task for another engine, which has done those before it."""
+    from .run import AGAIN, GOOD, run_task
+
+    if name not in tasks:
+        raise WrongUsageError(f"The plan has no task '{name}'; --list names them.")
+    outcome = run_task(farm, tasks, name)
+    print(f"{name}: {outcome.state}{f', {outcome.sentence}' if outcome.sentence else ''}")
+    if outcome.state in GOOD:
+        return 0
+    print(f"Error: {outcome.sentence}", file=sys.stderr)
+    return TRY_AGAIN if outcome.state == AGAIN else 1
+
+
+def _all(options: argparse.Namespace, plan, tasks: dict, page: Path) -> int:
+    from .cluster import connected, local_workers, run_on
+    from .report import write_report
+    from .run import AGAIN, FAILED, GOOD, Outcome
+    from .stamps import Keys, to_do
+
+    names, unreadable = to_do(tasks, Keys(plan.farm, tasks))
+    outcomes = {name: Outcome(name, FAILED, sentence) for name, sentence in unreadable.items()}
+    if options.list:
+        for name in tasks:
+            print(f"{name}: {'to do' if name in names else 'cannot be done' if name in outcomes else 'up to date'}")
+        return 0
+    for outcome in outcomes.values():
+        _say(outcome, len(outcomes), len(names) + len(unreadable))
+    workers = _counts(options.workers)[0] if options.workers else local_workers()
+    try:
+        if names:
+            plan.farm.work.mkdir(parents=True, exist_ok=True)
+            with connected(plan.farm, options.scheduler, workers, options.host, options.dashboard_port) as client:
+                print(f"{len(names)} of {len(tasks)} tasks to do; {client.dashboard_link} shows them", flush=True)
+                for outcome in run_on(client, plan.farm, tasks, names):
+                    outcomes[outcome.task] = outcome
+                    _say(outcome, len(outcomes), len(names) + len(unreadable))
+    finally:
+        write_report(plan, tasks, outcomes, page)
+    print(f"{page}: {len(plan.characters)} characters")
+    states = {outcome.state for outcome in outcomes.values()}
+    if states <= set(GOOD):
+        return 0
+    return 1 if FAILED in states or AGAIN not in states else TRY_AGAIN
+
+
+def _say(outcome, done: int, total: int) -> None:
+    seconds = f" in {outcome.seconds:.1f} s" if outcome.seconds else ""
+    text = f": {outcome.sentence}" if outcome.sentence else ""
+    print(f"[{done}/{total}] {outcome.task} {outcome.state}{seconds}{text}", flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The tasks on a Dask cluster: a local one, or one that is there. Workers start processes, and compute nothing."""
+
+import contextlib
+import itertools
+import logging
+import os
+import threading
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from fdda_addon.core.errors import FDDAError
+
+from .characters import Farm
+from .process import TryAgainError
+from .run import AGAIN, BLOCKED, FAILED, GOOD, Outcome, run_task
+from .tasks import REFINE, TRAIN, Task
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+LOOPBACK = "127.0.0.1"
+TASK_MB = 3000
+"""What a local worker is counted with: a Blender with a character, or a training."""
+CPU, GPU = "recording", "GPU"
+"""Resources of workers, where trainings need a GPU: a worker has one of them, or both."""
+CONNECT_SECONDS = 60
+KEEP_SECONDS, ABSENCES = 3.0, 6
+"""How often workers are counted, and how often one may be missed before there is another in its place."""
+LOST_WORKERS = 1_000
+"""A task may lose so many workers: it goes on where it was, whatever ended them."""
+
+
+class ClusterError(TryAgainError):
+    """The cluster is not there, or not any more."""
+
+
+def local_workers() -> int:
+    """How many workers this machine has the cores and the memory for."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e6
+    return max(1, min(cores, int(memory // TASK_MB)))
+
+
+@contextlib.contextmanager
+def connected(farm: Farm, scheduler: str, workers: int, host: str, port: int) -> Iterator["Client"]:
+    """A client of a cluster.
+
+    Args:
+        farm: whether trainings need a GPU.
+        scheduler: address of a cluster that is there, "tcp://…"; "dask" for what Dask's own configuration names; empty
+            to start one here, which ends with the block.
+        workers: of a local cluster.
+        host: what its scheduler listens on.
+        port: of its dashboard, 0 for any.
+
+    Raises:
+        ClusterError: it cannot be reached.
+        FDDAError: distributed is not installed.
+    """
+    try:
+        import dask
+        from distributed import Client
+    except ModuleNotFoundError as error:
+        raise FDDAError(
+            f"The farm needs the Python package '{error.name}'; make farm sets an environment up that has it."
+        ) from error
+    dask.config.set({"distributed.scheduler.allowed-failures": LOST_WORKERS})
+    with contextlib.ExitStack() as stack:
+        try:
+            if scheduler:
+                address = {} if scheduler == "dask" else {"address": scheduler}
+                client = Client(**address, timeout=CONNECT_SECONDS, set_as_default=False)
+            else:
+                cluster = stack.enter_context(_local_cluster(farm, workers, host, port))
+                client = Client(cluster, set_as_default=False)
+        except (OSError, ValueError, RuntimeError) as error:
+            where = f"There is no scheduler at '{scheduler}'" if scheduler else "The local cluster did not start"
+            raise ClusterError(f"{where} ({error}).") from error
+        yield stack.enter_context(client)
+
+
+@contextlib.contextmanager
+def _local_cluster(farm: Farm, workers: int, host: str, port: int) -> Iterator[object]:
+    """A cluster of processes on this machine. What workers start counts to no limit of Dask's: they are sized here."""
+    from distributed import Nanny, Scheduler, SpecCluster
+
+    quiet = logging.CRITICAL
+    options = {"nthreads": 1, "memory_limit": None, "host": host, "dashboard": False, "silence_logs": quiet}
+    kinds = [CPU] * workers + [GPU] * farm.gpu
+    specs = {n: {"cls": Nanny, "options": {**options, "resources": {kind: 1}}} for n, kind in enumerate(kinds)}
+    scheduler = {"cls": Scheduler, "options": {"host": host, "dashboard": True, "dashboard_address": f"{host}:{port}"}}
+    with SpecCluster(workers=specs, scheduler=scheduler, silence_logs=quiet) as cluster:
+        stop = threading.Event()
+        keeper = threading.Thread(target=_keep_workers, args=(cluster, stop), daemon=True)
+        keeper.start()
+        try:
+            yield cluster
+        finally:
+            stop.set()
+            keeper.join()
+
+
+def _keep_workers(cluster: object, stop: threading.Event) -> None:
+    """Replace workers that do not come back: a nanny starts its worker again, and gives up if that is killed too."""
+    absent: dict[int, int] = {}
+    following = itertools.count(len(cluster.worker_spec))
+    while not stop.wait(KEEP_SECONDS):
+        there = {worker["name"] for worker in dict(cluster.scheduler_info["workers"]).values()}
+        absent = {name: absent.get(name, 0) + 1 for name in cluster.worker_spec if name not in there}
+        if lost := [name for name, times in absent.items() if times > ABSENCES]:
+            for name in lost:
+                cluster.worker_spec[next(following)] = cluster.worker_spec.pop(name)
+            cluster.scale(len(cluster.worker_spec))
+
+
+def run_on(client: "Client", farm: Farm, tasks: dict[str, Task], names: list[str]) -> Iterator[Outcome]:
+    """Run tasks on a cluster, each when those before it are done.
+
+    Args:
+        client: of the cluster.
+        farm, tasks: the graph.
+        names: of the tasks to run, each after those that it needs.
+
+    Yields:
+        The outcome of each task as it ends.
+
+    Raises:
+        ClusterError: the scheduler is gone.
+    """
+    from distributed import as_completed
+
+    futures, run_id = {}, f"{time.time():.3f}"
+    for number, name in enumerate(names):
+        task = tasks[name]
+        own = {other: tasks[other] for other in _ancestors(tasks, name)} | {name: task}
+        needs_gpu = farm.gpu and task.kind == TRAIN
+        futures[name] = client.submit(
+            _run,
+            farm,
+            own,
+            name,
+            [futures[other] for other in task.after if other in futures],
+            key=f"{name}-{run_id}",
+            retries=farm.retries,
+            resources={GPU if needs_gpu else CPU: 1} if farm.gpu else None,
+            # What is refined is nearest to an end: it goes before what has not begun.
+            priority=(task.kind in (TRAIN, REFINE)) * len(names) - number,
+            pure=False,
+        )
+    by_key = {future.key: name for name, future in futures.items()}
+    try:
+        for future in as_completed(futures.values(), loop=client.loop):
+            yield _outcome(by_key[future.key], future)
+            if client.status != "running":
+                break
+    except (OSError, TimeoutError) as error:
+        raise ClusterError(f"The scheduler is gone ({error}); run the farm again, and it goes on.") from error
+    if client.status != "running":
+        raise ClusterError("The scheduler is gone; run the farm again, and it goes on.")
+
+
+def _ancestors(tasks: dict[str, Task], name: str) -> list[str]:
+    found: dict[str, None] = {}
+    waiting = list(tasks[name].after)
+    while waiting:
+        other = waiting.pop()
+        if other not in found:
+            found[other] = None
+            waiting += tasks[other].after
+    return list(found)
+
+
+def _run(farm: Farm, tasks: dict[str, Task], name: str, before: list[Outcome]) -> Outcome:
+    """What a worker does."""
+    for outcome in before:
+        if outcome.state not in GOOD:
+            return Outcome(name, BLOCKED, f"'{outcome.task}' is not done.")
+    outcome = run_task(farm, tasks, name)
+    if outcome.state == AGAIN:
+        # Dask counts the attempts; the disk or the memory may come back meanwhile.
+        time.sleep(farm.retry_seconds)
+        raise TryAgainError(outcome.sentence)
+    return outcome
+
+
+def _outcome(name: str, future: object) -> Outcome:
+    if future.status == "finished":
+        return future.result()
+    if future.status != "error":
+        return Outcome(name, AGAIN, "The scheduler is gone.")
+    error = future.exception()
+    is_again = isinstance(error, TryAgainError) or type(error).__name__ == "KilledWorker"
+    return Outcome(name, AGAIN if is_again else FAILED, str(error) or repr(error))

@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Runs the farm from its file, for engines that start a program and set no environment: `python farm/launch.py …`."""
+
+import sys
+from pathlib import Path
+
+# The folder of this file may hold names of the standard library; the project's does not.
+sys.path[0] = str(Path(__file__).resolve().parent.parent)
+
+if __name__ == "__main__":
+    from farm.__main__ import main
+
+    sys.exit(main())

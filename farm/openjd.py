@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The graph as a job template of Open Job Description (jobtemplate-2023-09), which render-farm managers take."""
+
+import sys
+from pathlib import Path
+
+from fdda_addon.core.output import check_writable, write_json
+
+from .characters import Plan
+from .stamps import ROOT
+from .tasks import BIND, RECORD, TRAIN, Task
+
+SPECIFICATION = "jobtemplate-2023-09"
+SHARD = "Shard"
+
+
+def write_template(plan: Plan, tasks: dict[str, Task], path: Path) -> int:
+    """Write the template of a plan; returns the exit status.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    check_writable(path)
+    template = make_template(plan, tasks, path.absolute().parent)
+    write_json(path, template)
+    print(f"{path}: a template of {len(template['steps'])} steps")
+    return 0
+
+
+def make_template(plan: Plan, tasks: dict[str, Task], folder: Path) -> dict:
+    """The template: a step for each task, one for all shards of a recording, and the report as the last.
+
+    Args:
+        plan, tasks: the graph.
+        folder: that the template is written to; a plan in it, or below, is the default of the parameter Plan.
+    """
+    steps = [_step(plan, tasks, task) for task in tasks.values() if task.kind != RECORD or task.name.endswith("-1")]
+    bound = [{"dependsOn": step_name(task)} for task in tasks.values() if task.kind == BIND]
+    steps.append({"name": "report", "dependencies": bound, "script": _script("--report-only")})
+    return {
+        "specificationVersion": SPECIFICATION,
+        "name": f"FDDA {plan.path.stem}"[:128],
+        "parameterDefinitions": [
+            _plan_parameter(plan, folder),
+            _text("Project", str(ROOT), "the folder of FDDA for Blender on the workers"),
+            _text("Python", sys.executable, "Python of the workers that has the packages of the project"),
+        ],
+        "jobEnvironments": [{"name": "FDDA", "variables": {"PYTHONPATH": "{{Param.Project}}"}}],
+        "steps": steps,
+    }
+
+
+def _plan_parameter(plan: Plan, folder: Path) -> dict:
+    # Defaults of paths are relative to the template, and inside of its folder.
+    is_inside = plan.path.is_relative_to(folder)
+    return {
+        "name": "Plan",
+        "type": "PATH",
+        "objectType": "FILE",
+        # Not copied to the workers and back: what tasks hand on lies in the folder that the plan names.
+        "dataFlow": "NONE",
+        **({"default": plan.path.relative_to(folder).as_posix()} if is_inside else {}),
+        "description": "characters.toml, in a folder that all workers see",
+    }
+
+
+def _text(name: str, default: str, description: str) -> dict:
+    return {"name": name, "type": "STRING", "default": default, "description": description}
+
+
+def step_name(task: Task) -> str:
+    """Name of the step of a task; the shards of a recording share one."""
+    return task.name.rpartition("-")[0] if task.kind == RECORD else task.name
+
+
+def _step(plan: Plan, tasks: dict[str, Task], task: Task) -> dict:
+    before = list(dict.fromkeys(step_name(tasks[name]) for name in task.after))
+    step = {"name": step_name(task), "script": _script("--task", task.name)}
+    if task.kind == RECORD:
+        shards = sum(other.kind == RECORD and step_name(other) == step["name"] for other in tasks.values())
+        step["script"] = _script("--task", f"{step['name']}-{{{{Task.Param.{SHARD}}}}}")
+        step["parameterSpace"] = {
+            "taskParameterDefinitions": [{"name": SHARD, "type": "INT", "range": f"1-{shards}" if shards > 1 else "1"}]
+        }
+    if before:
+        step["dependencies"] = [{"dependsOn": name} for name in before]
+    if task.kind == TRAIN and plan.farm.gpu:
+        step["hostRequirements"] = {"amounts": [{"name": "amount.worker.gpu", "min": 1}]}
+    return step
+
+
+def _script(*options: str) -> dict:
+    arguments = ["-P", "-m", "farm", "{{Param.Plan}}", *options]
+    return {"actions": {"onRun": {"command": "{{Param.Python}}", "args": arguments}}}

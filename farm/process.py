@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Runs a verb in a process of its own, and says how it ended."""
+
+import contextlib
+import fcntl
+import os
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from fdda_addon.core.errors import TRY_AGAIN, FDDAError
+
+from .characters import Farm
+from .stamps import ROOT
+
+WAIT_SECONDS = 0.2
+SENTENCE_BYTES = 64 << 10
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+POSIX_MB = 1024 if sys.platform != "darwin" else 1024 * 1024
+"""What the system counts peak memory in, in parts of a MB: kB on Linux, bytes on macOS."""
+
+
+class VerbError(FDDAError):
+    """A verb failed, and will fail again."""
+
+
+class TryAgainError(FDDAError):
+    """A verb failed for a reason of the machine's."""
+
+    exit_status = TRY_AGAIN
+
+
+@dataclass(frozen=True)
+class Ended:
+    """What a verb took: wall-clock time, and the most memory of a process of it."""
+
+    seconds: float
+    peak_mb: float
+
+
+@contextlib.contextmanager
+def held(path: Path) -> Iterator[int]:
+    """Hold the lock of a task; waits for it. Yields its file descriptor, for the processes that hold it as well.
+
+    The system frees it when the last process that has it is gone. A verb whose worker was killed goes on and holds it:
+    whoever is told to do the same task waits for it here, and finds it done.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def verb_command(farm: Farm, verb: tuple[str, ...]) -> list[str]:
+    """The command line of a verb, for `subprocess`."""
+    if farm.blender and verb[0] not in ("train", "merge-recordings"):
+        return [farm.blender, "--command", "fdda", *verb]
+    return [farm.python or sys.executable, "-P", "-m", "fdda_addon", *verb]
+
+
+def verb_environment(farm: Farm, verb: tuple[str, ...]) -> dict[str, str]:
+    """The environment of a verb."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *_paths()])}
+    if farm.trainer_python:
+        environment["FDDA_TRAINER_PYTHON"] = farm.trainer_python
+    if verb[0] == "train":
+        environment |= dict.fromkeys(THREADS, str(farm.threads))
+        if not farm.gpu:
+            environment["CUDA_VISIBLE_DEVICES"] = ""
+    return environment
+
+
+def _paths() -> list[str]:
+    return [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path and path != str(ROOT)]
+
+
+def run_verb(farm: Farm, verb: tuple[str, ...], folder: Path, log: Path, lock: int) -> Ended:
+    """Run a verb until it ends.
+
+    Args:
+        farm: how it is run.
+        verb: its name and options.
+        folder: that relative paths are in.
+        log: what it prints is added to this file.
+        lock: a descriptor that its process holds as well (`held`).
+
+    Raises:
+        VerbError: it failed, with its own sentence.
+        TryAgainError: the machine is to blame, or a signal ended it.
+    """
+    command = verb_command(farm, verb)
+    started = time.monotonic()
+    with open(log, "ab") as output:
+        output.write(f"$ {shlex.join(verb)}\n".encode())
+        output.flush()
+        begin = output.tell()
+        try:
+            process = subprocess.Popen(
+                command,
+                cwd=folder,
+                env=verb_environment(farm, verb),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                pass_fds=(lock,),
+                # Ctrl-C is for whoever started the farm; it ends what it started itself.
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise VerbError(f"'{command[0]}' cannot be started ({error.strerror}); see [farm] in the plan.") from error
+        try:
+            _, status, usage = os.wait4(process.pid, 0)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                os.killpg(process.pid, 15)
+            raise
+    process.returncode = code = os.waitstatus_to_exitcode(status)
+    if code < 0:
+        raise TryAgainError(f"{verb[0]} was ended by signal {-code}.")
+    if code:
+        sentence = _sentence(log, begin) or f"{verb[0]} ended with status {code}; see '{log}'."
+        raise (TryAgainError if code == TRY_AGAIN else VerbError)(sentence)
+    return Ended(time.monotonic() - started, usage.ru_maxrss / POSIX_MB)
+
+
+def _sentence(log: Path, begin: int) -> str:
+    """What a verb said last of its failure."""
+    with open(log, "rb") as file:
+        file.seek(0, os.SEEK_END)
+        file.seek(max(begin, file.tell() - SENTENCE_BYTES))
+        lines = [line.strip() for line in file.read().decode("utf-8", "replace").splitlines() if line.strip()]
+    errors = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
+    return (errors or lines or [""])[-1][:2000]

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What became of all characters: `report.json`, and the page made of it. docs/farm.md has the keys."""
+
+import json
+import time
+from pathlib import Path
+
+from fdda_addon.core.output import write_json, write_text
+
+from .characters import Character, Plan
+from .page import render_page
+from .run import BLOCKED, GOOD, Outcome
+from .stamps import Stamp, read_stamp
+from .tasks import BIND, EVALUATE, EVALUATION, KINDS, PICTURE, REFINE, REPORT, Task
+
+FORMAT, VERSION = "fdda-farm-report", 1
+MAX_REPORT_BYTES = 64 << 20
+BOUND, UNFINISHED, BROKEN = "done", "not done", "failed"
+MAX_PICTURE_BYTES = 8 << 20
+
+
+def write_report(plan: Plan, tasks: dict[str, Task], outcomes: dict[str, Outcome], page: Path) -> None:
+    """Write `report.html` and, beside it, `report.json`; what it said before is what it compares with.
+
+    Args:
+        plan, tasks: the farm; of characters that have no tasks here nothing is said anew.
+        outcomes: of the tasks that ran now, by their names.
+        page: the .html file.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    path = page.with_suffix(".json")
+    before = _read(path)
+    asked = {task.character for task in tasks.values()}
+    characters = {}
+    for character in plan.characters:
+        if character.name in asked:
+            own = {name: task for name, task in tasks.items() if task.character == character.name}
+            characters[character.name] = _character(character, own, outcomes)
+        elif character.name in before:
+            characters[character.name] = before[character.name]
+    for name, value in characters.items():
+        # A run that did nothing is compared with what the last that did something was compared with.
+        last = before.get(name, {})
+        value["before"] = last.get("before") if not _is_changed(value, last) else _summary(last)
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "plan": plan.path.name,
+        "written": time.strftime("%Y-%m-%d %H:%M:%S"),
+        "characters": characters,
+    }
+    write_json(path, content)
+    pictures = {character.name: _pictures(tasks, character) for character in plan.characters}
+    write_text(page, render_page(content, pictures))
+
+
+def _character(character: Character, tasks: dict[str, Task], outcomes: dict[str, Outcome]) -> dict:
+    stamps = {name: read_stamp(task) for name, task in tasks.items()}
+    failures = [
+        {"task": name, "state": outcomes[name].state, "sentence": outcomes[name].sentence}
+        for name in tasks
+        if name in outcomes and outcomes[name].state not in (*GOOD, BLOCKED)
+    ]
+    bind = next(task for task in tasks.values() if task.kind == BIND)
+    is_bound = stamps[bind.name] is not None and not failures and bind.name not in _not_good(outcomes)
+    ran = {name: stamp for name, stamp in stamps.items() if stamp is not None and not stamp.skipped}
+    return {
+        "state": BOUND if is_bound else BROKEN if failures else UNFINISHED,
+        "rig": character.rig.name,
+        "output": str(character.output),
+        "failures": failures,
+        "target_mm": character.target_mm,
+        "models": _models(tasks, bind, stamps[bind.name]) if is_bound else [],
+        "seconds": {kind: round(sum(s.seconds for n, s in ran.items() if tasks[n].kind == kind), 1) for kind in KINDS},
+        "peak_mb": max((stamp.peak_mb for stamp in ran.values()), default=0.0),
+        "hosts": sorted({stamp.host for stamp in ran.values() if stamp.host}),
+        "tasks": len(tasks),
+        "ran_now": sum(outcomes[name].state == "done" for name in tasks if name in outcomes),
+        "key": stamps[bind.name].key if is_bound else "",
+    }
+
+
+def _not_good(outcomes: dict[str, Outcome]) -> set[str]:
+    return {name for name, outcome in outcomes.items() if outcome.state not in GOOD}
+
+
+def _models(tasks: dict[str, Task], bind: Task, stamp: Stamp) -> list[dict]:
+    """Of each model that is bound: its errors, and the round that it is of."""
+    found = []
+    for place, rounds in bind.choices:
+        train = str(stamp.notes.get("bound", {}).get(place, rounds[0][0]))
+        errors = _read_json(bind.folder / Path(place).with_name(EVALUATION))
+        report = _read_json(bind.folder / Path(place).with_name(REPORT[0]))
+        refined = [name for name, task in tasks.items() if task.kind == REFINE and not _was_skipped(task)]
+        rounds_done = sum(
+            not _was_skipped(tasks[evaluate]) for _, evaluate in rounds if tasks[evaluate].kind == EVALUATE
+        )
+        found.append(
+            {
+                "name": Path(place).stem,
+                "file": place,
+                "round": int(train.rpartition("-")[2]),
+                "rounds": rounds_done,
+                "poses_added": len(refined) > 0,
+                "vertices": errors.get("vertices", 0),
+                "fdda": errors.get("fdda", {}),
+                "linear": errors.get("linear", {}),
+                "verdict": report.get("target", {}).get("verdict", ""),
+                "warnings": [str(warning.get("text", "")) for warning in report.get("warnings", [])],
+            }
+        )
+    return found
+
+
+def _was_skipped(task: Task) -> bool:
+    stamp = read_stamp(task)
+    return stamp is None or bool(stamp.skipped)
+
+
+def _pictures(tasks: dict[str, Task], character: Character) -> list[tuple[str, bytes]]:
+    """Heat maps of the bound models of a character, by the names of the models."""
+    bind = tasks.get(f"{character.name}/{BIND}")
+    found = []
+    for place, _ in bind.choices if bind else ():
+        path = bind.folder / Path(place).with_name(PICTURE)
+        if path.is_file() and path.stat().st_size <= MAX_PICTURE_BYTES:
+            found.append((Path(place).stem, path.read_bytes()))
+    return found
+
+
+def _is_changed(value: dict, last: dict) -> bool:
+    keys = ("state", "key", "models", "failures")
+    return any(value.get(key) != last.get(key) for key in keys)
+
+
+def _summary(last: dict) -> dict | None:
+    """What the next report compares with; None where there was none."""
+    if not last:
+        return None
+    return {key: last.get(key) for key in ("state", "models", "seconds", "failures")}
+
+
+def _read(path: Path) -> dict:
+    value = _read_json(path)
+    characters = value.get("characters")
+    if (value.get("format"), value.get("version")) != (FORMAT, VERSION) or not isinstance(characters, dict):
+        return {}
+    return {name: own for name, own in characters.items() if isinstance(own, dict)}
+
+
+def _read_json(path: Path) -> dict:
+    try:
+        if path.stat().st_size > MAX_REPORT_BYTES:
+            return {}
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) else {}

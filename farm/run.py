@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Does one task, wherever it is: checks what it uses, runs its verbs, and says by a stamp that it is done.
+
+It may be killed at any moment, and be started again on any machine: what is there is gone on with, what is done is not
+done again, and no two processes do the same task at a time.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import socket
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from fdda_addon.core.errors import FDDAError, exit_status
+from fdda_addon.core.output import is_left_over, replacing, write_text
+
+from .characters import Farm
+from .process import TryAgainError, held, run_verb
+from .stamps import Keys, Stamp, StampError, check_outputs, digest_outputs, is_up_to_date, read_stamp, write_stamp
+from .tasks import BIND, EVALUATION, REPORT, Task
+
+DONE, UP_TO_DATE, NOT_NEEDED, FAILED, AGAIN, BLOCKED = (
+    *("done", "up to date", "not needed", "failed", "try again", "blocked"),
+)
+GOOD = (DONE, UP_TO_DATE, NOT_NEEDED)
+KEY = ".fdda-farm-key"
+"""In the folder of a task: what the files in it are made for."""
+EXHAUSTED = "exhausted"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a task ended.
+
+    Attributes:
+        task: its name.
+        state: `DONE`, `UP_TO_DATE`, `NOT_NEEDED`, `FAILED`, `AGAIN` (for a reason of the machine's) or `BLOCKED`.
+        sentence: why it failed, or was not needed.
+        seconds, peak_mb: of its verbs.
+        host: name of the machine.
+    """
+
+    task: str
+    state: str
+    sentence: str = ""
+    seconds: float = 0.0
+    peak_mb: float = 0.0
+    host: str = ""
+
+
+def run_task(farm: Farm, tasks: dict[str, Task], name: str) -> Outcome:
+    """Do a task of a graph, unless it is up to date.
+
+    Returns:
+        How it ended; errors of the add-on are outcomes, any other is a bug and propagates.
+    """
+    task, host = tasks[name], socket.gethostname()
+    try:
+        key = Keys(farm, tasks).of(name)
+        with held(task.lock) as lock:
+            if is_up_to_date(task, key):
+                skipped = read_stamp(task).skipped
+                return Outcome(name, NOT_NEEDED if skipped else UP_TO_DATE, skipped, host=host)
+            if skipped := _skipped(tasks, task):
+                write_stamp(task, Stamp(key, {}, skipped, host=host))
+                return Outcome(name, NOT_NEEDED, skipped, host=host)
+            stamp = _do(farm, tasks, task, key, lock)
+            write_stamp(task, stamp)
+        return Outcome(name, DONE, "", stamp.seconds, stamp.peak_mb, host)
+    except FDDAError as error:
+        state = AGAIN if exit_status(error) == TryAgainError.exit_status else FAILED
+        return Outcome(name, state, str(error), host=host)
+    except OSError as error:
+        # Of the shared folder; a path that is wrong was found when the plan was read.
+        return Outcome(name, AGAIN, f"'{error.filename}': {error.strerror or error}.", host=host)
+
+
+def _skipped(tasks: dict[str, Task], task: Task) -> str:
+    """Why a task of a later round has nothing to do; empty where it has."""
+    if task.round is None:
+        return ""
+    before = read_stamp(tasks[task.round.evaluate])
+    if before is not None and before.skipped:
+        return before.skipped
+    train = tasks[task.round.train]
+    check_outputs(train, lambda name: name in REPORT)
+    check_outputs(tasks[task.round.evaluate])
+    reached = reached_mm(tasks[task.round.evaluate])
+    if reached <= task.round.target_mm:
+        return f"99.9 % of the vertices are within {reached:.3g} mm, and the target is {task.round.target_mm:g} mm."
+    verdict = _read_json(train.folder / REPORT[0]).get("target", {}).get("verdict", "")
+    if verdict == EXHAUSTED:
+        return f"More poses no longer help: 99.9 % of the vertices are within {reached:.3g} mm."
+    return ""
+
+
+def reached_mm(evaluate: Task) -> float:
+    """What 99.9 % of the vertices of held-out poses are within, by the evaluation of a task.
+
+    Raises:
+        StampError: it does not say.
+    """
+    try:
+        return float(_read_json(evaluate.folder / EVALUATION)["fdda"]["p999"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise StampError(f"The evaluation of '{evaluate.name}' is damaged; remove '{evaluate.stamp}'.") from error
+
+
+def _read_json(path: Path) -> dict:
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise StampError(f"'{path}' cannot be read ({error}); run the farm again.") from error
+    return value if isinstance(value, dict) else {}
+
+
+def _do(farm: Farm, tasks: dict[str, Task], task: Task, key: str, lock: int) -> Stamp:
+    notes = {}
+    _check_before(tasks, task)
+    _prepare(task, key)
+    if task.kind == BIND:
+        notes["bound"] = _choose(tasks, task)
+    for source, name in task.copies:
+        _copy(source, task.folder / name)
+    started, peak = time.monotonic(), 0.0
+    for verb in task.verbs:
+        peak = max(peak, run_verb(farm, verb, task.folder, task.log, lock).peak_mb)
+    seconds = time.monotonic() - started
+    outputs = digest_outputs(task)
+    for name, place in task.publishes:
+        _copy(task.folder / name, place)
+    return Stamp(key, outputs, "", round(seconds, 3), round(peak, 1), socket.gethostname(), notes)
+
+
+def _check_before(tasks: dict[str, Task], task: Task) -> None:
+    """Check by their fingerprints the files of other tasks that this one uses."""
+    used = [argument for verb in task.verbs for argument in verb] + [str(source) for source, _ in task.copies]
+    for name in task.after:
+        before = tasks[name]
+        stamp = read_stamp(before)
+        if stamp is not None and stamp.skipped:
+            continue
+        wanted = tuple(path for path in used if Path(path).is_relative_to(before.folder))
+        # Of a recording of several meshes, one may be used; of a model, what lies beside it is of use to others.
+        names = tuple(Path(path).relative_to(before.folder).as_posix() for path in wanted)
+        is_chosen = task.kind == BIND
+        check_outputs(before, lambda file, names=names, all_=is_chosen: all_ or _is_in(file, names))
+
+
+def _is_in(file: str, names: tuple[str, ...]) -> bool:
+    return any(file == name or file.startswith(f"{name}/") for name in names)
+
+
+def _prepare(task: Task, key: str) -> None:
+    """Make the folder of a task ready: what was made for something else goes, what was begun for the same stays."""
+    task.stamp.unlink(missing_ok=True)
+    begun = task.folder / KEY
+    # Nobody else holds the task: what is half is of processes that were killed, on whatever machine.
+    for half in (
+        *task.folder.parent.glob(f".new-{task.folder.name}-*"),
+        *task.folder.parent.glob(f".old-{task.folder.name}-*"),
+    ):
+        shutil.rmtree(half, ignore_errors=True)
+    for path in task.folder.rglob("*") if task.folder.exists() else ():
+        if is_left_over(path.name) or path.name == "recording.lock":
+            path.unlink(missing_ok=True)
+    if task.folder.exists() and (not begun.exists() or begun.read_text(encoding="utf-8") != key):
+        old = task.folder.with_name(f".old-{task.folder.name}-{os.getpid()}")
+        os.replace(task.folder, old)
+        shutil.rmtree(old, ignore_errors=True)
+    if not task.folder.exists():
+        new = task.folder.with_name(f".new-{task.folder.name}-{os.getpid()}")
+        new.mkdir(parents=True)
+        # What was printed while it was something else.
+        task.log.unlink(missing_ok=True)
+        write_text(new / KEY, key)
+        os.replace(new, task.folder)
+
+
+def _choose(tasks: dict[str, Task], task: Task) -> dict[str, str]:
+    """Copy the best model of all rounds, for each that is bound, with what says how good it is."""
+    bound = {}
+    for place, rounds in task.choices:
+        done = [(train, evaluate) for train, evaluate in rounds if not read_stamp(tasks[train]).skipped]
+        train, evaluate = min(done, key=lambda pair: reached_mm(tasks[pair[1]]))
+        own = task.folder / place
+        own.parent.mkdir(parents=True, exist_ok=True)
+        _copy(tasks[train].folder / own.name, own)
+        for name in REPORT:
+            _copy(tasks[train].folder / name, own.with_name(name))
+        _copy(tasks[evaluate].folder / EVALUATION, own.with_name(EVALUATION))
+        bound[place] = train
+    return bound
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a file, in place of what was there; or a folder, where it is not there yet: it may be gone on with.
+
+    Raises:
+        OutputError: the disk is full.
+        OSError: the same, of a folder.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if not source.is_dir():
+        with replacing(target) as temporary:
+            shutil.copyfile(source, temporary)
+        return
+    if target.exists():
+        return
+    new = target.with_name(f".new-{target.name}-{os.getpid()}")
+    with contextlib.suppress(FileNotFoundError):
+        shutil.rmtree(new)
+    try:
+        shutil.copytree(source, new, ignore=shutil.ignore_patterns("*.lock"))
+        os.replace(new, target)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)

@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Fingerprints: what a task depends on, and what it left. What is up to date follows, and what was changed since."""
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+
+from fdda_addon.core.errors import FDDAError
+from fdda_addon.core.output import is_left_over, write_json
+
+from .characters import Farm
+from .tasks import TRAIN, Task
+
+FORMAT, VERSION = "fdda-farm-task", 1
+MAX_STAMP_BYTES = 64 << 20
+ROOT = Path(__file__).resolve().parent.parent
+PIECE = 4 << 20
+
+
+class StampError(FDDAError):
+    """What a task left is not as it was left."""
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """What is written when a task is done.
+
+    Attributes:
+        key: fingerprint of what it depended on.
+        outputs: size in bytes and SHA-256 of each file below the folder of the task that is an output or in one.
+        skipped: why there was nothing to do; empty where there was.
+        seconds: that its verbs took.
+        peak_mb: most memory that a process of it took.
+        host: name of the machine.
+        notes: what the report wants to know, such as the task whose model was bound.
+    """
+
+    key: str
+    outputs: dict[str, tuple[int, str]]
+    skipped: str = ""
+    seconds: float = 0.0
+    peak_mb: float = 0.0
+    host: str = ""
+    notes: dict = field(default_factory=dict)
+
+
+def read_stamp(task: Task) -> Stamp | None:
+    """The stamp of a task; None where there is none that can be read."""
+    try:
+        if task.stamp.stat().st_size > MAX_STAMP_BYTES:
+            return None
+        value = json.loads(task.stamp.read_text(encoding="utf-8"))
+        if (value["format"], value["version"]) != (FORMAT, VERSION):
+            return None
+        outputs = {str(name): (int(size), str(digest)) for name, (size, digest) in value["outputs"].items()}
+        return Stamp(
+            str(value["key"]),
+            outputs,
+            str(value["skipped"]),
+            float(value["seconds"]),
+            float(value["peak_mb"]),
+            str(value["host"]),
+            dict(value["notes"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+
+
+def write_stamp(task: Task, stamp: Stamp) -> None:
+    """Say that a task is done.
+
+    Raises:
+        OutputError: the disk is full.
+    """
+    write_json(task.stamp, {"format": FORMAT, "version": VERSION, **asdict(stamp)})
+
+
+def digest_file(path: Path) -> tuple[int, str]:
+    """Size and SHA-256 of a file.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    digest, size = hashlib.sha256(), 0
+    with open(path, "rb") as file:
+        while piece := file.read(PIECE):
+            digest.update(piece)
+            size += len(piece)
+    return size, digest.hexdigest()
+
+
+def files_of(folder: Path, names: Iterable[str]) -> dict[str, Path]:
+    """The files that outputs are, or that are in outputs that are folders, by their names below the folder."""
+    found = {}
+    for name in names:
+        path = folder / name
+        inner = sorted(filter(_is_kept, path.rglob("*"))) if path.is_dir() else [path]
+        found |= {file.relative_to(folder).as_posix(): file for file in inner}
+    return found
+
+
+def _is_kept(path: Path) -> bool:
+    """Whether a file belongs to an output, and is no lock and no temporary file."""
+    return path.is_file() and path.suffix != ".lock" and not is_left_over(path.name)
+
+
+def digest_outputs(task: Task) -> dict[str, tuple[int, str]]:
+    """Size and SHA-256 of every file that a task has left.
+
+    Raises:
+        StampError: an output is missing.
+    """
+    try:
+        return {name: digest_file(path) for name, path in files_of(task.folder, task.outputs).items()}
+    except OSError as error:
+        raise StampError(f"'{task.name}' ended without '{error.filename}' ({error.strerror}).") from error
+
+
+def are_there(task: Task, stamp: Stamp) -> bool:
+    """Whether the outputs are there in the sizes that they had; what they hold is not read."""
+    try:
+        return all((task.folder / name).stat().st_size == size for name, (size, _) in stamp.outputs.items()) and all(
+            place.exists() for _, place in task.publishes
+        )
+    except OSError:
+        return False
+
+
+def check_outputs(task: Task, only: Callable[[str], bool] = lambda _: True) -> Stamp:
+    """Check that the outputs of a task are as it left them, before they are used.
+
+    Raises:
+        StampError: it is not done, or an output was changed.
+    """
+    stamp = read_stamp(task)
+    if stamp is None:
+        raise StampError(f"'{task.name}' is not done; run the farm again.")
+    for name, expected in stamp.outputs.items():
+        if not only(name):
+            continue
+        path = task.folder / name
+        try:
+            found = digest_file(path)
+        except OSError as error:
+            found = (-1, str(error.strerror))
+        if found != expected:
+            task.stamp.unlink(missing_ok=True)
+            raise StampError(
+                f"'{path}' is not what '{task.name}' left ({found[0]:,} bytes, {expected[0]:,} were written); run the "
+                "farm again, and it is made again."
+            )
+    return stamp
+
+
+class Keys:
+    """Fingerprints of what tasks depend on: verbs, files from outside, settings, and the tasks before."""
+
+    def __init__(self, farm: Farm, tasks: dict[str, Task]):
+        self._farm, self._tasks = farm, tasks
+        self._keys: dict[str, str] = {}
+        self._files: dict[Path, tuple[int, str]] = {}
+
+    def of(self, name: str) -> str:
+        """The key of a task.
+
+        Raises:
+            StampError: a file from outside cannot be read.
+        """
+        if name not in self._keys:
+            task = self._tasks[name]
+            files = [self._file(path) for path in task.files]
+            before = [self.of(other) for other in task.after]
+            own = [_without(str(self._farm.work), task.verbs), list(task.outputs), task.poses, str(task.round)]
+            # Where the verbs run counts where it changes what they make.
+            settings = [self._farm.threads, self._farm.gpu, self._farm.trainer_python] if task.kind == TRAIN else []
+            runs = [self._farm.python, self._farm.blender, version()]
+            text = json.dumps([own, _without(str(self._farm.work), task.publishes), settings, runs, files, before])
+            self._keys[name] = hashlib.sha256(text.encode()).hexdigest()
+        return self._keys[name]
+
+    def _file(self, path: Path) -> tuple[int, str]:
+        if path not in self._files:
+            try:
+                self._files[path] = digest_file(path)
+            except OSError as error:
+                raise StampError(f"There is no file '{path}' ({error.strerror}); see the plan.") from error
+        return self._files[path]
+
+
+def _without(folder: str, values: tuple) -> list:
+    """Values as texts, without the folder that all work lies in: it may be moved."""
+    return [[str(one).replace(folder, "") for one in value] for value in values]
+
+
+@cache
+def version() -> str:
+    """The version of the add-on, which its recordings and models are those of."""
+    try:
+        return str(tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))["version"])
+    except (OSError, ValueError, KeyError):
+        return ""
+
+
+def to_do(tasks: dict[str, Task], keys: Keys) -> tuple[list[str], dict[str, str]]:
+    """Names of the tasks that have to run, and why some cannot even be looked at.
+
+    As `make` does, from the end: what is done, and whose outputs are there, needs nothing before it.
+
+    Returns:
+        The names, in the order of `tasks`; and for tasks of characters whose files cannot be read a sentence each.
+    """
+    needed: set[str] = set()
+    failed: dict[str, str] = {}
+    waiting = [name for name in tasks if not any(name in task.after for task in tasks.values())]
+    seen = set(waiting)
+    while waiting:
+        name = waiting.pop()
+        try:
+            is_done = is_up_to_date(tasks[name], keys.of(name))
+        except StampError as error:
+            failed[name] = str(error)
+            continue
+        if not is_done:
+            needed.add(name)
+            for other in tasks[name].after:
+                if other not in seen:
+                    seen.add(other)
+                    waiting.append(other)
+    return [name for name in tasks if name in needed], failed
+
+
+def is_up_to_date(task: Task, key: str) -> bool:
+    """Whether a task is done, with what it depends on now."""
+    stamp = read_stamp(task)
+    return stamp is not None and stamp.key == key and are_there(task, stamp)

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The report of all characters: errors, what failed, what changed, and nothing that a name could break."""
+
+import json
+from html.parser import HTMLParser
+
+from farm.page import render_page
+from farm.report import write_report
+from farm.run import FAILED, Outcome
+from farm.stamps import Stamp, write_stamp
+from farm.tasks import make_tasks
+
+from .conftest import ONE
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def bound(plan, mean: float, key: str = "first") -> None:
+    """As if everything had run."""
+    for task in make_tasks(plan).values():
+        task.folder.mkdir(parents=True, exist_ok=True)
+        notes = {"bound": {"elbow.onnx": "elbow/train-0"}} if task.kind == "bind" else {}
+        write_stamp(task, Stamp(key, {}, seconds=2.0, peak_mb=100.0, host="here", notes=notes))
+    errors = {"mean": mean, "p999": 10 * mean, "max": 20 * mean}
+    folder = make_tasks(plan)["elbow/bind"].folder
+    (folder / "evaluation.json").write_text(json.dumps({"vertices": 300, "fdda": errors, "linear": errors}))
+    warnings = [{"name": "flips", "text": "Bones <flip> & turn."}]
+    (folder / "report.json").write_text(json.dumps({"warnings": warnings, "target": {"verdict": "missed"}}))
+    (folder / "heat_map.png").write_bytes(PNG)
+
+
+def test_what_changed_against_the_last_run(written):
+    plan = written(ONE + "target_mm = 0.5\nrounds = 0\n")
+    page, tasks = plan.path.with_name("report.html"), make_tasks(plan)
+    read = lambda: json.loads(page.with_suffix(".json").read_text())["characters"]["elbow"]  # noqa: E731
+    bound(plan, 0.1)
+    write_report(plan, tasks, {}, page)
+    assert read()["state"] == "done" and read()["before"] is None
+    bound(plan, 0.05, "second")
+    write_report(plan, tasks, {}, page)
+    assert read()["before"]["models"][0]["fdda"]["mean"] == 0.1
+    assert "-50 %" in page.read_text() and "0.5 met" in page.read_text()
+    # A run that changes nothing is compared with the same.
+    write_report(plan, tasks, {}, page)
+    assert read()["before"]["models"][0]["fdda"]["mean"] == 0.1
+
+
+def test_what_failed_is_said_and_escaped(written):
+    plan = written()
+    page, tasks = plan.path.with_name("report.html"), make_tasks(plan)
+    bound(plan, 0.1)
+    sentence = "'<script>alert(1)</script>' & more."
+    write_report(plan, tasks, {"elbow/train-0": Outcome("elbow/train-0", FAILED, sentence)}, page)
+    text = page.read_text()
+    assert "&#x27;&lt;script&gt;alert(1)&lt;/script&gt;&#x27; &amp; more." in text and "<script" not in text
+    own = json.loads(page.with_suffix(".json").read_text())["characters"]["elbow"]
+    assert own["state"] == "failed" and own["failures"][0]["sentence"] == sentence and own["models"] == []
+
+
+def test_the_page_is_whole(written):
+    """Every tag that is opened is closed, and nothing is fetched."""
+    plan = written(ONE + "target_mm = 0.5\nrounds = 0\n")
+    page, tasks = plan.path.with_name("report.html"), make_tasks(plan)
+    bound(plan, 0.1)
+    write_report(plan, tasks, {}, page)
+    text, open_tags, sources = page.read_text(), [], []
+
+    class Reader(HTMLParser):
+        def handle_starttag(self, tag: str, attributes: list) -> None:
+            sources.extend(value for name, value in attributes if name in ("src", "href"))
+            if tag not in ("meta", "img", "br"):
+                open_tags.append(tag)
+
+        def handle_endtag(self, tag: str) -> None:
+            assert open_tags.pop() == tag
+
+    Reader().feed(text)
+    assert open_tags == [] and sources and all(source.startswith("data:image/png;base64,") for source in sources)
+    assert "Bones &lt;flip&gt; &amp; turn." in text and "0.5 missed" in text
+
+
+def test_a_report_that_is_damaged_is_no_last_run(written):
+    plan = written()
+    page, tasks = plan.path.with_name("report.html"), make_tasks(plan)
+    page.with_suffix(".json").write_text('{"format": "fdda-farm-report", "version": 1, "characters": {"elbow": 3}}')
+    write_report(plan, tasks, {}, page)
+    own = json.loads(page.with_suffix(".json").read_text())["characters"]["elbow"]
+    assert own["state"] == "not done" and own["before"] is None
+    assert render_page({"plan": "p", "written": "now", "characters": {}}, {}).startswith("<!doctype html>")
