@@ -9,7 +9,8 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from conftest import ELBOW, ElbowFiles, predicted
+
+from .conftest import ELBOW, ElbowFiles, predicted
 
 WAVE = range(1, 31)
 """Frames of the elbow's action."""

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import fdda_addon
-from fdda_addon.cli import main
+from fdda_addon.cli.main import main
+from fdda_addon.rig.reading import PoseReader
 from fdda_addon.runtime.network import Network
 from fdda_addon.scene.controls import ControlReader
-from fdda_addon.scene.rig import PoseReader, SceneRig, armature_of, find_rig
+from fdda_addon.scene.scene_rig import SceneRig, armature_of, find_rig
 
 ELBOW = "elbow"
 ELBOW_RIG = "elbow_rig"
@@ -36,8 +37,8 @@ def run(*arguments: object) -> int:
 
 @pytest.fixture(scope="session")
 def elbow(tmp_path_factory: pytest.TempPathFactory) -> ElbowFiles:
-    from fdda_addon.cli.files import save_copy
-    from fdda_addon.elbow import build_elbow
+    from blend_fixtures.elbow import build_elbow
+    from fdda_addon.scene.blend_file import save_copy
 
     folder = tmp_path_factory.mktemp("elbow")
     files = ElbowFiles(*(folder / name for name in ("elbow.blend", "recording", "elbow.onnx", "bound.blend")))
@@ -77,7 +78,7 @@ def bound(elbow: ElbowFiles) -> bpy.types.Object:
 @pytest.fixture
 def library(elbow: ElbowFiles, tmp_path: Path):
     """A library with the bound elbow (`linked.Library`), and a new shot that is open."""
-    from linked import make_library
+    from .linked import make_library
 
     return make_library(elbow, tmp_path)
 
@@ -85,7 +86,7 @@ def library(elbow: ElbowFiles, tmp_path: Path):
 @pytest.fixture
 def pair(library) -> list[bpy.types.Object]:
     """Two overrides of the library's elbow in two poses."""
-    from linked import ANGLES, link, override
+    from .linked import ANGLES, link, override
 
     collection = link(library.path)
     return [override(collection, angle) for angle in ANGLES]

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 from mathutils import Euler
 
-from fdda_addon.scene.rig import SceneRig
+from fdda_addon.scene.scene_rig import SceneRig
 
 REACH, HEIGHT, RADIUS = 0.8, 0.9, 0.06
 WAVE, FRAMES = "wave", 24

@@ -11,13 +11,15 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW, ELBOW_RIG, ElbowFiles, assert_plays
 
 import fdda_addon
-from fdda_addon import models
+from fdda_addon.models import model_list
 from fdda_addon.runtime import model_files, nodes
-from fdda_addon.scene.rig import SceneRig, armature_modifier
+from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
 
+from .conftest import ELBOW, ELBOW_RIG, ElbowFiles, assert_plays
+
+ROOT = Path(__file__).resolve().parents[2]
 COLLECTION = "Character"
 ANGLES = (0.3, 1.4)
 """Radians: the bend of the elbows of a shot."""
@@ -123,18 +125,16 @@ def assert_play(library: Library, angles: tuple[float, ...] = ANGLES) -> list[np
 
 def elsewhere(call: str) -> None:
     """Call a function of this file in a process of its own, which has done nothing before."""
-    folders = [str(Path(fdda_addon.__file__).parents[1]), str(Path(__file__).parent)]
     code = f"""
-import sys
-sys.path[:0] = {folders!r}
-import fdda_addon, linked
+import fdda_addon
+from tests.blender import linked
 fdda_addon.register()
 try:
     linked.{call}
 finally:
     fdda_addon.unregister()
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -148,7 +148,7 @@ def pack_model(path: str) -> None:
     """Pack the model into the file of the character, and let the character be saved with the rig shown."""
     bpy.ops.wm.open_mainfile(filepath=path)
     mesh_object = bpy.data.objects[ELBOW]
-    models.adopt(mesh_object)
-    models.pack_entry(mesh_object, mesh_object.fdda.models[0])
+    model_list.adopt(mesh_object)
+    model_list.pack_entry(mesh_object, mesh_object.fdda.models[0])
     mesh_object.fdda.mode = "RIG"
     bpy.ops.wm.save_mainfile()

@@ -4,12 +4,13 @@
 from collections.abc import Callable
 
 import bpy
-from conftest import ELBOW
 
 from blend_fixtures.characters import stacks
 from blend_fixtures.characters.base import tube
-from fdda_addon.recording import RecordingSettings
-from fdda_addon.scene.rig import SceneRig, find_rig
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.scene.scene_rig import SceneRig, find_rig
+
+from .conftest import ELBOW
 
 FEW = RecordingSettings(poses=4, influence_poses=1)
 

@@ -8,11 +8,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from conftest import run
-from scene_state import fresh_elbow
 
-from fdda_addon.cli.files import save_copy
-from fdda_addon.scene.rig import SceneRig
+from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.scene_rig import SceneRig
+
+from .conftest import run
+from .scene_state import fresh_elbow
 
 PROGRESS = re.compile(r"(poses to fit|fit|influences|poses|training|evaluation|benchmark|frames): \d+ of \d+, .*")
 
@@ -28,13 +29,13 @@ class Refusal:
     def __init__(self, folder: Path, capfd: pytest.CaptureFixture):
         self.folder, self._capfd = folder, capfd
 
-    def __call__(self, *arguments: object) -> str:
-        """Run a verb and return its sentence."""
+    def __call__(self, *arguments: object, status: int = 1) -> str:
+        """Run a verb that ends with an exit status, and return its sentence."""
         before = files(self.folder)
         self._capfd.readouterr()
-        status = run(*arguments)
+        ended = run(*arguments)
         captured = self._capfd.readouterr()
-        assert status == 1, captured
+        assert ended == status, captured
         lines = [line for line in captured.err.splitlines() if not PROGRESS.fullmatch(line)]
         assert len(lines) == 1, captured.err
         assert re.fullmatch(r"Error: .+[^.]\.", lines[0]), "a sentence"

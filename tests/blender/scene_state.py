@@ -6,14 +6,14 @@ from collections.abc import Iterator
 import bpy
 import numpy as np
 
-from fdda_addon.scene.rig import SceneRig, find_rig
+from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 TRANSFORMS = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
 
 
 def fresh_elbow() -> SceneRig:
     """A new elbow in an empty scene."""
-    from fdda_addon.elbow import build_elbow
+    from blend_fixtures.elbow import build_elbow
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     build_elbow()

@@ -6,16 +6,18 @@ import json
 import bpy
 import numpy as np
 import pytest
-from conftest import run
-from figure import FRAMES, REACH, SMILE, WAVE, add_smile, add_wave, build_figure, edit_bones, key
-from scene_state import assert_same_state, drain, scene_state
 
 from fdda_addon.core.errors import RecordingError, RigError
-from fdda_addon.core.recording import Recording, read_recording
+from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.skinning import LinearLayer
-from fdda_addon.evaluation import EvaluationSettings, evaluate
-from fdda_addon.recording import RecordingSettings, record
-from fdda_addon.scene.rig import SceneRig
+from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.run import record
+from fdda_addon.scene.scene_rig import SceneRig
+
+from .conftest import run
+from .figure import FRAMES, REACH, SMILE, WAVE, add_smile, add_wave, build_figure, edit_bones, key
+from .scene_state import assert_same_state, drain, scene_state
 
 HAS_SLOTS = bpy.app.version >= (4, 4, 0)
 needs_slots = pytest.mark.skipif(not HAS_SLOTS, reason="actions have slots from Blender 4.4 on")

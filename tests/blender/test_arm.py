@@ -8,11 +8,11 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.arm import build_arm
+from blend_fixtures.elbow import LOWER_RANGE, UPPER_RANGE, build_elbow, elbow_surface
 from fdda_addon.arm.joints import JOINT_INDEX, JOINT_NAMES, JOINTS, LOCKED, joint
+from fdda_addon.arm.rig import build_arm
 from fdda_addon.arm.sculpt import arm_field
 from fdda_addon.arm.surface import Surface, sculpt_arm
-from fdda_addon.elbow import LOWER_RANGE, UPPER_RANGE, build_elbow, elbow_surface
 
 FIXTURES = Path(__file__).resolve().parents[2] / "blend_fixtures"
 VERTICES = {1: 1450, 2: 10_000, 3: 50_000}

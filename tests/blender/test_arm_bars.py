@@ -7,16 +7,15 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from conftest import assert_plays, run
 
-from fdda_addon import demo
+from benchmarks import demo
+
+from .conftest import assert_plays, run
 
 MEAN_BAR, MAX_BAR = 0.04, 0.15
 """Held-out errors of the model as parts of the linear layer's."""
-SPEED_BAR = 4.0
-"""A frame of the denser arm is to be so many times as fast as its rig's."""
-SPEED_FLOOR = 3.0
-"""What no version may fall below; docs/benchmarks.md has what is reached."""
+SPEED_BAR = 5.0
+"""With the default tolerance; docs/benchmarks.md has what a machine without other work measures, and the aim of 8."""
 SPEED_RUNS = 5
 
 
@@ -97,14 +96,14 @@ def denser(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def speed(denser: Path, *settings: object) -> float:
-    """How many times as fast a frame of the denser arm is with a model, trained with these settings.
+def speed(denser: Path) -> float:
+    """How many times as fast a frame of the denser arm is with a model.
 
     Each way's least median of some benchmarks: what else the machine does can only add to them.
     """
     rig, model, times = (denser / name for name in ("arm.blend", "arm.onnx", "times.json"))
     # The cost of a frame depends on the size of the model, not on how long it was trained.
-    assert run("train", denser / "recording", model, "--epochs", 3, *settings) == 0
+    assert run("train", denser / "recording", model, "--epochs", 3) == 0
     measured = []
     for _ in range(SPEED_RUNS):
         assert run("benchmark", rig, model, "--json", times) == 0
@@ -113,11 +112,5 @@ def speed(denser: Path, *settings: object) -> float:
     return of_rig / of_model
 
 
-@pytest.mark.xfail(bpy.app.version >= (5, 0), reason="3.8 on 5.2: docs/benchmarks.md, what falls short", strict=False)
-def test_frame_of_the_denser_arm_takes_a_quarter(denser):
-    """With the coarser basis that a user takes who wants speed; the default's is reported in docs/benchmarks.md."""
-    assert speed(denser, "--tolerance-mm", 0.1) >= SPEED_BAR
-
-
-def test_frame_of_the_denser_arm_never_falls_far_behind(denser):
-    assert speed(denser) >= SPEED_FLOOR
+def test_frame_of_the_denser_arm_takes_a_fifth(denser):
+    assert speed(denser) >= SPEED_BAR

@@ -10,7 +10,8 @@ import shutil
 import bpy
 import numpy as np
 import pytest
-from refusals import Refusal, files, save_elbow, small_files
+
+from .refusals import Refusal, files, save_elbow, small_files
 
 
 @pytest.fixture
@@ -122,7 +123,7 @@ def set_index(**values):
         (set_index(complete=40), "is incomplete: 40 of 150 poses; finish it with record --resume"),
         (cut_short, "residuals.npy' cannot be used: it is truncated: "),
         (set_index(version=2), "is a recording of version 2 and this add-on reads version 1; record again"),
-        (put_nan, "holds values that are not numbers (residuals, poses 0 to 149); record again"),
+        (put_nan, "holds values that are not numbers (residuals, pose 3); record again"),
     ],
     ids=["incomplete", "truncated", "other version", "NaN"],
 )

@@ -7,14 +7,16 @@ import bpy
 import numpy as np
 import onnx
 import pytest
-from conftest import run
 from onnx import TensorProto, helper, numpy_helper
-from refusals import Refusal, save_elbow
 
 from fdda_addon.core.errors import FDDAError
+from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY
+from fdda_addon.core.onnx_file import read_onnx
 from fdda_addon.runtime.binding import bind
-from fdda_addon.runtime.network import Network
-from fdda_addon.scene.rig import find_rig
+from fdda_addon.scene.scene_rig import find_rig
+
+from .conftest import run
+from .refusals import Refusal, save_elbow
 
 
 @pytest.fixture
@@ -118,9 +120,12 @@ def test_a_truncated_model(refusal, verb, elbow, tmp_path, part):
 
 
 def edited(elbow, tmp_path, change) -> "object":
-    """The elbow's model with something changed."""
+    """The elbow's model with something changed, and signed as if that were right."""
     model = onnx.load(elbow.model)
     change(model)
+    for prop in model.metadata_props:
+        if prop.key == CHECKSUM_KEY:
+            prop.value = read_onnx(model.SerializeToString()).checksum
     path = tmp_path / "m.onnx"
     path.write_bytes(model.SerializeToString())
     return path
@@ -154,8 +159,8 @@ def remove_metadata(model) -> None:
 
 
 def of_version_2(model) -> None:
-    value = json.loads(model.metadata_props[0].value)
-    model.metadata_props[0].value = json.dumps({**value, "version": 2})
+    (prop,) = (prop for prop in model.metadata_props if prop.key == METADATA_KEY)
+    prop.value = json.dumps({**json.loads(prop.value), "version": 2})
 
 
 @pytest.mark.parametrize(
@@ -187,11 +192,26 @@ def of_doubles(model) -> None:
     model.graph.input[0].type.tensor_type.elem_type = TensorProto.DOUBLE
 
 
-@pytest.mark.parametrize("change", [of_an_unknown_operator, with_a_loop, of_doubles])
-def test_what_onnx_runtime_refuses(refusal, verb, elbow, tmp_path, change):
+@pytest.mark.parametrize("change", [of_an_unknown_operator, with_a_loop])
+def test_graphs_that_are_refused_before_onnx_runtime_sees_them(refusal, verb, elbow, tmp_path, change):
     path = edited(elbow, tmp_path, change)
     text = refusal(*verb(elbow.rig, path))
+    assert text.startswith(f"The model '{path}' is refused: ") and text.endswith("; give one that train made.")
+
+
+def test_what_onnx_runtime_refuses(refusal, verb, elbow, tmp_path):
+    path = edited(elbow, tmp_path, of_doubles)
+    text = refusal(*verb(elbow.rig, path))
     assert text.startswith(f"ONNX Runtime refuses the model '{path}' (") and text.endswith("); train it again.")
+
+
+def test_weights_that_were_damaged_on_the_way(refusal, verb, elbow, tmp_path):
+    data = bytearray(elbow.model.read_bytes())
+    place = max(read_onnx(bytes(data)).constants.values(), key=lambda constant: len(constant.data)).data
+    data[bytes(data).index(bytes(place)) + len(place) // 2] ^= 0x40
+    path = tmp_path / "m.onnx"
+    path.write_bytes(data)
+    assert "is damaged: its checksum is not that of its weights" in refusal(*verb(elbow.rig, path))
 
 
 def answer_nan(model) -> None:
@@ -216,12 +236,11 @@ def answer_fewer(model) -> None:
     model.graph.node.append(helper.make_node("Slice", ["all", "from", "to", "axis"], ["positions"]))
 
 
-def test_a_model_that_answers_another_shape(elbow, tmp_path):
-    """ONNX Runtime may refuse it as it loads, or the add-on when it answers."""
+def test_a_model_that_answers_another_shape(refusal, verb, elbow, tmp_path):
     path = edited(elbow, tmp_path, answer_fewer)
-    with pytest.raises(FDDAError, match=r"refuses the model|invalid dimensions"):
-        network = Network(path)
-        network.positions(network.info.rest_matrices[None])
+    assert "is refused: its output 'positions' comes out as (1, 7, 3), not as (1, 300, 3)" in refusal(
+        *verb(elbow.rig, path)
+    )
 
 
 def test_a_refused_model_leaves_a_bound_object_as_it_is(bound, elbow, tmp_path):

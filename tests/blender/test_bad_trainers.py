@@ -10,11 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from conftest import run
-from refusals import Refusal
 
+from fdda_addon.core.errors import TRY_AGAIN
 from fdda_addon.core.messages import Message, MessageType
-from fdda_addon.trainer_environment.choice import PYTHON_VARIABLE
+from fdda_addon.training.environment.choice import PYTHON_VARIABLE
+
+from .conftest import run
+from .refusals import Refusal
 
 
 @pytest.fixture
@@ -25,7 +27,11 @@ def refusal(tmp_path, capfd) -> Refusal:
 @pytest.fixture
 def train(refusal, elbow, tmp_path):
     """Run `train` on the elbow's recording and return the sentence."""
-    return lambda *options: refusal("train", elbow.recording, tmp_path / "m.onnx", *options)
+
+    def run_train(*options: object, status: int = 1) -> str:
+        return refusal("train", elbow.recording, tmp_path / "m.onnx", *options, status=status)
+
+    return run_train
 
 
 def stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, *lines: str) -> Path:
@@ -99,7 +105,8 @@ def test_a_trainer_that_complains_and_ends(train, tmp_path, monkeypatch):
 
 def test_a_trainer_that_is_killed(train, tmp_path, monkeypatch):
     stand_in(tmp_path, monkeypatch, STARTED, PROGRESS, "kill -9 $$")
-    assert train() == ("The trainer was ended by signal 9 before it was done; no model was written, train again.")
+    sentence = "The trainer was ended by signal 9 before it was done; no model was written, train again."
+    assert train(status=TRY_AGAIN) == sentence
 
 
 def test_a_trainer_that_fails_in_a_sentence(train, tmp_path, monkeypatch):
@@ -122,7 +129,7 @@ def test_a_trainer_that_is_cancelled_by_someone_else(elbow, tmp_path, monkeypatc
 
 def test_a_trainer_that_does_not_stop_is_stopped(elbow, tmp_path, monkeypatch):
     """Leaving the block ends the process, also one that would go on for an hour."""
-    from fdda_addon.training import Training
+    from fdda_addon.training.process import Training
 
     stand_in(tmp_path, monkeypatch, f"echo $$ > '{tmp_path}/pid'", STARTED, "exec sleep 3600")
     with Training([]) as training:
@@ -133,7 +140,7 @@ def test_a_trainer_that_does_not_stop_is_stopped(elbow, tmp_path, monkeypatch):
 
 def test_nobody_waits_for_a_trainer_that_is_silent(tmp_path, monkeypatch):
     """As a window has it: a poll is answered at once, and a cancelled trainer ends without an error."""
-    from fdda_addon.training import Training
+    from fdda_addon.training.process import Training
 
     stand_in(tmp_path, monkeypatch, STARTED, "exec sleep 3600")
     with Training([]) as training:

@@ -7,12 +7,13 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from baked_files import CLOSE, WAVE, elbow_wave, model_says, plain_blender, read_pc2
-from conftest import ELBOW, ELBOW_RIG, evaluated, run
-from refusals import files, save_elbow
-from scene_state import fresh_elbow
 
-from fdda_addon.cli.files import save_copy
+from fdda_addon.scene.blend_file import save_copy
+
+from .baked_files import CLOSE, WAVE, elbow_wave, model_says, plain_blender, read_pc2
+from .conftest import ELBOW, ELBOW_RIG, evaluated, run
+from .refusals import files, save_elbow
+from .scene_state import fresh_elbow
 
 
 @pytest.fixture(scope="module")

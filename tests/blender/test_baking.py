@@ -4,13 +4,14 @@
 import bpy
 import numpy as np
 import pytest
-from baked_files import CLOSE, elbow_wave, model_says, read_pc2
-from conftest import ELBOW, ELBOW_RIG, evaluated, run
-from refusals import files, save_elbow
-from scene_state import assert_same_state, disarrange, drain, fresh_elbow, scene_state
 
-from fdda_addon.baking import BATCH_FRAMES, BakeSettings, bake
-from fdda_addon.scene.rig import find_rig
+from fdda_addon.baking.run import BATCH_FRAMES, BakeSettings, bake
+from fdda_addon.scene.scene_rig import find_rig
+
+from .baked_files import CLOSE, elbow_wave, model_says, read_pc2
+from .conftest import ELBOW, ELBOW_RIG, evaluated, run
+from .refusals import files, save_elbow
+from .scene_state import assert_same_state, disarrange, drain, fresh_elbow, scene_state
 
 
 @pytest.fixture(scope="module")

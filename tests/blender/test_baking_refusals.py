@@ -7,8 +7,9 @@ import shutil
 import bpy
 import numpy as np
 import pytest
-from conftest import run
-from refusals import Refusal, files, save_elbow, small_files
+
+from .conftest import run
+from .refusals import Refusal, files, save_elbow, small_files
 
 
 class TestRefusals:
@@ -55,7 +56,7 @@ class TestRefusals:
     def test_the_file_of_the_rig(self, refusal, elbow, tmp_path):
         rig = shutil.copy(elbow.rig, tmp_path / "rig.blend")
         text = refusal("bake", rig, elbow.model, rig)
-        assert text == f"'{rig}' is the file with the rig, which a bake replaces; give another name."
+        assert text == f"Cannot write '{rig}': it is read for this; give another name, or --overwrite."
 
     def test_a_point_cache_that_cannot_be_written(self, refusal, elbow, tmp_path):
         (tmp_path / "a.pc2").mkdir()

@@ -3,15 +3,17 @@
 
 import bpy
 import pytest
-from scene_state import assert_same_state, disarrange, drain, fresh_elbow, scene_state
 
-from fdda_addon.benchmark import benchmark
 from fdda_addon.core.errors import RigError
-from fdda_addon.core.recording_writer import RecordingWriter
-from fdda_addon.evaluation import EvaluationSettings, evaluate
-from fdda_addon.recording import RecordingSettings, record
+from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.run import record
 from fdda_addon.runtime.binding import true_rig
-from fdda_addon.scene.rig import SceneRig, find_rig
+from fdda_addon.scene.scene_rig import SceneRig, find_rig
+from fdda_addon.timing.benchmark import benchmark
+
+from .scene_state import assert_same_state, disarrange, drain, fresh_elbow, scene_state
 
 
 @pytest.fixture
@@ -96,7 +98,7 @@ def test_an_action_without_a_slot_stays_without(disarranged, tmp_path):
     assert_same_state(before, scene_state(disarranged))
 
 
-def test_tweak_mode_is_said_and_left_alone(disarranged, tmp_path):
+def test_tweak_mode_is_refused_and_left_alone(disarranged, tmp_path):
     """In it Blender takes no other action; half borrowed would be worse than refused."""
     animation = disarranged.armature_object.animation_data
     animation.action = None
@@ -109,7 +111,7 @@ def test_tweak_mode_is_said_and_left_alone(disarranged, tmp_path):
     assert_same_state(before, scene_state(disarranged))
 
 
-def test_hidden_objects_are_said(disarranged, tmp_path):
+def test_hidden_objects_are_refused_by_name(disarranged, tmp_path):
     disarranged.mesh_object.hide_viewport = True
     bpy.context.view_layer.update()
     with pytest.raises(RigError, match="'elbow' is hidden, so Blender does not evaluate it"):
@@ -117,20 +119,20 @@ def test_hidden_objects_are_said(disarranged, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["elbow", "elbow_rig"])
-def test_edit_mode_is_said(disarranged, tmp_path, name):
+def test_edit_mode_is_refused(disarranged, tmp_path, name):
     bpy.context.view_layer.objects.active = bpy.data.objects[name]
     bpy.ops.object.mode_set(mode="EDIT")
     with pytest.raises(RigError, match="'elbow' or its armature is in edit mode; leave it first"):
         drain(record(disarranged, tmp_path / "r", RECORDING))
 
 
-def test_rest_position_is_said(disarranged, tmp_path):
+def test_rest_position_is_refused(disarranged, tmp_path):
     disarranged.armature_object.data.pose_position = "REST"
     with pytest.raises(RigError, match="'elbow_rig' shows its rest position; set it to pose"):
         drain(record(disarranged, tmp_path / "r", RECORDING))
 
 
-def test_an_armature_modifier_that_is_off_is_said(disarranged, tmp_path):
+def test_an_armature_modifier_that_is_off_is_refused(disarranged, tmp_path):
     disarranged.mesh_object.modifiers["Armature"].show_viewport = False
     with pytest.raises(RigError, match="The Armature modifier of 'elbow' is switched off in the viewport"):
         drain(record(disarranged, tmp_path / "r", RECORDING))

@@ -6,14 +6,15 @@ import shutil
 
 import bpy
 import pytest
-from conftest import assert_plays, evaluated, pose, run
-from refusals import files, save_elbow
 
 import fdda_addon
-from fdda_addon.cli import VERBS
+from fdda_addon.cli.main import VERBS
 from fdda_addon.cli.progress import ProgressPrinter
-from fdda_addon.core.recording import read_recording
+from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.runtime import model_files, playback
+
+from .conftest import assert_plays, evaluated, pose, run
+from .refusals import files, save_elbow
 
 
 @pytest.mark.parametrize("arguments", [["--help"], *([verb, "--help"] for verb in VERBS)], ids=" ".join)
@@ -200,7 +201,7 @@ def test_binding_leaves_rig_and_model_alone(elbow, tmp_path):
 
 def test_a_bound_file_in_place_of_the_rig(elbow, tmp_path):
     rig = shutil.copy(elbow.rig, tmp_path / "rig.blend")
-    assert run("bind", rig, elbow.model, rig) == 0
+    assert run("bind", rig, elbow.model, rig, "--overwrite") == 0
     assert_plays(opened(rig), elbow.model)
 
 

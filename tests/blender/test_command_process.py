@@ -9,12 +9,13 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import run
-from refusals import files
 
-from fdda_addon.appender import BATCH_POSES
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.recording import read_index
+from fdda_addon.core.recording.index import read_index
+from fdda_addon.recording.appender import BATCH_POSES
+
+from .conftest import run
+from .refusals import files
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -28,6 +29,8 @@ def start(*arguments: object) -> subprocess.Popen:
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        # A script that runs the tests in the background has them ignore Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
 
 

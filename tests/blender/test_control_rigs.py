@@ -10,10 +10,11 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from conftest import assert_plays, run
 
 from blend_fixtures.characters import rigify
-from fdda_addon.core.recording import read_recording
+from fdda_addon.core.recording.reader import read_recording
+
+from .conftest import assert_plays, run
 
 ROOT = Path(__file__).resolve().parents[2]
 MOST = 0.1
@@ -45,7 +46,7 @@ def test_the_model_sees_deforming_bones_alone(character: Character):
     recording = read_recording(character.recording)
     names = recording.rig.joint_names
     assert names and all(name.startswith("DEF-") for name in names)
-    sampled = {channel.bone for channel in recording.info.sampling.channels}
+    sampled = {channel.name for channel in recording.info.sampling.channels}
     assert {"torso", "chest", "head"} <= sampled and not sampled & set(names)
     # What lies in the place of an original bone is a child of the deforming bone in that place.
     parents = {

@@ -3,11 +3,12 @@
 
 import bpy
 import pytest
-from conftest import ELBOW_RIG
 
 from fdda_addon.core.errors import RigError
 from fdda_addon.scene.control_names import resting_value
 from fdda_addon.scene.controls import ControlReader, is_driven, set_control, stated_controls
+
+from .conftest import ELBOW_RIG
 
 
 @pytest.fixture

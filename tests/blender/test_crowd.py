@@ -9,12 +9,12 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW, assert_plays, predicted, run
 
-from fdda_addon.runtime import playback
 from fdda_addon.runtime.binding import bind, unbind
-from fdda_addon.runtime.network import Network
-from fdda_addon.scene.rig import SceneRig, armature_modifier
+from fdda_addon.runtime.network import Execution
+from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
+
+from .conftest import ELBOW, assert_plays, predicted, run
 
 ROOT = Path(__file__).resolve().parents[2]
 CROWD = 20
@@ -40,24 +40,104 @@ def crowd_of(first: bpy.types.Object, count: int) -> list[bpy.types.Object]:
 @pytest.fixture
 def calls(monkeypatch) -> list[int]:
     """How many poses each call of a network got."""
-    counted, real = [], Network.positions
+    return count_calls(monkeypatch)
 
-    def positions(network: Network, pose_matrices: np.ndarray, *controls: np.ndarray) -> np.ndarray:
-        counted.append(len(pose_matrices))
-        return real(network, pose_matrices, *controls)
 
-    monkeypatch.setattr(playback.Network, "positions", positions)
+def count_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    counted, real = [], Execution.run
+
+    def run(execution: Execution) -> np.ndarray:
+        counted.append(len(execution.poses))
+        return real(execution)
+
+    monkeypatch.setattr(Execution, "run", run)
     return counted
 
 
-def test_a_crowd_is_one_call(bound, elbow, calls):
-    crowd = crowd_of(bound, CROWD)
-    calls.clear()
-    bpy.context.view_layer.update()
-    assert calls == [CROWD]
+def animate(crowd: list[bpy.types.Object]) -> None:
+    """Let each bend its elbow with the frames, each from where it is."""
     for mesh_object in crowd:
-        assert_plays(mesh_object, elbow.model)
+        armature_object = armature_modifier(mesh_object).object
+        armature_object.animation_data_clear()
+        bone = armature_object.pose.bones["lower"]
+        start = bone.rotation_euler[0]
+        for frame, angle in ((1, start), (60, start + 0.5)):
+            bone.rotation_euler[0] = angle
+            bone.keyframe_insert("rotation_euler", index=0, frame=frame)
+
+
+def test_a_crowd_that_plays_is_one_call(bound, elbow, calls):
+    crowd = crowd_of(bound, CROWD)
+    animate(crowd)
+    for frame in (1, 2, 3):
+        bpy.context.scene.frame_set(frame)
+    calls.clear()
+    for frame in (4, 9):
+        bpy.context.scene.frame_set(frame)
+        for mesh_object in crowd:
+            assert_plays(mesh_object, elbow.model)
+    assert calls.count(CROWD) == 2 and calls.count(1) == len(calls) - 2 == 2 * CROWD, "predicted() makes a call too"
     assert len({predicted(mesh_object, elbow.model).tobytes() for mesh_object in crowd}) == CROWD
+
+
+def test_one_of_a_crowd_that_is_posed_is_one_call(bound, elbow, calls):
+    crowd = crowd_of(bound, CROWD)
+    animate(crowd)
+    for frame in (1, 2, 3):
+        bpy.context.scene.frame_set(frame)
+    still = {mesh_object: assert_plays(mesh_object, elbow.model) for mesh_object in crowd}
+    for angle in (0.2, 0.4):
+        calls.clear()
+        armature_modifier(crowd[7]).object.pose.bones["lower"].rotation_euler[0] = angle
+        bpy.context.view_layer.update()
+        assert calls == [1]
+        moved = assert_plays(crowd[7], elbow.model)
+        assert np.abs(moved - still[crowd[7]]).max() > 1e-3
+        for mesh_object in crowd[:7] + crowd[8:]:
+            assert np.array_equal(assert_plays(mesh_object, elbow.model), still[mesh_object])
+    for frame in (3, 4, 5):
+        bpy.context.scene.frame_set(frame)
+        for mesh_object in crowd:
+            assert_plays(mesh_object, elbow.model)
+
+
+def test_crowds_that_come_and_go_leave_no_hubs(bound):
+    crowd = crowd_of(bound, 5)
+    animate(crowd)
+    bpy.context.view_layer.update()
+    count = len(bpy.data.objects)
+    for frame in range(1, 13, 3):
+        for later in range(3):
+            bpy.context.scene.frame_set(frame + later)
+        assert len(bpy.data.objects) == count + 1
+        armature_modifier(crowd[2]).object.pose.bones["lower"].rotation_euler[0] += 0.1
+        bpy.context.view_layer.update()
+        assert len(bpy.data.objects) == count
+
+
+def test_one_leaves_a_crowd(bound, elbow):
+    """Deleted, failed, switched off, duplicated or given another strength while all play: the others go on."""
+    crowd = crowd_of(bound, 12)
+    animate(crowd)
+    scene = bpy.context.scene
+    for frame in (1, 2, 3):
+        scene.frame_set(frame)
+    bpy.data.objects.remove(crowd.pop())
+    scene.frame_set(4)
+    bpy.data.objects.remove(armature_modifier(crowd[-1]).object)
+    scene.frame_set(5)
+    assert "is gone" in crowd.pop().fdda.status
+    scene.frame_set(6)
+    crowd.pop().fdda.mode = "RIG"
+    scene.frame_set(7)
+    crowd.pop().fdda.strength = 0.5
+    scene.frame_set(8)
+    copy = crowd[0].copy()
+    scene.collection.objects.link(copy)
+    for frame in (9, 10, 11, 12):
+        scene.frame_set(frame)
+        for mesh_object in (*crowd, copy):
+            assert_plays(mesh_object, elbow.model)
 
 
 def test_only_those_that_moved_are_evaluated(bound, calls):
@@ -82,7 +162,7 @@ def test_different_models_side_by_side(bound, elbow, tmp_path, calls):
         armature_modifier(mesh_object).object.pose.bones["lower"].rotation_euler[0] = -0.2 - 0.1 * number
     calls.clear()
     bpy.context.view_layer.update()
-    assert calls == [2, 2]
+    assert calls == [1] * 4
     for number, mesh_object in enumerate(crowd):
         assert_plays(mesh_object, elbow.model if number < 2 else other)
     assert np.abs(predicted(crowd[0], elbow.model) - predicted(crowd[0], other)).max() > 1e-4

@@ -6,14 +6,16 @@ import os
 import re
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
-from conftest import run
 
 from fdda_addon.core.messages import MessageType
-from fdda_addon.core.recording import STREAMED, array_shapes
-from fdda_addon.training import trainer_python
+from fdda_addon.core.recording.arrays import STREAMED, array_shapes
+from fdda_addon.training.process import trainer_python
+
+from .conftest import run
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -22,12 +24,13 @@ def page(name: str) -> str:
     return (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
 
 
-def run_code(name: str, folder: Path, python: str = sys.executable) -> str:
+def run_code(name: str, folder: Path, python: str = sys.executable, arguments: tuple[object, ...] = ()) -> str:
     """Run the only block of code of a page in a folder; returns what it prints."""
     (code,) = re.findall(r"```python\n(.*?)```", page(name), re.DOTALL)
+    code = textwrap.dedent(code)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     result = subprocess.run(
-        [python, "-W", "error::RuntimeWarning", "-c", code],
+        [python, "-W", "error::RuntimeWarning", "-c", code, *map(str, arguments)],
         cwd=folder,
         env=environment,
         capture_output=True,
@@ -53,7 +56,7 @@ def folder(elbow, tmp_path_factory) -> Path:
 def test_recording_code(folder):
     """Mean residual of the recording's first pose, as the core computes it."""
     from fdda_addon.core.metrics import distances
-    from fdda_addon.core.recording import read_recording
+    from fdda_addon.core.recording.reader import read_recording
     from fdda_addon.core.skinning import LinearLayer
 
     recording = read_recording(folder / "recording")
@@ -78,6 +81,13 @@ def test_messages_code(folder, tmp_path):
     (tmp_path / "recording").symlink_to(folder / "recording")
     lines = run_code("messages", tmp_path, trainer_python()).splitlines()
     assert len(lines) == 3 and lines[1].startswith("2/2: ") and lines[2] == "finished 0"
+
+
+def test_development_code(elbow, tmp_path):
+    """What plays is what the model says, the model is near the rig, and the linear layer is farther."""
+    text = run_code("development", tmp_path, arguments=(elbow.bound, "elbow", 12))
+    playback, model, linear = (float(far) for far in re.findall(r"^\w.*: ([\d.]+) at vertex", text, re.MULTILINE))
+    assert playback < 1e-5 and playback < model < 0.002 < linear
 
 
 def dotted(value: dict, prefix: str = "") -> set[str]:

@@ -6,20 +6,29 @@ import json
 import bpy
 import numpy as np
 import pytest
-from conftest import run
-from scene_state import drain
 
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.metrics import error_statistics
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.poses import beyond_range, sample_pose
-from fdda_addon.core.recording import read_recording
+from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.skinning import LinearLayer
-from fdda_addon.evaluation import HELD_OUT_INDEX, Evaluation, EvaluationSettings, NamedPose, evaluate, evaluate_action
+from fdda_addon.evaluation.run import (
+    HELD_OUT_INDEX,
+    Evaluation,
+    EvaluationSettings,
+    NamedPose,
+    evaluate,
+    evaluate_action,
+)
+from fdda_addon.poses.sampling import sampled_channels
+from fdda_addon.rig.reading import read_rig
 from fdda_addon.runtime.network import Network
 from fdda_addon.scene.armature import Poser, clear_pose
 from fdda_addon.scene.mesh import evaluated_positions
-from fdda_addon.scene.rig import read_rig, sampled_channels
+
+from .conftest import run
+from .scene_state import drain
 
 STATISTICS = ["mean", "rms", "p99", "p999", "max"]
 

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import bpy
 import pytest
-from conftest import pose
 
 from fdda_addon.runtime import model_files
+
+from .conftest import pose
 
 ROOT = Path(__file__).resolve().parents[2]
 LIFE = Path(__file__).with_name("extension_life.py")

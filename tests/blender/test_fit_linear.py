@@ -9,25 +9,28 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW, assert_plays, evaluated, pose, run
-from refusals import Refusal, save_elbow
-from scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
 from blend_fixtures.characters.base import cage, skin, tube
-from fdda_addon import heat_map
-from fdda_addon.cli.files import save_copy
+from blend_fixtures.elbow import build_elbow, lower_weights
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.model import read_model_info
-from fdda_addon.core.recording import read_recording
-from fdda_addon.core.recording_folder import FolderState, read_folder
+from fdda_addon.core.recording.folder import FolderState, read_folder
+from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearLayer
-from fdda_addon.elbow import build_elbow, lower_weights
-from fdda_addon.evaluation import EvaluationSettings, evaluate
-from fdda_addon.recording import RecordingSettings, record
+from fdda_addon.evaluation import heat_map
+from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.run import record
+from fdda_addon.rig.reading import PoseReader, read_rig
 from fdda_addon.runtime.binding import bind
-from fdda_addon.scene.rig import PoseReader, SceneRig, find_rig, read_rig
-from fdda_addon.trainer_environment.choice import PYTHON_VARIABLE
+from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.scene_rig import SceneRig, find_rig
+from fdda_addon.training.environment.choice import PYTHON_VARIABLE
+
+from .conftest import ELBOW, assert_plays, evaluated, pose, run
+from .refusals import Refusal, save_elbow
+from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
 SMOOTH = RecordingSettings(poses=60, influence_poses=2, fit_linear="smooth")
 

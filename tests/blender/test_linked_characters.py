@@ -4,8 +4,12 @@
 import bpy
 import numpy as np
 import pytest
-from conftest import assert_plays, predicted
-from linked import (
+
+from fdda_addon.runtime import nodes
+
+from . import test_crowd as crowd_tests
+from .conftest import assert_plays, predicted
+from .linked import (
     ANGLES,
     COLLECTION,
     armature_of,
@@ -19,9 +23,7 @@ from linked import (
     save_and_open,
     shot,
 )
-from test_renders import render_positions, rig_pixels, set_camera, still
-
-from fdda_addon.runtime import nodes, playback
+from .test_renders import render_positions, rig_pixels, set_camera, still
 
 CROWD = 20
 
@@ -125,8 +127,7 @@ def test_an_override_of_what_plays_already(library, tmp_path):
     armature_of(mesh_object).animation_data.action = None
     bend(mesh_object, 0.8)
     assert_play(library, (0.8,))
-    cache = nodes.cache_of(nodes.find_modifier(mesh_object))
-    assert not cache.is_runtime_data
+    assert nodes.cache_of(nodes.find_modifier(mesh_object)).is_runtime_data
     save_and_open(tmp_path)
     assert_play(library, (0.8,))
 
@@ -174,18 +175,11 @@ def test_a_duplicated_override_has_its_own_positions(pair, library, tmp_path):
 def test_a_crowd_of_overrides_is_one_call(library, monkeypatch):
     collection = link(library.path)
     crowd = [override(collection, 1.2 * number / CROWD) for number in range(CROWD)]
-    bpy.context.view_layer.update()
-    calls, real = [], playback.Network.positions
-
-    def positions(network, pose_matrices, *arguments):
-        calls.append(len(pose_matrices))
-        return real(network, pose_matrices, *arguments)
-
-    monkeypatch.setattr(playback.Network, "positions", positions)
-    for mesh_object in crowd:
-        bend(mesh_object, armature_of(mesh_object).pose.bones["lower"].rotation_euler[0] + 0.1)
-    bpy.context.view_layer.update()
-    assert calls == [CROWD]
+    crowd_tests.animate(crowd)
+    calls = crowd_tests.count_calls(monkeypatch)
+    for frame in (1, 2, 3, 4):
+        bpy.context.scene.frame_set(frame)
+    assert calls[-1] == CROWD
     for mesh_object in crowd:
         assert_plays(mesh_object, library.model)
     assert len({cache_name(mesh_object) for mesh_object in crowd}) == CROWD

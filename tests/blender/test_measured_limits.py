@@ -6,17 +6,19 @@ import math
 import bpy
 import numpy as np
 import pytest
-from conftest import run
-from figure import FRAMES, SMILE, WAVE, add_smile, add_wave, build_figure, edit_bones, key
 from mathutils import Euler
-from scene_state import fresh_elbow
 
 from fdda_addon.core.errors import RigError
-from fdda_addon.scene.action_range import measured_controls, measured_ranges
-from fdda_addon.scene.measured_limits import state_measured_limits
-from fdda_addon.scene.motion_range import local_limit, location_ranges, rotation_ranges, scale_ranges
-from fdda_addon.scene.rig import SceneRig, find_rig, read_rig
-from fdda_addon.scene.sampling import sampled_channels
+from fdda_addon.poses.action_range import measured_controls, measured_ranges
+from fdda_addon.poses.measured_limits import state_measured_limits
+from fdda_addon.poses.motion_range import local_limit, location_ranges, rotation_ranges, scale_ranges
+from fdda_addon.poses.sampling import sampled_channels
+from fdda_addon.rig.reading import read_rig
+from fdda_addon.scene.scene_rig import SceneRig, find_rig
+
+from .conftest import run
+from .figure import FRAMES, SMILE, WAVE, add_smile, add_wave, build_figure, edit_bones, key
+from .scene_state import fresh_elbow
 
 HAS_SLOTS = bpy.app.version >= (4, 4, 0)
 
@@ -127,7 +129,7 @@ def test_limits_state_the_ranges_with_their_margin_and_change_no_pose(figure):
     assert (moved.type, moved.influence, moved.owner_space) == ("LIMIT_LOCATION", 0, "LOCAL")
     assert location_ranges(bones["spine"])[1] == pytest.approx((-0.025, 0.075), abs=1e-3)
     assert scale_ranges(bones["arm.R"])[1] == pytest.approx((0.95, 1.15), abs=1e-3)
-    channels = {(c.bone, c.kind, c.axis): (c.low, c.high) for c in sampled_channels(figure, read_rig(figure))}
+    channels = {(c.name, c.kind, c.axis): (c.low, c.high) for c in sampled_channels(figure, read_rig(figure))}
     for limit in limits:
         assert channels[limit.bone, limit.kind, limit.axis] == pytest.approx((limit.low, limit.high), abs=1e-6)
 

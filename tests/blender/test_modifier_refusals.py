@@ -3,18 +3,20 @@
 
 import bpy
 import pytest
-from conftest import ELBOW, ELBOW_RIG, assert_plays
-from modifiers import FEW, at, character, nodes_at
-from scene_state import assert_same_state, drain, scene_state
 
 from blend_fixtures.characters import stacks
 from blend_fixtures.characters.base import drive, tube
 from fdda_addon.core.errors import RigError
-from fdda_addon.evaluation import EvaluationSettings, evaluate
-from fdda_addon.recording import RecordingSettings, record
-from fdda_addon.rig_check import check
+from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.rig_check import check
+from fdda_addon.recording.run import record
 from fdda_addon.runtime.binding import bind
-from fdda_addon.scene.rig import find_rig
+from fdda_addon.scene.scene_rig import find_rig
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays
+from .modifiers import FEW, at, character, nodes_at
+from .scene_state import assert_same_state, drain, scene_state
 
 
 def simulating(mesh_object: bpy.types.Object) -> None:

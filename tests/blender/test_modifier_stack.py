@@ -6,18 +6,19 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from conftest import assert_plays, evaluated, pose
-from modifiers import FEW, at, character, nodes_at
-from scene_state import assert_same_state, drain, scene_state
 
 from blend_fixtures.characters import stacks
-from fdda_addon import benchmark, rig_cost
-from fdda_addon.evaluation import EvaluationSettings, evaluate
-from fdda_addon.recording import record
-from fdda_addon.rig_check import check
+from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.recording.rig_check import check
+from fdda_addon.recording.run import record
+from fdda_addon.rig.modifier_stack import ModifierStack, read_stack
 from fdda_addon.runtime.binding import bind, unbind
-from fdda_addon.scene.modifier_stack import ModifierStack, read_stack
-from fdda_addon.scene.rig import SceneRig
+from fdda_addon.scene.scene_rig import SceneRig
+from fdda_addon.timing import benchmark, rig_cost
+
+from .conftest import assert_plays, evaluated, pose
+from .modifiers import FEW, at, character, nodes_at
+from .scene_state import assert_same_state, drain, scene_state
 
 MOVES = 0.001
 """Metres by which a stack moves some vertex, at the least, from where linear skinning has it."""

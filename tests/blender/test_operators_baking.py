@@ -4,13 +4,14 @@
 import bpy
 import numpy as np
 import pytest
-from baked_files import CLOSE, elbow_wave, plain_blender, read_pc2
-from conftest import ELBOW, assert_plays, pose
-from refusals import files
-from scene_state import assert_same_state, scene_state
-from test_operators_playback import refused
 
-from fdda_addon.scene.rig import find_rig
+from fdda_addon.scene.scene_rig import find_rig
+
+from .baked_files import CLOSE, elbow_wave, plain_blender, read_pc2
+from .conftest import ELBOW, assert_plays, evaluated, pose
+from .refusals import files
+from .scene_state import assert_same_state, scene_state
+from .test_operators_playback import refused
 
 
 @pytest.fixture(scope="module")
@@ -51,3 +52,44 @@ class TestOperator:
         bpy.ops.fdda.unbind()
         refused(lambda: bpy.ops.fdda.bake(filepath=str(tmp_path / "a.pc2")), "No model is bound; bind one first")
         assert files(tmp_path) == {}
+
+    @pytest.mark.parametrize(("mode", "strength"), [("FDDA", 0.4), ("LINEAR", 1.0)])
+    def test_strength_and_mode_are_baked_as_the_viewport_shows_them(self, active, tmp_path, mode, strength):
+        active.fdda.strength, active.fdda.mode = strength, mode
+        assert bpy.ops.fdda.bake(filepath=str(tmp_path / "a.pc2")) == {"FINISHED"}
+        bpy.context.scene.frame_set(12)
+        shown = evaluated(active)
+        baked = read_pc2(tmp_path / "a.pc2")[2][12 - bpy.context.scene.frame_start]
+        assert np.abs(baked - shown).max() < 1e-5
+        active.fdda.strength, active.fdda.mode = 1.0, "FDDA"
+        bpy.context.view_layer.update()
+        assert np.abs(baked - evaluated(active)).max() > 1e-4, "the pose tells the two apart"
+
+    def test_an_animated_strength_is_baked_frame_by_frame(self, active, tmp_path):
+        for frame, strength in ((1, 0.0), (20, 1.0)):
+            active.fdda.strength = strength
+            active.keyframe_insert("fdda.strength", frame=frame)
+        assert bpy.ops.fdda.bake(filepath=str(tmp_path / "a.pc2")) == {"FINISHED"}
+        baked = read_pc2(tmp_path / "a.pc2")[2]
+        for frame in (1, 9, 20):
+            bpy.context.scene.frame_set(frame)
+            assert np.abs(baked[frame - bpy.context.scene.frame_start] - evaluated(active)).max() < 1e-5
+
+
+def test_no_operator_remembers_the_file_or_object_of_the_last_time():
+    """Blender fills what is not given with what was used last: a second press would overwrite another character's."""
+    from importlib import import_module
+
+    from fdda_addon import operators
+
+    classes = [c for name in operators.MODULES for c in import_module(f"fdda_addon.operators.{name}").CLASSES]
+    names = [c.bl_idname.partition(".")[2] for c in classes if issubclass(c, bpy.types.Operator)]
+    rna = [getattr(bpy.ops.fdda, name).get_rna_type() for name in names]
+    subjects = {"FILE_PATH", "DIR_PATH"}
+    found = [
+        (kind.identifier, p.identifier, p.is_skip_save)
+        for kind in rna
+        for p in kind.properties
+        if p.type == "STRING" and (p.subtype in subjects or p.identifier in {"object", "action", "bone"})
+    ]
+    assert len(found) > 20 and [entry for entry in found if not entry[2]] == []

@@ -4,16 +4,18 @@
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW_RIG, pose
-from scene_state import assert_same_state, drain, scene_state
-from test_operators_playback import refused
 
-from fdda_addon import heat_map, last_evaluation, markers
 from fdda_addon.core.metrics import error_statistics, heat_colors
 from fdda_addon.core.partition import make_partitions
-from fdda_addon.evaluation import EvaluationSettings, evaluate, evaluate_action
+from fdda_addon.evaluation import heat_map, last_evaluation, markers
+from fdda_addon.evaluation.run import EvaluationSettings, evaluate, evaluate_action
+from fdda_addon.rig.reading import read_rig
 from fdda_addon.runtime.binding import true_rig
-from fdda_addon.scene.rig import find_rig, read_rig
+from fdda_addon.scene.scene_rig import find_rig
+
+from .conftest import ELBOW_RIG, pose
+from .scene_state import assert_same_state, drain, scene_state
+from .test_operators_playback import refused
 
 
 @pytest.fixture
@@ -179,9 +181,9 @@ def test_an_evaluation_does_not_outlive_many_others(active):
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
     assert last_evaluation.of(active) is not None
     kept = last_evaluation._kept[active.session_uid]
-    for uid in range(-last_evaluation.MOST_KEPT, 0):
+    for uid in range(-last_evaluation.MAX_KEPT, 0):
         last_evaluation._kept[uid] = kept
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
-    assert len(last_evaluation._kept) <= last_evaluation.MOST_KEPT and last_evaluation.of(active) is not None
-    for uid in range(-last_evaluation.MOST_KEPT, 0):
+    assert len(last_evaluation._kept) <= last_evaluation.MAX_KEPT and last_evaluation.of(active) is not None
+    for uid in range(-last_evaluation.MAX_KEPT, 0):
         last_evaluation._kept.pop(uid, None)

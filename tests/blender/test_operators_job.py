@@ -7,14 +7,15 @@ import bpy
 import pytest
 
 from fdda_addon.core.errors import FDDAError
-from fdda_addon.operators import job
-from fdda_addon.operators.job_state import JobState, Run
-from fdda_addon.recording import Progress
+from fdda_addon.core.progress import Progress
+from fdda_addon.jobs import job
+from fdda_addon.jobs.job import JobState, Run
+from fdda_addon.operators.job import JobOperator
 
 events: list[str] = []
 
 
-class FDDA_OT_count(job.JobOperator, bpy.types.Operator):  # noqa: N801 - Blender wants it
+class FDDA_OT_count(JobOperator, bpy.types.Operator):  # noqa: N801 - Blender wants it
     """Counts to `upto`, and does at `at` what `what` says."""
 
     bl_idname = "fdda.count"
@@ -116,7 +117,7 @@ def under_way(borrows_scene: bool) -> JobState:
         finally:
             events.append("given back")
 
-    run = Run(JobState("count", "Counting", borrows_scene=borrows_scene), steps())
+    run = Run(JobState("count", "Counting", borrows_scene=borrows_scene), steps(), str, str)
     assert not run.advance(0)
     return run.state
 

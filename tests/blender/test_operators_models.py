@@ -5,12 +5,13 @@ import shutil
 
 import bpy
 import pytest
-from conftest import ELBOW, ELBOW_RIG, assert_plays, pose
-from test_operators_playback import refused
 
 from fdda_addon.core.errors import ModelError
-from fdda_addon.model_list import bound_entry, megabytes
+from fdda_addon.models.entries import bound_entry, megabytes
 from fdda_addon.runtime import packed
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose
+from .test_operators_playback import refused
 
 
 @pytest.fixture
@@ -109,7 +110,7 @@ def test_borrowing_gives_a_packed_model_back(packed_elbow, elbow, second):
     from pathlib import Path
 
     from fdda_addon.runtime.binding import borrowed_binding
-    from fdda_addon.scene.rig import find_rig
+    from fdda_addon.scene.scene_rig import find_rig
 
     before = packed_elbow.fdda.model
     with borrowed_binding(find_rig(), Path(second)):
@@ -206,8 +207,8 @@ def test_a_stale_model_says_what_changed(bound, change, words):
 
 
 def test_another_range_of_motion_is_told_and_prevents_nothing(bound, elbow):
-    from fdda_addon.model_changes import changes_since
-    from fdda_addon.scene.rig import find_rig
+    from fdda_addon.models.changes import changes_since
+    from fdda_addon.scene.scene_rig import find_rig
 
     bpy.context.view_layer.objects.active = bound
     assert not changes_since(find_rig(), bound.fdda.models[0]).sentence
@@ -238,7 +239,9 @@ def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_pa
     import numpy as np
     import onnx
 
-    from fdda_addon import last_evaluation, models
+    from fdda_addon.core.model import CHECKSUM_KEY
+    from fdda_addon.evaluation import last_evaluation
+    from fdda_addon.models import model_list
 
     bpy.context.view_layer.objects.active = bound
     path = tmp_path / "second.onnx"
@@ -250,8 +253,10 @@ def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_pa
     node = next(node for node in model.graph.node if "positions" in node.output)
     node.output[0] = "before"
     model.graph.node.append(onnx.helper.make_node("Add", ["before", "before"], ["positions"]))
+    (checksum,) = (prop for prop in model.metadata_props if prop.key == CHECKSUM_KEY)
+    model.metadata_props.remove(checksum)
     onnx.save(model, path)
-    models.remember(bound, path)
+    model_list.remember(bound, path)
     bpy.context.view_layer.update()
     after = assert_plays(bound, path)
     np.testing.assert_allclose(after, 2 * before, atol=1e-5)
@@ -261,7 +266,7 @@ def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_pa
 def test_what_the_section_says_of_the_models(bound, elbow):
     from fdda_addon.panels import checks
     from fdda_addon.panels import models as section
-    from fdda_addon.scene.rig import find_rig
+    from fdda_addon.scene.scene_rig import find_rig
 
     bpy.context.view_layer.objects.active = bound
     checks.check_now(find_rig())

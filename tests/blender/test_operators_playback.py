@@ -6,11 +6,12 @@ import shutil
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
 
-from fdda_addon import frame_times, trust
-from fdda_addon.runtime import nodes
+from fdda_addon.runtime import nodes, trust
 from fdda_addon.runtime.network import Network
+from fdda_addon.timing import frame_times
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
 
 
 def refused(call, *words: str) -> None:

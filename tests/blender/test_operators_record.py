@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """From the sample arm to a model with operators alone, without a window: values, sentences, cancelling and undo."""
 
+import fcntl
 import json
 import math
 import os
@@ -9,17 +10,21 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW, ELBOW_RIG
-from scene_state import assert_same_state, scene_state
 
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.poses import sample_pose
-from fdda_addon.core.recording import read_index, read_recording
-from fdda_addon.core.recording_lock import LOCK
-from fdda_addon.operators import job
+from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.lock import LOCK
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.jobs import job
 from fdda_addon.operators.rig import cost_of
-from fdda_addon.scene.rig import SceneRig, read_rig, sampled_channels
-from fdda_addon.settings import model_file
+from fdda_addon.poses.sampling import sampled_channels
+from fdda_addon.properties.character import model_file
+from fdda_addon.rig.reading import read_rig
+from fdda_addon.scene.scene_rig import SceneRig
+
+from .conftest import ELBOW, ELBOW_RIG
+from .scene_state import assert_same_state, scene_state
 
 
 @pytest.fixture
@@ -35,19 +40,31 @@ def recorded_folder(tmp_path: Path) -> Path:
 
 
 class TestRig:
+    def test_the_cube_of_a_new_file_is_out_of_the_way_and_the_arm_in_view(self):
+        bpy.ops.wm.read_factory_settings()
+        assert bpy.ops.fdda.add_arm(density="1") == {"FINISHED"}
+        assert not bpy.data.objects["Cube"].visible_get() and bpy.data.objects["Cube"].hide_render
+        views = [a.spaces.active.region_3d for s in bpy.data.screens for a in s.areas if a.type == "VIEW_3D"]
+        assert views
+        for view in views:
+            assert 0.2 < view.view_location.x < 0.6 and 0.5 < view.view_distance < 1.5
+
     def test_the_arm_is_added_to_the_scene_that_is_there(self):
         bpy.ops.mesh.primitive_cube_add()
         cube = bpy.context.active_object
+        cube.location.x = 3
+        bpy.context.view_layer.update()
         assert bpy.ops.fdda.add_arm() == {"FINISHED"}
         arm = bpy.context.active_object
-        assert arm.name == "arm" and len(arm.data.vertices) == 1476 and arm.select_get()
+        assert arm.name == "arm" and len(arm.data.vertices) == 9960 and arm.select_get()
+        assert cube.visible_get(), "somebody has moved it"
         assert cube.name in bpy.context.scene.objects and not cube.select_get()
         assert bpy.context.scene.frame_end == 250
 
     def test_a_second_arm_has_a_rig_of_its_own(self):
-        bpy.ops.fdda.add_arm()
+        bpy.ops.fdda.add_arm(density="1")
         bpy.context.scene.frame_end = 77
-        bpy.ops.fdda.add_arm()
+        bpy.ops.fdda.add_arm(density="1")
         second = bpy.context.active_object
         assert second.name == "arm.001" and second.modifiers["Armature"].object.name == "arm_rig.001"
         driver = second.data.shape_keys.animation_data.drivers[0].driver
@@ -56,7 +73,7 @@ class TestRig:
 
     def test_adding_the_arm_can_be_undone(self):
         bpy.ops.ed.undo_push()
-        bpy.ops.fdda.add_arm()
+        bpy.ops.fdda.add_arm(density="1")
         bpy.ops.ed.undo_push()
         bpy.ops.ed.undo()
         assert "arm" not in bpy.data.objects and "arm_rig" not in bpy.data.objects
@@ -64,7 +81,7 @@ class TestRig:
     def test_not_in_edit_mode(self, saved):
         bpy.ops.object.mode_set(mode="EDIT")
         with pytest.raises(RuntimeError, match="Objects are added in object mode; switch to it first"):
-            bpy.ops.fdda.add_arm()
+            bpy.ops.fdda.add_arm(density="1")
 
     def test_measuring_gives_back_the_scene_and_keeps_the_cost(self, saved):
         before = scene_state(saved)
@@ -100,18 +117,21 @@ class TestWhichRig:
         bpy.context.view_layer.objects.active = saved.armature_object
         assert bpy.ops.fdda.measure() == {"FINISHED"}
 
-    def test_of_two_meshes_the_selected_one_is_meant(self, saved):
+    def test_of_two_meshes_the_selected_or_the_chosen_one_is_meant(self, saved):
         other = saved.mesh_object.copy()
         other.data = saved.mesh_object.data.copy()
         bpy.context.scene.collection.objects.link(other)
         for mesh_object in (saved.mesh_object, other):
             mesh_object.select_set(False)
         bpy.context.view_layer.objects.active = saved.armature_object
-        with pytest.raises(RuntimeError, match=r"2 meshes follow 'elbow_rig' \('elbow', 'elbow.001'\); select the one"):
-            bpy.ops.fdda.measure()
-        other.select_set(True)
         assert bpy.ops.fdda.measure() == {"FINISHED"}
-        assert job.state_of("measure").subject == "elbow.001"
+        assert job.state_of("measure").subject == saved.mesh_object.session_uid
+        bpy.context.window_manager.fdda.mesh = other.name
+        assert bpy.ops.fdda.measure() == {"FINISHED"}
+        assert job.state_of("measure").subject == other.session_uid
+        saved.mesh_object.select_set(True)
+        assert bpy.ops.fdda.measure() == {"FINISHED"}
+        assert job.state_of("measure").subject == saved.mesh_object.session_uid
 
 
 class TestPoses:
@@ -123,7 +143,7 @@ class TestPoses:
         assert bpy.ops.fdda.preview_pose(step=1) == {"FINISHED"}
         assert bpy.context.window_manager.fdda.pose_number == 4
         bones = saved.armature_object.pose.bones
-        shown = [bones[c.bone].rotation_euler[c.axis] for c in channels]
+        shown = [bones[c.name].rotation_euler[c.axis] for c in channels]
         np.testing.assert_allclose(shown, sample_pose(channels, 7, 4, 0.5), atol=1e-6)
         bpy.ops.fdda.preview_pose(number=0, step=-1)
         assert bpy.context.window_manager.fdda.pose_number == 0
@@ -147,7 +167,7 @@ class TestPoses:
 
     def ranges(self, rig: SceneRig) -> dict[str, tuple[float, float]]:
         return {
-            f"{c.bone} {'XYZ'[c.axis]}": (round(math.degrees(c.low)), round(math.degrees(c.high)))
+            f"{c.name} {'XYZ'[c.axis]}": (round(math.degrees(c.low)), round(math.degrees(c.high)))
             for c in sampled_channels(rig, read_rig(rig))
         }
 
@@ -201,7 +221,7 @@ class TestRecording:
         assert job.state_of("record").outcome == "Recorded 50 poses into 'elbow_recording'."
 
     def test_an_unsaved_file_has_no_place_for_it(self):
-        bpy.ops.fdda.add_arm()
+        bpy.ops.fdda.add_arm(density="1")
         with pytest.raises(RuntimeError, match=r"The \.blend file has not been saved, so there is no place beside it"):
             bpy.ops.fdda.record()
 
@@ -235,9 +255,14 @@ class TestRecording:
 
     def test_another_blender_is_recording_there(self, saved, tmp_path):
         recorded_folder(tmp_path).mkdir()
-        (recorded_folder(tmp_path) / LOCK).write_text(json.dumps({"pid": os.getppid(), "host": os.uname().nodename}))
-        with pytest.raises(RuntimeError, match=rf"Another Blender \(process {os.getppid()}\) is recording into"):
-            self.record(saved)
+        lock = recorded_folder(tmp_path) / LOCK
+        lock.write_text(json.dumps({"pid": os.getppid(), "host": os.uname().nodename}))
+        with lock.open() as held:
+            # The system's lock is of the open file, so this is another's also in one process.
+            fcntl.flock(held, fcntl.LOCK_EX)
+            with pytest.raises(RuntimeError, match=rf"Another Blender \(process {os.getppid()}\) is recording into"):
+                self.record(saved)
+        assert lock.exists()
 
     def test_removing_a_recording(self, saved, tmp_path):
         with pytest.raises(RuntimeError, match="holds no recording; there is nothing to remove"):

@@ -9,17 +9,18 @@ import pytest
 
 from blend_fixtures.characters import control_rigs, controls
 from fdda_addon.core.poses import CONTROL, LOCATION, ROTATION
-from fdda_addon.core.recording import Recording, read_index, read_recording
-from fdda_addon.operators.sampling import recording_settings
+from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.panels import checks
 from fdda_addon.panels.poses import sampled_by_bone
 from fdda_addon.panels.recording import content_of
 from fdda_addon.panels.sampled import counted
-from fdda_addon.recording import planned_rig
+from fdda_addon.properties.character import recording_folder
+from fdda_addon.properties.choices import recording_settings
+from fdda_addon.recording.plan import planned_rig
 from fdda_addon.scene.compatibility import curves_of
 from fdda_addon.scene.control_names import resting_value, suggested_controls
-from fdda_addon.scene.rig import SceneRig, find_rig
-from fdda_addon.settings import recording_folder
+from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 DEFORMING = ("upper", "lower")
 CONTROL_BONES = {"fk_upper", "fk_lower", "ik_hand", "ik_pole"}
@@ -55,7 +56,7 @@ def recorded(rig: SceneRig) -> Recording:
 
 
 def sampled_bones(recording: Recording) -> set[str]:
-    return {channel.bone for channel in recording.info.sampling.channels if channel.kind != CONTROL}
+    return {channel.name for channel in recording.info.sampling.channels if channel.kind != CONTROL}
 
 
 def select(rig: SceneRig, *names: str) -> None:

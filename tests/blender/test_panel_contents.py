@@ -7,19 +7,20 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW
-from scene_state import fresh_elbow
 
-from fdda_addon.core.recording_folder import FolderState
-from fdda_addon.operators import job
-from fdda_addon.operators.job_state import JobState, Run
+from fdda_addon.core.recording.folder import FolderState
+from fdda_addon.jobs import job
+from fdda_addon.jobs.job import JobState, Run
 from fdda_addon.panels import checks, curves
 from fdda_addon.panels.recording import content_of
 from fdda_addon.panels.section import duration, panel_rig
 from fdda_addon.panels.training import _report
-from fdda_addon.rig_cost import PLAYBACK_MS, RigCost, estimated_playback
-from fdda_addon.scene.rig import SceneRig
-from fdda_addon.settings import model_file, recording_folder
+from fdda_addon.properties.character import model_file, recording_folder
+from fdda_addon.scene.scene_rig import SceneRig
+from fdda_addon.timing.rig_cost import PLAYBACK_MS, RigCost, estimated_playback
+
+from .conftest import ELBOW
+from .scene_state import fresh_elbow
 
 
 @pytest.fixture
@@ -143,12 +144,13 @@ class TestTraining:
         assert pixels.shape == (curves.HEIGHT, curves.WIDTH, 4) and pixels.dtype == np.float32
         assert pixels.min() >= 0 and pixels.max() <= 1
         heights = {}
+        pixels = pixels[curves.BOTTOM :, curves.LEFT :]
         for name, (_, _, colour) in curves.LEGEND.items():
             distance = np.abs(pixels[..., :3] - np.float32(colour)).sum(axis=-1)
             heights[name] = distance.argmin(axis=0)
             assert distance.min(axis=0).max() < 0.05, "a line without gaps"
         for falls in heights.values():
-            assert falls[0] > falls[curves.WIDTH // 2] > falls[-1]
+            assert falls[0] > falls[len(falls) // 2] > falls[-1]
         assert (heights["validation"] > heights["training"]).all()
 
     @pytest.mark.parametrize("values", [[0.0, 0.0], [0.5, 0.5], [1e-9, 1e9]])
@@ -170,7 +172,7 @@ class TestTraining:
             assert (_report(path) is not None) is passed
 
     def test_its_trainer_ends_with_the_file(self, rig, elbow, tmp_path):
-        from fdda_addon.training import Training
+        from fdda_addon.training.process import Training
 
         trainings = []
 
@@ -179,7 +181,7 @@ class TestTraining:
                 trainings.append(training)
                 yield from training.messages(wait=False)
 
-        run = Run(JobState("train", "Training"), steps())
+        run = Run(JobState("train", "Training"), steps(), str, str)
         run.advance(0)
         process = trainings[0]._process
         assert process.poll() is None
@@ -218,3 +220,15 @@ class TestCost:
 )
 def test_durations(seconds, text):
     assert duration(seconds) == text
+
+
+def test_the_worst_frames_are_those_of_the_last_of_several_evaluations():
+    from fdda_addon.evaluation.last_evaluation import LastEvaluation
+    from fdda_addon.panels.evaluation import _worst
+
+    def evaluation(worst: int) -> LastEvaluation:
+        errors = np.zeros((3, 4), np.float32)
+        errors[worst] = 0.001
+        return LastEvaluation("", "m", 0, 0, {"fdda": errors, "linear": errors}, {}, (), ())
+
+    assert [_worst(evaluation(worst), 2)[0][0] for worst in (1, 2, 0)] == [1, 2, 0]

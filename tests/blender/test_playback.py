@@ -4,11 +4,12 @@
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, predicted
 
 from fdda_addon.runtime import nodes
 from fdda_addon.runtime.binding import bind, unbind
-from fdda_addon.scene.rig import find_rig
+from fdda_addon.scene.scene_rig import find_rig
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, predicted
 
 
 def test_opened_file_plays(bound, elbow):

@@ -7,14 +7,18 @@ import bpy
 import numpy as np
 import pytest
 from mathutils import Euler, Matrix
-from scene_state import drain, fresh_elbow
 
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.poses import DEFAULT_RANGE, Channel, sample_pose
-from fdda_addon.core.recording import read_recording
-from fdda_addon.recording import RecordingSettings, record
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.poses.sampling import sampled_channels
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.run import record
+from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene.armature import Poser, clear_pose
-from fdda_addon.scene.rig import SceneRig, read_rig, sampled_channels
+from fdda_addon.scene.scene_rig import SceneRig
+
+from .scene_state import drain, fresh_elbow
 
 
 @pytest.fixture
@@ -41,7 +45,7 @@ def ranges(rig: SceneRig, bone: str = "lower", kind: str = "rotation") -> dict[i
     return {
         c.axis: (round(c.low * scale, 3), round(c.high * scale, 3))
         for c in sampled_channels(rig, read_rig(rig))
-        if (c.bone, c.kind) == (bone, kind)
+        if (c.name, c.kind) == (bone, kind)
     }
 
 
@@ -181,7 +185,7 @@ def test_a_recording_poses_quaternion_bones_and_locations(fresh, lower, tmp_path
     drain(record(fresh, tmp_path / "r", RecordingSettings(poses=5)))
     recording = read_recording(tmp_path / "r")
     channels = recording.info.sampling.channels
-    assert [(c.bone, c.kind, c.axis) for c in channels] == [
+    assert [(c.name, c.kind, c.axis) for c in channels] == [
         *(("upper", "rotation", axis) for axis in range(3)),
         ("upper", "location", 2),
         *(("lower", "rotation", axis) for axis in range(3)),

@@ -7,17 +7,23 @@ import re
 import bpy
 import numpy as np
 import pytest
-from scene_state import drain, fresh_elbow
 
-from fdda_addon.appender import BATCH_POSES
 from fdda_addon.core.errors import RecordingError, RigError
 from fdda_addon.core.poses import sample_pose
-from fdda_addon.core.recording import Recording, read_index, read_recording
+from fdda_addon.core.progress import Progress
+from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.skinning import LinearLayer
-from fdda_addon.recording import Progress, RecordingSettings, record
+from fdda_addon.poses.sampling import sampled_channels
+from fdda_addon.recording.appender import BATCH_POSES
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.run import record
+from fdda_addon.rig.reading import PoseReader, read_rig
 from fdda_addon.scene.armature import Poser
 from fdda_addon.scene.mesh import evaluated_positions
-from fdda_addon.scene.rig import PoseReader, SceneRig, read_rig, sampled_channels
+from fdda_addon.scene.scene_rig import SceneRig
+
+from .scene_state import drain, fresh_elbow
 
 
 @pytest.fixture

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import bpy
 import pytest
-from conftest import ELBOW, ELBOW_RIG, run
 
-from fdda_addon.cli.files import save_copy
-from fdda_addon.core.partition import LEAST_VERTICES
-from fdda_addon.core.recording import read_recording
-from fdda_addon.core.recording_check import check_recording
-from fdda_addon.elbow import build_elbow
+from blend_fixtures.elbow import build_elbow
+from fdda_addon.core.checks.recording import check_recording
+from fdda_addon.core.defaults import MIN_VERTICES
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.scene.blend_file import save_copy
+
+from .conftest import ELBOW, ELBOW_RIG, run
 
 
 def record_elbow(folder: Path, turn: float, preserve_volume: bool, smooth: bool = True, poses: int = 200) -> Path:
@@ -148,7 +149,7 @@ class TestSmallPartitions:
     def test_the_sidebar_has_the_same_default_and_records_with_its_own(self, rig, tmp_path):
         bpy.ops.wm.open_mainfile(filepath=str(rig))
         elbow = bpy.data.objects[ELBOW]
-        assert elbow.fdda.settings.least_vertices == LEAST_VERTICES
+        assert elbow.fdda.settings.least_vertices == MIN_VERTICES
         elbow.fdda.settings.least_vertices, elbow.fdda.settings.poses = 0, 30
         bpy.context.view_layer.objects.active = elbow
         assert bpy.ops.fdda.record(object=ELBOW, folder=str(tmp_path / "apart")) == {"FINISHED"}

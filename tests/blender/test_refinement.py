@@ -6,19 +6,23 @@ import shutil
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW_RIG, run
 from mathutils import Matrix
-from scene_state import scene_state
 
 from fdda_addon.core.errors import FDDAError
 from fdda_addon.core.features import joint_features
 from fdda_addon.core.metrics import distances
 from fdda_addon.core.model import read_model_info
-from fdda_addon.core.recording import REFINED, read_recording
+from fdda_addon.core.recording.index import REFINED
+from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.skinning import LinearLayer
-from fdda_addon.refinement import RefinementSettings, refine
+from fdda_addon.recording.refinement import RefinementSettings, refine
+from fdda_addon.rig.reading import PoseEvaluator, read_rig
 from fdda_addon.runtime.network import Network
-from fdda_addon.scene.rig import PoseEvaluator, find_rig, read_rig
+from fdda_addon.scene.scene_rig import find_rig
+
+from .conftest import ELBOW_RIG, run
+from .refusals import files
+from .scene_state import scene_state
 
 
 @pytest.fixture
@@ -112,7 +116,30 @@ def test_another_rig_is_refused(elbow, recording, rig):
     assert "was trained for another rig" in sentence(rig, recording, elbow.model)
 
 
-@pytest.mark.parametrize("option", [["--resume"], ["--action", "elbow_wave"], ["--poses", 0]])
+def test_a_refinement_that_is_resumed_adds_what_is_missing(elbow, recording, rig, tmp_path):
+    """Stopped once, and run again when it is complete: the same bytes as in one go."""
+    whole = shutil.copytree(recording, tmp_path / "whole")
+    settings = RefinementSettings(poses=7, resume=True)
+    list(refine(rig, whole, elbow.model, settings))
+    steps = refine(rig, recording, elbow.model, settings)
+    for step in steps:
+        if step.stage == "poses" and step.done == 3:
+            break
+    steps.close()
+    assert len(read_recording(recording).pose_matrices) == 153
+    for _ in range(2):
+        assert list(refine(rig, recording, elbow.model, settings))[-1].done == 7
+        assert files(recording) == files(whole)
+
+
+def test_poses_that_were_not_chosen_for_the_model_are_not_resumed(elbow, recording, rig):
+    list(refine(rig, recording, elbow.model, RefinementSettings(poses=2)))
+    list(refine(rig, recording, elbow.model, RefinementSettings(poses=2)))
+    with pytest.raises(FDDAError, match=r"was trained on 150 poses, and the other 4 of .* were not chosen for it"):
+        list(refine(rig, recording, elbow.model, RefinementSettings(poses=2, resume=True)))
+
+
+@pytest.mark.parametrize("option", [["--shard", "1/2"], ["--action", "elbow_wave"], ["--poses", 0]])
 def test_options_that_contradict(elbow, recording, capfd, option):
     assert run("record", elbow.rig, recording, "--refine", elbow.model, *option) == 2
     assert "--refine adds random poses to a complete recording" in capfd.readouterr().err

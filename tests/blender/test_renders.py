@@ -6,7 +6,8 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW_RIG, assert_plays, predicted
+
+from .conftest import ELBOW_RIG, assert_plays, predicted
 
 FRAME = 22
 """Of the elbow's action: well bent."""

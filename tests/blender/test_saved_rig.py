@@ -4,10 +4,11 @@
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW, assert_plays, evaluated, pose
 
 import fdda_addon
 from fdda_addon.runtime import model_files
+
+from .conftest import ELBOW, assert_plays, evaluated, pose
 
 
 @pytest.fixture

@@ -11,17 +11,21 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from conftest import assert_plays, pose, run
-from refusals import Refusal, files
 
 import fdda_addon
 from blend_fixtures.characters.base import cage, link, skin
 from blend_fixtures.characters.meshes import body_and_sleeve
+from fdda_addon.core.errors import TRY_AGAIN
 from fdda_addon.core.model import read_model_info
-from fdda_addon.core.recording import read_index, read_recording
-from fdda_addon.recording import RecordingSettings, record_meshes
+from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.run import record_meshes
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import find_rigs
+
+from .conftest import assert_plays, pose, run
+from .refusals import Refusal, files
 
 BODY, SLEEVE = "elbow", "sleeve"
 POSES = 60
@@ -135,7 +139,7 @@ def test_each_mesh_has_its_own_shape_keys_as_controls(two, tmp_path):
     assert [control.name for control in body.rig.controls] == [puff]
     assert [control.name for control in sleeve.rig.controls] == [puff, fold]
     for recording in (body, sleeve):
-        sampled = [channel.bone for channel in recording.info.sampling.channels if channel.kind == "control"]
+        sampled = [channel.name for channel in recording.info.sampling.channels if channel.kind == "control"]
         assert sampled == [control.name for control in recording.rig.controls]
         assert np.ptp(recording.controls, axis=0).min() > 0.1
     assert np.abs(body.controls[:, 0] - sleeve.controls[:, 0]).max() > 0.1
@@ -214,8 +218,9 @@ def test_evaluation_and_benchmark_are_by_object(two, tmp_path, capfd):
     assert "'sleeve':\nerror in mm" in capfd.readouterr().out
     assert run("evaluate", two.rig, two.models, "--json", out, "--poses", 5, "--object", SLEEVE) == 0
     assert json.loads(out.read_text()) == objects[SLEEVE]
-    assert run("benchmark", two.rig, two.models, "--json", out, "--frames", 2) == 0
-    assert set(json.loads(out.read_text())["objects"]) == {BODY, SLEEVE}
+    times = tmp_path / "times.json"
+    assert run("benchmark", two.rig, two.models, "--json", times, "--frames", 2) == 0
+    assert set(json.loads(times.read_text())["objects"]) == {BODY, SLEEVE}
 
 
 def changed(two: Files, path: Path, change) -> Path:
@@ -296,7 +301,7 @@ def test_what_takes_one_mesh(two, tmp_path, monkeypatch, capfd, verb, options, t
     assert files(tmp_path) == {}
 
 
-def test_a_disk_that_lacks_the_room_is_said_before_anything_is_recorded(two, tmp_path, capfd):
-    sentence = Refusal(tmp_path, capfd)("record", two.rig, tmp_path / "r", "--all", "--poses", 10**11)
+def test_a_full_disk_is_refused_before_anything_is_recorded(two, tmp_path, capfd):
+    sentence = Refusal(tmp_path, capfd)("record", two.rig, tmp_path / "r", "--all", "--poses", 10**11, status=TRY_AGAIN)
     assert f"Cannot write the recording '{tmp_path / 'r' / BODY}': it takes 745" in sentence
     assert sentence.endswith(" GB left; make room, record fewer poses, or choose another folder.")

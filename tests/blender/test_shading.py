@@ -7,14 +7,16 @@ import bmesh
 import bpy
 import numpy as np
 import pytest
-from conftest import run
-from scene_state import drain
 
 from fdda_addon.core.skinning import LinearLayer
 from fdda_addon.core.surface import Surface
-from fdda_addon.evaluation import EvaluationSettings, evaluate
+from fdda_addon.evaluation.run import EvaluationSettings, evaluate
+from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene.mesh import topology
-from fdda_addon.scene.rig import SceneRig, read_rig
+from fdda_addon.scene.scene_rig import SceneRig
+
+from .conftest import run
+from .scene_state import drain
 
 EDGES = ["across", "beside", "inside", "ratio"]
 APPROXIMATE = 0.05

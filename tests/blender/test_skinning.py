@@ -6,12 +6,14 @@ from collections.abc import Callable
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW, evaluated, pose
 
+from blend_fixtures.elbow import build_elbow
 from fdda_addon.core.rig import UNMOVED
 from fdda_addon.core.skinning import LinearLayer
-from fdda_addon.elbow import build_elbow
-from fdda_addon.scene.rig import PoseEvaluator, find_rig, read_rig
+from fdda_addon.rig.reading import PoseEvaluator, read_rig
+from fdda_addon.scene.scene_rig import find_rig
+
+from .conftest import ELBOW, evaluated, pose
 
 EXACT = 2e-6
 

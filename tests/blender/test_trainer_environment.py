@@ -11,15 +11,17 @@ from pathlib import Path
 
 import bpy
 import pytest
-from conftest import run
-from tiny_wheels import pinned, write_wheel, write_wheels
 
 from fdda_addon.core.errors import TrainerEnvironmentError
-from fdda_addon.operators.trainer_environment import FDDA_OT_create_trainer_environment, _watch
-from fdda_addon.trainer_environment import choice, creation, folder, session
-from fdda_addon.trainer_environment.choice import Origin
-from fdda_addon.trainer_environment.creation import Creation
-from fdda_addon.trainer_environment.folder import FolderState
+from fdda_addon.jobs.job import ENVIRONMENT, Run, current, state_of, stop
+from fdda_addon.operators.trainer_environment import FDDA_OT_create_trainer_environment, begin
+from fdda_addon.training.environment import choice, creation, folder, session
+from fdda_addon.training.environment.choice import Origin
+from fdda_addon.training.environment.creation import Creation
+from fdda_addon.training.environment.folder import FolderState
+
+from .conftest import run
+from .tiny_wheels import pinned, write_wheel, write_wheels
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -29,7 +31,8 @@ def user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The add-on's own files lie in a folder of the test, and no variable names a Python."""
     monkeypatch.setattr(folder, "user_folder", lambda: tmp_path / "user")
     monkeypatch.delenv(choice.PYTHON_VARIABLE, raising=False)
-    session.stop()
+    stop("of another test", ENVIRONMENT)
+    session.remember(None)
     return tmp_path / "user"
 
 
@@ -185,7 +188,7 @@ def test_a_python_that_cannot_make_one(user: Path, wheels: Path, tmp_path: Path)
 
 
 def test_a_second_blender_waits(user: Path, own: Path):
-    code = "import sys; from pathlib import Path; from fdda_addon.trainer_environment.folder import claimed\n"
+    code = "import sys; from pathlib import Path; from fdda_addon.training.environment.folder import claimed\n"
     code += "with claimed(Path(sys.argv[1])): print('mine', flush=True); sys.stdin.read()"
     with subprocess.Popen(
         [sys.executable, "-c", code, own], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -206,16 +209,23 @@ def wait_for(condition, seconds: float = 60.0) -> None:
         time.sleep(0.02)
 
 
+def begin_creation(job: Creation) -> Run:
+    """As the button does in a window."""
+    return begin(
+        "create_trainer_environment", "Create", job.steps(), job.cancel, FDDA_OT_create_trainer_environment.keep
+    )
+
+
 def test_cancelled_it_ends_at_once_and_leaves_nothing(user: Path, wheels: Path):
     job = Creation(folder.own_folder(), folder.log_path(), wheels, sys.executable)
-    session.start(session.Task("Create", job.steps(), job.cancel, FDDA_OT_create_trainer_environment.keep))
-    assert not bpy.ops.fdda.create_trainer_environment.poll()
+    run = begin_creation(job)
+    assert not bpy.ops.fdda.create_trainer_environment.poll() and not run.work(0)
     wait_for(lambda: folder.own_folder().is_dir())
     process = job._process
     assert bpy.ops.fdda.cancel_trainer_environment() == {"FINISHED"}
-    wait_for(lambda: session.task.outcome is not None, 10)
+    wait_for(lambda: run.work(0), 10)
     assert process is None or process.poll() is not None
-    assert _watch() is None and session.task is None
+    assert current(ENVIRONMENT) is None and run.state.outcome == session.notice.message
     assert session.notice.level == "WARNING" and "was cancelled; nothing is left of it" in session.notice.message
     assert session.own_state() is FolderState.MISSING
     assert not bpy.ops.fdda.cancel_trainer_environment.poll()
@@ -233,18 +243,19 @@ def test_unregistering_ends_what_is_under_way(user: Path, wheels: Path):
     import fdda_addon
 
     job = Creation(folder.own_folder(), folder.log_path(), wheels, sys.executable)
-    session.start(session.Task("Create", job.steps(), job.cancel, FDDA_OT_create_trainer_environment.keep))
+    begin_creation(job).work(0)
     wait_for(lambda: folder.own_folder().is_dir())
     fdda_addon.unregister()
-    assert session.task is None and choice.preferred_python is None and not folder.own_folder().exists()
+    assert current(ENVIRONMENT) is None and choice.preferred_python is None and not folder.own_folder().exists()
 
 
 def test_a_check_in_the_background_is_kept(own: Path):
     python = choice.chosen_python()
-    steps = iter([choice.ping(python)])
-    session.start(session.Task("Check", steps, None, session.remember))
-    wait_for(lambda: session.task.outcome is not None)
-    assert _watch() is None
+    steps = (choice.ping(python) for _ in range(1))
+    run = begin("check_trainer", "Check", steps, None, session.remember)
+    assert not run.work(0) and not run.state.can_cancel and not bpy.ops.fdda.cancel_trainer_environment.poll()
+    wait_for(lambda: run.work(0))
+    assert state_of("check_trainer").outcome == session.answer.message
     assert session.answer.level == "INFO" and session.notice is None
 
 

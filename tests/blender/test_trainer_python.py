@@ -6,14 +6,15 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import run
-from tiny_wheels import TORCH
 
-from fdda_addon.trainer_environment import bases, check
-from fdda_addon.trainer_environment.answer import Answer
-from fdda_addon.trainer_environment.bases import ask, find_bases
-from fdda_addon.trainer_environment.choice import PYTHON_VARIABLE
-from fdda_addon.trainer_environment.folder import PACKAGES
+from fdda_addon.training.environment import bases, check
+from fdda_addon.training.environment.answer import Answer
+from fdda_addon.training.environment.bases import ask, find_bases
+from fdda_addon.training.environment.choice import PYTHON_VARIABLE
+from fdda_addon.training.environment.folder import PACKAGES
+
+from .conftest import run
+from .tiny_wheels import TORCH
 
 ADVICE = "do this"
 

@@ -7,14 +7,15 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, predicted, run
-from training_in_one import train_all
 
 import fdda_addon
 from blend_fixtures.characters.transforms import CENTIMETRES, TRANSFORMS
-from fdda_addon.cli.files import save_copy
 from fdda_addon.runtime.binding import bind
-from fdda_addon.scene.rig import armature_modifier, find_rig
+from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.scene_rig import armature_modifier, find_rig
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, predicted, run
+from .training_in_one import train_all
 
 POSES = ((0.3, -0.2, 0.1), (1.2, 0.5, -0.4), (1.9, 0.1, 0.6))
 """Radians: the bend of the lower bone, two turns of the upper one."""

@@ -6,7 +6,7 @@ import sys
 import zipfile
 from pathlib import Path
 
-from fdda_addon.trainer_environment.folder import PACKAGES, pins
+from fdda_addon.training.environment.folder import PACKAGES, pins
 
 TORCH = """__version__ = "{version}"
 class cuda:

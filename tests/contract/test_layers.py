@@ -5,52 +5,19 @@ Imports inside functions count too: a rule that a late import gets around is no 
 """
 
 import ast
+import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from .floors import ADDON, FLOORS, ROOT, import_graph, imported_names, module_of, room_graph
 
 STANDARD = sys.stdlib_module_names
 BLENDER = {"bpy", "bpy_extras", "mathutils", "bmesh", "gpu", "gpu_extras", "blf", "idprop"}
-
-# The layers of fdda_addon, lowest first. A module may import from its own layer and from those below; whatever is in
-# no other layer (recording, training, evaluation, runtime, arm, …) does the work: WORK.
-LAYERS = (
-    {"core"},
-    {"scene"},
-    (WORK := set()),
-    {"settings", "properties", "preferences", "operators"},
-    {"panels", "cli", "demo", "__main__", "__init__"},
-)
-
-
-def imported_names(file: Path) -> Iterator[str]:
-    """Absolute dotted names of everything that a file imports, relative imports resolved."""
-    package = list(file.relative_to(ROOT).with_suffix("").parts[:-1])
-    for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) - node.level + 1] if node.level else []
-            base += node.module.split(".") if node.module else []
-            # `from . import name` imports the module name; elsewhere the last part may be a class, which does no harm.
-            yield from (".".join([*base, alias.name]) for alias in node.names)
-
-
-def unit_of(name: str) -> str:
-    """The part of fdda_addon that a dotted name belongs to: 'core', 'recording', …, or '__init__'."""
-    parts = name.split(".")
-    return parts[1] if len(parts) > 1 else "__init__"
-
-
-def layer_of(unit: str) -> int:
-    return next((index for index, units in enumerate(LAYERS) if unit in units), LAYERS.index(WORK))
 
 
 def python_files(folder: str) -> list[Path]:
@@ -84,33 +51,82 @@ def test_the_trainer_needs_no_blender():
 
 def test_the_trainer_uses_only_the_core_of_the_addon():
     names = [(file.name, name) for file in python_files("trainer") for name in imported_names(file)]
-    assert [pair for pair in names if pair[1].startswith("fdda_addon") and unit_of(pair[1]) != "core"] == []
+    assert [
+        pair for pair in names if f"{pair[1]}.".startswith("fdda_addon.") and "fdda_addon.core." not in pair[1]
+    ] == []
+
+
+def test_the_farm_needs_no_blender_and_only_its_engine_needs_dask():
+    allowed = {"dask", "distributed", "fdda_addon", "farm"}
+    assert foreign_imports("farm", allowed) == []
+    importing = {file.name for file in python_files("farm") for name in imported_names(file) if "distributed" in name}
+    assert importing == {"cluster.py"}
+
+
+def test_the_farm_uses_only_the_core_of_the_addon():
+    names = {name for file in python_files("farm") for name in imported_names(file) if name.startswith("fdda_addon")}
+    assert names and [name for name in sorted(names) if not name.startswith("fdda_addon.core.")] == []
+
+
+def test_importing_the_farm_needs_no_dask():
+    """`farm --task` runs on the workers of other engines, and the add-on's verb starts it only when it is asked to."""
+    modules = [module_of(file) for file in python_files("farm") if file.name != "__main__.py"]
+    blocked = f"import sys; sys.modules.update(dict.fromkeys({sorted(BLENDER | {'dask', 'distributed', 'torch'})}))"
+    command = [sys.executable, "-c", f"{blocked}\nimport {', '.join(modules)}"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+
+
+def test_shards_are_merged_without_blender(tmp_path):
+    blocked = f"import sys; sys.modules.update(dict.fromkeys({sorted(BLENDER)}))"
+    verb = "from fdda_addon.cli.main import main; sys.exit(main(['merge-recordings', 'no', 'out'], 'fdda'))"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", f"{blocked}\n{verb}"]
+    result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert result.stderr == "Error: 'no' is not a recording: it has no recording.json; make one with record.\n"
 
 
 def test_the_examples_need_nothing_of_ours():
     assert foreign_imports("examples", {"numpy", "onnxruntime"}) == []
 
 
-def test_imports_in_the_addon_point_one_way():
-    wrong = []
-    for file in python_files("fdda_addon"):
-        unit = file.relative_to(ROOT / "fdda_addon").parts[0].removesuffix(".py")
-        for name in imported_names(file):
-            if name.startswith("fdda_addon") and layer_of(unit_of(name)) > layer_of(unit):
-                wrong.append(f"{file.relative_to(ROOT)} imports {name}, of a layer above")
+def test_every_file_of_the_addon_is_in_a_room():
+    rooms = {room for floor in FLOORS for room in floor}
+    assert set(room_graph()) == rooms
+
+
+def test_imports_in_the_addon_point_down():
+    floor_of = {room: number for number, floor in enumerate(FLOORS) for room in floor}
+    wrong = [
+        f"{room} imports from {other}, which is not below it"
+        for room, imported in room_graph().items()
+        for other in imported
+        if floor_of[other] <= floor_of[room]
+    ]
     assert wrong == []
 
 
-def test_parts_of_the_addon_do_not_import_in_a_circle():
-    graph: dict[str, set[str]] = {}
-    for file in python_files("fdda_addon"):
-        unit = file.relative_to(ROOT / "fdda_addon").parts[0].removesuffix(".py")
-        imported = {unit_of(name) for name in imported_names(file) if name.startswith("fdda_addon")}
-        graph.setdefault(unit, set()).update(imported - {unit})
+@pytest.mark.parametrize("folder", ["fdda_addon", "trainer", "farm"])
+def test_files_do_not_import_in_a_circle(folder):
     try:
-        TopologicalSorter(graph).prepare()
+        TopologicalSorter(import_graph(folder)).prepare()
     except CycleError as error:
         pytest.fail(" imports ".join(reversed(error.args[1])))
+
+
+def test_only_registration_and_entry_points_are_loose():
+    assert sorted(file.name for file in ADDON.glob("*.py")) == ["__init__.py", "__main__.py", "registration.py"]
+
+
+def test_packages_are_docstrings_and_lists_of_modules():
+    """What a package's file imports is imported with any of its modules: Blender starts without numpy."""
+    heavy = [
+        module
+        for module, imported in import_graph("fdda_addon").items()
+        if (ROOT / Path(*module.split("."))).is_dir() and imported and module != "fdda_addon"
+    ]
+    assert heavy == []
 
 
 def test_the_addon_imports_itself_relatively():
@@ -126,7 +142,8 @@ def test_the_addon_imports_itself_relatively():
 
 
 def test_the_addon_and_its_core_import_without_blender():
-    modules = ["fdda_addon"] + [f"fdda_addon.core.{file.stem}" for file in python_files("fdda_addon/core")]
+    files = [ROOT / "fdda_addon/__init__.py", *python_files("fdda_addon/core")]
+    modules = [module_of(file) for file in files]
     blocked = f"import sys; sys.modules.update(dict.fromkeys({sorted(BLENDER)}))"
     command = [sys.executable, "-c", f"{blocked}\nimport {', '.join(modules)}"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -139,12 +156,23 @@ def test_importing_the_addon_costs_nothing():
     assert result.stdout.strip() == "[]"
 
 
-def test_ctrl_c_waits_in_every_module_whose_functions_blender_calls():
-    """Blender prints what leaves a handler and goes on: a Ctrl-C that is raised there is lost."""
-    handlers = {
-        ".".join(file.relative_to(ROOT / "fdda_addon").with_suffix("").parts)
-        for file in python_files("fdda_addon")
-        if re.search(r"^@persistent$", file.read_text(), re.MULTILINE)
+def test_only_registration_adds_handlers():
+    """What is added elsewhere is in no table: nothing removes it, and a Ctrl-C that strikes there is lost."""
+    users = {
+        f.relative_to(ADDON).as_posix()
+        for f in python_files("fdda_addon")
+        if "getattr(bpy.app.handlers" in f.read_text()
     }
-    text = (ROOT / "fdda_addon/cli/interruption.py").read_text()
-    assert handlers and [name for name in sorted(handlers) if f'"{name}"' not in text] == []
+    assert users == {"registration.py"}
+    assert [
+        str(file)
+        for file in python_files("fdda_addon")
+        if re.search(r"app\.handlers\.\w+\.(append|insert|remove)", file.read_text())
+    ] == []
+
+
+def test_one_file_reads_and_writes_arrays_of_blender():
+    """There their type and shape are stated and checked; elsewhere Blender would convert them, or take half of them."""
+    files = [file for file in python_files("fdda_addon") if "foreach_" in file.read_text("utf-8")]
+    found = {file.relative_to(ADDON).as_posix() for file in files}
+    assert found == {"scene/arrays.py"}

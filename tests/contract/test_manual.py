@@ -9,19 +9,21 @@ from pathlib import Path
 
 import pytest
 
+from fdda_addon.core import defaults
+from fdda_addon.panels import MODULES as SECTIONS
+
 ROOT = Path(__file__).resolve().parents[2]
 ADDON = ROOT / "fdda_addon"
 MANUAL = (ROOT / "docs" / "manual.md").read_text(encoding="utf-8")
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 INTERFACE = [
     *(ADDON / "panels").glob("*.py"),
     *(ADDON / "operators").glob("*.py"),
-    *(ADDON / name for name in ("preferences.py", "properties.py", "settings.py", "evaluation_view.py")),
+    *sorted((ADDON / "properties").glob("*.py")),
     ROOT / "trainer" / "page.py",
 ]
 SENTENCES = list(ADDON.rglob("*.py"))
-SECTIONS = ("rig", "poses", "recording", "training", "playback", "evaluation", "models")
 TOLD_ELSEWHERE = {"bold"}
 """What the manual sets in bold to show what bold means."""
 
@@ -112,9 +114,11 @@ def properties() -> dict[str, dict]:
                 text = [template(keyword.value) for keyword in node.keywords if keyword.arg == "text"]
                 if ast.unparse(node.args[0]) == "settings" and text and text[0]:
                     shown[template(node.args[1])] = text[0]
-    for node in ast.walk(tree(ADDON / "settings.py")):
+    for node in ast.walk(tree(ADDON / "properties" / "character.py")):
         if isinstance(node, ast.AnnAssign) and isinstance(node.annotation, ast.Call):
             values = {k.arg: k.value.value for k in node.annotation.keywords if isinstance(k.value, ast.Constant)}
+            names = {k.arg: k.value.id for k in node.annotation.keywords if isinstance(k.value, ast.Name)}
+            values |= {argument: getattr(defaults, name) for argument, name in names.items() if hasattr(defaults, name)}
             found[shown.get(node.target.id, values.get("name"))] = values
     return found
 

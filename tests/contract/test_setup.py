@@ -101,6 +101,27 @@ def test_a_set_up_that_fails_leaves_no_stamp(tmp_path: Path, monkeypatch: pytest
     assert not (tmp_path / environment.STAMP).exists()
 
 
+def test_a_folder_without_a_python_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made: list[tuple[Path, str]] = []
+    monkeypatch.setattr(environment, "make", lambda folder, contents: made.append((folder, contents)))
+    monkeypatch.setattr(sys, "argv", ["environment.py", "make", str(tmp_path), "blender"])
+    assert environment.main() == 0
+    assert made == [(tmp_path, "blender")]
+
+
+def test_an_environment_that_a_link_leads_to_is_left_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Working trees may share one: making it anew through the link would empty it for all of them."""
+    shared, link = tmp_path / "shared", tmp_path / ".venv"
+    (shared / "bin").mkdir(parents=True)
+    (shared / "bin" / "python").write_text("in use")
+    (shared / environment.STAMP).write_text("of other requirements")
+    link.symlink_to(shared)
+    monkeypatch.setattr(environment, "run", lambda *_, **__: pytest.fail("a step was run"))
+    with pytest.raises(environment.SetupError, match=r"\.venv is a link to '.*shared' and is not up to date"):
+        environment.make(link, "everything")
+    assert (shared / "bin" / "python").read_text() == "in use" and (shared / environment.STAMP).exists()
+
+
 def test_uv_is_told_what_pip_was_told(monkeypatch: pytest.MonkeyPatch):
     for name in environment.UV_SETTINGS.values():
         monkeypatch.delenv(name, raising=False)
@@ -117,7 +138,7 @@ def test_uv_is_told_what_pip_was_told(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("version", PINS)
-def test_every_package_is_pinned_and_nothing_else_is_said(version: str):
+def test_requirement_files_hold_pins_alone(version: str):
     lines = [line for line in PINS[version].splitlines() if not line.startswith("#")]
     assert len(lines) > 20
     assert [line for line in lines if not re.fullmatch(r"[a-z0-9.-]+==[a-z0-9.]+", line)] == []
@@ -135,6 +156,14 @@ def test_the_pins_are_what_the_project_asks_for(version: str):
 def test_the_groups_of_an_environment_exist():
     for groups, _ in environment.CONTENTS.values():
         assert set(groups) <= set(PROJECT["dependency-groups"])
+
+
+def test_the_farm_is_in_no_environment_but_its_own():
+    assert [name for name, (groups, _) in environment.CONTENTS.items() if "farm" in groups] == ["farm"]
+    farm = {requirement.partition("==")[0] for requirement in PROJECT["dependency-groups"]["farm"]}
+    others = {name for group, own in PROJECT["dependency-groups"].items() if group != "farm" for name in own}
+    assert farm and not farm & {requirement.partition("==")[0] for requirement in others}
+    assert "farm" not in (ROOT / "setup/package.py").read_text(), "nor in the extension"
 
 
 def test_make_alone_prints_a_line_for_each_target():

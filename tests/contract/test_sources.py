@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = (
     "fdda_addon",
     "trainer",
+    "farm",
     "benchmarks",
     "tests",
     "blend_fixtures",

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from limb import record_limb
+
+from .limb import record_limb
 
 SMALL_DISK = 64 << 10
 """Bytes on the disk of `small_disk`."""

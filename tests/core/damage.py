@@ -7,7 +7,7 @@ import struct
 import pytest
 
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.recording import read_recording
+from fdda_addon.core.recording.reader import read_recording
 
 
 def refused(path, *words: str) -> None:

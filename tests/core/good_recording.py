@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from fdda_addon.core.checks.recording import check_recording
 from fdda_addon.core.controls import Control
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.poses import Channel
-from fdda_addon.core.recording import Recording, RecordingInfo, Sampling, Source
-from fdda_addon.core.recording_check import check_recording
+from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
+from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from fdda_addon.core.skinning import LinearLayer
 

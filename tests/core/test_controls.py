@@ -5,16 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from limb import CHANNELS, make_rig, random_poses, random_residuals, recording_info
-from tiny_model import tiny_info
 
 from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.model import ModelInfo, ModelPartition
 from fdda_addon.core.partition import make_partitions
-from fdda_addon.core.recording import read_recording
-from fdda_addon.core.recording_extension import RecordingExtension
-from fdda_addon.core.recording_writer import RecordingWriter
+from fdda_addon.core.recording.extension import RecordingExtension
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.writer import RecordingWriter
+
+from .limb import CHANNELS, make_rig, random_poses, random_residuals, recording_info
+from .tiny_model import tiny_info
 
 SMILE = Control("shape_keys", 'key_blocks["Smile"].value', 0.0, 1.0)
 FIST = Control("armature_object", 'pose.bones["hand.L"]["fist"]', -1.0, 1.0)
@@ -88,4 +89,4 @@ def test_a_model_with_a_partition_of_an_unknown_control_is_refused():
 
 def test_names_tell_controls_apart():
     assert SMILE.name == 'shape_keys/key_blocks["Smile"].value'
-    assert len({SMILE.name, FIST.name, *(c.bone for c in CHANNELS)}) == 4
+    assert len({SMILE.name, FIST.name, *(c.name for c in CHANNELS)}) == 4

@@ -2,9 +2,10 @@
 """What networks see of a pose, against the formula."""
 
 import numpy as np
-from limb import JOINTS, make_rig, random_poses, random_transforms
 
 from fdda_addon.core.features import joint_features
+
+from .limb import JOINTS, make_rig, random_poses, random_transforms
 
 
 def features_by_hand(pose: np.ndarray, rest: np.ndarray) -> np.ndarray:

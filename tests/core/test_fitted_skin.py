@@ -8,16 +8,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from damage import edit, refused
-from limb import make_rig, partitions_of, random_poses, random_residuals, recording_info
-from tiny_model import J, V, tiny_info, tiny_model
 
 from fdda_addon.core.errors import ModelError, OutputError, RecordingError
-from fdda_addon.core.fit_folder import FitPosesWriter, read_fit_poses
 from fdda_addon.core.model import SKIN_KEY, read_model, read_skin
-from fdda_addon.core.recording import read_recording
-from fdda_addon.core.recording_writer import RecordingWriter
+from fdda_addon.core.recording.fit_folder import FitPosesWriter, read_fit_poses
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.skin_fit import Gain, SkinFit, skin_from_text, skin_to_text
+
+from .damage import edit, refused
+from .limb import make_rig, partitions_of, random_poses, random_residuals, recording_info
+from .tiny_model import J, V, tiny_info, tiny_model
 
 FIT = SkinFit(
     "smooth",

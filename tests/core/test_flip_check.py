@@ -5,10 +5,11 @@ import re
 
 import numpy as np
 import pytest
-from good_recording import BONE, JOINTS, LIMIT, good_recording, only, warned, with_partitions
 
-from fdda_addon.core.flip_check import alike_poses
-from fdda_addon.core.recording import Recording
+from fdda_addon.core.checks.flips import alike_poses
+from fdda_addon.core.recording.reader import Recording
+
+from .good_recording import BONE, JOINTS, LIMIT, good_recording, only, warned, with_partitions
 
 
 def flipping(poses: int, reach: float, jump: float, seed: int = 0) -> Recording:

@@ -7,13 +7,15 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import SMALL_DISK
-from limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
 
 from fdda_addon.core.errors import OutputError
 from fdda_addon.core.output import write_text
-from fdda_addon.core.recording import read_index, read_recording
-from fdda_addon.core.recording_writer import RecordingWriter
+from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.writer import RecordingWriter
+
+from .conftest import SMALL_DISK
+from .limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
 
 ROOT = Path(__file__).resolve().parents[2]
 FULL = "No space left on device"
@@ -66,10 +68,9 @@ def test_a_disk_that_fills_up_while_recording_leaves_what_was_complete(small_dis
 LIMITED = """
 import resource, sys
 from pathlib import Path
-sys.path.insert(0, sys.argv[2])
-from limb import record_limb
 from fdda_addon.core.errors import OutputError
 from fdda_addon.core.output import write_text
+from tests.core.limb import record_limb
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 folder = Path(sys.argv[1])
 for job in (lambda: record_limb(folder / "recording", 500), lambda: write_text(folder / "old.txt", "x" * 30_000)):
@@ -83,7 +84,7 @@ for job in (lambda: record_limb(folder / "recording", 500), lambda: write_text(f
 @pytest.mark.skipif(sys.platform == "win32", reason="no such limit")
 def test_files_that_may_not_grow(tmp_path):
     (tmp_path / "old.txt").write_text("old")
-    command = [sys.executable, "-c", LIMITED, str(tmp_path), str(Path(__file__).parent)]
+    command = [sys.executable, "-c", LIMITED, str(tmp_path)]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.stdout.splitlines() == [
         f"Cannot write the recording '{tmp_path}/recording': File too large; make room or choose another folder.",

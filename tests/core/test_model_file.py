@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from limb import make_rig
 from onnx import TensorProto, helper
-from tiny_model import constant, external, in_subgraph, tiny_info, tiny_model
 
 from fdda_addon.core.errors import ModelError
 from fdda_addon.core.model import ModelInfo, ModelPartition, check_rig, read_model, read_model_info
 from fdda_addon.core.poses import Channel
+
+from .limb import make_rig
+from .tiny_model import constant, external, in_subgraph, tiny_info, tiny_model
 
 
 def save(tmp_path, model) -> os.PathLike:
@@ -62,21 +63,28 @@ def test_metadata_keys():
     assert np.shape(value["training_ranges"]["low"]) == np.shape(value["training_ranges"]["high"]) == (3, 12)
 
 
+def test_what_a_frame_reads_comes_back_and_must_be_a_size(tmp_path):
+    assert json.loads(tiny_info(constant_bytes=1234).to_json())["constant_bytes"] == 1234
+    assert read_model_info(save(tmp_path, tiny_model(metadata(constant_bytes=1234)))).constant_bytes == 1234
+    assert read_model_info(save(tmp_path, tiny_model())).constant_bytes == 0
+    refused(save(tmp_path, tiny_model(metadata(constant_bytes=-1))), "its constants are said to take -1 bytes")
+
+
 def test_metadata_without_numbers_is_not_written():
     with pytest.raises(ValueError, match="not JSON compliant"):
         tiny_info(parity_mm=float("nan")).to_json()
 
 
 def test_no_file(tmp_path):
-    refused(tmp_path / "none.onnx", "cannot be read: No such file or directory; train it first")
+    refused(tmp_path / "none.onnx", "cannot be read: No such file or directory; give one that train made")
 
 
 def test_a_folder(tmp_path):
-    refused(tmp_path, "is not a model: it is no file")
+    refused(tmp_path, "cannot be read: Is a directory")
 
 
 def test_a_device_that_never_ends():
-    refused(Path("/dev/zero"), "is not a model: it is no file")
+    refused(Path("/dev/zero"), "cannot be read: it is no ordinary file")
 
 
 @pytest.mark.parametrize("data", [b"", b"blender", bytes(500)])
@@ -156,19 +164,19 @@ def test_metadata_that_contradicts_itself(tmp_path, changes, words):
 
 def test_graph_that_contradicts_the_metadata(tmp_path):
     two = replace(tiny_info(), partitions=(ModelPartition(0, (), 5, 0),), vertex_count=5)
-    refused(save(tmp_path, tiny_model(two.to_json())), "The output 'positions'", "does not fit its 5 vertices")
+    refused(save(tmp_path, tiny_model(two.to_json())), "its output 'positions'", "does not fit its 5 vertices")
     one = tiny_info(
         joints=tiny_info().joints[:1],
         partitions=(ModelPartition(0, (), 4, 0),),
         **{name: getattr(tiny_info(), name)[:1] for name in ("rest_matrices", "feature_low", "feature_high")},
     )
-    refused(save(tmp_path, tiny_model(one.to_json())), "The input 'pose_matrices'", "does not fit its 1 joints")
+    refused(save(tmp_path, tiny_model(one.to_json())), "its input 'pose_matrices'", "does not fit its 1 joints")
 
 
 def test_a_model_without_our_input_or_output(tmp_path):
     model = tiny_model()
     model.graph.output[0].name = "vertices"
-    refused(save(tmp_path, model), "The output 'positions'")
+    refused(save(tmp_path, model), "its output 'positions'")
     model = tiny_model()
     model.graph.input[0].name = "pose"
     refused(save(tmp_path, model), "asks for inputs that no rig gives (pose)")

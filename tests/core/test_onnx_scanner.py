@@ -5,9 +5,10 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
-from tiny_model import J, V, constant, external, in_subgraph, tiny_info, tiny_model
 
 from fdda_addon.core.onnx_file import MAX_DEPTH, OnnxContents, read_onnx
+
+from .tiny_model import J, V, constant, external, in_subgraph, tiny_info, tiny_model
 
 CUSTOM = helper.make_node("Run", ["positions"], ["y"], domain="com.example")
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Files are replaced wholly or not at all, and a path that cannot be written is refused before the work."""
 
+import errno
 import json
 import os
 import subprocess
@@ -10,7 +11,15 @@ from pathlib import Path
 import pytest
 
 from fdda_addon.core.errors import OutputError
-from fdda_addon.core.output import check_folder_writable, check_writable, replacing, write_json, write_text
+from fdda_addon.core.output import (
+    check_folder_writable,
+    check_writable,
+    is_left_over,
+    replacing,
+    replacing_all,
+    write_json,
+    write_text,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -47,6 +56,53 @@ def test_json_without_numbers_leaves_the_old_file(tmp_path):
         write_json(path, {"mean": float("nan")})
     assert json.loads(path.read_text("utf-8")) == {"é": [1.5, None]}
     assert names(tmp_path) == ["a.json"]
+
+
+def test_names_of_temporary_files_cannot_be_foreseen_and_no_link_is_followed(tmp_path, monkeypatch):
+    path, victim = tmp_path / "a.json", tmp_path / "victim"
+    victim.write_text("precious")
+    (tmp_path / f".{os.getpid()}-a.json").symlink_to(victim)
+    seen = set()
+    for _ in range(20):
+        with replacing(path) as temporary:
+            seen.add(temporary.name)
+            temporary.write_text("new")
+    assert len(seen) == 20 and all(is_left_over(name) for name in seen)
+    assert victim.read_text() == "precious" and path.read_text() == "new"
+    # Even one who knows the name gains nothing.
+    monkeypatch.setattr("secrets.token_hex", lambda _: "0" * 12)
+    (tmp_path / f".fdda-{'0' * 12}.json").symlink_to(victim)
+    with pytest.raises(OutputError, match="File exists; nothing was changed"):
+        write_text(path, "mine")
+    assert victim.read_text() == "precious" and path.read_text() == "new"
+
+
+def test_files_that_belong_together_are_replaced_together(tmp_path):
+    paths = [tmp_path / name for name in ("a", "b", "c")]
+    for path in paths[:2]:
+        path.write_text("old")
+    with (
+        pytest.raises(OutputError, match=r"'.*a' with 'b', 'c': No space left on device; nothing was changed"),
+        replacing_all(*paths) as temporaries,
+    ):
+        for temporary in temporaries[:2]:
+            temporary.write_text("new")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert [path.read_text() for path in paths[:2]] == ["old", "old"] and names(tmp_path) == ["a", "b"]
+    with replacing_all(*paths) as temporaries:
+        for temporary in temporaries:
+            temporary.write_text("new")
+    assert [path.read_text() for path in paths] == ["new"] * 3 and names(tmp_path) == ["a", "b", "c"]
+
+
+def test_a_rename_that_fails_says_what_is_new(tmp_path):
+    paths = [tmp_path / "a", tmp_path / "b"]
+    with (
+        pytest.raises(OutputError, match=r"Is a directory; 'a' was replaced, and no other\.$"),
+        replacing_all(*paths),
+    ):
+        paths[1].mkdir()
+    assert names(tmp_path) == ["a", "b"]
 
 
 def test_a_new_file_has_the_usual_permissions(tmp_path):

@@ -2,9 +2,10 @@
 """Partitions by main joint, and the measure of how far a joint moves them."""
 
 import numpy as np
-from limb import INFLUENCING, VERTICES, make_rig, partitions_of
 
 from fdda_addon.core.partition import main_joints, make_partitions, partition_colors, residual_changes
+
+from .limb import INFLUENCING, VERTICES, make_rig, partitions_of
 
 
 def test_main_joint_has_the_largest_weight_and_the_first_wins_a_tie():

@@ -5,9 +5,10 @@ import json
 
 import numpy as np
 import pytest
-from damage import edit, refused
 
-from fdda_addon.core.recording import read_recording
+from fdda_addon.core.recording.reader import read_recording
+
+from .damage import edit, refused
 
 
 def test_a_recording_without_faces_is_read(recording):

@@ -7,16 +7,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from good_recording import BONE, JOINTS, LIMIT, good_recording, only, pose_rig, turns, warned, with_partitions, with_rig
 
-from fdda_addon.core import residual_scan
+from fdda_addon.core.checks import residual_scan
+from fdda_addon.core.checks.recording import NAMES, bone_lengths, check_recording, merges_in_words
+from fdda_addon.core.checks.warning import RecordingWarning, counted, length, listed
 from fdda_addon.core.controls import Control
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.poses import Channel
-from fdda_addon.core.recording import Recording, Source
-from fdda_addon.core.recording_check import NAMES, bone_lengths, check_recording, merges_in_words
-from fdda_addon.core.recording_warning import RecordingWarning, counted, length, listed
+from fdda_addon.core.recording.index import Source
+from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import UNMOVED, Joint
+
+from .good_recording import (
+    BONE,
+    JOINTS,
+    LIMIT,
+    good_recording,
+    only,
+    pose_rig,
+    turns,
+    warned,
+    with_partitions,
+    with_rig,
+)
 
 CHECKS = Path(__file__).resolve().parents[2] / "docs" / "checks.md"
 
@@ -41,7 +54,7 @@ def with_sources(recording: Recording, *sources: Source) -> Recording:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_nothing_is_said_of_a_good_recording(seed):
+def test_a_good_recording_has_no_warnings(seed):
     assert check_recording(good_recording(seed=seed)) == []
     assert check_recording(good_recording(poses=12, seed=seed)) == []
 
@@ -219,7 +232,7 @@ def test_a_joint_that_drives_another_is_not_dead(good):
     angles = np.random.default_rng(9).uniform(-1, 1, 200)
     driving = with_joint(good, Joint("target", 0), turns(angles))
     assert "dead-joints" in warned(driving)
-    channels = tuple(channel for channel in driving.info.sampling.channels if channel.bone != "hand")
+    channels = tuple(channel for channel in driving.info.sampling.channels if channel.name != "hand")
     sampling = replace(driving.info.sampling, channels=channels)
     driving = replace(driving, info=replace(driving.info, sampling=sampling))
     assert "dead-joints" in warned(driving)
@@ -287,7 +300,7 @@ def test_the_length_of_bones(good):
 
 
 def test_no_more_poses_are_read_than_are_needed(good, monkeypatch):
-    monkeypatch.setattr(residual_scan, "MOST_POSES", 50)
+    monkeypatch.setattr(residual_scan, "MAX_POSES", 50)
     monkeypatch.setattr(residual_scan, "SAMPLED_VERTICES", 40)
     scan = residual_scan.scan_residuals(good)
     assert len(scan.poses) == 50 and (scan.poses[0], scan.poses[-1]) == (0, 199)

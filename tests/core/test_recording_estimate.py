@@ -5,11 +5,12 @@ import os
 import shutil
 
 import pytest
-from limb import make_rig, record_limb
 
 from fdda_addon.core.errors import OutputError
-from fdda_addon.core.recording import read_recording
-from fdda_addon.core.recording_estimate import Estimate, check_room, recording_bytes, sizes_in_words
+from fdda_addon.core.recording.estimate import Estimate, check_room, recording_bytes, sizes_in_words
+from fdda_addon.core.recording.reader import read_recording
+
+from .limb import make_rig, record_limb
 
 
 @pytest.mark.parametrize(

@@ -5,12 +5,14 @@ import json
 
 import numpy as np
 import pytest
-from limb import make_rig, partitions_of, random_poses, random_residuals, recording_info
 
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.recording import INDEX, REFINED, Source, read_recording
-from fdda_addon.core.recording_extension import RecordingExtension
-from fdda_addon.core.recording_writer import RecordingWriter
+from fdda_addon.core.recording.extension import RecordingExtension
+from fdda_addon.core.recording.index import INDEX, REFINED, Source
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.writer import RecordingWriter
+
+from .limb import make_rig, partitions_of, random_poses, random_residuals, recording_info
 
 POSES, MORE = 12, 5
 

@@ -6,11 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from limb import JOINTS, make_rig, record_limb, recording_info
 
 from fdda_addon.core.errors import OutputError, RecordingError
-from fdda_addon.core.recording_folder import FolderContent, FolderState, read_folder, remove_recording
-from fdda_addon.core.recording_lock import LOCK
+from fdda_addon.core.recording.arrays import ARRAYS
+from fdda_addon.core.recording.folder import FolderContent, FolderState, read_folder, remove_recording
+from fdda_addon.core.recording.lock import LOCK, RecordingLock
+from fdda_addon.core.recording.writer import RecordingWriter
+
+from .good_recording import good_recording
+from .limb import JOINTS, make_rig, record_limb, recording_info
 
 POSES = 12
 SAMPLING = json.loads(json.dumps(recording_info(POSES).sampling.to_json()))
@@ -77,6 +81,33 @@ def test_removing_leaves_nothing_of_it_and_all_else(tmp_path):
     assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["with_notes", "with_notes/notes.txt"]
 
 
+def test_every_array_is_removed(tmp_path):
+    """Of a rig with controls too: what is left would refuse the next recording."""
+    path, recording = tmp_path / "r", good_recording(4)
+    info = replace(recording.info, complete=0)
+    with RecordingWriter(path, recording.rig, recording.partitions, info) as writer:
+        writer.append(recording.pose_matrices, recording.residuals, recording.controls)
+    assert (path / "controls.npy").exists()
+    assert {file.stem for file in path.glob("*.npy")} <= set(ARRAYS)
+    (path / f".fdda-{'0' * 12}.json").touch()
+    remove_recording(path)
+    assert not path.exists()
+
+
+LEFT_OVER = ("recording.lock", f".fdda-{'a1' * 6}.json", ".4711-recording.json")
+
+
+def test_what_a_first_write_left_that_was_killed_stops_nobody(tmp_path):
+    """A process that is killed while it writes the index for the first time leaves a file and no index."""
+    for name in LEFT_OVER:
+        (tmp_path / name).write_text("{")
+    assert look(tmp_path).state is FolderState.FREE
+    record_limb(tmp_path, POSES)
+    assert not {path.name for path in tmp_path.iterdir()} & set(LEFT_OVER)
+    (tmp_path / LEFT_OVER[1]).write_text("{")
+    assert look(tmp_path).state is FolderState.COMPLETE
+
+
 def test_nothing_to_remove(tmp_path):
     (tmp_path / "residuals.npy").write_text("of someone else")
     with pytest.raises(RecordingError, match="holds no recording; there is nothing to remove"):
@@ -86,13 +117,15 @@ def test_nothing_to_remove(tmp_path):
 
 def test_a_recording_that_is_being_written_is_not_removed(tmp_path):
     record_limb(tmp_path / "r", POSES)
-    (tmp_path / "r" / LOCK).write_text(json.dumps({"pid": 1, "host": "elsewhere"}))
+    lock = RecordingLock(tmp_path / "r")
+    lock.acquire()
     with pytest.raises(RecordingError, match="is recording into"):
         remove_recording(tmp_path / "r")
+    lock.release()
     assert look(tmp_path / "r").state is FolderState.COMPLETE
 
 
-def test_what_cannot_be_removed_is_said(tmp_path):
+def test_a_folder_that_cannot_be_removed_is_named(tmp_path):
     record_limb(tmp_path / "r", POSES)
     (tmp_path / "r" / "residuals.npy").unlink()
     (tmp_path / "r" / "residuals.npy").mkdir()

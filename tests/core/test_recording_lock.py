@@ -3,29 +3,58 @@
 
 import json
 import os
-import re
-import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from limb import make_rig, partitions_of, record_limb, recording_info
 
-from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.recording import read_index, read_recording
-from fdda_addon.core.recording_extension import RecordingExtension
-from fdda_addon.core.recording_lock import LOCK, RecordingLock
-from fdda_addon.core.recording_writer import RecordingWriter
+from fdda_addon.core.errors import OutputError, RecordingError
+from fdda_addon.core.recording.extension import RecordingExtension
+from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.lock import LOCK, RecordingLock
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.writer import RecordingWriter
+
+from .limb import make_rig, partitions_of, record_limb, recording_info
 
 ROOT = Path(__file__).resolve().parents[2]
 OTHER_PROCESS = """
 import sys
 from pathlib import Path
-from fdda_addon.core.recording_lock import RecordingLock
-RecordingLock(Path(sys.argv[1])).acquire()
+from fdda_addon.core.recording.lock import RecordingLock
+lock = RecordingLock(Path(sys.argv[1]))
+lock.acquire()
 print("locked", flush=True)
 sys.stdin.read()
+"""
+TAKERS = """
+import os, sys, time
+from pathlib import Path
+from fdda_addon.core.errors import RecordingError
+from fdda_addon.core.recording.lock import RecordingLock
+folder, marker = Path(sys.argv[1]), sys.argv[1] + "/held"
+end, won = time.monotonic() + 2, 0
+while time.monotonic() < end:
+    child = os.fork()
+    if not child:
+        # Takes the lock of one that is gone, and is gone without giving it back.
+        try:
+            lock = RecordingLock(folder)
+            lock.acquire()
+            os.close(os.open(marker, os.O_CREAT | os.O_EXCL))
+            time.sleep(0.001)
+            os.unlink(marker)
+            os._exit(0)
+        except RecordingError:
+            os._exit(1)
+        except FileExistsError:
+            os._exit(2)
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if status == 2:
+        sys.exit("two had it")
+    won += status == 0
+print(won)
 """
 
 
@@ -46,45 +75,63 @@ def write(path: Path, **options) -> RecordingWriter:
 
 
 def test_the_second_process_is_told_and_changes_nothing(other, tmp_path):
-    with pytest.raises(RecordingError, match=rf"Another Blender \(process {other.pid}\) is recording into"):
+    with pytest.raises(RecordingError, match=rf"Another Blender \(process {other.pid}\) is recording into") as error:
         write(tmp_path)
+    assert str(error.value).endswith("wait for it, or choose another folder.")
     assert [path.name for path in tmp_path.iterdir()] == [LOCK]
 
 
 def test_the_lock_of_a_process_that_is_gone_is_taken_over(other, tmp_path):
     other.kill()
     other.wait()
+    assert (tmp_path / LOCK).exists()
     with write(tmp_path):
         assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
     assert LOCK not in [path.name for path in tmp_path.iterdir()]
 
 
-def test_a_lock_of_another_machine_is_believed_and_can_be_removed(tmp_path):
-    (tmp_path / LOCK).write_text(json.dumps({"pid": 1, "host": "render-07"}))
-    with pytest.raises(RecordingError, match=re.escape("(process 1 on 'render-07')")) as error:
+def test_of_several_takers_of_a_dead_lock_one_gets_it(tmp_path):
+    (tmp_path / LOCK).write_text("{}")
+    command = [sys.executable, "-c", TAKERS, str(tmp_path)]
+    takers = [
+        subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(4)
+    ]
+    answers = [taker.communicate() for taker in takers]
+    assert [taker.returncode for taker in takers] == [0] * 4, answers
+    assert sum(int(out) for out, _ in answers) > 20
+
+
+OTHERS_LOCKS = {
+    "of another machine": json.dumps({"pid": 1, "host": "render-07"}),
+    "of the same number": json.dumps({"pid": os.getpid(), "host": os.uname().nodename}),
+    "empty, from a full disk": "",
+    "damaged": '{"pid": "x", "host": 1}',
+}
+
+
+@pytest.mark.parametrize("text", OTHERS_LOCKS.values(), ids=OTHERS_LOCKS)
+def test_what_a_file_says_that_nobody_has_locked_stops_nobody(tmp_path, text):
+    """Numbers of processes mean nothing in another container, or after a restart."""
+    (tmp_path / LOCK).write_text(text)
+    with write(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"pid": "x", "host": 1}', "x" * 5000, "[" * 900])
+def test_a_lock_that_names_nobody_holds_all_the_same(other, tmp_path, text):
+    (tmp_path / LOCK).write_text(text)
+    with pytest.raises(RecordingError, match=r"^Another process is recording into"):
         write(tmp_path)
-    assert str(error.value).endswith(f"remove '{LOCK}' there.")
-    (tmp_path / LOCK).unlink()
-    with write(tmp_path):
-        pass
 
 
-def test_a_lock_of_the_same_number_in_an_earlier_life_is_taken_over(tmp_path):
-    """Containers start with the same process numbers again."""
-    (tmp_path / LOCK).write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
-    with write(tmp_path):
-        pass
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"pid": "x", "host": 1}', '{"pid": -5, "host": "HOST"}'])
-def test_a_damaged_lock_holds_for_a_moment_only(tmp_path, text):
-    (tmp_path / LOCK).write_text(text.replace("HOST", socket.gethostname()))
-    if "-5" not in text:
-        with pytest.raises(RecordingError, match="Another process is recording"):
-            write(tmp_path)
-    os.utime(tmp_path / LOCK, (0, 0))
-    with write(tmp_path):
-        pass
+def test_a_lock_on_a_full_disk_holds(small_disk):
+    (small_disk / "ballast").write_bytes(b"x" * os.statvfs(small_disk).f_bavail * 4096)
+    lock = RecordingLock(small_disk)
+    lock.acquire()
+    with pytest.raises(RecordingError, match="This Blender is recording into"):
+        RecordingLock(small_disk).acquire()
+    lock.release()
+    assert not (small_disk / LOCK).exists()
 
 
 def test_one_process_does_not_write_a_recording_twice(tmp_path):
@@ -111,3 +158,19 @@ def test_a_lock_that_is_not_held_is_not_released(tmp_path):
     lock = RecordingLock(tmp_path)
     lock.release()
     assert not lock.is_held and (tmp_path / LOCK).exists()
+
+
+def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path):
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r" / LOCK).symlink_to(victim)
+    with pytest.raises(OutputError, match="Cannot write the recording"):
+        write(tmp_path / "r")
+    assert victim.read_text() == "precious" and victim.exists()
+
+
+def test_a_pipe_in_place_of_the_lock_blocks_nobody(tmp_path):
+    os.mkfifo(tmp_path / LOCK)
+    with pytest.raises(OutputError, match=rf"'{LOCK}' is no ordinary file"):
+        write(tmp_path)

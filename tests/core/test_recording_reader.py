@@ -6,10 +6,12 @@ import re
 
 import numpy as np
 import pytest
-from damage import array_file, edit, refused
 
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.recording import read_index, read_recording
+from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.reader import read_recording
+
+from .damage import array_file, edit, refused
 
 FIST = {"owner": "mesh_object", "path": '["fist"]', "low": 0, "high": 1}
 
@@ -142,7 +144,7 @@ def test_values_that_are_no_numbers(recording, name, value):
     array = np.load(recording / f"{name}.npy")
     array[11, 3, 1] = value
     np.save(recording / f"{name}.npy", array)
-    refused(recording, "holds values that are not numbers", f"({name}, poses 0 to 11)", "record again")
+    refused(recording, "holds values that are not numbers", f"({name}, pose 11)", "record again")
 
 
 @pytest.mark.parametrize("value", [np.nan, -0.5, 3.0])

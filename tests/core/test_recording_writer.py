@@ -6,7 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from limb import (
+
+from fdda_addon.core.errors import FDDAError, OutputError, RecordingError
+from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.writer import RecordingWriter
+
+from .limb import (
     INFLUENCING,
     JOINTS,
     make_rig,
@@ -16,10 +22,6 @@ from limb import (
     record_limb,
     recording_info,
 )
-
-from fdda_addon.core.errors import FDDAError, OutputError, RecordingError
-from fdda_addon.core.recording import read_index, read_recording
-from fdda_addon.core.recording_writer import RecordingWriter
 
 POSES = 12
 

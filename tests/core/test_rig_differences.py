@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from limb import JOINTS, make_rig
 
 from fdda_addon.core.rig import REST_TOLERANCE, Fingerprint, Joint, Rig, differences
+
+from .limb import JOINTS, make_rig
 
 
 def found(rig: Rig, **changes) -> list[str]:

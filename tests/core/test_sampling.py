@@ -68,7 +68,7 @@ def test_beyond_range_widens_about_the_middle():
     widened = beyond_range(CHANNELS, 2.5)
     found = [(c.low, c.high) for c in widened]
     np.testing.assert_allclose(found, [(-4, 6), (0.0625, 0.6875), (-0.035, 0.015)], atol=1e-12)
-    assert [(c.bone, c.kind, c.axis) for c in widened] == [(c.bone, c.kind, c.axis) for c in CHANNELS]
+    assert [(c.name, c.kind, c.axis) for c in widened] == [(c.name, c.kind, c.axis) for c in CHANNELS]
 
 
 def test_range_changes_name_the_bones():

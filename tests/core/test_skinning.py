@@ -3,9 +3,11 @@
 
 import numpy as np
 import pytest
-from limb import JOINTS, VERTICES, make_rig, partitions_of, random_poses, random_residuals, random_transforms
 
+from fdda_addon.core.errors import RigError
 from fdda_addon.core.skinning import LinearLayer, SkinBlock, skin_matrices
+
+from .limb import JOINTS, VERTICES, make_rig, partitions_of, random_poses, random_residuals, random_transforms
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +81,17 @@ def test_local_residuals_do_not_see_the_ancestors_move(rig):
 def test_a_joint_without_extent_has_no_local_residuals(rig):
     poses = random_poses(1)
     poses[0, 2, :3, :3] = 0
-    with pytest.raises(np.linalg.LinAlgError):
+    with pytest.raises(RigError, match=r"^Bone '.*' has a scale of zero in some pose; look for a constraint or driver"):
         LinearLayer(rig).local_residuals(poses, np.zeros((1, VERTICES, 3), np.float32))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 20])
+def test_a_pose_has_the_same_bits_among_any_number_of_others(rig, count):
+    poses, layer = random_poses(40), LinearLayer(rig)
+    positions = layer.positions(poses)
+    assert layer.positions(poses[:count]).tobytes() == positions[:count].tobytes()
+    residuals = layer.local_residuals(poses, positions + 0.01)
+    assert layer.local_residuals(poses[-count:], positions[-count:] + 0.01).tobytes() == residuals[-count:].tobytes()
 
 
 def test_skin_block_lists_the_joints_with_weight(rig):

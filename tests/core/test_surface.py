@@ -3,10 +3,11 @@
 
 import numpy as np
 import pytest
-from limb import make_rig, partitions_of
 
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.surface import Surface, SurfaceComparison, angles_between, are_faces, surface_errors
+
+from .limb import make_rig, partitions_of
 
 CUBE = np.float32([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 CUBE_FACES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]

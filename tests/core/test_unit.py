@@ -6,16 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from damage import edit, refused
-from limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
-from tiny_model import tiny_info
 
 from fdda_addon.core.metrics import distances, error_statistics
 from fdda_addon.core.model import ModelInfo
-from fdda_addon.core.recording import read_recording
-from fdda_addon.core.recording_extension import RecordingExtension
-from fdda_addon.core.recording_index import read_index
-from fdda_addon.core.recording_writer import RecordingWriter
+from fdda_addon.core.recording.extension import RecordingExtension
+from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.writer import RecordingWriter
+
+from .damage import edit, refused
+from .limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
+from .tiny_model import tiny_info
 
 BAD = (0, -0.01, float("nan"), float("inf"), "0.01", None, True, [0.01])
 

@@ -2,7 +2,6 @@
 """Two small models for the examples, trained once; one has a control and a joint that never moves."""
 
 import json
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,18 +10,16 @@ import numpy as np
 import pytest
 from mathutils import Euler, Matrix
 
+from fdda_addon.core.controls import Control
+from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
+from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.rig import UNMOVED, Joint
+from trainer.__main__ import main as train
+
+from ..trainer.chain import chain_angles, chain_residuals, chain_rig, pose_chain, write_chain
+
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "trainer")]
-
-from chain import chain_angles, chain_residuals, chain_rig, pose_chain, write_chain  # noqa: E402
-
-from fdda_addon.core.controls import Control  # noqa: E402
-from fdda_addon.core.partition import make_partitions  # noqa: E402
-from fdda_addon.core.recording import RecordingInfo, Sampling, Source  # noqa: E402
-from fdda_addon.core.recording_writer import RecordingWriter  # noqa: E402
-from fdda_addon.core.rig import UNMOVED, Joint  # noqa: E402
-from trainer.__main__ import main as train  # noqa: E402
-
 JOINTS, POSES = 4, 100
 CONTROL = Control("mesh_object", '["bulge"]', 0.25, 1.0)
 Turns = dict[str, tuple[float, float, float]]

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import CONTROL, ROOT, Character, expected_positions
 
 from fdda_addon.core.model import read_model_info
+
+from .conftest import CONTROL, ROOT, Character, expected_positions
 
 EXAMPLE = ROOT / "examples" / "python" / "play.py"
 TURNS = {"bone_0": (10.0, -70.0, 5.0), "bone_1": (40.0, 25.0, -30.0), "bone_3": (0.0, 0.0, 50.0)}
@@ -80,7 +81,7 @@ def test_what_follows_no_bone_stays(controlled: Character, tmp_path: Path):
     assert moved[still].max() < 1e-5 and np.median(moved[~still]) > 0.05
 
 
-def test_what_is_wrong_is_said_in_a_sentence(chain: Character, controlled: Character, tmp_path: Path):
+def test_bad_input_ends_with_one_sentence(chain: Character, controlled: Character, tmp_path: Path):
     other = tmp_path / "model.npy"
     for arguments, sentence in (
         (["--turn", "elbow", 1, 2, 3], "The model has no joint elbow; it has: bone_0, bone_1, bone_2, bone_3."),

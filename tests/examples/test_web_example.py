@@ -19,9 +19,10 @@ from threading import Thread
 import matplotlib.image
 import numpy as np
 import pytest
-from conftest import ROOT, Character, Turns, expected_positions
 
 from fdda_addon.core.model import read_model_info
+
+from .conftest import ROOT, Character, Turns, expected_positions
 
 WEB = ROOT / "examples" / "web"
 DRIVER = Path(__file__).parent / "drive_page.mjs"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Goes the whole path in a Blender with a window: `blender --python tests/gui/drive.py -- FOLDER`, started by run.py.
+"""Goes the whole path in a Blender with a window: `blender --python tests/gui/drive.py -- FOLDER STORY`, by run.py.
 
 Each step has its checks and leaves a picture in the folder. A step that fails says why and ends Blender with status 1.
 """
@@ -17,11 +17,13 @@ import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import story
-from window import picture, rest_mouse
+import path_story
+import work_story
+from window import StepError, picture, rest_mouse
 
-FOLDER = Path(sys.argv[sys.argv.index("--") + 1]).resolve()
-WATCH_SECONDS = 280
+FOLDER, NAME = Path(sys.argv[sys.argv.index("--") + 1]).resolve(), sys.argv[sys.argv.index("--") + 2]
+STEPS = {"path": path_story.STEPS, "work": work_story.STEPS}[NAME]
+WATCH_SECONDS = 590
 """All of it: a Blender that hangs is ended, and says where."""
 
 done: list[dict] = []
@@ -31,13 +33,13 @@ under_way = "starting"
 def steps() -> Iterator[float]:
     """Take all steps; seconds to wait."""
     global under_way
-    for number, step in enumerate(story.STEPS, 1):
+    for number, step in enumerate(STEPS, 1):
         under_way, began = step.__name__.replace("_", " "), time.monotonic()
         yield from step(FOLDER)
         shown = f"{number:02}_{step.__name__}.png"
         yield from rest_mouse()
         yield from picture(FOLDER / shown)
-        note({"step": under_way, "seconds": time.monotonic() - began, "picture": shown})
+        note({"step": under_way, "seconds": time.monotonic() - began, "picture": shown, "of": len(STEPS)})
 
 
 def note(entry: dict) -> None:
@@ -69,7 +71,7 @@ def tick(path: Iterator[float] = steps()) -> float | None:  # noqa: B008
         return next(path)
     except StopIteration:
         finish(0)
-    except story.StepError as error:
+    except StepError as error:
         print(f"Step '{under_way}' failed: {error}", file=sys.stderr, flush=True)
         give_up()
     except Exception:  # Blender would print it and stay open.
@@ -82,4 +84,6 @@ def tick(path: Iterator[float] = steps()) -> float | None:  # noqa: B008
 # Not a thread of Python: it would wait for ever where Blender does not let go of the interpreter.
 faulthandler.dump_traceback_later(WATCH_SECONDS, exit=True)
 bpy.context.preferences.view.show_splash = False
+# Without a window manager another window would lie over the first.
+bpy.context.preferences.view.filebrowser_display_type = "SCREEN"
 bpy.app.timers.register(tick, first_interval=1.0, persistent=True)

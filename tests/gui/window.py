@@ -110,10 +110,11 @@ def rest_mouse() -> Iterator[float]:
 
 
 def redraw() -> Iterator[float]:
-    """Draw the 3D View again."""
-    view_area().tag_redraw()
-    for each in view_area().regions:
-        each.tag_redraw()
+    """Draw the window again; a file browser may take all of it."""
+    for area in main_window().screen.areas:
+        area.tag_redraw()
+        for each in area.regions:
+            each.tag_redraw()
     yield DRAWING
 
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.poses import Channel
-from fdda_addon.core.recording import RecordingInfo, Sampling, Source
-from fdda_addon.core.recording_writer import RecordingWriter
+from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
+from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 
 LIMIT = 0.9

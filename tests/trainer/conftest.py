@@ -9,9 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from chain import write_chain
 
 from trainer.__main__ import main  # first of all: it says how threads wait, which torch reads when it loads
+
+from .chain import write_chain
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 QUICK = ("--epochs", "40", "--hidden", "24", "24", "--batch-size", "16")

@@ -22,7 +22,7 @@ def rms(values: np.ndarray) -> float:
 @pytest.mark.parametrize("poses, vertices", [(60, 50), (200, 20)], ids=["gram", "covariance"])
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-5, 1e-6])
 def test_as_few_shapes_as_the_tolerance_allows(poses, vertices, tolerance, monkeypatch):
-    monkeypatch.setattr(basis_module, "WORTHWHILE", 0)
+    monkeypatch.setattr(basis_module, "NEGLIGIBLE", 0)
     values = residuals(poses, vertices, 12)
     basis = make_basis(values, tolerance, np.random.default_rng(0))
     left = rms(values - basis.residuals(basis.coefficients(values)))
@@ -59,8 +59,8 @@ def test_a_constant_residual_needs_no_shape():
 
 
 def test_a_sample_of_the_poses_finds_the_same_shapes(monkeypatch):
-    monkeypatch.setattr(basis_module, "MOST_POSES", 50)
-    monkeypatch.setattr(basis_module, "WORTHWHILE", 0)
+    monkeypatch.setattr(basis_module, "MAX_POSES", 50)
+    monkeypatch.setattr(basis_module, "NEGLIGIBLE", 0)
     values = residuals(150, 60, 6)
     basis = make_basis(values, 1e-6, np.random.default_rng(0))
     assert rms(values - basis.residuals(basis.coefficients(values))) < 3e-6

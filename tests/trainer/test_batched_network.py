@@ -4,13 +4,14 @@
 import numpy as np
 import pytest
 import torch
-from chain import chain_angles
 
 from trainer.config import TrainingConfig
 from trainer.data import PartitionData, prepare, split_poses
 from trainer.loop import train
 from trainer.model import ACTIVATIONS, PartitionNetworks
 from trainer.process import Cancelled
+
+from .chain import chain_angles
 
 CONFIG = TrainingConfig(epochs=30, hidden=(16, 16), batch_size=16, tolerance_mm=0.01, learning_rate=0.01)
 

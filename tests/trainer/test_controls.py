@@ -9,16 +9,14 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-from chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
-from conftest import QUICK, run_page
 
 from fdda_addon.core.controls import Control
 from fdda_addon.core.errors import ModelError
 from fdda_addon.core.metrics import distances
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.partition import make_partitions
-from fdda_addon.core.recording import read_recording
-from fdda_addon.core.recording_writer import RecordingWriter
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearLayer
 from fdda_addon.runtime.network import Network
@@ -27,6 +25,9 @@ from trainer.config import TrainingConfig
 from trainer.data import split_recording
 from trainer.inputs import inputs_of_rig, middles
 from trainer.trust import make_trust_range
+
+from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
+from .conftest import QUICK, run_page
 
 POSES = 150
 BULGE = Control("shape_keys", 'key_blocks["Bulge"].value', 0, 1)

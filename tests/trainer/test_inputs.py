@@ -3,12 +3,13 @@
 
 import numpy as np
 import pytest
-from chain import chain_angles, chain_rig, pose_chain
 
 from fdda_addon.core.features import joint_features
 from fdda_addon.core.partition import Partition, make_partitions
 from fdda_addon.core.skinning import skin_matrices
 from trainer.inputs import make_inputs, middles
+
+from .chain import chain_angles, chain_rig, pose_chain
 
 PARENTS = np.array([-1, 0, 1, 1, 3])
 """0 carries 1, which carries 2 and 3; 3 carries 4."""

@@ -7,19 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chain import chain_angles, chain_info, chain_rig, pose_chain
-from conftest import QUICK, run_page
 
 from fdda_addon.core.metrics import distances
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.partition import Partition, main_joints, make_partitions
-from fdda_addon.core.recording_writer import RecordingWriter
+from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import UNMOVED, Joint, Rig
 from fdda_addon.core.skinning import LinearLayer, skin_matrices
 from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
 from trainer.inputs import inputs_of_rig, joints_between, middles
-from trainer.linear_fit import surroundings_of_rig
+from trainer.joint_fit import surroundings_of_rig
+
+from .chain import chain_angles, chain_info, chain_rig, pose_chain
+from .conftest import QUICK, run_page
 
 POSES, JOINTS = 120, 4
 UNMOVED_JOINT = JOINTS

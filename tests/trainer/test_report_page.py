@@ -3,14 +3,17 @@
 
 import base64
 import json
+import os
 import re
 import subprocess
 import sys
 from html.parser import HTMLParser
 
-from conftest import REPOSITORY
+import pytest
 
 from trainer.report import main
+
+from .conftest import REPOSITORY
 
 PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
@@ -74,6 +77,75 @@ def test_names_from_the_rig_cannot_break_the_page(report, tmp_path):
     assert main([str(tmp_path / "report.json")]) == 0
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "</script>" not in text and "&lt;b&gt;&amp;bone" in text
+
+
+TAG = "<script>alert(1)</script>"
+
+
+def places(value, path=()):
+    """Where a value and those inside of it are."""
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in items:
+        # The first of a list stands for all.
+        if not isinstance(key, int) or key == 0:
+            yield from places(inner, (*path, key))
+
+
+def put(value, path, new):
+    *way, last = path
+    for key in way:
+        value = value[key]
+    value[last] = new
+
+
+@pytest.mark.parametrize("new", [TAG, [TAG], {TAG: TAG}, None, float("nan"), 1e400, -5, 10**400, 1e300, 5e-324, True])
+def test_a_hostile_report_breaks_no_page(report, tmp_path, capsys, new):
+    """Whatever stands wherever: a page without a tag of its own, or a sentence."""
+    written = 0
+    for path in list(places(report))[1:]:
+        changed = json.loads(json.dumps(report))
+        put(changed, path, new)
+        (tmp_path / "report.json").write_text(json.dumps(changed))
+        (tmp_path / "report.html").unlink(missing_ok=True)
+        status = main([str(tmp_path / "report.json")])
+        said = capsys.readouterr().err
+        if status:
+            assert status == 1 and said.endswith("; train again.\n") and said.count("\n") == 1 and len(said) < 1200
+            continue
+        written += 1
+        tags = Tags((tmp_path / "report.html").read_text(encoding="utf-8"))
+        assert "script" not in {tag for tag, _ in tags.seen}, path
+        assert not tags.open
+    assert written or new != TAG
+
+
+@pytest.mark.parametrize("key", ["poses", "fdda", "linear"])
+@pytest.mark.parametrize("new", [TAG, None, [], {"mean": TAG}])
+def test_a_hostile_evaluation_is_refused(report, tmp_path, capsys, key, new):
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    statistics = {"mean": 0.125, "rms": 0.25, "p99": 0.5, "p999": 1.0, "max": 2.0}
+    evaluation = {"poses": 200, "fdda": statistics, "linear": statistics, key: new}
+    (tmp_path / "e.json").write_text(json.dumps(evaluation))
+    assert main([str(tmp_path / "report.json"), "--evaluation", str(tmp_path / "e.json")]) == 1
+    assert capsys.readouterr().err.startswith(f"The evaluation '{tmp_path / 'e.json'}' is damaged: ")
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_pipes_block_nobody(report, tmp_path, capsys):
+    os.mkfifo(tmp_path / "pipe.png")
+    for name in ("report.json", "pipe.png"):
+        assert main([str(tmp_path / name)]) == 1
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    assert main([str(tmp_path / "report.json"), "--pictures", str(tmp_path)]) == 1
+    assert "it is no ordinary file" in capsys.readouterr().err
+
+
+def test_the_page_takes_no_other_file_s_place(report, tmp_path, capsys):
+    (tmp_path / "report.html").write_text(json.dumps(report))
+    assert main([str(tmp_path / "report.html")]) == 1
+    assert "it is read for this" in capsys.readouterr().err
+    assert json.loads((tmp_path / "report.html").read_text()) == report
 
 
 def test_what_is_no_report_is_refused(tmp_path, capsys):

@@ -10,13 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chain import rotation
-from conftest import REPOSITORY
 
 from fdda_addon.core.errors import RecordingError
-from fdda_addon.core.fit_folder import FitPoses, FitPosesWriter, read_fit_poses, read_fitted
 from fdda_addon.core.messages import Message, MessageType
-from fdda_addon.core.recording_writer import array_header
+from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fit_poses, read_fitted
+from fdda_addon.core.recording.writer import array_header
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from fdda_addon.core.skin_fit import SkinFit
 from fdda_addon.core.skinning import LinearLayer
@@ -24,6 +22,9 @@ from trainer.fitted_skin import fit_folder, measure
 from trainer.process import Cancelled
 from trainer.skin_fit import main
 from trainer.skin_solver import SkinSolver, simplex_weights
+
+from .chain import rotation
+from .conftest import REPOSITORY
 
 JOINTS, VERTICES, POSES = 24, 300, 40
 

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chain import write_chain
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.recording import Recording, read_recording
-from fdda_addon.core.recording_index import ACTION, MIRRORED, RANDOM, REFINED, Source
+from fdda_addon.core.recording.index import ACTION, MIRRORED, RANDOM, REFINED, Source
+from fdda_addon.core.recording.reader import Recording, read_recording
 from trainer.config import TrainingConfig
 from trainer.data import BLOCK_FRAMES, Split, split_recording
+
+from .chain import write_chain
 
 CONFIG = TrainingConfig(seed=3)
 PARTS = ("training", "validation", "held_out")

@@ -5,18 +5,19 @@ import json
 
 import numpy as np
 import pytest
-from chain import write_chain
 
 from benchmarks.study import Plan, main, study
 from benchmarks.study_tables import tables
 from benchmarks.study_trainings import Trainings, cut, read_material
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.metrics import error_statistics
-from fdda_addon.core.recording import read_recording
+from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.skinning import LinearLayer
 from fdda_addon.runtime.network import Network
 from trainer.config import TrainingConfig
 from trainer.inputs import inputs_of_rig, middles
+
+from .chain import write_chain
 
 NAMES = ("bone_1", "bone_2")
 PLAN = Plan(

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from trainer.target import Verdict, judge
+from fdda_addon.core.report import Verdict
+from trainer.target import judge
 
 
 def outcome(*errors: float, target: float = 0.5, training: float = 0.1):

@@ -7,18 +7,19 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from chain import LIMIT, chain_angles, chain_residuals, pose_chain, write_chain
 
 from fdda_addon.core.features import joint_features
 from fdda_addon.core.metrics import distances
 from fdda_addon.core.model import check_rig, read_model_info
 from fdda_addon.core.partition import make_partitions
-from fdda_addon.core.recording import read_recording
+from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearLayer
 from trainer.__main__ import main
-from trainer.config import TrainingConfig
+from trainer.config import ACTIVATIONS, TrainingConfig
 from trainer.data import split_recording
+
+from .chain import LIMIT, chain_angles, chain_residuals, pose_chain, write_chain
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +162,7 @@ def test_report_measures_what_the_model_does(report, trained, recording, session
         assert len(p["curve"]["validation"]) == (40 if p["basis"] else 0)
 
 
-@pytest.mark.parametrize("activation", ["gelu", "tanh", "relu"])
+@pytest.mark.parametrize("activation", [name for name in ACTIVATIONS if name != TrainingConfig.activation])
 def test_every_activation_and_any_depth_exports(tmp_path, recording, activation):
     model = tmp_path / "m.onnx"
     options = ["--epochs", "2", "--activation", activation, "--hidden", *(["8"] if activation == "tanh" else ["8"] * 3)]

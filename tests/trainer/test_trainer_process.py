@@ -10,11 +10,12 @@ import sys
 
 import numpy as np
 import pytest
-from chain import write_chain
-from conftest import QUICK, REPOSITORY, start_trainer
 
 from fdda_addon.core.messages import Message, MessageType
 from trainer.__main__ import main
+
+from .chain import write_chain
+from .conftest import QUICK, REPOSITORY, start_trainer
 
 
 def decode(text: str) -> list[Message]:
@@ -127,21 +128,27 @@ def test_wrong_usage_exits_with_two(capsys):
     assert exit_.value.code == 2
 
 
-def test_a_full_disk_leaves_nothing(recording, tmp_path):
-    limit = 20_000
+@pytest.mark.parametrize("limit", [20_000, "after the model"])
+def test_a_full_disk_leaves_nothing(recording, trained, tmp_path, limit):
+    if limit == "after the model":
+        # The report is the last to be written, and the largest file.
+        sizes = sorted(path.stat().st_size for path in trained.iterdir())
+        limit = (sizes[-2] + sizes[-1]) // 2
 
     def small_files() -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    (tmp_path / "m.onnx").write_text("the old model")
+    old = trained.joinpath("model.onnx").read_bytes()
+    (tmp_path / "m.onnx").write_bytes(old)
     process = start_trainer(recording, tmp_path / "m.onnx", "--epochs", "2", "--messages", preexec_fn=small_files)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 1
     assert decode(out)[-1].type is MessageType.FAILED
-    assert err.startswith(f"Cannot write '{tmp_path / 'm.onnx'}': File too large; nothing was changed.")
+    assert err.startswith(f"Cannot write '{tmp_path / 'm.onnx'}' with 'm.weights.npz', 'report.json', 'report.html': ")
+    assert err.endswith("File too large; nothing was changed.\n")
     assert [p.name for p in tmp_path.iterdir()] == ["m.onnx"]
-    assert (tmp_path / "m.onnx").read_text() == "the old model"
+    assert (tmp_path / "m.onnx").read_bytes() == old
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -2,21 +2,24 @@
 """A training goes on from the last weights, on a recording that has grown."""
 
 import json
+import os
 import shutil
 import zipfile
 
 import numpy as np
 import pytest
-from chain import chain_angles, chain_residuals, pose_chain, write_chain
-from conftest import QUICK
 
-from fdda_addon.core.recording import read_recording
-from fdda_addon.core.recording_extension import RecordingExtension
+from fdda_addon.core.recording.extension import RecordingExtension
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.report import weights_path
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data import partitions_of, prepare, split_recording
 from trainer.inputs import inputs_of_rig, middles
-from trainer.weights import initial_networks, read_weights, weights_path
+from trainer.weights import initial_networks, read_weights
+
+from .chain import chain_angles, chain_residuals, pose_chain, write_chain
+from .conftest import QUICK
 
 GROWN = 60
 
@@ -122,7 +125,7 @@ def test_another_recording_of_the_rig_is_refused(model, tmp_path, capsys):
     assert "are of another recording or seed" in refused(capsys, tmp_path / "other", model)
 
 
-@pytest.mark.parametrize("damage", ["cut", "text", "packed", "shapes"])
+@pytest.mark.parametrize("damage", ["cut", "text", "packed", "shapes", "nan", "types", "pipe"])
 def test_damaged_weights_are_refused(recording, model, capsys, damage):
     path = weights_path(model)
     if damage == "cut":
@@ -135,12 +138,21 @@ def test_damaged_weights_are_refused(recording, model, capsys, damage):
         content["1/basis_mean"] = np.zeros(1 << 22, np.float32)
         np.savez_compressed(path, **content)
         assert zipfile.is_zipfile(path)
+    elif damage == "pipe":
+        path.unlink()
+        os.mkfifo(path)
     else:
         with np.load(path) as arrays:
             content = dict(arrays)
-        content["1/weight_1"] = content["1/weight_1"][1:]
+        changed = {"shapes": content["1/weight_1"][1:], "nan": content["1/weight_1"] * np.nan, "types": np.array("x")}
+        content["1/weight_1"] = changed[damage]
         np.savez(path, **content)
     before = model.read_bytes()
     text = refused(capsys, recording, model)
-    assert "cannot be used" in text and "train without --warm-start" in text
+    if damage == "pipe":
+        assert "it is no ordinary file" in text
+    elif damage == "text":
+        assert "another file is there, which is not the last weights of a training" in text
+    else:
+        assert "cannot be used" in text and "train without --warm-start" in text
     assert model.read_bytes() == before

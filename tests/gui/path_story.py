@@ -15,15 +15,29 @@ from types import ModuleType
 import bpy
 import numpy as np
 import sidebar
-from window import StepError, check, click, over, picture, press, redraw, region, rest_mouse, until, vivid_part
+from window import (
+    StepError,
+    check,
+    click,
+    over,
+    picture,
+    press,
+    redraw,
+    region,
+    rest_mouse,
+    until,
+    view_area,
+    vivid_part,
+)
 
 EXTENSION = "bl_ext.user_default.fdda"
-VERTICES, JOINTS, POSES, FRAMES = 1476, 22, 100, 250
+VERTICES, PAYING, JOINTS, POSES, FRAMES = 1476, 9960, 22, 100, 250
 FRAME = 110
 """Of the action, with elbow and fingers bent: where shapes are compared."""
 MODIFIERS = ["ARMATURE", "CORRECTIVE_SMOOTH"]
 BLEND = "arm.blend"
-PLAY_SECONDS = 4
+PLAY_SECONDS, SLOW_SECONDS = 4, 30
+"""The second where the processor draws, and is busy."""
 COLORED = 0.01
 """Part of the viewport that the arm takes, at least; without colours it is 0.001."""
 
@@ -50,6 +64,21 @@ def shape(frame: int = FRAME) -> np.ndarray:
     return positions
 
 
+def extent_in_view() -> float:
+    """How much of the viewport the arm takes, the larger of width and height as a part of the view's."""
+    from bpy_extras.view3d_utils import location_3d_to_region_2d
+    from mathutils import Vector
+
+    view, region3d = region("WINDOW"), view_area().spaces[0].region_3d
+    points = [
+        location_3d_to_region_2d(view, region3d, arm().matrix_world @ Vector(corner)) for corner in arm().bound_box
+    ]
+    check(all(points), "a part of the arm is behind the viewer")
+    inside = all(0 <= p.x <= view.width and 0 <= p.y <= view.height for p in points)
+    width, height = (np.ptp([p[axis] for p in points]) for axis in range(2))
+    return float(max(width / view.width, height / view.height)) if inside else 2.0
+
+
 def distance_mm(one: np.ndarray, other: np.ndarray) -> float:
     """Mean distance of vertices."""
     return float(np.linalg.norm(one - other, axis=1).mean()) * 1000
@@ -62,7 +91,7 @@ def switches() -> list[tuple[str, bool, bool]]:
 
 def job_done(verb: str, seconds: float) -> Iterator[float]:
     """Wait until the job that a button started has ended well."""
-    job = part("operators.job")
+    job = part("jobs.job")
     yield from until(lambda: job.state_of(verb) is not None, 10, f"the button starts no job {verb}")
     yield from until(lambda: not job.state_of(verb).is_running, seconds, f"the job {verb} does not end")
     state = job.state_of(verb)
@@ -72,7 +101,7 @@ def job_done(verb: str, seconds: float) -> Iterator[float]:
 def find_the_sidebar(_folder: Path) -> Iterator[float]:
     """The extension was enabled by its installation; its tab is in the sidebar."""
     check(EXTENSION in bpy.context.preferences.addons, f"{EXTENSION} is not enabled")
-    origin = Path(part("operators.job").__file__)
+    origin = Path(part("jobs.job").__file__)
     own = Path(os.environ["BLENDER_USER_RESOURCES"])
     check(origin.is_relative_to(own), f"the add-on comes from {origin}, not from what was installed into {own}")
     yield from sidebar.show()
@@ -82,10 +111,21 @@ def find_the_sidebar(_folder: Path) -> Iterator[float]:
 
 def add_the_arm(folder: Path) -> Iterator[float]:
     """Press Add Sample Arm, and save the file."""
-    bpy.data.objects.remove(bpy.data.objects["Cube"])
+    cube = bpy.data.objects["Cube"]
+    cube.select_set(False)
+    bpy.context.view_layer.objects.active = None
     yield from redraw()
     yield from sidebar.push("fdda.add_arm")
     yield from until(lambda: "arm" in bpy.data.objects, 20, "no arm is added")
+    check(not cube.visible_get(), "Blender's cube stands in the arm")
+    check(len(arm().data.vertices) == PAYING, f"the arm has {len(arm().data.vertices)} vertices")
+    yield from picture(folder / "framed.png")
+    check(0.4 < extent_in_view() < 1.0, f"the arm takes {extent_in_view():.2f} of the view's height or width")
+    # The small one is quicker for what follows.
+    bpy.ops.ed.undo()
+    yield 0.5
+    bpy.ops.fdda.add_arm(density="1")
+    bpy.ops.ed.undo_push(message="arm")
     check(bpy.context.view_layer.objects.active == arm(), "the arm is not the active object")
     check(len(arm().data.vertices) == VERTICES, f"the arm has {len(arm().data.vertices)} vertices")
     check(len(bpy.data.objects["arm_rig"].pose.bones) == JOINTS, "the armature has other joints")
@@ -149,20 +189,20 @@ def choose_a_hundred_poses(_folder: Path) -> Iterator[float]:
 
 def record(folder: Path) -> Iterator[float]:
     """Press Record and wait."""
-    job = part("operators.job")
+    job = part("jobs.job")
     yield from sidebar.open_section("recording")
     yield from sidebar.push("fdda.record")
     yield from until(lambda: job.state_of("record") and job.state_of("record").done, 30, "nothing is recorded")
     yield from picture(folder / "recording.png")
     yield from job_done("record", 90)
-    index = part("core.recording").read_index(folder / "work" / "arm_recording")
+    index = part("core.recording.index").read_index(folder / "work" / "arm_recording")
     check(index["complete"] == POSES, f"{index['complete']} poses are recorded")
     check(bpy.data.objects["arm_rig"].animation_data.action is not None, "the recording has not given the action back")
 
 
 def check_the_trainer(_folder: Path) -> Iterator[float]:
     """Press Check: the trainer's Python has torch."""
-    session = part("trainer_environment.session")
+    session = part("training.environment.session")
     yield from sidebar.open_section("training")
     yield from sidebar.push("fdda.check_trainer", across=0.2)
     yield from until(lambda: session.answer is not None, 60, "the check does not end")
@@ -172,7 +212,7 @@ def check_the_trainer(_folder: Path) -> Iterator[float]:
 
 def train(folder: Path) -> Iterator[float]:
     """Press Train, do something else meanwhile, and wait."""
-    job = part("operators.job")
+    job = part("jobs.job")
     epochs = arm().fdda.settings.epochs
     yield from sidebar.push("fdda.train")
     yield from until(lambda: job.current() is not None, 10, "the button starts no training")
@@ -222,8 +262,8 @@ def switch_the_deformation(folder: Path) -> Iterator[float]:
 def measure_the_model(_folder: Path) -> Iterator[float]:
     """Press Measure in the section Playback."""
     yield from sidebar.push("fdda.measure_model")
-    yield from until(lambda: part("frame_times").of(arm()) is not None, 60, "nothing is measured")
-    times = part("frame_times").of(arm())
+    yield from until(lambda: part("timing.frame_times").of(arm()) is not None, 60, "nothing is measured")
+    times = part("timing.frame_times").of(arm())
     check(min(times.rig, times.linear, times.fdda) > 0, f"there are times of 0: {times}")
 
 
@@ -234,7 +274,7 @@ def play_the_action(_folder: Path) -> Iterator[float]:
     yield from press("space")
     yield from until(lambda: main_screen().is_animation_playing, 5, "the space bar does not play the action")
     seen, end = {}, time.monotonic() + PLAY_SECONDS
-    while time.monotonic() < end:
+    while time.monotonic() < end or (len(seen) < 4 and time.monotonic() < end + SLOW_SECONDS):
         yield 0.1
         frame = bpy.context.scene.frame_current
         mesh = arm().evaluated_get(bpy.context.evaluated_depsgraph_get()).data
@@ -258,7 +298,7 @@ def evaluate(_folder: Path) -> Iterator[float]:
     bpy.context.scene.frame_set(FRAME)
     yield from sidebar.open_section("evaluation")
     yield from sidebar.push("fdda.evaluate")
-    evaluations = part("last_evaluation")
+    evaluations = part("evaluation.last_evaluation")
     yield from until(lambda: evaluations.of(arm()) is not None, 90, "nothing is evaluated")
     last = evaluations.of(arm())
     check(last.poses == FRAMES, f"{last.poses} frames are compared")
@@ -279,7 +319,9 @@ def show_the_partitions(folder: Path) -> Iterator[float]:
 def _paint(colors: str, folder: Path) -> Iterator[float]:
     across = {"ERRORS": 0.5, "PARTITIONS": 0.85}[colors]
     yield from sidebar.push(f"fdda.paint(colors='{colors}')", across)
-    yield from until(lambda: part("heat_map").painted(arm()) == colors, 5, f"the button does not show {colors}")
+    yield from until(
+        lambda: part("evaluation.heat_map").painted(arm()) == colors, 5, f"the button does not show {colors}"
+    )
     with over("WINDOW"):
         bpy.ops.object.select_all(action="DESELECT")
     shown = folder / "colors.png"
@@ -292,8 +334,8 @@ def _paint(colors: str, folder: Path) -> Iterator[float]:
 def mark_the_worst_frames(_folder: Path) -> Iterator[float]:
     """Press Mark, then the first of the worst frames, and look at its errors alone."""
     yield from sidebar.push("fdda.mark_worst", across=0.8)
-    worst = part("last_evaluation").of(arm()).worst(5)
-    found = part("markers").find(bpy.context.scene)
+    worst = part("evaluation.last_evaluation").of(arm()).worst(5)
+    found = part("evaluation.markers").find(bpy.context.scene)
     check(
         {marker.frame for marker in found} == {index + 1 for index, _ in worst},
         f"markers are at {sorted(marker.frame for marker in found)}, the worst frames are {worst}",
@@ -310,9 +352,13 @@ def mark_the_worst_frames(_folder: Path) -> Iterator[float]:
     yield from until(lambda: view.range_mm > before, 5, f"red begins at {view.range_mm} mm as before")
 
 
-def pack_the_model(_folder: Path) -> Iterator[float]:
-    """Press Pack in the section Models."""
+def unpack_and_pack_the_model(_folder: Path) -> Iterator[float]:
+    """The model was packed when it was bound. Press Unpack Model, and Pack, in the section Models."""
+    check(arm().fdda.packed is not None, "the bound model is not packed")
     yield from sidebar.open_section("models")
+    yield from sidebar.push("fdda.unpack_model")
+    yield from until(lambda: arm().fdda.packed is None, 5, "the button unpacks nothing")
+    yield from redraw()
     yield from sidebar.push("fdda.pack_model")
     yield from until(lambda: arm().fdda.packed is not None, 5, "the button packs nothing")
     check(distance_mm(shape(), _model_shape) < 1e-3, "packed, the model has another shape")
@@ -320,7 +366,7 @@ def pack_the_model(_folder: Path) -> Iterator[float]:
 
 def unbind(_folder: Path) -> Iterator[float]:
     """Press Unbind: the rig has its modifiers back."""
-    part("heat_map").clear_all()
+    part("evaluation.heat_map").clear_all()
     yield from sidebar.open_section("playback")
     yield from sidebar.push("fdda.unbind")
     yield from until(lambda: not arm().fdda.is_bound, 5, "the button does not unbind")
@@ -373,7 +419,7 @@ STEPS = (
     show_the_partitions,
     show_the_heat_map,
     mark_the_worst_frames,
-    pack_the_model,
+    unpack_and_pack_the_model,
     unbind,
     undo,
     save_and_open_again,

@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chain import chain_angles, chain_rig, pose_chain, rotation
 
 from fdda_addon.core.partition import Partition, make_partitions
 from fdda_addon.core.rig import Joint, Rig
 from fdda_addon.core.skinning import LinearLayer, skin_matrices
-from trainer.linear_fit import surroundings_of_rig
+from trainer.joint_fit import surroundings_of_rig
+
+from .chain import chain_angles, chain_rig, pose_chain, rotation
 
 JOINTS = 4
 INFLUENCING = {joint: tuple(j for j in (joint, joint + 1) if 0 < j < JOINTS) for joint in range(JOINTS)}

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The border between arrays and RNA: what is declared is what Blender keeps, and what does not fit is named."""
+
+import bpy
+import bpy.utils.previews
+import numpy as np
+import pytest
+
+from fdda_addon.scene import arrays
+from fdda_addon.scene.arrays import COORDINATE, LOOP_START, POSE_CHANNELS, POSE_MATRIX, VECTOR, Element, Reader
+from fdda_addon.scene.mesh import mesh_positions, set_mesh_positions
+
+OWNERS = {
+    "MeshVertex": (COORDINATE,),
+    "ShapeKeyPoint": (COORDINATE,),
+    "FloatVectorAttributeValue": (VECTOR,),
+    "MeshNormalValue": (VECTOR,),
+    "FloatColorAttributeValue": (arrays.COLOR,),
+    "ShapeKey": (arrays.MUTE,),
+    "MeshPolygon": (LOOP_START, arrays.MATERIAL_INDEX),
+    "MeshLoop": (arrays.VERTEX_INDEX,),
+    "MeshLoopTriangle": (arrays.TRIANGLE,),
+    "PoseBone": (POSE_MATRIX, *POSE_CHANNELS),
+    "Bone": (arrays.REST_MATRIX,),
+    "Keyframe": arrays.KEYFRAME,
+}
+"""Whose elements have them."""
+KINDS = {"FLOAT": np.float32, "INT": np.int32, "ENUM": np.int32, "BOOLEAN": np.bool_}
+
+
+@pytest.mark.parametrize("owner", OWNERS)
+def test_blender_keeps_what_is_declared(owner):
+    for element in OWNERS[owner]:
+        rna = getattr(bpy.types, owner).bl_rna.properties[element.name]
+        shape = tuple(size for size in getattr(rna, "array_dimensions", ()) if size)
+        assert (KINDS[rna.type], shape) == (element.dtype, element.shape), element.name
+
+
+def test_every_declaration_is_held_against_blender():
+    stated = [v if isinstance(v, tuple) else (v,) for k, v in vars(arrays).items() if k.isupper()]
+    assert {element for elements in stated for element in elements} == {e for own in OWNERS.values() for e in own}
+
+
+@pytest.fixture
+def mesh() -> bpy.types.Mesh:
+    mesh = bpy.data.meshes.new("three")
+    mesh.vertices.add(3)
+    return mesh
+
+
+def test_what_is_written_is_read(mesh):
+    positions = np.arange(9, dtype=np.float32).reshape(3, 3)
+    arrays.write(mesh.vertices, COORDINATE, positions)
+    for found in (arrays.read(mesh.vertices, COORDINATE), mesh_positions(mesh)):
+        assert found.dtype == np.float32 and np.array_equal(found, positions)
+    set_mesh_positions(mesh, -positions)
+    assert [tuple(vertex.co) for vertex in mesh.vertices] == [tuple(row) for row in (-positions).tolist()]
+    assert arrays.read(mesh.polygons, LOOP_START).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        (np.zeros((2, 3), np.float32), r"\(2, 3\) float32"),
+        (np.zeros((4, 3), np.float32), r"\(4, 3\) float32"),
+        (np.zeros((3, 3)), r"\(3, 3\) float64"),
+        (np.zeros(9, np.float32), r"\(9,\) float32"),
+        (np.zeros((3, 3), np.float32).T, r"\(3, 3\) float32, not contiguous"),
+    ],
+)
+def test_what_does_not_fit_is_named_and_not_written(mesh, values, named):
+    arrays.write(mesh.vertices, COORDINATE, np.ones((3, 3), np.float32))
+    with pytest.raises(ValueError, match=rf"'co' of .*\[3\], MeshVertices.* is \(3,\) float32 each, .* is {named}"):
+        arrays.write(mesh.vertices, COORDINATE, values)
+    assert (mesh_positions(mesh) == 1).all()
+
+
+def test_a_reader_reads_into_its_memory_and_refuses_another(mesh):
+    reader = Reader(VECTOR, np.empty((3, 3), np.float32))
+    set_mesh_positions(mesh, np.full((3, 3), 2, np.float32))
+    reader.read(mesh.attributes["position"].data)
+    assert (reader.values == 2).all()
+    mesh.vertices.add(1)
+    with pytest.raises(ValueError, match=r"'vector' of .*\[4\], FloatVectorAttribute.* the array is \(3, 3\) float32"):
+        reader.read(mesh.attributes["position"].data)
+    with pytest.raises(ValueError, match=r"'vector' of the memory to read into is .* the array is \(3, 3\) float64"):
+        Reader(VECTOR, np.empty((3, 3)))
+
+
+def test_a_property_that_is_not_there_is_a_bug(mesh):
+    with pytest.raises(AttributeError, match="nope"):
+        arrays.read(mesh.vertices, Element("nope", np.float32))
+
+
+def test_pixels_have_the_size_of_their_picture():
+    previews = bpy.utils.previews.new()
+    try:
+        preview = previews.new("picture")
+        preview.image_size = (4, 2)
+        pixels = np.linspace(0, 1, 32, dtype=np.float32).reshape(2, 4, 4)
+        arrays.write_pixels(preview, pixels)
+        assert np.abs(np.reshape(preview.image_pixels_float[:], (2, 4, 4)) - pixels).max() < 0.01
+        with pytest.raises(ValueError, match=r"\(2, 4, 4\) float32, the array is \(4, 2, 4\) float32"):
+            arrays.write_pixels(preview, pixels.reshape(4, 2, 4))
+    finally:
+        bpy.utils.previews.remove(previews)

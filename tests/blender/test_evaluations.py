@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Whatever evaluates shows the model's output: subframes, exports, motion blur, view layers, scenes, foreign code."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, predicted
+from .test_renders import rig_pixels, set_camera, still
+
+FRAMES = (4, 11, 20)
+
+
+@contextmanager
+def handler(name: str, function) -> Iterator[None]:
+    """A handler of another add-on."""
+    handlers = getattr(bpy.app.handlers, name)
+    handlers.append(function)
+    try:
+        yield
+    finally:
+        handlers.remove(function)
+
+
+def shown_in(graph: bpy.types.Depsgraph, mesh_object: bpy.types.Object) -> np.ndarray:
+    mesh = mesh_object.evaluated_get(graph).data
+    return np.array([vertex.co[:] for vertex in mesh.vertices], np.float32)
+
+
+@pytest.mark.parametrize("subframe", [0.25, 0.5, 0.999])
+def test_subframes(bound, elbow, subframe):
+    bpy.context.scene.frame_set(10)
+    whole = assert_plays(bound, elbow.model)
+    bpy.context.scene.frame_set(10, subframe=subframe)
+    assert np.abs(assert_plays(bound, elbow.model) - whole).max() > 1e-4
+
+
+def keyed(bound: bpy.types.Object) -> bpy.types.Object:
+    """The bound elbow with a shape key that the rig shows and the model has not learned."""
+    bound.fdda.mode = "RIG"
+    bound.shape_key_add(name="Basis")
+    key = bound.shape_key_add(name="bulge")
+    for point in key.data:
+        point.co.z *= 1.2
+    key.value = 1.0
+    bound.fdda.mode = "FDDA"
+    bpy.context.view_layer.update()
+    return bound
+
+
+def export_alembic(path: Path, mode: str) -> None:
+    bpy.ops.wm.alembic_export(
+        filepath=str(path), start=min(FRAMES), end=max(FRAMES), evaluation_mode=mode, as_background_job=False
+    )
+
+
+def export_usd(path: Path, mode: str) -> None:
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = min(FRAMES), max(FRAMES)
+    bpy.ops.wm.usd_export(
+        filepath=str(path), export_animation=True, evaluation_mode=mode, export_armatures=False, export_shapekeys=False
+    )
+
+
+def read_back(path: Path) -> dict[int, np.ndarray]:
+    """Positions of the exported mesh at frames."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    if path.suffix == ".abc":
+        bpy.ops.wm.alembic_import(filepath=str(path), as_background_job=False)
+    else:
+        bpy.ops.wm.usd_import(filepath=str(path))
+    mesh_object = max((o for o in bpy.data.objects if o.type == "MESH"), key=lambda o: len(o.data.vertices))
+    found = {}
+    for frame in FRAMES:
+        bpy.context.scene.frame_set(frame)
+        found[frame] = evaluated(mesh_object)
+    return found
+
+
+@pytest.mark.parametrize("suffix", [".abc", ".usdc"])
+@pytest.mark.parametrize("mode", ["VIEWPORT", "RENDER"])
+@pytest.mark.parametrize("use_in_render", [False, True])
+def test_exports(bound, elbow, tmp_path, suffix, mode, use_in_render):
+    """What is evaluated for renders is the rig, with its shape keys, unless renders use the model."""
+    keyed(bound).fdda.use_in_render = use_in_render
+    shows_model = use_in_render or mode == "VIEWPORT"
+    expected, other = {}, {}
+    for frame in FRAMES:
+        bpy.context.scene.frame_set(frame)
+        model = assert_plays(bound, elbow.model)
+        bound.fdda.mode = "RIG"
+        rig = evaluated(bound)
+        bound.fdda.mode = "FDDA"
+        expected[frame], other[frame] = (model, rig) if shows_model else (rig, model)
+    path = tmp_path / f"elbow{suffix}"
+    {".abc": export_alembic, ".usdc": export_usd}[suffix](path, mode)
+    for frame, positions in read_back(path).items():
+        assert np.abs(positions - expected[frame]).max() < 1e-5
+        assert np.abs(positions - other[frame]).max() > 1e-3
+
+
+def test_motion_blur_is_that_of_a_mesh_cache(bound, elbow, tmp_path):
+    """Cycles evaluates between frames; a mesh that an Alembic file moves is the measure."""
+    scene = bpy.context.scene
+    bound.fdda.use_in_render = True
+    set_camera()
+    scene.render.engine, scene.cycles.samples, scene.cycles.seed = "CYCLES", 8, 0
+    scene.cycles.use_denoising = False
+    scene.render.use_motion_blur, scene.render.motion_blur_shutter = True, 1.0
+    scene.render.motion_blur_position = "START"
+    light = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
+    light.rotation_euler[0] = 0.9
+    scene.collection.objects.link(light)
+    scene.frame_set(11)
+    model = still(tmp_path / "model.png")
+    assert not np.array_equal(model, rig_pixels(bound, tmp_path))
+    bpy.ops.wm.alembic_export(
+        filepath=str(tmp_path / "e.abc"), start=10, end=13, gsamples=2, xsamples=2, as_background_job=False
+    )
+    bound.hide_render = True
+    bpy.ops.wm.alembic_import(filepath=str(tmp_path / "e.abc"), set_frame_range=False, as_background_job=False)
+    scene.frame_set(11)
+    baked = still(tmp_path / "baked.png")
+    assert np.abs(model - baked).mean() < 2e-3
+    scene.render.use_motion_blur = False
+    assert np.abs(still(tmp_path / "sharp.png") - model).mean() > 4 * np.abs(model - baked).mean()
+
+
+def test_two_view_layers(bound, elbow):
+    scene = bpy.context.scene
+    second = scene.view_layers.new("second")
+    for angle in (0.4, 1.5):
+        bpy.data.objects[ELBOW_RIG].animation_data_clear()
+        pose(angle=angle)
+        second.update()
+        expected = assert_plays(bound, elbow.model)
+        assert np.abs(shown_in(second.depsgraph, bound) - expected).max() < 1e-5
+
+
+def test_two_scenes(bound, elbow):
+    """Linked to another scene, at another frame."""
+    first, second = bpy.context.scene, bpy.data.scenes.new("second")
+    for name in (ELBOW, ELBOW_RIG):
+        second.collection.objects.link(bpy.data.objects[name])
+    first.frame_set(5)
+    expected = {first: assert_plays(bound, elbow.model)}
+    second.frame_set(20)
+    assert np.abs(assert_plays(bound, elbow.model) - expected[first]).max() < 1e-5
+    graph = second.view_layers[0].depsgraph
+    assert np.abs(shown_in(graph, bound) - expected[first]).max() > 1e-2
+    first.frame_set(20)
+    assert np.abs(shown_in(graph, bound) - assert_plays(bound, elbow.model)).max() < 1e-5
+
+
+def test_a_foreign_handler_that_evaluates(bound, elbow):
+    seen = []
+
+    def evaluate(*_):
+        seen.append(evaluated(bound))
+
+    with handler("frame_change_post", evaluate):
+        for frame in FRAMES:
+            bpy.context.scene.frame_set(frame)
+            assert np.abs(seen[-1] - assert_plays(bound, elbow.model)).max() < 1e-5
+    assert len(seen) == len(FRAMES)
+
+
+def test_another_add_on_that_poses_after_a_frame(bound, elbow):
+    bpy.data.objects[ELBOW_RIG].animation_data_clear()
+
+    def set_pose(scene, _graph):
+        bpy.data.objects[ELBOW_RIG].pose.bones["lower"].rotation_euler[0] = scene.frame_current / 20
+
+    with handler("frame_change_post", set_pose):
+        shown = [assert_plays(bound, elbow.model) for frame in FRAMES if not bpy.context.scene.frame_set(frame)]
+    assert np.abs(shown[0] - shown[2]).max() > 1e-2
+
+
+def test_python_drivers_elsewhere(bound, elbow):
+    """Their expressions take Python's lock, on the threads that evaluate."""
+    bpy.context.preferences.filepaths.use_scripts_auto_execute = True
+    for number in range(20):
+        empty = bpy.data.objects.new(f"empty {number}", None)
+        bpy.context.scene.collection.objects.link(empty)
+        curve = empty.driver_add("location", 0)
+        curve.driver.expression = f"len([i for i in range({number} + int(frame))])"
+    for frame in FRAMES:
+        bpy.context.scene.frame_set(frame)
+        assert_plays(bound, elbow.model)
+        assert bpy.data.objects["empty 3"].matrix_world.translation.x == 3 + frame
+
+
+def test_a_driver_that_reads_another_pose(bound, elbow):
+    """The bend follows an empty that the frame moves."""
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    armature_object.animation_data_clear()
+    empty = bpy.data.objects.new("slider", None)
+    bpy.context.scene.collection.objects.link(empty)
+    for frame, value in ((1, 0.0), (30, 1.5)):
+        empty.location.x = value
+        empty.keyframe_insert("location", index=0, frame=frame)
+    curve = armature_object.pose.bones["lower"].driver_add("rotation_euler", 0)
+    curve.driver.type = "SUM"
+    variable = curve.driver.variables.new()
+    variable.type = "TRANSFORMS"
+    variable.targets[0].id = empty
+    shown = [assert_plays(bound, elbow.model) for frame in FRAMES if not bpy.context.scene.frame_set(frame)]
+    assert np.abs(shown[0] - shown[2]).max() > 1e-2
+
+
+def test_a_character_that_stands_still_is_not_evaluated(bound, monkeypatch):
+    from fdda_addon.runtime.live_binding import LiveBinding
+
+    bpy.data.objects[ELBOW_RIG].animation_data_clear()
+    bpy.context.view_layer.update()
+    calls, real = [], LiveBinding.play
+    monkeypatch.setattr(LiveBinding, "play", lambda self, cache: calls.append(cache) or real(self, cache))
+    bpy.context.scene.frame_set(7)
+    assert calls == []
+    pose(angle=0.7)
+    assert len(calls) == 1
+
+
+def test_a_render_of_the_rig_executes_no_model(bound, tmp_path, monkeypatch):
+    from fdda_addon.runtime.network import Execution
+
+    set_camera()
+    bpy.data.objects[ELBOW_RIG].animation_data_clear()
+    bpy.context.view_layer.update()
+    calls, real = [], Execution.run
+    monkeypatch.setattr(Execution, "run", lambda self: calls.append(self) or real(self))
+    still(tmp_path / "still.png")
+    assert calls == []
+
+
+def test_a_bone_that_is_edited(bound, elbow):
+    """The rest pose of the armature is another afterwards; Blender's skinning follows it, and so does the model."""
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    armature_object.animation_data_clear()
+    bpy.context.view_layer.objects.active = armature_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    armature_object.data.edit_bones["lower"].roll += 0.4
+    bpy.ops.object.mode_set(mode="OBJECT")
+    pose(angle=1.0)
+    assert_plays(bound, elbow.model)
+    bound.fdda.mode = "LINEAR"
+    linear = evaluated(bound)
+    bound.fdda.mode = "RIG"
+    bound.modifiers["CorrectiveSmooth"].show_viewport = False
+    assert np.abs(evaluated(bound) - linear).max() < 1e-5
+
+
+def test_another_armature(bound, elbow):
+    other = bpy.data.objects[ELBOW_RIG].copy()
+    other.animation_data_clear()
+    bpy.context.scene.collection.objects.link(other)
+    other.pose.bones["lower"].rotation_euler[0] = 1.4
+    bound.modifiers["Armature"].object = bound.parent = other
+    bpy.context.view_layer.update()
+    first = assert_plays(bound, elbow.model)
+    pose(other.name, angle=0.2)
+    assert np.abs(assert_plays(bound, elbow.model) - first).max() > 1e-2
+    assert np.abs(evaluated(bound) - predicted(bound, elbow.model)).max() < 1e-5

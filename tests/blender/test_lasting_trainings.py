@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A training goes on when the Blender that started it is closed, and whoever opens the character follows it."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import bpy
+import pytest
+
+from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.messages import MessageType
+from fdda_addon.core.model import read_model_info
+from fdda_addon.training import lasting
+
+LEAVING = """
+import sys
+sys.path.insert(0, {root!r})
+from pathlib import Path
+from fdda_addon.training import lasting
+lasting.user_folder = lambda: Path({user!r})
+with lasting.LastingTraining([{recording!r}, {model!r}, "--epochs", "{epochs}"], Path({model!r})) as training:
+    next(training.messages())
+    training.leave()
+"""
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(autouse=True)
+def _user(tmp_path, monkeypatch):
+    monkeypatch.setattr(lasting, "user_folder", lambda: tmp_path / "user")
+
+
+def leave_in_another_process(elbow, model: Path, epochs: int) -> None:
+    """Start a training in a process of its own that ends while it goes on."""
+    user = model.parent / "user"
+    code = LEAVING.format(
+        root=str(ROOT), user=str(user), recording=str(elbow.recording), model=str(model), epochs=epochs
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_it_goes_on_when_its_blender_is_closed_and_is_followed_from_the_start(elbow, tmp_path):
+    model = tmp_path / "m.onnx"
+    leave_in_another_process(elbow, model, 30)
+    assert lasting.is_known(model) and not model.exists()
+    with lasting.FollowedTraining(model) as training:
+        kinds = [message.type for message in training.messages()]
+    assert kinds[0] is MessageType.STARTED and kinds.count(MessageType.PROGRESS) == 30
+    assert kinds[-1] is MessageType.FINISHED
+    assert read_model_info(model).training["epochs"] == 30
+    assert not lasting.is_known(model)
+
+
+def test_one_that_ended_meanwhile_is_followed_too(elbow, tmp_path):
+    model = tmp_path / "m.onnx"
+    leave_in_another_process(elbow, model, 3)
+    end = time.monotonic() + 60
+    while lasting._Record(model).is_written() and time.monotonic() < end:
+        time.sleep(0.1)
+    with lasting.FollowedTraining(model) as training:
+        assert [message.type for message in training.messages()][-1] is MessageType.FINISHED
+
+
+def test_one_that_was_killed_says_so(elbow, tmp_path):
+    model = tmp_path / "m.onnx"
+    leave_in_another_process(elbow, model, 100_000)
+    with lasting.FollowedTraining(model) as training:
+        training._process.kill()
+        with pytest.raises(TrainingError, match="before it was done; no model was written, train again"):
+            list(training.messages())
+    assert not lasting.is_known(model)
+
+
+def test_one_that_is_followed_can_be_cancelled(elbow, tmp_path):
+    model = tmp_path / "m.onnx"
+    leave_in_another_process(elbow, model, 100_000)
+    with lasting.FollowedTraining(model) as training:
+        messages = training.messages()
+        next(messages)
+        training.cancel()
+        assert list(messages)[-1].type is MessageType.CANCELLED
+    assert not model.exists() and not lasting.is_known(model)
+
+
+def test_one_that_is_not_left_ends_with_its_block(elbow, tmp_path):
+    model = tmp_path / "m.onnx"
+    with lasting.LastingTraining([str(elbow.recording), str(model), "--epochs", "100000"], model) as training:
+        next(training.messages())
+        process = training._process
+    assert process.poll() is not None and not lasting.is_known(model)
+
+
+def test_a_number_of_another_process_is_never_ended(tmp_path):
+    """A machine that was switched off has given the number to somebody else."""
+    model = tmp_path / "m.onnx"
+    bystander = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    try:
+        record = lasting._Record(model)
+        record.new_messages().close()
+        record.name(bystander.pid)
+        with lasting.FollowedTraining(model) as training:
+            training.cancel()
+            training._process.kill()
+            list(training.messages())
+        assert bystander.poll() is None
+    finally:
+        bystander.kill()
+        bystander.wait()
+
+
+def test_what_is_no_record_is_none(tmp_path):
+    record = lasting._Record(tmp_path / "m.onnx")
+    record.new_messages().close()
+    for text in ("", "[]", '{"process": "x"}', '{"process": null}'):
+        record._path.write_text(text)
+        assert not lasting.is_known(tmp_path / "m.onnx")
+
+
+def test_adjust_last_operation_is_not_offered_for_any_job():
+    """It would do the work again at every change, in the foreground."""
+    from importlib import import_module
+
+    from fdda_addon import operators
+    from fdda_addon.operators.job import JobOperator
+
+    classes = [c for name in operators.MODULES for c in import_module(f"fdda_addon.operators.{name}").CLASSES]
+    jobs = [c for c in classes if issubclass(c, JobOperator)]
+    assert len(jobs) > 5 and [c.bl_idname for c in jobs if "UNDO" in c.bl_options] == []
+
+
+def test_another_file_knows_nothing_of_a_job_that_ended(rig):
+    from fdda_addon.jobs import job
+
+    bpy.ops.fdda.measure()
+    assert job.state_of("measure").subject == rig.mesh_object.session_uid
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    assert job.state_of("measure") is None

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Several meshes of one armature in one go, and all steps with one button."""
+
+import bpy
+import pytest
+
+from fdda_addon.evaluation import last_evaluation
+from fdda_addon.jobs import job
+from fdda_addon.scene.active_rig import rigs_together
+
+from .conftest import ELBOW, ELBOW_RIG
+from .scene_state import fresh_elbow
+
+
+@pytest.fixture
+def two(tmp_path) -> tuple[bpy.types.Object, bpy.types.Object]:
+    """The elbow and a copy of it on the same armature, which is active, in a saved file; few poses and epochs."""
+    rig = fresh_elbow()
+    other = rig.mesh_object.copy()
+    other.data = rig.mesh_object.data.copy()
+    bpy.context.scene.collection.objects.link(other)
+    for mesh_object in (rig.mesh_object, other):
+        mesh_object.select_set(False)
+    bpy.context.view_layer.objects.active = rig.armature_object
+    rig.mesh_object.fdda.settings.poses = 30
+    for mesh_object in (rig.mesh_object, other):
+        mesh_object.fdda.settings.epochs = 4
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "two.blend"))
+    return bpy.data.objects[ELBOW], bpy.data.objects["elbow.001"]
+
+
+def test_recorded_trained_bound_switched_and_evaluated_in_one_go(two, tmp_path):
+    assert [rig.mesh_object for rig in rigs_together(bpy.context)] == list(two)
+    assert bpy.ops.fdda.record(all_meshes=True) == {"FINISHED"}
+    assert two[1].fdda.settings.poses == 30, "the other takes over how the first is recorded"
+    assert bpy.ops.fdda.train(all_meshes=True) == {"FINISHED"}
+    assert job.state_of("train").outcome.startswith("Trained 'elbow.onnx' and 'elbow_001.onnx' in")
+    assert bpy.ops.fdda.bind(all_meshes=True) == {"FINISHED"}
+    for mode in ("RIG", "LINEAR", "FDDA"):
+        bpy.ops.fdda.switch(mode=mode, all_meshes=True)
+        assert [mesh_object.fdda.mode for mesh_object in two] == [mode, mode]
+    bpy.ops.fdda.evaluate(source="RANDOM", poses=3, all_meshes=True)
+    assert all(last_evaluation.of(mesh_object).poses == 3 for mesh_object in two)
+    assert "of 'elbow.001'" in job.state_of("evaluate").outcome
+    bpy.ops.fdda.switch(mode="RIG")
+    assert [mesh_object.fdda.mode for mesh_object in two] == ["RIG", "FDDA"]
+    assert bpy.ops.fdda.unbind(all_meshes=True) == {"FINISHED"}
+    assert not any(mesh_object.fdda.is_bound for mesh_object in two)
+
+
+def test_one_button_records_trains_and_binds(two):
+    bpy.context.view_layer.objects.active = two[0]
+    assert bpy.ops.fdda.make_model() == {"FINISHED"}
+    assert two[0].fdda.mode == "FDDA" and two[0].fdda.packed is not None and not two[1].fdda.is_bound
+    # Recorded already: it is trained again, and the new model plays.
+    before = two[0].fdda.packed.session_uid
+    two[0].fdda.settings.training_seed = 5
+    assert bpy.ops.fdda.make_model() == {"FINISHED"}
+    assert two[0].fdda.packed.session_uid != before
+
+
+def test_one_button_for_all_meshes(two):
+    assert bpy.ops.fdda.make_model(all_meshes=True) == {"FINISHED"}
+    assert all(mesh_object.fdda.mode == "FDDA" for mesh_object in two)
+
+
+def test_all_meshes_is_nothing_where_a_mesh_is_active(two):
+    bpy.context.view_layer.objects.active = two[1]
+    assert rigs_together(bpy.context) == []
+    two[1].fdda.settings.poses = 5
+    assert bpy.ops.fdda.record(all_meshes=True) == {"FINISHED"}
+    assert job.state_of("record").subject == two[1].session_uid
+
+
+def test_a_model_that_an_undo_takes_off_the_list_is_known(two):
+    from fdda_addon.panels import checks
+    from fdda_addon.panels.trained import trained
+    from fdda_addon.scene.scene_rig import SceneRig
+
+    bpy.context.view_layer.objects.active = two[0]
+    bpy.ops.fdda.record()
+    bpy.ops.fdda.train()
+    two[0].fdda.models.clear()
+    rig = SceneRig(two[0], bpy.data.objects[ELBOW_RIG])
+    checks.check_now(rig)
+    assert trained(rig).path.name == "elbow.onnx" and not trained(rig).foreign
+    assert bpy.ops.fdda.bind() == {"FINISHED"} and two[0].fdda.is_bound
+
+
+def test_a_model_of_another_mesh_of_the_name_is_told(two):
+    from fdda_addon.panels import checks
+    from fdda_addon.panels.trained import trained
+    from fdda_addon.scene.scene_rig import SceneRig
+
+    bpy.context.view_layer.objects.active = two[0]
+    bpy.ops.fdda.record()
+    bpy.ops.fdda.train()
+    two[0].data.vertices[0].co.x += 0.3
+    two[0].data.update()
+    bpy.context.view_layer.update()
+    rig = SceneRig(two[0], bpy.data.objects[ELBOW_RIG])
+    checks.check_now(rig)
+    assert "the rest pose of the mesh differs" in trained(rig).foreign

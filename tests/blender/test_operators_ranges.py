@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The range of motion of many bones at once: set, copied, mirrored, of a person, forgotten."""
+
+import math
+
+import bpy
+import pytest
+from mathutils import Vector
+
+from fdda_addon.poses.human_ranges import human_ranges, part_of
+from fdda_addon.poses.motion_range import DEFAULT, rotation_ranges
+from fdda_addon.scene.compatibility import is_selected, select_bone
+
+BONES = {
+    "Hips": ((0, 0, 1.0), (0, 0, 1.1)),
+    "LeftArm": ((0.2, 0, 1.4), (0.5, 0, 1.4)),
+    "LeftForeArm": ((0.5, 0, 1.4), (0.8, 0, 1.4)),
+    "RightArm": ((-0.2, 0, 1.4), (-0.5, 0, 1.4)),
+    "RightForeArm": ((-0.5, 0, 1.4), (-0.8, 0, 1.4)),
+    "tail": ((0, 0.2, 1.0), (0, 0.5, 1.0)),
+}
+
+
+@pytest.fixture
+def armature_object() -> bpy.types.Object:
+    """A small person in a T pose, with a mesh on the armature."""
+    armature = bpy.data.armatures.new("person")
+    armature_object = bpy.data.objects.new("person", armature)
+    mesh_object = bpy.data.objects.new("body", bpy.data.meshes.new("body"))
+    for o in (armature_object, mesh_object):
+        bpy.context.scene.collection.objects.link(o)
+    mesh_object.modifiers.new("Armature", "ARMATURE").object = armature_object
+    bpy.context.view_layer.objects.active = armature_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    for name, (head, tail) in BONES.items():
+        bone = armature.edit_bones.new(f"mixamorig:{name}")
+        bone.head, bone.tail = head, tail
+        bone.align_roll(Vector((0, 0, 1)) if "Arm" in name else Vector((0, -1, 0)))
+    bpy.ops.object.mode_set(mode="POSE")
+    return armature_object
+
+
+def bone(armature_object: bpy.types.Object, name: str) -> bpy.types.PoseBone:
+    return armature_object.pose.bones[f"mixamorig:{name}"]
+
+
+def select(armature_object: bpy.types.Object, *names: str) -> None:
+    for each in armature_object.pose.bones:
+        select_bone(each, each.name.partition(":")[2] in names)
+        assert is_selected(each) == (each.name.partition(":")[2] in names)
+
+
+def degrees(pose_bone: bpy.types.PoseBone) -> list[tuple[float, float]]:
+    return [(round(math.degrees(r.low)), round(math.degrees(r.high))) for r in rotation_ranges(pose_bone)]
+
+
+def test_many_bones_at_once(armature_object):
+    select(armature_object, "LeftArm", "tail")
+    low, high = (math.radians(-10), 0, math.radians(-30)), (math.radians(20), 1, math.radians(5))
+    assert bpy.ops.fdda.edit_ranges(axes=(True, False, True), low=low, high=high) == {"FINISHED"}
+    for name in ("LeftArm", "tail"):
+        assert degrees(bone(armature_object, name)) == [(-10, 20), (-45, 45), (-30, 5)]
+    assert all(r.source == DEFAULT for r in rotation_ranges(bone(armature_object, "Hips")))
+    with pytest.raises(RuntimeError, match="The range about X is empty; give a larger maximum"):
+        bpy.ops.fdda.edit_ranges(low=high, high=low)
+
+
+def test_copy_and_mirror(armature_object):
+    select(armature_object, "LeftArm")
+    low, high = ([math.radians(v) for v in values] for values in ((-10, -20, -30), (1, 2, 3)))
+    bpy.ops.fdda.edit_ranges(low=low, high=high)
+    assert bpy.ops.fdda.mirror_ranges() == {"FINISHED"}
+    assert degrees(bone(armature_object, "RightArm")) == [(-10, 1), (-2, 20), (-3, 30)]
+    select(armature_object, "tail", "Hips")
+    assert bpy.ops.fdda.copy_ranges(bone="mixamorig:LeftArm") == {"FINISHED"}
+    assert degrees(bone(armature_object, "tail")) == degrees(bone(armature_object, "LeftArm"))
+    assert bpy.ops.fdda.forget_ranges() == {"FINISHED"}
+    assert all(r.source == DEFAULT for r in rotation_ranges(bone(armature_object, "tail")))
+    select(armature_object, "tail")
+    with pytest.raises(RuntimeError, match="None of the selected bones has one on the other side"):
+        bpy.ops.fdda.mirror_ranges()
+
+
+def test_nothing_selected(armature_object):
+    select(armature_object)
+    for operator in (bpy.ops.fdda.edit_ranges, bpy.ops.fdda.mirror_ranges, bpy.ops.fdda.forget_ranges):
+        with pytest.raises(RuntimeError, match="No bone of 'person' is selected; tick bones in the list"):
+            operator()
+
+
+def test_a_person(armature_object):
+    assert bpy.ops.fdda.limits_preset() == {"FINISHED"}
+    assert all(r.source == DEFAULT for r in rotation_ranges(bone(armature_object, "tail")))
+    # Arms hang from a T pose by a turn about Y of the body; forearms fold by one about Z.
+    for side, sign in (("Left", 1), ("Right", -1)):
+        found = human_ranges(armature_object, bone(armature_object, f"{side}ForeArm").bone)
+        axes = bone(armature_object, f"{side}ForeArm").bone.matrix_local.to_3x3().transposed()
+        folding = max(range(3), key=lambda axis: abs(axes[axis].z))
+        turned = axes[folding].z * sign * -1
+        low, high = (round(math.degrees(v)) for v in found[folding])
+        assert {low, high} == {0, 120 if turned > 0 else -120} or {low, high} == {0, -120 if turned < 0 else 120}
+    with pytest.raises(RuntimeError, match="No bone of 'person' that states no range is named as a part of a body"):
+        bpy.ops.fdda.limits_preset()
+    assert bpy.ops.fdda.limits_preset(replace=True) == {"FINISHED"}
+
+
+@pytest.mark.parametrize(
+    ("name", "side"),
+    [
+        ("mixamorig:LeftForeArm", "left"),
+        ("DEF-forearm.R", "right"),
+        ("upper_arm.L", "left"),
+        ("CC_Base_L_Thigh", "left"),
+        ("Bip01 R Calf", "right"),
+        ("hand_r", "right"),
+        ("f_index.01.L", "left"),
+        ("RightHandThumb2", "right"),
+        ("spine.003", ""),
+        ("Head", ""),
+    ],
+)
+def test_names_of_parts(name, side):
+    ranges, found = part_of(name)
+    assert ranges is not None and found == side
+
+
+@pytest.mark.parametrize("name", ["tail", "skirt_01.L", "armor", "eye.L", "IK_target", "Bone.001"])
+def test_names_of_no_part(name):
+    assert part_of(name)[0] is None

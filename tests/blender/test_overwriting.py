@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""No verb writes over what it reads, or over a file of another kind, unless it is told to."""
+
+import json
+import os
+import shutil
+
+import pytest
+
+from .conftest import run
+from .refusals import Refusal, files
+
+IS_READ = "it is read for this; give another name, or --overwrite."
+IS_OTHER = "another file is there, which is not {}; give another name, or --overwrite."
+
+
+@pytest.fixture
+def place(elbow, tmp_path):
+    """A folder with the elbow's rig, recording and model, and a note of the user's."""
+    shutil.copy(elbow.rig, tmp_path / "rig.blend")
+    shutil.copy(elbow.model, tmp_path / "m.onnx")
+    shutil.copytree(elbow.recording, tmp_path / "recording")
+    (tmp_path / "notes.txt").write_text("months of work\n")
+    (tmp_path / "link.blend").symlink_to(tmp_path / "rig.blend")
+    os.link(tmp_path / "m.onnx", tmp_path / "hard.onnx")
+    return tmp_path
+
+
+RECORDING = "recording/recording.json"
+VERBS = {
+    "build-arm over a note": ("build-arm notes.txt", "notes.txt", "a .blend file"),
+    "limits in place": ("limits rig.blend rig.blend --action bend", "rig.blend", ""),
+    "limits over a model": ("limits rig.blend m.onnx --action bend", "m.onnx", "a .blend file"),
+    "check-recording over its index": (
+        f"check-recording recording --json {RECORDING}",
+        RECORDING,
+        "the JSON of a check",
+    ),
+    "check-recording over a rig": ("check-recording recording --json rig.blend", "rig.blend", "the JSON of a check"),
+    "train over a rig": ("train recording rig.blend --epochs 1", "rig.blend", "a model"),
+    "train over a note": ("train recording notes.txt --epochs 1", "notes.txt", "a model"),
+    "train over its recording": ("train recording recording/residuals.npy", "recording/residuals.npy", "a model"),
+    "train over an index": (f"train recording {RECORDING}", RECORDING, "a model"),
+    "refining over the rig": (
+        "train recording rig.blend --target-mm 1 --refine rig.blend --epochs 1",
+        "rig.blend",
+        "a model",
+    ),
+    "bind over its model": ("bind rig.blend m.onnx m.onnx", "m.onnx", ""),
+    "bind over its rig": ("bind rig.blend m.onnx rig.blend", "rig.blend", ""),
+    "bind over a link to its rig": ("bind rig.blend m.onnx link.blend", "link.blend", ""),
+    "bind over a second name of its model": ("bind rig.blend m.onnx hard.onnx", "hard.onnx", ""),
+    "bind over a note": ("bind rig.blend m.onnx notes.txt", "notes.txt", "a .blend file"),
+    "evaluate over its rig": ("evaluate rig.blend m.onnx --json rig.blend", "rig.blend", ""),
+    "evaluate over its model": ("evaluate rig.blend m.onnx --json m.onnx", "m.onnx", ""),
+    "evaluate over an index": (f"evaluate rig.blend m.onnx --json {RECORDING}", RECORDING, "the JSON of an evaluation"),
+    "a heat map over the rig": ("evaluate rig.blend m.onnx --json e.json --heatmap rig.blend", "rig.blend", ""),
+    "a heat map over a note": (
+        "evaluate rig.blend m.onnx --json e.json --heatmap notes.txt",
+        "notes.txt",
+        "a PNG picture",
+    ),
+    "benchmark over its model": ("benchmark rig.blend m.onnx --json m.onnx", "m.onnx", ""),
+    "benchmark over an index": (f"benchmark rig.blend m.onnx --json {RECORDING}", RECORDING, "the JSON of a benchmark"),
+    "bake over its rig": ("bake rig.blend m.onnx rig.blend", "rig.blend", ""),
+}
+
+
+@pytest.mark.parametrize(("line", "path", "kind"), VERBS.values(), ids=VERBS.keys())
+def test_a_verb_refuses(place, capfd, monkeypatch, line, path, kind):
+    monkeypatch.chdir(place)
+    words = IS_OTHER.format(kind) if kind else IS_READ
+    assert Refusal(place, capfd)(*line.split()) == f"Cannot write '{path}': {words}"
+
+
+def test_a_point_cache_beside_is_looked_at_too(place, capfd, monkeypatch):
+    monkeypatch.chdir(place)
+    (place / "out.pc2").write_text("mine")
+    text = Refusal(place, capfd)("bake", "rig.blend", "m.onnx", "out.blend")
+    assert text == f"Cannot write 'out.pc2': {IS_OTHER.format('a point cache')}"
+
+
+def test_the_report_and_the_weights_are_looked_at_too(place, capfd, monkeypatch):
+    monkeypatch.chdir(place)
+    for name, kind in (
+        ("report.json", "a training report"),
+        ("report.html", "the page of a training report"),
+        ("new.weights.npz", "the last weights of a training"),
+    ):
+        (place / name).write_text('{"mine": 1}')
+        text = Refusal(place, capfd)("train", "recording", "new.onnx", "--epochs", "1")
+        assert text == f"Cannot write '{name}': {IS_OTHER.format(kind)}"
+        (place / name).unlink()
+
+
+def test_two_outputs_of_one_name(place, capfd, monkeypatch):
+    monkeypatch.chdir(place)
+    refusal = Refusal(place, capfd)
+    text = refusal("evaluate", "rig.blend", "m.onnx", "--json", "e", "--heatmap", "e")
+    assert text == "Cannot write 'e': it would be the JSON of an evaluation and a PNG picture; give two names."
+    text = refusal("train", "recording", "report.json")
+    assert text == "Cannot write 'report.json': it would be a model and a training report; give two names."
+
+
+def test_a_bound_file_does_not_take_the_name_of_the_copied_model(place, capfd, monkeypatch):
+    monkeypatch.chdir(place)
+    (place / "there").mkdir()
+    text = Refusal(place, capfd)("bind", "rig.blend", "m.onnx", "there/m.onnx")
+    assert text == "Cannot write 'there/m.onnx': the copy of the model beside it has that name; give another name."
+
+
+def done(line: str) -> bool:
+    return run(*line.split()) == 0
+
+
+def test_what_a_verb_wrote_before_it_writes_again(place, monkeypatch):
+    monkeypatch.chdir(place)
+    verbs = (
+        "check-recording recording --json w.json",
+        "train recording new.onnx --epochs 2",
+        "bind rig.blend m.onnx bound.blend",
+        "evaluate rig.blend m.onnx --json e.json --poses 2 --heatmap e.png",
+        "benchmark rig.blend m.onnx --json b.json --frames 2",
+        "bake rig.blend m.onnx baked.blend --frames 1 2",
+        "bake rig.blend m.onnx baked.pc2 --frames 1 2",
+    )
+    for verb in (*verbs, *verbs):
+        assert done(verb), verb
+    left = [name for name in files(place) if "/" not in name and name.startswith(".")]
+    assert left == []
+
+
+def test_a_verb_that_is_told_to_overwrites(place, monkeypatch):
+    monkeypatch.chdir(place)
+    assert done("evaluate rig.blend m.onnx --json notes.txt --poses 2 --overwrite")
+    assert json.loads((place / "notes.txt").read_text())["unit"] == "mm"
+    (place / "mine.onnx").write_text("a note")
+    assert done("train recording mine.onnx --epochs 1 --overwrite")
+    assert (place / "mine.onnx").stat().st_size > 1000
+    before = (place / "rig.blend").read_bytes()
+    assert done("bind rig.blend m.onnx rig.blend --overwrite")
+    assert (place / "rig.blend").read_bytes() != before

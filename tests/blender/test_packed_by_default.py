@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Models travel with their file: packed when they are bound, or followed from folders that the user trusts."""
+
+import shutil
+
+import bpy
+import pytest
+
+from fdda_addon.core.errors import ModelError
+from fdda_addon.operators import playback
+from fdda_addon.runtime import model_files, packed
+from fdda_addon.scene import model_trust
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose
+
+
+@pytest.fixture
+def model(elbow, tmp_path):
+    """The elbow's model in a folder that is not the file's."""
+    folder = tmp_path / "models"
+    folder.mkdir()
+    return shutil.copy(elbow.model, folder / "elbow.onnx")
+
+
+def save_elsewhere(tmp_path):
+    """Save the open file into a folder of its own and open it as a new Blender does."""
+    path = tmp_path / "elsewhere" / "shot.blend"
+    path.parent.mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    model_files._chosen.clear()
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    return bpy.data.objects[ELBOW]
+
+
+def test_a_bound_model_comes_along_with_save_as(rig, elbow, model, tmp_path):
+    bpy.ops.fdda.bind(filepath=str(model))
+    assert rig.mesh_object.fdda.packed is not None
+    mesh_object = save_elsewhere(tmp_path)
+    pose(angle=1.1)
+    assert_plays(mesh_object, elbow.model)
+
+
+def test_a_found_model_comes_along(bound, elbow, model, tmp_path):
+    bpy.ops.fdda.relink(object=ELBOW, filepath=str(model))
+    assert bound.fdda.packed is not None
+    pose(angle=0.8)
+    assert_plays(save_elsewhere(tmp_path), elbow.model)
+
+
+def test_a_bound_model_comes_along_with_append(rig, elbow, model, tmp_path):
+    bpy.ops.fdda.bind(filepath=str(model))
+    path = tmp_path / "library" / "character.blend"
+    path.parent.mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    model_files._chosen.clear()
+    before = set(bpy.context.scene.objects.keys())
+    with bpy.data.libraries.load(str(path)) as (_, wanted):
+        wanted.objects = [ELBOW, ELBOW_RIG]
+    for appended in wanted.objects:
+        bpy.context.scene.collection.objects.link(appended)
+    pose(angle=1.2)
+    assert_plays(wanted.objects[0], elbow.model)
+    assert set(bpy.context.scene.objects.keys()) - before == {ELBOW, ELBOW_RIG}
+
+
+def test_a_large_one_stays_outside_and_is_told(rig, model, monkeypatch):
+    monkeypatch.setattr(playback, "LARGE_BYTES", 1000)
+    assert playback.bind_model(rig, model_files.Path(model)).endswith("the section Models packs it.")
+    assert rig.mesh_object.fdda.is_bound and rig.mesh_object.fdda.packed is None
+    bpy.ops.fdda.bind(pack_large=True)
+    assert rig.mesh_object.fdda.packed is not None
+
+
+def test_the_preferences_can_leave_models_outside(rig, model, monkeypatch):
+    monkeypatch.setattr(playback, "packs_models", lambda: False)
+    bpy.ops.fdda.bind(filepath=str(model))
+    assert rig.mesh_object.fdda.packed is None and not bpy.data.texts
+
+
+def test_a_packed_model_that_is_trained_anew_is_packed_anew(rig, elbow, model):
+    from fdda_addon.models.model_list import remember
+
+    bpy.ops.fdda.bind(filepath=str(model))
+    before = rig.mesh_object.fdda.packed.session_uid
+    remember(rig.mesh_object, model_files.Path(model))
+    assert rig.mesh_object.fdda.packed.session_uid == before, "the same file is not packed again"
+    with open(model, "ab") as file:
+        # A field that nobody knows: another file, the same model.
+        file.write(b"\xfa\x3f\x00")
+    remember(rig.mesh_object, model_files.Path(model))
+    assert packed.read(rig.mesh_object.fdda.packed) == model_files.Path(model).read_bytes()
+    assert len(rig.mesh_object.fdda.models) == 1 and len(bpy.data.texts) == 1
+
+
+def test_a_trusted_folder_is_followed_and_no_other(bound, elbow, model, tmp_path, monkeypatch):
+    bound.fdda.model = bound.fdda.models[0].path = str(model)
+    model_files._chosen.clear()
+    with pytest.raises(ModelError, match="or trust its folder in the preferences"):
+        model_files.model_path(bound)
+    monkeypatch.setattr(model_trust, "trusted_folders", lambda: [(tmp_path / "other").resolve()])
+    with pytest.raises(ModelError, match="is not followed"):
+        model_files.model_path(bound)
+    monkeypatch.setattr(model_trust, "trusted_folders", lambda: [tmp_path.resolve()])
+    assert model_files.model_path(bound) == model_files.Path(model)
+
+
+def test_a_link_out_of_a_trusted_folder_is_not_followed(elbow, tmp_path, monkeypatch):
+    trusted = tmp_path / "trusted"
+    trusted.mkdir()
+    (trusted / "way_out.onnx").symlink_to(elbow.model)
+    monkeypatch.setattr(model_trust, "trusted_folders", lambda: [trusted.resolve()])
+    assert not model_trust.is_trusted(trusted / "way_out.onnx")
+    assert not model_trust.is_trusted(trusted / ".." / "m.onnx") and model_trust.is_trusted(trusted / "m.onnx")

@@ -1,0 +1,365 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a user, a script or another add-on does to a playing character does not spoil the frames that follow."""
+
+import bpy
+import numpy as np
+import pytest
+
+import fdda_addon
+from fdda_addon.runtime import nodes
+from fdda_addon.scene.scene_rig import armature_modifier
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, predicted
+from .test_crowd import crowd_of
+from .test_evaluations import handler, keyed, shown_in
+from .test_renders import FRAME, animation, set_camera
+
+RENDER_HANDLERS = ("render_pre", "render_post", "render_write")
+
+
+def rig_positions(mesh_object: bpy.types.Object) -> np.ndarray:
+    mesh_object.fdda.mode = "RIG"
+    positions = evaluated(mesh_object)
+    mesh_object.fdda.mode = "FDDA"
+    return positions
+
+
+def in_memory() -> tuple[int, int]:
+    return len(bpy.data.objects), len(bpy.data.meshes)
+
+
+@pytest.mark.parametrize("when", RENDER_HANDLERS)
+@pytest.mark.parametrize("what", ["save", "strength", "mode"])
+@pytest.mark.parametrize("use_in_render", [False, True])
+def test_a_handler_of_a_render_that_touches_it(bound, elbow, tmp_path, when, what, use_in_render):
+    bound.fdda.use_in_render = use_in_render
+    set_camera()
+    before = animation(tmp_path / "before")
+
+    def touch(*_):
+        if what == "save":
+            bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "backup.blend"), copy=True)
+        elif what == "strength":
+            bound.fdda.strength = 0.5
+            bound.fdda.strength = 1.0
+        else:
+            bound.fdda.mode = "RIG"
+            bound.fdda.mode = "FDDA"
+
+    with handler(when, touch):
+        touched = animation(tmp_path / "touched")
+    for frame, pixels in before.items():
+        assert np.array_equal(touched[frame], pixels), frame
+    bpy.context.scene.frame_set(FRAME)
+    assert_plays(bound, elbow.model)
+
+
+@pytest.mark.parametrize("is_applied", [False, True], ids=["removed", "applied"])
+def test_without_its_modifier_the_rig_is_back_at_once(bound, is_applied, capsys):
+    pose(angle=1.2)
+    if is_applied:
+        with bpy.context.temp_override(object=bound):
+            bpy.ops.object.modifier_apply(modifier="FDDA")
+    else:
+        bound.modifiers.remove(nodes.find_modifier(bound))
+    bpy.context.view_layer.update()
+    assert bound.fdda.mode == "RIG" and "was removed; bind the model again" in bound.fdda.status
+    assert [m.show_viewport for m in bound.modifiers] == [True, True]
+    first = evaluated(bound)
+    pose(angle=0.3)
+    assert np.abs(evaluated(bound) - first).max() > 1e-2
+    assert capsys.readouterr().out.count("switched off") == 1
+
+
+def key_mode(mesh_object: bpy.types.Object, modes: dict[int, str]) -> None:
+    for frame, mode in modes.items():
+        mesh_object.fdda.mode = mode
+        mesh_object.keyframe_insert("fdda.mode", frame=frame)
+
+
+def test_a_mode_that_is_keyed(bound, elbow):
+    key_mode(bound, {1: "FDDA", 8: "LINEAR", 12: "RIG", 16: "FDDA", 20: "RIG", 24: "LINEAR"})
+    shown = {}
+    for frame in (3, 9, 13, 17, 21, 25, 13, 3):
+        bpy.context.scene.frame_set(frame)
+        # What is drawn, without another evaluation.
+        shown[frame] = shown_in(bpy.context.view_layer.depsgraph, bound)
+        assert np.array_equal(evaluated(bound), shown[frame])
+        if bound.fdda.mode == "FDDA":
+            assert_plays(bound, elbow.model)
+    bound.animation_data_clear()
+    for frame, mode in ((3, "FDDA"), (9, "LINEAR"), (13, "RIG"), (17, "FDDA"), (21, "RIG"), (25, "LINEAR")):
+        bpy.context.scene.frame_set(frame)
+        bound.fdda.mode = mode
+        bpy.context.view_layer.update()
+        assert np.abs(evaluated(bound) - shown[frame]).max() < 1e-6, frame
+    assert not bound.fdda.status
+
+
+def test_a_mode_that_is_set_shows_at_once(bound, elbow):
+    pose(angle=1.1)
+    graph = bpy.context.view_layer.depsgraph
+    for mode in ("RIG", "FDDA", "LINEAR", "RIG", "LINEAR", "FDDA"):
+        bound.fdda.mode = mode
+        bpy.context.view_layer.update()
+        drawn = shown_in(graph, bound)
+        assert np.array_equal(drawn, evaluated(bound)), mode
+    assert_plays(bound, elbow.model)
+
+
+def test_renders_of_a_mode_that_is_keyed(bound, elbow, tmp_path):
+    bound.fdda.use_in_render = True
+    set_camera()
+    bound.fdda.mode = "RIG"
+    rig = animation(tmp_path / "rig")
+    bound.fdda.mode = "FDDA"
+    model = animation(tmp_path / "model")
+    key_mode(bound, {FRAME - 1: "FDDA", FRAME: "RIG", FRAME + 1: "FDDA"})
+    for curve in curves(bound):
+        for point in curve.keyframe_points:
+            point.interpolation = "CONSTANT"
+    mixed = animation(tmp_path / "mixed")
+    for frame, source in ((FRAME - 1, model), (FRAME, rig), (FRAME + 1, model)):
+        assert np.array_equal(mixed[frame], source[frame]), frame
+    assert not np.array_equal(rig[FRAME - 1], model[FRAME - 1])
+
+
+def curves(mesh_object: bpy.types.Object) -> list[bpy.types.FCurve]:
+    from fdda_addon.scene.compatibility import curves_of
+
+    return curves_of(mesh_object.animation_data.action, mesh_object)
+
+
+@pytest.mark.parametrize("is_driven", [False, True], ids=["keyed", "driven"])
+def test_a_strength_that_is_animated(bound, elbow, is_driven):
+    if is_driven:
+        curve = bound.driver_add("fdda.strength")
+        curve.driver.expression = "min(1, frame / 20)"
+    else:
+        for frame, strength in ((0, 0.0), (20, 1.0)):
+            bound.fdda.strength = strength
+            bound.keyframe_insert("fdda.strength", frame=frame)
+        for found in curves(bound):
+            for point in found.keyframe_points:
+                point.interpolation = "LINEAR"
+    shown = {}
+    for frame in (5, 10, 20):
+        bpy.context.scene.frame_set(frame)
+        shown[frame] = evaluated(bound)
+    assert_plays(bound, elbow.model)
+    bound.animation_data_clear()
+    for frame, positions in shown.items():
+        bpy.context.scene.frame_set(frame)
+        bound.fdda.strength = 1
+        playing = assert_plays(bound, elbow.model)
+        bound.fdda.strength = 0
+        linear, strength = evaluated(bound), min(1, frame / 20)
+        assert np.abs(positions - (linear + strength * (playing - linear))).max() < 1e-6
+
+
+def test_shape_keys_are_back_with_the_rig(bound, elbow):
+    keyed(bound)
+    pose(angle=1.1)
+    assert_plays(bound, elbow.model)
+    shown = rig_positions(bound)
+    bound.data.shape_keys.key_blocks["bulge"].value = 0
+    bpy.context.view_layer.update()
+    assert_plays(bound, elbow.model)
+    assert np.abs(rig_positions(bound) - shown).max() > 1e-3
+    assert not bound.show_only_shape_key and not any(key.mute for key in bound.data.shape_keys.key_blocks)
+
+
+def test_shape_keys_of_two_objects(bound, elbow):
+    """One plays, the other shows the rig of the same mesh."""
+    keyed(bound)
+    pose(angle=0.9)
+    expected = rig_positions(bound)
+    other = bound.copy()
+    bpy.context.scene.collection.objects.link(other)
+    other.fdda.mode = "RIG"
+    for angle in (1.4, 0.9):
+        pose(angle=angle)
+    assert np.abs(evaluated(other) - expected).max() < 1e-6
+    assert_plays(bound, elbow.model)
+
+
+def test_duplicates_and_deletions_leave_nothing(bound, tmp_path):
+    pose(angle=0.5)
+    objects, meshes = in_memory()
+    for _ in range(30):
+        copy = bound.copy()
+        bpy.context.scene.collection.objects.link(copy)
+        bpy.context.view_layer.update()
+        assert in_memory() == (objects + 2, meshes + 1)
+        bpy.data.objects.remove(copy)
+        bpy.context.view_layer.update()
+    assert in_memory() == (objects, meshes)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
+    fdda_addon.unregister()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
+    assert in_memory() == (objects - 1, meshes - 1)
+
+
+def test_a_deleted_character_leaves_nothing(bound):
+    bpy.ops.object.select_all(action="DESELECT")
+    bound.select_set(True)
+    bpy.context.view_layer.objects.active = bound
+    bpy.ops.object.delete()
+    bpy.context.view_layer.update()
+    assert [o.name for o in bpy.data.objects] == [ELBOW_RIG]
+
+
+def test_purging_what_nothing_uses(bound, elbow):
+    crowd = crowd_of(bound, 5)
+    for frame in (1, 2, 3, 4):
+        bpy.context.scene.frame_set(frame)
+    bpy.data.orphans_purge(do_recursive=True)
+    for frame in (5, 6):
+        bpy.context.scene.frame_set(frame)
+        for mesh_object in crowd:
+            assert_plays(mesh_object, elbow.model)
+
+
+def test_without_the_addon_nothing_of_it_is_left_or_said(bound, tmp_path, capfd):
+    pose(angle=1.3)
+    true = rig_positions(bound)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
+    fdda_addon.unregister()
+    capfd.readouterr()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
+    pose(angle=1.3)
+    assert np.abs(evaluated(bpy.data.objects[ELBOW]) - true).max() < 1e-6
+    printed = "".join(capfd.readouterr())
+    assert "rror" not in printed and "river" not in printed and "fdda" not in printed
+    assert {o.name for o in bpy.data.objects} == {ELBOW, ELBOW_RIG}
+
+
+def test_disabled_and_enabled(bound, elbow, capfd):
+    pose(angle=1.0)
+    expected, count = rig_positions(bound), in_memory()
+    for _ in range(3):
+        fdda_addon.unregister()
+        assert not hasattr(bpy.types.Object, "fdda_playback")
+        assert in_memory() == (count[0] - 1, count[1] - 1)
+        bpy.context.view_layer.update()
+        assert np.abs(evaluated(bound) - expected).max() < 1e-6
+        fdda_addon.register()
+        bpy.context.view_layer.update()
+        assert_plays(bound, elbow.model)
+        assert in_memory() == count
+    assert "rror" not in "".join(capfd.readouterr())
+
+
+def test_a_file_that_was_saved_by_itself(bound, elbow, tmp_path):
+    """An auto-save calls no handler. Where the add-on is missing, the mesh is as it was modelled, not a point."""
+    handlers = [bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:]]
+    bpy.app.handlers.save_pre.clear()
+    bpy.app.handlers.save_post.clear()
+    path = elbow.bound.with_name("itself.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:] = handlers
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    pose(angle=0.8)
+    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+    fdda_addon.unregister()
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    mesh_object = bpy.data.objects[ELBOW]
+    rest = np.array([vertex.co[:] for vertex in mesh_object.data.vertices], np.float32)
+    assert np.abs(evaluated(mesh_object) - rest).max() < 1e-6
+
+
+def test_reverting_a_file(bound, elbow):
+    path = elbow.bound.with_name("reverted.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    for angle in (0.4, 1.2):
+        pose(angle=angle)
+        bpy.ops.wm.revert_mainfile()
+        pose(angle=angle + 0.1)
+        assert_plays(bpy.data.objects[ELBOW], elbow.model)
+
+
+def test_a_joint_that_is_not_a_number(bound, elbow):
+    """What it moves follows the joint above it; the rest of the character is as it was."""
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    armature_object.animation_data_clear()
+    pose(angle=0.0)
+    straight = assert_plays(bound, elbow.model)
+    armature_object.pose.bones["lower"].rotation_euler[0] = float("nan")
+    pose(bone="upper", angle=0.5)
+    shown = evaluated(bound)
+    assert np.isfinite(shown).all() and "joint 'lower' of 'elbow_rig' is not a number" in bound.fdda.status
+    assert bound.fdda.mode == "FDDA"
+    pose(angle=0.0)
+    assert np.abs(shown - assert_plays(bound, elbow.model)).max() < 1e-5
+    assert np.abs(shown - straight).max() > 1e-2
+
+
+def test_one_character_that_fails_in_any_way_leaves_the_others(bound, elbow, monkeypatch, capsys):
+    from fdda_addon.runtime.live_binding import LiveBinding
+
+    crowd = crowd_of(bound, 3)
+    bpy.context.view_layer.update()
+    real = LiveBinding.write
+
+    def write(self, cache, mesh_object):
+        if mesh_object.name == crowd[1].name:
+            raise SystemExit("out")
+        real(self, cache, mesh_object)
+
+    monkeypatch.setattr(LiveBinding, "write", write)
+    for mesh_object in crowd:
+        armature_modifier(mesh_object).object.pose.bones["lower"].rotation_euler[0] += 0.1
+    bpy.context.view_layer.update()
+    assert [o.fdda.mode for o in crowd] == ["FDDA", "RIG", "FDDA"]
+    assert "cannot be played (SystemExit('out'))" in crowd[1].fdda.status
+    assert [m.show_viewport for m in crowd[1].modifiers] == [True, True, False]
+    for mesh_object in (crowd[0], crowd[2]):
+        assert_plays(mesh_object, elbow.model)
+    assert capsys.readouterr().out.count("switched off") == 1
+
+
+def test_a_topology_that_changes_shows_the_rig_in_the_same_frame(bound):
+    bound.data.vertices.add(3)
+    bound.data.update()
+    bpy.context.scene.frame_set(9)
+    bpy.context.view_layer.update()
+    assert "has 303 vertices and its model was trained for 300" in bound.fdda.status
+    assert len(evaluated(bound)) == 303 and bound.modifiers["Armature"].show_viewport
+
+
+def test_undo_of_many_kinds(bound, elbow):
+    """Undo steps before and after a duplicate, a mode and a deletion."""
+
+    def step(name):
+        bpy.context.view_layer.update()
+        bpy.ops.ed.undo_push(message=name)
+
+    step("start")
+    pose(angle=0.6)
+    step("pose")
+    copy = bpy.data.objects[ELBOW].copy()
+    bpy.context.scene.collection.objects.link(copy)
+    step("duplicate")
+    bpy.data.objects[ELBOW].fdda.mode = "RIG"
+    step("mode")
+    bpy.data.objects.remove(bpy.data.objects[copy.name])
+    step("delete")
+
+    def check():
+        bpy.context.view_layer.update()
+        for mesh_object in [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]:
+            if mesh_object.fdda.mode == "FDDA":
+                assert_plays(mesh_object, elbow.model)
+            else:
+                assert np.abs(evaluated(mesh_object) - predicted(mesh_object, elbow.model)).max() > 1e-5
+
+    for _ in range(2):
+        for _ in range(4):
+            bpy.ops.ed.undo()
+            check()
+        for _ in range(4):
+            bpy.ops.ed.redo()
+            check()
+    bpy.ops.ed.undo()
+    pose(angle=1.0)
+    check()

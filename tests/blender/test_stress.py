@@ -1,0 +1,18 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A short run of `benchmarks/stress_playback.py`: characters show what their model says, whatever is done to them."""
+
+import bpy
+import pytest
+
+from benchmarks.stress_playback import LARGEST, WEIGHTS, Stress
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_whatever_is_done_at_random(bound, elbow, tmp_path, seed):
+    bpy.context.scene.frame_set(1)
+    outcome = Stress(bound, elbow.model, 6, tmp_path, seed).run(250)
+    assert outcome.largest < LARGEST, outcome.worst
+    assert outcome.compared > 750 and len(outcome.operations) == len(WEIGHTS)
+    # What was allocated once stays; a character more or less is below a megabyte.
+    half = len(outcome.memory) // 2
+    assert outcome.memory[-1] - outcome.memory[half] < 10

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The exit status of an error: a farm runs again what failed for a reason of the machine's, and nothing else."""
+
+import errno
+
+import pytest
+
+from fdda_addon.core.errors import (
+    TRY_AGAIN,
+    BusyError,
+    NoRoomError,
+    OutputError,
+    RigError,
+    TrainingDiedError,
+    WrongUsageError,
+    exit_status,
+)
+from fdda_addon.core.output import replacing
+
+
+def caused_by(cause: BaseException) -> OutputError:
+    try:
+        raise OutputError("It failed.") from cause
+    except OutputError as error:
+        return error
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ENOMEM, errno.ESTALE])
+def test_what_the_machine_caused_may_be_tried_again(number):
+    assert exit_status(caused_by(OSError(number, "text"))) == TRY_AGAIN
+    assert exit_status(caused_by(caused_by(OSError(number, "text")))) == TRY_AGAIN
+
+
+@pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES, errno.EISDIR, errno.EROFS, errno.ENAMETOOLONG])
+def test_what_the_user_caused_will_never_work(number):
+    assert exit_status(caused_by(OSError(number, "text"))) == 1
+
+
+def test_errors_that_say_so_themselves():
+    assert [exit_status(kind("text")) for kind in (BusyError, NoRoomError, TrainingDiedError)] == [TRY_AGAIN] * 3
+    assert exit_status(RigError("text")) == 1 and exit_status(WrongUsageError("text")) == 2
+    assert exit_status(caused_by(MemoryError())) == TRY_AGAIN
+
+
+def test_a_full_disk_through_the_writer_of_files(tmp_path):
+    with pytest.raises(OutputError) as failed, replacing(tmp_path / "a.json"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert exit_status(failed.value) == TRY_AGAIN and list(tmp_path.iterdir()) == []

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The report of a training: what is written is read, and what is damaged is refused with the place named."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from fdda_addon.core import report as report_format
+from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.report import page_path, read_report, report_path, weights_path, write_report
+
+ERRORS = {"mean": 0.1, "rms": 0.2, "p99": 0.5, "p999": 1, "max": 2.5}
+REPORT = {
+    "unit": "mm",
+    "model": "elbow.onnx",
+    "model_bytes": 1000,
+    "recording": "recording",
+    "object": "Ellbogen ü",
+    "vertices": 300,
+    "joints": 2,
+    "poses": 150,
+    "training": {"seconds": 1.5, "device": "cpu", "epochs": 2, "training_poses": 120, "held_out_poses": 15, "l1": 0.0},
+    "parity": 1e-4,
+    "fdda": {"training": ERRORS, "held_out": ERRORS},
+    "linear": {"held_out": ERRORS},
+    "normals": None,
+    "edges": {way: {"inside": 0.1, "beside": None, "across": None} for way in ("fdda", "linear")},
+    "histogram": {"edges": [0.0, 1.0], "fdda": [3], "linear": [4]},
+    "partitions": [
+        {
+            "joint": "upper",
+            "vertices": 300,
+            "influencing": ["lower"],
+            "features": 12,
+            "basis": 4,
+            "truncation": 0.01,
+            "training": ERRORS,
+            "held_out": ERRORS,
+            "linear": ERRORS,
+            "histogram": [3],
+            "curve": {"training": [1.0, 0.5], "validation": [1.0, 0.6], "best_epoch": 2},
+        }
+    ],
+    "warnings": [{"name": "flips", "text": "It jumps."}],
+    "target": {"target": 0.5, "p999": 1.0, "verdict": "missed"},
+}
+
+
+def damaged(place: tuple, value: object) -> dict:
+    """The report with another value at a place; the key is gone where it is `...`."""
+    copy = json.loads(json.dumps(REPORT))
+    owner = copy
+    for step in place[:-1]:
+        owner = owner[step]
+    if value is ...:
+        del owner[place[-1]]
+    else:
+        owner[place[-1]] = value
+    return copy
+
+
+def test_what_lies_beside_a_model():
+    model = Path("folder/arm.onnx")
+    assert [str(path(model)) for path in (report_path, page_path, weights_path)] == [
+        *("folder/report.json", "folder/report.html", "folder/arm.weights.npz")
+    ]
+
+
+def test_what_is_written_is_read(tmp_path):
+    write_report(tmp_path / "report.json", REPORT)
+    assert read_report(tmp_path / "report.json") == {"format": "fdda-report", "version": 1, **REPORT}
+
+
+@pytest.mark.parametrize("key", ["warnings", "target", "normals", "edges"])
+def test_what_may_be_missing(tmp_path, key):
+    write_report(tmp_path / "report.json", damaged((key,), ...))
+    assert key not in read_report(tmp_path / "report.json")
+
+
+DAMAGE = [
+    (("fdda",), ..., "it has no fdda"),
+    (("fdda", "held_out"), 3, "fdda.held_out is no object"),
+    (("fdda", "held_out", "p999"), ..., "fdda.held_out has no p999"),
+    (("fdda", "held_out", "max"), "2", "fdda.held_out.max is no number"),
+    (("fdda", "held_out", "max"), True, "fdda.held_out.max is no number"),
+    (("vertices",), 3.5, "vertices is no whole number"),
+    (("parity",), 10**400, "parity is out of all bounds"),
+    (("model",), ["elbow.onnx"], "model is no text"),
+    (("partitions",), {}, "partitions is no list"),
+    (("partitions", 0, "curve", "validation", 1), None, "partitions[0].curve.validation[1] is no number"),
+    (("partitions", 0, "merged"), [3], "partitions[0].merged[0] is no text"),
+    (("edges", "fdda", "inside"), "0", "edges.fdda.inside is no number"),
+    (("warnings", 0), {"text": "…"}, "warnings[0] has no name"),
+    (("target", "verdict"), "lunch", "target.verdict is no verdict"),
+]
+
+
+@pytest.mark.parametrize(("place", "value", "sentence"), DAMAGE, ids=[sentence for *_, sentence in DAMAGE])
+def test_damage_is_named_and_not_written(tmp_path, place, value, sentence):
+    path = tmp_path / "report.json"
+    report = damaged(place, value)
+    with pytest.raises(ValueError, match=sentence.replace("[", r"\[")):
+        write_report(path, report)
+    assert not path.exists()
+    path.write_text(json.dumps({"format": "fdda-report", "version": 1, **report}))
+    with pytest.raises(TrainingError) as caught:
+        read_report(path)
+    assert str(caught.value) == f"The report '{path}' is damaged: {sentence}; train again."
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
+def test_what_is_no_number_is_out_of_bounds(tmp_path, number):
+    path = tmp_path / "report.json"
+    write_report(path, REPORT)
+    path.write_text(path.read_text().replace('"parity": 0.0001', f'"parity": {number}'))
+    with pytest.raises(TrainingError, match="parity is out of all bounds"):
+        read_report(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe{", b"[" * 200_000])
+def test_what_cannot_be_read(tmp_path, content):
+    path = tmp_path / "report.json"
+    path.write_bytes(content)
+    with pytest.raises(TrainingError, match=r"The report '.*' cannot be read \(.*\); train again"):
+        read_report(path)
+    with pytest.raises(TrainingError, match="cannot be read"):
+        read_report(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", "3", '{"format": "fdda-report", "version": 2}'])
+def test_what_is_another_format(tmp_path, text):
+    (tmp_path / "report.json").write_text(text)
+    with pytest.raises(TrainingError, match="is not a training report of this version; train again"):
+        read_report(tmp_path / "report.json")
+
+
+def test_a_report_that_is_too_large(tmp_path, monkeypatch):
+    monkeypatch.setattr(report_format, "MAX_BYTES", 1 << 20)
+    (tmp_path / "report.json").write_bytes(b" " * ((1 << 20) + 1))
+    with pytest.raises(TrainingError, match=r"it is larger than 1 MB.*; train again"):
+        read_report(tmp_path / "report.json")
+
+
+def test_the_manual_has_every_name():
+    text = (Path(__file__).parents[2] / "docs" / "training.md").read_text(encoding="utf-8")
+    section = text[text.index("## report.json") :]
+
+    def names(kind: object) -> set[str]:
+        if isinstance(kind, report_format._OrNull):
+            return names(kind.kind)
+        if isinstance(kind, list):
+            return names(kind[0])
+        if not isinstance(kind, dict):
+            return set()
+        return {key.removesuffix("?") for key in kind} | {name for inner in kind.values() for name in names(inner)}
+
+    elsewhere = {"inside", "beside", "across"} | set(REPORT["training"])  # evaluation.md, and the settings
+    assert sorted(name for name in names(report_format._REPORT) - elsewhere if name not in section) == []

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Names that are not ASCII, on a terminal that is nothing else; and file names that are not even UTF-8."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+
+from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.rig import Joint
+
+from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
+from .conftest import REPOSITORY
+
+ASCII = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """A recording of a chain with names from all over the world."""
+    rig = chain_rig(2)
+    rig = replace(rig, joints=(Joint("Wurzel ß", -1), Joint("前腕.L", 0)))
+    angles = chain_angles(60, 2, 0)
+    path = tmp_path / "Aufnahme äöü"
+    info = replace(chain_info(60), object_name="Ärmel")
+    with RecordingWriter(path, rig, make_partitions(rig, {0: (1,), 1: (1,)}), info) as writer:
+        writer.append(pose_chain(rig, angles), chain_residuals(rig, angles))
+    return path
+
+
+def trainer(*arguments) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", *arguments]
+    return subprocess.run(command, cwd=REPOSITORY, env=ASCII, capture_output=True, check=False)
+
+
+def test_a_training_on_a_terminal_that_knows_ascii_only(recording, tmp_path):
+    model = tmp_path / "modèle.onnx"
+    done = trainer("trainer", recording, model, "--epochs", "2", "--hidden", "8")
+    assert done.returncode == 0, done.stderr
+    assert rb"\u524d\u8155.L" in done.stdout and b"Wurzel \\xdf" in done.stdout
+    assert model.exists()
+    done = trainer("trainer.report", tmp_path / "réport.json")
+    assert done.returncode == 1 and done.stderr.startswith(b"The report '") and b"Traceback" not in done.stderr
+
+
+def test_a_file_name_that_is_no_text(recording, tmp_path):
+    model = os.fsencode(tmp_path) + b"/m\xff.onnx"
+    done = trainer("trainer", recording, model, "--epochs", "2", "--hidden", "8")
+    assert done.returncode == 0, done.stderr
+    assert os.path.exists(model) and (tmp_path / "report.html").exists()

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The graph: it agrees with PyTorch wherever bones may be, costs no more than it must, and old models still play."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+
+import trainer.training
+from fdda_addon.core.model import read_model_info
+from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.runtime.network import Network
+from trainer.__main__ import main
+from trainer.deformation import Deformation, is_sheared
+from trainer.export import open_session, reference_positions
+from trainer.graph import build_graph
+
+from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain, rotation
+from .conftest import QUICK
+
+OLD_MODELS = Path(__file__).with_name("old_models")
+SHEAR = np.eye(4)
+SHEAR[0, 1] = 0.3
+
+
+def keep_deformation(monkeypatch) -> list[Deformation]:
+    """The deformations that trainings make from now on."""
+    made, make = [], trainer.training._deformation
+    monkeypatch.setattr(trainer.training, "_deformation", lambda *args: made.append(make(*args)) or made[-1])
+    return made
+
+
+@pytest.fixture(scope="module")
+def deformation(recording, tmp_path_factory) -> Deformation:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        made = keep_deformation(monkeypatch)
+        assert main([str(recording), str(tmp_path_factory.mktemp("graph") / "model.onnx"), *QUICK]) == 0
+    return made[0]
+
+
+def played(deformation: Deformation, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    session = open_session(build_graph(deformation).SerializeToString())
+    return tuple(session.run(["positions", "trust"], {"pose_matrices": poses}))
+
+
+def agrees(deformation: Deformation, poses: np.ndarray, tolerance: float = 2e-6) -> np.ndarray:
+    """Compare with PyTorch; returns the trust."""
+    positions, trust = played(deformation, poses)
+    expected, expected_trust = reference_positions(deformation, poses, np.zeros((len(poses), 0), np.float32))
+    np.testing.assert_allclose(positions, expected, atol=tolerance)
+    np.testing.assert_allclose(trust, expected_trust, atol=1e-5)
+    return trust
+
+
+@pytest.mark.parametrize("sheared", [False, True])
+def test_rigid_bones(deformation, sheared):
+    angles = chain_angles(20, 3, 5)
+    angles[:, 2, 1] = 0
+    assert (agrees(replace(deformation, sheared=sheared), pose_chain(deformation.rig, angles)) == 1).all()
+
+
+@pytest.mark.parametrize("sheared", [False, True])
+@pytest.mark.parametrize("scale", [(2, 2, 2), (0.01, 0.01, 0.01), (1.1, 0.9, 1.05)])
+def test_scaled_bones(deformation, sheared, scale):
+    poses = pose_chain(deformation.rig, chain_angles(20, 3, 5))
+    poses[:, 1:] = poses[:, 1:] @ np.diag([*scale, 1]).astype(np.float32)
+    agrees(replace(deformation, sheared=sheared), poses)
+
+
+def test_a_character_that_is_scaled_as_a_whole_keeps_its_residuals(deformation):
+    angles = chain_angles(10, 3, 5)
+    angles[:, 2, 1] = 0
+    poses = pose_chain(deformation.rig, angles)
+    scaled = np.diag([2, 2, 2, 1]).astype(np.float32) @ poses
+    # The last partition does not look at the root, which was locked.
+    last = deformation.partitions[2].vertices
+    positions, trust = played(deformation, scaled)
+    assert (trust[:, 2] == 1).all()
+    np.testing.assert_allclose(positions[:, last], 2 * played(deformation, poses)[0][:, last], atol=4e-6)
+    assert np.abs(positions - LinearLayer(deformation.rig).positions(scaled))[:, last].max() > 1e-3
+
+
+def test_far_from_the_origin(deformation):
+    poses = pose_chain(deformation.rig, chain_angles(5, 3, 5))
+    away = np.eye(4)
+    away[:3, 3] = 60, -70, 40
+    agrees(deformation, (away @ poses).astype(np.float32), tolerance=1e-4)
+
+
+def test_a_sheared_bone_gives_numbers_and_takes_trust_at_most(deformation):
+    poses = (pose_chain(deformation.rig, chain_angles(5, 3, 5)).astype(np.float64) @ SHEAR).astype(np.float32)
+    positions, trust = played(deformation, poses)
+    linear = LinearLayer(deformation.rig).positions(poses)
+    assert np.isfinite(positions).all() and (trust >= 0).all() and (trust <= 1).all()
+    assert np.abs(positions - linear).max() < 0.1
+    agrees(replace(deformation, sheared=True), poses)
+
+
+def test_shear_is_found_and_scale_is_none(recording):
+    poses = pose_chain(chain_rig(), chain_angles(300, 3, 0))
+    assert not is_sheared(poses)
+    assert not is_sheared(poses @ np.diag([3, 0.2, 1, 1]).astype(np.float32))
+    poses[299, 1] = poses[299, 1] @ SHEAR.astype(np.float32)
+    assert is_sheared(poses)
+
+
+def test_a_recording_with_sheared_bones_plays_them(tmp_path, monkeypatch):
+    rig, angles = chain_rig(), chain_angles(120, 3, 0)
+    # A mesh object that is scaled along a slanted axis shears every matrix.
+    squash = rotation(0, 0.7) @ np.diag([1, 1, 0.6, 1]) @ rotation(0, -0.7)
+    rig = replace(rig, rest_matrices=(squash @ rig.rest_matrices).astype(np.float32))
+    poses = (squash @ pose_chain(chain_rig(), angles)).astype(np.float32)
+    influencing = {0: (1,), 1: (1, 2), 2: (2,)}
+    with RecordingWriter(tmp_path / "recording", rig, make_partitions(rig, influencing), chain_info(120)) as writer:
+        writer.append(poses, chain_residuals(chain_rig(), angles))
+    made = keep_deformation(monkeypatch)
+    assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *QUICK]) == 0
+    assert made[0].sheared and read_model_info(tmp_path / "model.onnx").parity_mm < 1e-2
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["fdda"]["held_out"]["mean"] < 0.1 * report["linear"]["held_out"]["mean"]
+
+
+def test_the_graph_has_few_nodes(trained):
+    """Half a microsecond each, and most of one in a frame."""
+    info, graph = read_model_info(trained / "model.onnx"), onnx.load(trained / "model.onnx").graph
+    assert len(graph.node) <= 56 + len(info.partitions)
+
+
+def test_constants_are_the_matrices_and_little_else(trained, deformation, report):
+    info, graph = read_model_info(trained / "model.onnx"), onnx.load(trained / "model.onnx").graph
+    arrays = [onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer]
+    assert info.constant_bytes == report["constant_bytes"] == sum(array.nbytes for array in arrays)
+    assert f"{info.constant_bytes:,}" in (trained / "report.html").read_text()
+    networks = sum(a.size for network in deformation.networks for a in (*network.weights, *network.biases))
+    matrices = sum((4 * 2 + 4 * len(p.fit.joints) + 3 * len(p.basis.shapes)) * p.vertices for p in deformation.prepared)
+    assert info.constant_bytes < 1.5 * 4 * (networks + matrices) + 16_000
+
+
+def test_a_model_of_the_first_version_still_plays():
+    network = Network(OLD_MODELS / "version_1.onnx")
+    assert network.info.constant_bytes == 0 and network.info.vertex_count == 90
+    poses = pose_chain(chain_rig(), chain_angles(2, 3, 7))
+    expected = np.load(OLD_MODELS / "positions.npy")
+    np.testing.assert_allclose(network.positions(poses), expected, atol=2e-6)
+    assert network.trust(poses).shape == (2, 3)

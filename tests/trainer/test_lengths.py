@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Whatever unit a character is built in, and wherever its mesh lies: the same model, within rounding."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdda_addon.core.checks.recording import check_recording
+from fdda_addon.core.model import read_model_info
+from fdda_addon.core.partition import make_partitions
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.report import report_path
+from trainer.__main__ import main
+from trainer.config import TrainingConfig
+from trainer.data import partitions_of, prepare, split_recording
+from trainer.inputs import inputs_of_rig, middles
+
+from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
+from .conftest import QUICK
+
+JOINTS, POSES = 4, 160
+METRES = "metres"
+WAYS = {
+    METRES: (1.0, 0.0),
+    "centimetres": (100.0, 0.0),
+    "millimetres": (1000.0, 0.0),
+    "kilometres": (0.001, 0.0),
+    "100 metres away": (1.0, 100.0),
+    "millimetres, 100 metres away": (1000.0, 100.0),
+}
+OTHERS = [name for name in WAYS if name != METRES]
+
+
+def write(path, per_metre: float, away: float) -> None:
+    """A recording of the chain in another unit, so many to the metre, so many metres from the origin."""
+    rig = chain_rig(JOINTS)
+    angles = chain_angles(POSES, JOINTS, seed=3)
+    matrices, residuals = pose_chain(rig, angles).astype(np.float64), chain_residuals(rig, angles)
+    rest, positions = rig.rest_matrices.astype(np.float64), rig.rest_positions.astype(np.float64)
+    for array in (rest, matrices):
+        array[..., :3, 3] = per_metre * (array[..., :3, 3] + away)
+    rig = replace(
+        rig,
+        rest_positions=(per_metre * (positions + away)).astype(np.float32),
+        rest_matrices=rest.astype(np.float32),
+        metres_per_unit=1 / per_metre,
+    )
+    influencing = {j: tuple(i for i in (j, j + 1) if 0 < i < JOINTS) for j in range(JOINTS)}
+    with RecordingWriter(path, rig, make_partitions(rig, influencing), chain_info(POSES)) as writer:
+        writer.append(matrices.astype(np.float32), per_metre * residuals)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> dict:
+    """Recording, report and model of each."""
+    folder, found = tmp_path_factory.mktemp("lengths"), {}
+    for name, way in WAYS.items():
+        path = folder / name
+        path.mkdir()
+        write(path / "recording", *way)
+        model = path / "m.onnx"
+        assert main([str(path / "recording"), str(model), *QUICK]) == 0, name
+        report = json.loads(report_path(model).read_text())
+        found[name] = read_recording(path / "recording"), report, read_model_info(model)
+    return found
+
+
+def prepared(recording) -> list:
+    config = TrainingConfig(seed=0)
+    rig, split = recording.rig, split_recording(recording, config)
+    inputs = inputs_of_rig(rig, middles(rig, recording.partitions), recording.partitions)
+    partitions = partitions_of(recording, inputs)
+    return [prepare(p, split, config.tolerance_mm, config.seed, rig.metres_per_unit) for p in partitions]
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_networks_see_the_same(trained, name):
+    """Not the rounding of what stands still, and all that moves, however small its number is."""
+    for own, metres in zip(*(prepared(trained[n][0]) for n in (name, METRES)), strict=True):
+        assert own.columns.tolist() == metres.columns.tolist()
+        assert own.fit.joints.tolist() == metres.fit.joints.tolist()
+        assert abs(len(own.basis.shapes) - len(metres.basis.shapes)) <= 1
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_models_are_as_good(trained, name):
+    own, metres = (trained[n][1] for n in (name, METRES))
+    # One step of float32, mm: positions far from the origin are no more exact than that.
+    step = 1000 * float(np.spacing(np.float32(WAYS[name][1])))
+    for way in ("fdda", "linear"):
+        for statistic, value in metres[way]["held_out"].items():
+            assert own[way]["held_out"][statistic] == pytest.approx(value, rel=0.1, abs=step), (way, statistic)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_the_same_counts_as_locked(trained, name):
+    """What the trust is taken for: ranges in true metres agree."""
+    (_, _, own), (_, _, metres) = trained[name], trained[METRES]
+    per_metre, _ = WAYS[name]
+    for mine, theirs in ((own.feature_low, metres.feature_low), (own.feature_high, metres.feature_high)):
+        mine = mine.copy()
+        mine[:, 3::4] /= per_metre
+        assert np.abs(mine - theirs)[1:].max() < 2e-4
+
+
+@pytest.mark.parametrize("name", WAYS)
+def test_nothing_is_suspicious(trained, name):
+    own, metres = ({warning.name for warning in check_recording(trained[n][0])} for n in (name, METRES))
+    assert own == metres
