@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks.bench import measure, run
 from blend_fixtures.characters.meshes import five_hundred_bones
-from fdda_addon.arm import build_arm
+from fdda_addon.arm.rig import build_arm
 from fdda_addon.scene.blend_file import save_copy
 
 

@@ -18,15 +18,18 @@ import bpy
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import fdda_addon
-from fdda_addon.benchmark import benchmark, random_action
 from fdda_addon.core.poses import sample_pose
-from fdda_addon.recording import RecordingSettings, record
+from fdda_addon.poses.sampling import sampled_channels
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.run import record
+from fdda_addon.rig.reading import PoseReader, read_rig
 from fdda_addon.runtime import model_files
 from fdda_addon.runtime.network import Network
 from fdda_addon.scene.armature import Poser, clear_pose
 from fdda_addon.scene.borrow import borrowed_pose
 from fdda_addon.scene.mesh import evaluated_positions
-from fdda_addon.scene.rig import PoseReader, SceneRig, armature_modifier, find_rig, read_rig, sampled_channels
+from fdda_addon.scene.scene_rig import SceneRig, armature_modifier, find_rig
+from fdda_addon.timing.benchmark import benchmark, random_action
 
 ROUNDS = 5
 CROWD = 20

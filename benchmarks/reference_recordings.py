@@ -23,7 +23,7 @@ from fdda_addon.core.partition import Partition
 from trainer.config import TrainingConfig, add_options, config_from_arguments
 from trainer.data import PartitionData, PreparedPartition, prepare, split_poses
 from trainer.inputs import Inputs, make_inputs
-from trainer.linear_fit import make_surroundings
+from trainer.joint_fit import make_surroundings
 from trainer.loop import train
 from trainer.model import Network
 

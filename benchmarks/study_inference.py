@@ -19,7 +19,7 @@ def inference_times(models: list[list[Path]], pose: np.ndarray) -> list[list[flo
 
     Args:
         models: files, a list for each configuration.
-        pose: (1, J, 4, 4) float32, mesh-object space, metres.
+        pose: (1, J, 4, 4) float32, mesh-object space, mesh units.
 
     Returns:
         Microseconds a call, the median for each model, in the same order.

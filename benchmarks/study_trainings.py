@@ -12,13 +12,13 @@ import torch
 
 from fdda_addon.core.errors import RecordingError, TrainingError
 from fdda_addon.core.metrics import error_statistics
-from fdda_addon.core.output import write_json
-from fdda_addon.core.recording import Recording, partitions_json, read_partitions, read_recording
+from fdda_addon.core.output import replacing, write_json
+from fdda_addon.core.recording.reader import Recording, partitions_json, read_partitions, read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
 from trainer.config import TrainingConfig
 from trainer.data import partitions_of, prepare, split_poses
-from trainer.deformation import Deformation
+from trainer.deformation import Deformation, is_sheared
 from trainer.export import Measured, build_model, measure, write_model
 from trainer.inputs import Inputs, inputs_of_rig, middles
 from trainer.loop import Curves, train
@@ -95,13 +95,21 @@ def train_once(material: Material, config: TrainingConfig, model_path: Path) -> 
     seen = inputs.features(poses, recording.rig.rest_matrices, controls)
     trust = make_trust_range(seen, recording.rig, recording.partitions)
     deformation = Deformation(
-        recording.rig, recording.partitions, inputs, tuple(prepared), trained.networks, trust, config.activation
+        recording.rig,
+        recording.partitions,
+        inputs,
+        tuple(prepared),
+        trained.networks,
+        trust,
+        config.activation,
+        is_sheared(recording.pose_matrices),
     )
     exported = build_model(recording, deformation, split.validation, config.to_json())
     held_out = measure(
         exported.session, material.held_out, deformation, np.arange(len(material.held_out.pose_matrices))
     )
-    write_model(model_path, exported.content)
+    with replacing(model_path) as temporary:
+        write_model(temporary, exported.content)
     return {
         "seconds": {key: round(value, 2) for key, value in seconds.items()},
         "model_bytes": len(exported.content),

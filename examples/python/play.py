@@ -82,7 +82,7 @@ def write_obj(path: Path, positions: np.ndarray, faces: list[np.ndarray]) -> Non
 def read_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Pose a model and write the mesh.")
     parser.add_argument("model", help=".onnx file")
-    parser.add_argument("out", type=Path, help=".obj file, or .npy file of an array (V, 3); mesh-object space, metres")
+    parser.add_argument("out", type=Path, help=".obj file, or .npy file of an array (V, 3); mesh-object space")
     of_turns = {"nargs": 4, "metavar": ("JOINT", "X", "Y", "Z"), "help": "degrees"}
     of_controls = {"nargs": 2, "metavar": ("OWNER/PATH", "VALUE"), "help": "an input beside the joints"}
     parser.add_argument("--turn", **of_turns, action="append", default=[])

@@ -1,0 +1,270 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Draws the floors of the code for docs/development.md, read from the code: `make map`.
+
+    python docs/pictures/make_map.py OUT.svg
+
+The layout is that of a layered graph: an arrow that passes a floor holds a place on it, and rooms and places move to
+where their arrows are short.
+"""
+
+import ast
+import itertools
+import sys
+import textwrap
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import matplotlib
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+from matplotlib.path import Path as Curve
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from tests.contract.floors import FLOORS, ROOT, import_graph, module_of, room_graph, room_of
+
+WINGS = {
+    "__init__": ("what people touch", "#c8553d"),
+    "models": ("the work", "#2f6690"),
+    "rig": ("Blender's data", "#3a7d44"),
+    "core.checks": ("without Blender", "#6b5b95"),
+}
+"""From the floor of this room down: what the floors have in common, and their colour."""
+TRAINER, TRAINER_COLOUR = "trainer", "#8a6d3b"
+WIDTH, HEIGHT, LANE, GAP = 6.9, 1.72, 0.3, 0.55
+"""Of a room, of a place that an arrow holds, and between two of either."""
+FLOOR = 2.45
+"""From one floor to the next."""
+INK, PAPER = "#222222", "#ffffff"
+MAIN_FILES = 6
+SENTENCE, FILES = 48, 44
+"""Letters in a line."""
+SETTLING = 200
+
+
+@dataclass(eq=False)
+class Item:
+    """A room, or the place that an arrow holds where it passes a floor; `x` is its middle."""
+
+    name: str
+    width: float
+    x: float = 0.0
+    above: list["Item"] = field(default_factory=list)
+    below: list["Item"] = field(default_factory=list)
+
+
+def files_of(room: str) -> list[Path]:
+    """The files of a room, without those of rooms inside of it."""
+    if room == TRAINER:
+        return sorted((ROOT / TRAINER).rglob("*.py"))
+    return [
+        file
+        for file in sorted((ROOT / "fdda_addon").rglob("*.py"))
+        if room_of(module_of(file).removeprefix("fdda_addon").lstrip(".")) == room
+    ]
+
+
+def purpose(room: str) -> str:
+    """The first sentence of a room's docstring."""
+    file = ROOT / "fdda_addon" / Path(*room.split("."))
+    if room == TRAINER:
+        file = ROOT / TRAINER
+    file = file / "__init__.py" if file.is_dir() else file.with_suffix(".py")
+    text = " ".join((ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or "").split())
+    return text.partition(". ")[0].rstrip(".").replace("`", "")
+
+
+def main_files(room: str) -> list[str]:
+    """The files of a room that other rooms import most, its doors; then those that its own do, then the longest."""
+    files = {module_of(file): file for file in files_of(room) if file.name != "__init__.py"}
+    graph = import_graph(TRAINER if room == TRAINER else "fdda_addon")
+    inside, outside = (
+        Counter(name for module, imported in graph.items() if (module in files) == own for name in imported)
+        for own in (True, False)
+    )
+    ranked = sorted(files, key=lambda module: (-outside[module], -inside[module], -_lines(files[module])))
+    return [files[module].stem for module in ranked[:MAIN_FILES]]
+
+
+def _lines(file: Path) -> int:
+    return len(file.read_text(encoding="utf-8").splitlines())
+
+
+def arrows() -> dict[str, set[str]]:
+    """Who imports from whom, without what follows from the other arrows."""
+    graph = room_graph()
+    below = {room: _reached(graph, room) for room in graph}
+    return {
+        room: {other for other in imported if not any(other in below[third] for third in imported - {other})}
+        for room, imported in graph.items()
+    }
+
+
+def _reached(graph: dict[str, set[str]], room: str) -> set[str]:
+    found: set[str] = set()
+    waiting = [room]
+    while waiting:
+        for other in graph[waiting.pop()] - found:
+            found.add(other)
+            waiting.append(other)
+    return found
+
+
+def place(floors: list[list[str]], edges: dict[str, set[str]]) -> tuple[list[list[Item]], dict[str, Item]]:
+    """Items of each floor from left to right, and the rooms by name."""
+    number = {room: floor for floor, rooms in enumerate(floors) for room in rooms}
+    rooms = {room: Item(room, WIDTH) for room in number}
+    rows = [[rooms[room] for room in floor] for floor in floors]
+    for room, below in sorted(edges.items()):
+        for other in sorted(below):
+            last = rooms[room]
+            for floor in range(number[room] + 1, number[other]):
+                lane = Item("", LANE)
+                rows[floor].append(lane)
+                last = _join(last, lane)
+            _join(last, rooms[other])
+    for row in rows:
+        _spread(row)
+    for turn in range(SETTLING):
+        order = range(len(rows)) if turn % 2 else reversed(range(len(rows)))
+        for floor in order:
+            row = rows[floor]
+            for item in row:
+                near = [other.x for other in (*item.above, *item.below)]
+                item.x = sum(near) / len(near) if near else 0.0
+            if turn < SETTLING / 2:
+                row.sort(key=lambda item: item.x)
+            _spread(row)
+    return rows, rooms
+
+
+def _join(above: Item, below: Item) -> Item:
+    above.below.append(below)
+    below.above.append(above)
+    return below
+
+
+def _spread(row: list[Item]) -> None:
+    """Move items apart that overlap, in their order, with their common middle where it was."""
+    for _ in range(SETTLING):
+        moved = False
+        for left, right in itertools.pairwise(row):
+            lacking = (left.width + right.width) / 2 + GAP - (right.x - left.x)
+            if lacking > 1e-3:
+                left.x, right.x, moved = left.x - lacking / 2, right.x + lacking / 2, True
+        if not moved:
+            return
+
+
+def _curve(item: Item, other: Item, y: dict[Item, float]) -> Curve:
+    """From the bottom of a room through the places of an arrow to the top of another room."""
+    start, points = y[item] - HEIGHT / 2, [(item.x, y[item] - HEIGHT / 2)]
+    codes, below = [Curve.MOVETO], other
+    x = item.x
+    while True:
+        end = y[below] + HEIGHT / 2
+        middle = (start + end) / 2
+        points += [(x, middle), (below.x, middle), (below.x, end)]
+        codes += [Curve.CURVE4] * 3
+        if below.name:
+            return Curve(points, codes)
+        points.append((below.x, y[below] - HEIGHT / 2))
+        codes.append(Curve.LINETO)
+        x, start, below = below.x, y[below] - HEIGHT / 2, below.below[0]
+
+
+def draw(path: Path) -> None:
+    """Draw the map into a file."""
+    matplotlib.rcParams.update({"svg.hashsalt": "fdda", "font.family": "DejaVu Sans"})
+    edges = arrows()
+    rows, rooms = place([list(floor) for floor in FLOORS], edges)
+    y = {item: -floor * FLOOR for floor, row in enumerate(rows) for item in row}
+    if rooms["training"].x < max(rooms[room].x for floor in FLOORS if "training" in floor for room in floor):
+        # Towards the process that it starts, which is drawn on the right.
+        for item in y:
+            item.x = -item.x
+    colours, wing = {}, None
+    spans: dict[tuple[str, str], list[int]] = {}
+    for floor, row in enumerate(FLOORS):
+        wing = next((WINGS[room] for room in row if room in WINGS), wing)
+        colours |= dict.fromkeys(row, wing[1])
+        spans.setdefault(wing, []).append(floor)
+    left = min(item.x - item.width / 2 for row in rows for item in row) - 0.6
+    right = max(item.x + item.width / 2 for row in rows for item in row) + 0.6
+    trainer = Item(TRAINER, WIDTH, right + 1.6 + WIDTH / 2)
+    rooms[TRAINER], colours[TRAINER] = trainer, TRAINER_COLOUR
+    y[trainer] = y[rooms["training"]]
+    low, high = -(len(rows) - 1) * FLOOR - 1.2, 1.2
+    end = trainer.x + WIDTH / 2 + 0.7
+    figure = Figure(figsize=((end - left + 1.2) / 2, (high - low) / 2))
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set(xlim=(left - 1.2, end), ylim=(low, high))
+    axes.axis("off")
+    figure.patch.set_facecolor(PAPER)
+    for (text, colour), numbers in spans.items():
+        top, bottom = -numbers[0] * FLOOR + FLOOR / 2, -numbers[-1] * FLOOR - FLOOR / 2
+        axes.add_patch(_box(left, bottom + 0.08, right - left, top - bottom - 0.16, colour, 0.07, 0.3))
+        axes.text(left - 0.55, (top + bottom) / 2, text, rotation=90, ha="center", va="center", size=15, color=colour)
+    for room in edges:
+        for item in rooms[room].below:
+            _arrow(axes, _curve(rooms[room], item, y), colours[room])
+    _draw_trainer(axes, rooms, y)
+    for name, item in rooms.items():
+        _draw_room(axes, item, y[item], colours[name])
+    figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None, dpi=100)
+
+
+def _draw_trainer(axes, rooms: dict[str, Item], y: dict[Item, float]) -> None:
+    """The building beside: who starts it, and what it uses of the other."""
+    trainer, training, used = rooms[TRAINER], rooms["training"], rooms["core.checks"]
+    width, height = trainer.width + 0.6, HEIGHT + 1.3
+    axes.add_patch(
+        _box(trainer.x - width / 2, y[trainer] - HEIGHT / 2 - 0.35, width, height, TRAINER_COLOUR, 0.09, 0.3)
+    )
+    text = "another process, with PyTorch and without Blender"
+    axes.text(trainer.x, y[trainer] + HEIGHT / 2 + 0.45, text, ha="center", size=10, color=TRAINER_COLOUR)
+    # Below its floor, where no room is in the way.
+    start, level, turn = training.x + 0.4 * training.width, y[training] - HEIGHT / 2 - 0.4, trainer.x - width / 2 - 0.6
+    points = [(start, level + 0.4), (start, level), (turn, level), (turn, y[trainer])]
+    _arrow(axes, Curve([*points, (trainer.x - trainer.width / 2, y[trainer])]), WINGS["models"][1], "--")
+    text = "starts, and reads its messages"
+    axes.text(turn - 0.9, level + 0.08, text, ha="right", size=9, color=WINGS["models"][1])
+    down, level = trainer.x, y[used]
+    points = [(down, y[trainer] - HEIGHT / 2), (down, level + 1), (down, level), (down - 1, level)]
+    codes = [Curve.MOVETO, Curve.LINETO, Curve.CURVE3, Curve.CURVE3, Curve.LINETO]
+    _arrow(axes, Curve([*points, (used.x + used.width / 2, level)], codes), TRAINER_COLOUR)
+
+
+def _box(x: float, y: float, width: float, height: float, colour: str, alpha: float, radius: float) -> FancyBboxPatch:
+    style = f"round,pad=0,rounding_size={radius}"
+    return FancyBboxPatch((x, y), width, height, boxstyle=style, facecolor=colour, alpha=alpha, linewidth=0, zorder=0)
+
+
+def _arrow(axes, curve: Curve, colour: str, style: str = "-") -> None:
+    axes.add_patch(
+        FancyArrowPatch(
+            path=curve, arrowstyle="-|>", mutation_scale=13, color=colour, linewidth=1.5, linestyle=style, zorder=1
+        )
+    )
+
+
+def _draw_room(axes, item: Item, y: float, colour: str) -> None:
+    x = item.x - item.width / 2
+    box = _box(x, y - HEIGHT / 2, item.width, HEIGHT, PAPER, 1.0, 0.16)
+    box.set(edgecolor=colour, linewidth=1.6, zorder=2)
+    axes.add_patch(box)
+    files = files_of(item.name)
+    lines = sum(map(_lines, files))
+    count = f"{len(files)} files, {lines:,} lines" if len(files) > 1 else f"{lines:,} lines"
+    axes.text(x + 0.2, y + 0.58, item.name, size=13, weight="bold", color=colour, va="center", zorder=3)
+    axes.text(x + item.width - 0.2, y + 0.58, count, size=9, color="#666666", ha="right", va="center", zorder=3)
+    text = "\n".join(textwrap.wrap(purpose(item.name), SENTENCE, max_lines=2, placeholder=" …"))
+    axes.text(x + 0.2, y + 0.33, text, size=9, color=INK, va="top", zorder=3, linespacing=1.3)
+    if len(files) > 1:
+        names = textwrap.shorten(" ".join(main_files(item.name)), FILES, placeholder="").replace(" ", "  ")
+        axes.text(x + 0.2, y - 0.62, names, size=8.5, color=colour, va="center", zorder=3, family="DejaVu Sans Mono")
+
+
+if __name__ == "__main__":
+    draw(Path(sys.argv[1]))
