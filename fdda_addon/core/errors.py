@@ -23,7 +23,7 @@ MACHINE = {
 """What the system says when a disk, the memory or a shared folder gave out, and not when a path is wrong."""
 LONGEST = 1000
 """Letters of a sentence. What a file of somebody else's says is quoted in it, and may be a million letters long."""
-_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+_CONTROL = r"[\x00-\x1f\x7f-\x9f\u2028\u2029]"
 
 
 def one_line(text: str) -> str:
@@ -31,7 +31,7 @@ def one_line(text: str) -> str:
     if len(text) > LONGEST:
         half = LONGEST // 2
         text = f"{text[:half]} […] {text[-half:]}"
-    return _CONTROL.sub(lambda found: repr(found.group())[1:-1], text)
+    return re.sub(_CONTROL, lambda found: repr(found.group())[1:-1], text)
 
 
 class FDDAError(Exception):

@@ -16,11 +16,11 @@ class FileKind:
 
     Attributes:
         name: for sentences, with its article.
-        head: what such a file begins with.
+        head: what such a file begins with, a pattern.
     """
 
     name: str
-    head: re.Pattern[bytes]
+    head: bytes
 
     def is_of(self, path: Path) -> bool:
         """Whether a file is of this kind. An empty one is of every kind.
@@ -30,23 +30,19 @@ class FileKind:
         """
         with open_input(path) as file:
             head = file.read(HEAD_BYTES)
-        return not head or self.head.match(head) is not None
-
-
-def _kind(name: str, head: bytes) -> FileKind:
-    return FileKind(name, re.compile(head, re.DOTALL))
+        return not head or re.match(self.head, head, re.DOTALL) is not None
 
 
 _OF_OBJECTS = rb'\s*\{\s*(?:"objects":\s*\{\s*"(?:[^"\\]|\\.)*":\s*\{\s*)?'
 
-BLEND = _kind("a .blend file", rb"BLENDER|\x28\xb5\x2f\xfd|\x1f\x8b")
+BLEND = FileKind("a .blend file", rb"BLENDER|\x28\xb5\x2f\xfd|\x1f\x8b")
 """Plain, or compressed by a new or an old Blender."""
-MODEL = _kind("a model", rb"\x08[\x01-\x1f][\x12\x1a\x22\x3a]")
-WEIGHTS = _kind("the last weights of a training", rb"PK\x03\x04.{26}about\.npy")
-REPORT = _kind("a training report", rb'\s*\{\s*"format":\s*"fdda-report"')
-PAGE = _kind("the page of a training report", rb"<!doctype html>.*training report</title>")
-EVALUATION = _kind("the JSON of an evaluation", _OF_OBJECTS + rb'"unit":\s*"mm"')
-BENCHMARK = _kind("the JSON of a benchmark", _OF_OBJECTS + rb'"unit":\s*"ms"')
-WARNINGS = _kind("the JSON of a check", rb'\s*\{\s*"warnings":')
-PICTURE = _kind("a PNG picture", rb"\x89PNG\r\n")
-POINT_CACHE = _kind("a point cache", rb"POINTCACHE2\0")
+MODEL = FileKind("a model", rb"\x08[\x01-\x1f][\x12\x1a\x22\x3a]")
+WEIGHTS = FileKind("the last weights of a training", rb"PK\x03\x04.{26}about\.npy")
+REPORT = FileKind("a training report", rb'\s*\{\s*"format":\s*"fdda-report"')
+PAGE = FileKind("the page of a training report", rb"<!doctype html>.*training report</title>")
+EVALUATION = FileKind("the JSON of an evaluation", _OF_OBJECTS + rb'"unit":\s*"mm"')
+BENCHMARK = FileKind("the JSON of a benchmark", _OF_OBJECTS + rb'"unit":\s*"ms"')
+WARNINGS = FileKind("the JSON of a check", rb'\s*\{\s*"warnings":')
+PICTURE = FileKind("a PNG picture", rb"\x89PNG\r\n")
+POINT_CACHE = FileKind("a point cache", rb"POINTCACHE2\0")

@@ -9,7 +9,7 @@ STYLE = (
     "td,th{border:1px solid #bbb;padding:.2em .6em;text-align:left}pre{background:#eee;padding:.6em;overflow:auto}"
     "code{background:#eee}img{max-width:100%}h2,h3,h4{margin-top:1.6em}:target{background:#fe8}"
 )
-_BLOCK = re.compile(r"^(#{1,6} |\||    |<img|- |\d+\. )")
+_BLOCK = r"^(#{1,6} |\||    |<img|- |\d+\. )"
 
 
 def anchor(heading: str) -> str:
@@ -27,9 +27,9 @@ def _blocks(text: str) -> list[list[str]]:
     """Groups of lines: a heading, a table, a list, code, or a paragraph."""
     blocks: list[list[str]] = [[]]
     for line in text.splitlines():
-        own = _BLOCK.match(line)
+        own = re.match(_BLOCK, line)
         kind = own[1].strip()[:1] if own else ""
-        previous = _BLOCK.match(blocks[-1][0]) if blocks[-1] else None
+        previous = re.match(_BLOCK, blocks[-1][0]) if blocks[-1] else None
         is_list = previous is not None and (previous[1] == "- " or previous[1][0].isdigit())
         if not line.strip():
             blocks.append([])

@@ -14,7 +14,7 @@ from .errors import OutputError
 from .file_kind import FileKind
 
 TEMPORARY = ".fdda-"
-_LEFT_OVER = re.compile(r"\.fdda-[0-9a-f]{12}(\..*)?|\.\d+-recording\.json", re.DOTALL)
+_LEFT_OVER = r"\.fdda-[0-9a-f]{12}(\..*)?|\.\d+-recording\.json"
 """Names that `replacing` gives, and those that earlier versions gave to the index of a recording."""
 
 
@@ -155,7 +155,7 @@ def _new_file(path: Path) -> Path:
 
 def is_left_over(name: str) -> bool:
     """Whether a file of this name was left by a process that was ended while it wrote."""
-    return _LEFT_OVER.fullmatch(name) is not None
+    return re.fullmatch(_LEFT_OVER, name, re.DOTALL) is not None
 
 
 def write_text(path: Path, text: str) -> None:

@@ -5,7 +5,7 @@ import re
 
 import bpy
 
-_NAME = re.compile(r"FDDA \d+: \d+\.\d+ mm")
+_NAME = r"FDDA \d+: \d+\.\d+ mm"
 """Ours are known by their names: Blender 5 lets markers carry nothing else."""
 
 
@@ -23,7 +23,7 @@ def place(scene: bpy.types.Scene, worst: list[tuple[int, float]]) -> None:
 
 def find(scene: bpy.types.Scene) -> list[bpy.types.TimelineMarker]:
     """Our markers."""
-    return [marker for marker in scene.timeline_markers if _NAME.fullmatch(marker.name)]
+    return [marker for marker in scene.timeline_markers if re.fullmatch(_NAME, marker.name)]
 
 
 def remove(scene: bpy.types.Scene) -> int:

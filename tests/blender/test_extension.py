@@ -21,7 +21,8 @@ ROOT = Path(__file__).resolve().parents[2]
 LIFE = Path(__file__).with_name("extension_life.py")
 VERSION = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["version"]
 PACKAGE = ROOT / "dist" / f"fdda_addon-{VERSION}.zip"
-START_SECONDS = 0.05
+START = 0.07
+"""Of the time that Blender itself takes to start, in seconds of the processor: 50 ms where it takes 0.7 s."""
 STATE = ("classes", "operators", "properties", "handlers", "keymap_items", "additions", "commands", "preferences")
 
 
@@ -78,11 +79,11 @@ def test_enabled_it_is_all_there(story: dict):
 
 
 def test_blender_starts_as_fast_with_it(package: Path, tmp_path: Path):
-    """Seconds of the processor, the best of three starts: the first compiles the modules, the machine may be busy."""
+    """The best of three starts: the first compiles the modules, and the machine may be busy, or slow in all it does."""
     assert blender("install", package, user=tmp_path).returncode == 0
     starts = [json.loads(blender("start", user=tmp_path).stdout.splitlines()[-1]) for _ in range(3)]
     assert all(start["modules"] == [] for start in starts)
-    assert min(start["seconds"] for start in starts) < START_SECONDS
+    assert min(start["seconds"] for start in starts) < START * min(start["blender_seconds"] for start in starts)
 
 
 def test_disabled_it_leaves_nothing_registered(story: dict):
