@@ -12,7 +12,7 @@ from ..core.errors import ModelError
 from ..core.model import CONTROLS_INPUT, POSE_INPUT, POSITIONS_OUTPUT, TRUST_OUTPUT, check_model, read_model, read_skin
 from ..core.rig import Rig
 
-THREADED_VERTICES = 20_000
+THREADED_VERTICES = 100_000
 """From this many vertices on a second thread gains more than it costs."""
 MAX_THREADS = 4
 MAX_BOUND = 4
