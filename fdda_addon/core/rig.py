@@ -163,7 +163,9 @@ def differences(
     if theirs != ours:
         if missing := sorted(theirs - ours):
             found.append(f"the armature lacks {_names(missing)}")
-        if extra := sorted(ours - theirs):
+        if UNMOVED in ours - theirs:
+            found.append("some vertices follow no bone")
+        if extra := sorted(ours - theirs - {UNMOVED}):
             found.append(f"it does not know {_names(extra)}")
     elif joints != rig.joints:
         found.append("its joints have other parents")

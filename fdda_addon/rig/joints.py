@@ -26,12 +26,15 @@ def choose_joints(
     Args:
         scene_rig: the rig.
         skinning: names of the bones that have weights; all deforming bones when there are none. `UNMOVED` counts.
-        besides: names of other joints; those that the armature lacks are left out. When it is not given, the bones
-            that state a range of motion, those that the mesh depends on otherwise, and all bones above a joint.
+        besides: names of other joints; those that the armature lacks are left out. Where they are all of the joints,
+            theirs is the order of the joints: that of the bones changes with bones that are none. When it is not
+            given, the bones that state a range of motion, those that the mesh depends on otherwise, and all bones
+            above a joint.
     """
     armature_object = scene_rig.armature_object
     bones = armature_object.data.bones
     wanted = set(skinning)
+    besides = None if besides is None else list(besides)
     if not wanted - {UNMOVED}:
         wanted |= {bone.name for bone in bones if bone.use_deform}
     if besides is not None:
@@ -44,6 +47,11 @@ def choose_joints(
     parents = _parents(own)
     depths = {bone.name: _depth(bone.name, parents) for bone in own}
     ordered = sorted((bone.name for bone in own), key=depths.__getitem__)
+    given = [name for name in besides or () if name != UNMOVED]
+    if set(given) == set(ordered):
+        places = {name: place for place, name in enumerate(given)}
+        if all(places.get(parents[name], -1) < places[name] for name in given):
+            ordered = given
     index = {name: number for number, name in enumerate(ordered)}
     joints = [Joint(name, index[parents[name]] if parents[name] else -1) for name in ordered]
     return (*joints, *([Joint(UNMOVED, -1)] if UNMOVED in wanted else []))

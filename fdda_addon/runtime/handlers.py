@@ -41,6 +41,7 @@ def _play(cache: bpy.types.Object) -> float:
 @persistent
 def _on_frame(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     if playback := _playback():
+        playback.note_data(depsgraph)
         playback.follow(depsgraph)
         playback.gather(frame_changed=True)
 
@@ -63,7 +64,7 @@ def _play_anew() -> None:
 @persistent
 def _on_loaded(*_: object) -> None:
     if _PLAYBACK in sys.modules:
-        sys.modules[_PLAYBACK].forget()
+        sys.modules[_PLAYBACK].forget_rigs()
     # A file holds the true rig, whatever plays in it.
     _play_anew()
     if _MODEL_FILES in sys.modules:
@@ -87,7 +88,7 @@ def _on_undone(*_: object) -> None:
 def _on_linking(*_: object) -> None:
     # A library that is reloaded brings other objects under the same names.
     if playback := _playback():
-        playback.forget()
+        playback.forget_rigs()
 
 
 @persistent

@@ -18,6 +18,7 @@ from ..scene.controls import ControlReader
 from ..scene.mesh import set_mesh_positions
 from ..scene.scene_rig import SceneRig, armature_of, is_flat
 from . import cache as caches
+from . import rig_check
 from .model_files import network_of
 from .network import Execution
 
@@ -38,6 +39,7 @@ class LiveBinding:
     Attributes:
         uid: session id of the object.
         network: its model.
+        form: of its rig, when it was made.
         error: why it cannot play any more, noted while it was evaluated.
         is_outdated: it has to be made anew: its armature has other bones.
         job: what has to be executed for the pose that was read last.
@@ -63,9 +65,11 @@ class LiveBinding:
         self.error: FDDAError | None = None
         self.is_outdated = False
         info = self.network.info
-        scene_rig = self._scene_rig(mesh_object)
+        scene_rig = self.scene_rig(mesh_object)
         self._armature_uid = scene_rig.armature_object.session_uid
         self._check_vertices(mesh_object)
+        self.form = rig_check.Form.of(scene_rig)
+        self.check_rig(mesh_object)
         self._reader = self._make_reader(scene_rig)
         self._controls = ControlReader(scene_rig, info.controls)
         self._linear_layer: LinearLayer | None = None
@@ -91,11 +95,11 @@ class LiveBinding:
 
     def sources(self, mesh_object: bpy.types.Object, cache: bpy.types.Object) -> list[caches.Variable]:
         """What is read in `play`."""
-        return caches.sources_of(cache, self._scene_rig(mesh_object), self.network.info.controls)
+        return caches.sources_of(cache, self.scene_rig(mesh_object), self.network.info.controls)
 
     def inputs(self, mesh_object: bpy.types.Object) -> list[caches.Variable]:
         """What the positions follow from besides."""
-        return caches.further_inputs(self._scene_rig(mesh_object), self.network.info.joint_names)
+        return caches.further_inputs(self.scene_rig(mesh_object), self.network.info.joint_names)
 
     def find(self) -> bpy.types.Object | None:
         """The object, under whatever name it has now; None when it is gone or no longer bound."""
@@ -108,13 +112,44 @@ class LiveBinding:
         return found if found.fdda.is_bound else None
 
     def fits(self, mesh_object: bpy.types.Object) -> bool:
-        """Whether the object still has the armature, the vertices and the modifier that it had."""
+        """Whether the object still has the armature, the mesh, the vertices and the settings that it had."""
         try:
             self._check_vertices(mesh_object)
         except ModelError:
             return False
         armature_object = armature_of(mesh_object)
-        return armature_object is not None and armature_object.session_uid == self._armature_uid
+        return (
+            armature_object is not None
+            and armature_object.session_uid == self._armature_uid
+            and mesh_object.data.session_uid == self.form.mesh
+            and self.form.skin[0] == rig_check.settings_of(mesh_object)
+        )
+
+    def has_skin(self, mesh_object: bpy.types.Object) -> bool:
+        """Whether the object still has the vertex groups, and the settings, that it had."""
+        return self.form.skin == rig_check.skin_of(mesh_object)
+
+    def has_bones(self, mesh_object: bpy.types.Object, also_parents: bool) -> bool:
+        """Whether its armature still has the bones that it had, in the rest pose and the order that they had."""
+        armature_object = armature_of(mesh_object)
+        if armature_object is None:
+            return False
+        armature = armature_object.data
+        return rig_check.bones_of(armature) == self.form.bones and not (
+            also_parents and rig_check.parents_of(armature) != self.form.parents
+        )
+
+    def has_rest(self, mesh_object: bpy.types.Object) -> bool:
+        """Whether its vertices still are where they were at rest."""
+        return rig_check.rest_of(mesh_object.data) == self.form.rest
+
+    def check_rig(self, mesh_object: bpy.types.Object) -> None:
+        """Fail when the rig is no longer the one that the model was trained for.
+
+        Raises:
+            FDDAError: as `rig_check.check`.
+        """
+        rig_check.check(self.scene_rig(mesh_object), self.network, self.form)
 
     @property
     def has_news(self) -> bool:
@@ -238,7 +273,12 @@ class LiveBinding:
                 "undo the change, or record and train again."
             )
 
-    def _scene_rig(self, mesh_object: bpy.types.Object) -> SceneRig:
+    def scene_rig(self, mesh_object: bpy.types.Object) -> SceneRig:
+        """The rig of the object.
+
+        Raises:
+            RigError: its armature is gone.
+        """
         armature_object = armature_of(mesh_object)
         if armature_object is None:
             raise RigError(f"The armature of '{mesh_object.name}' is gone; give its Armature modifier an armature.")

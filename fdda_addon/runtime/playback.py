@@ -14,7 +14,8 @@ import bpy
 from ..core.errors import FDDAError, ModelError
 from ..scene.compatibility import curves_of
 from . import cache as caches
-from . import nodes, switch
+from . import nodes, rig_check, switch
+from .changed import Changed
 from .crowd import Crowds, is_hub
 from .live_binding import LiveBinding
 from .model_files import network_of
@@ -25,7 +26,7 @@ _live: dict[int, LiveBinding] = {}
 """Those that play, by the session id of their cache object."""
 _crowds = Crowds()
 _edited: set[int] = set()
-"""Session ids of the armature objects that are in edit mode."""
+"""Session ids of the bound objects whose meshes are being changed, in edit mode or another."""
 _object_count = -1
 _is_following = False
 
@@ -98,27 +99,60 @@ def _follow_mode(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) 
 
 
 def note_changes(depsgraph: bpy.types.Depsgraph) -> None:
-    """Look anew at the bound objects and armatures that an evaluation has changed."""
-    for update in depsgraph.updates:
-        changed = update.id.original
-        if not isinstance(changed, bpy.types.Object):
+    """Look anew at the bound objects, and at the rigs, that an evaluation has changed."""
+    changed = Changed.by(depsgraph)
+    for mesh_object, is_mesh, is_whole in changed.mesh_objects:
+        if not mesh_object.fdda.is_bound:
             continue
-        if changed.type == "ARMATURE":
-            # An armature is reported whenever it is posed; its bones change in edit mode.
-            if changed.mode == "EDIT":
-                _edited.add(changed.session_uid)
-            elif changed.session_uid in _edited:
-                _edited.discard(changed.session_uid)
-                forget()
-        elif changed.type == "MESH" and changed.fdda.is_bound:
-            if changed.session_uid not in _bound:
-                look_again()
-                continue
-            _bound[changed.session_uid] = _is_mode_animated(changed)
-            if update.is_updated_geometry:
-                uid, live = _of(changed)
-                if live is not None and not (live.fits(changed) and _reads(changed, uid)):
-                    _drop(uid)
+        if mesh_object.session_uid not in _bound:
+            look_again()
+            continue
+        _bound[mesh_object.session_uid] = _is_mode_animated(mesh_object)
+        uid, live = _of(mesh_object)
+        if live is None:
+            continue
+        if (is_mesh and not (live.fits(mesh_object) and _reads(mesh_object, uid))) or (
+            is_whole and not live.has_skin(mesh_object)
+        ):
+            _drop(uid)
+        elif mesh_object.mode not in rig_check.SETTLED_MODES:
+            _edited.add(mesh_object.session_uid)
+    # A render's own graph takes everything for new.
+    if depsgraph.mode != "RENDER":
+        _note_rigs(changed)
+
+
+def note_data(depsgraph: bpy.types.Depsgraph) -> None:
+    """As `note_changes`, with a frame; one in which nothing has changed but poses costs nothing."""
+    if any(depsgraph.id_type_updated(kind) for kind in ("ARMATURE", "MESH", "SCENE")):
+        note_changes(depsgraph)
+
+
+def _note_rigs(changed: Changed) -> None:
+    for mesh, is_whole in changed.meshes.items():
+        if is_whole:
+            rig_check.doubt(mesh)
+    for uid, live in list(_live.items()):
+        is_other = changed.armatures.get(live.form.armature)
+        mesh_is_other = changed.meshes.get(live.form.mesh)
+        if is_other is None and mesh_is_other is None and live.uid not in _edited:
+            continue
+        mesh_object = live.find()
+        if mesh_object is None:
+            continue
+        if is_other is not None and not live.has_bones(mesh_object, also_parents=is_other):
+            _drop(uid)
+        elif mesh_object.mode not in rig_check.SETTLED_MODES:
+            _edited.add(live.uid)
+        elif mesh_is_other or live.uid in _edited or (mesh_is_other is False and not live.has_rest(mesh_object)):
+            if live.uid in _edited:
+                _edited.discard(live.uid)
+                rig_check.doubt(live.form.mesh)
+            live.form = rig_check.Form.of(live.scene_rig(mesh_object))
+            try:
+                live.check_rig(mesh_object)
+            except FDDAError as error:
+                live.error = error
 
 
 def _is_mode_animated(mesh_object: bpy.types.Object) -> bool:
@@ -157,7 +191,14 @@ def forget() -> None:
     _live.clear()
     _crowds.forget()
     _bound.clear()
+    _edited.clear()
     look_again()
+
+
+def forget_rigs() -> None:
+    """As `forget`, and read all rigs anew: other datablocks may stand under the same names."""
+    rig_check.forget()
+    forget()
 
 
 def make_anew(mesh_object: bpy.types.Object) -> None:
@@ -248,6 +289,8 @@ def scan() -> None:
                 live = _live.get(cache.session_uid)
                 if live is None or live.uid != mesh_object.session_uid:
                     _live[cache.session_uid] = LiveBinding(mesh_object, cache)
+                    if mesh_object.mode not in rig_check.SETTLED_MODES:
+                        _edited.add(mesh_object.session_uid)
                 else:
                     # Blender hands a driver on to the override of what it reads.
                     live.connect(mesh_object, cache)

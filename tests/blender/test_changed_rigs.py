@@ -1,0 +1,381 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A rig that is changed while a model plays on it: the model goes on where it may, else the rig is back, with why."""
+
+from collections.abc import Callable
+
+import bpy
+import numpy as np
+import pytest
+
+from fdda_addon.rig.reading import read_model_rig
+from fdda_addon.runtime import rig_check
+from fdda_addon.runtime.model_files import network_of
+from fdda_addon.scene.scene_rig import find_rig
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
+from .test_crowd import crowd_of
+from .test_evaluations import keyed
+
+
+def edit(scene_object: bpy.types.Object, change: Callable[[], object]) -> None:
+    """Do something in edit mode, as a script: nothing is evaluated before it is over."""
+    bpy.context.view_layer.objects.active = scene_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    change()
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def edit_bones() -> bpy.types.ArmatureEditBones:
+    return bpy.data.objects[ELBOW_RIG].data.edit_bones
+
+
+def add_bone(name: str, parent: str = "") -> None:
+    bone = edit_bones().new(name)
+    bone.head, bone.tail = (1, 0, 0), (1, 0, 0.3)
+    bone.parent = edit_bones().get(parent)
+
+
+def change_roll():
+    edit_bones()["lower"].roll += 0.4
+
+
+def change_head():
+    edit_bones()["lower"].head.x += 0.05
+
+
+def change_parent():
+    edit_bones()["lower"].parent = None
+
+
+def exchange_joint():
+    edit_bones().remove(edit_bones()["lower"])
+    add_bone("other", "upper")
+
+
+def sort_vertices():
+    bpy.ops.mesh.select_all(action="SELECT")
+    bpy.ops.mesh.sort_elements(type="REVERSE", elements={"VERT"})
+
+
+def other_mesh():
+    mesh = bpy.data.meshes["elbow"].copy()
+    mesh.vertices.foreach_set("co", np.random.default_rng(0).random(3 * len(mesh.vertices)).astype(np.float32))
+    bpy.data.objects[ELBOW].data = mesh
+
+
+def write_positions():
+    mesh = bpy.data.objects[ELBOW].data
+    positions = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", positions)
+    mesh.vertices.foreach_set("co", positions * 1.1)
+
+
+def move_key():
+    bpy.data.objects[ELBOW].data.shape_keys.reference_key.data[0].co.x += 0.05
+
+
+def flip_faces():
+    bpy.ops.mesh.select_all(action="SELECT")
+    bpy.ops.mesh.flip_normals()
+
+
+def groups() -> bpy.types.VertexGroups:
+    return bpy.data.objects[ELBOW].vertex_groups
+
+
+def remove_group():
+    groups().remove(groups()["lower"])
+
+
+def rename_bone():
+    bpy.data.objects[ELBOW_RIG].data.bones["lower"].name = "elsewhere"
+
+
+REST, WEIGHTS = "the rest pose of the", "the skin weights differ"
+NO_BONE = "some vertices follow no bone"
+IN_EDIT_MODE = {
+    "roll": (ELBOW_RIG, change_roll, f"{REST} armature differs"),
+    "head": (ELBOW_RIG, change_head, f"{REST} armature differs"),
+    "parent": (ELBOW_RIG, change_parent, "its joints have other parents"),
+    "exchanged joint": (ELBOW_RIG, exchange_joint, "the armature lacks the joint 'lower'"),
+    "sorted vertices": (ELBOW, sort_vertices, f"{REST} mesh differs"),
+    "flipped faces": (ELBOW, flip_faces, "the topology of the mesh differs"),
+}
+BY_SCRIPT = {
+    "another mesh": (other_mesh, f"{REST} mesh differs"),
+    "positions": (write_positions, f"{REST} mesh differs"),
+    "weights": (lambda: groups()["lower"].add([0, 1], 0.3, "ADD"), WEIGHTS),
+    "a weight": (lambda: change_weight(), WEIGHTS),
+    "a group is gone": (remove_group, NO_BONE),
+    "a group has another name": (lambda: setattr(groups()["lower"], "name", "elsewhere"), NO_BONE),
+    "no deform": (lambda: setattr(bpy.data.objects[ELBOW_RIG].data.bones["lower"], "use_deform", False), NO_BONE),
+    "an inverted group": (lambda: set_modifier(vertex_group="upper"), NO_BONE),
+    "no groups": (lambda: set_modifier(use_vertex_groups=False, use_bone_envelopes=True), WEIGHTS),
+    "bone name": (rename_bone, "the armature lacks the joint 'lower'"),
+}
+
+
+def change_weight():
+    vertex = next(v for v in bpy.data.objects[ELBOW].data.vertices if len(v.groups) > 1 and v.groups[0].weight > 0.2)
+    vertex.groups[0].weight *= 0.5
+
+
+def set_modifier(**settings: object) -> None:
+    for name, value in settings.items():
+        setattr(bpy.data.objects[ELBOW].modifiers["Armature"], name, value)
+
+
+def assert_given_back(mesh_object: bpy.types.Object, clause: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The rig shows, as it does where nothing was ever bound, and it was said why, once."""
+    assert mesh_object.fdda.mode == "RIG" and clause in mesh_object.fdda.status
+    assert mesh_object.fdda.status.endswith("undo the change, or record and train again.")
+    assert all(m.show_viewport for m in mesh_object.modifiers if m.name != "FDDA")
+    assert capsys.readouterr().out.count("switched off") == 1
+    shown = evaluated(mesh_object)
+    mesh_object.update_tag()
+    bpy.context.view_layer.update()
+    assert np.array_equal(evaluated(mesh_object), shown)
+
+
+def look(when: str) -> None:
+    if when == "frame":
+        bpy.context.scene.frame_set(7)
+    else:
+        bpy.context.view_layer.update()
+
+
+@pytest.mark.parametrize("when", ["update", "frame"])
+@pytest.mark.parametrize("what", IN_EDIT_MODE)
+def test_an_edit_gives_the_rig_back(bound, what, when, capsys):
+    name, change, clause = IN_EDIT_MODE[what]
+    pose(angle=1.0)
+    edit(bpy.data.objects[name], change)
+    look(when)
+    assert_given_back(bound, clause, capsys)
+
+
+@pytest.mark.parametrize("when", ["update", "frame"])
+@pytest.mark.parametrize("what", BY_SCRIPT)
+def test_a_script_gives_the_rig_back(bound, what, when, capsys):
+    change, clause = BY_SCRIPT[what]
+    pose(angle=1.0)
+    change()
+    look(when)
+    assert_given_back(bound, clause, capsys)
+
+
+def test_the_reference_key_gives_the_rig_back(bound, capsys):
+    keyed(bound)
+    pose(angle=1.0)
+    assert not bound.fdda.status
+    move_key()
+    look("update")
+    assert_given_back(bound, f"{REST} mesh differs", capsys)
+
+
+def test_data_of_another_object_give_the_rig_back(bound, capsys):
+    """The armature is edited, and the mesh is, through an object that has nothing to do with the character."""
+    for scene_object, change, clause in (
+        (bpy.data.objects[ELBOW_RIG], change_roll, f"{REST} armature differs"),
+        (bound, flip_faces, "the topology of the mesh differs"),
+    ):
+        other = bpy.data.objects.new("other", scene_object.data)
+        bpy.context.scene.collection.objects.link(other)
+        pose(angle=1.0)
+        edit(other, change)
+        look("update")
+        assert_given_back(bound, clause, capsys)
+        if scene_object.type == "ARMATURE":
+            edit(other, lambda: setattr(edit_bones()["lower"], "roll", edit_bones()["lower"].roll - 0.4))
+            bound.fdda.mode = "FDDA"
+            look("update")
+            assert not bound.fdda.status
+            assert bound.fdda.mode == "FDDA"
+
+
+@pytest.mark.parametrize("when", ["update", "frame"])
+def test_bones_that_are_no_joints_may_come_go_and_change_places(bound, elbow, when):
+    """The order of the bones is another, that of the joints is not."""
+    rig = bpy.data.objects[ELBOW_RIG]
+
+    def names():
+        return [bone.name for bone in rig.data.bones]
+
+    edit(rig, lambda: (add_bone("a"), add_bone("b"), add_bone("c", "upper")))
+    look(when)
+    pose(angle=0.7)
+    assert_plays(bound, elbow.model)
+    seen = {names().index("lower")}
+    for bone, parent in (("upper", "a"), ("a", "b"), ("upper", ""), ("b", "upper"), ("c", "a"), ("c", "")):
+        edit(rig, lambda b=bone, p=parent: setattr(edit_bones()[b], "parent", edit_bones().get(p)))
+        seen.add(names().index("lower"))
+        look(when)
+        pose(angle=0.9)
+        assert_plays(bound, elbow.model)
+    assert len(seen) > 1
+    edit(rig, lambda: edit_bones().remove(edit_bones()["a"]))
+    look(when)
+    assert_plays(bound, elbow.model)
+    assert bound.fdda.mode == "FDDA"
+
+
+def test_an_edit_that_changes_nothing_of_the_rig(bound, elbow):
+    edit(bound, lambda: bpy.ops.mesh.select_all(action="SELECT"))
+    bound.vertex_groups.new(name="no bone").add([0, 5], 0.5, "REPLACE")
+    bound.data.attributes.new("colour", "FLOAT_COLOR", "POINT")
+    look("update")
+    pose(angle=1.1)
+    assert_plays(bound, elbow.model)
+
+
+def test_objects_that_move_on_their_own_play_on(bound, elbow):
+    """The relation of mesh and armature is no part of the rig: animation moves both."""
+    bpy.data.objects[ELBOW_RIG].location = (0.3, 0.1, 0)
+    bpy.data.objects[ELBOW_RIG].rotation_euler = (0.2, 0.1, 0.4)
+    bpy.context.view_layer.update()
+    bound.data.update()
+    rig_check.forget()
+    pose(angle=1.1)
+    assert_plays(bound, elbow.model)
+
+
+def test_a_change_while_no_model_played(bound, capsys):
+    bound.fdda.mode = "RIG"
+    edit(bpy.data.objects[ELBOW_RIG], change_roll)
+    bound.fdda.mode = "FDDA"
+    look("update")
+    assert_given_back(bound, f"{REST} armature differs", capsys)
+
+
+def test_undone_it_plays_again(bound, elbow):
+    bpy.ops.ed.undo_push(message="start")
+    edit(bpy.data.objects[ELBOW_RIG], change_roll)
+    bpy.context.view_layer.update()
+    assert bound.fdda.mode == "RIG"
+    bpy.ops.ed.undo_push(message="roll")
+    bpy.ops.ed.undo()
+    bpy.context.view_layer.update()
+    pose(angle=1.0)
+    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+    bpy.ops.ed.redo()
+    bpy.context.view_layer.update()
+    assert "rest pose" in bpy.data.objects[ELBOW].fdda.status
+
+
+def test_weights_that_an_undo_brings_back(bound):
+    """What is written without an evaluation is found by the undo that reads it."""
+    bound.fdda.mode = "RIG"
+    groups()["lower"].add([0], 0.3, "ADD")
+    bpy.context.view_layer.update()
+    bpy.ops.ed.undo_push(message="other weights")
+    groups()["lower"].add([0], 0.3, "SUBTRACT")
+    bound.fdda.mode = "FDDA"
+    bpy.context.view_layer.update()
+    bpy.ops.ed.undo_push(message="weights as before")
+    bpy.ops.ed.undo()
+    bpy.data.objects[ELBOW].fdda.mode = "FDDA"
+    bpy.context.view_layer.update()
+    assert WEIGHTS in bpy.data.objects[ELBOW].fdda.status
+
+
+def test_a_file_in_which_the_rig_was_changed_without_the_addon(bound, tmp_path, capsys):
+    import fdda_addon
+
+    path = bpy.data.filepath.replace("bound.blend", "changed.blend")
+    fdda_addon.unregister()
+    edit(bpy.data.objects[ELBOW_RIG], change_roll)
+    bpy.ops.wm.save_as_mainfile(filepath=path, copy=True)
+    fdda_addon.register()
+    capsys.readouterr()
+    bpy.ops.wm.open_mainfile(filepath=path)
+    bpy.context.view_layer.update()
+    assert_given_back(bpy.data.objects[ELBOW], f"{REST} armature differs", capsys)
+
+
+@pytest.mark.parametrize("is_reloaded", [False, True], ids=["opened", "reloaded"])
+def test_a_linked_rig_that_its_own_file_changed(library, pair, is_reloaded):
+    shot = str(library.path.with_name("shot.blend"))
+    bpy.context.view_layer.update()
+    assert not any(o.fdda.status for o in pair)
+    bpy.ops.wm.save_as_mainfile(filepath=shot)
+    if is_reloaded:
+        bpy.ops.wm.open_mainfile(filepath=shot)
+        bpy.context.view_layer.update()
+        change_in_another_process(library.path)
+        bpy.data.libraries[0].reload()
+    else:
+        change_in_another_process(library.path)
+        bpy.ops.wm.open_mainfile(filepath=shot)
+    bpy.context.view_layer.update()
+    overrides = [o for o in bpy.data.objects if o.type == "MESH" and o.override_library and o.fdda.is_bound]
+    assert len(overrides) == 2
+    for mesh_object in overrides:
+        assert mesh_object.fdda.mode == "RIG" and "rest pose of the armature differs" in mesh_object.fdda.status
+
+
+def change_in_another_process(path) -> None:
+    import subprocess
+    import sys
+
+    lines = [
+        "import bpy",
+        f"bpy.ops.wm.open_mainfile(filepath={str(path)!r})",
+        f"bpy.context.view_layer.objects.active = bpy.data.objects[{ELBOW_RIG!r}]",
+        "bpy.ops.object.mode_set(mode='EDIT')",
+        f"bpy.data.objects[{ELBOW_RIG!r}].data.edit_bones['lower'].roll += 0.4",
+        "bpy.ops.object.mode_set(mode='OBJECT')",
+        "bpy.ops.wm.save_mainfile()",
+    ]
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True, capture_output=True, timeout=120)
+
+
+def test_one_of_a_crowd(bound, elbow):
+    crowd = crowd_of(bound, 5)
+    for frame in (1, 2, 3):
+        bpy.context.scene.frame_set(frame)
+    crowd[2].data = crowd[2].data.copy()
+    crowd[2].vertex_groups["lower"].add([0], 0.3, "ADD")
+    bpy.context.scene.frame_set(4)
+    assert [o.fdda.mode for o in crowd] == ["FDDA", "FDDA", "RIG", "FDDA", "FDDA"]
+    bpy.context.scene.frame_set(5)
+    for mesh_object in crowd[:2] + crowd[3:]:
+        assert_plays(mesh_object, elbow.model)
+
+
+def test_the_mode_of_the_mesh_holds_the_check_back(bound, capsys):
+    """Where it is left, the rig is looked at."""
+    pose(angle=1.0)
+    bpy.context.view_layer.objects.active = bound
+    bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
+    groups()["lower"].add([0, 1], 0.3, "ADD")
+    bpy.context.view_layer.update()
+    assert bound.fdda.mode == "FDDA" and not bound.fdda.status
+    bpy.ops.object.mode_set(mode="OBJECT")
+    bpy.context.view_layer.update()
+    assert_given_back(bound, WEIGHTS, capsys)
+
+
+def test_playback_and_posing_read_no_rig(bound, elbow, monkeypatch):
+    """Neither frames nor poses by hand, nor shape keys that bones drive, have the rig read again."""
+    keyed(bound)
+    key = bound.data.shape_keys.key_blocks["bulge"]
+    driver = key.driver_add("value").driver
+    variable = driver.variables.new()
+    variable.type, variable.targets[0].id = "TRANSFORMS", bpy.data.objects[ELBOW_RIG]
+    variable.targets[0].bone_target, variable.targets[0].transform_type = "lower", "ROT_X"
+    driver.type = "SUM"
+    pose(angle=0.2)
+    pose(angle=0.3)
+    monkeypatch.setattr(rig_check, "read_model_rig", None)
+    monkeypatch.setattr(rig_check, "rest_of", None)
+    for step in range(5):
+        bpy.context.scene.frame_set(step)
+        pose(angle=0.1 * step)
+    assert_plays(bound, elbow.model)
+
+
+def test_the_joints_of_a_model_keep_their_order(bound):
+    rig = bpy.data.objects[ELBOW_RIG]
+    edit(rig, lambda: (add_bone("a", "upper"), add_bone("b", "a")))
+    info = network_of(bound).info
+    assert read_model_rig(find_rig(), info).joints == info.joints
