@@ -63,6 +63,9 @@ bench: .venv  ## time the arm at three densities, and other rigs: RIGS="a.blend 
 sampling: .venv  ## compare ways to choose poses, into out/sampling (20 minutes)
 	.venv/bin/python benchmarks/sampling.py out/sampling
 
+soak: .venv  ## hostile files, kills, full disks, frames, undo: what held and what fell short, into out/soak (20 minutes)
+	.venv/bin/python benchmarks/soak.py out/soak $(OPTIONS)
+
 study: .venv  ## compare sizes and activations of the networks, into out/study (30 minutes)
 	.venv/bin/python benchmarks/study.py out/study
 
@@ -85,11 +88,11 @@ lint: .venv  ## ruff's checks and formatting
 	.venv/bin/ruff check
 	.venv/bin/ruff format --check
 
-package: .venv  ## dist/fdda_addon-VERSION.zip, to install in Blender (PLATFORM=all: one for each)
+package: .venv  ## dist/fdda_addon-VERSION.zip, to install in Blender (PLATFORM=all: all platforms)
 	.venv/bin/python setup/package.py $(PLATFORM)
 
 requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
-	for version in 3.11 3.13; do .venv/bin/uv pip compile --quiet --no-annotate \
+	for version in 3.11 3.13 3.14; do .venv/bin/uv pip compile --quiet --no-annotate \
 		--python-version $$version --python-platform x86_64-manylinux_2_28 --custom-compile-command 'make requirements' \
 		--group blender --group trainer --group test --group farm --group lint --group setup \
 		--output-file requirements/python-$$version.txt || exit; done
@@ -97,4 +100,4 @@ requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
 clean:  ## remove what was built and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-examples test-gui test-all test-line bench sampling study characters pictures map fixtures lint package requirements clean
+.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-examples test-gui test-all test-line bench sampling soak study characters pictures map fixtures lint package requirements clean

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Builds dist/fdda_addon-VERSION.zip, the extension that Blender installs, for one platform or for all.
 
+On Linux there is a second one, dist/fdda_addon-VERSION-python3.14.zip: Blender as distributions build it runs on the
+system's Python, and all Pythons together would be too large a zip.
+
 An extension is a package with the manifest beside its `__init__.py`, but here the manifest is at the root and the code
 in `fdda_addon/`. So a copy is staged, with the trainer, its pinned requirements and the wheels of onnxruntime for the
-Python of every Blender, and Blender's own extension tool, which comes with the bpy wheel and does not import it, builds
-and checks the zip.
+Pythons of these Blenders, and Blender's own extension tool, which comes with the bpy wheel and does not import it,
+builds and checks the zip.
 """
 
 import argparse
@@ -24,12 +27,16 @@ STAGE = DIST / "stage"
 # Blender's names of the platforms, and pip's, oldest system first. Not macos-x64: onnxruntime has no wheels for it.
 PLATFORMS = {
     "linux-x64": ("manylinux_2_27_x86_64", "manylinux_2_28_x86_64"),
+    "linux-arm64": ("manylinux_2_27_aarch64", "manylinux_2_28_aarch64"),
     "macos-arm64": ("macosx_14_0_arm64",),
     "windows-x64": ("win_amd64",),
+    "windows-arm64": ("win_arm64",),
 }
 ALL = "all"
-# Blender 4.5 and 5.0 run on Python 3.11, later ones on 3.13.
+# Of blender.org: 4.5 and 5.0 run on Python 3.11, later ones on 3.13. Of distributions: on the system's, in 2026 that of
+# Debian, Arch and Fedora is 3.14.
 PYTHONS = ("3.11", "3.13")
+SYSTEM_PYTHONS = ("3.14",)
 # What a zip may have at most: it is downloaded by hand, and kept a second time where it is installed.
 LARGEST_MB = 60
 
@@ -68,13 +75,18 @@ def asked_platforms(names: list[str]) -> list[str]:
     return platforms
 
 
-def fetch_wheels(name: str) -> list[Path]:
-    """The onnxruntime wheels for a platform, as pinned; pip fetches those that dist/wheels does not have yet.
+def builds(name: str) -> list[tuple[str, ...]]:
+    """The Pythons of each zip for a platform: Blender's own, and on Linux that of distributions."""
+    return [PYTHONS, *((python,) for python in SYSTEM_PYTHONS if name.startswith("linux"))]
+
+
+def fetch_wheels(name: str, pythons: tuple[str, ...]) -> list[Path]:
+    """The onnxruntime wheels for a platform and Pythons, as pinned; pip fetches those that dist/wheels does not have.
 
     Its dependencies are left out: numpy is Blender's, and playing a model needs no other.
     """
     wheels = []
-    for python in PYTHONS:
+    for python in pythons:
         pins = (ROOT / "requirements" / f"python-{python}.txt").read_text().splitlines()
         requirement = next(pin for pin in pins if pin.startswith("onnxruntime=="))
         folder = DIST / "wheels" / f"{requirement}-{python}-{name}"
@@ -137,12 +149,15 @@ def main() -> int:
     version = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["version"]
     try:
         for name in asked_platforms(names):
-            # As Blender's `--split-platforms` calls them, where there are several.
-            suffix = f"-{name.replace('-', '_')}" if names else ""
-            package = DIST / f"fdda_addon-{version}{suffix}.zip"
-            stage(name, fetch_wheels(name))
-            build(package)
-            print(f"{package.relative_to(ROOT)} ({package.stat().st_size / 1e6:.0f} MB) for {name}")
+            for pythons in builds(name):
+                # As Blender's `--split-platforms` calls them, where there are several.
+                suffix = f"-{name.replace('-', '_')}" if names else ""
+                suffix += "" if pythons == PYTHONS else f"-python{pythons[0]}"
+                package = DIST / f"fdda_addon-{version}{suffix}.zip"
+                stage(name, fetch_wheels(name, pythons))
+                build(package)
+                size = package.stat().st_size / 1e6
+                print(f"{package.relative_to(ROOT)} ({size:.0f} MB) for {name}, Python {' and '.join(pythons)}")
     except PackageError as error:
         print(error, file=sys.stderr)
         return 1

@@ -47,7 +47,7 @@ class Network:
             version = ".".join(map(str, sys.version_info[:2]))
             raise ModelError(
                 f"ONNX Runtime cannot be loaded by Python {version} ({error}); install the extension's zip for this "
-                "platform, in a Blender with Python 3.11 or 3.13."
+                f"platform and for Python {version}: 3.11 and 3.13 are in one, 3.14 has its own."
             ) from error
         onnxruntime.set_default_logger_severity(3)
         onnxruntime.disable_telemetry_events()

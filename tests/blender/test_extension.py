@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LIFE = Path(__file__).with_name("extension_life.py")
 VERSION = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["version"]
 PACKAGE = ROOT / "dist" / f"fdda_addon-{VERSION}.zip"
+OF_DISTRIBUTIONS = PACKAGE.with_name(f"fdda_addon-{VERSION}-python3.14.zip")
 START = 0.07
 """Of the time that Blender itself takes to start, in seconds of the processor: 50 ms where it takes 0.7 s."""
 STATE = ("classes", "operators", "properties", "handlers", "keymap_items", "additions", "commands", "preferences")
@@ -107,16 +108,31 @@ def test_uninstalled_it_leaves_nothing(story: dict):
     assert story["uninstalled"]["files"] == story["before"]["files"] and not story["uninstalled"]["kept"]
 
 
+def pythons(manifest: dict) -> list[str]:
+    """Which Pythons the wheels are for."""
+    return [wheel.split("-")[2] for wheel in manifest["wheels"]]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Blender has a Python of its own")
+def test_distributions_have_a_zip_of_their_own(package: Path):
+    """The same but for the wheels."""
+    contents = []
+    for path in (package, OF_DISTRIBUTIONS):
+        with zipfile.ZipFile(path) as archive:
+            names = {name for name in archive.namelist() if not name.startswith("wheels/")} - {"blender_manifest.toml"}
+            contents.append({name: archive.read(name) for name in names})
+            manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
+    assert contents[0] == contents[1]
+    assert pythons(manifest) == ["cp314"] and OF_DISTRIBUTIONS.stat().st_size < 60e6
+
+
 def test_it_is_small_enough_and_says_what_it_may_do(package: Path):
     assert package.stat().st_size < 60e6
     with zipfile.ZipFile(package) as archive:
         manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
         names = archive.namelist()
     assert set(manifest["permissions"]) == {"files", "network"}
-    assert [python for python in ("cp311", "cp313") if any(f"-{python}-" in wheel for wheel in manifest["wheels"])] == [
-        "cp311",
-        "cp313",
-    ]
+    assert pythons(manifest) == ["cp311", "cp313"]
     assert not [name for name in names if "__pycache__" in name]
 
 

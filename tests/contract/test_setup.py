@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-PINS = {version: (ROOT / f"requirements/python-{version}.txt").read_text() for version in ("3.11", "3.13")}
+PINS = {version: (ROOT / f"requirements/python-{version}.txt").read_text() for version in ("3.11", "3.13", "3.14")}
 
 
 def load(name: str) -> ModuleType:
@@ -196,8 +196,15 @@ def test_the_extension_is_staged_as_blender_expects_it(tmp_path: Path, monkeypat
 
 def test_a_package_is_for_this_platform_or_for_all():
     assert package.asked_platforms([]) == [package.this_platform()]
-    assert package.asked_platforms(["all"]) == ["linux-x64", "macos-arm64", "windows-x64"]
+    everywhere = ["linux-x64", "linux-arm64", "macos-arm64", "windows-x64", "windows-arm64"]
+    assert package.asked_platforms(["all"]) == everywhere
     assert package.asked_platforms(["windows-x64"]) == ["windows-x64"]
+
+
+def test_linux_has_a_zip_for_the_python_of_distributions():
+    """Three wheels of 24 MB are more than a zip may have."""
+    assert package.builds("linux-x64") == package.builds("linux-arm64") == [("3.11", "3.13"), ("3.14",)]
+    assert package.builds("windows-x64") == package.builds("macos-arm64") == [("3.11", "3.13")]
 
 
 def test_a_platform_without_wheels_is_refused_in_a_sentence():
@@ -205,8 +212,8 @@ def test_a_platform_without_wheels_is_refused_in_a_sentence():
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 1 and result.stdout == ""
     assert result.stderr == (
-        "ONNX Runtime has no wheels for the platform macos-x64; set PLATFORM to all or one of linux-x64, macos-arm64, "
-        "windows-x64.\n"
+        "ONNX Runtime has no wheels for the platform macos-x64; set PLATFORM to all or one of linux-x64, linux-arm64, "
+        "macos-arm64, windows-x64, windows-arm64.\n"
     )
 
 

@@ -41,6 +41,15 @@ def lacking(blender: str) -> str:
     return ""
 
 
+def package_for(blender: str) -> Path:
+    """The zip for the Python of a Blender: that of distributions where it runs on the system's."""
+    question = "import sys; print('Python {}.{}'.format(*sys.version_info))"
+    command = [blender, "--background", "--factory-startup", "--python-expr", question]
+    said = subprocess.run(command, capture_output=True, text=True, check=False, timeout=INSTALL_SECONDS).stdout
+    own = PACKAGE.with_name(f"{PACKAGE.stem}-python3.14.zip")
+    return own if "Python 3.14" in said.splitlines() else PACKAGE
+
+
 def on_display(command: list[str]) -> list[str]:
     """The command on the display that there is, else on a virtual one."""
     if os.environ.get("DISPLAY"):
@@ -90,10 +99,11 @@ def drive(folder: Path, blender: str, stories: tuple[str, ...]) -> str:
     """Install and go through stories; returns what is wrong with the outcome, empty when all is well."""
     user = folder / "user"
     environment = {"FDDA_TRAINER_PYTHON": sys.executable, **os.environ, "BLENDER_USER_RESOURCES": str(user)}
-    install = [blender, "--command", "extension", "install-file", "-r", "user_default", "-e", str(PACKAGE)]
+    package = package_for(blender)
+    install = [blender, "--command", "extension", "install-file", "-r", "user_default", "-e", str(package)]
     status = run(install, environment, INSTALL_SECONDS, folder / "install.txt")
     if status != 0:
-        return f"Blender did not install {PACKAGE.name} ({status_name(status)})"
+        return f"Blender did not install {package.name} ({status_name(status)})"
     return next(filter(None, (_tell(folder, name, blender, environment) for name in stories)), "")
 
 
