@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Damage to JSON and to bytes, drawn at random from seeds."""
+
+import copy
+import json
+
+import numpy as np
+
+ODD = (
+    None, True, False, 0, 1, -1, 2**31, 2**63, -(2**63), 10**30, 1e308, -1e-308, float("inf"), float("-inf"),
+    float("nan"), "", "x", "7", "ß\x1b[2J\n", "../../etc/passwd", "/dev/zero", "x" * 100_000, [], [[]], [0] * 1000,
+    {}, {"a": {"b": []}}, [None], [{}], "\ud800",
+)  # fmt: skip
+
+
+def mutated_bytes(random: np.random.Generator, data: bytes) -> bytes:
+    """The bytes with some flipped, lost, doubled, moved or replaced."""
+    data = bytearray(data)
+    for _ in range(int(random.integers(1, 4))):
+        place = int(random.integers(max(1, len(data))))
+        length = int(2 ** random.uniform(0, np.log2(len(data) + 2)))
+        kind = random.integers(7)
+        if kind < 3:
+            for _ in range(int(random.integers(1, 33))):
+                # Structure is at the beginning and at the end, values are between.
+                where = (
+                    int(random.integers(len(data)))
+                    if random.random() < 0.4
+                    else int(random.integers(min(4096, len(data))))
+                )
+                data[where] ^= 1 << int(random.integers(8))
+        elif kind == 3:
+            del data[place:]
+        elif kind == 4:
+            del data[place : place + length]
+        elif kind == 5:
+            data[place:place] = data[place : place + length]
+        else:
+            data[place : place + length] = random.bytes(min(length, 4096))
+        if not data:
+            return b""
+    return bytes(data)
+
+
+def mutated_json(random: np.random.Generator, value: object) -> object:
+    """A copy of what JSON holds with some values replaced, removed or added."""
+    value = copy.deepcopy(value)
+    for _ in range(int(random.integers(1, 4))):
+        holder, key = _place(random, value)
+        if holder is None:
+            return ODD[random.integers(len(ODD))]
+        kind = random.integers(6)
+        if kind == 0:
+            del holder[key]
+        elif kind == 1 and isinstance(holder, list):
+            holder.insert(int(random.integers(len(holder) + 1)), copy.deepcopy(holder[key]))
+        elif kind == 2 and isinstance(holder[key], (int, float)) and not isinstance(holder[key], bool):
+            holder[key] = holder[key] * int(random.choice([-1, 2, 1000])) + int(random.integers(-2, 3))
+        elif kind == 3 and isinstance(holder[key], str):
+            holder[key] = mutated_bytes(random, holder[key].encode() or b"x").decode("utf-8", "replace")
+        else:
+            holder[key] = ODD[random.integers(len(ODD))]
+        if not isinstance(value, (dict, list)) or not value:
+            break
+    return value
+
+
+def json_text(value: object) -> str:
+    """As JSON; what JSON has no words for as Python writes it."""
+    return json.dumps(value)
+
+
+def _place(random: np.random.Generator, value: object) -> tuple:
+    """A list or object inside of a value and one of its keys, any depth as likely."""
+    holder = key = None
+    while isinstance(value, (dict, list)) and value:
+        holder = value
+        key = int(random.integers(len(value))) if isinstance(value, list) else list(value)[random.integers(len(value))]
+        value = holder[key]
+        if random.random() < 0.35:
+            break
+    return holder, key
