@@ -4,6 +4,8 @@
 import sys
 
 from .cli.main import main
+from .core.terminal import use_utf8
 
 if __name__ == "__main__":
+    use_utf8()
     sys.exit(main(sys.argv[1:], "python -m fdda_addon"))

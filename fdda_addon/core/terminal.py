@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What a terminal or a log cannot show is written out in its place, so that no name ends a verb."""
 
+import os
 import sys
 
 
@@ -10,3 +11,12 @@ def show_all_names() -> None:
         # Whoever calls a verb may have put something else in their place.
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
+
+
+def use_utf8() -> None:
+    """Start this program of Python again where it takes names and paths for ASCII: those of objects are UTF-8.
+
+    With LC_ALL=C Python does so by itself, unless it was told not to (PYTHONUTF8=0). Blender always does.
+    """
+    if sys.getfilesystemencoding() == "ascii":
+        os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
