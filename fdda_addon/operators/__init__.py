@@ -19,5 +19,6 @@ MODULES: tuple[str, ...] = (
     "models",
     "help",
     "meshes",
+    "clipboard",
 )
 """The modules of this package; each lists its classes in `CLASSES`."""

@@ -29,6 +29,7 @@ _edited: set[int] = set()
 """Session ids of the bound objects whose meshes are being changed, in edit mode or another."""
 _object_count = -1
 _is_following = False
+_is_given_back = False
 
 
 def play(driven: bpy.types.Object) -> None:
@@ -233,6 +234,21 @@ def resume() -> None:
     scan()
 
 
+@contextmanager
+def rigs_given_back() -> Iterator[None]:
+    """Borrow the open file as it is without models, to write parts of it: nothing of ours comes along."""
+    global _is_given_back
+    give_back_rigs()
+    remove_caches()
+    # Operators evaluate before they begin.
+    _is_given_back = True
+    try:
+        yield
+    finally:
+        _is_given_back = False
+        resume()
+
+
 def remove_caches() -> None:
     """Remove all cache objects, and forget what plays; `resume` makes them anew.
 
@@ -273,7 +289,7 @@ def fail(mesh_object: bpy.types.Object, error: FDDAError) -> None:
 def scan() -> None:
     """Find the bound objects when objects have come or gone; each that plays has its own cache object."""
     global _object_count
-    if _object_count == len(bpy.data.objects):
+    if _is_given_back or _object_count == len(bpy.data.objects):
         return
     _crowds.forget()
     taken: set[int] = set()

@@ -200,6 +200,23 @@ def test_duplicates_and_deletions_leave_nothing(bound, tmp_path):
     assert in_memory() == (objects - 1, meshes - 1)
 
 
+def test_what_is_duplicated_and_deleted_by_hand_is_not_saved(bound, elbow, tmp_path):
+    bpy.ops.ed.undo_push(message="start")
+    for _ in range(30):
+        bpy.ops.object.select_all(action="DESELECT")
+        bpy.data.objects[ELBOW].select_set(True)
+        bpy.context.view_layer.objects.active = bpy.data.objects[ELBOW]
+        bpy.ops.object.duplicate()
+        bpy.context.view_layer.update()
+        bpy.ops.object.delete()
+        bpy.context.view_layer.update()
+        bpy.ops.ed.undo_push(message="deleted")
+    assert_plays(bpy.data.objects[ELBOW], elbow.model)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"), copy=True)
+    with bpy.data.libraries.load(str(tmp_path / "saved.blend")) as (found, _):
+        assert found.meshes == [ELBOW] and sorted(found.objects) == [ELBOW, ELBOW_RIG]
+
+
 def test_a_deleted_character_leaves_nothing(bound):
     bpy.ops.object.select_all(action="DESELECT")
     bound.select_set(True)

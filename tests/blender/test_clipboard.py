@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What is copied to the clipboard, or written to a library, is the true rig; pasted it plays."""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+import fdda_addon
+from fdda_addon.runtime import playback
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
+
+
+def to_clipboard(_: bpy.types.Object, folder: Path) -> Path:
+    bpy.ops.object.select_all(action="SELECT")
+    bpy.context.preferences.filepaths.temporary_directory = str(folder)
+    assert bpy.ops.fdda.copy_objects() == {"FINISHED"}
+    (path,) = folder.rglob("copybuffer*.blend")
+    return path
+
+
+def to_library(mesh_object: bpy.types.Object, folder: Path) -> Path:
+    with playback.rigs_given_back():
+        bpy.data.libraries.write(str(folder / "library.blend"), {mesh_object})
+    return folder / "library.blend"
+
+
+@pytest.mark.parametrize("write", [to_clipboard, to_library])
+@pytest.mark.parametrize("use_in_render", [False, True])
+def test_it_is_the_true_rig(bound, elbow, tmp_path, write, use_in_render):
+    bound.fdda.use_in_render = use_in_render
+    bpy.data.objects[ELBOW_RIG].animation_data_clear()
+    pose(angle=1.2)
+    bound.fdda.mode = "RIG"
+    rig = evaluated(bound)
+    bound.fdda.mode = "FDDA"
+    bpy.context.view_layer.update()
+    path = write(bound, tmp_path)
+    pose(angle=0.7)
+    assert_plays(bound, elbow.model)
+    fdda_addon.unregister()
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    with bpy.data.libraries.load(str(path)) as (found, wanted):
+        assert sorted(found.objects) == [ELBOW, ELBOW_RIG] and found.meshes == [ELBOW]
+        wanted.objects = list(found.objects)
+    for pasted in wanted.objects:
+        bpy.context.scene.collection.objects.link(pasted)
+    bpy.context.view_layer.update()
+    shown = {m.name: (m.show_viewport, m.show_render) for m in bpy.data.objects[ELBOW].modifiers}
+    assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
+    assert np.array_equal(evaluated(bpy.data.objects[ELBOW]), rig)
+
+
+def test_pasted_it_plays(bound, elbow, tmp_path):
+    to_clipboard(bound, tmp_path)
+    assert bpy.ops.view3d.pastebuffer() == {"FINISHED"}
+    bpy.context.view_layer.update()
+    pasted = bpy.data.objects[f"{ELBOW}.001"]
+    assert pasted.fdda.is_playing
+    pose(f"{ELBOW_RIG}.001", angle=1.0)
+    assert_plays(pasted, elbow.model)
+    assert_plays(bound, elbow.model)
+
+
+def test_what_blenders_own_operator_copied_plays_too(bound, elbow):
+    """It is called from the menu, and by scripts; the rig is off in what it writes, and back with mode RIG."""
+    bpy.ops.object.select_all(action="SELECT")
+    bpy.ops.view3d.copybuffer()
+    bpy.ops.view3d.pastebuffer()
+    bpy.context.view_layer.update()
+    pasted = bpy.data.objects[f"{ELBOW}.001"]
+    assert_plays(pasted, elbow.model)
+    pasted.fdda.mode = "RIG"
+    assert [m.show_viewport for m in pasted.modifiers] == [True, True, False]
+
+
+def test_in_another_mode_it_says_why_not(bound):
+    bpy.context.view_layer.objects.active = bound
+    bpy.ops.object.mode_set(mode="EDIT")
+    with pytest.raises(RuntimeError, match="Objects are copied in object mode"):
+        bpy.ops.fdda.copy_objects()
