@@ -12,10 +12,10 @@ import numpy as np
 
 from ..core import file_kind
 from ..core.errors import FDDAError, OutputError, WrongUsageError
+from ..core.mask import Blend
 from ..core.output import check_outputs, replacing, replacing_all
 from ..core.point_cache import PointCacheWriter, read_point_cache
 from ..core.progress import Progress
-from ..core.skinning import LinearLayer
 from ..poses.action_range import action_frames
 from ..poses.clip import find_action
 from ..rig.modifier_stack import check_evaluable, read_stack
@@ -27,6 +27,7 @@ from ..scene.armature import clear_pose
 from ..scene.blend_file import save_copy
 from ..scene.borrow import assign_action, borrowed_attributes, borrowed_pose, borrowed_visibility
 from ..scene.controls import ControlReader
+from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
 from .baked_mesh import check_local, play_point_cache, play_shape_keys, stand_in
 
@@ -167,8 +168,10 @@ class FrameReader:
         info = opened.network.info
         self._reader = PoseReader(scene_rig, info.joint_names, info.rest_matrices)
         self._controls = ControlReader(scene_rig, info.controls)
-        self._strength, self._opened = strength, opened
-        self._linear_layer: LinearLayer | None = None
+        self._strength = strength
+        # The rest pose of the model: the objects may have moved since.
+        rig = replace(opened.linear_rig, rest_matrices=info.rest_matrices)
+        self._blend = Blend(rig, read_mask(scene_rig.mesh_object))
 
     def read(self, frame: int) -> tuple[np.ndarray, ...]:
         """Go to a frame; returns the inputs of the model, each without its first axis, and its strength there."""
@@ -188,23 +191,13 @@ class FrameReader:
         """
         poses, controls, strengths = (np.stack(values) for values in zip(*inputs, strict=True))
         positions = self.network.positions(poses, controls)
-        if strengths.min() < 1:
-            linear = self._linear_positions(poses)
-            positions = linear + strengths[:, None, None] * (positions - linear)
+        positions = self._blend.apply(positions, poses, strengths)
         if not np.isfinite(positions).all():
             raise FDDAError(
                 f"The model '{self.network.path}' gives positions that are not numbers; look for a scale of zero or a "
                 "broken driver in the rig, else train again."
             )
         return positions
-
-    def _linear_positions(self, poses: np.ndarray) -> np.ndarray:
-        """(N, V, 3) float32 of the linear layer alone, mesh-object space, mesh units."""
-        if self._linear_layer is None:
-            # The rest pose of the model: the objects may have moved since.
-            rest_matrices = self.network.info.rest_matrices
-            self._linear_layer = LinearLayer(replace(self._opened.linear_rig, rest_matrices=rest_matrices))
-        return self._linear_layer.positions(poses)
 
 
 def _write_frames(path: Path, reader: FrameReader, frames: range) -> Iterator[Progress]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED
 from ..core.errors import FDDAError, RigError
+from ..core.mask import Mask
 from ..core.metrics import ErrorStatistics, distances, error_statistics
 from ..core.partition import Partition
 from ..core.poses import Channel, beyond_range, sample_pose
@@ -23,6 +24,7 @@ from ..rig.reading import PoseEvaluator
 from ..runtime.network import Network
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser, clear_pose
+from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
 
 HELD_OUT_INDEX = 1 << 33
@@ -150,7 +152,8 @@ def evaluate(
 ) -> Iterator[Progress | Evaluation]:
     """Compare a model with its rig; a generator that does the work while it is iterated.
 
-    The scene is as before when the generator ends, is closed, or raises.
+    Where the mesh object has a mask, what is compared is the model as the mask lets it show. The scene is as before
+    when the generator ends, is closed, or raises.
 
     Yields:
         Progress, and as the last thing the Evaluation.
@@ -170,7 +173,8 @@ def evaluate(
     total = settings.poses + extra * len(settings.beyond) + len(settings.named)
     total += sum(len(clip.frames) for clip in clips)
     with borrowed_rig(scene_rig, rig, channels, clips) as player:
-        comparison = _Comparison(PoseEvaluator(scene_rig, rig), network, layer, total, settings.surface)
+        evaluator, mask = PoseEvaluator(scene_rig, rig), read_mask(scene_rig.mesh_object)
+        comparison = _Comparison(evaluator, network, layer, total, settings.surface, mask)
         held_out = None
         if settings.poses:
             poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses)
@@ -198,7 +202,8 @@ def evaluate_action(scene_rig: SceneRig, model: Path | Network, name: str) -> It
     network, layer = _prepare(scene_rig, model)
     with borrowed_rig(scene_rig, layer.rig, (), clips) as player:
         evaluator = PoseEvaluator(scene_rig, layer.rig)
-        comparison = _Comparison(evaluator, network, layer, len(clips[0].frames), surface=False)
+        mask = read_mask(scene_rig.mesh_object)
+        comparison = _Comparison(evaluator, network, layer, len(clips[0].frames), surface=False, mask=mask)
         errors = yield from comparison.compare(name, player.frames(clips[0]))
     yield Evaluation(layer.partitions, layer.rig.joint_names, errors)
 
@@ -237,7 +242,16 @@ def _named_pose(scene_rig: SceneRig, pose: NamedPose) -> Iterator[None]:
 class _Comparison:
     """Evaluates poses three ways and counts them."""
 
-    def __init__(self, evaluator: PoseEvaluator, network: Network, layer: LinearLayer, total: int, surface: bool):
+    def __init__(
+        self,
+        evaluator: PoseEvaluator,
+        network: Network,
+        layer: LinearLayer,
+        total: int,
+        surface: bool,
+        mask: Mask | None,
+    ):
+        self._mask = mask
         self._evaluator, self._network, self._layer = evaluator, network, layer
         self._done, self._total = 0, total
         rig, self._surface = layer.rig, None
@@ -261,8 +275,10 @@ class _Comparison:
             matrices.append(pose)
             positions.append(true)
             values.append(controls)
-            fdda.append(distances(moved, true, self._metres_per_unit))
             skinned = self._layer.positions(pose[None])[0]
+            if self._mask is not None:
+                moved = self._mask.blended(skinned, moved)
+            fdda.append(distances(moved, true, self._metres_per_unit))
             linear.append(distances(skinned, true, self._metres_per_unit))
             if self._surface:
                 surface.append(self._surface.compare(true, (moved, skinned)))

@@ -109,6 +109,15 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         strength = column.row()
         strength.enabled = binding.mode == "FDDA"
         strength.prop(binding, "strength", slider=True)
+        mask = column.row(align=True)
+        mask.enabled = binding.mode == "FDDA"
+        mask.prop_search(binding, "mask", mesh_object, "vertex_groups")
+        invert = mask.row(align=True)
+        invert.active = bool(binding.mask)
+        invert.prop(binding, "invert_mask", text="", icon="ARROW_LEFTRIGHT")
+        if binding.mask and binding.mask not in mesh_object.vertex_groups:
+            text = f"'{mesh_object.name}' has no vertex group '{binding.mask}'; the model counts everywhere."
+            draw_sentence(layout, context, text, "ERROR")
         column.prop(binding, "use_in_render")
 
     def _draw_times(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:

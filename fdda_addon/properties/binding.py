@@ -26,6 +26,12 @@ def _apply(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
     apply(binding.id_data)
 
 
+def _apply_mask(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
+    from ..runtime.binding import apply_mask
+
+    apply_mask(binding.id_data)
+
+
 class FDDA_PG_modifier(bpy.types.PropertyGroup):
     """A modifier of the rig and how it was shown before a model took its place."""
 
@@ -91,6 +97,21 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
         default=1,
         subtype="FACTOR",
         update=_apply,
+        override=OVERRIDABLE,
+    )
+    mask: StringProperty(
+        name="Mask",
+        description=(
+            "The vertex group that says where the model counts: with a weight of 1 it does, with 0, and outside of the "
+            "group, there is linear skinning, in between a blend. Empty: everywhere"
+        ),
+        update=_apply_mask,
+        override=OVERRIDABLE,
+    )
+    invert_mask: BoolProperty(
+        name="Invert Mask",
+        description="The model counts where the vertex group has a weight of 0: the group is what is left out",
+        update=_apply_mask,
         override=OVERRIDABLE,
     )
     use_in_render: BoolProperty(

@@ -97,6 +97,12 @@ def apply(mesh_object: bpy.types.Object) -> None:
         mesh_object.update_tag()
 
 
+def apply_mask(mesh_object: bpy.types.Object) -> None:
+    """Show a bound object with the mask that its properties name now."""
+    if mesh_object.fdda.is_bound:
+        playback.follow_mask(mesh_object)
+
+
 @contextmanager
 def true_rig(mesh_object: bpy.types.Object) -> Iterator[None]:
     """Borrow a bound object for its rig: the rig deforms it inside, the binding is as before afterwards."""

@@ -10,11 +10,12 @@ import bpy
 import numpy as np
 
 from ..core.errors import FDDAError, ModelError, RigError
+from ..core.mask import Blend
 from ..core.rig import UNMOVED
-from ..core.skinning import LinearLayer
 from ..rig.reading import PoseReader, read_model_rig
 from ..scene.arrays import MUTE, write
 from ..scene.controls import ControlReader
+from ..scene.mask import mask_key, read_mask
 from ..scene.mesh import set_mesh_positions
 from ..scene.scene_rig import SceneRig, armature_of, is_flat
 from . import cache as caches
@@ -72,7 +73,8 @@ class LiveBinding:
         self.check_rig(mesh_object)
         self._reader = self._make_reader(scene_rig)
         self._controls = ControlReader(scene_rig, info.controls)
-        self._linear_layer: LinearLayer | None = None
+        self._mask_key, self._mask = mask_key(mesh_object), read_mask(mesh_object)
+        self._blend: Blend | None = None
         self.execution = self._own_execution = Execution(self.network, 1)
         self.job: Job | None = None
         self.was_executed = False
@@ -152,6 +154,34 @@ class LiveBinding:
         rig_check.check(self.scene_rig(mesh_object), self.network, self.form)
 
     @property
+    def has_mask(self) -> bool:
+        """Whether the model does not count everywhere."""
+        return self._mask is not None
+
+    def follow_mask(self, mesh_object: bpy.types.Object, weights_changed: bool) -> bool:
+        """Take the mask that the object has now.
+
+        Args:
+            mesh_object: the object.
+            weights_changed: its vertex groups may have other weights.
+
+        Returns:
+            Whether it is another than before; the pose has to be played again then.
+        """
+        key = mask_key(mesh_object)
+        if key == self._mask_key and not (weights_changed and self._mask is not None):
+            return False
+        mask = read_mask(mesh_object)
+        with self.lock:
+            self._mask_key, before, self._mask = key, self._mask, mask
+            if mask == before:
+                return False
+            self._blend = None if self._blend is None else self._blend.with_mask(mask)
+            # What was shown had the other mask.
+            self._shown = None
+        return True
+
+    @property
     def has_news(self) -> bool:
         """Whether `take_news` would say another thing than the last time."""
         return self._news != self._sentence
@@ -227,10 +257,9 @@ class LiveBinding:
     def accept(self, execution: Execution, place: int) -> None:
         """Take the positions of `job` from an execution of several poses; they stay there while they are shown."""
         self.execution, self._positions = execution, execution.positions[place]
-        if self.job.strength < 1:
-            linear = self._linear_positions(self.job.scene_rig, self.job.pose)
-            difference = self._positions - linear if self.job.strength > 0 else np.float32(0)
-            self._positions = linear + np.float32(self.job.strength) * difference
+        if self.job.strength < 1 or self._mask is not None:
+            strengths, blend = np.array([self.job.strength], np.float32), self._make_blend(self.job.scene_rig)
+            self._positions = blend.apply(execution.positions[place : place + 1], self.job.pose[None], strengths)[0]
 
     def write(self, cache: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
         """Give an evaluated cache object the positions, also those it had: it may show those of the rest pose again."""
@@ -251,13 +280,13 @@ class LiveBinding:
         )
         return (skin @ info.rest_matrices).astype(np.float32)
 
-    def _linear_positions(self, scene_rig: SceneRig, pose_matrices: np.ndarray) -> np.ndarray:
-        """(V, 3) float32 of the linear layer alone, mesh-object space, mesh units."""
-        if self._linear_layer is None:
+    def _make_blend(self, scene_rig: SceneRig) -> Blend:
+        """What blends the model with the linear layer, made when it is needed first."""
+        if self._blend is None:
             rig = self.network.linear_rig(read_model_rig(scene_rig, self.network.info))
             # The rest pose of the model: the objects may have moved since, and pose matrices refer to it.
-            self._linear_layer = LinearLayer(replace(rig, rest_matrices=self.network.info.rest_matrices))
-        return self._linear_layer.positions(pose_matrices[None])[0]
+            self._blend = Blend(replace(rig, rest_matrices=self.network.info.rest_matrices), self._mask)
+        return self._blend
 
     def _rest_sentence(self) -> str:
         self.execution.poses[0] = self.network.info.rest_matrices

@@ -6,7 +6,7 @@ evaluation is over (`follow`). Live bindings hold names and session ids, never R
 undo or the load of a file. They are found anew from the properties of the objects whenever something may have changed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 
 import bpy
@@ -105,6 +105,7 @@ def note_changes(depsgraph: bpy.types.Depsgraph) -> None:
     for mesh_object, is_mesh, is_whole in changed.mesh_objects:
         if not mesh_object.fdda.is_bound:
             continue
+        follow_mask(mesh_object)
         if mesh_object.session_uid not in _bound:
             look_again()
             continue
@@ -118,6 +119,7 @@ def note_changes(depsgraph: bpy.types.Depsgraph) -> None:
             _drop(uid)
         elif mesh_object.mode not in rig_check.SETTLED_MODES:
             _edited.add(mesh_object.session_uid)
+    _follow_weights(changed.meshes)
     # A render's own graph takes everything for new.
     if depsgraph.mode != "RENDER":
         _note_rigs(changed)
@@ -154,6 +156,22 @@ def _note_rigs(changed: Changed) -> None:
                 live.check_rig(mesh_object)
             except FDDAError as error:
                 live.error = error
+
+
+def follow_mask(mesh_object: bpy.types.Object, *, weights_changed: bool = False) -> None:
+    """Play the pose again with the mask that a bound object has now, if it is another."""
+    uid, live = _of(mesh_object)
+    if live is not None and live.follow_mask(mesh_object, weights_changed):
+        for cache in [o for o in bpy.data.objects if o.session_uid == uid]:
+            cache.data.update_tag()
+
+
+def _follow_weights(meshes: Container[int]) -> None:
+    """The weights of meshes, by their session ids, may have been painted; those of masks are read anew."""
+    for live in [live for live in _live.values() if live.has_mask and live.form.mesh in meshes]:
+        mesh_object = live.find()
+        if mesh_object is not None:
+            follow_mask(mesh_object, weights_changed=True)
 
 
 def _is_mode_animated(mesh_object: bpy.types.Object) -> bool:
