@@ -63,12 +63,13 @@ def unregister() -> None:
 
 def handler_table() -> list[tuple[str, Callable[..., None]]]:
     """All handlers of the add-on: name of the list in `bpy.app.handlers` and function, in the order of the calls."""
+    from .evaluation import side_by_side
     from .jobs import job
     from .operators import training
     from .panels import checks
     from .runtime import handlers
 
-    return [entry for module in (job, checks, handlers, training) for entry in module.HANDLERS.items()]
+    return [entry for module in (job, checks, handlers, side_by_side, training) for entry in module.HANDLERS.items()]
 
 
 def _register_package(package: ModuleType) -> None:

@@ -10,7 +10,7 @@ from ..core.defaults import EVALUATION_SEED, SIDEBAR_EVALUATION_POSES
 from ..core.errors import ModelError, RigError
 from ..core.progress import Progress
 from ..core.report import REPORT_HTML, page_path
-from ..evaluation import last_evaluation
+from ..evaluation import last_evaluation, side_by_side
 from ..evaluation.loaded import loaded_heat_map
 from ..models.entries import bound_entry, bound_name
 from ..properties.view import show_graph
@@ -226,6 +226,45 @@ class FDDA_OT_open_report(OnModel, bpy.types.Operator):
         return page_path(model_list.entry_path(mesh_object, entry).resolve())
 
 
+class FDDA_OT_compare(OnModel, bpy.types.Operator):
+    bl_idname = "fdda.compare"
+    bl_label = "Side by Side"
+    bl_description = "Show the true rig together with what plays, beside it or over it as a wireframe"
+    bl_options = {"REGISTER", "UNDO"}
+
+    way: bpy.props.EnumProperty(
+        name="Show the Rig",
+        description="Where the true rig is shown",
+        items=(
+            ("NONE", "Off", "What plays alone"),
+            ("BESIDE", "Beside", "The rig next to what plays, to its right as seen from the front"),
+            ("OVERLAY", "Overlay", "The rig as a wireframe over what plays"),
+        ),
+        default="BESIDE",
+    )
+    distance: bpy.props.FloatProperty(
+        name="Distance",
+        description="How far to the side along X; 0 for the width of the character and a little",
+        subtype="DISTANCE",
+        options={"SKIP_SAVE"},
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return cls.has_bound(context)
+
+    def work(self, context: bpy.types.Context) -> str:
+        rigs = self.bound_rigs(context)
+        for scene_rig in rigs:
+            if scene_rig.mesh_object.mode == "EDIT":
+                raise RigError(f"'{scene_rig.mesh_object.name}' is in edit mode; leave it first.")
+        for scene_rig in rigs:
+            side_by_side.show(scene_rig.mesh_object, self.way, self.distance)
+        names = " and ".join(f"'{rig.mesh_object.name}'" for rig in rigs)
+        where = {"NONE": "is shown alone", "BESIDE": "has its rig beside it", "OVERLAY": "has its rig over it"}
+        return f"{names} {where[self.way]}."
+
+
 class FDDA_OT_show_bone(OnRig, bpy.types.Operator):
     bl_idname = "fdda.show_bone"
     bl_label = "Show Bone"
@@ -261,6 +300,7 @@ class FDDA_OT_show_bone(OnRig, bpy.types.Operator):
 
 CLASSES = (
     FDDA_OT_evaluate,
+    FDDA_OT_compare,
     FDDA_OT_show_bone,
     FDDA_OT_paint,
     FDDA_OT_fit_range,
@@ -269,7 +309,10 @@ CLASSES = (
 
 
 def unregister() -> None:
-    """Paint nothing any more."""
+    """Paint nothing and compare nothing any more."""
+    # No data is there while Blender starts or ends.
+    if hasattr(bpy.data, "objects"):
+        side_by_side.hide_all()
     show_graph(False)
     heat_map = loaded_heat_map()
     if heat_map is not None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError, ModelError
+from ..evaluation import side_by_side
 from ..jobs.job import current
 from ..models.entries import bound_name, chosen_entry, megabytes
 from ..properties.character import trained_file
@@ -240,6 +241,7 @@ class FDDA_OT_unbind(OnModel, bpy.types.Operator):
             mesh_object = scene_rig.mesh_object
             model_list.adopt(mesh_object)
             names.append(bound_name(mesh_object))
+            side_by_side.hide(mesh_object)
             unbind(mesh_object)
         return f"The rig deforms again; {' and '.join(names)} {'is' if len(names) == 1 else 'are'} unbound."
 

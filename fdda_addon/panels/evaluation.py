@@ -3,13 +3,13 @@
 
 import bpy
 
-from ..evaluation import last_evaluation, markers
+from ..evaluation import last_evaluation, markers, side_by_side
 from ..evaluation.loaded import loaded_heat_map
 from ..jobs import job
 from ..models.entries import bound_name
 from ..scene.scene_rig import SceneRig
 from .names import shown_name
-from .section import Section, draw_button, draw_job, draw_sentence, panel_rig
+from .section import Section, draw_button, draw_job, draw_sentence, panel_rig, together
 
 FEW_PARTITIONS = 5
 FIGURES = (("Mean", "mean"), ("99 %", "p99"), ("Largest", "max"))
@@ -37,6 +37,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
                 layout, context, "Bind a model first: what is compared with the rig is the bound model.", "INFO"
             )
         else:
+            _draw_side_by_side(layout, context, scene_rig)
             self._draw_start(context, scene_rig)
         last = last_evaluation.of(scene_rig.mesh_object)
         if last is not None:
@@ -73,6 +74,15 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         button.source, button.poses, button.seed = view.source, view.poses, view.seed
         if state is not None and state.outcome_level != "INFO":
             draw_job(layout, context, "evaluate")
+
+
+def _draw_side_by_side(layout: bpy.types.UILayout, context: bpy.types.Context, scene_rig: SceneRig) -> None:
+    row = layout.row(align=True)
+    row.label(text="Show the Rig")
+    shown = side_by_side.way_of(scene_rig.mesh_object)
+    for way, text in (("NONE", "Off"), ("BESIDE", "Beside"), ("OVERLAY", "Overlay")):
+        button = row.operator("fdda.compare", text=text, depress=shown == way)
+        button.way, button.all_meshes = way, together(context) > 0
 
 
 def _draw_figures(

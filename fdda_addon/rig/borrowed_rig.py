@@ -10,6 +10,7 @@ from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer, clip_actions, played_clips
 from ..scene.armature import clear_pose
 from ..scene.borrow import borrowed_pose
+from ..scene.comparison import hidden_comparisons
 from ..scene.controls import borrowed_controls
 from ..scene.scene_rig import SceneRig
 from .modifier_stack import borrowed_stack
@@ -45,6 +46,7 @@ def borrowed_rigs(
     controlled = [(scene_rig, control_names(rig, channels)) for scene_rig, rig, channels in (*rigs, *beside)]
     with ExitStack() as stack:
         player = stack.enter_context(played_clips(controlled, clips))
+        stack.enter_context(hidden_comparisons())
         for scene_rig, _, _ in rigs:
             stack.enter_context(borrowed_stack(scene_rig.mesh_object))
         stack.enter_context(borrowed_pose(armature_object, clip_actions(armature_object, clips)))

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import bpy
 
 from ..core.errors import RigError
+from .comparison import is_comparison
 from .kept import kept
 from .scene_rig import SceneRig, armature_of, find_rig, parenting_sentence
 
@@ -85,7 +86,8 @@ def rigs_together(context: bpy.types.Context) -> list[SceneRig]:
 
 
 def _meshes_of(context: bpy.types.Context, armature_object: bpy.types.Object) -> list[bpy.types.Object]:
-    return [o for o in context.scene.objects if o.type == "MESH" and _follows(o, armature_object)]
+    meshes = [o for o in context.scene.objects if o.type == "MESH" and _follows(o, armature_object)]
+    return [o for o in meshes if not is_comparison(o)]
 
 
 def _mesh_of(context: bpy.types.Context, armature_object: bpy.types.Object) -> bpy.types.Object:

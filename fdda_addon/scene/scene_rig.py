@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import bpy
 
 from ..core.errors import RigError
+from .comparison import is_comparison
 
 MODIFIER_NAME = "FDDA"
 """Name of the Geometry Nodes modifier that plays a model; it is never part of the rig."""
@@ -32,7 +33,7 @@ def find_rig(name: str = "") -> SceneRig:
     Raises:
         RigError: there is none, or more than one.
     """
-    meshes = [o for o in bpy.context.scene.objects if o.type == "MESH"]
+    meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and not is_comparison(o)]
     if name:
         named = bpy.context.scene.objects.get(name)
         if named is None or named.type != "MESH":
@@ -61,7 +62,8 @@ def find_rigs() -> list[SceneRig]:
     Raises:
         RigError: there is none.
     """
-    rigged = [o for o in bpy.context.scene.objects if o.type == "MESH" and armature_modifier(o) is not None]
+    meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and not is_comparison(o)]
+    rigged = [o for o in meshes if armature_modifier(o) is not None]
     return [SceneRig(o, armature_of(o)) for o in rigged] or [find_rig()]
 
 

@@ -24,6 +24,7 @@ from ..runtime.binding import borrowed_binding
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser, clear_pose
 from ..scene.borrow import assign_action, borrowed_attributes, borrowed_pose
+from ..scene.comparison import hidden_comparisons
 from ..scene.scene_rig import SceneRig, armature_modifier
 
 ROUNDS = 5
@@ -141,7 +142,7 @@ def playing(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> Iterator
     """
     animation = scene_rig.armature_object.animation_data
     own_action = animation.action if animation else None
-    with borrowed_pose(scene_rig.armature_object, [own_action] if own_action else []):
+    with hidden_comparisons(), borrowed_pose(scene_rig.armature_object, [own_action] if own_action else []):
         action = own_action or random_action(scene_rig, channels)
         assign_action(scene_rig.armature_object, action)
         try:
