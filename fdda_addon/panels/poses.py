@@ -210,14 +210,24 @@ def _draw_bone(layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBo
             _draw_ranges(layout.box(), rig, bone)
 
 
-def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
-    """The ranges of a bone as the fields in which Blender keeps them."""
-    from ..poses.motion_range import CONSTRAINT, DEFAULT, IK, local_limit, location_ranges, rotation_ranges
+@kept
+def _ranges_of(rig: SceneRig, bone: bpy.types.PoseBone) -> tuple[str, list, tuple[int, ...]]:
+    """Name of a bone and where its ranges come from, its ranges about the axes, and the axes that it is moved along."""
+    from ..poses.motion_range import CONSTRAINT, DEFAULT, IK, location_ranges, rotation_ranges
 
     ranges = rotation_ranges(bone)
     where = {CONSTRAINT: "Limit Rotation", IK: "IK limits", DEFAULT: "default"}
     sources = {r.source for r in ranges if r.moves} or {DEFAULT}
-    box.label(text=f"{bone.name} ({', '.join(where[source] for source in sorted(sources))})", icon="BONE_DATA")
+    locations = () if bone.bone.use_connect else tuple(location_ranges(bone))
+    return f"{bone.name} ({', '.join(where[source] for source in sorted(sources))})", ranges, locations
+
+
+def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
+    """The ranges of a bone as the fields in which Blender keeps them."""
+    from ..poses.motion_range import CONSTRAINT, DEFAULT, local_limit
+
+    text, ranges, locations = _ranges_of(rig, bone)
+    box.label(text=text, icon="BONE_DATA")
     column = box.column(align=True)
     for axis, r in enumerate(ranges):
         row = column.split(factor=0.25, align=True)
@@ -234,7 +244,6 @@ def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBon
         fields.prop(owner, f"{prefix}min_{AXES[axis]}", text="")
         fields.prop(owner, f"{prefix}max_{AXES[axis]}", text="")
         _draw_state_button(fields, rig, bone, axis, "fdda.unstate_range", "X")
-    locations = {} if bone.bone.use_connect else location_ranges(bone)
     for axis in locations:
         row = column.row(align=True)
         limit = local_limit(bone, "LIMIT_LOCATION")

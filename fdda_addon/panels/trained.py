@@ -23,21 +23,26 @@ class Trained:
     foreign: str = ""
 
 
-@kept
 def trained(rig: SceneRig) -> Trained | None:
     """The model that a training of this rig has written, also where an undo has taken it off the list."""
+    return _trained(rig)[0]
+
+
+@kept
+def _trained(rig: SceneRig) -> tuple[Trained | None]:
+    """As `trained`; in a tuple, for that there is none is kept as well."""
     path = trained_file(rig.mesh_object)
     check = checks.known(rig)
     if path is None:
-        return None
+        return (None,)
     if check is None or check.rig is None:
-        return Trained(path)
+        return (Trained(path),)
     status = os.stat(path)
     key = (path, status.st_mtime_ns, status.st_size, id(check.rig))
     if key not in _checked:
         _checked.clear()
         _checked[key] = _foreign(rig, check.rig, path)
-    return Trained(path, _checked[key])
+    return (Trained(path, _checked[key]),)
 
 
 def _foreign(scene_rig: SceneRig, rig: object, path: Path) -> str:

@@ -3,7 +3,8 @@
 
 While an animation plays, Blender draws the sidebar at every frame. What a frame cannot change is kept: until Blender
 evaluates a change, a file or an undo step is loaded, or a job tells, and for a second at most, as files change by
-themselves. Without a window, where scripts look right after they have changed something, nothing is kept.
+themselves; while an animation plays, until it stops. Without a window, where scripts look right after they have changed
+something, nothing is kept.
 """
 
 import functools
@@ -28,7 +29,8 @@ def kept(work: Callable) -> Callable:
         global _until
         now = time.monotonic()
         if now > _until or bpy.app.background:
-            forget()
+            if bpy.app.background or not _is_playing():
+                forget()
             _until = now + SECONDS
         value = values.get(key)
         if value is None:
@@ -38,6 +40,11 @@ def kept(work: Callable) -> Callable:
         return value
 
     return look
+
+
+def _is_playing() -> bool:
+    """Whether an animation plays in some window."""
+    return any(window.screen.is_animation_playing for window in bpy.context.window_manager.windows)
 
 
 def forget() -> None:
