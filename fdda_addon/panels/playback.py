@@ -29,6 +29,14 @@ def lies_outside(mesh_object: bpy.types.Object) -> bool:
     return bool(bpy.data.filepath) and not path.is_relative_to(file.parent) and not is_trusted(path)
 
 
+def mask_sentence(mesh_object: bpy.types.Object) -> str:
+    """What is wrong with the mask of a mesh; empty when nothing is, or there is none."""
+    name = mesh_object.fdda.mask
+    if not name or name in mesh_object.vertex_groups:
+        return ""
+    return f"'{mesh_object.name}' has no vertex group '{name}', so the model counts everywhere; choose another mask."
+
+
 def _trust(mesh_object: bpy.types.Object) -> object:
     from ..runtime.trust import partition_trust
 
@@ -115,8 +123,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         invert = mask.row(align=True)
         invert.active = bool(binding.mask)
         invert.prop(binding, "invert_mask", text="", icon="ARROW_LEFTRIGHT")
-        if binding.mask and binding.mask not in mesh_object.vertex_groups:
-            text = f"'{mesh_object.name}' has no vertex group '{binding.mask}'; the model counts everywhere."
+        if text := mask_sentence(mesh_object):
             draw_sentence(layout, context, text, "ERROR")
         column.prop(binding, "use_in_render")
 
