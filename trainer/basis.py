@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Basis shapes of the local residuals of a partition: principal components, as many as a tolerance asks for."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,10 @@ MAX_POSES = 1000
 MAX_SHAPES = 128
 NEGLIGIBLE = 0.01
 """Part of the rms residual that shapes need not hold, whatever the tolerance: networks err far more than that."""
+WORST = 2.0
+"""Where partitions share their shapes, none is left with more than this many times what each may leave on average."""
+FINER = 4.0
+"""Shapes are shared out of those that each partition would have at a tolerance so many times finer."""
 COLUMN_BLOCK = 1 << 14
 """The Gram matrix is summed up over blocks of this many columns, so that float64 costs little memory."""
 
@@ -23,11 +28,13 @@ class Basis:
         shapes: (K, 3 Vp) float32, orthonormal rows, no unit. K is 0 when the mean alone is within the tolerance.
         truncation: rms distance over poses and vertices that the shapes leave of the residuals they were made of,
             mesh units.
+        left: (K + 1,) float64, the same by number of shapes: of none, of the first, ... of all of them.
     """
 
     mean: np.ndarray
     shapes: np.ndarray
     truncation: float
+    left: np.ndarray
 
     def coefficients(self, residuals: np.ndarray) -> np.ndarray:
         """(N, 3 Vp) residuals to (N, K) float32 coefficients, both in mesh units.
@@ -40,6 +47,44 @@ class Basis:
     def residuals(self, coefficients: np.ndarray) -> np.ndarray:
         """(N, K) coefficients to (N, 3 Vp) float32 residuals, both in mesh units."""
         return (coefficients @ self.shapes + self.mean).astype(np.float32)
+
+    def first(self, count: int) -> "Basis":
+        """The basis of the first `count` shapes alone."""
+        return Basis(self.mean, self.shapes[:count], float(self.left[count]), self.left[: count + 1])
+
+
+def share_shapes(left: Sequence[np.ndarray], vertices: Sequence[int], tolerance: float, units: int) -> list[int]:
+    """How many shapes each partition needs, for the rms distance of all of them together to come to the tolerance.
+
+    A shape more goes where it takes off the most for the numbers that it adds to a frame: partitions whose residuals
+    are simple get more than their own tolerance asks for, those that go on and on get fewer. A partition may leave a
+    hundredth of its own residual in place of the tolerance, where that is more, as in `make_basis`.
+
+    Args:
+        left: for each partition what is left by number of shapes, as `Basis.left`.
+        vertices: of each.
+        tolerance: rms distance over poses and all vertices that may remain, mesh units.
+        units: how many numbers a shape adds to a network, beside three for each vertex.
+
+    Returns:
+        The numbers of shapes.
+    """
+    allowed = [max(tolerance, NEGLIGIBLE * float(own[0])) for own in left]
+    counts, gains = [], []
+    for number, (own, size, most) in enumerate(zip(left, vertices, allowed, strict=True)):
+        enough = own <= WORST * most
+        counts.append(int(np.argmax(enough)) if enough.any() else len(own) - 1)
+        taken = size * (own[:-1] ** 2 - own[1:] ** 2)[counts[-1] :]
+        gains += [(taken_off / (3 * size + units), number, taken_off) for taken_off in taken.tolist()]
+    remaining = sum(size * float(own[k]) ** 2 for own, size, k in zip(left, vertices, counts, strict=True))
+    wanted = sum(size * most**2 for size, most in zip(vertices, allowed, strict=True))
+    # Those of one partition come in their order: each takes off no more than the one before it.
+    for _, number, taken_off in sorted(gains, key=lambda gain: -gain[0]):
+        if remaining <= wanted:
+            break
+        counts[number] += 1
+        remaining -= taken_off
+    return counts
 
 
 def make_basis(residuals: np.ndarray, tolerance: float, rng: np.random.Generator) -> Basis:
@@ -76,7 +121,8 @@ def make_basis(residuals: np.ndarray, tolerance: float, rng: np.random.Generator
             # Block by block: a product with float64 would make a float64 copy of all residuals.
             shapes[block] = (residuals[:, block].astype(np.float64) - mean[block]).T @ vectors
         vectors = np.linalg.qr(shapes)[0] if shapes_needed else shapes
-    return Basis(mean, np.ascontiguousarray(vectors.T, np.float32), float(left[shapes_needed]))
+    shapes = np.ascontiguousarray(vectors.T, np.float32)
+    return Basis(mean, shapes, float(left[shapes_needed]), left[: shapes_needed + 1])
 
 
 def _blocks(length: int) -> list[slice]:

@@ -17,8 +17,8 @@ class TrainingConfig:
 
     Attributes:
         seed: of the split, the initial weights, the order of the poses and the dropout.
-        tolerance_mm: a partition gets as many basis shapes as it takes to bring the rms error of its training
-            residuals, over poses and vertices, to this.
+        tolerance_mm: there are as many basis shapes as it takes to bring the rms error of the training residuals, over
+            poses and all vertices, to this.
         hidden: units of each hidden layer of a partition's network.
         activation: between the layers, one of `ACTIVATIONS`.
         epochs: passes over the training poses.
@@ -100,7 +100,7 @@ class TrainingConfig:
 
 HELP = {
     "seed": "of the split, the initial weights and the order of the poses",
-    "tolerance_mm": "rms error that the basis shapes of a partition may leave, in mm",
+    "tolerance_mm": "rms error that the basis shapes may leave over the whole mesh, in mm",
     "hidden": "units of each hidden layer",
     "activation": "between the layers",
     "epochs": "passes over the training poses",

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What the networks are trained on: features and coefficients of each partition."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Fingerprint
 from fdda_addon.core.skinning import skin_matrices
 
-from .basis import Basis, make_basis
+from .basis import FINER, Basis, make_basis, share_shapes
 from .config import TrainingConfig
 from .inputs import Inputs
 from .joint_fit import JointFit, Surroundings, surroundings_of_rig
@@ -81,6 +81,7 @@ class PreparedPartition:
         residual_rms: rms distance over training poses and vertices that the fit leaves, about the mean, mesh units.
         validation_truncation: (n,) rms distance over the vertices that the basis leaves of each validation pose,
             mesh units.
+        validation: (n,) indices of these poses.
         mm_per_unit: what lengths above have to be multiplied by to be in mm, as in `Rig.metres_per_unit`.
     """
 
@@ -95,7 +96,19 @@ class PreparedPartition:
     coefficients: np.ndarray
     residual_rms: float
     validation_truncation: np.ndarray
+    validation: np.ndarray
     mm_per_unit: float = 1000.0
+
+    def with_shapes(self, count: int) -> "PreparedPartition":
+        """The same with the first `count` shapes alone."""
+        left_out = self.coefficients[self.validation, count:].astype(np.float64)
+        squared = self.validation_truncation**2 + (left_out**2).sum(axis=1) / self.vertices
+        return replace(
+            self,
+            basis=self.basis.first(count),
+            coefficients=np.ascontiguousarray(self.coefficients[:, :count]),
+            validation_truncation=np.sqrt(squared),
+        )
 
 
 def split_poses(poses: np.ndarray, validation_fraction: float, seed: int, held_out_fraction: float = 0.0) -> Split:
@@ -244,8 +257,34 @@ def prepare(
         coefficients,
         float(np.sqrt(_mean_square(residuals, basis.mean, split.training) / partition.vertices)),
         np.sqrt((truncated**2).sum(axis=1) / partition.vertices),
+        split.validation,
         mm_per_unit,
     )
+
+
+def prepare_together(
+    partitions: Sequence[PartitionData],
+    split: Split,
+    tolerance_mm: float,
+    seed: int,
+    metres_per_unit: float = 1.0,
+    units: int = 0,
+    prepared: Callable[[int], None] = lambda done: None,
+) -> list[PreparedPartition]:
+    """As `prepare`, of partitions that share the tolerance (`share_shapes`).
+
+    Args:
+        partitions, split, tolerance_mm, seed, metres_per_unit: as there.
+        units: of the last hidden layer.
+        prepared: told after each how many are read.
+    """
+    found = []
+    for partition in partitions:
+        found.append(prepare(partition, split, tolerance_mm / FINER, seed, metres_per_unit))
+        prepared(len(found))
+    left, vertices = [own.basis.left for own in found], [own.vertices for own in found]
+    counts = share_shapes(left, vertices, tolerance_mm / (1000 * metres_per_unit), units + 1)
+    return [own.with_shapes(count) for own, count in zip(found, counts, strict=True)]
 
 
 def _mean_square(residuals: np.ndarray, mean: np.ndarray, poses: np.ndarray) -> float:

@@ -23,7 +23,7 @@ from fdda_addon.core.rig import UNMOVED_LABEL
 from . import report
 from .announcements import Announcer
 from .config import TrainingConfig
-from .data import PreparedPartition, Split, held_back_digest, partitions_of, prepare, split_recording
+from .data import PreparedPartition, Split, held_back_digest, partitions_of, prepare_together, split_recording
 from .deformation import Deformation, is_sheared
 from .export import build_model, measure, measure_surface, write_model
 from .inputs import Inputs, inputs_of_rig, middles
@@ -221,12 +221,19 @@ def _prepare(
     announcer: Announcer,
     should_stop: Callable[[], bool],
 ) -> list[PreparedPartition]:
-    prepared, metres_per_unit = [], recording.rig.metres_per_unit
-    for partition in partitions_of(recording, inputs):
+    def announce(done: int) -> None:
+        announcer.say(MessageType.PREPARING, done=done, total=len(recording.partitions))
         _check_stop(should_stop)
-        prepared.append(prepare(partition, split, config.tolerance_mm, config.seed, metres_per_unit))
-        announcer.say(MessageType.PREPARING, done=len(prepared), total=len(recording.partitions))
-    return prepared
+
+    return prepare_together(
+        partitions_of(recording, inputs),
+        split,
+        config.tolerance_mm,
+        config.seed,
+        recording.rig.metres_per_unit,
+        config.hidden[-1],
+        announce,
+    )
 
 
 def _deformation(

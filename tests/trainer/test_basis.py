@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from trainer import basis as basis_module
-from trainer.basis import make_basis
+from trainer.basis import make_basis, share_shapes
 
 
 def residuals(poses: int, vertices: int, rank: int, seed: int = 0) -> np.ndarray:
@@ -64,3 +64,47 @@ def test_a_sample_of_the_poses_finds_the_same_shapes(monkeypatch):
     values = residuals(150, 60, 6)
     basis = make_basis(values, 1e-6, np.random.default_rng(0))
     assert rms(values - basis.residuals(basis.coefficients(values))) < 3e-6
+
+
+def spectra() -> tuple[list[np.ndarray], list[int]]:
+    """What is left of three partitions by number of shapes: a simple one, one that goes on and on, a small one."""
+    return [np.array(own) for own in ([1.0, 0.1, 0.02, 0.005], 0.8 ** np.arange(25), [0.5, 0.1, 0.05])], [400, 40, 10]
+
+
+def left_together(left: list[np.ndarray], vertices: list[int], counts: list[int]) -> float:
+    squared = sum(size * own[count] ** 2 for own, size, count in zip(left, vertices, counts, strict=True))
+    return float(np.sqrt(squared / sum(vertices)))
+
+
+def test_partitions_share_shapes_to_keep_the_tolerance_with_less_to_read():
+    left, vertices = spectra()
+    counts = share_shapes(left, vertices, 0.06, units=65)
+    alone = [int(np.argmax(own <= 0.06)) for own in left]
+    assert left_together(left, vertices, counts) <= 0.06
+
+    def numbers(shapes: list[int]) -> int:
+        return sum(count * (3 * size + 65) for count, size in zip(shapes, vertices, strict=True))
+
+    assert numbers(counts) < numbers(alone)
+    assert all(own[count] <= 2 * 0.06 for own, count in zip(left, counts, strict=True))
+
+
+def test_one_partition_shares_with_nobody():
+    left, vertices = spectra()
+    for own, size in zip(left, vertices, strict=True):
+        (count,) = share_shapes([own], [size], 0.06, units=65)
+        assert own[count] <= 0.06 < own[count - 1]
+
+
+def test_where_the_tolerance_cannot_be_kept_all_shapes_are_taken():
+    left, vertices = [np.array([1.0, 0.5]), np.array([1.0])], [10, 10]
+    assert share_shapes(left, vertices, 1e-3, units=0) == [1, 0]
+
+
+def test_the_first_shapes_of_a_basis_leave_what_it_says():
+    values = residuals(60, 50, 12)
+    basis = make_basis(values, 1e-5, np.random.default_rng(0))
+    for count in range(len(basis.shapes) + 1):
+        fewer = basis.first(count)
+        left = rms(values - fewer.residuals(fewer.coefficients(values)))
+        assert fewer.truncation == pytest.approx(left, rel=0.02, abs=1e-8)
