@@ -87,7 +87,9 @@ def share_shapes(left: Sequence[np.ndarray], vertices: Sequence[int], tolerance:
     return counts
 
 
-def make_basis(residuals: np.ndarray, tolerance: float, rng: np.random.Generator) -> Basis:
+def make_basis(
+    residuals: np.ndarray, tolerance: float, rng: np.random.Generator, weights: np.ndarray | None = None
+) -> Basis:
     """Find the basis shapes that bring the rms distance to the tolerance.
 
     Principal components through the Gram matrix of the poses, or through the covariance of the coordinates where
@@ -97,32 +99,46 @@ def make_basis(residuals: np.ndarray, tolerance: float, rng: np.random.Generator
         residuals: (N, 3 Vp) float32, the training poses of one partition, mesh units.
         tolerance: rms distance over poses and vertices that may remain, mesh units.
         rng: chooses the poses when there are more than `MAX_POSES`.
+        weights: (N,) how much each pose counts; all the same when left out.
     """
-    mean = residuals.mean(axis=0, dtype=np.float64).astype(np.float32)
+    weights = np.ones(len(residuals)) if weights is None else weights
+    mean = _weighted_mean(residuals, weights)
     count, width = residuals.shape
     if count > MAX_POSES and width > MAX_POSES:
         rows = np.sort(rng.choice(count, MAX_POSES, replace=False))
-        residuals, count = residuals[rows], MAX_POSES
+        residuals, weights, count = residuals[rows], weights[rows], MAX_POSES
     by_pose = count <= width
+    roots = np.sqrt(weights)[:, None]
     products = np.zeros((min(count, width),) * 2)
     for block in _blocks(width if by_pose else count):
         part = residuals[:, block] if by_pose else residuals[block]
-        centred = part.astype(np.float64) - (mean[block] if by_pose else mean)
+        centred = (part.astype(np.float64) - (mean[block] if by_pose else mean)) * roots[
+            slice(None) if by_pose else block
+        ]
         products += centred @ centred.T if by_pose else centred.T @ centred
     values, vectors = np.linalg.eigh(products)
     values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1]
     # What is left after the first k components, as an rms over poses and vertices.
-    left = np.sqrt(np.append(np.cumsum(values[::-1])[::-1], 0) / (count * width / 3))
+    left = np.sqrt(np.append(np.cumsum(values[::-1])[::-1], 0) / (weights.sum() * width / 3))
     shapes_needed = min(int(np.argmax(left <= max(tolerance, NEGLIGIBLE * left[0]))), MAX_SHAPES)
     vectors = vectors[:, :shapes_needed]
     if by_pose:
         shapes = np.empty((width, shapes_needed))
         for block in _blocks(width):
             # Block by block: a product with float64 would make a float64 copy of all residuals.
-            shapes[block] = (residuals[:, block].astype(np.float64) - mean[block]).T @ vectors
+            shapes[block] = ((residuals[:, block].astype(np.float64) - mean[block]) * roots).T @ vectors
         vectors = np.linalg.qr(shapes)[0] if shapes_needed else shapes
     shapes = np.ascontiguousarray(vectors.T, np.float32)
     return Basis(mean, shapes, float(left[shapes_needed]), left[: shapes_needed + 1])
+
+
+def _weighted_mean(residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    if (weights == 1).all():
+        return residuals.mean(axis=0, dtype=np.float64).astype(np.float32)
+    total = np.zeros(residuals.shape[1])
+    for block in _blocks(residuals.shape[1]):
+        total[block] = weights @ residuals[:, block].astype(np.float64)
+    return (total / weights.sum()).astype(np.float32)
 
 
 def _blocks(length: int) -> list[slice]:

@@ -2,7 +2,7 @@
 """What the networks are trained on: features and coefficients of each partition."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from .joint_fit import JointFit, Surroundings, surroundings_of_rig
 MIN_POSES = 10
 BLOCK_FRAMES = 10
 """Frames of animation that are held back together: neighbours are nearly the same pose."""
+MARGIN_WEIGHT = 0.1
+"""What a pose of the margin counts for in the basis, where others count 1: its residual is many times as large, and the
+shapes are chosen for the range of motion."""
 MIN_SPREAD = 1e-5
 """A feature that spreads less than this over the training poses counts as constant: mesh units, or no unit."""
 BLOCK_FLOATS = 1 << 22
@@ -58,11 +61,17 @@ class Split:
         training: those that the basis and the weights are made of.
         validation: those that choose the best weights.
         held_out: those that nothing is made of or chosen by, to measure the error on.
+        margin: those of `training` that lie around the range of motion.
     """
 
     training: np.ndarray
     validation: np.ndarray
     held_out: np.ndarray
+    margin: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def weights(self, of_margin: float) -> np.ndarray:
+        """(n,) float64 of the training poses: 1, or `of_margin` for those of the margin."""
+        return np.where(np.isin(self.training, self.margin), of_margin, 1.0)
 
 
 @dataclass(frozen=True)
@@ -142,16 +151,21 @@ def split_recording(recording: Recording, config: TrainingConfig) -> Split:
     """Split the poses of a recording.
 
     Random poses are split one by one, frames of animation in blocks: an error on a pose would say nothing when the
-    frames before and after it have trained. Refined poses all train: they are no sample of the range of motion, and an
-    error measured on them would say nothing of it. What is held out stays so when a recording is extended.
+    frames before and after it have trained. Refined poses and those of the margin all train: they are no sample of the
+    range of motion, and an error measured on them would say nothing of it. What is held out stays so when a recording
+    is extended.
 
     Raises:
         TrainingError: there are too few poses beside the refined ones.
     """
     sources = recording.info.sampling.sources
-    refined = np.concatenate([np.full(s.poses, s.kind == REFINED) for s in sources])
-    _check_count(int((~refined).sum()))
+    besides = np.concatenate([np.full(s.poses, s.kind == REFINED) for s in sources])
     random = np.concatenate([np.full(s.poses, s.kind == RANDOM) for s in sources])
+    around = np.zeros(0, np.int64)
+    if margin := recording.info.sampling.margin:
+        around = np.flatnonzero(random)[random.sum() - margin.poses :]
+        besides[around], random[around] = True, False
+    _check_count(int((~besides).sum()))
     fractions = config.validation_fraction, config.seed, config.held_out_fraction
     splits = [_split(np.flatnonzero(random), *fractions)] if random.any() else []
     if blocks := _blocks(sources):
@@ -163,7 +177,7 @@ def split_recording(recording: Recording, config: TrainingConfig) -> Split:
         np.sort(np.concatenate([getattr(split, part) for split in splits]))
         for part in ("training", "validation", "held_out")
     )
-    return Split(np.append(training, np.flatnonzero(refined)), validation, held_out)
+    return Split(np.append(training, np.flatnonzero(besides)), validation, held_out, around)
 
 
 def _blocks(sources: tuple[Source, ...]) -> list[list[int]]:
@@ -242,7 +256,8 @@ def prepare(
     residuals = residuals.reshape(len(features), -1)
     mm_per_unit = 1000 * metres_per_unit
     tolerance = tolerance_mm / mm_per_unit if len(columns) else np.inf
-    basis = make_basis(residuals[split.training], tolerance, np.random.default_rng([seed, 2]))
+    rng, weights = np.random.default_rng([seed, 2]), split.weights(MARGIN_WEIGHT)
+    basis = make_basis(residuals[split.training], tolerance, rng, weights)
     coefficients = basis.coefficients(residuals)
     truncated = residuals[split.validation] - basis.residuals(coefficients[split.validation])
     return PreparedPartition(

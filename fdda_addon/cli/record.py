@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..core.defaults import MIN_VERTICES, POSES, REFINEMENT_POSES, SPREAD
+from ..core.defaults import MARGIN, MIN_VERTICES, POSES, REFINEMENT_POSES, SPREAD
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -45,6 +45,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=SPREAD,
         help=f"standard deviation as a part of half the range (default {SPREAD})",
+    )
+    parser.add_argument(
+        "--margin",
+        type=float,
+        default=MARGIN,
+        metavar="F",
+        help="draw a quarter of the random poses from F times the range of motion, locked axes turned too, for a model "
+        f"that knows what is beyond; 1 for none (default {MARGIN:g})",
     )
     parser.add_argument("--action", action="append", default=[], metavar="NAME", help="record its frames as well")
     parser.add_argument(
@@ -117,6 +125,7 @@ def _shard(text: str) -> tuple[int, int]:
 def run(options: argparse.Namespace) -> None:
     from ..core.checks.recording import merges_in_words
     from ..core.errors import WrongUsageError
+    from ..core.poses import MAX_MARGIN
     from ..core.recording.index import read_index, read_info
     from ..runtime.binding import true_rig
     from .files import open_file
@@ -127,6 +136,8 @@ def run(options: argparse.Namespace) -> None:
     # Wider is uniform already, and most draws would fall outside and be drawn again.
     if not 0 < options.spread <= 10:
         raise WrongUsageError("--spread must be more than 0 and at most 10.")
+    if not 1 <= options.margin <= MAX_MARGIN:
+        raise WrongUsageError(f"--margin must be 1, for none, to {MAX_MARGIN:g} times the range of motion.")
     of_new = (
         options.action,
         options.strip,
@@ -197,6 +208,7 @@ def _steps(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> 
     settings = RecordingSettings(
         seed=options.seed,
         spread=options.spread,
+        margin=options.margin,
         actions=tuple(options.action),
         resume=options.resume,
         sample=tuple(options.sample),

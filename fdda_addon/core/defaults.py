@@ -7,6 +7,8 @@ POSES = 1000
 """Random poses of a recording."""
 SPREAD = 1.0
 """Standard deviation of random poses, as a part of half the range."""
+MARGIN = 1.0
+"""How many times as wide as the range of motion the poses of its margin are; 1 for none of them."""
 INFLUENCE_POSES = 10
 """How often each joint is moved alone to find the partitions that it influences."""
 MIN_VERTICES = 8

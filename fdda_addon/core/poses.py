@@ -15,6 +15,12 @@ DEFAULT_RANGE = (-np.pi / 4, np.pi / 4)
 
 LONGEST_BONE = 2100
 """Letters of what a channel is called in a file: a control has an owner and a path."""
+MARGIN_PART = 0.25
+"""Part of the random poses that lies in the margin, where there is one."""
+MAX_MARGIN = 4.0
+"""Wider is no pose of anybody."""
+LOCKED_RANGE = np.pi / 4
+"""How far a locked axis turns in the margin, radians: by this for every range that the margin adds to a range."""
 RANGE_TOLERANCE = 1e-4
 """Radians or metres. Ranges that differ by less count as the same: Blender keeps them as float32."""
 
@@ -98,6 +104,66 @@ def beyond_range(channels: tuple[Channel, ...], factor: float) -> tuple[Channel,
         middle, half = (channel.low + channel.high) / 2, (channel.high - channel.low) / 2 * factor
         widened.append(replace(channel, low=middle - half, high=middle + half))
     return tuple(widened)
+
+
+@dataclass(frozen=True)
+class Margin:
+    """Poses around the range of motion: what a model is to know of where an animator breaks the limits.
+
+    Attributes:
+        factor: how many times as wide as the range of motion they are drawn.
+        poses: how many of the random poses, the last ones.
+        channels: of these poses, with the widened ranges; those of the other poses first, then the locked axes.
+    """
+
+    factor: float
+    poses: int
+    channels: tuple[Channel, ...]
+
+    def to_json(self) -> dict:
+        limits = [channel.to_json() for channel in self.channels]
+        return {"factor": self.factor, "poses": self.poses, "limits": limits}
+
+    @staticmethod
+    def from_json(value: dict) -> "Margin":
+        """Read it from a file.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is damaged.
+        """
+        factor, poses = value["factor"], value["poses"]
+        if type(factor) not in (int, float) or not 1 < factor <= MAX_MARGIN:
+            raise ValueError(f"its margin is {factor!r} times the range")
+        if type(poses) is not int or poses < 0:
+            raise ValueError(f"its margin has {poses!r} poses")
+        if not isinstance(value["limits"], list):
+            raise TypeError("the limits of its margin are no list")
+        return Margin(float(factor), poses, tuple(Channel.from_json(channel) for channel in value["limits"]))
+
+
+def margin_of(channels: tuple[Channel, ...], locked: tuple[Channel, ...], factor: float, poses: int) -> Margin | None:
+    """The margin of random poses; None where there is none.
+
+    Controls keep their ranges, which their properties hold them to, and scales stay above zero.
+
+    Args:
+        channels: of the poses inside the range of motion.
+        locked: axes of the same bones that do not turn there (`LOCKED_RANGE`), whatever their ranges say.
+        factor: how many times as wide as the range the margin is; 1 for none.
+        poses: how many random poses there are in all.
+    """
+    count = round(poses * MARGIN_PART)
+    if factor == 1 or not count:
+        return None
+    widened = []
+    for own, wide in zip(channels, beyond_range(channels, factor), strict=True):
+        if own.kind == CONTROL:
+            wide = own
+        elif own.kind == SCALE:
+            wide = replace(wide, low=max(wide.low, min(own.low, own.low / factor)))
+        widened.append(wide)
+    turn = LOCKED_RANGE * (factor - 1)
+    return Margin(factor, count, (*widened, *(replace(channel, low=-turn, high=turn) for channel in locked)))
 
 
 def range_changes(before: tuple[Channel, ...], after: tuple[Channel, ...]) -> list[str]:

@@ -270,6 +270,7 @@ def _draw_random(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     column.prop(settings, "poses", text="Random Poses")
     column.prop(settings, "seed")
     column.prop(settings, "spread")
+    column.prop(settings, "margin")
     row = layout.row(align=True)
     row.operator("fdda.preview_pose", text="", icon="TRIA_LEFT").step = -1
     row.operator("fdda.preview_pose", text=f"Show Pose {number}").step = 0

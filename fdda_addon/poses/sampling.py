@@ -198,6 +198,19 @@ def chosen_channels(armature_object: bpy.types.Object, choice: Choice) -> tuple[
     return tuple(found)
 
 
+def locked_channels(armature_object: bpy.types.Object, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
+    """The locked axes of the bones that channels turn, and those whose range is empty, in the order of the bones."""
+    turned = {channel.name for channel in channels if channel.kind == ROTATION}
+    sampled = {(channel.name, channel.axis) for channel in channels if channel.kind == ROTATION}
+    return tuple(
+        Channel(bone.name, ROTATION, axis, 0.0, 0.0)
+        for bone in armature_object.pose.bones
+        if bone.name in turned
+        for axis, stated in enumerate(rotation_ranges(bone))
+        if not stated.moves and (bone.name, axis) not in sampled
+    )
+
+
 def _rotations(bone: bpy.types.PoseBone, ranges: dict[int, tuple[float, float]]) -> list[Channel]:
     return [Channel(bone.name, ROTATION, axis, *bounds) for axis, bounds in ranges.items()]
 

@@ -18,7 +18,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..core.defaults import EPOCHS, MIN_VERTICES, POSES, SPREAD, TARGET_MM, TOLERANCE_MM
+from ..core.defaults import EPOCHS, MARGIN, MIN_VERTICES, POSES, SPREAD, TARGET_MM, TOLERANCE_MM
 from ..core.errors import OutputError
 from ..scene.scene_rig import SceneRig, armature_of
 
@@ -68,6 +68,15 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         default=SPREAD,
         min=0.05,
         max=10.0,
+        step=10,
+    )
+    margin: FloatProperty(
+        name="Margin",
+        description="A quarter of the random poses is drawn from so many times the range of motion, and turns locked "
+        "axes too, so that the model knows what is beyond; Limit constraints are off meanwhile. 1 for none",
+        default=MARGIN,
+        min=1.0,
+        max=4.0,
         step=10,
     )
     sample: EnumProperty(

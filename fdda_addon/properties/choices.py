@@ -30,6 +30,8 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
         poses=settings.poses,
         seed=settings.seed,
         spread=settings.spread,
+        # The property holds float32, and files what was typed.
+        margin=round(settings.margin, 6),
         actions=actions,
         resume=resume,
         sample=_sample(settings, actions),
@@ -42,7 +44,17 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
 
 def take_over_sampling(settings: FDDA_PG_character, other: FDDA_PG_character) -> None:
     """Give a mesh what another on the same armature is recorded with; its files and its training stay its own."""
-    for name in ("poses", "seed", "spread", "sample", "bone_collection", "fit_linear", "mirror", "least_vertices"):
+    for name in (
+        "poses",
+        "seed",
+        "spread",
+        "margin",
+        "sample",
+        "bone_collection",
+        "fit_linear",
+        "mirror",
+        "least_vertices",
+    ):
         setattr(settings, name, getattr(other, name))
     for name, values in (("sampled_bones", ("name",)), ("controls", ("name", "has_range", "low", "high"))):
         own = getattr(settings, name)

@@ -4,13 +4,13 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ..core.defaults import INFLUENCE_POSES, MIN_VERTICES, POSES, SPREAD
+from ..core.defaults import INFLUENCE_POSES, MARGIN, MIN_VERTICES, POSES, SPREAD
 from ..core.partition import INFLUENCE_TOLERANCE
-from ..core.poses import Channel
+from ..core.poses import Channel, Margin, margin_of
 from ..core.recording.index import RANDOM, Sampling, Source
 from ..core.rig import Rig
 from ..poses.clip import find_clips
-from ..poses.sampling import Choice, choose, sampled_channels
+from ..poses.sampling import Choice, choose, locked_channels, sampled_channels
 from ..rig.dependencies import read_dependencies
 from ..rig.reading import read_rig
 from ..scene.controls import stated_controls
@@ -25,6 +25,8 @@ class RecordingSettings:
         poses: number of random poses.
         seed: of the random poses.
         spread: standard deviation of the random poses as a part of half the range of motion.
+        margin: how many times as wide as the range of motion some of the random poses are (`core.poses.margin_of`); 1
+            for none of them.
         actions, strips: names of actions, and of strips of the NLA, whose frames are recorded after the random poses.
         mirror: record each of these frames a second time, mirrored.
         influence_poses: how often each joint is moved alone to find the partitions that it influences.
@@ -43,6 +45,7 @@ class RecordingSettings:
     poses: int = POSES
     seed: int = 0
     spread: float = SPREAD
+    margin: float = MARGIN
     actions: tuple[str, ...] = ()
     influence_poses: int = INFLUENCE_POSES
     influence_tolerance: float = INFLUENCE_TOLERANCE
@@ -95,4 +98,12 @@ def planned_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels:
     sources = [Source(RANDOM, settings.poses)] if settings.poses else []
     clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
     sources += [clip.source for clip in clips]
-    return Sampling(settings.seed, settings.spread, channels if settings.poses else (), tuple(sources))
+    own = channels if settings.poses else ()
+    margin = planned_margin(scene_rig, settings, own)
+    return Sampling(settings.seed, settings.spread, own, tuple(sources), margin)
+
+
+def planned_margin(scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]) -> Margin | None:
+    """The margin of the random poses of a recording, of which `channels` are sampled inside the range of motion."""
+    locked = locked_channels(scene_rig.armature_object, channels)
+    return margin_of(channels, locked, settings.margin, settings.poses if channels else 0)

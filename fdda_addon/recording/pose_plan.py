@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The poses of a recording, or of several that share them: random ones, then the frames of clips."""
 
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 
 import numpy as np
 
@@ -9,8 +9,10 @@ from ..core.controls import MESH_OBJECT, SHAPE_KEYS
 from ..core.poses import CONTROL, Channel, sample_pose
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
+from ..poses.suspended_limits import SuspendedLimits
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
+from .plan import RecordingSettings, planned_margin
 
 
 class PosePlan:
@@ -23,19 +25,17 @@ class PosePlan:
     def __init__(
         self,
         meshes: Sequence[tuple[SceneRig, tuple[Channel, ...]]],
-        poses: int,
-        seed: int,
-        spread: float,
+        settings: RecordingSettings,
         clips: tuple[Clip, ...],
     ):
         """Args:
         meshes: each with the channels that move it.
-        poses, seed, spread: of the random poses, as in `RecordingSettings`.
+        settings: of the recording.
         clips: whose frames follow.
         """
         self._rigs = [scene_rig for scene_rig, _ in meshes]
-        self._poses, self._seed, self._spread, self._clips = poses, seed, spread, clips
-        self.total = poses + sum(len(clip.frames) for clip in clips)
+        self._settings, self._clips = settings, clips
+        self.total = settings.poses + sum(len(clip.frames) for clip in clips)
         # The first mesh moves what all have in common.
         found: dict[tuple, tuple[int, Channel]] = {}
         for number, (_, channels) in enumerate(meshes):
@@ -44,6 +44,7 @@ class PosePlan:
                 found.setdefault((own, channel.name, channel.kind, channel.axis), (own, channel))
         self._owners = np.array([own for own, _ in found.values()], np.int64)
         self._channels = tuple(channel for _, channel in found.values())
+        self._margin = planned_margin(self._rigs[0], settings, self._channels)
 
     def channels_of(self, number: int) -> tuple[Channel, ...]:
         """The channels of the poses as the recording of a mesh has them: without those of other meshes."""
@@ -51,23 +52,46 @@ class PosePlan:
         return tuple(channel for channel, is_own in zip(self._channels, own, strict=True) if is_own)
 
     def poses(self, player: ClipPlayer, wanted: Container[int]) -> Iterator[int]:
-        """Pose the rigs, one pose an iteration, in the poses that are wanted, by their numbers; yields the number."""
-        posers = [
-            (Poser(self._rigs[max(own, 0)], tuple(self._channels[place] for place in places)), places)
-            for own in np.unique(self._owners).tolist()
-            for places in [np.flatnonzero(self._owners == own)]
-        ]
-        for index in range(self._poses):
+        """Pose the rigs, one pose an iteration, in the poses that are wanted, by their numbers; yields the number.
+
+        Limit constraints that would hold a pose of the margin are off while it is shown.
+        """
+        poses, margin = self._settings.poses, self._margin
+        inside = poses - (margin.poses if margin else 0)
+        set_pose = self._setter(self._channels)
+        for index in range(inside):
             if index in wanted:
-                values = sample_pose(self._channels, self._seed, index, self._spread)
-                for poser, places in posers:
-                    poser.set(values[places])
+                set_pose(sample_pose(self._channels, self._settings.seed, index, self._settings.spread))
                 yield index
+        if margin:
+            set_pose = self._setter(margin.channels)
+            with SuspendedLimits(self._rigs[0].armature_object, margin.channels) as limits:
+                for index in range(inside, poses):
+                    if index in wanted:
+                        values = sample_pose(margin.channels, self._settings.seed, index, self._settings.spread)
+                        set_pose(values)
+                        limits.suspend(values)
+                        yield index
         frames = ((clip, frame) for clip in self._clips for frame in clip.frames)
-        for index, (clip, frame) in enumerate(frames, self._poses):
+        for index, (clip, frame) in enumerate(frames, poses):
             if index in wanted:
                 player.show(clip, frame)
                 yield index
+
+    def _setter(self, channels: tuple[Channel, ...]) -> Callable[[np.ndarray], None]:
+        """What poses the rigs, of channels that begin with those of the plan; what follows is of the armature."""
+        owners = np.append(self._owners, np.full(len(channels) - len(self._owners), -1))
+        posers = [
+            (Poser(self._rigs[max(own, 0)], tuple(channels[place] for place in places)), places)
+            for own in np.unique(owners).tolist()
+            for places in [np.flatnonzero(owners == own)]
+        ]
+
+        def set_pose(values: np.ndarray) -> None:
+            for poser, places in posers:
+                poser.set(values[places])
+
+        return set_pose
 
 
 def _is_of_mesh(channel: Channel) -> bool:

@@ -99,7 +99,7 @@ def _plan(
         check_folder_writable(path)
         check_recordable(path, settings.resume)
     channels = [(scene_rig, own) for scene_rig, (_, own) in zip(meshes, read, strict=True)]
-    plan = PosePlan(channels, settings.poses, settings.seed, settings.spread, clips)
+    plan = PosePlan(channels, settings, clips)
     if plan.total < 1:
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
     wanted = len(_wanted(settings, plan.total))
@@ -202,7 +202,7 @@ def _record_poses(
         yield Progress("poses", first, len(wanted), estimate(meshes, len(wanted), len(wanted) - first))
         left = plan.poses(player, wanted[first:])
         # Closed before the writers: what was evaluated is kept when the recording is broken off.
-        with closing(append_poses(left, appenders)) as steps:
+        with closing(left), closing(append_poses(left, appenders)) as steps:
             for done in steps:
                 yield Progress("poses", done, len(wanted))
 

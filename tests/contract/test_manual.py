@@ -157,7 +157,7 @@ def test_quoted_symptoms_are_what_the_addon_says():
 def test_settings_are_those_of_the_sidebar():
     rows = re.findall(r"^\| \*\*(.+?)\*\* \| ([\d.]+) \| (.+) \|$", MANUAL, re.MULTILINE)
     known = properties()
-    assert len(rows) == 7
+    assert len(rows) == 8
     for name, default, text in rows:
         assert float(default) == known[name].get("default", 0), name
         if limits := re.match(r"([\d.]+) to ([\d.]+):", text):

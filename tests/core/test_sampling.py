@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.poses import Channel, beyond_range, range_changes, sample_pose
+from fdda_addon.core.poses import Channel, Margin, beyond_range, margin_of, range_changes, sample_pose
 
 CHANNELS = (
     Channel("a", "rotation", 0, -1.0, 3.0),
@@ -80,3 +80,25 @@ def test_range_changes_name_the_bones():
     assert range_changes(CHANNELS, (CHANNELS[0], CHANNELS[2])) == ["a"]
     other = (*CHANNELS[:2], Channel("c", "location", 1, -0.02, 0.0))
     assert range_changes(CHANNELS, other) == ["c", "b"]
+
+
+def test_a_margin_widens_ranges_about_their_middles_and_unlocks_axes():
+    locked = (Channel("a", "rotation", 1, 0.0, 0.0),)
+    others = (Channel("b", "scale", 0, 0.5, 1.5), Channel("shape_keys/x", "control", 0, 0.0, 1.0))
+    margin = margin_of((*CHANNELS, *others), locked, 3.0, 100)
+    assert (margin.factor, margin.poses) == (3.0, 25)
+    bounds = [(c.name, c.kind, c.axis, round(c.low, 6), round(c.high, 6)) for c in margin.channels]
+    assert bounds == [
+        ("a", "rotation", 0, -5.0, 7.0),
+        ("a", "rotation", 2, 0.0, 0.75),
+        ("b", "location", 1, -0.04, 0.02),
+        ("b", "scale", 0, round(0.5 / 3, 6), 2.5),
+        ("shape_keys/x", "control", 0, 0.0, 1.0),
+        ("a", "rotation", 1, round(-np.pi / 2, 6), round(np.pi / 2, 6)),
+    ]
+    assert Margin.from_json(margin.to_json()) == margin
+
+
+def test_no_margin():
+    assert margin_of(CHANNELS, (), 1.0, 100) is None
+    assert margin_of((), (), 2.0, 0) is None

@@ -108,3 +108,18 @@ def test_the_first_shapes_of_a_basis_leave_what_it_says():
         fewer = basis.first(count)
         left = rms(values - fewer.residuals(fewer.coefficients(values)))
         assert fewer.truncation == pytest.approx(left, rel=0.02, abs=1e-8)
+
+
+@pytest.mark.parametrize("poses, vertices", [(60, 50), (200, 20)], ids=["gram", "covariance"])
+def test_a_pose_that_counts_twice_is_as_good_as_two(poses, vertices):
+    values = residuals(poses, vertices, 12)
+    twice = np.concatenate([values, values[:10]])
+    weights = np.where(np.arange(poses) < 10, 2.0, 1.0)
+    weighted, repeated = (
+        make_basis(values, 1e-5, np.random.default_rng(0), weights),
+        make_basis(twice, 1e-5, np.random.default_rng(0)),
+    )
+    np.testing.assert_allclose(weighted.mean, repeated.mean, atol=1e-8)
+    np.testing.assert_allclose(weighted.left, repeated.left, rtol=1e-3, atol=1e-9)
+    first = slice(0, 5)
+    np.testing.assert_allclose(np.abs(weighted.shapes[first] @ repeated.shapes[first].T), np.eye(5), atol=1e-3)

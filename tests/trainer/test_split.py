@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.poses import Margin
 from fdda_addon.core.recording.index import ACTION, MIRRORED, RANDOM, REFINED, Source
 from fdda_addon.core.recording.reader import Recording, read_recording
 from trainer.config import TrainingConfig
@@ -85,6 +86,19 @@ def test_refined_poses_beside_frames_all_train(source):
     after = split(source, Source(ACTION, 100, "walk", (1, 1)), Source(REFINED, 7, "model.onnx"))
     assert np.array_equal(after.held_out, before.held_out) and np.array_equal(after.validation, before.validation)
     assert np.array_equal(after.training[-7:], np.arange(100, 107))
+
+
+def test_poses_of_the_margin_all_train(source):
+    sampling = source.info.sampling
+    with_margin = replace(sampling, margin=Margin(2.0, 50, sampling.channels))
+    other = replace(source, info=replace(source.info, sampling=with_margin))
+    found = split(other, Source(RANDOM, 200), Source(ACTION, 100, "walk", (1, 1)))
+    assert np.array_equal(found.margin, np.arange(150, 200))
+    assert np.isin(found.margin, found.training).all()
+    alone = split(source, Source(RANDOM, 150))
+    assert np.array_equal(found.held_out[found.held_out < 200], alone.held_out)
+    weights = found.weights(0.1)
+    assert np.array_equal(found.training[weights == 0.1], found.margin) and set(weights) == {0.1, 1.0}
 
 
 def test_too_few_poses_are_refused(source):

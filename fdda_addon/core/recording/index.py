@@ -9,7 +9,7 @@ from pathlib import Path
 from ..controls import read_controls
 from ..errors import RecordingError
 from ..input_file import read_input
-from ..poses import Channel
+from ..poses import Channel, Margin
 from ..rig import Fingerprint, read_joints, read_name
 from ..skin_fit import SkinFit
 from ..surface import MIN_CORNERS
@@ -50,15 +50,17 @@ class Source:
 
 @dataclass(frozen=True)
 class Sampling:
-    """How the poses were chosen."""
+    """How the poses were chosen; `margin` is of random poses around the range of motion, where there are any."""
 
     seed: int
     spread: float
     channels: tuple[Channel, ...]
     sources: tuple[Source, ...]
+    margin: Margin | None = None
 
     def to_json(self) -> dict:
         return {
+            **({"margin": self.margin.to_json()} if self.margin else {}),
             "seed": self.seed,
             "spread": self.spread,
             "limits": [channel.to_json() for channel in self.channels],
@@ -173,12 +175,13 @@ def _sampling(value: dict) -> Sampling:
         raise ValueError(f"its spread is {spread!r}")
     if not isinstance(value["limits"], list) or not isinstance(value["sources"], list):
         raise TypeError("its range of motion or its sources are no list")
-    return Sampling(
-        seed,
-        float(spread),
-        tuple(Channel.from_json(channel) for channel in value["limits"]),
-        tuple(_source(source) for source in value["sources"]),
-    )
+    sources = tuple(_source(source) for source in value["sources"])
+    margin = Margin.from_json(value["margin"]) if "margin" in value else None
+    random = sum(source.poses for source in sources if source.kind == RANDOM)
+    if margin and margin.poses > random:
+        raise ValueError(f"{margin.poses} of its {random} random poses lie in the margin")
+    channels = tuple(Channel.from_json(channel) for channel in value["limits"])
+    return Sampling(seed, float(spread), channels, sources, margin)
 
 
 def _source(value: dict) -> Source:

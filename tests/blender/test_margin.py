@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Poses around the range of motion: beyond limits and off locked axes, the rig's own limits suspended meanwhile."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from fdda_addon.core.errors import RecordingError
+from fdda_addon.core.poses import Channel
+from fdda_addon.core.recording.merge import merge_recordings
+from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.core.skinning import skin_matrices
+from fdda_addon.poses.suspended_limits import SuspendedLimits
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.run import record
+from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.scene_rig import SceneRig, find_rig
+
+from .conftest import run
+from .refusals import files, save_elbow
+from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
+
+SETTINGS = RecordingSettings(poses=40, margin=2.0, influence_poses=2, actions=("elbow_wave",))
+INSIDE = 30
+"""Of the 40 random poses, the first."""
+
+
+@pytest.fixture
+def rig(tmp_path) -> Path:
+    return save_elbow(tmp_path / "elbow.blend")
+
+
+def opened(rig: Path) -> SceneRig:
+    bpy.ops.wm.open_mainfile(filepath=str(rig))
+    return find_rig()
+
+
+def recorded(rig: Path, path: Path, settings: RecordingSettings = SETTINGS) -> Recording:
+    drain(record(opened(rig), path, settings))
+    return read_recording(path)
+
+
+def bends(recording: Recording) -> np.ndarray:
+    """(N, 3, 3) rotation of the lower bone against the upper one, in the lower one's own axes."""
+    rig = recording.rig
+    skin = skin_matrices(np.array(recording.pose_matrices, np.float64), rig.rest_matrices.astype(np.float64))
+    rest = rig.rest_matrices[1, :3, :3].astype(np.float64)
+    return rest.T @ np.linalg.inv(skin[:, 0, :3, :3]) @ skin[:, 1, :3, :3] @ rest
+
+
+def angles(rotations: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arccos(np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+
+
+def test_poses_of_the_margin_leave_the_limits_and_locked_axes(rig, tmp_path):
+    recording = recorded(rig, tmp_path / "r")
+    margin = recording.info.sampling.margin
+    assert (margin.factor, margin.poses) == (2.0, 10)
+    own, turned = recording.info.sampling.channels, bends(recording)
+    (bend,) = (c for c in own if c.name == "lower")
+    # The bone turns about the axis of its range alone, where limits hold; elsewhere about the others as well.
+    about = np.eye(3)[bend.axis]
+    off_axis = np.degrees(np.arccos(np.clip(turned @ about @ about, -1, 1)))
+    assert off_axis[:INSIDE].max() < 0.1 < 5 < off_axis[INSIDE : SETTINGS.poses].max()
+    middle, half = (bend.low + bend.high) / 2, (bend.high - bend.low) / 2
+    assert angles(turned)[:INSIDE].max() <= math.degrees(middle + half) + 0.1
+    assert angles(turned)[INSIDE : SETTINGS.poses].max() > math.degrees(middle + half) + 5
+
+
+def test_poses_inside_and_frames_are_those_of_a_recording_without_a_margin(rig, tmp_path):
+    """Neither an unlocked axis nor a limit that is off is left behind for the frames that follow."""
+    without = recorded(rig, tmp_path / "without", replace(SETTINGS, margin=1.0))
+    recording = recorded(rig, tmp_path / "with")
+    for name in ("pose_matrices", "residuals"):
+        ours, theirs = np.array(getattr(recording, name)), np.array(getattr(without, name))
+        assert np.array_equal(ours[:INSIDE], theirs[:INSIDE])
+        assert np.array_equal(ours[SETTINGS.poses :], theirs[SETTINGS.poses :])
+    assert without.info.sampling.margin is None
+    assert recording.info.sampling.channels == without.info.sampling.channels
+
+
+def test_the_scene_is_given_back(rig, tmp_path):
+    found = opened(rig)
+    muted = {c.name: c.mute for bone in found.armature_object.pose.bones for c in bone.constraints}
+    before = scene_state(found)
+    drain(record(found, tmp_path / "whole", SETTINGS))
+    steps = record(found, tmp_path / "broken", SETTINGS)
+    for step in steps:
+        if step.stage == "poses" and step.done == INSIDE + 5:
+            break
+    steps.close()
+    assert {c.name: c.mute for bone in found.armature_object.pose.bones for c in bone.constraints} == muted
+    assert_same_state(before, scene_state(found))
+
+
+@pytest.mark.parametrize("at", [12, INSIDE + 3, SETTINGS.poses + 4])
+def test_resumed_it_is_bit_for_bit_the_same(rig, tmp_path, at):
+    drain(record(opened(rig), tmp_path / "whole", SETTINGS))
+    steps = record(opened(rig), tmp_path / "broken", SETTINGS)
+    for step in steps:
+        if step.stage == "poses" and step.done == at:
+            break
+    steps.close()
+    drain(record(opened(rig), tmp_path / "broken", replace(SETTINGS, resume=True)))
+    assert files(tmp_path / "broken") == files(tmp_path / "whole")
+
+
+def test_shards_join_to_the_same(rig, tmp_path):
+    drain(record(opened(rig), tmp_path / "whole", SETTINGS))
+    shards = [tmp_path / str(number) for number in range(1, 4)]
+    for number, shard in enumerate(shards, 1):
+        drain(record(opened(rig), shard, replace(SETTINGS, shard=(number, 3))))
+    drain(merge_recordings(shards, tmp_path / "merged"))
+    assert files(tmp_path / "merged") == files(tmp_path / "whole")
+
+
+def test_another_margin_is_another_recording(rig, tmp_path):
+    drain(record(opened(rig), tmp_path / "r", SETTINGS), stop_after=10)
+    with pytest.raises(RecordingError, match=r"recorded with another sampling\.margin"):
+        drain(record(opened(rig), tmp_path / "r", replace(SETTINGS, margin=1.5, resume=True)))
+
+
+def test_only_limits_that_would_hold_a_pose_are_off():
+    found = fresh_elbow()
+    bone = found.armature_object.pose.bones["lower"]
+    (limit,) = bone.constraints
+    world, weak = (bone.constraints.new("LIMIT_ROTATION") for _ in range(2))
+    world.owner_space, weak.owner_space, weak.influence = "WORLD", "LOCAL", 0.0
+    for constraint in (world, weak):
+        constraint.use_limit_x = True
+    channels = tuple(
+        Channel("lower", "rotation", axis, getattr(limit, f"min_{letter}"), getattr(limit, f"max_{letter}"))
+        for axis, letter in enumerate("xyz")
+    )
+    inside = np.array([(channel.low + channel.high) / 2 for channel in channels])
+    with SuspendedLimits(found.armature_object, channels) as limits:
+        for beyond, off in ((0.0, False), (3.0, True), (0.0, False), (-3.0, True)):
+            limits.suspend(inside + beyond)
+            assert (limit.mute, world.mute, weak.mute) == (off, False, False)
+    assert not limit.mute
+
+
+def test_the_verb(rig, tmp_path, capfd):
+    assert run("record", rig, tmp_path / "r", "--poses", 20, "--margin", 1.5) == 0
+    margin = read_recording(tmp_path / "r").info.sampling.margin
+    assert (margin.factor, margin.poses) == (1.5, 5)
+    for value in ("0.5", "4.5", "nan"):
+        assert run("record", rig, tmp_path / "s", "--margin", value) == 2
+        assert "--margin must be 1, for none, to 4 times the range of motion." in capfd.readouterr().err
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_model_knows_what_lies_beyond(tmp_path):
+    """The same rig without its limits, so that evaluate can pose it beyond: a quarter of the error and less."""
+    found = fresh_elbow()
+    for bone in found.armature_object.pose.bones:
+        for constraint in bone.constraints:
+            constraint.influence = 0.0
+    rig = tmp_path / "elbow.blend"
+    save_copy(rig)
+    errors = {}
+    for margin in ("1", "2"):
+        recording, model, out = tmp_path / margin, tmp_path / f"{margin}.onnx", tmp_path / f"{margin}.json"
+        assert run("record", rig, recording, "--poses", 200, "--margin", margin) == 0
+        assert run("train", recording, model, "--epochs", 60) == 0
+        assert run("evaluate", rig, model, "--json", out, "--poses", 40, "--beyond", 2) == 0
+        errors[margin] = _errors(out)
+    assert errors["2"][1] < errors["1"][1] / 2
+    assert errors["2"][0] < 1.5 * errors["1"][0]
+
+
+def _errors(path: Path) -> tuple[float, float]:
+    """Mean error inside the range of motion, and at twice the range, mm."""
+    found = json.loads(path.read_text())
+    return found["fdda"]["mean"], found["beyond"][0]["fdda"]["mean"]
