@@ -13,8 +13,10 @@ CURVE_POINTS = 120
 """A curve with more epochs is thinned out to this many points."""
 
 
-def learning_curves(training: Sequence[float], validation: Sequence[float], low: float, high: float) -> str:
-    """Small chart of one partition: error by epoch, logarithmic between `low` and `high` mm."""
+def learning_curves(
+    training: Sequence[float], validation: Sequence[float], worst: Sequence[float], low: float, high: float
+) -> str:
+    """Small chart of one partition: errors by epoch, logarithmic between `low` and `high` mm; `worst` may be empty."""
     width, height, left, bottom = 230, 110, 38, 16
     if not validation:
         return (
@@ -23,7 +25,9 @@ def learning_curves(training: Sequence[float], validation: Sequence[float], low:
         )
     y = _log_axis(low, high, height - bottom, 6)
     parts = [_grid_lines(low, high, y, left, width - 4)]
-    for name, values in (("training", training), ("validation", validation)):
+    for name, values in (("training", training), ("worst", worst), ("validation", validation)):
+        if not values:
+            continue
         chosen = np.unique(np.linspace(0, len(values) - 1, min(CURVE_POINTS, len(values))).round().astype(int))
         span = max(1, len(values) - 1)
         points = " ".join(f"{left + (width - 6 - left) * i / span:.1f},{y(values[i]):.1f}" for i in chosen)
@@ -35,8 +39,14 @@ def learning_curves(training: Sequence[float], validation: Sequence[float], low:
     return f'<svg viewBox="0 0 {width} {height}" role="img">{"".join(parts)}</svg>'
 
 
-def error_bars(names: Sequence[str], fdda: Sequence[float], linear: Sequence[float], largest: Sequence[float]) -> str:
-    """Mean error of each partition, model against linear layer, and the model's largest error; logarithmic, mm."""
+def error_bars(
+    names: Sequence[str],
+    fdda: Sequence[float],
+    linear: Sequence[float],
+    p999: Sequence[float],
+    largest: Sequence[float],
+) -> str:
+    """Mean error of each partition, model against linear layer, and the model's p99.9 and largest; logarithmic, mm."""
     row, left, right, top = 20, 130, 16, 24
     width, height = 880, top + row * len(names) + 8
     positive = [value for value in (*fdda, *linear, *largest) if value > 0] or [1.0]
@@ -55,12 +65,12 @@ def error_bars(names: Sequence[str], fdda: Sequence[float], linear: Sequence[flo
                 f'<rect class="bar {kind}" x="{left}" y="{middle - thick / 2}" height="{thick}" rx="1.5" '
                 f'width="{max(0.0, end - left):.1f}"><title>{escape(name)}: {value:.4f} mm</title></rect>'
             )
-        if largest[number] > 0:
-            at = x(largest[number])
-            parts.append(
-                f'<line class="most" x1="{at:.1f}" x2="{at:.1f}" y1="{middle - 6}" y2="{middle + 6}">'
-                f"<title>largest: {largest[number]:.3f} mm</title></line>"
-            )
+        for value, what, half in ((p999[number], "99.9 %", 3), (largest[number], "largest", 6)):
+            if value > 0:
+                parts.append(
+                    f'<line class="most" x1="{x(value):.1f}" x2="{x(value):.1f}" y1="{middle - half}" '
+                    f'y2="{middle + half}"><title>{what}: {value:.3f} mm</title></line>'
+                )
     return f'<svg viewBox="0 0 {width} {height}" role="img">{"".join(parts)}</svg>'
 
 

@@ -26,11 +26,13 @@ SMOOTHING = 1e-6
 class Curves:
     """Errors of one partition by epoch: means over poses of the rms distance over vertices, mm.
 
-    Those of training are of the weights as they move, those of validation of their running average.
+    Those of training are of the weights as they move, those of validation of their running average. `worst_mm` is the
+    largest of the validation poses, in place of their mean.
     """
 
     training_mm: list[float] = field(default_factory=list)
     validation_mm: list[float] = field(default_factory=list)
+    worst_mm: list[float] = field(default_factory=list)
     best_epoch: int = 0
 
 
@@ -175,7 +177,7 @@ class _Loop:
                 schedule.step()
                 self._average((epoch - 1) * steps + step)
                 training_mm += (errors * self.to_mm.square() + self.left_mm.square()).sqrt().sum(dim=1)
-            validation_mm = self._validate()
+            validation_mm, worst_mm = self._validate()
             self._keep_best(validation_mm, epoch, curves)
             validation = validation_mm.cpu().numpy()
             if not np.isfinite(validation).all():
@@ -184,9 +186,10 @@ class _Loop:
                     f"{config.learning_rate:g}."
                 )
             learned = (training_mm / poses).tolist()
-            for curve, train_mm, own_mm in zip(curves, learned, validation, strict=True):
+            for curve, train_mm, own_mm, most_mm in zip(curves, learned, validation, worst_mm.tolist(), strict=True):
                 curve.training_mm.append(train_mm)
                 curve.validation_mm.append(float(own_mm))
+                curve.worst_mm.append(most_mm)
             if progress:
                 means = [
                     (float(errors @ learning_vertices) + constant_mm) / vertices.sum()
@@ -219,15 +222,16 @@ class _Loop:
         torch._foreach_lerp_(self.averaged, list(self.model.parameters()), 1 - decay)
 
     @torch.no_grad()
-    def _validate(self) -> torch.Tensor:
-        """(P,) mean error of the validation poses with the averaged weights, mm."""
+    def _validate(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """(P,) mean error of the validation poses with the averaged weights, and that of the worst of them, mm."""
         own = [parameter.data for parameter in self.model.parameters()]
         for parameter, average in zip(self.model.parameters(), self.averaged, strict=True):
             parameter.data = average
         squared = (self.model(self.x_validation) - self.y_validation).square().sum(dim=2) * self.to_mm.square()
         for parameter, data in zip(self.model.parameters(), own, strict=True):
             parameter.data = data
-        return (squared + self.truncation_mm.square()).sqrt().mean(dim=1)
+        errors = (squared + self.truncation_mm.square()).sqrt()
+        return errors.mean(dim=1), errors.max(dim=1).values
 
     def _keep_best(self, validation_mm: torch.Tensor, epoch: int, curves: list[Curves]) -> None:
         better = validation_mm < self.best_mm

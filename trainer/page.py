@@ -9,14 +9,15 @@ from pathlib import Path
 from fdda_addon.core.input_file import read_input
 from fdda_addon.core.rig import UNMOVED_LABEL
 
+from .causes import CAUSES
 from .charts import curve_limits, error_bars, histogram, learning_curves
 
 MAX_PICTURE_BYTES = 256 << 20
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c1f24; --soft: #666d78; --paper: #fff; --card: #f5f6f8; --line: #dfe2e7;
-  --fdda: #e2711d; --linear: #b9c0cb; --train: #7b93b8; }
+  --fdda: #e2711d; --linear: #b9c0cb; --train: #7b93b8; --worst: #b03a7a; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e8eaee; --soft: #98a0ad; --paper: #16181c; --card: #1f2228;
-  --line: #343942; --linear: #545c69; --train: #7d9ccc; } }
+  --line: #343942; --linear: #545c69; --train: #7d9ccc; --worst: #d66aa5; } }
 * { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 1080px; padding: 40px 28px 80px; background: var(--paper); color: var(--ink);
   font: 15px/1.5 system-ui, "Segoe UI", "Helvetica Neue", Arial, sans-serif; font-variant-numeric: tabular-nums; }
@@ -33,6 +34,7 @@ svg { display: block; width: 100%; height: auto; overflow: visible; }
 .label { fill: var(--ink); font-size: 12px; }
 .curve { fill: none; stroke-width: 1.6; stroke-linejoin: round; }
 .curve.training { stroke: var(--train); } .curve.validation { stroke: var(--fdda); }
+.curve.worst { stroke: var(--worst); stroke-width: 1; }
 .bar.linear, .area.linear { fill: var(--linear); } .bar.fdda, .area.fdda { fill: var(--fdda); }
 .area { fill-opacity: .78; } .most { stroke: var(--fdda); stroke-width: 2; }
 .key { display: inline-block; width: 11px; height: 11px; border-radius: 2px; margin: 0 5px 0 12px; }
@@ -60,6 +62,7 @@ def render_html(report: dict, pictures: Sequence[Path] = (), evaluation: dict | 
         _evaluation(evaluation),
         _errors(report),
         _surface(report),
+        _worst(report["partitions"]),
         _curves(report),
         _table(report["partitions"], report["fdda"]["held_out"], report["linear"]["held_out"], report),
         _settings(report),
@@ -145,6 +148,7 @@ def _errors(report: dict) -> str:
         [p["joint"] or UNMOVED_LABEL for p in partitions],
         [p["held_out"]["mean"] for p in partitions],
         [p["linear"]["mean"] for p in partitions],
+        [p["held_out"]["p999"] for p in partitions],
         [p["held_out"]["max"] for p in partitions],
     )
     counts = report["histogram"]
@@ -152,7 +156,7 @@ def _errors(report: dict) -> str:
         "<h2>Held-out error</h2><p>Share of vertices by their distance to the true rig."
         f"{_key('fdda', 'FDDA')}{_key('linear', 'linear layer alone')}</p>"
         f"{histogram(counts['edges'], counts['fdda'], counts['linear'])}"
-        "<h2>Held-out error by partition</h2><p>Bars are means, the tick is the largest error."
+        "<h2>Held-out error by partition</h2><p>Bars are means, the ticks the 99.9th percentile and the largest error."
         f"{_key('fdda', 'FDDA')}{_key('linear', 'linear layer alone')}</p>{bars}"
     )
 
@@ -174,17 +178,64 @@ def _surface(report: dict) -> str:
     )
 
 
+def _worst(partitions: list[dict]) -> str:
+    """What the largest errors have in common, the largest first; nothing for a report that does not say it."""
+    known = sorted((p for p in partitions if "worst" in p), key=lambda p: -p["held_out"]["max"])
+    if not known:
+        return ""
+    rows = ""
+    for p in known:
+        w = p["worst"]
+        joint = f"{escape(w['joint'])}, {w['extreme']:.1f} times" if w["joint"] else "-"
+        border = "-" if w["border"] is None else f"{w['border']:.1f} times"
+        cells = (
+            *(f"{p['held_out'][k]:.3f}" for k in ("mean", "p999", "max")),
+            *(f"{w['poses']:,}", f"{w['vertices']:,}", f"{100 * w['shapes']:.0f} %", border, joint),
+            *(f"{w['distance']:.1f} times", f"{w['training']:.1f} times", escape(CAUSES.get(w["cause"], w["cause"]))),
+        )
+        rows += f"<tr><td>{_joint(p)}</td>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+    heads = (
+        *(
+            "partition",
+            "mean",
+            "99.9 %",
+            "max",
+            "poses",
+            "vertices",
+            "not in the shapes",
+            "at borders",
+            "furthest joint",
+        ),
+        *("from training poses", "over training errors", "what helps"),
+    )
+    return (
+        "<h2>The largest errors</h2><p>What the half percent of the vertices that are furthest off has in common, "
+        "against what is usual: in how many poses and vertices, how much of it no shape reaches, how much more often "
+        "it lies beside another partition, the joint that is furthest from its middle, how far the nearest training "
+        "pose is, and the 99.9th percentile over that of the training poses.</p>"
+        '<div class="scroll"><table><thead><tr>'
+        f"{''.join(f'<th>{head}</th>' for head in heads)}</tr></thead><tbody>{rows}</tbody></table></div>"
+    )
+
+
+def _curve(curve: dict, low: float, high: float) -> str:
+    return learning_curves(curve["training"], curve["validation"], curve.get("worst", ()), low, high)
+
+
 def _curves(report: dict) -> str:
     curves = [p["curve"] for p in report["partitions"]]
-    low, high = curve_limits([values for c in curves for values in (c["training"], c["validation"])])
+    low, high = curve_limits(
+        [values for c in curves for values in (c["training"], c["validation"], c.get("worst", ()))]
+    )
     figures = "".join(
-        f"<figure>{learning_curves(p['curve']['training'], p['curve']['validation'], low, high)}"
+        f"<figure>{_curve(p['curve'], low, high)}"
         f"<figcaption><b>{_joint(p)}</b> &middot; best at {p['curve']['best_epoch']}</figcaption></figure>"
         for p in report["partitions"]
     )
     return (
         "<h2>Learning curves</h2><p>Error of the poses in mm, by epoch, one scale for all. "
-        f'{_key("train", "training")}{_key("fdda", "validation")}</p><div class="multiples">{figures}</div>'
+        f"{_key('train', 'training')}{_key('fdda', 'validation')}{_key('worst', 'its worst pose')}</p>"
+        f'<div class="multiples">{figures}</div>'
     )
 
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # The page can be written again where torch is not installed.
     from .deformation import Deformation
     from .export import Exported, Measured
     from .loop import Curves
+    from .worst import Worst
 
 HISTOGRAM_EDGES_MM = np.concatenate([[0.0], np.geomspace(1e-4, 1e3, 71)])
 """Ten bins a decade; the first one holds everything below a ten-thousandth of a millimetre."""
@@ -40,6 +41,7 @@ def make_report(
     surface: dict,
     curves: Sequence[Curves],
     model_name: str,
+    worst: Sequence[Worst],
 ) -> dict:
     """What `report.json` holds (`core.report`). docs/training.md describes the keys; errors are in mm.
 
@@ -48,11 +50,14 @@ def make_report(
         on_training: errors on a sample of the training poses.
         surface: `normals` and `edges` of held-out poses.
         model_name: file name of the model.
+        worst: of each partition.
     """
     names, controls = recording.rig.joint_names, [control.name for control in recording.rig.controls]
     held_out = exported.held_out
     partitions = []
-    for partition, prepared, curve in zip(deformation.partitions, deformation.prepared, curves, strict=True):
+    for partition, prepared, curve, largest in zip(
+        deformation.partitions, deformation.prepared, curves, worst, strict=True
+    ):
         own = partition.vertices
         partitions.append(
             {
@@ -68,9 +73,11 @@ def make_report(
                 "held_out": error_statistics(held_out.fdda[:, own]).to_json(),
                 "linear": error_statistics(held_out.linear[:, own]).to_json(),
                 "histogram": _histogram(held_out.fdda[:, own]),
+                "worst": largest.to_json(),
                 "curve": {
                     "training": [round(value, 6) for value in curve.training_mm],
                     "validation": [round(value, 6) for value in curve.validation_mm],
+                    "worst": [round(value, 6) for value in curve.worst_mm],
                     "best_epoch": curve.best_epoch,
                 },
             }

@@ -34,6 +34,7 @@ from .process import Cancelled
 from .target import Outcome, judge
 from .trust import make_trust_range
 from .weights import LastWeights, initial_networks, read_weights, write_weights
+from .worst import find_worst
 
 WARM_EPOCHS, WARM_RATE = 0.5, 0.3
 """A warm start takes this part of the epochs and of the learning rate: most is learned already."""
@@ -119,8 +120,9 @@ def train_model(
     sample = split.training[:: max(1, len(split.training) // len(split.held_out))]
     on_training = measure(exported.session, recording, deformation, sample)
     surface = measure_surface(exported.session, recording, deformation, split.held_out)
+    worst = find_worst(recording, deformation, split, exported.held_out.fdda, on_training.fdda)
     content = report.make_report(
-        recording, deformation, exported, on_training, surface, trained.curves, model_path.name
+        recording, deformation, exported, on_training, surface, trained.curves, model_path.name, worst
     )
     # Not in the model: the same recording and settings give the same bytes.
     content["training"] = {**content["training"], "seconds": round(time.perf_counter() - started, 2)}

@@ -52,7 +52,18 @@ _PARTITION = {
     "held_out": _ERRORS,
     "linear": _ERRORS,
     "histogram": [int],
-    "curve": {"training": [float], "validation": [float], "best_epoch": int},
+    "worst?": {
+        "poses": int,
+        "vertices": int,
+        "shapes": float,
+        "border": _OrNull(float),
+        "joint": str,
+        "extreme": float,
+        "distance": float,
+        "training": float,
+        "cause": str,
+    },
+    "curve": {"training": [float], "validation": [float], "worst?": [float], "best_epoch": int},
 }
 _REPORT = {
     "unit": str,

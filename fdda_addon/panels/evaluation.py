@@ -12,7 +12,7 @@ from .names import shown_name
 from .section import Section, draw_button, draw_job, draw_sentence, panel_rig, together
 
 FEW_PARTITIONS = 5
-FIGURES = (("Mean", "mean"), ("99 %", "p99"), ("Largest", "max"))
+FIGURES = (("Mean", "mean"), ("99.9 %", "p999"), ("Largest", "max"))
 
 
 class FDDA_PT_evaluation(Section, bpy.types.Panel):

@@ -146,18 +146,20 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         draw_sentence(layout, context, f"Warning: {warning['name']}; the report says what to do.", "INFO")
     everything = report["fdda"]["held_out"]
     header, body = layout.panel("fdda_held_out", default_closed=True)
-    header.label(text=f"Held-out error: mean {everything['mean']:.3f}, max {everything['max']:.2f} mm")
+    figures = f"mean {everything['mean']:.3f}, 99.9 % {everything['p999']:.2f}, max {everything['max']:.2f} mm"
+    header.label(text=f"Held-out error: {figures}")
     if body is None:
         return
     body.label(text="By partition, worst first")
     partitions = sorted(report["partitions"], key=lambda p: -p["held_out"]["max"])
     shown = partitions if context.window_manager.fdda.show_all_partitions else partitions[:SHOWN_PARTITIONS]
-    names, means, largest = _columns(body.box())
-    for column, text in ((names, "Partition"), (means, "Mean"), (largest, "Max")):
+    names, means, nearly, largest = _columns(body.box())
+    for column, text in ((names, "Partition"), (means, "Mean"), (nearly, "99.9 %"), (largest, "Max")):
         column.label(text=text)
     for p in shown:
         names.label(text=shown_name(rig.armature_object, p["joint"]))
         means.label(text=f"{p['held_out']['mean']:.3f}")
+        nearly.label(text=f"{p['held_out']['p999']:.2f}")
         largest.label(text=f"{p['held_out']['max']:.2f}")
     if len(partitions) > SHOWN_PARTITIONS:
         text = f"Show All {len(partitions)} Partitions"
@@ -165,11 +167,11 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 
 
 def _columns(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
-    """A column for names, and two for numbers at the right."""
-    left = layout.split(factor=0.5)
+    """A column for names, and three for numbers at the right."""
+    left = layout.split(factor=0.4)
     columns = [left.column(align=True)]
-    right = left.split(factor=0.5)
-    for _ in range(2):
+    right = left.row(align=True)
+    for _ in range(3):
         columns.append(right.column(align=True))
         columns[-1].alignment = "RIGHT"
     return columns
