@@ -12,8 +12,11 @@ from benchmarks import demo
 
 from .conftest import assert_plays, run
 
-MEAN_BAR, MAX_BAR = 0.04, 0.15
+MEAN_BAR, P999_BAR, MAX_BAR = 0.012, 0.03, 0.15
 """Held-out errors of the model as parts of the linear layer's."""
+BEYOND_BARS = {"1.5": 0.03, "2": 0.06, "3": 0.2}
+"""Mean errors at so many times the range of motion."""
+NAMED_BARS = {"elbow 3x its range, off its axis": 0.45, "metacarpals 2.5x their range": 0.15}
 SPEED_BAR = 5.0
 """With the default tolerance; docs/benchmarks.md has what a machine without other work measures, and the aim of 8."""
 SPEED_RUNS = 5
@@ -48,13 +51,15 @@ def test_files(made):
 def test_held_out_errors(errors):
     assert errors["poses"] == 200
     assert errors["fdda"]["mean"] <= MEAN_BAR * errors["linear"]["mean"]
+    assert errors["fdda"]["p999"] <= P999_BAR * errors["linear"]["p999"]
     assert errors["fdda"]["max"] <= MAX_BAR * errors["linear"]["max"]
 
 
-def test_beyond_the_range_is_no_worse_than_linear(errors):
+def test_beyond_the_range(errors):
     assert [e["name"] for e in errors["beyond"]] == ["1.5 times the range", "2 times the range", "3 times the range"]
+    bars = {**{f"{factor} times the range": bar for factor, bar in BEYOND_BARS.items()}, **NAMED_BARS}
     for poses in (*errors["beyond"], *errors["named"]):
-        assert poses["fdda"]["mean"] < poses["linear"]["mean"], poses["name"]
+        assert poses["fdda"]["mean"] < bars[poses["name"]] * poses["linear"]["mean"], poses["name"]
         # Nothing explodes: no vertex is further from the rig than the linear layer leaves it, by more than a trifle.
         assert poses["fdda"]["max"] < 1.05 * poses["linear"]["max"], poses["name"]
 
