@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The same recording, settings and seed give the same model, from one process to the next."""
+
+from pathlib import Path
+
+import pytest
+
+from .conftest import start_trainer
+
+
+@pytest.mark.parametrize("options", [(), ("--dropout", "0.1")], ids=["as it is", "dropout"])
+def test_the_same_bytes_in_two_processes(recording, tmp_path: Path, options):
+    found = {}
+    for name, seed in (("first", 3), ("second", 3), ("other", 4)):
+        model = tmp_path / name / "model.onnx"
+        model.parent.mkdir()
+        process = start_trainer(recording, model, "--epochs", "5", "--seed", str(seed), *options)
+        assert process.communicate()[1] == "" and process.returncode == 0
+        found[name] = model.read_bytes()
+    assert found["first"] == found["second"] != found["other"]
