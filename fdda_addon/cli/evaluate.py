@@ -16,6 +16,7 @@ from .files import add_rig_options
 from .folders import by_object, headed, open_rigs
 from .outputs import add_overwrite
 from .progress import ProgressPrinter
+from .target import add_target, target_settings
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -38,6 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--beyond", type=float, action="append", default=[], metavar="X", help="compare at X times the range as well"
     )
+    add_target(parser)
     parser.add_argument("--heatmap", metavar="OUT.png", type=Path, help="draw rig, linear layer and model as heat maps")
     add_overwrite(parser)
 
@@ -47,6 +49,7 @@ def run(options: argparse.Namespace) -> None:
         raise WrongUsageError("--poses and --seed must be 0 or more, and --beyond more than 0.")
     if not options.poses and (options.beyond or not (options.action or options.strip)):
         raise WrongUsageError("With --poses 0 only actions and strips are compared; give --action and no --beyond.")
+    target = target_settings(options)
     outputs = [(options.json, EVALUATION), *([(options.heatmap, PICTURE)] if options.heatmap else [])]
     check_outputs(outputs, (options.rig, options.model), options.overwrite)
     rigs = open_rigs(options)
@@ -55,8 +58,17 @@ def run(options: argparse.Namespace) -> None:
             f"--heatmap draws one mesh, and '{options.model}' holds models of several; give --object."
         )
     settings = EvaluationSettings(
-        options.poses, options.seed, tuple(options.action), tuple(options.beyond), strips=tuple(options.strip)
+        options.poses,
+        options.seed,
+        tuple(options.action),
+        tuple(options.beyond),
+        strips=tuple(options.strip),
+        target=target,
     )
+    if options.target and options.heatmap:
+        raise WrongUsageError("--heatmap draws the rig and its model, and no target; leave one of them out.")
+    if options.target and len(rigs) > 1:
+        raise WrongUsageError("--target is of one mesh; give --object.")
     evaluations = {name: run_evaluation(*rig_and_model, settings) for name, rig_and_model in rigs.items()}
     with replacing_all(*(path for path, _ in outputs)) as (errors, *pictures):
         for picture in pictures:

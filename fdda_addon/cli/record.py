@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     from .files import add_rig
+    from .target import add_target
 
     add_rig(parser)
     parser.add_argument(
@@ -103,6 +104,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--influences", metavar="FOLDER", type=Path, help="take them from what --influences-only made of the same rig"
     )
+    add_target(parser)
     parser.add_argument(
         "--refine", metavar="MODEL.onnx", type=Path, help="add poses to the recording where this model is worst"
     )
@@ -130,6 +132,7 @@ def run(options: argparse.Namespace) -> None:
     from ..runtime.binding import true_rig
     from .files import open_file
     from .progress import ProgressPrinter
+    from .target import target_settings
 
     if (options.poses or 0) < 0 or options.seed < 0 or options.least_vertices < 0:
         raise WrongUsageError("--poses, --seed and --least-vertices must be 0 or more.")
@@ -138,6 +141,7 @@ def run(options: argparse.Namespace) -> None:
         raise WrongUsageError("--spread must be more than 0 and at most 10.")
     if not 1 <= options.margin <= MAX_MARGIN:
         raise WrongUsageError(f"--margin must be 1, for none, to {MAX_MARGIN:g} times the range of motion.")
+    target_settings(options)
     of_new = (
         options.action,
         options.strip,
@@ -148,11 +152,12 @@ def run(options: argparse.Namespace) -> None:
         options.shard,
         options.influences_only,
         options.influences,
+        options.target,
     )
     if options.refine and (any(of_new) or options.poses == 0):
         raise WrongUsageError(
             "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --sample, "
-            "--control, --fit-linear, --shard and --influences out."
+            "--control, --fit-linear, --shard, --influences and --target out."
         )
     if options.influences_only and (options.shard or options.influences):
         raise WrongUsageError("--influences-only finds influences for all shards; leave --shard and --influences out.")
@@ -170,7 +175,7 @@ def run(options: argparse.Namespace) -> None:
             if step.note:
                 progress.end_line()
                 print(step.note, flush=True)
-            progress.show(step.stage, step.done, step.total)
+            progress.show(step.stage, step.done, step.total, step.detail)
     seconds = time.monotonic() - start
     for _, recording in rigs:
         if not options.refine:
@@ -200,8 +205,10 @@ def _steps(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> 
     from ..recording.plan import RecordingSettings
     from ..recording.refinement import RefinementSettings, refine
     from ..recording.run import record_meshes
+    from .target import poses_of, target_settings
 
-    given = {} if options.poses is None else {"poses": options.poses}
+    poses = poses_of(rigs[0][0], options)
+    given = {} if poses is None else {"poses": poses}
     if options.refine:
         settings = RefinementSettings(seed=options.seed, resume=options.resume, **given)
         return refine(rigs[0][0], options.recording, options.refine, settings)
@@ -220,6 +227,7 @@ def _steps(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> 
         shard=options.shard,
         influences_only=options.influences_only,
         influences=options.influences,
+        target=target_settings(options),
         **given,
     )
     return record_meshes(rigs, settings)

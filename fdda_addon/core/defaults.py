@@ -15,6 +15,8 @@ MIN_VERTICES = 8
 """Partitions of fewer vertices are merged into others."""
 REFINEMENT_POSES = 250
 """Poses that are added where a model is worst."""
+STILL_MM = 0.1
+"""A target that poses are held for is at rest when no vertex moves by more from a frame to the next."""
 
 TOLERANCE_MM = 0.04
 """What the basis shapes may leave, over the whole mesh."""

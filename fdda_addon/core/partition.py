@@ -137,6 +137,41 @@ def _steps_down(rig: Rig, ancestor: int, joint: int) -> int:
     return steps if joint >= 0 else 0
 
 
+def nearby_influences(rig: Rig, partitions: tuple[Partition, ...]) -> tuple[Partition, ...]:
+    """Partitions with the joints that are likely to influence them, where none can be moved to see whether it does.
+
+    These are the main joint, all above it, since what sags asks which way is down, those that skin a vertex of the
+    partition or one that shares a face with it, and the parents of all of these; and every control.
+
+    Args:
+        rig: the rig.
+        partitions: of the rig; their influences are left out.
+    """
+    skins = np.zeros((rig.vertex_count, len(rig.joints)), bool)
+    rows = np.repeat(np.arange(rig.vertex_count), rig.skin_joints.shape[1])
+    used = rig.skin_weights.ravel() > 0
+    skins[rows[used], rig.skin_joints.ravel()[used]] = True
+    face_of_corner = np.repeat(
+        np.arange(len(rig.face_starts)), np.diff(np.append(rig.face_starts, len(rig.face_vertices)))
+    )
+    joints = {}
+    for partition in partitions:
+        own = np.zeros(rig.vertex_count, bool)
+        own[partition.vertices] = True
+        touched = np.unique(face_of_corner[own[rig.face_vertices]])
+        own[rig.face_vertices[np.isin(face_of_corner, touched)]] = True
+        found = {partition.joint, *np.flatnonzero(skins[own].any(axis=0)).tolist()}
+        found |= {rig.joints[joint].parent for joint in found if rig.joints[joint].parent >= 0}
+        above = rig.joints[partition.joint].parent
+        while above >= 0:
+            found.add(above)
+            above = rig.joints[above].parent
+        joints[partition.joint] = tuple(sorted(found))
+    controls = {partition.joint: tuple(range(len(rig.controls))) for partition in partitions}
+    merged = {joint: partition.joint for partition in partitions for joint in partition.merged}
+    return make_partitions(rig, joints, controls, merged)
+
+
 def residual_changes(partitions: tuple[Partition, ...], moved: np.ndarray, base: np.ndarray) -> np.ndarray:
     """How far local residuals move between poses, the most in each partition.
 

@@ -2,6 +2,7 @@
 """Compares a model and the linear layer with the true rig, on poses that training never saw."""
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from ..poses.sampling import model_channels
 from ..rig.borrowed_rig import borrowed_rig
 from ..rig.modifier_stack import check_evaluable
 from ..rig.reading import PoseEvaluator
+from ..rig.target_time import DIRECT, OWN_SURFACE, Approach, TargetSettings, make_approach, way
 from ..runtime.network import Network
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser, clear_pose
@@ -51,6 +53,7 @@ class EvaluationSettings:
         beyond: factors by which the range of motion is widened for further poses, a quarter as many for each.
         named: poses that are compared as well, each on its own.
         surface: compare normals and edges too, which takes longer than all else.
+        target: what the model and the linear layer are compared with; the rig itself where it names none.
     """
 
     poses: int = EVALUATION_POSES
@@ -60,6 +63,7 @@ class EvaluationSettings:
     named: tuple[NamedPose, ...] = ()
     surface: bool = True
     strips: tuple[str, ...] = ()
+    target: TargetSettings = OWN_SURFACE
 
 
 @dataclass
@@ -165,6 +169,8 @@ def evaluate(
     clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips)
     if not settings.poses and not clips:
         raise RigError("There is nothing to evaluate: 0 poses and no action; give --poses or --action.")
+    random = settings.poses or len(settings.beyond) or len(settings.named)
+    approach = make_approach(scene_rig, settings.target, clips, random)
     network, layer = _prepare(scene_rig, model)
     rig = layer.rig
     # A rig that is posed by actions alone may have nothing to sample.
@@ -172,40 +178,44 @@ def evaluate(
     extra = max(1, settings.poses // 4)
     total = settings.poses + extra * len(settings.beyond) + len(settings.named)
     total += sum(len(clip.frames) for clip in clips)
-    with borrowed_rig(scene_rig, rig, channels, clips) as player:
-        evaluator, mask = PoseEvaluator(scene_rig, rig), read_mask(scene_rig.mesh_object)
+    with ExitStack() as borrowed:
+        if approach.target:
+            borrowed.enter_context(approach.target.borrowed())
+        player = borrowed.enter_context(borrowed_rig(scene_rig, rig, channels, clips))
+        evaluator = PoseEvaluator(scene_rig, rig, approach.target)
+        mask = read_mask(scene_rig.mesh_object)
         comparison = _Comparison(evaluator, network, layer, total, settings.surface, mask)
         held_out = None
         if settings.poses:
-            poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses)
+            poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses, approach)
             held_out = yield from comparison.compare("held-out poses", poses)
         beyond = []
         for number, factor in enumerate(settings.beyond, 1):
             first = HELD_OUT_INDEX * (1 + number)
-            poses = _random_poses(scene_rig, beyond_range(channels, factor), settings.seed, first, extra)
+            poses = _random_poses(scene_rig, beyond_range(channels, factor), settings.seed, first, extra, approach)
             beyond.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
         named = []
         for pose in settings.named:
-            named.append((yield from comparison.compare(pose.name, _named_pose(scene_rig, pose))))
+            named.append((yield from comparison.compare(pose.name, _named_pose(scene_rig, pose, approach))))
         actions = []
         for clip in clips:
-            actions.append((yield from comparison.compare(clip.title, player.frames(clip))))
+            frames = approach.frames(player, clip, range(len(clip.frames)))
+            actions.append((yield from comparison.compare(clip.title, frames)))
     yield Evaluation(layer.partitions, rig.joint_names, held_out or actions[0], actions, beyond, named, channels)
 
 
-def evaluate_action(scene_rig: SceneRig, model: Path | Network, name: str) -> Iterator[Progress | Evaluation]:
+def evaluate_action(
+    scene_rig: SceneRig, model: Path | Network, name: str, target: TargetSettings = OWN_SURFACE
+) -> Iterator[Progress | Evaluation]:
     """Compare positions on the frames of one action alone, which stand in the place of held-out poses.
 
     As `evaluate` in all else.
     """
-    clips = find_clips(scene_rig.armature_object, [name])
-    network, layer = _prepare(scene_rig, model)
-    with borrowed_rig(scene_rig, layer.rig, (), clips) as player:
-        evaluator = PoseEvaluator(scene_rig, layer.rig)
-        mask = read_mask(scene_rig.mesh_object)
-        comparison = _Comparison(evaluator, network, layer, len(clips[0].frames), surface=False, mask=mask)
-        errors = yield from comparison.compare(name, player.frames(clips[0]))
-    yield Evaluation(layer.partitions, layer.rig.joint_names, errors)
+    settings = EvaluationSettings(poses=0, actions=(name,), surface=False, target=target)
+    for step in evaluate(scene_rig, model, settings):
+        if isinstance(step, Evaluation):
+            step.actions = []
+        yield step
 
 
 def _prepare(scene_rig: SceneRig, model: Path | Network) -> tuple[Network, LinearLayer]:
@@ -222,21 +232,23 @@ def pose_held_out(scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int,
 
 
 def _random_poses(
-    scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, first: int, count: int
+    scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, first: int, count: int, approach: Approach = DIRECT
 ) -> Iterator[None]:
-    poser = Poser(scene_rig, channels)
-    for index in range(first, first + count):
-        poser.set(sample_pose(channels, seed, index))
-        yield
+    poser, rest = Poser(scene_rig, channels), np.array([channel.rest for channel in channels])
+    with approach.borrowed():
+        for index in range(first, first + count):
+            values = sample_pose(channels, seed, index)
+            approach.reach(way(poser.set, rest, values))
+            yield
 
 
-def _named_pose(scene_rig: SceneRig, pose: NamedPose) -> Iterator[None]:
+def _named_pose(scene_rig: SceneRig, pose: NamedPose, approach: Approach) -> Iterator[None]:
     clear_pose(scene_rig.armature_object)
-    Poser(
-        scene_rig,
-        tuple(Channel(bone, "rotation", axis, 0, 0) for bone in pose.rotations for axis in range(3)),
-    ).set(np.array([angle for angles in pose.rotations.values() for angle in angles]))
-    yield
+    channels = tuple(Channel(bone, "rotation", axis, 0, 0) for bone in pose.rotations for axis in range(3))
+    values = np.array([angle for angles in pose.rotations.values() for angle in angles])
+    with approach.borrowed():
+        approach.reach(way(Poser(scene_rig, channels).set, np.zeros(len(values)), values))
+        yield
 
 
 class _Comparison:

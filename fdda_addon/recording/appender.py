@@ -12,6 +12,7 @@ from ..core.recording.extension import RecordingExtension
 from ..core.recording.writer import RecordingWriter
 from ..core.skinning import LinearLayer
 from ..rig.reading import PoseEvaluator
+from ..rig.target_time import DIRECT, Approach
 
 BATCH_BYTES = 6 << 20
 BATCH_POSES = 250
@@ -27,8 +28,13 @@ class Appender:
     """
 
     def __init__(
-        self, evaluator: PoseEvaluator, layer: LinearLayer, writer: RecordingWriter | RecordingExtension
+        self,
+        evaluator: PoseEvaluator,
+        layer: LinearLayer,
+        writer: RecordingWriter | RecordingExtension,
+        approach: Approach = DIRECT,
     ) -> None:
+        self._approach = approach
         self.done = writer.complete
         self._evaluator, self._layer, self._writer = evaluator, layer, writer
         self._size = max(1, min(BATCH_POSES, BATCH_BYTES // (layer.rig.vertex_count * 12)))
@@ -42,9 +48,10 @@ class Appender:
         Raises:
             FDDAError: a pose before it could not be appended.
         """
-        self._batch.append(self._evaluator.evaluate())
+        self._batch.append((*self._evaluator.evaluate(), self._approach.is_at_rest))
         self.done += 1
-        if len(self._batch) == self._size:
+        # What took seconds to settle is not lost.
+        if len(self._batch) == self._size or self._approach.settler:
             self._wait()
             self._previous = self._pool.submit(self._append, self._batch)
             self._batch = []
@@ -54,8 +61,10 @@ class Appender:
             self._previous.result()
 
     def _append(self, batch: list[tuple]) -> None:
-        pose_matrices, positions, controls = (np.stack(arrays) for arrays in zip(*batch, strict=True))
-        self._writer.append(pose_matrices, self._layer.local_residuals(pose_matrices, positions), controls)
+        pose_matrices, positions, controls, are_at_rest = (np.stack(arrays) for arrays in zip(*batch, strict=True))
+        unsettled = np.flatnonzero(~are_at_rest).tolist()
+        arrays = pose_matrices, self._layer.local_residuals(pose_matrices, positions), controls
+        self._writer.append(*arrays, *([unsettled] if unsettled else []))
 
     def __enter__(self) -> Self:
         return self

@@ -18,6 +18,7 @@ from ..core.rig import Rig
 from ..core.skin_fit import SkinFit
 from ..rig.borrowed_rig import Posed
 from ..rig.reading import PoseEvaluator
+from ..rig.target import Target
 from ..scene.scene_rig import SceneRig
 
 
@@ -52,6 +53,7 @@ class Planned:
         channels: that move it.
         limits: channels of its recording: those that move the meshes which share its poses included.
         known: folder that may know weights and influences already.
+        target: whose surface is recorded; None for that of the rig.
     """
 
     scene_rig: SceneRig
@@ -60,11 +62,16 @@ class Planned:
     channels: tuple[Channel, ...]
     limits: tuple[Channel, ...]
     known: Path | None = None
+    target: Target | None = None
 
     @property
     def name(self) -> str:
         """Name of the mesh object."""
         return self.scene_rig.mesh_object.name
+
+    def evaluator(self, rig: Rig) -> PoseEvaluator:
+        """Evaluates the poses of the mesh, its weights those of `rig`."""
+        return PoseEvaluator(self.scene_rig, rig, self.target)
 
     @property
     def posed(self) -> Posed:
@@ -107,19 +114,20 @@ class Found:
     evaluator: TimedEvaluator
 
 
-def estimate(meshes: Sequence[Found], poses: int, left: int) -> str:
+def estimate(meshes: Sequence[Found], poses: int, left: int, seconds_a_pose: float | None = None) -> str:
     """A sentence about what poses of some meshes will take; empty without poses.
 
     Args:
         meshes: which are evaluated together.
         poses: of the complete recordings.
         left: how many of them are still to be recorded.
+        seconds_a_pose: what one takes, where more than its evaluation does; of the evaluators where it is left out.
     """
     if not left:
         return ""
     rigs = [found.fitted.rig for found in meshes]
     # Whatever is read of it, all of the scene is evaluated each time.
-    times = [found.evaluator.seconds_a_pose for found in meshes]
+    times = [seconds_a_pose or found.evaluator.seconds_a_pose for found in meshes]
     seconds = None if None in times else max(times) * left
     size = sum(recording_bytes(rig, poses) for rig in rigs)
     return Estimate(left, sum(rig.vertex_count for rig in rigs), size, seconds).sentence()

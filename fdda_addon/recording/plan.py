@@ -13,6 +13,7 @@ from ..poses.clip import find_clips
 from ..poses.sampling import Choice, choose, locked_channels, sampled_channels
 from ..rig.dependencies import read_dependencies
 from ..rig.reading import read_rig
+from ..rig.target_time import OWN_SURFACE, TargetSettings
 from ..scene.controls import stated_controls
 from ..scene.scene_rig import SceneRig
 
@@ -40,6 +41,7 @@ class RecordingSettings:
         influences_only: find what a recording needs before its first pose, and record none.
         influences: folder with what `influences_only` found, of the same rig and settings; found anew when left out.
             Where several meshes are recorded, it has a folder of the same name for each.
+        target: whose surface is recorded.
     """
 
     poses: int = POSES
@@ -59,6 +61,7 @@ class RecordingSettings:
     shard: tuple[int, int] | None = None
     influences_only: bool = False
     influences: Path | None = None
+    target: TargetSettings = OWN_SURFACE
 
 
 def planned_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:

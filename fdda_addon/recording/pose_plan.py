@@ -10,6 +10,7 @@ from ..core.poses import CONTROL, Channel, sample_pose
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
 from ..poses.suspended_limits import SuspendedLimits
+from ..rig.target_time import DIRECT, Approach, way
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
 from .plan import RecordingSettings, planned_margin
@@ -27,14 +28,17 @@ class PosePlan:
         meshes: Sequence[tuple[SceneRig, tuple[Channel, ...]]],
         settings: RecordingSettings,
         clips: tuple[Clip, ...],
+        approach: Approach = DIRECT,
     ):
         """Args:
         meshes: each with the channels that move it.
         settings: of the recording.
         clips: whose frames follow.
+        approach: how a target that depends on time is brought to the poses.
         """
         self._rigs = [scene_rig for scene_rig, _ in meshes]
         self._settings, self._clips = settings, clips
+        self.approach = approach
         self.total = settings.poses + sum(len(clip.frames) for clip in clips)
         # The first mesh moves what all have in common.
         found: dict[tuple, tuple[int, Channel]] = {}
@@ -58,25 +62,35 @@ class PosePlan:
         """
         poses, margin = self._settings.poses, self._margin
         inside = poses - (margin.poses if margin else 0)
-        set_pose = self._setter(self._channels)
-        for index in range(inside):
-            if index in wanted:
-                set_pose(sample_pose(self._channels, self._settings.seed, index, self._settings.spread))
-                yield index
-        if margin:
-            set_pose = self._setter(margin.channels)
-            with SuspendedLimits(self._rigs[0].armature_object, margin.channels) as limits:
-                for index in range(inside, poses):
-                    if index in wanted:
-                        values = sample_pose(margin.channels, self._settings.seed, index, self._settings.spread)
+        with self.approach.borrowed():
+            set_pose = self._setter(self._channels)
+            for index in range(inside):
+                if index in wanted:
+                    self._reach(self._channels, index, set_pose)
+                    yield index
+            if margin:
+                set_pose = self._setter(margin.channels)
+                with SuspendedLimits(self._rigs[0].armature_object, margin.channels) as limits:
+
+                    def set_beyond(values: np.ndarray) -> None:
                         set_pose(values)
                         limits.suspend(values)
-                        yield index
-        frames = ((clip, frame) for clip in self._clips for frame in clip.frames)
-        for index, (clip, frame) in enumerate(frames, poses):
-            if index in wanted:
-                player.show(clip, frame)
-                yield index
+
+                    for index in range(inside, poses):
+                        if index in wanted:
+                            self._reach(margin.channels, index, set_beyond)
+                            yield index
+        first = poses
+        for clip in self._clips:
+            own = [number for number in range(len(clip.frames)) if first + number in wanted]
+            for number in self.approach.frames(player, clip, own):
+                yield first + number
+            first += len(clip.frames)
+
+    def _reach(self, channels: tuple[Channel, ...], index: int, set_pose: Callable[[np.ndarray], None]) -> None:
+        """Bring the rigs from the rest pose to a random pose."""
+        values = sample_pose(channels, self._settings.seed, index, self._settings.spread)
+        self.approach.reach(way(set_pose, np.array([channel.rest for channel in channels]), values))
 
     def _setter(self, channels: tuple[Channel, ...]) -> Callable[[np.ndarray], None]:
         """What poses the rigs, of channels that begin with those of the plan; what follows is of the armature."""

@@ -11,19 +11,20 @@ import bpy
 
 from ..core.errors import RecordingError
 from ..core.output import check_folder_writable
-from ..core.partition import GOLDEN_RATIO, merged_partitions
+from ..core.partition import GOLDEN_RATIO, merged_partitions, nearby_influences
 from ..core.poses import sample_pose
 from ..core.progress import Progress
 from ..core.recording.estimate import check_room, recording_bytes
 from ..core.recording.index import INDEX, RecordingInfo
 from ..core.recording.shard import Shard, shard_poses
+from ..core.recording.target import POSE
 from ..core.recording.writer import RecordingWriter, check_recordable
 from ..core.skinning import LinearLayer
 from ..poses.clip import Clip, find_clips
 from ..poses.clip_player import ClipPlayer
 from ..rig.borrowed_rig import borrowed_rigs
 from ..rig.modifier_stack import check_evaluable
-from ..rig.reading import PoseEvaluator
+from ..rig.target_time import make_approach
 from ..scene.scene_rig import SceneRig
 from .appender import Appender, append_poses
 from .influences import Search, find_influences
@@ -32,6 +33,7 @@ from .mesh_group import common_armature, controls_of_each, in_passes
 from .phases import Fitted, Found, Planned, TimedEvaluator, estimate
 from .plan import RecordingSettings, planned_rig, planned_sampling
 from .pose_plan import PosePlan
+from .target_check import check_moves
 from .weight_fitting import check_has_weights, fit_weights, poses_to_fit
 
 Before, After = TypeVar("Before", Planned, Fitted), TypeVar("After")
@@ -73,13 +75,23 @@ def record_meshes(rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSett
     meshes = [scene_rig for scene_rig, _ in rigs]
     clips = find_clips(common_armature(meshes), settings.actions, settings.strips, settings.mirror)
     planned, plan = _plan(rigs, settings, clips)
-    posed = [mesh.posed for mesh in planned]
+    target = plan.approach.target
+    with target.borrowed() if target else nullcontext():
+        yield from _record_planned(planned, settings, clips, plan)
+
+
+def _record_planned(
+    planned: list[Planned], settings: RecordingSettings, clips: tuple[Clip, ...], plan: PosePlan
+) -> Iterator[Progress]:
+    meshes, posed = [mesh.scene_rig for mesh in planned], [mesh.posed for mesh in planned]
     with borrowed_rigs(posed, clips) if settings.fit_linear else nullcontext() as player:
         fitted = yield from _in_turn(planned, lambda mesh: _fit(mesh, settings, plan, player))
     for numbers in in_passes(meshes):
         together = [fitted[number] for number in numbers]
         others = [own for number, own in enumerate(posed) if number not in numbers]
         with borrowed_rigs([posed[number] for number in numbers], clips, others) as player:
+            if plan.approach.target:
+                yield from check_moves(together[0], plan, player)
             found = yield from _in_turn(together, lambda mesh: _find_influences(mesh, settings, clips, player))
             yield from _record_poses(found, settings, plan, player)
 
@@ -92,6 +104,8 @@ def _plan(
         raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
     meshes = [scene_rig for scene_rig, _ in rigs]
     controls = [settings.controls] if len(rigs) == 1 else controls_of_each(meshes, settings.controls)
+    if settings.target.name and len(rigs) > 1:
+        raise RecordingError("A target is one of one mesh; record the meshes one by one, each with its target.")
     read = []
     for (scene_rig, path), own in zip(rigs, controls, strict=True):
         check_evaluable(scene_rig)
@@ -99,14 +113,15 @@ def _plan(
         check_folder_writable(path)
         check_recordable(path, settings.resume)
     channels = [(scene_rig, own) for scene_rig, (_, own) in zip(meshes, read, strict=True)]
-    plan = PosePlan(channels, settings, clips)
+    approach = make_approach(meshes[0], settings.target, clips, settings.poses)
+    plan = PosePlan(channels, settings, clips, approach)
     if plan.total < 1:
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
     wanted = len(_wanted(settings, plan.total))
     check_room([(path, recording_bytes(rig, wanted)) for (_, path), (rig, _) in zip(rigs, read, strict=True)])
     known = [_known(path, settings, len(rigs) > 1) for _, path in rigs]
     planned = [
-        Planned(scene_rig, rig, path, own, plan.channels_of(number), known[number])
+        Planned(scene_rig, rig, path, own, plan.channels_of(number), known[number], approach.target)
         for number, ((scene_rig, path), (rig, own)) in enumerate(zip(rigs, read, strict=True))
     ]
     return planned, plan
@@ -155,7 +170,7 @@ def _fit(
         return Fitted(mesh, mesh.rig, None)
     numbers = poses_to_fit(plan.total, mesh.rig.vertex_count)
     posed = plan.poses(player, frozenset(numbers))
-    evaluator = PoseEvaluator(mesh.scene_rig, mesh.rig)
+    evaluator = mesh.evaluator(mesh.rig)
     fitted = yield from fit_weights(mesh.rig, settings.fit_linear, posed, len(numbers), evaluator)
     return Fitted(mesh, *fitted)
 
@@ -173,7 +188,7 @@ def _find_influences(
         settings.influence_poses,
         settings.influence_tolerance,
     )
-    evaluator = TimedEvaluator(PoseEvaluator(scene_rig, mesh.rig))
+    evaluator = TimedEvaluator(mesh.planned.evaluator(mesh.rig))
     known = mesh.planned.known
     if known and (partitions := recorded_partitions(known, mesh.rig, settings.least_vertices)):
         return Found(mesh, partitions, evaluator)
@@ -183,6 +198,10 @@ def _find_influences(
             "rig and options (record --influences-only)."
         )
     cut = merged_partitions(mesh.rig, settings.least_vertices)
+    target = mesh.planned.target
+    if target and target.follows != POSE:
+        # What depends on time does not answer when a joint is moved.
+        return Found(mesh, nearby_influences(mesh.rig, cut), evaluator)
     partitions = yield from find_influences(scene_rig, mesh.rig, cut, evaluator, search)
     return Found(mesh, partitions, evaluator)
 
@@ -194,17 +213,18 @@ def _record_poses(
     with ExitStack() as stack:
         appenders = []
         for mesh in meshes:
-            info = _info(mesh, settings, plan, wanted)
+            info = replace(_info(mesh, settings, plan, wanted), target=plan.approach.recorded)
             writer = RecordingWriter(mesh.fitted.planned.path, mesh.fitted.rig, mesh.partitions, info, settings.resume)
             layer = LinearLayer(mesh.fitted.rig, mesh.partitions)
-            appenders.append(Appender(mesh.evaluator, layer, stack.enter_context(writer)))
-        first = min(appender.done for appender in appenders)
-        yield Progress("poses", first, len(wanted), estimate(meshes, len(wanted), len(wanted) - first))
+            appenders.append(Appender(mesh.evaluator, layer, stack.enter_context(writer), plan.approach))
+        first, settler = min(appender.done for appender in appenders), plan.approach.settler
+        seconds = settler.last.seconds if settler and settler.last else None
+        yield Progress("poses", first, len(wanted), estimate(meshes, len(wanted), len(wanted) - first, seconds))
         left = plan.poses(player, wanted[first:])
         # Closed before the writers: what was evaluated is kept when the recording is broken off.
         with closing(left), closing(append_poses(left, appenders)) as steps:
             for done in steps:
-                yield Progress("poses", done, len(wanted))
+                yield Progress("poses", done, len(wanted), detail=str(settler.last) if settler else "")
 
 
 def _info(mesh: Found, settings: RecordingSettings, plan: PosePlan, wanted: range) -> RecordingInfo:

@@ -193,6 +193,14 @@ def borrowed_stack(mesh_object: bpy.types.Object) -> Iterator[None]:
 
 
 @contextmanager
+def without_live(mesh_object: bpy.types.Object) -> Iterator[None]:
+    """As `borrowed_stack`, whatever vertices are left."""
+    stack = read_stack(mesh_object)
+    with _switched_off(mesh_object, [mesh_object.modifiers[name] for name in stack.live]):
+        yield
+
+
+@contextmanager
 def _switched_off(mesh_object: bpy.types.Object, modifiers: Iterable[bpy.types.Modifier]) -> Iterator[None]:
     # By identifier: while a job runs in the window, the modifiers may be added to.
     uids = {m.persistent_uid for m in modifiers if m.show_viewport}

@@ -20,6 +20,7 @@ from ..scene.skin import read_skin
 from ..scene.unit import metres_per_unit
 from .joints import choose_joints
 from .modifier_stack import check_evaluable, deforming_modifiers
+from .target import Target
 
 IDENTITY_TOLERANCE = 1e-6
 """Mesh and armature count as unmoved, one against the other, when no matrix element differs by more."""
@@ -151,14 +152,15 @@ class PoseReader:
 class PoseEvaluator:
     """Evaluates the scene as it is posed and reads pose matrices, positions and controls."""
 
-    def __init__(self, scene_rig: SceneRig, rig: Rig):
+    def __init__(self, scene_rig: SceneRig, rig: Rig, target: Target | None = None):
         """Args:
             scene_rig, rig: the rig.
+            target: whose positions are read in place of the rig's own.
 
         Raises:
             RigError: the rig lacks one of its controls.
         """
-        self._scene_rig = scene_rig
+        self._scene_rig, self._target = scene_rig, target
         self._reader = PoseReader(scene_rig, rig.joint_names, rig.rest_matrices)
         self._controls = ControlReader(scene_rig, rig.controls)
 
@@ -172,7 +174,10 @@ class PoseEvaluator:
         depsgraph = bpy.context.evaluated_depsgraph_get()
         mesh_object = self._scene_rig.mesh_object.evaluated_get(depsgraph)
         armature_object = self._scene_rig.armature_object.evaluated_get(depsgraph)
-        positions = mesh_io.evaluated_positions(self._scene_rig.mesh_object, depsgraph)
+        if self._target is not None:
+            positions = self._target.positions(depsgraph)
+        else:
+            positions = mesh_io.evaluated_positions(self._scene_rig.mesh_object, depsgraph)
         controls = self._controls.read(self._scene_rig, depsgraph)
         return self._reader.read(mesh_object, armature_object), positions, controls
 

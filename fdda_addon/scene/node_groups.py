@@ -13,7 +13,8 @@ ATTRIBUTE_NODES = {
     "GeometryNodeViewer", "NodeGroupInput", "NodeReroute",
 }  # fmt: skip
 POSITION_NODE = "GeometryNodeSetPosition"
-TIME_NODES = {"GeometryNodeInputSceneTime", "GeometryNodeSimulationInput", "GeometryNodeSimulationOutput"}
+SIMULATION_NODES = {"GeometryNodeSimulationInput", "GeometryNodeSimulationOutput"}
+TIME_NODES = {"GeometryNodeInputSceneTime", *SIMULATION_NODES}
 UNLINKED = "unlinked"
 
 

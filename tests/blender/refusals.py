@@ -15,7 +15,9 @@ from fdda_addon.scene.scene_rig import SceneRig
 from .conftest import run
 from .scene_state import fresh_elbow
 
-PROGRESS = re.compile(r"(poses to fit|fit|influences|poses|training|evaluation|benchmark|frames): \d+ of \d+, .*")
+PROGRESS = re.compile(
+    r"(poses to fit|fit|influences|target|poses|training|evaluation|benchmark|frames): \d+ of \d+, .*"
+)
 
 
 def files(folder: Path) -> dict[str, bytes | None]:

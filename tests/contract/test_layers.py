@@ -17,7 +17,7 @@ import pytest
 from .floors import ADDON, FLOORS, ROOT, import_graph, imported_names, module_of, room_graph
 
 STANDARD = sys.stdlib_module_names
-BLENDER = {"bpy", "bpy_extras", "mathutils", "bmesh", "gpu", "gpu_extras", "blf", "idprop"}
+BLENDER = {"bpy", "bpy_extras", "mathutils", "bmesh", "gpu", "gpu_extras", "blf", "idprop", "pxr"}
 
 
 def python_files(folder: str) -> list[Path]:

@@ -15,6 +15,7 @@ from ..skin_fit import SkinFit
 from ..surface import MIN_CORNERS
 from ..unit import read_unit
 from .shard import Shard
+from .target import RecordedTarget
 
 FORMAT = "fdda-recording"
 VERSION = 1
@@ -73,7 +74,8 @@ class RecordingInfo:
     """What `recording.json` says beside the arrays.
 
     `fit` is there where the skin weights are not the rig's own, `shard` where the poses are a part of those of a plan:
-    `sampling` is that of the whole plan then.
+    `sampling` is that of the whole plan then. `target` is there where the surface is another object's; `unsettled` are
+    numbers of poses, ascending, in which it did not come to rest.
     """
 
     poses: int
@@ -84,6 +86,8 @@ class RecordingInfo:
     sampling: Sampling
     fit: SkinFit | None = None
     shard: Shard | None = None
+    target: RecordedTarget | None = None
+    unsettled: tuple[int, ...] = ()
 
 
 def read_index(path: Path) -> dict:
@@ -153,18 +157,21 @@ def _check_index(index: dict) -> None:
         SkinFit.from_json(index["fit"])
     if "shard" in index:
         Shard.from_json(index["shard"], index["poses"])
+    if "target" in index:
+        RecordedTarget.from_json(index["target"])
+    _check_numbers(index.get("unsettled", []), "unsettled pose", index["complete"], "it")
     _sampling(index["sampling"])
 
 
-def _check_numbers(values: list, what: str, count: int) -> None:
+def _check_numbers(values: list, what: str, count: int, owner: str = "a partition") -> None:
     """Fail where values are no list of different indices below a count."""
     if not isinstance(values, list):
-        raise TypeError(f"a partition has {what}s that are no list")
+        raise TypeError(f"{owner} has {what}s that are no list")
     for value in values:
         if type(value) is not int or not 0 <= value < count:
-            raise ValueError(f"a partition has {what} {value!r} of {count}")
+            raise ValueError(f"{owner} has {what} {value!r} of {count}")
     if len(set(values)) != len(values):
-        raise ValueError(f"a partition has a {what} twice")
+        raise ValueError(f"{owner} has a {what} twice")
 
 
 def _sampling(value: dict) -> Sampling:
@@ -206,4 +213,6 @@ def read_info(index: dict) -> RecordingInfo:
         _sampling(index["sampling"]),
         SkinFit.from_json(index["fit"]) if "fit" in index else None,
         Shard.from_json(index["shard"], index["poses"]) if "shard" in index else None,
+        RecordedTarget.from_json(index["target"]) if "target" in index else None,
+        tuple(index.get("unsettled", ())),
     )

@@ -19,7 +19,7 @@ from .writer import RecordingWriter, different_keys
 
 PIECE_BYTES = 16 << 20
 """Poses are copied in pieces of at most this size."""
-OF_EACH = ("poses", "complete", "shard")
+OF_EACH = ("poses", "complete", "shard", "unsettled")
 """Keys of the index that differ between the shards of one recording."""
 
 
@@ -111,18 +111,20 @@ def _check_alike(parts: Sequence[Recording]) -> None:
 def _merge(parts: Sequence[Recording], path: Path, stage: str) -> Iterator[Progress]:
     first = parts[0]
     total = first.info.shard.total
-    info = replace(first.info, poses=total, complete=0, shard=None)
+    info = replace(first.info, poses=total, complete=0, shard=None, unsettled=())
     with RecordingWriter(path, first.rig, first.partitions, info, resume=(path / INDEX).exists()) as writer:
         yield Progress(stage, writer.complete, total)
         for part in parts:
             start = writer.complete - part.info.shard.first
-            for arrays in _pieces(part, start):
-                writer.append(*arrays)
+            for begin, arrays in _pieces(part, start):
+                end = begin + len(arrays[0])
+                writer.append(*arrays, [pose - begin for pose in part.info.unsettled if begin <= pose < end])
                 yield Progress(stage, writer.complete, total)
 
 
-def _pieces(part: Recording, start: int) -> Iterator[list[np.ndarray]]:
-    """The poses of a shard from number `start` of its own on, (n, ...) of each array that grows with the poses.
+def _pieces(part: Recording, start: int) -> Iterator[tuple[int, list[np.ndarray]]]:
+    """The poses of a shard from number `start` of its own on, (n, ...) of each array that grows with the poses,
+    and the number of the first of them.
 
     Each piece is mapped by itself: what is mapped counts to the memory of a process for as long as it is.
     """
@@ -131,7 +133,7 @@ def _pieces(part: Recording, start: int) -> Iterator[list[np.ndarray]]:
     count = max(1, PIECE_BYTES // max(1, 4 * sum(math.prod(row) for row in rows.values())))
     for begin in range(start, poses, count):
         end = min(begin + count, poses)
-        yield [_read(part.path / f"{name}.npy", (poses, *row), begin, end) for name, row in rows.items()]
+        yield begin, [_read(part.path / f"{name}.npy", (poses, *row), begin, end) for name, row in rows.items()]
 
 
 def _read(path: Path, shape: tuple[int, ...], begin: int, end: int) -> np.ndarray:

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -21,6 +22,9 @@ from .arrays import ARRAYS, STREAMED, array_shapes, bad_pose, open_array, stream
 from .index import FORMAT, INDEX, VERSION, RecordingInfo, read_index
 from .lock import LOCK, RecordingLock
 from .reader import check_poses, check_resumable, partitions_json
+
+GROWS = ("complete", "unsettled")
+"""Keys of the index that change while poses are added."""
 
 
 class RecordingWriter:
@@ -49,6 +53,7 @@ class RecordingWriter:
         """
         self.path, self.rig, self.partitions, self.info = path, rig, partitions, info
         self.complete = 0
+        self.unsettled: list[int] = []
         self._faces, self._corners = len(rig.face_starts), len(rig.face_vertices)
         self._files: dict[str, io.BufferedRandom] = {}
         self._is_new = False
@@ -84,11 +89,12 @@ class RecordingWriter:
         # The scale of an object may be animated; no array depends on it.
         self.rig = replace(self.rig, metres_per_unit=read_unit(previous))
         own = self._index()
-        if different := [key for key in different_keys(previous, own) if key != "complete"]:
+        if different := [key for key in different_keys(previous, own) if key not in GROWS]:
             raise RecordingError(
                 f"Cannot resume '{self.path}': it was recorded with another {', '.join(different)}; "
                 "record with the same rig and options, or into another folder."
             )
+        self.unsettled = list(previous.get("unsettled", ()))
         return previous["complete"]
 
     def _open_arrays(self) -> None:
@@ -167,6 +173,8 @@ class RecordingWriter:
             "controls": [control.to_json() for control in self.rig.controls],
             "partitions": partitions_json(self.partitions),
             **({"fit": info.fit.to_json()} if info.fit else {}),
+            **({"target": info.target.to_json()} if info.target else {}),
+            **({"unsettled": list(self.unsettled)} if self.unsettled else {}),
             # Through JSON and back, so that it compares equal with what was read.
             "sampling": json.loads(json.dumps(info.sampling.to_json())),
         }
@@ -174,13 +182,20 @@ class RecordingWriter:
     def _write_index(self) -> None:
         write_json(self.path / INDEX, self._index())
 
-    def append(self, pose_matrices: np.ndarray, residuals: np.ndarray, controls: np.ndarray | None = None) -> None:
+    def append(
+        self,
+        pose_matrices: np.ndarray,
+        residuals: np.ndarray,
+        controls: np.ndarray | None = None,
+        unsettled: Sequence[int] = (),
+    ) -> None:
         """Add poses.
 
         Args:
             pose_matrices: (n, J, 4, 4), mesh-object space, mesh units.
             residuals: (n, V, 3), local residuals, mesh units.
             controls: (n, C), where the rig has controls.
+            unsettled: which of them did not come to rest, counted from 0.
 
         Raises:
             OutputError: the disk is full or went away; the poses before stay complete.
@@ -195,6 +210,7 @@ class RecordingWriter:
                 os.fsync(self._files[name].fileno())
         except OSError as error:
             raise self._failed(error) from error
+        self.unsettled += [self.complete + number for number in unsettled]
         self.complete += len(pose_matrices)
         self._write_index()
 

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Options about a target: another object whose surface is learnt in place of the rig's own."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+from ..core.defaults import STILL_MM
+from ..core.errors import WrongUsageError
+
+if TYPE_CHECKING:
+    from ..rig.target_time import TargetSettings
+    from ..scene.scene_rig import SceneRig
+
+
+def add_target(parser: argparse.ArgumentParser) -> None:
+    """Declare `--target` and how it is brought to poses."""
+    parser.add_argument(
+        "--target",
+        default="",
+        metavar="OBJECT",
+        help="the surface is what this object shows, which has the same vertices: a copy with other modifiers, a "
+        "cache, a simulation",
+    )
+    parser.add_argument(
+        "--pre-roll",
+        type=int,
+        default=0,
+        metavar="N",
+        help="let a simulated target go from the rest pose to the first frame of an action in the N frames before it",
+    )
+    parser.add_argument(
+        "--settle",
+        type=int,
+        default=0,
+        metavar="N",
+        help="hold each random pose until a simulated target is at rest, for N frames at most",
+    )
+    parser.add_argument(
+        "--still-mm",
+        type=float,
+        default=STILL_MM,
+        metavar="X",
+        help=f"at rest is a target of which no vertex moves by more mm a frame (default {STILL_MM})",
+    )
+
+
+def target_settings(options: argparse.Namespace) -> "TargetSettings":
+    """The settings that the options state.
+
+    Raises:
+        WrongUsageError: they make no sense.
+    """
+    from ..rig.target_time import TargetSettings
+
+    if options.pre_roll < 0 or options.settle < 0 or not 0 < options.still_mm < float("inf"):
+        raise WrongUsageError("--pre-roll and --settle must be 0 or more, and --still-mm more than 0.")
+    if (options.pre_roll or options.settle) and not options.target:
+        raise WrongUsageError("--pre-roll and --settle are about a target; give --target OBJECT.")
+    return TargetSettings(options.target, options.pre_roll, options.settle, options.still_mm)
+
+
+def poses_of(scene_rig: "SceneRig", options: argparse.Namespace) -> int | None:
+    """How many random poses are asked for; None where nothing says.
+
+    A target that shows frames has none: 0 where actions or strips are given.
+    """
+    from ..core.recording.target import POSE
+    from ..rig.target import find_target
+
+    if options.poses is not None or not options.target or options.settle or not (options.action or options.strip):
+        return options.poses
+    return None if find_target(scene_rig, options.target).follows == POSE else 0

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The time range of an Alembic file: what Blender shows of a cache, but says to no script.
+
+Only the container is read, Ogawa, which Alembic has written by default since 2013: "Ogawa", a byte that says whether
+the file is complete, two bytes of version, and the position of the root group. A group is a number of children and
+their positions, the highest bit set for data; data are a number of bytes and the bytes. The fifth child of the root is
+the table of time samplings: for each the number of samples, the seconds of a cycle, and the times of a cycle
+(Alembic's AbcCoreOgawa/WriteUtil, WriteTimeSampling).
+"""
+
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+from .input_file import open_input
+
+SIGNATURE = b"Ogawa"
+TIME_SAMPLINGS = 4
+IS_DATA = 1 << 63
+MAX_CHILDREN, MAX_BYTES = 64, 1 << 20
+"""The root group has six children, and a table of time samplings has a few numbers for each rate."""
+ACYCLIC = 1e30
+"""Seconds of a cycle where each sample has a time of its own: Alembic writes a number larger than any time."""
+
+
+def time_range(path: Path) -> tuple[float, float] | None:
+    """First and last second of what moves in an Alembic file.
+
+    None where the file is of another container (HDF5), is no Alembic file, is damaged, or holds nothing that moves.
+
+    Raises:
+        OSError: it cannot be opened.
+    """
+    with open_input(path) as file:
+        try:
+            return _range(_time_samplings(file))
+        except (struct.error, ValueError, OverflowError):
+            return None
+
+
+def _time_samplings(file: BinaryIO) -> bytes:
+    """The table of time samplings; ValueError or struct.error where there is none."""
+    head = file.read(16)
+    if head[:5] != SIGNATURE:
+        raise ValueError("another container")
+    file.seek(struct.unpack("<8xQ", head)[0])
+    count = struct.unpack("<Q", file.read(8))[0]
+    if not TIME_SAMPLINGS < count <= MAX_CHILDREN:
+        raise ValueError("another archive")
+    place = struct.unpack(f"<{count}Q", file.read(8 * count))[TIME_SAMPLINGS]
+    if not place & IS_DATA:
+        raise ValueError("no data")
+    file.seek(place & ~IS_DATA)
+    size = struct.unpack("<Q", file.read(8))[0]
+    if size > MAX_BYTES:
+        raise ValueError("too many samplings")
+    return file.read(size)
+
+
+def _range(table: bytes) -> tuple[float, float] | None:
+    place, found = 0, []
+    while place < len(table):
+        samples, cycle, count = struct.unpack_from("<IdI", table, place)
+        times = struct.unpack_from(f"<{count}d", table, place + 16)
+        place += 16 + 8 * count
+        # One sample is what does not move; Alembic begins each table with it.
+        if samples > 1 and times:
+            last = times[min(samples, count) - 1] if cycle > ACYCLIC else 0.0
+            if cycle <= ACYCLIC:
+                cycles, rest = divmod(samples - 1, count)
+                last = times[rest] + cycles * cycle
+            found.append((times[0], last))
+    return (min(first for first, _ in found), max(last for _, last in found)) if found else None

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How many frames the files have that a Mesh Cache modifier plays: .pc2 and .mdd, by their headers."""
+
+import struct
+from pathlib import Path
+
+from .errors import PointCacheError
+from .input_file import open_input
+from .point_cache import read_point_cache
+
+_MDD = struct.Struct(">ii")
+"""Frames and points; then float32 seconds of each frame, then x, y, z of each point, frame by frame; big-endian."""
+
+
+def mesh_cache_frames(path: Path) -> int:
+    """Frames of a .pc2 or .mdd file.
+
+    Raises:
+        PointCacheError: it cannot be read, or its size is not what its header says.
+    """
+    if path.suffix.lower() != ".mdd":
+        return len(read_point_cache(path).positions)
+    try:
+        with open_input(path) as file:
+            head, size = file.read(_MDD.size), path.stat().st_size
+    except OSError as error:
+        raise PointCacheError(f"The point cache '{path}' cannot be read: {error.strerror or error}.") from error
+    frames, points = _MDD.unpack(head) if len(head) == _MDD.size else (0, 0)
+    if frames < 1 or points < 1 or size != _MDD.size + 4 * frames + 12 * frames * points:
+        raise PointCacheError(
+            f"The point cache '{path}' is damaged: it has {size} bytes and its header says {frames} frames of {points} "
+            "points; write it again."
+        )
+    return frames

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A target: another object, of the same vertices, whose surface is learnt in place of the rig's own."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+
+from ..core.errors import RigError
+from ..core.recording.target import FRAMES, POSE, SIMULATION
+from ..poses.clip import Clip
+from ..scene import mesh as mesh_io
+from ..scene.borrow import borrowed_attributes
+from ..scene.scene_rig import SceneRig, is_flat
+from .modifier_stack import is_playback, without_live
+from .target_caches import Cache, read_caches
+
+
+@dataclass(frozen=True)
+class Target:
+    """A target of a rig. Holds RNA references: not to be kept.
+
+    Attributes:
+        scene_rig: the rig that learns.
+        target_object: whose surface it learns.
+        caches: what of it depends on time.
+    """
+
+    scene_rig: SceneRig
+    target_object: bpy.types.Object
+    caches: tuple[Cache, ...]
+
+    @property
+    def follows(self) -> str:
+        """`POSE`, `FRAMES` or `SIMULATION` of `core.recording.target`."""
+        if any(cache.is_simulation for cache in self.caches):
+            return SIMULATION
+        return FRAMES if self.caches else POSE
+
+    @property
+    def simulations(self) -> tuple[Cache, ...]:
+        """The caches that are simulated while frames are visited."""
+        return tuple(cache for cache in self.caches if cache.is_simulation)
+
+    @property
+    def first_frame(self) -> int:
+        """The frame where its simulations start; that of the scene where none says."""
+        starts = [cache.first for cache in self.simulations if cache.first is not None]
+        return int(min(starts, default=bpy.context.scene.frame_start))
+
+    def positions(self, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
+        """What it shows: (V, 3) float32, the space of the rig's mesh object, mesh units.
+
+        Raises:
+            RigError: it has other vertices in this pose.
+        """
+        shown = self.target_object.evaluated_get(depsgraph)
+        mesh_object = self.scene_rig.mesh_object.evaluated_get(depsgraph)
+        if len(shown.data.vertices) != len(self.scene_rig.mesh_object.data.vertices):
+            raise RigError(self._other_count(len(shown.data.vertices)))
+        positions = mesh_io.mesh_positions(shown.data)
+        relation = np.array(mesh_object.matrix_world.inverted_safe() @ shown.matrix_world, np.float64)
+        if np.array_equal(relation, np.eye(4)):
+            return positions
+        return (positions @ relation[:3, :3].T + relation[:3, 3]).astype(np.float32)
+
+    def check_mesh(self) -> None:
+        """Fail where what it shows now has other vertices, or other faces, than the mesh of the rig.
+
+        Raises:
+            RigError: says how many.
+        """
+        shown = self.target_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+        mesh = self.scene_rig.mesh_object.data
+        if len(shown.vertices) != len(mesh.vertices):
+            raise RigError(self._other_count(len(shown.vertices)))
+        # A cache may hold points alone.
+        if len(shown.polygons) and len(mesh.polygons) and not _have_same_faces(shown, mesh):
+            raise RigError(
+                f"The target '{self.name}' has as many vertices as '{self.scene_rig.mesh_object.name}' and other "
+                "faces, so its vertices are in another order or of another mesh; export it with the vertices of the "
+                "mesh in their order."
+            )
+
+    def _other_count(self, count: int) -> str:
+        own = len(self.scene_rig.mesh_object.data.vertices)
+        return (
+            f"The target '{self.name}' has {count:,} vertices and '{self.scene_rig.mesh_object.name}' has {own:,}; "
+            "a target needs the same vertices in the same order."
+        )
+
+    @property
+    def name(self) -> str:
+        """Of its object."""
+        return self.target_object.name
+
+    @contextmanager
+    def borrowed(self) -> Iterator[None]:
+        """Switch off what makes new vertices after the target is deformed, a subdivision for example."""
+        with without_live(self.target_object):
+            yield
+
+
+def find_target(scene_rig: SceneRig, name: str) -> Target:
+    """The target of a rig by the name of its object.
+
+    Raises:
+        RigError: there is no mesh of this name, it is the rig's own, plays a model, is hidden, has other vertices or
+            faces, or a file that it plays is missing.
+    """
+    mesh_object, scene = scene_rig.mesh_object, bpy.context.scene
+    target_object = scene.objects.get(name)
+    if target_object is None or target_object.type != "MESH":
+        known = ", ".join(f"'{o.name}'" for o in scene.objects if o.type == "MESH" and o != mesh_object) or "none"
+        raise RigError(f"The scene has no mesh object '{name}' to be the target; its other mesh objects: {known}.")
+    if target_object == mesh_object:
+        raise RigError(
+            f"'{name}' cannot be its own target: a target is another object, which shows what '{name}' is to learn; "
+            "leave the target out to record the rig itself."
+        )
+    if any(is_playback(modifier) and modifier.show_viewport for modifier in target_object.modifiers):
+        raise RigError(
+            f"The target '{name}' plays a model, so there is nothing to learn from it but that model; let it show its "
+            "rig, or choose another object."
+        )
+    if target_object.mode == "EDIT":
+        raise RigError(f"The target '{name}' is in edit mode; leave it first.")
+    if is_flat(target_object):
+        raise RigError(f"The target '{name}' has a scale of zero; give it another.")
+    target = Target(scene_rig, target_object, read_caches(scene_rig, target_object))
+    if not target_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).is_evaluated:
+        raise RigError(f"The target '{name}' is hidden, so Blender does not evaluate it; show it in the viewport.")
+    with target.borrowed():
+        target.check_mesh()
+    return target
+
+
+def check_clips(target: Target, clips: Sequence[Clip], pre_roll: int) -> None:
+    """Fail where frames of clips are not among those that a target has, or cannot be brought into it.
+
+    Raises:
+        RigError: names the frames of both.
+    """
+    if pre_roll and not target.simulations:
+        raise RigError(
+            f"The target '{target.name}' is no simulation, so there is nothing that a pre-roll would change; leave it "
+            "out."
+        )
+    if target.follows != POSE and (mirrored := [clip for clip in clips if clip.is_mirrored]):
+        raise RigError(
+            f"The target '{target.name}' shows the frames of '{mirrored[0].name}' as they are, and not mirrored; leave "
+            "the mirrored frames out."
+        )
+    for clip in clips:
+        for cache in target.caches:
+            first = None if pre_roll and cache in target.simulations else cache.first
+            frames, what = clip.frames, f"{clip.kind} '{clip.name}'"
+            if (first is not None and frames[0] < first) or (cache.last is not None and frames[-1] > cache.last):
+                to = "on" if cache.last is None else f"to {cache.last:g}"
+                raise RigError(
+                    f"The {what} has the frames {frames[0]} to {frames[-1]}, and {cache.words} has those from "
+                    f"{cache.first:g} {to}; record an action within, or give it more frames."
+                )
+        if pre_roll and clip.frames[0] - pre_roll < 0 and any(c.owner == bpy.context.scene for c in target.simulations):
+            raise RigError(
+                f"A pre-roll of {pre_roll} frames before frame {clip.frames[0]} of '{clip.name}' begins before frame "
+                f"0, where Blender simulates no Geometry Nodes; move the {clip.kind} to later frames."
+            )
+
+
+@contextmanager
+def borrowed_range(target: Target, first: int, last: int | None = None) -> Iterator[None]:
+    """Let the simulations of a target start at a frame, and last until another at least."""
+    with ExitStack() as stack:
+        for cache in target.simulations:
+            if cache.owner is not None:
+                end = max(cache.owner.frame_end, last or first)
+                # The end first: Blender lets none of the two pass the other.
+                stack.enter_context(borrowed_attributes(cache.owner, frame_end=end))
+                stack.enter_context(borrowed_attributes(cache.owner, frame_start=first))
+        yield
+
+
+def _have_same_faces(first: bpy.types.Mesh, second: bpy.types.Mesh) -> bool:
+    """Whether two meshes have the same faces, in any order and wherever and in whichever direction each begins."""
+    faces = [_faces_by_size(*mesh_io.topology(mesh)) for mesh in (first, second)]
+    return faces[0].keys() == faces[1].keys() and all(
+        np.array_equal(rows, faces[1][size]) for size, rows in faces[0].items()
+    )
+
+
+def _faces_by_size(starts: np.ndarray, vertices: np.ndarray) -> dict[int, np.ndarray]:
+    """For each number of corners the (n, corners) vertices of the faces that have it, all sorted."""
+    sizes = np.diff(np.append(starts, len(vertices)))
+    found = {}
+    for size in np.unique(sizes).tolist():
+        rows = np.sort(vertices[starts[sizes == size][:, None] + np.arange(size)], axis=1)
+        found[size] = rows[np.lexsort(rows.T[::-1])]
+    return found

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Brings a target that depends on time to poses: frames in their order with a pre-roll, poses held until it rests."""
+
+import time
+from collections.abc import Callable, Container, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+
+from ..core.defaults import STILL_MM
+from ..core.errors import RigError
+from ..core.recording.target import FRAMES, POSE, SIMULATION, RecordedTarget
+from ..poses.clip import Clip
+from ..poses.clip_player import ClipPlayer
+from ..scene.arrays import POSE_CHANNELS, read, write
+from ..scene.scene_rig import SceneRig
+from ..scene.unit import metres_per_unit
+from .target import Target, borrowed_range, check_clips, find_target
+
+APPROACH = 10
+"""Frames in which a pose is approached that is held afterwards."""
+QUIET = 3
+"""So many frames in a row no vertex may move: what swings stands still for one at each turn."""
+
+
+@dataclass(frozen=True)
+class TargetSettings:
+    """Which target is evaluated, and how.
+
+    Attributes:
+        name: of its object; empty for the rig itself.
+        pre_roll: frames before the first of an action, in which the rig goes from the rest pose to it.
+        settle: frames for which a random pose is held at most until the target has come to rest; 0 for not at all.
+        still_mm: it is at rest when no vertex moves by more from a frame to the next, mm.
+    """
+
+    name: str = ""
+    pre_roll: int = 0
+    settle: int = 0
+    still_mm: float = STILL_MM
+
+
+OWN_SURFACE = TargetSettings()
+"""No target: the rig is evaluated itself."""
+
+
+@dataclass(frozen=True)
+class Settled:
+    """How a target came to rest in a pose.
+
+    Attributes:
+        frames: for which the pose was held.
+        speed_mm: of the fastest vertex in the last of them, mm a frame.
+        is_at_rest: it came to rest.
+        seconds: that all of it took.
+    """
+
+    frames: int
+    speed_mm: float
+    is_at_rest: bool
+    seconds: float
+
+    def __str__(self) -> str:
+        what = f"{self.frames} frames, {self.seconds:.1f} s"
+        return what if self.is_at_rest else f"not at rest after {what}: {self.speed_mm:.2g} mm a frame"
+
+
+class Settler:
+    """Holds poses until a target has come to rest: what it shows depends on the pose alone then.
+
+    Attributes:
+        frames: for which a pose is held at most.
+        still_mm: the target is at rest when no vertex moves by more from a frame to the next, mm.
+        last: how the last pose came to rest, None before the first.
+    """
+
+    def __init__(self, target: Target, frames: int, still_mm: float = STILL_MM):
+        """Args:
+        target: a simulation.
+        frames, still_mm: as above.
+        """
+        self._target, self.frames, self.still_mm = target, frames, still_mm
+        self._mm_per_unit = 1000 * metres_per_unit(target.scene_rig.mesh_object)
+        self._first = target.first_frame
+        self.last: Settled | None = None
+
+    @contextmanager
+    def borrowed(self) -> Iterator[None]:
+        """Let the simulations of the target last for as long as it takes; poses are settled inside."""
+        with borrowed_range(self._target, self._first, self._first + 2 * APPROACH + self.frames):
+            yield
+
+    def settle(self, pose: Callable[[float], None], over: Callable[[float], None] | None = None) -> Settled:
+        """Go from the rest pose to a pose, and hold it until the target rests or the frames are over.
+
+        Args:
+            pose: sets what part of the way from the rest pose is done, 0 to 1.
+            over: the same of another pose, which is passed through on the way.
+        """
+        start, scene, frame = time.perf_counter(), bpy.context.scene, self._first
+        ways = [(over, range(APPROACH + 1)), (pose, range(1, APPROACH + 1))] if over else [(pose, range(APPROACH + 1))]
+        for way, steps in ways:
+            for step in steps:
+                way(step / APPROACH)
+                scene.frame_set(frame)
+                frame += 1
+        before, quiet, held, speed = self._positions(), 0, 0, 0.0
+        while held < self.frames and quiet < QUIET:
+            scene.frame_set(frame + held)
+            now = self._positions()
+            speed = float(np.sqrt(np.einsum("vc,vc->v", now - before, now - before).max())) * self._mm_per_unit
+            before, held = now, held + 1
+            quiet = quiet + 1 if speed <= self.still_mm else 0
+        self.last = Settled(held, speed, quiet >= QUIET, time.perf_counter() - start)
+        return self.last
+
+    def _positions(self) -> np.ndarray:
+        return self._target.positions(bpy.context.evaluated_depsgraph_get())
+
+
+def show_frames(
+    player: ClipPlayer, clip: Clip, wanted: Container[int], target: Target | None = None, pre_roll: int = 0
+) -> Iterator[int]:
+    """Show frames of a clip, one an iteration, in their order; yields their numbers in the clip.
+
+    Where the target is a simulation, all frames from its first on are visited, until the last that is wanted.
+
+    Args:
+        player: plays the clip.
+        clip: the clip.
+        wanted: numbers of the frames that are yielded.
+        target: what is evaluated; None for the rig itself.
+        pre_roll: frames before the first, in which the rig goes from the rest pose to that of the first.
+    """
+    numbers = [number for number in range(len(clip.frames)) if number in wanted]
+    if target is None or not target.simulations or not numbers:
+        for number in numbers:
+            player.show(clip, clip.frames[number])
+            yield number
+        return
+    first = clip.frames[0] - pre_roll if pre_roll else target.first_frame
+    with borrowed_range(target, first, clip.frames[-1]) if pre_roll else _as_it_is():
+        if pre_roll:
+            _roll_in(target, player, clip, first)
+        else:
+            for frame in range(first, clip.frames[0]):
+                player.show(clip, frame)
+        for number, frame in enumerate(clip.frames[: numbers[-1] + 1]):
+            player.show(clip, frame)
+            if number in wanted:
+                yield number
+
+
+@contextmanager
+def _as_it_is() -> Iterator[None]:
+    yield
+
+
+def _roll_in(target: Target, player: ClipPlayer, clip: Clip, first: int) -> None:
+    """Go from the rest pose, at a frame, to the pose of the first frame of a clip, up to the frame before it."""
+    armature_object = target.scene_rig.armature_object
+    bones = armature_object.pose.bones
+    player.show(clip, clip.frames[0])
+    goal = [read(bones, channel) for channel in POSE_CHANNELS]
+    player.stop()
+    rest = [read(bones, channel) for channel in POSE_CHANNELS]
+    for frame in range(first, clip.frames[0]):
+        part = (frame - first) / (clip.frames[0] - first)
+        for channel, start, end in zip(POSE_CHANNELS, rest, goal, strict=True):
+            write(bones, channel, _between(channel.name, start, end, np.float32(part)))
+        armature_object.update_tag(refresh={"DATA"})
+        bpy.context.scene.frame_set(frame)
+
+
+def _between(name: str, start: np.ndarray, end: np.ndarray, part: np.float32) -> np.ndarray:
+    if name == "rotation_quaternion":
+        # The shorter way; Blender normalises.
+        end = np.where((start * end).sum(axis=1, keepdims=True) < 0, -end, end)
+    return start + part * (end - start)
+
+
+def way(set_values: Callable[[np.ndarray], None], rest: np.ndarray, values: np.ndarray) -> Callable[[float], None]:
+    """Sets what part of the way from values (C,) of the rest pose to those of a pose is done, 0 to 1."""
+
+    def pose(part: float) -> None:
+        set_values(values if part == 1 else rest + part * (values - rest))
+
+    return pose
+
+
+class Approach:
+    """How a rig, or a target, is brought to poses.
+
+    Attributes:
+        target: what is evaluated; None for the rig itself.
+        settler: holds the random poses; None where they are evaluated at once.
+    """
+
+    def __init__(self, target: Target | None = None, pre_roll: int = 0, settler: Settler | None = None):
+        """Args:
+        target, settler: as above.
+        pre_roll: as in `show_frames`.
+        """
+        self.target, self.settler = target, settler
+        self._pre_roll = pre_roll
+
+    @property
+    def recorded(self) -> RecordedTarget | None:
+        """What a recording says of the target."""
+        if self.target is None:
+            return None
+        held = (self.settler.frames, self.settler.still_mm) if self.settler else ()
+        return RecordedTarget(self.target.name, self.target.follows, self._pre_roll, *held)
+
+    @contextmanager
+    def borrowed(self) -> Iterator[None]:
+        """Random poses are reached inside."""
+        with self.settler.borrowed() if self.settler else _as_it_is():
+            yield
+
+    def reach(self, pose: Callable[[float], None]) -> None:
+        """Bring it to a random pose; `pose` sets what part of the way from the rest pose is done, 0 to 1."""
+        if self.settler:
+            self.settler.settle(pose)
+        else:
+            pose(1)
+
+    def frames(self, player: ClipPlayer, clip: Clip, wanted: Container[int]) -> Iterator[int]:
+        """As `show_frames`."""
+        yield from show_frames(player, clip, wanted, self.target, self._pre_roll)
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the last random pose came to rest, or was not held."""
+        return self.settler is None or self.settler.last is None or self.settler.last.is_at_rest
+
+
+DIRECT = Approach()
+"""Of a rig, which follows from its pose at once."""
+
+
+def make_approach(scene_rig: SceneRig, settings: TargetSettings, clips: Sequence[Clip], random: int) -> Approach:
+    """How poses are reached with these settings; all that can be refused is refused.
+
+    Args:
+        scene_rig: the rig.
+        settings: of the target.
+        clips: whose frames are evaluated.
+        random: how many random poses are.
+
+    Raises:
+        RigError: as `find_target` and `check_clips`, or the target cannot be brought to these poses.
+    """
+    if not settings.name:
+        if settings.pre_roll or settings.settle:
+            raise RigError(
+                "There is no target whose time a pre-roll or settling would change; give one, or none of both."
+            )
+        return DIRECT
+    target = find_target(scene_rig, settings.name)
+    if random and target.follows == FRAMES:
+        raise RigError(
+            f"The target '{target.name}' shows frames ({target.caches[0].words}), and not random poses; record 0 of "
+            "them, and the action that it was made with."
+        )
+    if random and target.follows == SIMULATION and not settings.settle:
+        raise RigError(
+            f"The target '{target.name}' is a simulation ({target.simulations[0].words}): what it shows in a random "
+            "pose depends on the pose before; let it settle, or record 0 of them, and actions."
+        )
+    if settings.settle and (target.follows != SIMULATION or any(not c.is_simulation for c in target.caches)):
+        raise RigError(f"The target '{target.name}' cannot settle: {_why_not(target)}; leave settling out.")
+    if settings.settle and clips:
+        raise RigError(
+            f"Settled poses are random ones, and '{clips[0].name}' is to be recorded too, frame by frame; leave it "
+            "out, or make a recording of each."
+        )
+    check_clips(target, clips, settings.pre_roll)
+    settler = Settler(target, settings.settle, settings.still_mm) if settings.settle else None
+    return Approach(target, settings.pre_roll, settler)
+
+
+def _why_not(target: Target) -> str:
+    if target.follows == POSE:
+        return "it follows the pose at once"
+    cache = next(cache for cache in target.caches if not cache.is_simulation)
+    return f"{cache.words} has the frames that it has"

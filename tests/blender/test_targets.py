@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Recordings of a target: another object whose surface is learnt in place of the rig's own."""
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from blend_fixtures.characters import targets
+from blend_fixtures.elbow import ACTION, FRAMES
+from fdda_addon.core.alembic import time_range
+from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.scene.blend_file import save_copy
+
+from .conftest import run
+from .refusals import Refusal
+
+EXACT = 1e-5
+"""Part of the character's size by which a surface that went through a file may differ."""
+
+
+@pytest.fixture
+def refusal(tmp_path, capfd) -> Refusal:
+    return Refusal(tmp_path, capfd)
+
+
+def built(build, path: Path) -> Path:
+    """Build a character, and save it."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    build()
+    save_copy(path)
+    return path
+
+
+def recorded(rig: Path, path: Path, *options: object) -> Recording:
+    assert run("record", rig, path, "--object", "elbow", *options) == 0
+    return read_recording(path)
+
+
+def of_flesh(rig: Path, path: Path, *options: object) -> Recording:
+    return recorded(rig, path, "--target", "flesh", "--action", ACTION, *options)
+
+
+def complex_positions(recording: Recording) -> np.ndarray:
+    from fdda_addon.core.skinning import LinearLayer
+
+    layer = LinearLayer(recording.rig, recording.partitions)
+    return layer.complex_positions(np.array(recording.pose_matrices), np.array(recording.residuals))
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory) -> Recording:
+    """A recording of the copy as a rig of its own, on its action."""
+    import fdda_addon
+
+    fdda_addon.register()
+    folder = tmp_path_factory.mktemp("own")
+    rig = built(targets.target_copy, folder / "rig.blend")
+    assert run("record", rig, folder / "own", "--object", "flesh", "--poses", 0, "--action", ACTION) == 0
+    return read_recording(folder / "own")
+
+
+FILES = (targets.target_alembic, targets.target_usd, targets.target_pc2, targets.target_mdd)
+
+
+@pytest.mark.parametrize("build", [targets.target_copy, *FILES])
+def test_a_target_is_recorded_as_the_rig_that_it_shows(build, own, tmp_path):
+    rig = built(build, tmp_path / "rig.blend")
+    recording = of_flesh(rig, tmp_path / "recording", *(["--poses", 0] if build is targets.target_copy else []))
+    assert len(recording.pose_matrices) == FRAMES
+    assert np.array_equal(recording.pose_matrices, own.pose_matrices)
+    apart = np.abs(complex_positions(recording) - complex_positions(own)).max()
+    assert apart <= EXACT * own.rig.size
+    target = json.loads((tmp_path / "recording" / "recording.json").read_text())["target"]
+    follows = "pose" if build is targets.target_copy else "frames"
+    assert target == {"object": "flesh", "follows": follows, "pre_roll": 0}
+
+
+def test_a_copy_is_recorded_in_random_poses_and_its_influences_are_found(tmp_path):
+    rig = built(targets.target_copy, tmp_path / "rig.blend")
+    recording = recorded(rig, tmp_path / "recording", "--target", "flesh", "--poses", 20)
+    assert (tmp_path / "own").exists() is False
+    assert run("record", rig, tmp_path / "own", "--object", "flesh", "--poses", 20) == 0
+    own = read_recording(tmp_path / "own")
+    assert np.array_equal(recording.residuals, own.residuals)
+    assert [p.influencing for p in recording.partitions] == [p.influencing for p in own.partitions]
+
+
+def test_sculpted_shapes_are_recorded(tmp_path):
+    recording = of_flesh(built(targets.target_shape_keys, tmp_path / "rig.blend"), tmp_path / "recording")
+    lengths = np.linalg.norm(recording.residuals, axis=2)
+    bent = recording.pose_matrices[:, 1] - recording.pose_matrices[:1, 1]
+    assert lengths[np.abs(bent).max(axis=(1, 2)).argmax()].max() > 0.005
+    assert lengths[0].max() < 1e-5
+
+
+def test_a_target_in_another_place_and_unit_is_seen_in_the_space_of_the_mesh(own, tmp_path):
+    def build() -> None:
+        targets.target_alembic()
+        mesh = bpy.data.objects["elbow"]
+        mesh.parent = None
+        mesh.scale = (0.5, 0.5, 0.5)
+        mesh.data.transform(((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, 2, 0), (0, 0, 0, 1)))
+
+    recording = of_flesh(built(build, tmp_path / "rig.blend"), tmp_path / "recording")
+    apart = np.abs(complex_positions(recording) - 2 * complex_positions(own)).max()
+    assert apart <= 2 * EXACT * own.rig.size
+
+
+def test_a_model_of_a_cache_is_bound_evaluated_and_plays_without_it(tmp_path):
+    rig = built(targets.target_alembic, tmp_path / "rig.blend")
+    of_flesh(rig, tmp_path / "recording")
+    model, bound = tmp_path / "elbow.onnx", tmp_path / "bound.blend"
+    assert run("train", tmp_path / "recording", model, "--epochs", 60) == 0
+    errors = tmp_path / "errors.json"
+    options = ["--object", "elbow", "--target", "flesh", "--poses", 0, "--action", ACTION, "--json", errors]
+    assert run("evaluate", rig, model, *options) == 0
+    found = json.loads(errors.read_text())
+    assert found["poses"] == FRAMES
+    assert found["fdda"]["mean"] < 0.3 * found["linear"]["mean"]
+    assert run("bind", rig, model, bound, "--object", "elbow") == 0
+    bpy.ops.wm.open_mainfile(filepath=str(bound))
+    from .conftest import assert_plays
+
+    bpy.data.objects.remove(bpy.data.objects["flesh"])
+    bpy.context.scene.frame_set(20)
+    assert_plays(bpy.data.objects["elbow"], model)
+
+
+def change(build, work, path: Path) -> Path:
+    """A character that something was done to."""
+
+    def both() -> None:
+        build()
+        work()
+
+    return built(both, path)
+
+
+def refused(refusal: Refusal, rig: Path, *options: object, target: str = "flesh") -> str:
+    return refusal(
+        "record", rig, rig.parent / "recording", "--object", "elbow", "--target", target, "--action", ACTION, *options
+    )
+
+
+def add_vertices() -> None:
+    bpy.data.objects["flesh"].data.vertices.add(3)
+
+
+def test_another_number_of_vertices(refusal, tmp_path):
+    rig = change(targets.target_copy, add_vertices, tmp_path / "rig.blend")
+    assert refused(refusal, rig) == (
+        "The target 'flesh' has 303 vertices and 'elbow' has 300; a target needs the same vertices in the same order."
+    )
+
+
+def test_other_faces(refusal, tmp_path):
+    def turn() -> None:
+        mesh = bpy.data.objects["flesh"].data
+        for loop in mesh.loops[:4]:
+            loop.vertex_index += 5
+
+    rig = change(targets.target_copy, turn, tmp_path / "rig.blend")
+    assert refused(refusal, rig).startswith("The target 'flesh' has as many vertices as 'elbow' and other faces, so")
+
+
+def test_the_same_faces_in_another_order_are_the_same(tmp_path):
+    def reverse() -> None:
+        mesh = bpy.data.objects["flesh"].data
+        faces = [tuple(face.vertices)[::-1] for face in mesh.polygons][::-1]
+        points = [vertex.co[:] for vertex in mesh.vertices]
+        mesh.clear_geometry()
+        mesh.from_pydata(points, [], faces)
+
+    rig = change(targets.target_pc2, reverse, tmp_path / "rig.blend")
+    assert len(of_flesh(rig, tmp_path / "recording").residuals) == FRAMES
+
+
+def test_frames_that_a_cache_does_not_have(refusal, tmp_path):
+    def later() -> None:
+        bpy.data.objects["flesh"].modifiers["Cache"].frame_start = 5
+
+    rig = change(targets.target_pc2, later, tmp_path / "rig.blend")
+    assert refused(refusal, rig) == (
+        f"The action '{ACTION}' has the frames 1 to {FRAMES}, and the modifier 'Cache' of 'flesh' has those from 5 to "
+        f"{FRAMES + 4}; record an action within, or give it more frames."
+    )
+
+
+@pytest.mark.parametrize("build", [targets.target_alembic, targets.target_usd])
+def test_frames_that_a_file_does_not_have(build, refusal, tmp_path):
+    def shift() -> None:
+        bpy.data.cache_files[0].frame_offset = 3
+
+    rig = change(build, shift, tmp_path / "rig.blend")
+    assert f" has the frames 1 to {FRAMES}, and the modifier 'MeshSequenceCache' of 'flesh' has those from 4 to " in (
+        refused(refusal, rig)
+    )
+
+
+def test_a_file_that_is_missing(refusal, capfd, tmp_path):
+    def lose() -> None:
+        bpy.data.objects["flesh"].modifiers["Cache"].filepath = "/nowhere/flesh.pc2"
+
+    rig = change(targets.target_pc2, lose, tmp_path / "rig.blend")
+    assert refused(refusal, rig) == (
+        "The modifier 'Cache' of 'flesh' plays the file '/nowhere/flesh.pc2', which is not there; put it there, or "
+        "choose another file in the modifier."
+    )
+
+    def lose_file() -> None:
+        bpy.data.cache_files[0].filepath = "/nowhere/flesh.abc"
+
+    rig = change(targets.target_alembic, lose_file, tmp_path / "other.blend")
+    assert run("record", rig, tmp_path / "recording", "--object", "elbow", "--target", "flesh", "--action", ACTION) == 1
+    # Blender says something itself.
+    assert "plays the file '/nowhere/flesh.abc', which is not there" in capfd.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "recording").exists()
+
+
+def test_a_file_that_is_damaged(refusal, tmp_path):
+    rig = built(targets.target_mdd, tmp_path / "rig.blend")
+    path = Path(bpy.data.objects["flesh"].modifiers["Cache"].filepath)
+    path.write_bytes(path.read_bytes()[:-5])
+    assert refused(refusal, rig).startswith("The modifier 'Cache' of 'flesh' plays what cannot be read. The point")
+
+
+def test_the_mesh_itself(refusal, tmp_path):
+    rig = built(targets.target_copy, tmp_path / "rig.blend")
+    assert refused(refusal, rig, target="elbow").startswith("'elbow' cannot be its own target: a target is another")
+
+
+def test_no_such_object(refusal, tmp_path):
+    rig = built(targets.target_copy, tmp_path / "rig.blend")
+    assert refused(refusal, rig, target="skin") == (
+        "The scene has no mesh object 'skin' to be the target; its other mesh objects: 'flesh'."
+    )
+
+
+def test_a_target_that_plays_a_model(refusal, elbow, tmp_path):
+    def bind() -> None:
+        from fdda_addon.runtime.binding import bind as bind_model
+        from fdda_addon.scene.scene_rig import find_rig
+
+        bind_model(find_rig("flesh"), elbow.model)
+
+    rig = change(targets.target_copy, bind, tmp_path / "rig.blend")
+    assert refused(refusal, rig).startswith("The target 'flesh' plays a model, so there is nothing to learn from it")
+
+
+def test_a_target_that_does_not_move(refusal, tmp_path):
+    def hold() -> None:
+        bpy.data.objects["flesh"].modifiers["Armature"].show_viewport = False
+
+    rig = change(targets.target_copy, hold, tmp_path / "rig.blend")
+    text = refused(refusal, rig)
+    assert text.startswith("The target 'flesh' does not move while 'elbow' does, by ")
+    assert text.endswith(" mm; look whether its modifiers are on and its cache is that of this action, or choose "
+                         "another target.")  # fmt: skip
+
+
+def test_a_hidden_target(refusal, tmp_path):
+    def hide() -> None:
+        bpy.data.objects["flesh"].hide_viewport = True
+
+    rig = change(targets.target_copy, hide, tmp_path / "rig.blend")
+    assert refused(refusal, rig) == (
+        "The target 'flesh' is hidden, so Blender does not evaluate it; show it in the viewport."
+    )
+
+
+def test_random_poses_of_a_cache(refusal, tmp_path):
+    rig = built(targets.target_pc2, tmp_path / "rig.blend")
+    assert refused(refusal, rig, "--poses", 5) == (
+        "The target 'flesh' shows frames (the modifier 'Cache' of 'flesh'), and not random poses; record 0 of them, "
+        "and the action that it was made with."
+    )
+
+
+def test_mirrored_frames_of_a_cache(refusal, tmp_path):
+    rig = built(targets.target_pc2, tmp_path / "rig.blend")
+    assert refused(refusal, rig, "--mirror").startswith(
+        f"The target 'flesh' shows the frames of '{ACTION}' as they are, and not mirrored"
+    )
+
+
+def test_settling_and_pre_roll_of_what_is_no_simulation(refusal, tmp_path):
+    rig = built(targets.target_pc2, tmp_path / "rig.blend")
+    assert refused(refusal, rig, "--poses", 0, "--settle", 5) == (
+        "The target 'flesh' cannot settle: the modifier 'Cache' of 'flesh' has the frames that it has; leave settling "
+        "out."
+    )
+    assert refused(refusal, rig, "--pre-roll", 5).startswith("The target 'flesh' is no simulation, so there is nothing")
+    rig = built(targets.target_copy, tmp_path / "copy.blend")
+    assert "cannot settle: it follows the pose at once;" in refused(refusal, rig, "--settle", 5)
+
+
+def test_one_target_is_of_one_mesh(refusal, tmp_path):
+    rig = built(targets.target_copy, tmp_path / "rig.blend")
+    assert refusal("record", rig, tmp_path / "out", "--all", "--target", "flesh").startswith(
+        "A target is one of one mesh; record the meshes one by one"
+    )
+
+
+def test_the_times_of_alembic_files(tmp_path):
+    built(targets.target_alembic, tmp_path / "rig.blend")
+    path = Path(bpy.data.cache_files[0].filepath)
+    assert np.allclose(np.array(time_range(path)) * 24, (1, FRAMES))
+    data = path.read_bytes()
+    damaged = tmp_path / "damaged.abc"
+    for cut in (b"", data[:4], data[:12], data[:200], b"Ogawa\xff\x00\x01" + b"\xff" * 64):
+        damaged.write_bytes(cut)
+        assert time_range(damaged) is None
