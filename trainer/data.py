@@ -153,7 +153,7 @@ def split_recording(recording: Recording, config: TrainingConfig) -> Split:
     Random poses are split one by one, frames of animation in blocks: an error on a pose would say nothing when the
     frames before and after it have trained. Refined poses and those of the margin all train: they are no sample of the
     range of motion, and an error measured on them would say nothing of it. What is held out stays so when a recording
-    is extended.
+    is extended. Poses in which the target did not come to rest are in no part, unless they are asked for.
 
     Raises:
         TrainingError: there are too few poses beside the refined ones.
@@ -165,7 +165,17 @@ def split_recording(recording: Recording, config: TrainingConfig) -> Split:
     if margin := recording.info.sampling.margin:
         around = np.flatnonzero(random)[random.sum() - margin.poses :]
         besides[around], random[around] = True, False
+    usable = np.ones(len(besides), bool)
+    if not config.unsettled:
+        usable[list(recording.info.unsettled)] = False
+    at_rest = int((usable & ~besides).sum())
+    if not usable.all() and at_rest < MIN_POSES:
+        raise TrainingError(
+            f"Only {at_rest} of the {len(usable)} poses of the recording came to rest and training takes at least "
+            f"{MIN_POSES}; hold them for more frames (record --settle), or take all with --unsettled."
+        )
     _check_count(int((~besides).sum()))
+    random, around = random & usable, around[usable[around]]
     fractions = config.validation_fraction, config.seed, config.held_out_fraction
     splits = [_split(np.flatnonzero(random), *fractions)] if random.any() else []
     if blocks := _blocks(sources):
@@ -177,7 +187,7 @@ def split_recording(recording: Recording, config: TrainingConfig) -> Split:
         np.sort(np.concatenate([getattr(split, part) for split in splits]))
         for part in ("training", "validation", "held_out")
     )
-    return Split(np.append(training, np.flatnonzero(besides)), validation, held_out, around)
+    return Split(np.append(training, np.flatnonzero(besides & usable)), validation, held_out, around)
 
 
 def _blocks(sources: tuple[Source, ...]) -> list[list[int]]:

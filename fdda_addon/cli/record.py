@@ -126,6 +126,7 @@ def _shard(text: str) -> tuple[int, int]:
 
 def run(options: argparse.Namespace) -> None:
     from ..core.checks.recording import merges_in_words
+    from ..core.checks.target import unsettled_in_words
     from ..core.errors import WrongUsageError
     from ..core.poses import MAX_MARGIN
     from ..core.recording.index import read_index, read_info
@@ -182,8 +183,9 @@ def run(options: argparse.Namespace) -> None:
             index = read_index(recording)
             if options.fit_linear:
                 print(read_info(index).fit.sentence())
-            if line := merges_in_words(index, options.least_vertices):
-                print(line)
+            for line in (merges_in_words(index, options.least_vertices), unsettled_in_words(index)):
+                if line:
+                    print(line)
         done = "influences" if options.influences_only else f"{step.total} poses{' added' if options.refine else ''}"
         print(f"{recording}: {done} in {seconds:.1f} s")
 

@@ -2,6 +2,7 @@
 """Operators of the section Evaluation: compare, colour the mesh, open the report."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -13,6 +14,7 @@ from ..core.report import REPORT_HTML, page_path
 from ..evaluation import last_evaluation, side_by_side
 from ..evaluation.loaded import loaded_heat_map
 from ..models.entries import bound_entry, bound_name
+from ..properties.choices import target_settings
 from ..properties.view import show_graph
 from ..scene.active_rig import any_mesh
 from .job import JobOperator
@@ -63,11 +65,15 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
             mesh_object = scene_rig.mesh_object
             self.state.begin_part(mesh_object.name if len(rigs) > 1 else "")
             network, uid = network_of(mesh_object), mesh_object.session_uid
+            target = target_settings(mesh_object.fdda.settings)
             with true_rig(mesh_object):
                 if self._action:
-                    steps = evaluate_action(scene_rig, network, self._action)
+                    steps = evaluate_action(scene_rig, network, self._action, replace(target, settle=0))
                 else:
-                    steps = evaluate(scene_rig, network, EvaluationSettings(self.poses, self.seed, surface=False))
+                    wanted = EvaluationSettings(
+                        self.poses, self.seed, surface=False, target=replace(target, pre_roll=0)
+                    )
+                    steps = evaluate(scene_rig, network, wanted)
                 for step in steps:
                     if isinstance(step, Progress):
                         yield step
@@ -88,8 +94,10 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
             )
             fdda, linear = last.total["fdda"], last.total["linear"]
             of = f" of '{mesh_object.name}'" if len(result) > 1 else ""
+            target = mesh_object.fdda.settings.target
+            true = f"'{target}'" if target else "the rig"
             sentences.append(
-                f"FDDA{of} is {fdda.mean:.2f} mm from the rig on average and {fdda.max:.1f} mm at most; "
+                f"FDDA{of} is {fdda.mean:.2f} mm from {true} on average and {fdda.max:.1f} mm at most; "
                 f"the linear layer {linear.mean:.2f} and {linear.max:.1f} mm."
             )
         context.window_manager.fdda_view.pose = -1

@@ -91,6 +91,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 
     settings = rig.mesh_object.fdda.settings
     draw_path(layout, settings, "recording")
+    _draw_target(layout, context, settings)
     layout.prop(settings, "fit_linear")
     layout.prop(settings, "least_vertices")
     found = shown_content(rig)
@@ -121,6 +122,14 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         draw_sentence(layout, context, content.sentence, "ERROR")
     if content.poses:
         layout.operator("fdda.remove_recording", text="Remove Recording", icon="TRASH").object = rig.mesh_object.name
+
+
+def _draw_target(layout: bpy.types.UILayout, context: bpy.types.Context, settings: bpy.types.PropertyGroup) -> None:
+    layout.prop_search(settings, "target", context.scene, "objects", icon="OUTLINER_OB_MESH")
+    if settings.target:
+        row = layout.row(align=True)
+        row.prop(settings, "pre_roll")
+        row.prop(settings, "settle")
 
 
 def _draw_record(

@@ -104,6 +104,24 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         ),
         default="RIG",
     )
+    target: StringProperty(
+        name="Target",
+        description="Mesh object whose surface is recorded in place of what the rig shows: a copy under other "
+        "modifiers, a cache, a simulation, with the same vertices; empty for the rig itself",
+    )
+    pre_roll: IntProperty(
+        name="Pre-Roll",
+        description="Frames before the first of an action, in which a simulated target goes from the rest pose to it",
+        min=0,
+        soft_max=100,
+    )
+    settle: IntProperty(
+        name="Settle",
+        description="Frames for which a random pose is held at most until a simulated target is at rest; 0 to record "
+        "none of them",
+        min=0,
+        soft_max=200,
+    )
     mirror: BoolProperty(
         name="Mirrored",
         description="Record each frame of the actions a second time, left and right exchanged; the armature has to be "

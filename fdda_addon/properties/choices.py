@@ -11,6 +11,7 @@ from .character import FDDA_PG_character, wanted_fit
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..recording.plan import RecordingSettings
+    from ..rig.target_time import TargetSettings
 
 ALL_SHAPE_KEYS = "shape_keys"
 """Stands for all shape keys that no driver moves (`scene.controls.stated_controls`)."""
@@ -39,7 +40,17 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
         fit_linear=wanted_fit(settings),
         least_vertices=settings.least_vertices,
         mirror=settings.mirror and bool(actions),
+        target=target_settings(settings),
     )
+
+
+def target_settings(settings: FDDA_PG_character) -> "TargetSettings":
+    """Which target a character is recorded and evaluated with, and how it is brought to poses."""
+    from ..rig.target_time import TargetSettings
+
+    if not settings.target:
+        return TargetSettings()
+    return TargetSettings(settings.target, settings.pre_roll, settings.settle)
 
 
 def take_over_sampling(settings: FDDA_PG_character, other: FDDA_PG_character) -> None:

@@ -8,11 +8,13 @@ from ..core.defaults import INFLUENCE_POSES, MARGIN, MIN_VERTICES, POSES, SPREAD
 from ..core.partition import INFLUENCE_TOLERANCE
 from ..core.poses import Channel, Margin, margin_of
 from ..core.recording.index import RANDOM, Sampling, Source
+from ..core.recording.target import POSE
 from ..core.rig import Rig
 from ..poses.clip import find_clips
 from ..poses.sampling import Choice, choose, locked_channels, sampled_channels
 from ..rig.dependencies import read_dependencies
 from ..rig.reading import read_rig
+from ..rig.target import find_target
 from ..rig.target_time import OWN_SURFACE, TargetSettings
 from ..scene.controls import stated_controls
 from ..scene.scene_rig import SceneRig
@@ -71,9 +73,18 @@ def planned_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, 
         RigError: the rig cannot be read, or nothing may be sampled.
     """
     choice, besides = planned_choice(scene_rig, settings)
-    rig = read_rig(scene_rig, besides)
+    rig = read_rig(scene_rig, besides, depends_on_time(scene_rig, settings))
     channels = sampled_channels(scene_rig, rig, choice) if settings.poses else ()
     return replace(rig, controls=choice.controls), channels
+
+
+def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings) -> bool:
+    """Whether these settings have a target that does not follow from the pose at once: what sags, for example.
+
+    Raises:
+        RigError: as `find_target`.
+    """
+    return bool(settings.target.name) and find_target(scene_rig, settings.target.name).follows != POSE
 
 
 def planned_choice(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Choice, frozenset[str] | None]:

@@ -73,6 +73,11 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         OutputError: the recording cannot be written.
     """
     recording = read_recording(path)
+    if recording.info.target:
+        raise RecordingError(
+            f"The recording '{path}' is of the target '{recording.info.target.object_name}', and poses are added of "
+            "rigs alone; record more poses of the target into another folder."
+        )
     check_evaluable(scene_rig)
     opened = open_model(scene_rig, model)
     network, rig = opened.network, opened.rig

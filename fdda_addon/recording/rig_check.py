@@ -12,7 +12,7 @@ from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..rig.reading import read_rig
 from ..scene.controls import stated_controls
 from ..scene.scene_rig import SceneRig
-from .plan import RecordingSettings, planned_choice
+from .plan import RecordingSettings, depends_on_time, planned_choice
 
 DEFAULTS = RecordingSettings()
 
@@ -27,7 +27,7 @@ class RigCheck:
         channels: what a random pose may move, empty when nothing.
         replaced: names of the modifiers that a model takes the place of.
         found: the controls that nobody listed: drivers of the mesh read them, or the actions that are sampled key them.
-        besides: joints that the rig was read with (`read_rig`).
+        besides, with_unmoved: what the rig was read with (`read_rig`).
     """
 
     problems: tuple[str, ...]
@@ -36,6 +36,7 @@ class RigCheck:
     replaced: tuple[str, ...] = ()
     found: tuple[Control, ...] = ()
     besides: frozenset[str] | None = None
+    with_unmoved: bool = False
 
     def checked_again(self, scene_rig: SceneRig, settings: RecordingSettings = DEFAULTS) -> "RigCheck":
         """The check without reading the mesh again: for changes of modifiers, modes, ranges of motion and choices."""
@@ -58,15 +59,17 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, before: RigCheck | 
     try:
         result = replace(result, replaced=tuple(m.name for m in deforming_modifiers(scene_rig.mesh_object)))
         choice, besides = planned_choice(scene_rig, settings)
-        if before is not None and before.rig is not None and before.besides == besides:
+        with_unmoved = depends_on_time(scene_rig, settings)
+        read_with = besides, with_unmoved
+        if before is not None and before.rig is not None and (before.besides, before.with_unmoved) == read_with:
             rig = before.rig
         else:
-            rig = read_rig(scene_rig, besides)
+            rig = read_rig(scene_rig, *read_with)
         if rig.controls != choice.controls:
             rig = replace(rig, controls=choice.controls)
         listed = stated_controls(scene_rig, settings.controls)
         found = tuple(control for control in choice.controls if control not in listed)
-        result = replace(result, rig=rig, found=found, besides=besides)
+        result = replace(result, rig=rig, found=found, besides=besides, with_unmoved=with_unmoved)
         result = replace(result, channels=sampled_channels(scene_rig, rig, choice))
     except RigError as error:
         # A rig of which nothing may be sampled is recorded by its actions alone.

@@ -26,13 +26,14 @@ IDENTITY_TOLERANCE = 1e-6
 """Mesh and armature count as unmoved, one against the other, when no matrix element differs by more."""
 
 
-def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None) -> Rig:
+def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None, with_unmoved: bool = False) -> Rig:
     """Read a rig.
 
     Args:
         scene_rig: the rig.
         besides: names of joints beside the bones that have weights, as of a model or a recording; when it is not given,
             the bones that have a range of motion, those that the mesh depends on otherwise, and all above a joint.
+        with_unmoved: also the joint that never moves, which says which way is down.
 
     Raises:
         RigError: there is no vertex, or an object has a scale of zero.
@@ -44,7 +45,7 @@ def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None) -> Rig:
     if not len(mesh_object.data.vertices):
         raise RigError(f"The mesh of '{mesh_object.name}' has no vertices; choose another object.")
     skin = read_skin(mesh_object, armature_object, armature_modifier(mesh_object))
-    joints = choose_joints(scene_rig, skin.bones, besides)
+    joints = choose_joints(scene_rig, (*skin.bones, UNMOVED) if with_unmoved else skin.bones, besides)
     names = tuple(joint.name for joint in joints)
     skin_joints, skin_weights = skin.arrays({name: number for number, name in enumerate(names)})
     rest_positions = mesh_io.rest_positions(mesh_object.data)

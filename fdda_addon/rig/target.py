@@ -96,6 +96,14 @@ class Target:
         """Of its object."""
         return self.target_object.name
 
+    def forget(self) -> None:
+        """Let its simulations begin anew at their first frame: what they keep of frames may be of another pose."""
+        for cache in self.simulations:
+            if cache.owner is not None:
+                # Posing alone does not tell a soft body.
+                cache.owner.id_data.update_tag()
+        self.target_object.update_tag()
+
     @contextmanager
     def borrowed(self) -> Iterator[None]:
         """Switch off what makes new vertices after the target is deformed, a subdivision for example."""

@@ -100,6 +100,7 @@ class Settler:
             over: the same of another pose, which is passed through on the way.
         """
         start, scene, frame = time.perf_counter(), bpy.context.scene, self._first
+        self._target.forget()
         ways = [(over, range(APPROACH + 1)), (pose, range(1, APPROACH + 1))] if over else [(pose, range(APPROACH + 1))]
         for way, steps in ways:
             for step in steps:
@@ -145,6 +146,7 @@ def show_frames(
         if pre_roll:
             _roll_in(target, player, clip, first)
         else:
+            target.forget()
             for frame in range(first, clip.frames[0]):
                 player.show(clip, frame)
         for number, frame in enumerate(clip.frames[: numbers[-1] + 1]):
@@ -166,6 +168,7 @@ def _roll_in(target: Target, player: ClipPlayer, clip: Clip, first: int) -> None
     goal = [read(bones, channel) for channel in POSE_CHANNELS]
     player.stop()
     rest = [read(bones, channel) for channel in POSE_CHANNELS]
+    target.forget()
     for frame in range(first, clip.frames[0]):
         part = (frame - first) / (clip.frames[0] - first)
         for channel, start, end in zip(POSE_CHANNELS, rest, goal, strict=True):

@@ -12,6 +12,7 @@ from blend_fixtures.characters import targets
 from blend_fixtures.elbow import ACTION, FRAMES
 from fdda_addon.core.alembic import time_range
 from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.core.rig import UNMOVED
 from fdda_addon.scene.blend_file import save_copy
 
 from .conftest import run
@@ -70,7 +71,10 @@ def test_a_target_is_recorded_as_the_rig_that_it_shows(build, own, tmp_path):
     rig = built(build, tmp_path / "rig.blend")
     recording = of_flesh(rig, tmp_path / "recording", *(["--poses", 0] if build is targets.target_copy else []))
     assert len(recording.pose_matrices) == FRAMES
-    assert np.array_equal(recording.pose_matrices, own.pose_matrices)
+    # Beside the bones is the joint that never moves, where the target may know which way is down.
+    names = ["upper", "lower"] if build is targets.target_copy else ["upper", "lower", UNMOVED]
+    assert list(recording.rig.joint_names) == names
+    assert np.array_equal(recording.pose_matrices[:, :2], own.pose_matrices)
     apart = np.abs(complex_positions(recording) - complex_positions(own)).max()
     assert apart <= EXACT * own.rig.size
     target = json.loads((tmp_path / "recording" / "recording.json").read_text())["target"]
@@ -109,7 +113,7 @@ def test_a_target_in_another_place_and_unit_is_seen_in_the_space_of_the_mesh(own
     assert apart <= 2 * EXACT * own.rig.size
 
 
-def test_a_model_of_a_cache_is_bound_evaluated_and_plays_without_it(tmp_path):
+def test_a_model_of_a_cache_is_bound_evaluated_and_plays_without_it(tmp_path, capfd):
     rig = built(targets.target_alembic, tmp_path / "rig.blend")
     of_flesh(rig, tmp_path / "recording")
     model, bound = tmp_path / "elbow.onnx", tmp_path / "bound.blend"
@@ -120,6 +124,8 @@ def test_a_model_of_a_cache_is_bound_evaluated_and_plays_without_it(tmp_path):
     found = json.loads(errors.read_text())
     assert found["poses"] == FRAMES
     assert found["fdda"]["mean"] < 0.3 * found["linear"]["mean"]
+    assert run("record", rig, tmp_path / "recording", "--object", "elbow", "--refine", model) == 1
+    assert "is of the target 'flesh', and poses are added of rigs alone" in capfd.readouterr().err
     assert run("bind", rig, model, bound, "--object", "elbow") == 0
     bpy.ops.wm.open_mainfile(filepath=str(bound))
     from .conftest import assert_plays
@@ -313,3 +319,35 @@ def test_the_times_of_alembic_files(tmp_path):
     for cut in (b"", data[:4], data[:12], data[:200], b"Ogawa\xff\x00\x01" + b"\xff" * 64):
         damaged.write_bytes(cut)
         assert time_range(damaged) is None
+
+
+def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
+    built(targets.target_pc2, tmp_path / "rig.blend")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "rig.blend"))
+    mesh_object = bpy.data.objects["elbow"]
+    bpy.context.view_layer.objects.active = mesh_object
+    settings = mesh_object.fdda.settings
+    settings.target, settings.poses, settings.settle = "flesh", 0, 0
+    bpy.data.actions[ACTION].fdda.record = True
+    bpy.context.window_manager.fdda.all_meshes = False
+    assert bpy.ops.fdda.record() == {"FINISHED"}
+    recording = read_recording(tmp_path / "elbow_recording")
+    assert np.abs(complex_positions(recording) - complex_positions(own)).max() <= EXACT * own.rig.size
+    assert recording.info.target.object_name == "flesh"
+    settings.poses = 3
+    with pytest.raises(RuntimeError, match="The target 'flesh' shows frames"):
+        bpy.ops.fdda.record(folder=str(tmp_path / "random"))
+    model = tmp_path / "elbow.onnx"
+    assert run("train", recording.path, model, "--epochs", 30) == 0
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "rig.blend"))
+    from fdda_addon.evaluation import last_evaluation
+    from fdda_addon.runtime.binding import bind
+    from fdda_addon.scene.scene_rig import find_rig
+
+    mesh_object = bpy.data.objects["elbow"]
+    mesh_object.fdda.settings.target = "flesh"
+    bind(find_rig("elbow"), model)
+    bpy.context.view_layer.objects.active = mesh_object
+    assert bpy.ops.fdda.evaluate(source="ACTION", action=ACTION) == {"FINISHED"}
+    linear = last_evaluation.of(mesh_object).total["linear"]
+    assert linear.mean > 0.5  # The rig itself is its linear layer.

@@ -104,3 +104,15 @@ def test_poses_of_the_margin_all_train(source):
 def test_too_few_poses_are_refused(source):
     with pytest.raises(TrainingError, match="has 9 poses and training takes at least 10; record more"):
         split(source, Source(RANDOM, 4), Source(ACTION, 5, "nod", (1, 1)), Source(REFINED, 50, "model.onnx"))
+
+
+def test_poses_that_did_not_come_to_rest_are_in_no_part_unless_they_are_asked_for(source):
+    sampling = replace(source.info.sampling, sources=(Source(RANDOM, 30),))
+    info = replace(source.info, sampling=sampling, unsettled=tuple(range(0, 30, 3)))
+    found = split_recording(replace(source, info=info), CONFIG)
+    poses = np.sort(np.concatenate([getattr(found, part) for part in PARTS]))
+    assert np.array_equal(poses, [pose for pose in range(30) if pose % 3])
+    all_of_them = split_recording(replace(source, info=info), replace(CONFIG, unsettled=True))
+    assert sum(len(getattr(all_of_them, part)) for part in PARTS) == 30
+    with pytest.raises(TrainingError, match="Only 4 of the 30 poses of the recording came to rest and training takes"):
+        split_recording(replace(source, info=replace(info, unsettled=tuple(range(26)))), CONFIG)

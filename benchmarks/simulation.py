@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What is learnt of a simulation: `python benchmarks/simulation.py OUT`, the figures of docs/simulations.md.
+
+Gives the arm flesh that sags and bulges, held to the skin of its bones: a soft body of Blender's own. Records settled
+poses, trains, and compares model and linear layer with settled poses that training never saw, beside how far two ways
+to the same pose lie apart and what a frame costs. Writes OUT/simulation.json, and the files of each step beside it.
+"""
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+import bpy  # noqa: E402
+
+import fdda_addon  # noqa: E402
+from fdda_addon.arm.rig import build_arm  # noqa: E402
+from fdda_addon.cli.main import main as run_verb  # noqa: E402
+from fdda_addon.scene.blend_file import save_copy  # noqa: E402
+
+FLESH = "flesh"
+FRAMES = 60
+"""Frames that are timed."""
+
+
+def build(path: Path, kind: str) -> None:
+    """The arm, which keeps its Armature modifier alone, and a copy of it that is flesh."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    build_arm()
+    arm = next(o for o in bpy.context.scene.objects if o.type == "MESH")
+    for modifier in [m for m in arm.modifiers if m.type != "ARMATURE"]:
+        arm.modifiers.remove(modifier)
+    flesh = arm.copy()
+    flesh.data, flesh.name = arm.data.copy(), FLESH
+    bpy.context.scene.collection.objects.link(flesh)
+    if kind == "soft-body":
+        make_soft_body(flesh)
+    else:
+        make_cloth(flesh)
+    bpy.context.scene.frame_set(1)
+    save_copy(path)
+
+
+def make_soft_body(flesh: bpy.types.Object) -> None:
+    """Springs along the edges, goals at the skin of the bones."""
+    flesh.modifiers.new("Softbody", "SOFT_BODY")
+    soft = flesh.soft_body
+    soft.use_goal, soft.goal_default, soft.goal_spring, soft.goal_friction = True, 0.9, 0.9, 30.0
+    soft.use_edges, soft.pull, soft.push, soft.damping, soft.bend = True, 0.3, 0.3, 50.0, 0.2
+    soft.mass = 0.3
+
+
+def make_cloth(flesh: bpy.types.Object) -> None:
+    """Cloth that is pinned by half everywhere: gravity and the stretch of its edges do the rest."""
+    pin = flesh.vertex_groups.new(name="pin")
+    pin.add(range(len(flesh.data.vertices)), 0.5, "REPLACE")
+    settings = flesh.modifiers.new("Cloth", "CLOTH").settings
+    settings.vertex_group_mass, settings.quality, settings.air_damping = "pin", 5, 10.0
+
+
+def frame_ms(path: Path, shown: str, hidden: str) -> float:
+    """Median time of a frame of the action with one object shown, ms; its simulation is not cached yet."""
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    bpy.data.objects[hidden].hide_viewport = True
+    scene, times = bpy.context.scene, []
+    scene.frame_set(1)
+    for frame in range(2, FRAMES + 2):
+        start = time.perf_counter()
+        scene.frame_set(frame)
+        times.append((time.perf_counter() - start) * 1000)
+    return sorted(times)[len(times) // 2]
+
+
+def verb(*arguments: object) -> float:
+    """Run a verb of the command line; returns its seconds."""
+    start = time.perf_counter()
+    if status := run_verb([str(argument) for argument in arguments], "fdda"):
+        raise SystemExit(status)
+    return time.perf_counter() - start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--kind", choices=("soft-body", "cloth"), default="soft-body")
+    parser.add_argument("--poses", type=int, default=300)
+    parser.add_argument("--held-out", type=int, default=50)
+    parser.add_argument("--settle", type=int, default=60)
+    options = parser.parse_args()
+    out = options.out
+    out.mkdir(parents=True, exist_ok=True)
+    rig, recording, model, bound, errors = (
+        out / name for name in ("rig.blend", "recording", "model/arm.onnx", "bound.blend", "errors.json")
+    )
+    fdda_addon.register()
+    build(rig, options.kind)
+    of_target = ["--object", "arm", "--target", FLESH, "--settle", options.settle]
+    seconds = {"record": verb("record", rig, recording, *of_target, "--poses", options.poses, "--resume")}
+    model.parent.mkdir(exist_ok=True)
+    seconds["train"] = verb("train", recording, model)
+    evaluated = [*of_target, "--poses", options.held_out, "--json", errors, "--overwrite"]
+    seconds["evaluate"] = verb("evaluate", rig, model, *evaluated)
+    verb("bind", rig, model, bound, "--object", "arm", "--overwrite")
+    found = json.loads(errors.read_text(encoding="utf-8"))
+    index = json.loads((recording / "recording.json").read_text(encoding="utf-8"))
+    result = {
+        "blender": bpy.app.version_string,
+        "kind": options.kind,
+        "poses": options.poses,
+        "unsettled": len(index.get("unsettled", ())),
+        "linear_mm": found["linear"],
+        "fdda_mm": found["fdda"],
+        "part": found["fdda"]["mean"] / found["linear"]["mean"],
+        "repeats": index.get("repeats"),
+        "simulation_ms": frame_ms(rig, FLESH, "arm"),
+        "model_ms": frame_ms(bound, "arm", FLESH),
+        "seconds": seconds,
+    }
+    result["faster"] = result["simulation_ms"] / result["model_ms"]
+    (out / "simulation.json").write_text(json.dumps(result, indent=1), encoding="utf-8")
+    print(json.dumps(result, indent=1))
+
+
+if __name__ == "__main__":
+    main()

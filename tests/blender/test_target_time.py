@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Targets that depend on time: frames in their order, pre-roll, poses that are held until a simulation rests."""
+
+import json
+import shutil
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from blend_fixtures.characters import targets
+from blend_fixtures.elbow import ACTION, FRAMES
+from fdda_addon.core.recording.reader import open_recording, read_recording
+from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.recording.run import record
+from fdda_addon.rig.target_time import TargetSettings
+from fdda_addon.scene.scene_rig import find_rig
+
+from .conftest import evaluated, run
+from .refusals import Refusal
+from .scene_state import assert_same_state, drain, scene_state
+from .test_targets import built, complex_positions, of_flesh, recorded, refused
+
+SIMULATIONS = (targets.target_soft_body, targets.target_cloth, targets.target_geometry_nodes)
+SETTLED = ("--target", "flesh", "--settle", 80)
+
+
+@pytest.fixture
+def refusal(tmp_path, capfd) -> Refusal:
+    return Refusal(tmp_path, capfd)
+
+
+def played(rig: Path) -> np.ndarray:
+    """(F, V, 3), what the flesh shows when the action plays from the first frame, as a user plays it."""
+    bpy.ops.wm.open_mainfile(filepath=str(rig))
+    found = []
+    for frame in range(1, FRAMES + 1):
+        bpy.context.scene.frame_set(frame)
+        found.append(evaluated(bpy.data.objects["flesh"]))
+    return np.stack(found)
+
+
+@pytest.mark.parametrize("build", SIMULATIONS)
+def test_a_simulation_is_recorded_as_it_plays(build, tmp_path):
+    rig = built(build, tmp_path / "rig.blend")
+    recording = of_flesh(rig, tmp_path / "recording")
+    assert recording.info.target.follows == "simulation"
+    assert np.abs(complex_positions(recording) - played(rig)).max() < 1e-5
+    # The second time what the simulation has kept is of the first.
+    again = of_flesh(rig, tmp_path / "again")
+    assert np.array_equal(recording.residuals, again.residuals)
+
+
+def test_frames_after_the_first_of_a_cache_are_walked_to(tmp_path):
+    def start_earlier() -> None:
+        targets.target_soft_body().modifiers["Softbody"].point_cache.frame_start = -9
+
+    early = of_flesh(built(start_earlier, tmp_path / "early.blend"), tmp_path / "early")
+    late = of_flesh(built(targets.target_soft_body, tmp_path / "late.blend"), tmp_path / "late")
+    # Ten frames in the first pose let the flesh sag.
+    lengths = [np.linalg.norm(recording.residuals[0], axis=1).max() for recording in (early, late)]
+    assert lengths[0] > 0.003 and lengths[1] < 1e-5
+
+
+@pytest.mark.parametrize("build", SIMULATIONS[:2])
+def test_a_pre_roll_goes_from_rest_to_the_first_pose(build, tmp_path):
+    rig = built(build, tmp_path / "rig.blend")
+    recording = of_flesh(rig, tmp_path / "recording", "--pre-roll", 20)
+    assert recording.info.target.pre_roll == 20
+    without = of_flesh(rig, tmp_path / "without")
+    assert np.array_equal(recording.pose_matrices, without.pose_matrices)
+    assert np.linalg.norm(recording.residuals[0], axis=1).max() > 0.001
+    assert np.linalg.norm(without.residuals[0], axis=1).max() < 1e-5
+    # What the pose is before does not matter: it begins at rest.
+    bpy.ops.wm.open_mainfile(filepath=str(rig))
+    before = scene_state(find_rig("elbow"))
+    settings = RecordingSettings(poses=0, actions=(ACTION,), target=TargetSettings("flesh", pre_roll=20))
+    drain(record(find_rig("elbow"), tmp_path / "third", settings))
+    assert_same_state(before, scene_state(find_rig("elbow")))
+    cache = bpy.data.objects["flesh"].modifiers[-1].point_cache
+    assert (cache.frame_start, cache.frame_end) == (1, 250)
+    assert np.array_equal(read_recording(tmp_path / "third").residuals, recording.residuals)
+
+
+def test_a_pre_roll_of_geometry_nodes_lacks_frames(refusal, tmp_path):
+    rig = built(targets.target_geometry_nodes, tmp_path / "rig.blend")
+    assert refused(refusal, rig, "--pre-roll", 5) == (
+        f"A pre-roll of 5 frames before frame 1 of '{ACTION}' begins before frame 0, where Blender simulates no "
+        "Geometry Nodes; move the action to later frames."
+    )
+
+
+def test_frames_that_a_simulation_does_not_have(refusal, tmp_path):
+    def end_early() -> None:
+        targets.target_cloth().modifiers["Cloth"].point_cache.frame_end = 20
+
+    text = refused(refusal, built(end_early, tmp_path / "cloth.blend"))
+    assert f"has the frames 1 to {FRAMES}, and the modifier 'Cloth' of 'flesh' has those from 1 to 20;" in text
+
+    def short_scene() -> None:
+        targets.target_geometry_nodes()
+        bpy.context.scene.frame_end = 25
+
+    text = refused(refusal, built(short_scene, tmp_path / "nodes.blend"))
+    assert "the modifier 'Lag' of 'flesh' has those from 1 to 25;" in text
+
+
+def test_random_poses_of_a_simulation_have_to_settle(refusal, tmp_path):
+    rig = built(targets.target_cloth, tmp_path / "rig.blend")
+    assert refused(refusal, rig, "--poses", 5).startswith(
+        "The target 'flesh' is a simulation (the modifier 'Cloth' of 'flesh'): what it shows in a random pose depends"
+    )
+    assert refused(refusal, rig, "--poses", 5, "--settle", 9).startswith(
+        f"Settled poses are random ones, and '{ACTION}' is to be recorded too, frame by frame;"
+    )
+
+
+def test_a_simulation_that_does_not_move(refusal, tmp_path):
+    def hold() -> None:
+        targets.target_cloth().modifiers["Armature"].show_viewport = False
+        bpy.data.objects["flesh"].modifiers["Cloth"].settings.effector_weights.gravity = 0
+
+    rig = built(hold, tmp_path / "rig.blend")
+    assert refused(refusal, rig).startswith("The target 'flesh' does not move while 'elbow' does, by ")
+
+
+@pytest.mark.parametrize("build", SIMULATIONS)
+def test_a_settled_pose_depends_on_the_pose_alone(build, tmp_path):
+    rig = built(build, tmp_path / "rig.blend")
+    recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 6)
+    assert recording.info.unsettled == ()
+    target = json.loads((tmp_path / "recording" / "recording.json").read_text())["target"]
+    assert target == {"object": "flesh", "follows": "simulation", "pre_roll": 0, "settle": 80, "still_mm": 0.1}
+    # Other poses before it, or none.
+    assert run("record", rig, tmp_path / "half", "--object", "elbow", *SETTLED, "--poses", 6, "--shard", "2/2") == 0
+    half = open_recording(tmp_path / "half")
+    assert np.array_equal(half.pose_matrices, recording.pose_matrices[3:])
+    assert np.array_equal(half.residuals, recording.residuals[3:])
+
+
+def test_settling_resumes_where_it_was_killed(tmp_path):
+    rig = built(targets.target_cloth, tmp_path / "rig.blend")
+    whole = recorded(rig, tmp_path / "whole", *SETTLED, "--poses", 8)
+    bpy.ops.wm.open_mainfile(filepath=str(rig))
+    settings = RecordingSettings(poses=8, target=TargetSettings("flesh", settle=80))
+    steps = record(find_rig("elbow"), tmp_path / "parts", settings)
+    for step in steps:
+        if (step.stage, step.done) == ("poses", 3):
+            # What a kill leaves: nothing is closed.
+            shutil.copytree(tmp_path / "parts", tmp_path / "killed")
+            break
+    steps.close()
+    (tmp_path / "killed" / "recording.lock").unlink()
+    left = json.loads((tmp_path / "killed" / "recording.json").read_text())["complete"]
+    assert left >= 2
+    assert run("record", rig, tmp_path / "killed", "--object", "elbow", *SETTLED, "--poses", 8, "--resume") == 0
+    for name in ("pose_matrices.npy", "residuals.npy", "recording.json"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    assert len(whole.residuals) == 8
+
+
+def test_poses_that_do_not_settle_are_named(tmp_path, capfd):
+    rig = built(targets.target_soft_body, tmp_path / "rig.blend")
+    hasty = "--target", "flesh", "--settle", 12, "--poses", 5
+    recording = recorded(rig, tmp_path / "recording", *hasty)
+    assert recording.info.unsettled == (0, 1, 2, 3, 4)
+    assert "5 of 5 poses did not come to rest in 12 frames: 0, 1, 2 and 2 more" in capfd.readouterr().out
+    shards = [tmp_path / f"shard{number}" for number in (1, 2)]
+    for number, shard in enumerate(shards, 1):
+        assert run("record", rig, shard, "--object", "elbow", *hasty, "--shard", f"{number}/2") == 0
+    assert run("merge-recordings", *shards, tmp_path / "merged") == 0
+    for name in ("pose_matrices.npy", "residuals.npy", "recording.json"):
+        assert (tmp_path / "merged" / name).read_bytes() == (tmp_path / "recording" / name).read_bytes(), name
+
+
+def test_a_settled_model_is_evaluated_against_settled_poses(tmp_path):
+    rig = built(targets.target_cloth, tmp_path / "rig.blend")
+    recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 40)
+    model, errors = tmp_path / "elbow.onnx", tmp_path / "errors.json"
+    assert run("train", recording.path, model, "--epochs", 60) == 0
+    options = ["--object", "elbow", *SETTLED, "--poses", 6, "--json", errors]
+    assert run("evaluate", rig, model, *options) == 0
+    found = json.loads(errors.read_text())
+    assert found["fdda"]["mean"] < found["linear"]["mean"]
+
+
+def test_other_simulations_are_not_disturbed(tmp_path):
+    def with_flag() -> None:
+        targets.target_cloth()
+        mesh = bpy.data.meshes.new("flag")
+        mesh.from_pydata([(x / 9, 2.0, y / 9) for x in range(10) for y in range(10)], [],
+                         [(i * 10 + j, i * 10 + j + 1, i * 10 + j + 11, i * 10 + j + 10)
+                          for i in range(9) for j in range(9)])  # fmt: skip
+        flag = bpy.data.objects.new("flag", mesh)
+        bpy.context.scene.collection.objects.link(flag)
+        flag.modifiers.new("Cloth", "CLOTH")
+
+    rig = built(with_flag, tmp_path / "rig.blend")
+    bpy.ops.wm.open_mainfile(filepath=str(rig))
+    for frame in range(1, 13):
+        bpy.context.scene.frame_set(frame)
+    before = evaluated(bpy.data.objects["flag"])
+    settings = RecordingSettings(poses=4, target=TargetSettings("flesh", settle=40))
+    drain(record(find_rig("elbow"), tmp_path / "recording", settings))
+    assert bpy.context.scene.frame_current == 12
+    assert np.array_equal(evaluated(bpy.data.objects["flag"]), before)
+    assert np.abs(before - np.array([v.co for v in bpy.data.objects["flag"].data.vertices])).max() > 0.01
