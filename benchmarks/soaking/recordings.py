@@ -94,7 +94,7 @@ def mutate(random: np.random.Generator, recording: Path) -> str:
         return f"bytes of {path.name}"
     try:
         array = np.load(path)
-    except ValueError:
+    except (ValueError, EOFError):
         return f"{path.name} is none"
     if kind == 6:
         shape = list(array.shape)
