@@ -82,7 +82,9 @@ def _draw_side_by_side(layout: bpy.types.UILayout, context: bpy.types.Context, s
     shown = side_by_side.way_of(scene_rig.mesh_object)
     for way, text in (("NONE", "Off"), ("BESIDE", "Beside"), ("OVERLAY", "Overlay")):
         button = row.operator("fdda.compare", text=text, depress=shown == way)
-        button.way, button.all_meshes = way, together(context) > 0
+        button.way = way
+        if together(context):
+            button.all_meshes = True
 
 
 def _draw_figures(
