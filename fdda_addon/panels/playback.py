@@ -139,11 +139,18 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         times = frame_times.of(mesh_object)
         if times is not None:
             grid = body.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
-            for label, value in (("Rig", times.rig), ("Armature alone", times.linear), ("FDDA", times.fdda)):
+            for label, value in (
+                ("Rig", f"{times.rig:.2f} ms"),
+                ("Armature alone", f"{times.linear:.2f} ms"),
+                ("FDDA", f"{times.fdda:.2f} ms"),
+                ("… without its model", f"{times.floor:.2f} ms"),
+                ("The model alone", f"{times.inference:.2f} ms"),
+                *((("It reads", f"{times.constant_bytes / 1e6:.1f} MB"),) if times.constant_bytes else ()),
+            ):
                 grid.label(text=label)
                 number = grid.row()
                 number.alignment = "RIGHT"
-                number.label(text=f"{value:.2f} ms")
+                number.label(text=value)
             draw_sentence(body, context, times.sentence, "INFO" if times.fdda < times.rig else "ERROR")
         body.operator("fdda.measure_model", text="Measure Again" if times else "Measure", icon="TIME")
 

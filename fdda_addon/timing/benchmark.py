@@ -26,13 +26,13 @@ from ..scene.armature import Poser, clear_pose
 from ..scene.borrow import assign_action, borrowed_attributes, borrowed_pose
 from ..scene.comparison import hidden_comparisons
 from ..scene.scene_rig import SceneRig, armature_modifier
+from .frame_times import FrameTimes, verdict
 
 ROUNDS = 5
 """How often the ways take turns."""
 WARM_UP = 3
 RANDOM_POSES, KEY_STEP = 20, 5
 """Poses of the animation of a rig that has none, and the frames between them."""
-WORTH_IT = 1.0
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,7 @@ class Benchmark:
         rig: all modifiers of the rig. linear: its Armature modifier alone. fdda: the model in their place.
         floor: as fdda, with constant positions in place of the model's.
         inference: the model alone, one pose.
+        constant_bytes: of the model's graph, all of which a frame reads; 0 where the model does not say.
     """
 
     vertices: int
@@ -53,6 +54,15 @@ class Benchmark:
     fdda: list[float]
     floor: list[float]
     inference: list[float]
+    constant_bytes: int
+
+    def frame_times(self, model: str) -> FrameTimes:
+        """The medians, for a model's file."""
+        return FrameTimes(
+            **{way: float(np.median(times)) for way, times in self._times()},
+            constant_bytes=self.constant_bytes,
+            model=model,
+        )
 
     @property
     def ratio(self) -> float:
@@ -70,13 +80,15 @@ class Benchmark:
             "cores": os.cpu_count(),
             **{way: {"median": _round(np.median(t)), "p90": _round(np.percentile(t, 90))} for way, t in self._times()},
             "ratio": _round(self.ratio),
+            "pays": self.ratio > 1,
+            "constant_bytes": self.constant_bytes,
         }
 
     def _times(self) -> list[tuple[str, list[float]]]:
         return [(way, getattr(self, way)) for way in ("rig", "linear", "fdda", "floor", "inference")]
 
     def table(self) -> str:
-        """The times as text, and a sentence where the model is not worth it."""
+        """The times as text, and whether the model pays."""
         labels = {
             "rig": "true rig",
             "linear": "Armature modifier alone",
@@ -87,9 +99,9 @@ class Benchmark:
         lines = [f"{self.vertices} vertices, ms a frame{'median':>12}{'p90':>10}"]
         for way, times in self._times():
             lines.append(f"  {labels[way]:<27}{np.median(times):>10.3f}{np.percentile(times, 90):>10.3f}")
-        lines.append(f"  FDDA is {self.ratio:.2f} times as fast as the rig.")
-        if self.ratio < WORTH_IT:
-            lines.append("  It is not worth it here: the modifiers of this rig cost less than a model's playback.")
+        if self.constant_bytes:
+            lines.append(f"  {'a frame reads of the model, MB':<31}{self.constant_bytes / 1e6:>6.2f}")
+        lines.append(f"  {verdict(float(np.median(self.rig)), float(np.median(self.fdda)))}")
         return "\n".join(lines)
 
 
@@ -131,7 +143,13 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
         pose = network.info.rest_matrices[None]
         controls = np.zeros((1, len(network.info.controls)), np.float32)
         inference = _time([lambda: network.positions(pose, controls)] * (frames + WARM_UP))[WARM_UP:]
-    yield Benchmark(len(mesh_object.data.vertices), each * ROUNDS, **times, inference=inference)
+    yield Benchmark(
+        len(mesh_object.data.vertices),
+        each * ROUNDS,
+        **times,
+        inference=inference,
+        constant_bytes=network.info.constant_bytes,
+    )
 
 
 @contextmanager

@@ -2,38 +2,48 @@
 """What a frame of each mesh object took when it was last measured, for the sidebar; it lasts for the session."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import bpy
-
-if TYPE_CHECKING:  # Blender starts without numpy.
-    from .benchmark import Benchmark
 
 _kept: dict[int, "FrameTimes"] = {}
 
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """Milliseconds a frame, medians: of the rig, its Armature modifier alone, and the model; the model's file."""
+    """What a frame takes, medians in milliseconds.
+
+    Attributes:
+        rig: with all modifiers of the rig. linear: with its Armature modifier alone. fdda: with the model.
+        floor: as fdda, with a model that costs nothing: Blender's part.
+        inference: the model alone, one pose.
+        constant_bytes: that the model reads in a frame; 0 where it does not say.
+        model: the model's file.
+    """
 
     rig: float
     linear: float
     fdda: float
+    floor: float
+    inference: float
+    constant_bytes: int
     model: str
 
     @property
     def sentence(self) -> str:
-        """What the times mean."""
-        if self.fdda >= self.rig:
-            return "Not worth it here: the modifiers of this rig cost less than the playback of a model."
-        return f"FDDA is {self.rig / self.fdda:.1f} times as fast as the rig."
+        """Whether the model pays."""
+        return verdict(self.rig, self.fdda)
 
 
-def keep(mesh_object: bpy.types.Object, measured: "Benchmark") -> FrameTimes:
+def verdict(rig: float, fdda: float) -> str:
+    """Whether a model pays that takes so many milliseconds a frame in place of the rig's."""
+    if fdda >= rig:
+        return "Not worth it here: the modifiers of this rig cost less than the playback of a model."
+    return f"FDDA is {rig / fdda:.1f} times as fast as the rig: it pays."
+
+
+def keep(mesh_object: bpy.types.Object, times: FrameTimes) -> None:
     """Note what was measured with the bound model."""
-    times = (sorted(getattr(measured, way))[len(getattr(measured, way)) // 2] for way in ("rig", "linear", "fdda"))
-    _kept[mesh_object.session_uid] = FrameTimes(*times, mesh_object.fdda.model)
-    return _kept[mesh_object.session_uid]
+    _kept[mesh_object.session_uid] = times
 
 
 def of(mesh_object: bpy.types.Object) -> FrameTimes | None:

@@ -185,7 +185,18 @@ def test_benchmark(elbow, tmp_path, capfd):
     assert run("benchmark", elbow.rig, elbow.model, "--json", path, "--frames", 12) == 0
     report = json.loads(path.read_text())
     ways = ["rig", "linear", "fdda", "floor", "inference"]
-    assert list(report) == ["unit", "vertices", "frames", "blender", "processor", "cores", *ways, "ratio"]
+    assert list(report) == [
+        "unit",
+        "vertices",
+        "frames",
+        "blender",
+        "processor",
+        "cores",
+        *ways,
+        "ratio",
+        "pays",
+        "constant_bytes",
+    ]
     assert (report["unit"], report["vertices"], report["frames"]) == ("ms", 300, 15)
     assert report["blender"] == bpy.app.version_string
     for way in ways:
@@ -193,8 +204,10 @@ def test_benchmark(elbow, tmp_path, capfd):
     assert report["linear"]["median"] < report["rig"]["median"]
     assert report["ratio"] == pytest.approx(report["rig"]["median"] / report["fdda"]["median"], rel=0.05)
     out = capfd.readouterr().out
-    assert f"FDDA is {report['ratio']:.2f} times as fast as the rig." in out
-    assert ("It is not worth it here" in out) == (report["ratio"] < 1)
+    assert report["pays"] == (report["ratio"] > 1) == ("times as fast as the rig: it pays." in out)
+    assert report["pays"] != ("Not worth it here" in out)
+    assert report["constant_bytes"] == Network(elbow.model).info.constant_bytes > 10_000
+    assert f"{report['constant_bytes'] / 1e6:.2f}" in out
 
 
 def test_an_action_alone_is_what_it_is_beside_held_out_poses(rig, elbow):

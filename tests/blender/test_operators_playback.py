@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.runtime import nodes, trust
+from fdda_addon.runtime import model_files, nodes, trust
 from fdda_addon.runtime.network import Network
 from fdda_addon.timing import frame_times
 
@@ -72,7 +72,8 @@ def test_a_model_of_another_rig_leaves_the_bound_one(bound, elbow):
     bpy.context.view_layer.objects.active = bound
     bound.data.vertices[0].co.x += 0.1
     refused(lambda: bpy.ops.fdda.bind(filepath=str(elbow.model)), "the rest pose of the mesh differs")
-    assert bound.fdda.is_bound and bound.fdda.mode == "FDDA"
+    # The bound one is not of this mesh any more either: it is kept, and the rig shows.
+    assert bound.fdda.is_bound and bound.fdda.mode == "RIG" and "the rest pose of the mesh" in bound.fdda.status
 
 
 def test_undo_of_bind_and_unbind(rig, elbow):
@@ -124,7 +125,8 @@ def test_measure(bound):
     assert frame_times.of(bound) is None
     assert bpy.ops.fdda.measure_model(frames=5) == {"FINISHED"}
     times = frame_times.of(bound)
-    assert min(times.rig, times.linear, times.fdda) > 0
+    assert min(times.rig, times.linear, times.fdda, times.floor, times.inference) > 0
+    assert times.constant_bytes == model_files.network_of(bound).info.constant_bytes > 0
     worth = times.rig > times.fdda
     assert times.sentence.startswith("FDDA is" if worth else "Not worth it here")
     assert bound.fdda.mode == "LINEAR" and bound.fdda.is_bound and bound.fdda.model == "//elbow.onnx"
