@@ -79,6 +79,9 @@ def _key(kind: str, text: str) -> str:
     return f'<span class="key" style="background: var(--{kind})"></span>{text}'
 
 
+REPEATED = "mean distance between two ways to the same pose: no model can be closer"
+
+
 def _head(report: dict) -> str:
     held_out, linear, training = report["fdda"]["held_out"], report["linear"]["held_out"], report["training"]
     cards = [
@@ -86,6 +89,7 @@ def _head(report: dict) -> str:
             _mm(held_out["mean"]),
             f"held-out mean error, {_share(held_out['mean'], linear['mean'])} of the linear layer's",
         ),
+        *([(_mm(report["repeats"]["apart_mm"]["mean"]), REPEATED)] if "repeats" in report else []),
         (_mm(held_out["p999"]), f"99.9 % of vertices below; linear layer {_mm(linear['p999'])}"),
         (_mm(held_out["max"]), f"largest error, {_share(held_out['max'], linear['max'])} of the linear layer's"),
         (f"{training['seconds']:.0f} s", f"training on {escape(training['device'])}, {training['epochs']} epochs"),

@@ -29,7 +29,10 @@ def run(options: argparse.Namespace) -> None:
 
     if options.json:
         check_outputs({options.json: WARNINGS}, overwrite=options.overwrite)
-    warnings = check_recording(read_recording(options.recording))
+    recording = read_recording(options.recording)
+    if recording.info.repeats:
+        print(recording.info.repeats.sentence())
+    warnings = check_recording(recording)
     for warning in warnings:
         print(warning)
     if options.json:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     from .files import add_rig
-    from .target import add_target
+    from .target import add_repeats, add_target
 
     add_rig(parser)
     parser.add_argument(
@@ -105,6 +105,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--influences", metavar="FOLDER", type=Path, help="take them from what --influences-only made of the same rig"
     )
     add_target(parser)
+    add_repeats(parser)
     parser.add_argument(
         "--refine", metavar="MODEL.onnx", type=Path, help="add poses to the recording where this model is worst"
     )
@@ -186,6 +187,8 @@ def run(options: argparse.Namespace) -> None:
             for line in (merges_in_words(index, options.least_vertices), unsettled_in_words(index)):
                 if line:
                     print(line)
+            if repeats := read_info(index).repeats:
+                print(repeats.sentence())
         done = "influences" if options.influences_only else f"{step.total} poses{' added' if options.refine else ''}"
         print(f"{recording}: {done} in {seconds:.1f} s")
 

@@ -4,12 +4,24 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from ..core.defaults import STILL_MM
+from ..core.defaults import REPEATS, STILL_MM
 from ..core.errors import WrongUsageError
 
 if TYPE_CHECKING:
     from ..rig.target_time import TargetSettings
     from ..scene.scene_rig import SceneRig
+
+
+def add_repeats(parser: argparse.ArgumentParser) -> None:
+    """Declare `--repeats`."""
+    parser.add_argument(
+        "--repeats",
+        type=int,
+        default=REPEATS,
+        metavar="N",
+        help="approach N of the poses that settle from another direction as well, to say how close a model can come "
+        f"(default {REPEATS})",
+    )
 
 
 def add_target(parser: argparse.ArgumentParser) -> None:
@@ -52,11 +64,12 @@ def target_settings(options: argparse.Namespace) -> "TargetSettings":
     """
     from ..rig.target_time import TargetSettings
 
-    if options.pre_roll < 0 or options.settle < 0 or not 0 < options.still_mm < float("inf"):
-        raise WrongUsageError("--pre-roll and --settle must be 0 or more, and --still-mm more than 0.")
+    repeats = getattr(options, "repeats", 0)
+    if min(options.pre_roll, options.settle, repeats) < 0 or not 0 < options.still_mm < float("inf"):
+        raise WrongUsageError("--pre-roll, --settle and --repeats must be 0 or more, and --still-mm more than 0.")
     if (options.pre_roll or options.settle) and not options.target:
         raise WrongUsageError("--pre-roll and --settle are about a target; give --target OBJECT.")
-    return TargetSettings(options.target, options.pre_roll, options.settle, options.still_mm)
+    return TargetSettings(options.target, options.pre_roll, options.settle, options.still_mm, repeats)
 
 
 def poses_of(scene_rig: "SceneRig", options: argparse.Namespace) -> int | None:

@@ -17,6 +17,8 @@ REFINEMENT_POSES = 250
 """Poses that are added where a model is worst."""
 STILL_MM = 0.1
 """A target that poses are held for is at rest when no vertex moves by more from a frame to the next."""
+REPEATS = 10
+"""Poses that are approached from another direction as well."""
 
 TOLERANCE_MM = 0.04
 """What the basis shapes may leave, over the whole mesh."""

@@ -10,10 +10,13 @@ from ..core.poses import CONTROL, Channel, sample_pose
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
 from ..poses.suspended_limits import SuspendedLimits
-from ..rig.target_time import DIRECT, Approach, way
+from ..rig.target_time import DIRECT, Approach, Settled, way
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
 from .plan import RecordingSettings, planned_margin
+
+REPEAT_INDEX = 1 << 36
+"""Poses that are passed through are drawn from indices that neither a recording nor an evaluation reaches."""
 
 
 class PosePlan:
@@ -66,7 +69,7 @@ class PosePlan:
             set_pose = self._setter(self._channels)
             for index in range(inside):
                 if index in wanted:
-                    self._reach(self._channels, index, set_pose)
+                    self.approach.reach(self._way_to(self._channels, index, set_pose))
                     yield index
             if margin:
                 set_pose = self._setter(margin.channels)
@@ -78,7 +81,7 @@ class PosePlan:
 
                     for index in range(inside, poses):
                         if index in wanted:
-                            self._reach(margin.channels, index, set_beyond)
+                            self.approach.reach(self._way_to(margin.channels, index, set_beyond))
                             yield index
         first = poses
         for clip in self._clips:
@@ -87,10 +90,18 @@ class PosePlan:
                 yield first + number
             first += len(clip.frames)
 
-    def _reach(self, channels: tuple[Channel, ...], index: int, set_pose: Callable[[np.ndarray], None]) -> None:
-        """Bring the rigs from the rest pose to a random pose."""
+    def repeat(self, index: int) -> Settled:
+        """Hold a random pose within the range that is reached over another one, which no recording of this plan has."""
+        set_pose = self._setter(self._channels)
+        pose, over = (self._way_to(self._channels, number, set_pose) for number in (index, REPEAT_INDEX + index))
+        return self.approach.settler.settle(pose, over)
+
+    def _way_to(
+        self, channels: tuple[Channel, ...], index: int, set_pose: Callable[[np.ndarray], None]
+    ) -> Callable[[float], None]:
+        """Sets what part of the way from the rest pose to a random pose is done, 0 to 1."""
         values = sample_pose(channels, self._settings.seed, index, self._settings.spread)
-        self.approach.reach(way(set_pose, np.array([channel.rest for channel in channels]), values))
+        return way(set_pose, np.array([channel.rest for channel in channels]), values)
 
     def _setter(self, channels: tuple[Channel, ...]) -> Callable[[np.ndarray], None]:
         """What poses the rigs, of channels that begin with those of the plan; what follows is of the armature."""

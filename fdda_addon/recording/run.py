@@ -33,6 +33,7 @@ from .mesh_group import common_armature, controls_of_each, in_passes
 from .phases import Fitted, Found, Planned, TimedEvaluator, estimate
 from .plan import RecordingSettings, planned_rig, planned_sampling
 from .pose_plan import PosePlan
+from .repeats import measure_repeats
 from .target_check import check_moves
 from .weight_fitting import check_has_weights, fit_weights, poses_to_fit
 
@@ -225,6 +226,9 @@ def _record_poses(
         with closing(left), closing(append_poses(left, appenders)) as steps:
             for done in steps:
                 yield Progress("poses", done, len(wanted), detail=str(settler.last) if settler else "")
+        if settler and settings.target.repeats and len(wanted) == plan.total:
+            yield from measure_repeats(meshes[0], plan, writer, settings.target.repeats)
+            yield Progress("poses", len(wanted), len(wanted))
 
 
 def _info(mesh: Found, settings: RecordingSettings, plan: PosePlan, wanted: range) -> RecordingInfo:

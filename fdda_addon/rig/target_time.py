@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from ..core.defaults import STILL_MM
+from ..core.defaults import REPEATS, STILL_MM
 from ..core.errors import RigError
 from ..core.recording.target import FRAMES, POSE, SIMULATION, RecordedTarget
 from ..poses.clip import Clip
@@ -34,12 +34,14 @@ class TargetSettings:
         pre_roll: frames before the first of an action, in which the rig goes from the rest pose to it.
         settle: frames for which a random pose is held at most until the target has come to rest; 0 for not at all.
         still_mm: it is at rest when no vertex moves by more from a frame to the next, mm.
+        repeats: how many of the poses that are held are approached from another direction as well.
     """
 
     name: str = ""
     pre_roll: int = 0
     settle: int = 0
     still_mm: float = STILL_MM
+    repeats: int = REPEATS
 
 
 OWN_SURFACE = TargetSettings()

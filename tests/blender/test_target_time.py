@@ -174,15 +174,45 @@ def test_poses_that_do_not_settle_are_named(tmp_path, capfd):
         assert (tmp_path / "merged" / name).read_bytes() == (tmp_path / "recording" / name).read_bytes(), name
 
 
-def test_a_settled_model_is_evaluated_against_settled_poses(tmp_path):
-    rig = built(targets.target_cloth, tmp_path / "rig.blend")
-    recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 40)
+def test_a_settled_model_is_evaluated_against_settled_poses(tmp_path, capfd):
+    rig = built(targets.target_soft_body, tmp_path / "rig.blend")
+    recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 40, "--repeats", 3)
+    repeats = recording.info.repeats
+    assert len(repeats.poses) == 3 and 0 <= repeats.apart_mm["mean"] < 0.2 * repeats.linear_mm
+    capfd.readouterr()
+    assert run("check-recording", recording.path) == 0
+    assert capfd.readouterr().out.startswith("The same pose from two directions: ")
+    assert recording.info.unsettled == ()
     model, errors = tmp_path / "elbow.onnx", tmp_path / "errors.json"
     assert run("train", recording.path, model, "--epochs", 60) == 0
     options = ["--object", "elbow", *SETTLED, "--poses", 6, "--json", errors]
     assert run("evaluate", rig, model, *options) == 0
     found = json.loads(errors.read_text())
     assert found["fdda"]["mean"] < found["linear"]["mean"]
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["repeats"] == repeats.to_json()
+    assert "two ways to the same pose" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_cloth_that_folds_one_way_or_the_other_is_named(tmp_path, capfd):
+    rig = built(targets.target_cloth, tmp_path / "rig.blend")
+    recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 16, "--repeats", 5)
+    assert recording.info.repeats.apart_mm["mean"] > 0.2 * recording.info.repeats.linear_mm
+    assert run("check-recording", recording.path) == 0
+    out = capfd.readouterr().out
+    assert "hysteresis" in out and "mm from itself when the same pose is reached from another direction" in out
+
+
+def test_repeats_are_measured_once_and_again_where_they_are_missing(tmp_path):
+    rig = built(targets.target_geometry_nodes, tmp_path / "rig.blend")
+    options = ["--object", "elbow", *SETTLED, "--poses", 6]
+    assert run("record", rig, tmp_path / "recording", *options, "--repeats", 0) == 0
+    assert read_recording(tmp_path / "recording").info.repeats is None
+    for _ in range(2):
+        assert run("record", rig, tmp_path / "recording", *options, "--repeats", 2, "--resume") == 0
+        repeats = read_recording(tmp_path / "recording").info.repeats
+        # It lags, and has no memory of the way once it rests.
+        assert len(repeats.poses) == 2 and repeats.apart_mm["max"] < 0.5
 
 
 def test_other_simulations_are_not_disturbed(tmp_path):

@@ -11,10 +11,12 @@ from .flips import check_flips
 from .poses import check_poses
 from .residual_scan import ResidualScan, scan_residuals
 from .rest import check_rest
+from .target import check_target
 from .warning import RecordingWarning, counted, joint_name, length, listed
 
 NAMES = (
     *("units", "axes", "large-residuals", "duplicate-poses", "hidden-inputs", "degenerate-poses", "flips"),
+    *("hysteresis", "frame-jumps", "frozen-frames", "target-place"),
     *("dead-controls", "dead-joints", "still-vertices", "small-partitions"),
 )
 """All names that a warning may have."""
@@ -45,6 +47,7 @@ def check_recording(recording: Recording) -> list[RecordingWarning]:
         *_check_large(recording, scan),
         *check_poses(recording),
         *check_flips(recording, scan),
+        *check_target(recording),
         *_check_controls(recording),
         *_check_joints(recording),
         *_check_still(recording, scan, moving),

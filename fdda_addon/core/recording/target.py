@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from ..rig import read_name
 
+STATISTICS = ("mean", "rms", "p99", "p999", "max")
 POSE, FRAMES, SIMULATION = "pose", "frames", "simulation"
 """What a target follows: the pose at once; the frame, as caches do; or the pose and what was before it."""
 FOLLOWS = (POSE, FRAMES, SIMULATION)
@@ -51,3 +52,43 @@ class RecordedTarget:
         if type(target.still_mm) not in (int, float) or not 0 <= target.still_mm < math.inf:
             raise ValueError(f"its target rests below {target.still_mm!r} mm")
         return target
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Poses that were approached from two directions: no model can be closer to a target than these are apart.
+
+    Attributes:
+        poses: their numbers.
+        apart_mm: distance of the vertices between the two, mm: mean, rms, percentiles 99 and 99.9, and largest.
+        linear_mm: mean distance of the target from the linear layer in these poses, mm.
+    """
+
+    poses: tuple[int, ...]
+    apart_mm: dict[str, float]
+    linear_mm: float
+
+    def to_json(self) -> dict:
+        return {"poses": list(self.poses), "apart_mm": self.apart_mm, "linear_mm": self.linear_mm}
+
+    @staticmethod
+    def from_json(value: dict, poses: int) -> "Repeats":
+        """ValueError, TypeError or KeyError where it is damaged; `poses` is how many there are."""
+        found = Repeats(
+            tuple(value["poses"]), {name: value["apart_mm"][name] for name in STATISTICS}, value["linear_mm"]
+        )
+        if not found.poses or not all(type(pose) is int and 0 <= pose < poses for pose in found.poses):
+            raise ValueError("its repeated poses are none of its poses")
+        for number in (*found.apart_mm.values(), found.linear_mm):
+            if type(number) not in (int, float) or not 0 <= number < math.inf:
+                raise ValueError(f"repeated poses are {number!r} mm apart")
+        return found
+
+    def sentence(self) -> str:
+        """What it comes to, for people."""
+        count = "1 pose" if len(self.poses) == 1 else f"{len(self.poses)} poses"
+        return (
+            f"The same pose from two directions: {self.apart_mm['mean']:.3g} mm apart on average, "
+            f"{self.apart_mm['max']:.3g} mm at most ({count}); the linear layer is {self.linear_mm:.3g} mm off. No "
+            "model can be closer than that."
+        )

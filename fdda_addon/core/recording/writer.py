@@ -22,8 +22,9 @@ from .arrays import ARRAYS, STREAMED, array_shapes, bad_pose, open_array, stream
 from .index import FORMAT, INDEX, VERSION, RecordingInfo, read_index
 from .lock import LOCK, RecordingLock
 from .reader import check_poses, check_resumable, partitions_json
+from .target import Repeats
 
-GROWS = ("complete", "unsettled")
+GROWS = ("complete", "unsettled", "repeats")
 """Keys of the index that change while poses are added."""
 
 
@@ -54,6 +55,7 @@ class RecordingWriter:
         self.path, self.rig, self.partitions, self.info = path, rig, partitions, info
         self.complete = 0
         self.unsettled: list[int] = []
+        self.repeats: Repeats | None = None
         self._faces, self._corners = len(rig.face_starts), len(rig.face_vertices)
         self._files: dict[str, io.BufferedRandom] = {}
         self._is_new = False
@@ -89,12 +91,14 @@ class RecordingWriter:
         # The scale of an object may be animated; no array depends on it.
         self.rig = replace(self.rig, metres_per_unit=read_unit(previous))
         own = self._index()
-        if different := [key for key in different_keys(previous, own) if key not in GROWS]:
+        if different := [key for key in different_keys(previous, own) if key.partition(".")[0] not in GROWS]:
             raise RecordingError(
                 f"Cannot resume '{self.path}': it was recorded with another {', '.join(different)}; "
                 "record with the same rig and options, or into another folder."
             )
         self.unsettled = list(previous.get("unsettled", ()))
+        if "repeats" in previous:
+            self.repeats = Repeats.from_json(previous["repeats"], previous["complete"])
         return previous["complete"]
 
     def _open_arrays(self) -> None:
@@ -175,6 +179,7 @@ class RecordingWriter:
             **({"fit": info.fit.to_json()} if info.fit else {}),
             **({"target": info.target.to_json()} if info.target else {}),
             **({"unsettled": list(self.unsettled)} if self.unsettled else {}),
+            **({"repeats": self.repeats.to_json()} if self.repeats else {}),
             # Through JSON and back, so that it compares equal with what was read.
             "sampling": json.loads(json.dumps(info.sampling.to_json())),
         }
@@ -213,6 +218,18 @@ class RecordingWriter:
         self.unsettled += [self.complete + number for number in unsettled]
         self.complete += len(pose_matrices)
         self._write_index()
+
+    def note_repeats(self, repeats: Repeats) -> None:
+        """Write what poses that were approached twice came to.
+
+        Raises:
+            OutputError: the disk is full or went away.
+        """
+        self.repeats = repeats
+        try:
+            self._write_index()
+        except OSError as error:
+            raise self._failed(error) from error
 
     def _failed(self, error: OSError) -> OutputError:
         kept = f"{self.complete} of {self.info.poses} poses are complete, continue with --resume"

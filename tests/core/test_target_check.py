@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What is said of a target: in the index of a recording, and by the checks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdda_addon.core.checks.target import check_target, unsettled_in_words
+from fdda_addon.core.recording.index import ACTION, Source
+from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.target import RecordedTarget, Repeats
+from fdda_addon.core.skinning import LinearLayer
+
+from .good_recording import good_recording, recorded_positions
+
+FRAMES = 40
+TARGET = RecordedTarget("flesh", "frames")
+
+
+@pytest.fixture
+def swinging() -> Recording:
+    """A chain that swings smoothly over the frames of an action, from frame 5 on; the target bulges with it."""
+    angles = 0.6 * np.sin(np.linspace(0, 6, FRAMES))[:, None] * np.ones(4)
+    recording = good_recording(angles=angles)
+    sampling = replace(recording.info.sampling, sources=(Source(ACTION, FRAMES, "swing", (5, 1)),))
+    controls = np.full((FRAMES, 1), 0.5, np.float32)
+    residuals = recording.residuals.copy()
+    residuals[:, :, 1] = 0
+    recording = replace(recording, controls=controls, residuals=residuals)
+    return replace(recording, info=replace(recording.info, sampling=sampling, target=TARGET))
+
+
+def shown(recording: Recording) -> np.ndarray:
+    layer = LinearLayer(recording.rig, recording.partitions)
+    return layer.complex_positions(recording.pose_matrices, recording.residuals)
+
+
+def only(recording: Recording, name: str) -> str:
+    (warning,) = check_target(recording)
+    assert warning.name == name
+    return warning.text
+
+
+def test_a_target_that_follows_is_good(swinging):
+    assert check_target(swinging) == []
+
+
+def test_a_recording_without_a_target_is_not_looked_at(swinging):
+    info = replace(swinging.info, target=None)
+    assert check_target(replace(recorded_positions(swinging, shown(swinging) * 100), info=info)) == []
+
+
+def test_a_cache_that_ends_before_the_action(swinging):
+    positions = shown(swinging)
+    positions[35:] = positions[34]
+    text = only(recorded_positions(swinging, positions), "frozen-frames")
+    assert text.startswith("The target stands still in 5 frames in which the rig moves: 'swing 40', 'swing 41', ")
+
+
+def test_a_frame_that_jumps(swinging):
+    positions = shown(swinging)
+    positions[20, 100] += (0.0, 0.3, 0.0)
+    text = only(recorded_positions(swinging, positions), "frame-jumps")
+    assert text.startswith("The target jumps in 2 frames, by up to 30")
+    assert "'swing 25'" in text and "'swing 26'" in text
+
+
+@pytest.mark.parametrize(("factor", "move"), [(100.0, 0.0), (0.01, 0.0), (1.0, 3.0)])
+def test_a_target_in_other_units_or_another_place(factor, move, swinging):
+    text = only(recorded_positions(swinging, shown(swinging) * factor + (move, 0, 0)), "target-place")
+    assert text.startswith("The target 'flesh' is ") and "it is in other units or another place" in text
+
+
+def test_the_same_pose_from_two_directions(swinging):
+    def with_repeats(mean: float) -> Recording:
+        statistics = {"mean": mean, "rms": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
+        return replace(swinging, info=replace(swinging.info, repeats=Repeats((1, 2), statistics, 5.0)))
+
+    assert check_target(with_repeats(0.9)) == []
+    assert only(with_repeats(1.1), "hysteresis").startswith("The target is 1.1 mm from itself when the same pose is")
+    sentence = with_repeats(1.1).info.repeats.sentence()
+    assert sentence.startswith("The same pose from two directions: 1.1 mm apart on average, 4 mm at most (2 poses);")
+
+
+def test_poses_that_did_not_settle_in_words():
+    assert unsettled_in_words({"complete": 9}) == ""
+    index = {"complete": 9, "unsettled": [1, 4], "target": {"settle": 30}}
+    assert unsettled_in_words(index).startswith("2 of 9 poses did not come to rest in 30 frames: 1 and 4. A training")
+
+
+def test_index_of_repeats():
+    statistics = {"mean": 0.5, "rms": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
+    repeats = Repeats((1, 2), statistics, 5.0)
+    assert Repeats.from_json(repeats.to_json(), 3) == repeats
+    for change in ({"poses": []}, {"poses": [3]}, {"apart_mm": statistics | {"max": -1}}, {"linear_mm": "5"}):
+        with pytest.raises((ValueError, TypeError)):
+            Repeats.from_json(repeats.to_json() | change, 3)
+
+
+def test_index_of_a_target():
+    settled = RecordedTarget("flesh", "simulation", 3, 60, 0.1)
+    assert RecordedTarget.from_json(settled.to_json()) == settled
+    assert RecordedTarget.from_json(TARGET.to_json()) == TARGET
+    for change in ({"follows": "wind"}, {"pre_roll": -1}, {"settle": 1.5}, {"still_mm": float("nan")}, {"object": 3}):
+        with pytest.raises((ValueError, TypeError)):
+            RecordedTarget.from_json(settled.to_json() | change)
