@@ -2,7 +2,7 @@
 """Records, binds and compares the characters of `rows`; the training in between is that of `training`."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
@@ -81,7 +81,7 @@ def compare_row(row: Row, folder: Path) -> list[Result]:
     bpy.ops.wm.open_mainfile(filepath=str(folder / "rig.blend"))
     rigs = [find_rig(name) for name in row.meshes]
     networks = [Network(model_path(row, folder, name)) for name in row.meshes]
-    errors = [_errors(scene_rig, network) for scene_rig, network in zip(rigs, networks, strict=True)]
+    errors = [_errors(row, scene_rig, network) for scene_rig, network in zip(rigs, networks, strict=True)]
     units = [metres_per_unit(scene_rig.mesh_object) for scene_rig in rigs]
     channels = model_channels(rigs[0], read_model_rig(rigs[0], networks[0].info), networks[0].info)
     for scene_rig, network in zip(rigs, networks, strict=True):
@@ -100,9 +100,12 @@ def compare_row(row: Row, folder: Path) -> list[Result]:
     ]
 
 
-def _errors(scene_rig: SceneRig, network: Network) -> tuple[float, float, float]:
+def _errors(row: Row, scene_rig: SceneRig, network: Network) -> tuple[float, float, float]:
     """`linear_mm`, `fdda_mm` and `moved_mm` of a Result."""
-    *_, evaluation = evaluate(scene_rig, network, HELD_OUT)
+    settings = replace(HELD_OUT, target=row.recording.target)
+    if not row.recording.poses:
+        settings = replace(settings, poses=0, actions=row.recording.actions)
+    *_, evaluation = evaluate(scene_rig, network, settings)
     held_out = evaluation.held_out
     rest = rest_positions(scene_rig.mesh_object.data)
     moved = distances(held_out.positions, rest, metres_per_unit(scene_rig.mesh_object))

@@ -4,16 +4,19 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from blend_fixtures.elbow import ACTION
 from fdda_addon.recording.plan import RecordingSettings
+from fdda_addon.rig.target_time import TargetSettings
 
-from . import control_rigs, controls, meshes, skinning, stacks, transforms
+from . import control_rigs, controls, meshes, skinning, stacks, targets, transforms
 
-SKINNING, MODIFIERS, CONTROL_RIGS, INPUTS, MESHES = (
+SKINNING, MODIFIERS, CONTROL_RIGS, INPUTS, MESHES, TARGETS = (
     "Skinning",
     "Modifiers",
     "Control rigs",
     "Inputs beside joints",
     "Meshes and objects",
+    "Targets",
 )
 POSES = 80
 FEW_MOVES = 4
@@ -57,6 +60,18 @@ def _limb(build: Callable[[], object], text: str, **settings: object) -> Row:
 
 def _tube(topic: str, build: Callable[[], object], text: str, **settings: object) -> Row:
     return Row(build.__name__, topic, text, build, **settings)
+
+
+def _frames(build: Callable[[], object], text: str) -> Row:
+    """A target that shows the frames of an action, and is compared on them."""
+    settings = _recording(poses=0, actions=(ACTION,), target=TargetSettings(targets.TARGET))
+    return _tube(TARGETS, build, f"{text}; learnt from an action, and compared on it", recording=settings)
+
+
+def _settled(build: Callable[[], object], text: str) -> Row:
+    """A simulation that is learnt and compared in poses that settle."""
+    target = TargetSettings(targets.TARGET, settle=80, repeats=0)
+    return _tube(TARGETS, build, f"{text}; poses settle", recording=_recording(poses=60, target=target))
 
 
 ROWS: tuple[Row, ...] = (
@@ -167,4 +182,18 @@ ROWS: tuple[Row, ...] = (
         meshes=("creature",),
         epochs=30,
     ),
+    _tube(
+        TARGETS,
+        targets.target_copy,
+        "a copy with delta mush is the target",
+        recording=_recording(target=TargetSettings(targets.TARGET)),
+    ),
+    _frames(targets.target_alembic, "an Alembic file is the target"),
+    _frames(targets.target_usd, "a USD file is the target"),
+    _frames(targets.target_pc2, "a .pc2 file is the target"),
+    _frames(targets.target_mdd, "an .mdd file is the target"),
+    _frames(targets.target_shape_keys, "keyed shape keys are the target"),
+    _settled(targets.target_soft_body, "a soft body is the target"),
+    _settled(targets.target_cloth, "cloth is the target"),
+    _settled(targets.target_geometry_nodes, "a simulation of Geometry Nodes is the target"),
 )

@@ -12,7 +12,7 @@ import pytest
 
 import fdda_addon
 from benchmarks.characters import END, START, table
-from blend_fixtures.characters import controls, skinning, stacks, transforms
+from blend_fixtures.characters import controls, skinning, stacks, targets, transforms
 from blend_fixtures.characters.comparison import compare_row, record_row
 from blend_fixtures.characters.rows import ROWS, Row
 from blend_fixtures.characters.training import Trainings
@@ -59,7 +59,7 @@ def test_a_character_is_learnt_and_played(row: Row, folder: Path):
 
 def test_every_character_of_the_folder_has_a_row():
     built = {row.build for row in ROWS}
-    assert built >= {*skinning.SKINNINGS, *stacks.STACKS, *controls.CONTROLS, *transforms.TRANSFORMS}
+    assert built >= {*skinning.SKINNINGS, *stacks.STACKS, *controls.CONTROLS, *transforms.TRANSFORMS, *targets.TARGETS}
     assert len({row.name for row in ROWS}) == len({row.text for row in ROWS}) == len(ROWS)
 
 

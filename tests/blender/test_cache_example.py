@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The example of docs/simulations.md, as a user runs it: a cache is made, its stack thrown away, the cache learnt."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import bpy
+import pytest
+
+from blend_fixtures.elbow import ACTION, FRAMES, build_elbow
+from fdda_addon.core.point_cache import PointCacheWriter
+from fdda_addon.scene.blend_file import save_copy
+from fdda_addon.scene.mesh import evaluated_positions
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLE = ROOT / "examples" / "cache" / "learn_from_cache.py"
+
+
+def make_cache(path: Path, mesh_object: bpy.types.Object) -> None:
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end = 1, FRAMES
+    for scene_object in scene.objects:
+        scene_object.select_set(scene_object == mesh_object)
+    if path.suffix == ".abc":
+        bpy.ops.wm.alembic_export(filepath=str(path), selected=True, start=1, end=FRAMES)
+        return
+    with open(path, "wb") as file:
+        writer = PointCacheWriter(file, len(mesh_object.data.vertices), 1, FRAMES)
+        for frame in range(1, FRAMES + 1):
+            scene.frame_set(frame)
+            writer.append(evaluated_positions(mesh_object, bpy.context.evaluated_depsgraph_get())[None])
+        writer.finish()
+    scene.frame_set(1)
+
+
+@pytest.mark.parametrize("suffix", ["abc", "pc2"])
+def test_a_cache_is_learnt_from_files_alone(suffix, tmp_path):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    mesh_object, _ = build_elbow()
+    cache, rig, out = tmp_path / f"elbow.{suffix}", tmp_path / "rig.blend", tmp_path / "out"
+    make_cache(cache, mesh_object)
+    mesh_object.modifiers.remove(mesh_object.modifiers["CorrectiveSmooth"])
+    save_copy(rig)
+    command = [sys.executable, EXAMPLE, rig, cache, out, "--object", "elbow", "--action", ACTION]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    errors = json.loads((out / "errors.json").read_text(encoding="utf-8"))
+    assert errors["poses"] == FRAMES
+    assert errors["fdda"]["mean"] < 0.15 * errors["linear"]["mean"]
