@@ -69,6 +69,9 @@ soak: .venv  ## hostile files, kills, full disks, frames, undo: what held and wh
 study: .venv  ## compare sizes and activations of the networks, into out/study (30 minutes)
 	.venv/bin/python benchmarks/study.py out/study
 
+simulation: .venv  ## learn flesh that Blender simulates, for docs/simulations.md, into out/simulation (20 minutes)
+	.venv/bin/python benchmarks/simulation.py out/simulation
+
 characters: .venv  ## record, train, bind and compare every kind of character on both LTS lines, for docs/characters.md
 	@$(MAKE) .venv-line LINE=$(OTHER_LINE)
 	.venv/bin/python benchmarks/characters.py out/characters
@@ -100,4 +103,4 @@ requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
 clean:  ## remove what was built and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-examples test-gui test-all test-line bench sampling soak study characters pictures map fixtures lint package requirements clean
+.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-examples test-gui test-all test-line bench sampling soak study simulation characters pictures map fixtures lint package requirements clean

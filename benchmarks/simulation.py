@@ -25,6 +25,8 @@ from fdda_addon.scene.blend_file import save_copy  # noqa: E402
 FLESH = "flesh"
 FRAMES = 60
 """Frames that are timed."""
+PICTURED = 10
+"""Held-out poses, of another seed, of which three are drawn."""
 
 
 def build(path: Path, kind: str) -> None:
@@ -104,6 +106,8 @@ def main() -> None:
     seconds["train"] = verb("train", recording, model)
     evaluated = [*of_target, "--poses", options.held_out, "--json", errors, "--overwrite"]
     seconds["evaluate"] = verb("evaluate", rig, model, *evaluated)
+    pictured = [*of_target, "--poses", PICTURED, "--json", out / "pictured.json", "--heatmap", out / "heat_map.png"]
+    verb("evaluate", rig, model, *pictured, "--seed", 2, "--overwrite")
     verb("bind", rig, model, bound, "--object", "arm", "--overwrite")
     found = json.loads(errors.read_text(encoding="utf-8"))
     index = json.loads((recording / "recording.json").read_text(encoding="utf-8"))

@@ -8,13 +8,11 @@ tells the steps.
 """
 
 import argparse
+import subprocess
 import sys
 from pathlib import Path
 
 import bpy
-
-import fdda_addon
-from fdda_addon.cli.main import main as verb
 
 TARGET = "target"
 
@@ -42,8 +40,9 @@ def import_cache(path: Path, mesh_object: bpy.types.Object) -> bpy.types.Object:
 
 def run(*arguments: object) -> None:
     """A verb of the command line; ends the program where it fails, after it has said why."""
-    if status := verb([str(argument) for argument in arguments], "fdda"):
-        sys.exit(status)
+    done = subprocess.run([sys.executable, "-m", "fdda_addon", *map(str, arguments)], check=False)
+    if done.returncode:
+        sys.exit(done.returncode)
 
 
 def main() -> None:
@@ -56,7 +55,6 @@ def main() -> None:
     options = parser.parse_args()
     out = options.out.resolve()
     (out / "model").mkdir(parents=True, exist_ok=True)
-    fdda_addon.register()
     bpy.ops.wm.open_mainfile(filepath=str(options.rig))
     import_cache(options.cache.resolve(), bpy.data.objects[options.object]).name = TARGET
     with_target = out / "target.blend"

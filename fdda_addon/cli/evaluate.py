@@ -65,8 +65,6 @@ def run(options: argparse.Namespace) -> None:
         strips=tuple(options.strip),
         target=target,
     )
-    if options.target and options.heatmap:
-        raise WrongUsageError("--heatmap draws the rig and its model, and no target; leave one of them out.")
     if options.target and len(rigs) > 1:
         raise WrongUsageError("--target is of one mesh; give --object.")
     evaluations = {name: run_evaluation(*rig_and_model, settings) for name, rig_and_model in rigs.items()}
@@ -75,7 +73,9 @@ def run(options: argparse.Namespace) -> None:
             from ..evaluation.pictures import draw_comparison, worst_poses
 
             ((name, (scene_rig, model)),) = rigs.items()
-            draw_comparison(scene_rig, model, worst_poses(evaluations[name].held_out), picture, heat=True)
+            true = f"target '{options.target}'" if options.target else "true rig"
+            poses = worst_poses(evaluations[name].held_out)
+            draw_comparison(scene_rig, model, poses, picture, heat=True, true=true)
         content = by_object({name: evaluation.to_json() for name, evaluation in evaluations.items()})
         errors.write_text(json_text(content), encoding="utf-8")
     for name, evaluation in evaluations.items():

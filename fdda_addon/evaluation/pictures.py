@@ -63,6 +63,7 @@ def draw_comparison(
     heat: bool,
     title: str = "",
     view: View = View(),  # noqa: B008 - frozen
+    true: str = "true rig",
 ) -> None:
     """Draw true rig, linear layer and model side by side, a row a pose.
 
@@ -71,6 +72,7 @@ def draw_comparison(
         poses: what to draw.
         path: of the PNG file.
         heat: colour each vertex by its distance from the true rig.
+        true: what the positions of the poses are of.
 
     Raises:
         ModelError: the model cannot be read, or is of another rig.
@@ -82,11 +84,11 @@ def draw_comparison(
     for pose in poses:
         linear = layer.positions(pose.pose_matrices[None])[0]
         fdda = network.positions(pose.pose_matrices[None], pose.controls[None])[0].copy()
-        cells = [(pose.positions, f"{pose.name}: true rig"), (linear, "linear layer"), (fdda, "FDDA")]
+        cells = [(pose.positions, f"{pose.name}: {true}"), (linear, "linear layer"), (fdda, "FDDA")]
         rows.append(
             [_cell(positions, pose.positions, label, heat, network.info.metres_per_unit) for positions, label in cells]
         )
-    title = title or ("Distance from the true rig" if heat else "True rig, linear layer and FDDA")
+    title = title or (f"Distance from the {true}" if heat else f"{true[0].upper()}{true[1:]}, linear layer and FDDA")
     draw(scene_rig.mesh_object.data, rows, path, title, view, heat_scale=heat, sculpted=not heat)
 
 

@@ -24,6 +24,7 @@ class PosePlan:
 
     Attributes:
         total: number of poses.
+        inside: how many random poses are within the range of motion, the first; those of a margin follow.
     """
 
     def __init__(
@@ -52,6 +53,7 @@ class PosePlan:
         self._owners = np.array([own for own, _ in found.values()], np.int64)
         self._channels = tuple(channel for _, channel in found.values())
         self._margin = planned_margin(self._rigs[0], settings, self._channels)
+        self.inside = settings.poses - (self._margin.poses if self._margin else 0)
 
     def channels_of(self, number: int) -> tuple[Channel, ...]:
         """The channels of the poses as the recording of a mesh has them: without those of other meshes."""
@@ -64,10 +66,9 @@ class PosePlan:
         Limit constraints that would hold a pose of the margin are off while it is shown.
         """
         poses, margin = self._settings.poses, self._margin
-        inside = poses - (margin.poses if margin else 0)
         with self.approach.borrowed():
             set_pose = self._setter(self._channels)
-            for index in range(inside):
+            for index in range(self.inside):
                 if index in wanted:
                     self.approach.reach(self._way_to(self._channels, index, set_pose))
                     yield index
@@ -79,7 +80,7 @@ class PosePlan:
                         set_pose(values)
                         limits.suspend(values)
 
-                    for index in range(inside, poses):
+                    for index in range(self.inside, poses):
                         if index in wanted:
                             self.approach.reach(self._way_to(margin.channels, index, set_beyond))
                             yield index

@@ -19,7 +19,7 @@ from .pose_plan import PosePlan
 def measure_repeats(mesh: Found, plan: PosePlan, writer: RecordingWriter, count: int) -> Iterator[Progress]:
     """Reach some poses of a recording over other ones, and note how far the target is from what was recorded.
 
-    Nothing is done where that was noted before. Poses that did not come to rest are not repeated.
+    Nothing is done where that was noted before. Poses that did not come to rest, and those of a margin, are not repeated.
 
     Args:
         mesh: whose poses were recorded.
@@ -30,7 +30,7 @@ def measure_repeats(mesh: Found, plan: PosePlan, writer: RecordingWriter, count:
     Yields:
         Progress of the stage "repeats".
     """
-    at_rest = sorted(set(range(writer.complete)) - set(writer.unsettled))
+    at_rest = sorted(set(range(min(writer.complete, plan.inside))) - set(writer.unsettled))
     if writer.repeats or not at_rest:
         return
     places = sorted({int(number * GOLDEN_RATIO * len(at_rest)) % len(at_rest) for number in range(count)})
