@@ -88,7 +88,7 @@ def test_shards_are_merged_without_blender(tmp_path):
 
 
 def test_the_examples_need_nothing_of_ours():
-    assert foreign_imports("examples", {"numpy", "onnxruntime"}) == []
+    assert foreign_imports("examples", {"numpy", "onnxruntime", "bpy"}) == []
 
 
 def test_every_file_of_the_addon_is_in_a_room():
