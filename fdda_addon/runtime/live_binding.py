@@ -47,6 +47,8 @@ class LiveBinding:
         was_executed: it had a job, since whoever asked set it back.
         execution: where its positions lie.
         graphs: addresses of the dependency graphs that know of it.
+        viewports: address of its evaluated mesh object in each graph of a viewport, by the address of the graph; kept
+            where it has shape keys.
         lock: to be held from `read` to `write`.
     """
 
@@ -79,6 +81,7 @@ class LiveBinding:
         self.job: Job | None = None
         self.was_executed = False
         self.graphs: set[int] = set()
+        self.viewports: dict[int, int] = {}
         # A render may evaluate on another thread while the window does.
         self.lock = threading.Lock()
         self._shown: tuple | None = None
@@ -264,7 +267,9 @@ class LiveBinding:
     def write(self, cache: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
         """Give an evaluated cache object the positions, also those it had: it may show those of the rest pose again."""
         set_mesh_positions(cache.data, self._positions)
-        _mute_shape_keys(mesh_object)
+        # Baking asks here too where renders show the rig, and needs the shape keys.
+        if mesh_object.as_pointer() in self.viewports.values():
+            _mute_shape_keys(mesh_object)
 
     def _mended(self, pose: np.ndarray, armature: str) -> np.ndarray:
         """A pose in which every joint is a number: one that is none moves as the next above it does."""
@@ -327,8 +332,8 @@ class LiveBinding:
 def _mute_shape_keys(mesh_object: bpy.types.Object) -> None:
     """Spare an evaluated object the mixing of its shape keys, which Blender does whether anything reads them or not.
 
-    Only evaluations in which the model is on come here, so one that shows the rig has its shape keys. What the user set
-    comes back when Blender copies the shape keys anew. Shape keys that another object has too stay as they are.
+    Viewports in which the model is on, so what shows the rig has its shape keys. What the user set comes back when
+    Blender copies the shape keys anew. Shape keys that another object has too stay as they are.
     """
     keys = mesh_object.data.shape_keys
     if keys is not None and mesh_object.original.data.users == 1:

@@ -54,6 +54,7 @@ def follow(depsgraph: bpy.types.Depsgraph) -> None:
             _drop(uid)
     scan()
     _greet(depsgraph)
+    _know_viewport(depsgraph)
     for live in list(_live.values()):
         mesh_object = live.find() if live.error or live.has_news else None
         if mesh_object is None:
@@ -78,6 +79,16 @@ def _greet(depsgraph: bpy.types.Depsgraph) -> None:
         for cache in [o for o in bpy.data.objects if o.session_uid in new]:
             _live[cache.session_uid].graphs.add(key)
             cache.data.update_tag()
+
+
+def _know_viewport(depsgraph: bpy.types.Depsgraph) -> None:
+    """Tell the live bindings that have shape keys what evaluates for a viewport: a getter does not learn for whom."""
+    if depsgraph.mode != "VIEWPORT":
+        return
+    for live in _live.values():
+        mesh_object = live.find()
+        if mesh_object is not None and mesh_object.data.shape_keys is not None:
+            live.viewports[depsgraph.as_pointer()] = mesh_object.evaluated_get(depsgraph).as_pointer()
 
 
 def _follow_mode(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What evaluates for renders and is no picture: OBJ, bakes; and pictures of poses that another add-on sets."""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from .conftest import ELBOW_RIG, assert_plays, evaluated, pose
+from .test_evaluations import handler, keyed
+from .test_renders import FRAME, animation, set_camera, still
+
+OBJ_DIGITS = 2e-6
+"""Metres: an OBJ file has six digits."""
+
+
+@pytest.fixture(params=[False, True], ids=["rig in renders", "model in renders"])
+def character(request, bound, elbow) -> tuple[bpy.types.Object, np.ndarray, np.ndarray]:
+    """The elbow with a shape key, posed; what renders show of it and what they do not."""
+    keyed(bound).fdda.use_in_render = request.param
+    bpy.data.objects[ELBOW_RIG].animation_data_clear()
+    pose(angle=1.1)
+    model = assert_plays(bound, elbow.model)
+    bound.fdda.mode = "RIG"
+    rig = evaluated(bound)
+    bound.fdda.mode = "FDDA"
+    bpy.context.view_layer.update()
+    return (bound, model, rig) if request.param else (bound, rig, model)
+
+
+def test_obj(character, tmp_path):
+    _, shown, other = character
+    path = tmp_path / "elbow.obj"
+    axes = {"forward_axis": "Y", "up_axis": "Z"}
+    bpy.ops.wm.obj_export(filepath=str(path), export_eval_mode="DAG_EVAL_RENDER", **axes)
+    lines = [line.split()[1:4] for line in path.read_text().splitlines() if line.startswith("v ")]
+    positions = np.array(lines, np.float64)
+    assert np.abs(positions - shown).max() < OBJ_DIGITS and np.abs(positions - other).max() > 1e-3
+
+
+def test_bake(character):
+    """Cycles bakes where each vertex is into a colour attribute."""
+    bound, shown, other = character
+    scene = bpy.context.scene
+    scene.render.engine, scene.cycles.samples = "CYCLES", 1
+    colours = bound.data.attributes.new("baked", "FLOAT_COLOR", "POINT")
+    bound.data.attributes.active_color = colours
+    if not bound.data.materials:
+        bound.data.materials.append(bpy.data.materials.new("plain"))
+    bpy.ops.object.select_all(action="DESELECT")
+    bound.select_set(True)
+    bpy.context.view_layer.objects.active = bound
+    bpy.context.view_layer.update()
+    assert bpy.ops.object.bake(type="POSITION", target="VERTEX_COLORS") == {"FINISHED"}
+    values = np.empty(4 * len(bound.data.vertices), np.float32)
+    bound.data.attributes["baked"].data.foreach_get("color", values)
+    positions = values.reshape(-1, 4)[:, :3]
+    assert np.abs(positions - shown).max() < 1e-4 < 1e-3 < np.abs(positions - other).max()
+
+
+def test_animations_of_poses_that_another_add_on_sets(bound, tmp_path):
+    """Each frame has its own pose, not that of the frame before."""
+    bound.fdda.use_in_render = True
+    bpy.data.objects[ELBOW_RIG].animation_data_clear()
+    set_camera()
+    bone = bpy.data.objects[ELBOW_RIG].pose.bones["lower"]
+    expected = {}
+    for frame in (FRAME - 1, FRAME, FRAME + 1):
+        bpy.context.scene.frame_set(frame)
+        pose(angle=frame % 3 * 0.5)
+        expected[frame] = still(Path(tmp_path / f"{frame}.png"))
+
+    def set_pose(scene, _graph):
+        bone.rotation_euler[0] = scene.frame_current % 3 * 0.5
+
+    with handler("frame_change_post", set_pose):
+        rendered = animation(tmp_path)
+    assert [frame for frame in expected if not np.array_equal(rendered[frame], expected[frame])] == []
+    assert not np.array_equal(expected[FRAME - 1], expected[FRAME])
