@@ -19,7 +19,8 @@ from .pose_plan import PosePlan
 def measure_repeats(mesh: Found, plan: PosePlan, writer: RecordingWriter, count: int) -> Iterator[Progress]:
     """Reach some poses of a recording over other ones, and note how far the target is from what was recorded.
 
-    Nothing is done where that was noted before. Poses that did not come to rest, and those of a margin, are not repeated.
+    Nothing is done where that was noted before. Poses that did not come to rest are not repeated,
+    and those of a margin neither.
 
     Args:
         mesh: whose poses were recorded.

@@ -86,7 +86,10 @@ class LiveBinding:
         self.lock = threading.Lock()
         self._shown: tuple | None = None
         self._positions: np.ndarray | None = None
-        self._sentence = self._news = self._rest_sentence()
+        self._sentence = self._news = ""
+        self.execution.poses[0] = info.rest_matrices
+        # The first pose is played when the handlers have been called already.
+        self._look_for_numbers(self.execution.run())
         self.connect(mesh_object, cache)
 
     def connect(self, mesh_object: bpy.types.Object, cache: bpy.types.Object) -> None:
@@ -260,6 +263,7 @@ class LiveBinding:
     def accept(self, execution: Execution, place: int) -> None:
         """Take the positions of `job` from an execution of several poses; they stay there while they are shown."""
         self.execution, self._positions = execution, execution.positions[place]
+        self._look_for_numbers(self._positions)
         if self.job.strength < 1 or self._mask is not None:
             strengths, blend = np.array([self.job.strength], np.float32), self._make_blend(self.job.scene_rig)
             self._positions = blend.apply(execution.positions[place : place + 1], self.job.pose[None], strengths)[0]
@@ -293,11 +297,12 @@ class LiveBinding:
             self._blend = Blend(replace(rig, rest_matrices=self.network.info.rest_matrices), self._mask)
         return self._blend
 
-    def _rest_sentence(self) -> str:
-        self.execution.poses[0] = self.network.info.rest_matrices
-        if np.isfinite(self.execution.run()).all():
-            return ""
-        return f"The model '{self.network.path.name}' gives positions that are not numbers; train it again."
+    def _look_for_numbers(self, positions: np.ndarray) -> None:
+        # A sum is the quickest way to find one that is none among many.
+        with np.errstate(all="ignore"):
+            total = positions.sum()
+        if not np.isfinite(total):
+            self._news = f"The model '{self.network.path.name}' gives positions that are not numbers; train it again."
 
     def _check_vertices(self, mesh_object: bpy.types.Object) -> None:
         count, expected = len(mesh_object.data.vertices), self.network.info.vertex_count
