@@ -77,8 +77,9 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
 
 
 def _draw_side_by_side(layout: bpy.types.UILayout, context: bpy.types.Context, scene_rig: SceneRig) -> None:
-    row = layout.row(align=True)
-    row.label(text="Show the Rig")
+    column = layout.column(align=True)
+    column.label(text="Show the Rig")
+    row = column.row(align=True)
     shown = side_by_side.way_of(scene_rig.mesh_object)
     for way, text in (("NONE", "Off"), ("BESIDE", "Beside"), ("OVERLAY", "Overlay")):
         button = row.operator("fdda.compare", text=text, depress=shown == way)

@@ -146,10 +146,10 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         draw_sentence(layout, context, f"Warning: {warning['name']}; the report says what to do.", "INFO")
     everything = report["fdda"]["held_out"]
     header, body = layout.panel("fdda_held_out", default_closed=True)
-    figures = f"mean {everything['mean']:.3f}, 99.9 % {everything['p999']:.2f}, max {everything['max']:.2f} mm"
-    header.label(text=f"Held-out error: {figures}")
+    header.label(text=f"Held-out mean {everything['mean']:.3f}, max {everything['max']:.2f} mm")
     if body is None:
         return
+    body.label(text=f"99.9 % within {everything['p999']:.2f} mm")
     body.label(text="By partition, worst first")
     partitions = sorted(report["partitions"], key=lambda p: -p["held_out"]["max"])
     shown = partitions if context.window_manager.fdda.show_all_partitions else partitions[:SHOWN_PARTITIONS]
