@@ -12,6 +12,11 @@ from .on_pose import OnPose
 AXES = "XYZ"
 
 
+def _counted(count: int, one: str = "has", many: str = "have") -> str:
+    """The beginning of a sentence about so many bones: "1 bone has", "4 bones have"."""
+    return f"1 bone {one}" if count == 1 else f"{count} bones {many}"
+
+
 class _OnSelected(OnPose):
     """Mixin for an operator on the ranges of the selected bones."""
 
@@ -91,7 +96,7 @@ class FDDA_OT_edit_ranges(_OnSelected, bpy.types.Operator):
         for bone in bones:
             for axis in (axis for axis in range(3) if self.axes[axis]):
                 state_rotation_range(bone, axis, self.low[axis], self.high[axis])
-        return f"{len(bones)} bones have these ranges."
+        return f"{_counted(len(bones))} these ranges."
 
 
 class FDDA_OT_copy_ranges(_OnSelected, bpy.types.Operator):
@@ -113,7 +118,7 @@ class FDDA_OT_copy_ranges(_OnSelected, bpy.types.Operator):
         targets = [bone for bone in self.selected(context) if bone != source]
         for target in targets:
             _copy(source, target)
-        return f"{len(targets)} bones have the ranges of '{source.name}'."
+        return f"{_counted(len(targets))} the ranges of '{source.name}'."
 
 
 class FDDA_OT_mirror_ranges(_OnSelected, bpy.types.Operator):
@@ -132,7 +137,7 @@ class FDDA_OT_mirror_ranges(_OnSelected, bpy.types.Operator):
             raise RigError("None of the selected bones has one on the other side by its name; select arm.L or LeftArm.")
         for bone, other in pairs:
             _copy(bone, other, mirrored=True)
-        return f"{len(pairs)} bones of the other side have mirrored ranges."
+        return f"On the other side {_counted(len(pairs))} mirrored ranges."
 
 
 class FDDA_OT_limits_preset(OnPose, bpy.types.Operator):
@@ -175,7 +180,7 @@ class FDDA_OT_limits_preset(OnPose, bpy.types.Operator):
                 f"No bone of '{armature_object.name}' that states no range is named as a part of a body; set the "
                 "ranges by hand, or from actions."
             )
-        return f"{done} bones have the range of motion of a person."
+        return f"{_counted(done)} the range of motion of a person."
 
 
 class FDDA_OT_forget_ranges(_OnSelected, bpy.types.Operator):
@@ -191,7 +196,7 @@ class FDDA_OT_forget_ranges(_OnSelected, bpy.types.Operator):
         for bone in bones:
             for axis in range(3):
                 unstate_rotation_range(bone, axis)
-        return f"{len(bones)} bones state no range any more."
+        return f"{_counted(len(bones), 'states', 'state')} no range any more."
 
 
 CLASSES = (
