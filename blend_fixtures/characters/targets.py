@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Characters that learn the surface of another object, `flesh`: a function each, which builds it in the current scene.
 
-The mesh `elbow` keeps nothing but its Armature modifier. Files are written to Blender's folder for temporary files.
+The mesh `elbow` keeps nothing but its Armature modifier. Files go to a folder that is removed when Python ends.
 """
 
+import functools
 import struct
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -50,7 +52,7 @@ def target_usd() -> None:
 def target_pc2() -> None:
     """A .pc2 file of the copy's action, played by Mesh Cache."""
     flesh = target_copy()
-    path = Path(bpy.app.tempdir) / "flesh.pc2"
+    path = _folder() / "flesh.pc2"
     with open(path, "wb") as file:
         writer = PointCacheWriter(file, len(flesh.data.vertices), 1, FRAMES)
         for positions in _shown(flesh):
@@ -62,7 +64,7 @@ def target_pc2() -> None:
 def target_mdd() -> None:
     """An .mdd file of the copy's action, played by Mesh Cache."""
     flesh = target_copy()
-    path = Path(bpy.app.tempdir) / "flesh.mdd"
+    path = _folder() / "flesh.mdd"
     seconds = np.arange(FRAMES, dtype=">f4") / bpy.context.scene.render.fps
     head = struct.pack(">ii", FRAMES, len(flesh.data.vertices)) + seconds.tobytes()
     path.write_bytes(head + b"".join(positions.astype(">f4").tobytes() for positions in _shown(flesh)))
@@ -153,6 +155,16 @@ def lagging_group() -> bpy.types.NodeTree:
     return group
 
 
+def _folder() -> Path:
+    """Where cache files lie. Blender's own folder for temporary files is emptied when another file is opened."""
+    return Path(_temporary().name)
+
+
+@functools.cache
+def _temporary() -> tempfile.TemporaryDirectory:
+    return tempfile.TemporaryDirectory(prefix="fdda_targets_")
+
+
 def _copy(mesh_object: bpy.types.Object) -> bpy.types.Object:
     """A copy of an object with a mesh of its own."""
     flesh = mesh_object.copy()
@@ -185,7 +197,7 @@ def _through_a_file(suffix: str, export: Callable[[str], object]) -> None:
     scene.frame_start, scene.frame_end = 1, FRAMES
     for scene_object in scene.objects:
         scene_object.select_set(scene_object == flesh)
-    path = str(Path(bpy.app.tempdir) / f"flesh.{suffix}")
+    path = str(_folder() / f"flesh.{suffix}")
     export(path)
     bpy.data.objects.remove(flesh)
     before = set(bpy.data.objects)
