@@ -155,7 +155,7 @@ def table(cases: list[Case]) -> str:
         lines.append(
             f"| {name} | {len(own):,} | " + " | ".join(f"{count:,}" for count in counts) + f" | "
             f"{max(case.seconds for case in own):.1f} | {max(case.peak_mb for case in own):.0f} | "
-            f"{growth(own):.0f} | {off:.2g} |"
+            f"{round(growth(own))} | {off:.2g} |"
         )
     return "\n".join(lines)
 
