@@ -63,7 +63,7 @@ bench: .venv  ## time the arm at three densities, and other rigs: RIGS="a.blend 
 sampling: .venv  ## compare ways to choose poses, into out/sampling (20 minutes)
 	.venv/bin/python benchmarks/sampling.py out/sampling
 
-soak: .venv  ## hostile files, kills, full disks, frames, undo: what held and what fell short, into out/soak (20 minutes)
+soak: .venv  ## hostile files, kills, full disks, frames, undo: what held and what fell short, into out/soak (20 minutes at most)
 	.venv/bin/python benchmarks/soak.py out/soak $(OPTIONS)
 
 study: .venv  ## compare sizes and activations of the networks, into out/study (30 minutes)
