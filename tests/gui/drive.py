@@ -17,12 +17,20 @@ import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import leave_story
 import path_story
+import shot_story
 import work_story
 from window import StepError, picture, rest_mouse
 
 FOLDER, NAME = Path(sys.argv[sys.argv.index("--") + 1]).resolve(), sys.argv[sys.argv.index("--") + 2]
-STEPS = {"path": path_story.STEPS, "work": work_story.STEPS}[NAME]
+STEPS = {
+    "path": path_story.STEPS,
+    "work": work_story.STEPS,
+    "shot": shot_story.STEPS,
+    "leave": leave_story.LEAVE,
+    "back": leave_story.BACK,
+}[NAME]
 WATCH_SECONDS = 590
 """All of it: a Blender that hangs is ended, and says where."""
 

@@ -27,6 +27,9 @@ LACKING = 3
 FEW_VALUES = 32
 STORIES = ("path", "work")
 """The path of a first model, and the work with it: each in a Blender of its own, the second with the first's files."""
+FURTHER = ("shot", "leave", "back")
+"""What else a shot takes; a Blender that is closed while it trains, and the one that is opened afterwards. Run by name
+alone: of the first, the steps after the mask have not been gone through in a window yet, of the others none."""
 
 
 def lacking(blender: str) -> str:
@@ -140,7 +143,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="for pictures; what an earlier run left there is removed")
     parser.add_argument("blender", nargs="?", default="blender", help="command that starts Blender")
-    parser.add_argument("--story", choices=STORIES, help="this one alone; 'work' needs what 'path' has left in FOLDER")
+    parser.add_argument(
+        "--story", choices=(*STORIES, *FURTHER), help="this one alone; all need what 'path' has left in FOLDER"
+    )
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # What was started is ended on the way out.
     folder = options.folder.resolve()
@@ -150,7 +155,7 @@ def main() -> int:
     if not PACKAGE.is_file():
         print(f"There is no {PACKAGE}; build it with 'make package'.", file=sys.stderr)
         return 1
-    if options.story != "work":
+    if options.story in {None, STORIES[0]}:
         shutil.rmtree(folder, ignore_errors=True)
     for part in ("work", "user"):
         (folder / part).mkdir(parents=True, exist_ok=True)

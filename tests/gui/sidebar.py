@@ -8,7 +8,7 @@ Command" does: so the mouse goes down the sidebar until that is the button that 
 from collections.abc import Iterator
 
 import bpy
-from window import check, click, move, over, redraw, region, settle, view_area
+from window import below_mouse, check, click, move, over, redraw, region, settle, view_area
 
 SECTIONS = ("rig", "poses", "recording", "training", "playback", "evaluation", "models")
 """From the top."""
@@ -65,19 +65,6 @@ def _click_header(index: int) -> Iterator[float]:
     yield from click(sidebar.x + 90 * scale, top - (HEADER + index * PITCH) * scale)
 
 
-def below_mouse() -> str:
-    """What the button below the mouse does: "fdda.record(…)", or the property that it shows; empty where none is."""
-    manager = bpy.context.window_manager
-    manager.clipboard = ""
-    with over("UI"):
-        for copy, options in (("copy_python_command_button", {}), ("copy_data_path_button", {"full_path": True})):
-            operator = getattr(bpy.ops.ui, copy)
-            if operator.poll():
-                operator(**options)
-                break
-    return manager.clipboard
-
-
 def find(what: str, across: float = 0.5) -> Iterator[float]:
     """Move the mouse down the sidebar onto a button; returns its place in the window.
 
@@ -98,7 +85,9 @@ def find(what: str, across: float = 0.5) -> Iterator[float]:
     for y in [*known, *going_down, *going_down]:
         move(x, y)
         yield from settle()
-        if what in below_mouse():
+        with over("UI"):
+            found = below_mouse()
+        if what in found:
             _places[what] = y
             return x, y
     check(False, f"there is no button {what} in the sidebar")

@@ -95,6 +95,11 @@ def click(x: float, y: float, times: int = 1) -> Iterator[float]:
     yield from settle()
 
 
+def button(what: str) -> None:
+    """Press the left button of the mouse, "mousedown", or let go of it, "mouseup"."""
+    _xdotool(what, 1)
+
+
 def press(*keys: str) -> Iterator[float]:
     """Press keys, named as xdotool does; they go to what is below the mouse."""
     for key in keys:
@@ -107,6 +112,18 @@ def rest_mouse() -> Iterator[float]:
     view = region("WINDOW")
     move(view.x + 0.35 * view.width, view.y + 0.06 * view.height)
     yield from settle()
+
+
+def below_mouse() -> str:
+    """What the button below the mouse does: "fdda.record(…)", or the property that it shows; empty where none is."""
+    manager = bpy.context.window_manager
+    manager.clipboard = ""
+    for copy, options in (("copy_python_command_button", {}), ("copy_data_path_button", {"full_path": True})):
+        operator = getattr(bpy.ops.ui, copy)
+        if operator.poll():
+            operator(**options)
+            break
+    return manager.clipboard
 
 
 def redraw() -> Iterator[float]:
