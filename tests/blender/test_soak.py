@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from .conftest import run
+
 ROOT = Path(__file__).resolve().parents[2]
 SEED = 77
 
@@ -18,6 +20,7 @@ def folder(elbow, tmp_path_factory) -> Path:
     for name, path in (("elbow.blend", elbow.rig), ("elbow.onnx", elbow.model), ("bound.blend", elbow.bound)):
         (folder / name).write_bytes(path.read_bytes())
     (folder / "recording").symlink_to(elbow.recording)
+    assert run("record", elbow.rig, folder / "short recording", "--poses", 40) == 0
     return folder
 
 
