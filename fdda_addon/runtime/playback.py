@@ -15,7 +15,7 @@ from ..core.errors import FDDAError, ModelError
 from ..scene.compatibility import curves_of
 from . import cache as caches
 from . import nodes, rig_check, switch
-from .changed import Changed
+from .changed import Changed, only_keys
 from .crowd import Crowds, is_hub
 from .live_binding import LiveBinding
 from .model_files import network_of
@@ -137,8 +137,9 @@ def note_changes(depsgraph: bpy.types.Depsgraph) -> None:
 
 
 def note_data(depsgraph: bpy.types.Depsgraph) -> None:
-    """As `note_changes`, with a frame; one in which nothing has changed but poses costs nothing."""
-    if any(depsgraph.id_type_updated(kind) for kind in ("ARMATURE", "MESH", "SCENE")):
+    """As `note_changes`, with a frame; one in which nothing has changed but poses and shape keys costs nothing."""
+    updated = depsgraph.id_type_updated
+    if updated("ARMATURE") or updated("SCENE") or (updated("MESH") and not (updated("KEY") and only_keys(depsgraph))):
         note_changes(depsgraph)
 
 
