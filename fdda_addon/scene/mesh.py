@@ -49,7 +49,11 @@ def evaluated_positions(mesh_object: bpy.types.Object, depsgraph: bpy.types.Deps
 def mesh_positions(mesh: bpy.types.Mesh) -> np.ndarray:
     """Positions of the vertices of a mesh, original or evaluated: (V, 3) float32, its object's space, metres."""
     # Through the attribute: reading or writing the vertices themselves is some hundred times slower.
-    return read(mesh.attributes["position"].data, VECTOR)
+    positions = mesh.attributes.get("position")
+    if positions is None:
+        # In edit mode a mesh has no attributes; its vertices are where they were before.
+        return read(mesh.vertices, COORDINATE)
+    return read(positions.data, VECTOR)
 
 
 def set_mesh_positions(mesh: bpy.types.Mesh, positions: np.ndarray) -> None:

@@ -380,3 +380,15 @@ def test_undo_of_many_kinds(bound, elbow):
     bpy.ops.ed.undo()
     pose(angle=1.0)
     check()
+
+
+def test_enabled_while_the_mesh_is_in_edit_mode(bound, elbow):
+    """Blender then holds no attributes of the mesh; the add-on is there, and the model plays on afterwards."""
+    bpy.context.view_layer.objects.active = bound
+    fdda_addon.unregister()
+    bpy.ops.object.mode_set(mode="EDIT")
+    fdda_addon.register()
+    bpy.ops.object.mode_set(mode="OBJECT")
+    bpy.data.objects[ELBOW].fdda.mode = "FDDA"
+    pose(angle=0.8)
+    assert_plays(bpy.data.objects[ELBOW], elbow.model)
