@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fdda_addon.core.errors import FDDAError
+from fdda_addon.core.poses import MAX_MARGIN
 
 MAX_PLAN_BYTES = 4 << 20
 MAX_SHARDS, MAX_ROUNDS = 1000, 20
@@ -58,7 +59,8 @@ class Character:
         output: folder of the bound file, its models and their reports.
         objects: names of the mesh objects; empty for the only one of the file.
         depends: files that the rig's file links, so that a change of them is noticed.
-        poses, seed, spread, actions, strips, mirror, sample, controls, fit_linear, least_vertices: as of `record`.
+        poses, seed, spread, margin, actions, strips, mirror, sample, controls, fit_linear, least_vertices: as of
+            `record`.
         shards: how many parts the poses are recorded in.
         train: settings of the training by name, as of `train`.
         target_mm: what 99.9 % of the vertices of held-out poses are to be within; 0 for no target.
@@ -76,6 +78,7 @@ class Character:
     poses: int = 1000
     seed: int = 0
     spread: float = 1.0
+    margin: float = 1.0
     actions: tuple[str, ...] = ()
     strips: tuple[str, ...] = ()
     mirror: bool = False
@@ -101,8 +104,12 @@ class Plan:
     characters: tuple[Character, ...]
 
 
-LEAST = {"poses": 0, "seed": 0, "shards": 1, "rounds": 0, "refine_poses": 1, "evaluate_poses": 1, "threads": 1}
-MOST = {"shards": MAX_SHARDS, "rounds": MAX_ROUNDS, "threads": 1024, "retries": 10_000, "spread": 10}
+LEAST = {
+    **{"poses": 0, "seed": 0, "rounds": 0},
+    **{"shards": 1, "refine_poses": 1, "evaluate_poses": 1, "threads": 1, "margin": 1},
+}
+MOST = {"shards": MAX_SHARDS, "rounds": MAX_ROUNDS, "threads": 1024, "retries": 10_000}
+MOST |= {"spread": 10, "margin": int(MAX_MARGIN)}
 
 
 def read_plan(path: Path) -> Plan:

@@ -42,6 +42,7 @@ def test_defaults_hold_for_all_and_give_way(written):
         (HERO + "poses = -1", "poses is from 0 to 1,000,000,000, and not -1"),
         (HERO + "shards = 0", "shards is from 1 to 1,000, and not 0"),
         (HERO + "spread = nan", "spread is a number, and not nan"),
+        (HERO + "margin = 0.5", "margin is from 1 to 4, and not 0.5"),
         (HERO + "target_mm = -0.5", "target_mm is from 0 to"),
         (HERO + 'actions = "walk"', "actions is a list of texts, such as [\"a\"], and not 'walk'"),
         (HERO + "actions = [3]", "actions is a text, and not 3"),
