@@ -15,7 +15,7 @@ from .benchmark import armature_alone, playing, time_frames
 ROUNDS = 4
 FRAMES_EACH = 5
 
-PLAYBACK_MS = ((1_476, 0.677), (9_960, 0.929), (50_618, 1.749))
+PLAYBACK_MS = ((1_476, 0.50), (9_960, 0.51), (50_618, 0.73))
 """By vertex count: what a frame with a model costs beyond the Armature modifier alone, ms; from docs/benchmarks.md."""
 CLEAR_GAIN = 1.3
 """Below this an estimate is too close to call."""
