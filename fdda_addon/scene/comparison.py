@@ -6,8 +6,6 @@ from contextlib import ExitStack, contextmanager
 
 import bpy
 
-from .borrow import borrowed_attributes
-
 KEY = "fdda_compared"
 """Custom property of a copy: the mesh object that it is compared with."""
 
@@ -25,6 +23,8 @@ def comparisons() -> list[bpy.types.Object]:
 @contextmanager
 def hidden_comparisons() -> Iterator[None]:
     """Spare Blender their evaluation for a while."""
+    from .borrow import borrowed_attributes  # Blender starts without numpy.
+
     with ExitStack() as stack:
         for other in comparisons():
             stack.enter_context(borrowed_attributes(other, hide_viewport=True))
