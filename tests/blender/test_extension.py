@@ -80,9 +80,9 @@ def test_enabled_it_is_all_there(story: dict):
 
 
 def test_blender_starts_as_fast_with_it(package: Path, tmp_path: Path):
-    """The best of three starts: the first compiles the modules, and the machine may be busy, or slow in all it does."""
+    """The best of five starts: the first compiles the modules, and the machine may be busy, or slow in all it does."""
     assert blender("install", package, user=tmp_path).returncode == 0
-    starts = [json.loads(blender("start", user=tmp_path).stdout.splitlines()[-1]) for _ in range(3)]
+    starts = [json.loads(blender("start", user=tmp_path).stdout.splitlines()[-1]) for _ in range(5)]
     assert all(start["modules"] == [] for start in starts)
     assert min(start["seconds"] for start in starts) < START * min(start["blender_seconds"] for start in starts)
 
