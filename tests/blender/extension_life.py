@@ -12,10 +12,8 @@ import sys
 import time
 from pathlib import Path
 
-_begin = time.process_time()
-import bpy  # noqa: E402 (what this takes is Blender's own start)
+import bpy
 
-BLENDER_SECONDS = time.process_time() - _begin
 REPOSITORY, IDENTIFIER = "user_default", "fdda"
 MODULE = f"bl_ext.{REPOSITORY}.{IDENTIFIER}"
 
@@ -88,7 +86,7 @@ def start() -> dict:
     seconds, wall_seconds = time.process_time() - begin, time.perf_counter() - begin_wall
     bpy.context.scene.frame_set(2)
     modules = sorted({"numpy", "onnxruntime", "torch"} & set(sys.modules))
-    return {"seconds": seconds, "blender_seconds": BLENDER_SECONDS, "wall_seconds": wall_seconds, "modules": modules}
+    return {"seconds": seconds, "wall_seconds": wall_seconds, "modules": modules}
 
 
 def live(package: str) -> dict[str, dict]:

@@ -22,8 +22,16 @@ LIFE = Path(__file__).with_name("extension_life.py")
 VERSION = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["version"]
 PACKAGE = ROOT / "dist" / f"fdda_addon-{VERSION}.zip"
 OF_DISTRIBUTIONS = PACKAGE.with_name(f"fdda_addon-{VERSION}-python3.14.zip")
-START = 0.07
-"""Of the time that Blender itself takes to start, in seconds of the processor: 50 ms where it takes 0.7 s."""
+START_SECONDS, START = 0.05, 0.65
+"""Seconds of the processor; and on a machine that is slow just now, the part of what `PYTHONS_OWN` takes on it."""
+PYTHONS_OWN = """
+import time
+begin = time.process_time()
+import argparse, asyncio, concurrent.futures, ctypes.util, email.mime.multipart, http.server, logging.config
+import multiprocessing.pool, pydoc, sqlite3, tarfile, unittest.mock, xmlrpc.client, zipfile
+print(time.process_time() - begin)
+"""
+"""A start of as many modules, which are Python's: how fast the machine is just now."""
 STATE = ("classes", "operators", "properties", "handlers", "keymap_items", "additions", "commands", "preferences")
 
 
@@ -82,9 +90,12 @@ def test_enabled_it_is_all_there(story: dict):
 def test_blender_starts_as_fast_with_it(package: Path, tmp_path: Path):
     """The best of five starts: the first compiles the modules, and the machine may be busy, or slow in all it does."""
     assert blender("install", package, user=tmp_path).returncode == 0
-    starts = [json.loads(blender("start", user=tmp_path).stdout.splitlines()[-1]) for _ in range(5)]
+    starts, own = [], []
+    for _ in range(5):
+        starts.append(json.loads(blender("start", user=tmp_path).stdout.splitlines()[-1]))
+        own.append(float(subprocess.check_output([sys.executable, "-I", "-c", PYTHONS_OWN], text=True)))
     assert all(start["modules"] == [] for start in starts)
-    assert min(start["seconds"] for start in starts) < START * min(start["blender_seconds"] for start in starts)
+    assert min(start["seconds"] for start in starts) < max(START_SECONDS, START * min(own))
 
 
 def test_disabled_it_leaves_nothing_registered(story: dict):
