@@ -50,17 +50,3 @@ class Changed:
             if changed.meshes.get(mesh.session_uid) is False:
                 del changed.meshes[mesh.session_uid]
         return changed
-
-
-def only_keys(depsgraph: bpy.types.Depsgraph) -> bool:
-    """Whether all meshes that an evaluation has changed follow their shape keys, which rigs drive in every frame."""
-    meshes, driven = set(), set()
-    for update in depsgraph.updates:
-        found = update.id
-        if isinstance(found, bpy.types.Mesh):
-            if update.is_updated_transform:
-                return False
-            meshes.add(found.original.session_uid)
-        elif isinstance(found, bpy.types.Key) and not update.is_updated_transform:
-            driven.add(found.original.user.session_uid)
-    return meshes <= driven

@@ -15,7 +15,7 @@ from ..core.errors import FDDAError, ModelError
 from ..scene.compatibility import curves_of
 from . import cache as caches
 from . import nodes, rig_check, switch
-from .changed import Changed, only_keys
+from .changed import Changed
 from .crowd import Crowds, is_hub
 from .live_binding import LiveBinding
 from .model_files import network_of
@@ -112,7 +112,21 @@ def _follow_mode(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) 
 
 def note_changes(depsgraph: bpy.types.Depsgraph) -> None:
     """Look anew at the bound objects, and at the rigs, that an evaluation has changed."""
-    changed = Changed.by(depsgraph)
+    _note(Changed.by(depsgraph), depsgraph)
+
+
+def note_data(depsgraph: bpy.types.Depsgraph) -> None:
+    """As `note_changes`, with a frame; one in which nothing has changed but poses and shape keys costs nothing."""
+    updated = depsgraph.id_type_updated
+    if updated("ARMATURE") or updated("SCENE"):
+        note_changes(depsgraph)
+    elif updated("MESH"):
+        changed = Changed.by(depsgraph)
+        if changed.meshes:
+            _note(changed, depsgraph)
+
+
+def _note(changed: Changed, depsgraph: bpy.types.Depsgraph) -> None:
     for mesh_object, is_mesh, is_whole in changed.mesh_objects:
         if not mesh_object.fdda.is_bound:
             continue
@@ -134,13 +148,6 @@ def note_changes(depsgraph: bpy.types.Depsgraph) -> None:
     # A render's own graph takes everything for new.
     if depsgraph.mode != "RENDER":
         _note_rigs(changed)
-
-
-def note_data(depsgraph: bpy.types.Depsgraph) -> None:
-    """As `note_changes`, with a frame; one in which nothing has changed but poses and shape keys costs nothing."""
-    updated = depsgraph.id_type_updated
-    if updated("ARMATURE") or updated("SCENE") or (updated("MESH") and not (updated("KEY") and only_keys(depsgraph))):
-        note_changes(depsgraph)
 
 
 def _note_rigs(changed: Changed) -> None:
