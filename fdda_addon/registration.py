@@ -68,8 +68,10 @@ def handler_table() -> list[tuple[str, Callable[..., None]]]:
     from .operators import training
     from .panels import checks
     from .runtime import handlers
+    from .scene import stored_paths
 
-    return [entry for module in (job, checks, handlers, side_by_side, training) for entry in module.HANDLERS.items()]
+    modules = (job, checks, handlers, side_by_side, stored_paths, training)
+    return [entry for module in modules for entry in module.HANDLERS.items()]
 
 
 def _register_package(package: ModuleType) -> None:

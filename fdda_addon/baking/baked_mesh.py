@@ -11,11 +11,11 @@ import numpy as np
 from ..core.errors import RigError
 from ..rig.modifier_stack import ModifierStack
 from ..runtime.binding import unbind
-from ..runtime.model_files import stored_path
 from ..scene.arrays import COORDINATE, write
 from ..scene.borrow import borrowed_attributes
 from ..scene.compatibility import animation_curves
 from ..scene.mesh import rest_positions
+from ..scene.stored_paths import stored_path
 
 MODIFIER_NAME = "FDDA Bake"
 BASIS = "Basis"

@@ -66,13 +66,13 @@ def _put_beside(scene_rig: "SceneRig", model: Path, out: Path) -> Path:
     from ..core.output import replacing
     from ..models.entries import bound_entry
     from ..models.model_list import adopt
+    from ..scene.stored_paths import stored_path
 
     place = beside(model, out)
     binding = scene_rig.mesh_object.fdda
     adopt(scene_rig.mesh_object)
     entry = bound_entry(scene_rig.mesh_object)
-    binding.model = "//" + place.resolve().relative_to(out.resolve().parent).as_posix()
-    entry.path = binding.model
+    entry.path = binding.model = stored_path(place)
     if place.exists():
         return model
     with replacing(place) as temporary:

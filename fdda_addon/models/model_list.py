@@ -12,9 +12,9 @@ from ..core.output import check_writable, replacing
 from ..evaluation import last_evaluation
 from ..runtime import model_files, packed, playback
 from ..runtime.binding import bind, unbind
-from ..runtime.model_files import absolute_path, path_for
 from ..runtime.opened_model import fitting_rig
 from ..scene.scene_rig import SceneRig
+from ..scene.stored_paths import absolute_path, path_for
 from .entries import bound_entry, bound_name, chosen_entry, is_bound
 
 _infos: dict[tuple, ModelInfo] = {}

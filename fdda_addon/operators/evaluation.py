@@ -21,8 +21,6 @@ from .job import JobOperator
 from .on_rig import OnRig
 from .playback import OnModel
 
-"""Name of the page that a training writes beside its model."""
-
 
 class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.evaluate"

@@ -10,6 +10,7 @@ import bpy
 from ..core.errors import RigError
 from ..rig.modifier_stack import check_stack
 from ..scene.scene_rig import SceneRig
+from ..scene.stored_paths import path_for
 from . import cache as caches
 from . import model_files, nodes, packed, playback, switch
 from .opened_model import open_model
@@ -46,7 +47,7 @@ def bind(
     # Those after the last deforming one stay and work on what the model gives.
     nodes.add_modifier(mesh_object, stack.place)
     binding = mesh_object.fdda
-    binding.model = model_files.path_for(mesh_object, model)
+    binding.model = path_for(mesh_object, model)
     binding.packed = packed_model
     binding.use_in_render = use_in_render
     binding.is_bound = True

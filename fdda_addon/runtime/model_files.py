@@ -8,6 +8,7 @@ import bpy
 
 from ..core.errors import ModelError
 from ..scene.model_trust import is_trusted
+from ..scene.stored_paths import absolute_path, origin
 from . import packed
 from .network import Network
 
@@ -66,7 +67,7 @@ def allowed_path(mesh_object: bpy.types.Object, stored: str) -> Path:
         ModelError: the path of a saved file leads out of the file's folder.
     """
     path = absolute_path(mesh_object, stored)
-    library = _origin(mesh_object, stored).library
+    library = origin(mesh_object, stored).library
     file = bpy.path.abspath(library.filepath) if library else bpy.data.filepath
     # Resolved: the way from the open file to the model leads through "..".
     in_folder = not file or path.resolve().is_relative_to(Path(file).resolve().parent)
@@ -76,48 +77,6 @@ def allowed_path(mesh_object: bpy.types.Object, stored: str) -> Path:
             "choose it again and pack it, move it beside the file, or trust its folder in the preferences."
         )
     return path
-
-
-def absolute_path(mesh_object: bpy.types.Object, stored: str) -> Path:
-    """Where a path leads that is stored with an object, whether it is followed or not."""
-    library = _origin(mesh_object, stored).library
-    return Path(os.path.normpath(bpy.path.abspath(stored, library=library)))
-
-
-def stored_path(path: Path) -> str:
-    """How the open file remembers where a file is: relative to itself, where that can be said."""
-    try:
-        return bpy.path.relpath(str(path.absolute())) if bpy.data.filepath else str(path.absolute())
-    except ValueError:
-        # On another drive of Windows.
-        return str(path.absolute())
-
-
-def path_for(mesh_object: bpy.types.Object, model: Path) -> str:
-    """How an object remembers where a model is; a library override calls the library's own as the library does."""
-    inherited = _inherited_paths(mesh_object)
-    for stored in inherited:
-        if stored and absolute_path(mesh_object, stored) == Path(os.path.normpath(model.absolute())):
-            return stored
-    stored = stored_path(model)
-    # The same words would mean the file beside the library.
-    return f"//./{stored.removeprefix('//')}" if stored in inherited else stored
-
-
-def _origin(mesh_object: bpy.types.Object, stored: str) -> bpy.types.Object:
-    """The object that a path was stored with first: a library override may have it from its library."""
-    while stored in _inherited_paths(mesh_object):
-        mesh_object = mesh_object.override_library.reference
-    return mesh_object
-
-
-def _inherited_paths(mesh_object: bpy.types.Object) -> list[str]:
-    """The paths that the object of which this is a library override knows; none where it is not."""
-    override = mesh_object.override_library
-    if override is None or override.reference is None:
-        return []
-    binding = override.reference.fdda
-    return [binding.model, *(entry.path for entry in binding.models)]
 
 
 def choose(model: Path) -> None:

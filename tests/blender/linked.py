@@ -16,6 +16,7 @@ import fdda_addon
 from fdda_addon.models import model_list
 from fdda_addon.runtime import model_files, nodes
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
+from fdda_addon.scene.stored_paths import stored_path
 
 from .conftest import ELBOW, ELBOW_RIG, ElbowFiles, assert_plays
 
@@ -41,7 +42,10 @@ def save_character(source: Path, path: Path) -> None:
     for name in (ELBOW, ELBOW_RIG):
         bpy.context.scene.collection.objects.unlink(bpy.data.objects[name])
         collection.objects.link(bpy.data.objects[name])
-    bpy.data.objects[ELBOW].fdda.model = "//elbow.onnx" if bpy.data.objects[ELBOW].fdda.is_bound else ""
+    binding, model = bpy.data.objects[ELBOW].fdda, stored_path(path.with_name("elbow.onnx"))
+    binding.model = model if binding.is_bound else ""
+    for entry in binding.models:
+        entry.path = model
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
 
 

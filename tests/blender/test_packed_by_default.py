@@ -112,3 +112,42 @@ def test_a_link_out_of_a_trusted_folder_is_not_followed(elbow, tmp_path, monkeyp
     monkeypatch.setattr(model_trust, "trusted_folders", lambda: [trusted.resolve()])
     assert not model_trust.is_trusted(trusted / "way_out.onnx")
     assert not model_trust.is_trusted(trusted / ".." / "m.onnx") and model_trust.is_trusted(trusted / "m.onnx")
+
+
+@pytest.fixture
+def followed(rig, model, tmp_path, monkeypatch):
+    """The elbow in a saved file, bound to a model that stays in a trusted folder; a recording is named as well."""
+    monkeypatch.setattr(playback, "packs_models", lambda: False)
+    monkeypatch.setattr(model_trust, "trusted_folders", lambda: [tmp_path.resolve()])
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "first.blend"))
+    bpy.ops.fdda.bind(filepath=str(model))
+    settings = bpy.data.objects[ELBOW].fdda.settings
+    settings.recording, settings.model = "//poses/elbow", "//models/trained.onnx"
+    return bpy.data.objects[ELBOW]
+
+
+def named_paths(mesh_object):
+    binding = mesh_object.fdda
+    return [binding.model, binding.models[0].path, binding.settings.recording, binding.settings.model]
+
+
+def test_a_model_outside_is_found_after_save_as(followed, elbow, tmp_path):
+    assert named_paths(followed) == ["//models/elbow.onnx"] * 2 + ["//poses/elbow", "//models/trained.onnx"]
+    mesh_object = save_elsewhere(tmp_path)
+    there = ["//../models/elbow.onnx"] * 2 + ["//../poses/elbow", "//../models/trained.onnx"]
+    assert named_paths(mesh_object) == there
+    pose(angle=1.1)
+    assert_plays(mesh_object, elbow.model)
+
+
+def test_a_copy_finds_the_model_and_the_open_file_too(followed, elbow, tmp_path):
+    before, copy = named_paths(followed), tmp_path / "copies" / "copy.blend"
+    copy.parent.mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True)
+    assert named_paths(followed) == before
+    with pytest.raises(RuntimeError):
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "nowhere" / "shot.blend"))
+    assert named_paths(followed) == before
+    bpy.ops.wm.open_mainfile(filepath=str(copy))
+    pose(angle=0.9)
+    assert_plays(bpy.data.objects[ELBOW], elbow.model)
