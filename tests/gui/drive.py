@@ -17,8 +17,10 @@ import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import cast_story
 import leave_story
 import path_story
+import ranges_story
 import shot_story
 import work_story
 from window import StepError, picture, rest_mouse
@@ -28,6 +30,8 @@ STEPS = {
     "path": path_story.STEPS,
     "work": work_story.STEPS,
     "shot": shot_story.STEPS,
+    "cast": cast_story.STEPS,
+    "ranges": ranges_story.STEPS,
     "leave": leave_story.LEAVE,
     "back": leave_story.BACK,
 }[NAME]

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import bpy
 import sidebar
-from path_story import BLEND, arm, job_done, part
-from shot_story import look_at
+from arm import BLEND, arm, check_it_plays, emptied, job_done, look_at, part
 from window import check, picture, redraw, until
 
-EPOCHS = 1500
+EPOCHS = 8000
 """So many that the training outlasts the start of a Blender."""
 
 
@@ -21,9 +20,8 @@ def _file(folder: Path) -> Path:
 
 def start_a_training(folder: Path) -> Iterator[float]:
     """A file with a recording; press Train."""
-    own = _file(folder).parent
-    own.mkdir(exist_ok=True)
-    shutil.copytree(folder / "work" / "arm_recording", own / "arm_recording", dirs_exist_ok=True)
+    own = emptied(_file(folder).parent)
+    shutil.copytree(folder / "work" / "arm_recording", own / "arm_recording")
     bpy.ops.wm.open_mainfile(filepath=str(folder / "work" / BLEND), load_ui=False)
     yield 1.0
     bpy.ops.fdda.unbind(object="arm")
@@ -67,7 +65,7 @@ def bind_what_was_trained(folder: Path) -> Iterator[float]:
     yield from redraw()
     yield from sidebar.push("fdda.bind")
     yield from until(lambda: arm().fdda.is_bound, 20, "the trained model is not bound")
-    check(arm().fdda.mode == "FDDA" and not arm().fdda.status, f"it plays {arm().fdda.mode}: {arm().fdda.status}")
+    check_it_plays()
 
 
 LEAVE = (start_a_training, close_blender)

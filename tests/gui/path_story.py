@@ -4,21 +4,21 @@
 Buttons are pressed with the mouse. What Blender itself offers for opening and saving is called.
 """
 
-import importlib
 import json
 import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 
 import bpy
 import numpy as np
 import sidebar
+from arm import BLEND, EXTENSION, FRAME, arm, check_it_plays, distance_mm, job_done, part, shape
 from window import (
     StepError,
     check,
     click,
+    main_screen,
     over,
     picture,
     press,
@@ -30,12 +30,8 @@ from window import (
     vivid_part,
 )
 
-EXTENSION = "bl_ext.user_default.fdda"
 VERTICES, PAYING, JOINTS, POSES, FRAMES = 1476, 9960, 22, 100, 250
-FRAME = 110
-"""Of the action, with elbow and fingers bent: where shapes are compared."""
 MODIFIERS = ["ARMATURE", "CORRECTIVE_SMOOTH"]
-BLEND = "arm.blend"
 PLAY_SECONDS, SLOW_SECONDS = 4, 30
 """The second where the processor draws, and is busy."""
 COLORED = 0.01
@@ -43,25 +39,6 @@ COLORED = 0.01
 
 _rig_shape: np.ndarray | None = None
 _model_shape: np.ndarray | None = None
-
-
-def part(name: str) -> ModuleType:
-    """A module of the installed extension."""
-    return importlib.import_module(f"{EXTENSION}.fdda_addon.{name}")
-
-
-def arm() -> bpy.types.Object:
-    """The mesh: looked up each time, as an undo or another file makes references invalid."""
-    return bpy.data.objects["arm"]
-
-
-def shape(frame: int = FRAME) -> np.ndarray:
-    """(V, 3) metres: what Blender shows of the arm at a frame of its action."""
-    bpy.context.scene.frame_set(frame)
-    mesh = arm().evaluated_get(bpy.context.evaluated_depsgraph_get()).data
-    positions = np.empty((len(mesh.vertices), 3), np.float32)
-    mesh.attributes["position"].data.foreach_get("vector", positions.reshape(-1))
-    return positions
 
 
 def extent_in_view() -> float:
@@ -79,23 +56,9 @@ def extent_in_view() -> float:
     return float(max(width / view.width, height / view.height)) if inside else 2.0
 
 
-def distance_mm(one: np.ndarray, other: np.ndarray) -> float:
-    """Mean distance of vertices."""
-    return float(np.linalg.norm(one - other, axis=1).mean()) * 1000
-
-
 def switches() -> list[tuple[str, bool, bool]]:
     """The rig's modifiers and where they are shown."""
     return [(m.type, m.show_viewport, m.show_render) for m in arm().modifiers if m.type in MODIFIERS]
-
-
-def job_done(verb: str, seconds: float) -> Iterator[float]:
-    """Wait until the job that a button started has ended well."""
-    job = part("jobs.job")
-    yield from until(lambda: job.state_of(verb) is not None, 10, f"the button starts no job {verb}")
-    yield from until(lambda: not job.state_of(verb).is_running, seconds, f"the job {verb} does not end")
-    state = job.state_of(verb)
-    check(state.outcome_level == "INFO", f"the job {verb} ended with '{state.outcome}'")
 
 
 def find_the_sidebar(_folder: Path) -> Iterator[float]:
@@ -238,7 +201,7 @@ def bind(_folder: Path) -> Iterator[float]:
     yield from sidebar.open_section("playback")
     yield from sidebar.push("fdda.bind")
     yield from until(lambda: arm().fdda.is_bound, 20, "the button binds nothing")
-    check(arm().fdda.mode == "FDDA" and not arm().fdda.status, f"it plays {arm().fdda.mode}: {arm().fdda.status}")
+    check_it_plays()
     check(not any(viewport for _, viewport, _ in switches()), f"the rig's modifiers are still on: {switches()}")
     _model_shape = shape()
     apart = distance_mm(_model_shape, _rig_shape)
@@ -287,10 +250,6 @@ def play_the_action(_folder: Path) -> Iterator[float]:
     first, last = seen[min(seen)], seen[max(seen)]
     check(distance_mm(first, last) > 1, f"the arm has the same shape at frame {min(seen)} and {max(seen)}")
     check(not arm().fdda.status, f"the model was switched off: {arm().fdda.status}")
-
-
-def main_screen() -> bpy.types.Screen:
-    return bpy.context.window_manager.windows[0].screen
 
 
 def evaluate(_folder: Path) -> Iterator[float]:

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tomllib
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -25,11 +26,9 @@ WIDTH, HEIGHT = 1600, 1200
 INSTALL_SECONDS, SECONDS, END_SECONDS = 60, 600, 5
 LACKING = 3
 FEW_VALUES = 32
-STORIES = ("path", "work")
-"""The path of a first model, and the work with it: each in a Blender of its own, the second with the first's files."""
-FURTHER = ("shot", "leave", "back")
-"""What else a shot takes; a Blender that is closed while it trains, and the one that is opened afterwards. Run by name
-alone: of the first, the steps after the mask have not been gone through in a window yet, of the others none."""
+STORIES = ("path", "work", "shot", "cast", "ranges", "leave", "back")
+"""Each in a Blender of its own, with the files of those before: the path of a first model, the work with it, what a
+shot takes, several characters, ranges of motion, a Blender that is closed while it trains, and the next one."""
 
 
 def lacking(blender: str) -> str:
@@ -98,7 +97,7 @@ def is_one_color(picture: Path) -> bool:
     return len(set(zlib.decompress(packed))) < FEW_VALUES
 
 
-def drive(folder: Path, blender: str, stories: tuple[str, ...]) -> str:
+def drive(folder: Path, blender: str, stories: Sequence[str]) -> str:
     """Install and go through stories; returns what is wrong with the outcome, empty when all is well."""
     user = folder / "user"
     environment = {"FDDA_TRAINER_PYTHON": sys.executable, **os.environ, "BLENDER_USER_RESOURCES": str(user)}
@@ -143,9 +142,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="for pictures; what an earlier run left there is removed")
     parser.add_argument("blender", nargs="?", default="blender", help="command that starts Blender")
-    parser.add_argument(
-        "--story", choices=(*STORIES, *FURTHER), help="this one alone; all need what 'path' has left in FOLDER"
-    )
+    help_of_story = "these alone; all need what 'path' has left in FOLDER"
+    parser.add_argument("--story", nargs="+", choices=STORIES, help=help_of_story)
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # What was started is ended on the way out.
     folder = options.folder.resolve()
@@ -155,11 +153,12 @@ def main() -> int:
     if not PACKAGE.is_file():
         print(f"There is no {PACKAGE}; build it with 'make package'.", file=sys.stderr)
         return 1
-    if options.story in {None, STORIES[0]}:
+    stories = options.story or STORIES
+    if STORIES[0] in stories:
         shutil.rmtree(folder, ignore_errors=True)
     for part in ("work", "user"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    wrong = drive(folder, options.blender, (options.story,) if options.story else STORIES)
+    wrong = drive(folder, options.blender, stories)
     if wrong:
         print(f"The test of the window failed: {wrong}.", file=sys.stderr)
         return 1

@@ -54,9 +54,19 @@ def main_window() -> bpy.types.Window:
     return bpy.context.window_manager.windows[0]
 
 
+def main_screen() -> bpy.types.Screen:
+    return main_window().screen
+
+
+def browsers() -> int:
+    """How many file browsers are open."""
+    windows = bpy.context.window_manager.windows
+    return sum(area.type == "FILE_BROWSER" for window in windows for area in window.screen.areas)
+
+
 def view_area() -> bpy.types.Area:
     """The 3D View, the largest area of the window."""
-    areas = [area for area in main_window().screen.areas if area.type == "VIEW_3D"]
+    areas = [area for area in main_screen().areas if area.type == "VIEW_3D"]
     return max(areas, key=lambda area: area.width * area.height)
 
 
@@ -128,7 +138,7 @@ def below_mouse() -> str:
 
 def redraw() -> Iterator[float]:
     """Draw the window again; a file browser may take all of it."""
-    for area in main_window().screen.areas:
+    for area in main_screen().areas:
         area.tag_redraw()
         for each in area.regions:
             each.tag_redraw()

@@ -11,20 +11,24 @@ from pathlib import Path
 import bpy
 import numpy as np
 import sidebar
-from path_story import BLEND, arm, distance_mm, job_done, part, shape
-from window import check, main_window, move, over, picture, press, redraw, rest_mouse, settle, until, view_area
+from arm import BLEND, arm, armature, distance_mm, emptied, job_done, look_at, open_in, part, shape
+from window import (
+    browsers,
+    check,
+    main_window,
+    move,
+    over,
+    picture,
+    press,
+    redraw,
+    rest_mouse,
+    settle,
+    until,
+    view_area,
+)
 
 LONG = 100_000
 """Epochs of a training that does not end by itself."""
-
-
-def armature() -> bpy.types.Object:
-    return bpy.data.objects["arm_rig"]
-
-
-def browsers() -> int:
-    windows = bpy.context.window_manager.windows
-    return sum(area.type == "FILE_BROWSER" for window in windows for area in window.screen.areas)
 
 
 def leave_browser() -> Iterator[float]:
@@ -39,16 +43,8 @@ def leave_browser() -> Iterator[float]:
 
 def open_the_bound_file(folder: Path) -> Iterator[float]:
     """Open the file of the path, in a folder of its own without any model beside it: the model came along inside."""
-    own = folder / "work" / "alone"
-    own.mkdir(exist_ok=True)
-    shutil.copy(folder / "work" / BLEND, own / BLEND)
-    bpy.ops.wm.open_mainfile(filepath=str(own / BLEND), load_ui=False)
-    yield 1.0
-    check(arm().fdda.mode == "FDDA" and not arm().fdda.status, f"it plays {arm().fdda.mode}: {arm().fdda.status}")
+    yield from open_in(folder / "work" / "alone", folder)
     check(arm().fdda.packed is not None, "the model is not packed")
-    bpy.context.view_layer.objects.active = arm()
-    with over("WINDOW"):
-        bpy.ops.view3d.view_selected()
     yield from sidebar.show()
 
 
@@ -84,19 +80,13 @@ def add_model_asks_each_time(_folder: Path) -> Iterator[float]:
 def save_into_another_folder(folder: Path) -> Iterator[float]:
     """Save As elsewhere and open that: it plays."""
     before = shape()
-    other = folder / "work" / "elsewhere"
-    other.mkdir(exist_ok=True)
+    other = emptied(folder / "work" / "elsewhere")
     bpy.ops.wm.save_as_mainfile(filepath=str(other / BLEND))
     bpy.ops.wm.open_mainfile(filepath=str(other / BLEND), load_ui=False)
     yield 1.0
     apart = distance_mm(shape(), before)
     check(arm().fdda.mode == "FDDA" and apart < 1e-3, f"it is {apart:.3f} mm off; {arm().fdda.status}")
-    with over("WINDOW"):
-        bpy.ops.object.select_all(action="DESELECT")
-    arm().select_set(True)
-    bpy.context.view_layer.objects.active = arm()
-    with over("WINDOW"):
-        bpy.ops.view3d.view_selected()
+    look_at(arm())
 
 
 def select_bones_in_the_list(folder: Path) -> Iterator[float]:
@@ -221,7 +211,7 @@ def close_the_file_while_it_trains(folder: Path) -> Iterator[float]:
     """Train, open another file, come back: the training goes on and is followed. Cancel it."""
     job = part("jobs.job")
     work = folder / "work" / "elsewhere"
-    shutil.copytree(folder / "work" / "arm_recording", work / "arm_recording", dirs_exist_ok=True)
+    shutil.copytree(folder / "work" / "arm_recording", work / "arm_recording")
     arm().fdda.settings.epochs, arm().fdda.settings.model = LONG, "//long/arm.onnx"
     bpy.ops.wm.save_mainfile()
     yield 1.5
@@ -245,8 +235,7 @@ def close_the_file_while_it_trains(folder: Path) -> Iterator[float]:
 
 def make_a_model_in_one_go(folder: Path) -> Iterator[float]:
     """A new file with the arm, saved; one button: it is recorded, trained and bound."""
-    own = folder / "work" / "one_go"
-    own.mkdir(exist_ok=True)
+    own = emptied(folder / "work" / "one_go")
     bpy.ops.wm.read_homefile(app_template="", load_ui=False)
     yield 0.5
     bpy.ops.fdda.add_arm(density="1")
