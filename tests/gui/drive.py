@@ -21,6 +21,7 @@ import cast_story
 import leave_story
 import path_story
 import ranges_story
+import session_story
 import shot_story
 import work_story
 from window import StepError, picture, rest_mouse
@@ -32,6 +33,7 @@ STEPS = {
     "shot": shot_story.STEPS,
     "cast": cast_story.STEPS,
     "ranges": ranges_story.STEPS,
+    "session": session_story.STEPS,
     "leave": leave_story.LEAVE,
     "back": leave_story.BACK,
 }[NAME]

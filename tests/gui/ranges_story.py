@@ -112,4 +112,16 @@ def _width(bone: bpy.types.PoseBone, ranges: object) -> float:
     return found.high - found.low
 
 
-STEPS = (give_a_figure_human_ranges, mirror_and_copy_ranges)
+def read_names_with_a_prefix(folder: Path) -> Iterator[float]:
+    """All bones begin alike, as with Mixamo's: the list shows what tells them apart."""
+    armature = bpy.data.objects["figure_rig"]
+    for bone in armature.data.bones:
+        bone.name = f"mixamorig:{bone.name}"
+    yield 1.0
+    yield from redraw()
+    yield from picture(folder / "names.png")
+    shown = part("panels.names").shown_name(armature, "mixamorig:upper_arm.L")
+    check(shown == "upper_arm.L", f"the bone is shown as '{shown}'")
+
+
+STEPS = (give_a_figure_human_ranges, mirror_and_copy_ranges, read_names_with_a_prefix)

@@ -37,8 +37,18 @@ def show() -> Iterator[float]:
 
 def open_sections() -> Iterator[float]:
     """Which sections are open; returns their names. Closed, they are not drawn."""
-    _drawn.clear()
+    forget_drawn()
     yield from redraw()
+    return drawn()
+
+
+def forget_drawn() -> None:
+    """Forget which sections were drawn."""
+    _drawn.clear()
+
+
+def drawn() -> set[str]:
+    """The sections that were drawn since that was forgotten."""
     return set(_drawn)
 
 
