@@ -15,7 +15,8 @@ from fdda_addon.core.errors import FDDAError
 from .characters import Farm
 from .process import TryAgainError
 from .run import AGAIN, BLOCKED, FAILED, GOOD, Outcome, run_task
-from .tasks import REFINE, TRAIN, Task
+from .simulation import rest_seconds, task_seconds
+from .tasks import TRAIN, Task
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -132,7 +133,8 @@ def run_on(client: "Client", farm: Farm, tasks: dict[str, Task], names: list[str
     from distributed import as_completed
 
     futures, run_id = {}, f"{time.time():.3f}"
-    for number, name in enumerate(names):
+    rest = rest_seconds(tasks, task_seconds(tasks)[0])
+    for name in names:
         task = tasks[name]
         own = {other: tasks[other] for other in _ancestors(tasks, name)} | {name: task}
         needs_gpu = farm.gpu and task.kind == TRAIN
@@ -145,8 +147,8 @@ def run_on(client: "Client", farm: Farm, tasks: dict[str, Task], names: list[str
             key=f"{name}-{run_id}",
             retries=farm.retries,
             resources={GPU if needs_gpu else CPU: 1} if farm.gpu else None,
-            # What is refined is nearest to an end: it goes before what has not begun.
-            priority=(task.kind in (TRAIN, REFINE)) * len(names) - number,
+            # As the simulation has it: what is farthest from the end goes first.
+            priority=rest[name],
             pure=False,
         )
     by_key = {future.key: name for name, future in futures.items()}

@@ -58,6 +58,18 @@ def _estimated(task: Task, rates: list[float]) -> float:
     return START_SECONDS + ONCE.get(task.kind, 0.0) + SECONDS_A_POSE.get(task.kind, 0.0) * task.poses
 
 
+def rest_seconds(tasks: dict[str, Task], seconds: dict[str, float]) -> dict[str, float]:
+    """For each task, the longest way from its start to an end of the graph."""
+    rest = dict.fromkeys(tasks, 0.0)
+    for name in reversed(tasks):
+        # What waits for it comes later in the graph, and has told already what follows.
+        rest[name] += seconds[name]
+        for other in tasks[name].after:
+            if other in rest:
+                rest[other] = max(rest[other], rest[name])
+    return rest
+
+
 def simulate(tasks: dict[str, Task], seconds: dict[str, float], workers: int) -> Simulated:
     """Run the graph on paper: a free worker takes the task with the longest way to the end of those that can begin.
 
@@ -71,9 +83,7 @@ def simulate(tasks: dict[str, Task], seconds: dict[str, float], workers: int) ->
     for name, before in missing.items():
         for other in before:
             users[other].append(name)
-    rest: dict[str, float] = {}
-    for name in reversed(tasks):
-        rest[name] = seconds[name] + max((rest[user] for user in users[name]), default=0.0)
+    rest = rest_seconds(tasks, seconds)
     left = {name: len(before) for name, before in missing.items()}
     ready = [(-rest[name], name) for name, count in left.items() if not count]
     heapq.heapify(ready)

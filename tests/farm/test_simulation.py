@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from farm.characters import Farm
-from farm.simulation import ONCE, START_SECONDS, longest_path, print_estimate, simulate, task_seconds
+from farm.simulation import ONCE, START_SECONDS, longest_path, print_estimate, rest_seconds, simulate, task_seconds
 from farm.stamps import Stamp, write_stamp
 from farm.tasks import RECORD, Task, make_tasks
 
@@ -40,6 +40,7 @@ def test_what_has_the_longest_way_goes_first():
     """Shards and their merge; a short task that nothing waits for comes last, and hides beside the others."""
     tasks = graph(short="", a="", b="", merge="a b", train="merge")
     seconds = {"short": 2.0, "a": 2.0, "b": 2.0, "merge": 1.0, "train": 5.0}
+    assert rest_seconds(tasks, seconds) == {"short": 2, "a": 8, "b": 8, "merge": 6, "train": 5}
     assert simulate(tasks, seconds, 2).seconds == 8
     assert simulate(tasks, seconds, 1).seconds == sum(seconds.values())
 
