@@ -91,9 +91,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 
     settings = rig.mesh_object.fdda.settings
     draw_path(layout, settings, "recording")
-    _draw_target(layout, context, settings)
-    layout.prop(settings, "fit_linear")
-    layout.prop(settings, "least_vertices")
+    _draw_settings(layout, context, settings)
     found = shown_content(rig)
     if isinstance(found, str):
         draw_sentence(layout, context, found, "ERROR")
@@ -124,12 +122,15 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         layout.operator("fdda.remove_recording", text="Remove Recording", icon="TRASH").object = rig.mesh_object.name
 
 
-def _draw_target(layout: bpy.types.UILayout, context: bpy.types.Context, settings: bpy.types.PropertyGroup) -> None:
-    layout.prop_search(settings, "target", context.scene, "objects", icon="OUTLINER_OB_MESH")
+def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context, settings: bpy.types.PropertyGroup) -> None:
+    column = layout.column()
+    column.use_property_split, column.use_property_decorate = True, False
+    column.prop_search(settings, "target", context.scene, "objects", icon="OUTLINER_OB_MESH")
     if settings.target:
-        row = layout.row(align=True)
-        row.prop(settings, "pre_roll")
-        row.prop(settings, "settle")
+        column.prop(settings, "pre_roll")
+        column.prop(settings, "settle")
+    column.prop(settings, "fit_linear")
+    column.prop(settings, "least_vertices")
 
 
 def _draw_record(
