@@ -18,6 +18,7 @@ import bpy
 sys.path.insert(0, str(Path(__file__).parent))
 
 import cast_story
+import endure_story
 import leave_story
 import path_story
 import ranges_story
@@ -34,6 +35,7 @@ STEPS = {
     "cast": cast_story.STEPS,
     "ranges": ranges_story.STEPS,
     "session": session_story.STEPS,
+    "endure": endure_story.STEPS,
     "leave": leave_story.LEAVE,
     "back": leave_story.BACK,
 }[NAME]

@@ -30,6 +30,8 @@ STORIES = ("path", "work", "shot", "cast", "ranges", "session", "leave", "back")
 """Each in a Blender of its own, with the files of those before: the path of a first model, the work with it, what a
 shot takes, several characters, ranges of motion, what a long session must not spoil, a Blender that is closed while it
 trains, and the next one."""
+LONG = ("endure",)
+"""Run by name alone: five minutes of work with one character."""
 
 
 def lacking(blender: str) -> str:
@@ -144,7 +146,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path, help="for pictures; what an earlier run left there is removed")
     parser.add_argument("blender", nargs="?", default="blender", help="command that starts Blender")
     help_of_story = "these alone; all need what 'path' has left in FOLDER"
-    parser.add_argument("--story", nargs="+", choices=STORIES, help=help_of_story)
+    parser.add_argument("--story", nargs="+", choices=(*STORIES, *LONG), help=help_of_story)
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # What was started is ended on the way out.
     folder = options.folder.resolve()
