@@ -66,10 +66,10 @@ def _play(random: np.random.Generator) -> Iterator[float]:
 def _turn(random: np.random.Generator) -> Iterator[float]:
     """R, a move of the mouse, a click: a bone turns, and Blender writes an undo step."""
     bones = armature().pose.bones
-    part("scene.compatibility").select_bone(bones[armature().data.bones.active.name], False)
     chosen = bones[BONES[random.integers(len(BONES))]]
+    for bone in bones:
+        part("scene.compatibility").select_bone(bone, bone == chosen)
     armature().data.bones.active = chosen.bone
-    part("scene.compatibility").select_bone(chosen, True)
     view = region("WINDOW")
     x, y = view.x + 0.4 * view.width, view.y + 0.2 * view.height
     move(x, y)
