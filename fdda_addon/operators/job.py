@@ -127,7 +127,7 @@ class JobOperator:
         except FDDAError as error:
             self.report({"ERROR"}, str(error))
             return False
-        self._timer, self._shown, self._redrawn, self._worked = None, None, 0.0, time.monotonic()
+        self._timer, self._said, self._shown, self._redrawn, self._worked = None, None, None, 0.0, time.monotonic()
         self._run = Run(
             state,
             self.steps(context),
@@ -155,8 +155,7 @@ class JobOperator:
         shown = (state.stage, state.done, len(state.log) + len(state.warnings), state.cancel_requested)
         if shown != self._shown and now - self._redrawn >= REDRAW_SECONDS:
             self._shown, self._redrawn = shown, now
-            if self.borrows_scene:
-                context.workspace.status_text_set(f"{self.title}: {state.sentence} (ESC: cancel)")
+            self._say(context, f"{self.title}: {state.sentence} (ESC: cancel)" if self.borrows_scene else None)
             redraw()
         return None
 
@@ -166,12 +165,17 @@ class JobOperator:
         self.report({state.outcome_level}, state.outcome)
         return {"FINISHED"} if state.outcome_level == "INFO" else {"CANCELLED"}
 
+    def _say(self, context: bpy.types.Context, text: str | None) -> None:
+        """Show a text in the status bar, or Blender's own again where one was shown."""
+        if text != self._said and context.workspace is not None:
+            context.workspace.status_text_set(text)
+            self._said = text
+
     def _leave(self, context: bpy.types.Context) -> None:
         if self._timer is not None:
             context.window_manager.event_timer_remove(self._timer)
             self._timer = None
-            if context.workspace is not None:
-                context.workspace.status_text_set(None)
+            self._say(context, None)
 
 
 def _is_harmless(context: bpy.types.Context, event: bpy.types.Event) -> bool:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """A bound mesh shows the model's output for the evaluated pose, however the pose came about."""
 
+import shutil
+
 import bpy
 import numpy as np
 import pytest
@@ -237,8 +239,7 @@ def test_removed_modifier_is_reported(bound):
 
 
 def test_missing_model_is_reported(bound, elbow, tmp_path):
-    path = tmp_path / "alone.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    path = shutil.copy(elbow.bound, tmp_path / "alone.blend")
     bpy.ops.wm.open_mainfile(filepath=str(path))
     mesh_object = bpy.data.objects[ELBOW]
     bpy.context.view_layer.update()

@@ -2,7 +2,10 @@
 """Targets that depend on time: frames in their order, pre-roll, poses that are held until a simulation rests."""
 
 import json
-import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import bpy
@@ -23,6 +26,7 @@ from .scene_state import assert_same_state, drain, scene_state
 from .test_targets import built, complex_positions, of_flesh, recorded, refused
 
 SIMULATIONS = (targets.target_soft_body, targets.target_cloth, targets.target_geometry_nodes)
+ROOT = Path(__file__).resolve().parents[2]
 SETTLED = ("--target", "flesh", "--settle", 80)
 
 
@@ -140,24 +144,26 @@ def test_a_settled_pose_depends_on_the_pose_alone(build, tmp_path):
 
 
 def test_settling_resumes_where_it_was_killed(tmp_path):
-    rig = built(targets.target_cloth, tmp_path / "rig.blend")
+    rig, killed = built(targets.target_cloth, tmp_path / "rig.blend"), tmp_path / "killed"
     whole = recorded(rig, tmp_path / "whole", *SETTLED, "--poses", 8)
-    bpy.ops.wm.open_mainfile(filepath=str(rig))
-    settings = RecordingSettings(poses=8, target=TargetSettings("flesh", settle=80))
-    steps = record(find_rig("elbow"), tmp_path / "parts", settings)
-    for step in steps:
-        if (step.stage, step.done) == ("poses", 3):
-            # What a kill leaves: nothing is closed.
-            shutil.copytree(tmp_path / "parts", tmp_path / "killed")
-            break
-    steps.close()
-    (tmp_path / "killed" / "recording.lock").unlink()
-    left = json.loads((tmp_path / "killed" / "recording.json").read_text())["complete"]
-    assert left >= 2
-    assert run("record", rig, tmp_path / "killed", "--object", "elbow", *SETTLED, "--poses", 8, "--resume") == 0
+    words = ("record", rig, killed, "--object", "elbow", *SETTLED, "--poses", 8)
+    process = subprocess.Popen([sys.executable, "-m", "fdda_addon", *map(str, words)], cwd=ROOT)
+    while process.poll() is None and complete_poses(killed) < 2:
+        time.sleep(0.002)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL, "it was quicker than the kill"
+    assert run(*words, "--resume") == 0
     for name in ("pose_matrices.npy", "residuals.npy", "recording.json"):
-        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+        assert (killed / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
     assert len(whole.residuals) == 8
+
+
+def complete_poses(recording: Path) -> int:
+    """How many poses its index says are complete; 0 while there is none."""
+    try:
+        return json.loads((recording / "recording.json").read_text())["complete"]
+    except FileNotFoundError:
+        return 0
 
 
 def test_poses_that_do_not_settle_are_named(tmp_path, capfd):
