@@ -91,8 +91,6 @@ def test_what_no_model_can_stand_in_for_is_named(name, elbow, tmp_path):
     assert sentence in check(rig).problems
     assert_same_state(before, scene_state(rig))
     assert not (tmp_path / "recording").exists()
-    if name == "FLUID":
-        return  # Blender itself does not free two blocks of a fluid domain that is switched off, add-on or none.
     # Switched off, nothing is wrong with it.
     rig.mesh_object.modifiers["It"].show_viewport = False
     assert check(rig).problems == ()
