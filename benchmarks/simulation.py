@@ -23,7 +23,6 @@ from fdda_addon.cli.main import main as run_verb  # noqa: E402
 from fdda_addon.scene.blend_file import save_copy  # noqa: E402
 
 FLESH = "flesh"
-FLESHY, GOAL, HAND_GOAL = ("shoulder", "elbow"), 0.9, 0.99
 FRAMES = 60
 """Frames that are timed."""
 PICTURED = 10
@@ -40,12 +39,10 @@ def build(path: Path, kind: str) -> None:
     flesh = arm.copy()
     flesh.data, flesh.name = arm.data.copy(), FLESH
     bpy.context.scene.collection.objects.link(flesh)
-    if kind == "cloth":
-        make_cloth(flesh)
-    else:
+    if kind == "soft-body":
         make_soft_body(flesh)
-    if kind == "painted":
-        paint_goals(flesh)
+    else:
+        make_cloth(flesh)
     bpy.context.scene.frame_set(1)
     save_copy(path)
 
@@ -54,20 +51,9 @@ def make_soft_body(flesh: bpy.types.Object) -> None:
     """Springs along the edges, goals at the skin of the bones."""
     flesh.modifiers.new("Softbody", "SOFT_BODY")
     soft = flesh.soft_body
-    soft.use_goal, soft.goal_default, soft.goal_spring, soft.goal_friction = True, GOAL, 0.9, 30.0
+    soft.use_goal, soft.goal_default, soft.goal_spring, soft.goal_friction = True, 0.9, 0.9, 30.0
     soft.use_edges, soft.pull, soft.push, soft.damping, soft.bend = True, 0.3, 0.3, 50.0, 0.2
     soft.mass = 0.3
-
-
-def paint_goals(flesh: bpy.types.Object) -> None:
-    """There is little flesh on a hand: what hangs on shoulder and elbow sags as without, the rest a tenth as much."""
-    names = [group.name for group in flesh.vertex_groups]
-    goal = flesh.vertex_groups.new(name="goal")
-    for vertex in flesh.data.vertices:
-        weights = {names[element.group]: element.weight for element in vertex.groups}
-        fleshy = sum(weights.get(name, 0.0) for name in FLESHY) / sum(weights.values())
-        goal.add([vertex.index], fleshy * GOAL + (1 - fleshy) * HAND_GOAL, "REPLACE")
-    flesh.soft_body.vertex_group_goal = goal.name
 
 
 def make_cloth(flesh: bpy.types.Object) -> None:
@@ -102,7 +88,7 @@ def verb(*arguments: object) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--kind", choices=("soft-body", "painted", "cloth"), default="soft-body")
+    parser.add_argument("--kind", choices=("soft-body", "cloth"), default="soft-body")
     parser.add_argument("--poses", type=int, default=300)
     parser.add_argument("--held-out", type=int, default=50)
     parser.add_argument("--settle", type=int, default=60)
