@@ -70,7 +70,8 @@ def handler_table() -> list[tuple[str, Callable[..., None]]]:
     from .runtime import handlers
     from .scene import stored_paths
 
-    modules = (job, checks, handlers, side_by_side, stored_paths, training)
+    # After a save paths are put back before models are looked for.
+    modules = (stored_paths, job, checks, handlers, side_by_side, training)
     return [entry for module in modules for entry in module.HANDLERS.items()]
 
 

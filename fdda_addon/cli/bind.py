@@ -72,7 +72,8 @@ def _put_beside(scene_rig: "SceneRig", model: Path, out: Path) -> Path:
     binding = scene_rig.mesh_object.fdda
     adopt(scene_rig.mesh_object)
     entry = bound_entry(scene_rig.mesh_object)
-    entry.path = binding.model = stored_path(place)
+    # Through links the way may lead elsewhere than to what lies below the file.
+    entry.path = binding.model = stored_path(out.parent / place.resolve().relative_to(out.resolve().parent))
     if place.exists():
         return model
     with replacing(place) as temporary:

@@ -59,7 +59,7 @@ def _inherited_paths(mesh_object: bpy.types.Object) -> list[str]:
 
 
 def _own_paths() -> Iterator[tuple[bpy.types.Object, bpy.types.PropertyGroup, str]]:
-    """Where a path is kept that is relative to the open file: the object, the property group, and the name."""
+    """Where a path is kept that is not a library's: the object, the property group, and the name."""
     for mesh_object in bpy.data.objects:
         if mesh_object.type != "MESH" or mesh_object.library is not None:
             continue
@@ -67,13 +67,13 @@ def _own_paths() -> Iterator[tuple[bpy.types.Object, bpy.types.PropertyGroup, st
         places = [(binding, "model"), (binding.settings, "recording"), (binding.settings, "model")]
         for owner, name in [*places, *((entry, "path") for entry in binding.models)]:
             stored = getattr(owner, name)
-            if stored.startswith(RELATIVE) and stored not in inherited:
+            if stored and stored not in inherited:
                 yield mesh_object, owner, name
 
 
 def _relative(path: Path, folder: Path) -> str:
     try:
-        return RELATIVE + Path(os.path.relpath(path, folder)).as_posix()
+        return bpy.path.relpath(str(path), start=str(folder)).replace(os.sep, "/")
     except ValueError:
         # On another drive of Windows.
         return str(path)
@@ -85,13 +85,15 @@ def _on_save_begins(file: str = "", *_: object) -> None:
     _rebased.clear()
     _saved_from = bpy.data.filepath
     folder = Path(os.path.abspath(file)).parent
-    if not _saved_from or not file or folder == Path(os.path.normpath(_saved_from)).parent:
+    if not file or (_saved_from and folder == Path(os.path.normpath(_saved_from)).parent):
         return
     for mesh_object, owner, name in _own_paths():
         stored = getattr(owner, name)
-        _rebased.append((owner, name, stored))
         path = Path(os.path.normpath(bpy.path.abspath(stored)))
-        setattr(owner, name, _unlike_inherited(mesh_object, _relative(path, folder)))
+        # What is given in full stays so, but for what goes wherever the file goes.
+        if (stored.startswith(RELATIVE) and _saved_from) or path.is_relative_to(folder):
+            _rebased.append((owner, name, stored))
+            setattr(owner, name, _unlike_inherited(mesh_object, _relative(path, folder)))
 
 
 @persistent

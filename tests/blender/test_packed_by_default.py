@@ -11,7 +11,7 @@ from fdda_addon.operators import playback
 from fdda_addon.runtime import model_files, packed
 from fdda_addon.scene import model_trust
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose, run
 
 
 @pytest.fixture
@@ -145,9 +145,34 @@ def test_a_copy_finds_the_model_and_the_open_file_too(followed, elbow, tmp_path)
     copy.parent.mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True)
     assert named_paths(followed) == before
+    pose(angle=0.7)
+    assert_plays(followed, elbow.model)
     with pytest.raises(RuntimeError):
         bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "nowhere" / "shot.blend"))
     assert named_paths(followed) == before
+    pose(angle=0.8)
+    assert_plays(followed, elbow.model)
     bpy.ops.wm.open_mainfile(filepath=str(copy))
     pose(angle=0.9)
     assert_plays(bpy.data.objects[ELBOW], elbow.model)
+
+
+@pytest.mark.parametrize(("folder", "stored"), [(".", "//models/elbow.onnx"), ("elsewhere", None)])
+def test_what_is_given_in_full_stays_so_unless_it_lies_below_the_file(followed, model, tmp_path, folder, stored):
+    bpy.data.objects[ELBOW].fdda.model = followed.fdda.models[0].path = str(model)
+    (tmp_path / "source").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "source" / "first.blend"))
+    assert named_paths(followed)[:2] == [str(model)] * 2
+    path = tmp_path / folder / "second.blend"
+    path.parent.mkdir(exist_ok=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    assert named_paths(followed)[:2] == [stored or str(model)] * 2
+
+
+def test_a_file_that_is_bound_through_a_link_has_its_model_below(elbow, tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    model = shutil.copy(elbow.model, tmp_path / "real" / "elbow.onnx")
+    assert run("bind", elbow.rig, model, tmp_path / "link" / "bound.blend") == 0
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "link" / "bound.blend"))
+    assert bpy.data.objects[ELBOW].fdda.model == "//elbow.onnx"
