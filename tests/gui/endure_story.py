@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 import sidebar
 from arm import arm, armature, check_it_plays, open_in, part, positions
-from window import check, click, main_screen, move, over, press, region, rest_mouse, settle, until
+from window import check, click, move, over, play, press, region, rest_mouse, settle, stop
 
 SECONDS, SEED = 300, 0
 NEAR, FLAT_MB = 1e-5, 60
@@ -55,12 +55,9 @@ def play_pose_and_undo(_folder: Path) -> Iterator[float]:
 
 
 def _play(random: np.random.Generator) -> Iterator[float]:
-    yield from rest_mouse()
-    yield from press("space")
-    yield from until(lambda: main_screen().is_animation_playing, 5, "the space bar does not play the action")
+    yield from play()
     yield float(random.uniform(0.5, 3))
-    yield from press("space")
-    yield from until(lambda: not main_screen().is_animation_playing, 5, "the space bar does not stop the action")
+    yield from stop()
 
 
 def _turn(random: np.random.Generator) -> Iterator[float]:

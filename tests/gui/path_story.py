@@ -18,13 +18,14 @@ from window import (
     StepError,
     check,
     click,
-    main_screen,
     over,
     picture,
+    play,
     press,
     redraw,
     region,
     rest_mouse,
+    stop,
     until,
     view_area,
     vivid_part,
@@ -233,9 +234,7 @@ def measure_the_model(_folder: Path) -> Iterator[float]:
 def play_the_action(_folder: Path) -> Iterator[float]:
     """Press space over the viewport: the arm moves, frame by frame."""
     bpy.context.scene.frame_set(1)
-    yield from rest_mouse()
-    yield from press("space")
-    yield from until(lambda: main_screen().is_animation_playing, 5, "the space bar does not play the action")
+    yield from play()
     seen, end = {}, time.monotonic() + PLAY_SECONDS
     while time.monotonic() < end or (len(seen) < 4 and time.monotonic() < end + SLOW_SECONDS):
         yield 0.1
@@ -244,8 +243,7 @@ def play_the_action(_folder: Path) -> Iterator[float]:
         positions = np.empty((len(mesh.vertices), 3), np.float32)
         mesh.attributes["position"].data.foreach_get("vector", positions.reshape(-1))
         seen[frame] = positions
-    yield from press("space")
-    yield from until(lambda: not main_screen().is_animation_playing, 5, "the space bar does not stop the action")
+    yield from stop()
     check(len(seen) > 2, f"in {PLAY_SECONDS} seconds the frames {sorted(seen)} were shown")
     first, last = seen[min(seen)], seen[max(seen)]
     check(distance_mm(first, last) > 1, f"the arm has the same shape at frame {min(seen)} and {max(seen)}")

@@ -10,7 +10,18 @@ from pathlib import Path
 import bpy
 import sidebar
 from arm import arm, distance_mm, job_done, look_at, open_in, part, positions, shape
-from window import browsers, check, main_screen, main_window, move, picture, press, redraw, rest_mouse, settle, until
+from window import (
+    browsers,
+    check,
+    close_browser,
+    picture,
+    play,
+    press,
+    redraw,
+    rest_mouse,
+    stop,
+    until,
+)
 
 EPOCHS, FRAMES, PLAY_SECONDS = 20, 40, 3
 HALF = 0.5
@@ -30,16 +41,14 @@ def play_with_the_tab_open(folder: Path) -> Iterator[float]:
     bpy.context.scene.frame_set(1)
     yield from rest_mouse()
     yield 1.0
-    yield from press("space")
-    yield from until(lambda: main_screen().is_animation_playing, 5, "the space bar does not play the action")
+    yield from play()
     sidebar.forget_drawn()
     end = time.monotonic() + PLAY_SECONDS
     while time.monotonic() < end:
         yield 0.1
     drawn = sidebar.drawn()
     yield from picture(folder / "playing.png")
-    yield from press("space")
-    yield from until(lambda: not main_screen().is_animation_playing, 5, "the space bar does not stop the action")
+    yield from stop()
     check(bpy.context.scene.frame_current != 1, "the action has not played")
     check(not drawn, f"while it plays the sections {sorted(drawn)} are drawn")
 
@@ -75,10 +84,7 @@ def bake_half_the_strength(folder: Path) -> Iterator[float]:
     yield from sidebar.open_section("playback")
     yield from sidebar.push("fdda.bake")
     yield from until(browsers, 5, "Bake… opens no file browser")
-    move(main_window().width / 2, main_window().height / 2)
-    yield from settle()
-    yield from press("Return")
-    yield from until(lambda: not browsers(), 5, "Return does not close the file browser")
+    yield from close_browser("Return")
     yield from job_done("bake", 60)
     yield from redraw()
     yield from picture(folder / "baked.png")

@@ -18,11 +18,13 @@ from window import (
     over,
     picture,
     pixels,
+    play,
     press,
     redraw,
     region,
     rest_mouse,
     settle,
+    stop,
     until,
     view_area,
 )
@@ -114,11 +116,9 @@ def show_the_rig_beside(folder: Path) -> Iterator[float]:
     before = positions(part("evaluation.side_by_side").find(arm()))
     yield from rest_mouse()
     bpy.context.scene.frame_set(1)
-    yield from press("space")
-    yield from until(lambda: main_screen().is_animation_playing, 5, "the space bar does not play the action")
+    yield from play()
     yield from until(lambda: bpy.context.scene.frame_current > 40, 30, "the action does not go on")
-    yield from press("space")
-    yield from until(lambda: not main_screen().is_animation_playing, 5, "the space bar does not stop the action")
+    yield from stop()
     check(
         distance_mm(positions(part("evaluation.side_by_side").find(arm())), before) > 1, "the rig beside does not move"
     )

@@ -136,6 +136,28 @@ def below_mouse() -> str:
     return manager.clipboard
 
 
+def play() -> Iterator[float]:
+    """Press space over the viewport: the action plays."""
+    yield from rest_mouse()
+    yield from press("space")
+    yield from until(lambda: main_screen().is_animation_playing, 5, "the space bar does not play the action")
+
+
+def stop() -> Iterator[float]:
+    """Press space again: it plays no more."""
+    yield from press("space")
+    yield from until(lambda: not main_screen().is_animation_playing, 5, "the space bar does not stop the action")
+
+
+def close_browser(key: str) -> Iterator[float]:
+    """Press a key, "Escape" or "Return", with the mouse over the file browser: it closes."""
+    move(main_window().width / 2, main_window().height / 2)
+    yield from settle()
+    yield from press(key)
+    yield from until(lambda: not browsers(), 5, f"{key} does not close the file browser")
+    yield 0.5
+
+
 def redraw() -> Iterator[float]:
     """Draw the window again; a file browser may take all of it."""
     for area in main_screen().areas:

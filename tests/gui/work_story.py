@@ -15,30 +15,18 @@ from arm import BLEND, arm, armature, distance_mm, emptied, job_done, look_at, o
 from window import (
     browsers,
     check,
-    main_window,
-    move,
+    close_browser,
     over,
     picture,
     press,
     redraw,
     rest_mouse,
-    settle,
     until,
     view_area,
 )
 
 LONG = 100_000
 """Epochs of a training that does not end by itself."""
-
-
-def leave_browser() -> Iterator[float]:
-    """Close the file browser with ESC, the mouse over it."""
-    window = main_window()
-    move(window.width / 2, window.height / 2)
-    yield from settle()
-    yield from press("Escape")
-    yield from until(lambda: not browsers(), 5, "ESC does not close the file browser")
-    yield 0.5
 
 
 def open_the_bound_file(folder: Path) -> Iterator[float]:
@@ -56,13 +44,13 @@ def bake_asks_each_time(folder: Path) -> Iterator[float]:
     yield from sidebar.push("fdda.bake")
     yield from until(browsers, 5, "Bake… opens no file browser")
     yield from picture(folder / "bake_dialog.png")
-    yield from leave_browser()
+    yield from close_browser("Escape")
     bpy.ops.fdda.bake(filepath=str(baked))
     before = baked.read_bytes()
     yield from redraw()
     yield from sidebar.push("fdda.bake")
     yield from until(browsers, 5, "Bake… opens no file browser the second time")
-    yield from leave_browser()
+    yield from close_browser("Escape")
     check(baked.read_bytes() == before, "the first bake was written over")
     check([p.name for p in baked.parent.glob("*baked*")] == [], "something was baked that nobody asked for")
 
@@ -73,7 +61,7 @@ def add_model_asks_each_time(_folder: Path) -> Iterator[float]:
     for _ in range(2):
         yield from sidebar.push("fdda.add_model", across=0.97)
         yield from until(browsers, 5, "+ opens no file browser")
-        yield from leave_browser()
+        yield from close_browser("Escape")
     check(len(arm().fdda.models) == 1, f"the list has {len(arm().fdda.models)} models")
 
 
