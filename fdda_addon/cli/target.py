@@ -19,8 +19,8 @@ def add_repeats(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=REPEATS,
         metavar="N",
-        help="approach N of the poses that settle from another direction as well, to say how close a model can come "
-        f"(default {REPEATS})",
+        help="approach N of the poses that settle, or of the frames of actions, from another direction as well, to say "
+        f"how close a model of a simulation can come (default {REPEATS})",
     )
 
 

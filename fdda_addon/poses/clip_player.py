@@ -3,12 +3,15 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import bpy
+import numpy as np
 
 from ..core.recording.index import ACTION
 from ..scene.armature import clear_pose
-from ..scene.borrow import animated_values, assign_action, driving_actions, set_value
+from ..scene.arrays import POSE_CHANNELS, read, write
+from ..scene.borrow import animated_values, assign_action, driving_actions, read_value, set_value
 from ..scene.compatibility import curves_of
 from ..scene.controls import owner_of, set_control
 from ..scene.scene_rig import SceneRig
@@ -20,6 +23,19 @@ Numbers = dict[tuple[bpy.types.ID, str], object]
 
 Controlled = Sequence[tuple[SceneRig, Iterable[str]]]
 """Rigs of one armature, each with the names of the controls that something else sets between frames."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a clip set in a frame.
+
+    Attributes:
+        channels: of the pose bones, an array for each of `POSE_CHANNELS`.
+        numbers: what else it animates.
+    """
+
+    channels: tuple[np.ndarray, ...]
+    numbers: Numbers
 
 
 class ClipPlayer:
@@ -72,6 +88,24 @@ class ClipPlayer:
         for frame in clip.frames[first:]:
             self.show(clip, frame)
             yield
+
+    @property
+    def shown(self) -> Shown:
+        """What the clip has set in the frame that is shown."""
+        bones = self._armature_object.pose.bones
+        numbers = {(datablock, path): read_value(datablock, path) for datablock, path in self._numbers}
+        return Shown(tuple(read(bones, channel) for channel in POSE_CHANNELS), numbers)
+
+    def put(self, shown: Shown, frame: int) -> None:
+        """Go to a frame with what a clip has set in another; nothing drives the rig."""
+        self.stop()
+        for channel, values in zip(POSE_CHANNELS, shown.channels, strict=True):
+            write(self._armature_object.pose.bones, channel, values)
+        for (datablock, path), value in shown.numbers.items():
+            set_value(datablock, path, value)
+        for datablock in {self._armature_object, *(datablock for datablock, _ in shown.numbers)}:
+            datablock.update_tag()
+        bpy.context.scene.frame_set(frame)
 
     def stop(self) -> None:
         """Let nothing drive the rig; it is at rest, its numbers as in the file."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The poses of a recording, or of several that share them: random ones, then the frames of clips."""
 
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Collection, Container, Iterator, Sequence
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from ..core.poses import CONTROL, Channel, sample_pose
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
 from ..poses.suspended_limits import SuspendedLimits
-from ..rig.target_time import DIRECT, Approach, Settled, way
+from ..rig.target_time import DIRECT, Approach, shown_again, way
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
 from .plan import RecordingSettings, planned_margin
@@ -91,11 +91,37 @@ class PosePlan:
                 yield first + number
             first += len(clip.frames)
 
-    def repeat(self, index: int) -> Settled:
-        """Hold a random pose within the range that is reached over another one, which no recording of this plan has."""
-        set_pose = self._setter(self._channels)
-        pose, over = (self._way_to(self._channels, number, set_pose) for number in (index, REPEAT_INDEX + index))
-        return self.approach.settler.settle(pose, over)
+    @property
+    def repeatable(self) -> list[int]:
+        """Numbers of the poses that `poses_again` may reach, ascending; those of a margin are not among them."""
+        if not self.approach.has_ways:
+            return []
+        if self.approach.settler:
+            # There are no frames of clips (`make_approach`).
+            return list(range(self.inside))
+        first, numbers = self._settings.poses, []
+        for clip in self._clips:
+            numbers += [first + number for number in shown_again(clip)]
+            first += len(clip.frames)
+        return numbers
+
+    def poses_again(self, player: ClipPlayer, wanted: Collection[int]) -> Iterator[int]:
+        """As `poses`, over another way: random poses over one that no recording of this plan has, and frames of clips
+        from those that follow them."""
+        if self.approach.settler:
+            set_pose = self._setter(self._channels)
+            with self.approach.borrowed():
+                for index in sorted(wanted):
+                    numbers = (index, REPEAT_INDEX + index)
+                    self.approach.settler.settle(*(self._way_to(self._channels, n, set_pose) for n in numbers))
+                    yield index
+            return
+        first = self._settings.poses
+        for clip in self._clips:
+            if own := {number - first for number in wanted if 0 <= number - first < len(clip.frames)}:
+                for number in self.approach.frames_again(player, clip, own):
+                    yield first + number
+            first += len(clip.frames)
 
     def _way_to(
         self, channels: tuple[Channel, ...], index: int, set_pose: Callable[[np.ndarray], None]

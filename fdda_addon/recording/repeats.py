@@ -2,6 +2,7 @@
 """How far apart what a target shows in one pose is, by the way there: below that no model of the pose can go."""
 
 from collections.abc import Iterator
+from contextlib import closing
 
 import numpy as np
 
@@ -12,40 +13,42 @@ from ..core.recording.arrays import open_array
 from ..core.recording.target import Repeats
 from ..core.recording.writer import RecordingWriter
 from ..core.skinning import LinearLayer
+from ..poses.clip_player import ClipPlayer
 from .phases import Found
 from .pose_plan import PosePlan
 
 
-def measure_repeats(mesh: Found, plan: PosePlan, writer: RecordingWriter, count: int) -> Iterator[Progress]:
-    """Reach some poses of a recording over other ones, and note how far the target is from what was recorded.
+def measure_repeats(
+    mesh: Found, plan: PosePlan, player: ClipPlayer | None, writer: RecordingWriter, count: int
+) -> Iterator[Progress]:
+    """Reach some poses of a recording over another way, and note how far the target is from what was recorded.
 
-    Nothing is done where that was noted before. Poses that did not come to rest are not repeated,
-    and those of a margin neither.
+    Nothing is done where that was noted before. Poses that did not come to rest are not repeated.
 
     Args:
         mesh: whose poses were recorded.
-        plan: of random poses, which are held.
+        plan: of the poses.
+        player: plays its clips; None where there are none.
         writer: of the recording, all poses of which are complete.
         count: how many poses are repeated at most.
 
     Yields:
         Progress of the stage "repeats".
     """
-    at_rest = sorted(set(range(min(writer.complete, plan.inside))) - set(writer.unsettled))
-    if writer.repeats or not at_rest:
+    found = [number for number in plan.repeatable if number not in writer.unsettled]
+    if writer.repeats or not found:
         return
-    places = sorted({int(number * GOLDEN_RATIO * len(at_rest)) % len(at_rest) for number in range(count)})
-    numbers = [at_rest[place] for place in places]
-    rig, layer = writer.rig, LinearLayer(writer.rig, writer.partitions)
+    numbers = sorted({found[int(number * GOLDEN_RATIO * len(found)) % len(found)] for number in range(count)})
+    rig, layer, settler = writer.rig, LinearLayer(writer.rig, writer.partitions), plan.approach.settler
     recorded = open_array(writer.path / "residuals.npy", (writer.complete, rig.vertex_count, 3), np.float32)
     apart, linear = [], []
-    with plan.approach.borrowed():
-        for done, number in enumerate(numbers, 1):
-            plan.repeat(number)
+    # So that what plays is stopped.
+    with closing(plan.poses_again(player, numbers)) as again:
+        for done, number in enumerate(again, 1):
             pose, positions, _ = mesh.evaluator.evaluate()
             before = layer.complex_positions(pose[None], np.array(recorded[number])[None])[0]
             apart.append(distances(positions, before, rig.metres_per_unit))
             linear.append(distances(before, layer.positions(pose[None])[0], rig.metres_per_unit))
-            yield Progress("repeats", done, len(numbers), detail=str(plan.approach.settler.last))
+            yield Progress("repeats", done, len(numbers), detail=str(settler.last) if settler else "")
     statistics = {name: round(value, 6) for name, value in error_statistics(np.stack(apart)).to_json().items()}
     writer.note_repeats(Repeats(tuple(numbers), statistics, round(float(np.mean(linear)) * 1000, 6)))

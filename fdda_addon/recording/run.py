@@ -226,8 +226,8 @@ def _record_poses(
         with closing(left), closing(append_poses(left, appenders)) as steps:
             for done in steps:
                 yield Progress("poses", done, len(wanted), detail=str(settler.last) if settler else "")
-        if settler and settings.target.repeats and len(wanted) == plan.total:
-            yield from measure_repeats(meshes[0], plan, writer, settings.target.repeats)
+        if plan.repeatable and settings.target.repeats and len(wanted) == plan.total:
+            yield from measure_repeats(meshes[0], plan, player, writer, settings.target.repeats)
             yield Progress("poses", len(wanted), len(wanted))
 
 

@@ -179,15 +179,15 @@ def check_clips(target: Target, clips: Sequence[Clip], pre_roll: int) -> None:
 
 
 @contextmanager
-def borrowed_range(target: Target, first: int, last: int | None = None) -> Iterator[None]:
-    """Let the simulations of a target start at a frame, and last until another at least."""
+def borrowed_range(target: Target, first: int | None, last: int) -> Iterator[None]:
+    """Let the simulations of a target start at a frame, None for where each does, and last until another at least."""
     with ExitStack() as stack:
         for cache in target.simulations:
             if cache.owner is not None:
-                end = max(cache.owner.frame_end, last or first)
                 # The end first: Blender lets none of the two pass the other.
-                stack.enter_context(borrowed_attributes(cache.owner, frame_end=end))
-                stack.enter_context(borrowed_attributes(cache.owner, frame_start=first))
+                stack.enter_context(borrowed_attributes(cache.owner, frame_end=max(cache.owner.frame_end, last)))
+                if first is not None:
+                    stack.enter_context(borrowed_attributes(cache.owner, frame_start=first))
         yield
 
 

@@ -2,8 +2,8 @@
 """Brings a target that depends on time to poses: frames in their order with a pre-roll, poses held until it rests."""
 
 import time
-from collections.abc import Callable, Container, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Container, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 
 import bpy
@@ -14,13 +14,15 @@ from ..core.errors import RigError
 from ..core.recording.target import FRAMES, POSE, SIMULATION, RecordedTarget
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
-from ..scene.arrays import POSE_CHANNELS, read, write
+from ..scene.arrays import POSE_CHANNELS, write
 from ..scene.scene_rig import SceneRig
 from ..scene.unit import metres_per_unit
 from .target import Target, borrowed_range, check_clips, find_target
 
 APPROACH = 10
 """Frames in which a pose is approached that is held afterwards."""
+AGAIN = 100
+"""Frames of a clip beyond so many are not shown from the other side: all that are before them are played twice."""
 QUIET = 3
 """So many frames in a row no vertex may move: what swings stands still for one at each turn."""
 
@@ -34,7 +36,8 @@ class TargetSettings:
         pre_roll: frames before the first of an action, in which the rig goes from the rest pose to it.
         settle: frames for which a random pose is held at most until the target has come to rest; 0 for not at all.
         still_mm: it is at rest when no vertex moves by more from a frame to the next, mm.
-        repeats: how many of the poses that are held are approached from another direction as well.
+        repeats: how many of the poses that are held, or of the frames of actions, a simulation is brought to a second
+            time, from another direction.
     """
 
     name: str = ""
@@ -143,23 +146,57 @@ def show_frames(
             player.show(clip, clip.frames[number])
             yield number
         return
-    first = clip.frames[0] - pre_roll if pre_roll else target.first_frame
-    with borrowed_range(target, first, clip.frames[-1]) if pre_roll else _as_it_is():
-        if pre_roll:
-            _roll_in(target, player, clip, first)
-        else:
-            target.forget()
-            for frame in range(first, clip.frames[0]):
-                player.show(clip, frame)
+    with _begun(player, clip, target, pre_roll):
         for number, frame in enumerate(clip.frames[: numbers[-1] + 1]):
             player.show(clip, frame)
             if number in wanted:
                 yield number
 
 
+def shown_again(clip: Clip) -> range:
+    """Numbers of the frames of a clip that can be shown from the other side: there are some to come back from."""
+    return range(min(len(clip.frames) - APPROACH, AGAIN))
+
+
+def show_frames_again(
+    player: ClipPlayer, clip: Clip, wanted: Collection[int], target: Target, pre_roll: int = 0
+) -> Iterator[int]:
+    """Show frames of a clip from the other side: it is played past the last, and back to the first, as time goes on.
+
+    Args:
+        player: plays the clip.
+        clip: the clip.
+        wanted: numbers of the frames that are yielded, at least one, each of `shown_again`.
+        target: a simulation.
+        pre_roll: as in `show_frames`.
+
+    Yields:
+        Their numbers in the clip, the last one first.
+    """
+    turn = max(wanted) + APPROACH
+    with _begun(player, clip, target, pre_roll, beyond=turn):
+        ways = []
+        for frame in clip.frames[: turn + 1]:
+            player.show(clip, frame)
+            ways.append(player.shown)
+        for step, number in enumerate(range(turn - 1, min(wanted) - 1, -1), 1):
+            player.put(ways[number], clip.frames[turn] + step)
+            if number in wanted:
+                yield number
+
+
 @contextmanager
-def _as_it_is() -> Iterator[None]:
-    yield
+def _begun(player: ClipPlayer, clip: Clip, target: Target, pre_roll: int, beyond: int = 0) -> Iterator[None]:
+    """A simulation is at the frame before the first of a clip, and goes on until so many frames beyond its last."""
+    first, last = (clip.frames[0] - pre_roll if pre_roll else None), clip.frames[-1] + beyond
+    with borrowed_range(target, first, last) if pre_roll or beyond else nullcontext():
+        if pre_roll:
+            _roll_in(target, player, clip, first)
+        else:
+            target.forget()
+            for frame in range(target.first_frame, clip.frames[0]):
+                player.show(clip, frame)
+        yield
 
 
 def _roll_in(target: Target, player: ClipPlayer, clip: Clip, first: int) -> None:
@@ -167,9 +204,9 @@ def _roll_in(target: Target, player: ClipPlayer, clip: Clip, first: int) -> None
     armature_object = target.scene_rig.armature_object
     bones = armature_object.pose.bones
     player.show(clip, clip.frames[0])
-    goal = [read(bones, channel) for channel in POSE_CHANNELS]
+    goal = player.shown.channels
     player.stop()
-    rest = [read(bones, channel) for channel in POSE_CHANNELS]
+    rest = player.shown.channels
     target.forget()
     for frame in range(first, clip.frames[0]):
         part = (frame - first) / (clip.frames[0] - first)
@@ -222,7 +259,7 @@ class Approach:
     @contextmanager
     def borrowed(self) -> Iterator[None]:
         """Random poses are reached inside."""
-        with self.settler.borrowed() if self.settler else _as_it_is():
+        with self.settler.borrowed() if self.settler else nullcontext():
             yield
 
     def reach(self, pose: Callable[[float], None]) -> None:
@@ -235,6 +272,15 @@ class Approach:
     def frames(self, player: ClipPlayer, clip: Clip, wanted: Container[int]) -> Iterator[int]:
         """As `show_frames`."""
         yield from show_frames(player, clip, wanted, self.target, self._pre_roll)
+
+    def frames_again(self, player: ClipPlayer, clip: Clip, wanted: Collection[int]) -> Iterator[int]:
+        """As `show_frames_again`."""
+        yield from show_frames_again(player, clip, wanted, self.target, self._pre_roll)
+
+    @property
+    def has_ways(self) -> bool:
+        """Whether what is shown may depend on the way to a pose, and not on the pose alone."""
+        return self.target is not None and bool(self.target.simulations)
 
     @property
     def is_at_rest(self) -> bool:

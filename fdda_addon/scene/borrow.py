@@ -70,16 +70,25 @@ def animated_values(owner: bpy.types.ID, actions: Iterable[bpy.types.Action]) ->
     values = {}
     for path in {curve.data_path for action in actions for curve in animation_curves(action)}:
         try:
-            value = owner.path_resolve(path)
+            values[path] = read_value(owner, path)
         except ValueError:
             # A curve of something that is not there, or of another datablock's slot.
             continue
-        values[path] = value[:] if hasattr(value, "__len__") else value
     return values
 
 
+def read_value(owner: bpy.types.ID, path: str) -> object:
+    """The number at an RNA path, or a copy of the numbers.
+
+    Raises:
+        ValueError: there is nothing at the path.
+    """
+    value = owner.path_resolve(path)
+    return value[:] if hasattr(value, "__len__") else value
+
+
 def set_value(owner: bpy.types.ID, path: str, value: object) -> None:
-    """Set what `path_resolve` reads."""
+    """Set what `read_value` reads."""
     struct = owner.path_resolve(path, False).data
     if path.endswith('"]'):
         struct[bpy.utils.unescape_identifier(path[path.rindex('["') + 2 : -2])] = value

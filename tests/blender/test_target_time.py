@@ -17,7 +17,8 @@ from blend_fixtures.elbow import ACTION, FRAMES
 from fdda_addon.core.recording.reader import open_recording, read_recording
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
-from fdda_addon.rig.target_time import TargetSettings
+from fdda_addon.rig.target_time import APPROACH, TargetSettings
+from fdda_addon.scene.compatibility import animation_curves
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import evaluated, run
@@ -219,6 +220,43 @@ def test_repeats_are_measured_once_and_again_where_they_are_missing(tmp_path):
         repeats = read_recording(tmp_path / "recording").info.repeats
         # It lags, and has no memory of the way once it rests.
         assert len(repeats.poses) == 2 and repeats.apart_mm["max"] < 0.5
+
+
+@pytest.mark.parametrize("options", [(), ("--pre-roll", 4)])
+def test_frames_of_an_action_are_repeated_on_the_way_back(options, tmp_path):
+    def lags() -> None:
+        targets.target_geometry_nodes()
+        bpy.context.scene.frame_start = 5 if options else 1
+        for curve in animation_curves(bpy.data.actions[ACTION]):
+            for point in curve.keyframe_points:
+                point.co[0] += 5 if options else 0
+
+    def there_and_back() -> None:
+        lags()
+        for curve in animation_curves(bpy.data.actions[ACTION]):
+            first = int(curve.range()[0])
+            values = [curve.evaluate(first + number) for number in range(turn + 1)]
+            curve.keyframe_points.clear()
+            for number, value in enumerate([*values, *values[-2::-1]]):
+                curve.keyframe_points.insert(first + number, value).interpolation = "LINEAR"
+
+    rig = built(lags, tmp_path / "rig.blend")
+    recording = of_flesh(rig, tmp_path / "recording", *options, "--repeats", 5)
+    repeats = recording.info.repeats
+    turn = max(repeats.poses) + APPROACH
+    both = of_flesh(built(there_and_back, tmp_path / "both.blend"), tmp_path / "both", *options, "--repeats", 0)
+    shown, numbers = complex_positions(both), np.array(repeats.poses)
+    apart = np.linalg.norm(shown[numbers] - shown[2 * turn - numbers], axis=2) * 1000
+    assert len(numbers) == 5 and apart.mean() > 1
+    assert repeats.apart_mm["mean"] == pytest.approx(apart.mean(), rel=1e-3)
+    assert repeats.apart_mm["max"] == pytest.approx(apart.max(), rel=1e-3)
+    assert both.info.repeats is None
+    assert np.array_equal(complex_positions(both)[: turn + 1], complex_positions(recording)[: turn + 1])
+
+
+def test_what_follows_the_pose_is_not_repeated(tmp_path):
+    rig = built(targets.target_copy, tmp_path / "rig.blend")
+    assert of_flesh(rig, tmp_path / "recording").info.repeats is None
 
 
 def test_other_simulations_are_not_disturbed(tmp_path):

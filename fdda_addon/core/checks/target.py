@@ -41,7 +41,8 @@ def _check_repeats(recording: Recording) -> list[RecordingWarning]:
     text = (
         f"The target is {repeats.apart_mm['mean']:.2g} mm from itself when the same pose is reached from another "
         f"direction, on average over {len(repeats.poses)} poses, and the linear layer is {repeats.linear_mm:.2g} mm "
-        "off: no model can be closer; hold poses for more frames, damp the simulation, or leave folds to another mesh."
+        "off: no model can be closer; hold poses for more frames or play actions slower, damp the simulation, or leave "
+        "folds to another mesh."
     )
     return [RecordingWarning("hysteresis", text)]
 
