@@ -31,6 +31,7 @@ from .loop import Trained, choose_device, train
 from .outputs import check_training_outputs, training_outputs
 from .page import render_html
 from .process import Cancelled
+from .sagging import without_needless_down
 from .target import Outcome, judge
 from .trust import make_trust_range
 from .weights import LastWeights, initial_networks, read_weights, write_weights
@@ -70,6 +71,7 @@ def train_model(
     check_training_outputs(model_path, overwrite)
     recording = read_recording(recording_path)
     split = split_recording(recording, config)
+    recording = without_needless_down(recording, split)
     held_back = held_back_digest(recording, split)
     last = _last_weights(model_path, recording, held_back, config) if warm_start else None
     device = choose_device()

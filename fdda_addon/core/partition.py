@@ -137,15 +137,17 @@ def _steps_down(rig: Rig, ancestor: int, joint: int) -> int:
     return steps if joint >= 0 else 0
 
 
-def nearby_influences(rig: Rig, partitions: tuple[Partition, ...]) -> tuple[Partition, ...]:
+def nearby_influences(rig: Rig, partitions: tuple[Partition, ...], sags: bool = True) -> tuple[Partition, ...]:
     """Partitions with the joints that are likely to influence them, where none can be moved to see whether it does.
 
-    These are the main joint, all above it, since what sags asks which way is down, those that skin a vertex of the
-    partition or one that shares a face with it, and the parents of all of these; and every control.
+    These are the main joint, those that skin a vertex of the partition or one that shares a face with it, the parents
+    of all of these, and every control. Where the surface sags, all joints above are among them, as it asks which way is
+    down; where it does not, the one root of all of them is not, as it moves them as a whole.
 
     Args:
         rig: the rig.
         partitions: of the rig; their influences are left out.
+        sags: the surface may depend on which way is down.
     """
     skins = np.zeros((rig.vertex_count, len(rig.joints)), bool)
     rows = np.repeat(np.arange(rig.vertex_count), rig.skin_joints.shape[1])
@@ -162,14 +164,23 @@ def nearby_influences(rig: Rig, partitions: tuple[Partition, ...]) -> tuple[Part
         own[rig.face_vertices[np.isin(face_of_corner, touched)]] = True
         found = {partition.joint, *np.flatnonzero(skins[own].any(axis=0)).tolist()}
         found |= {rig.joints[joint].parent for joint in found if rig.joints[joint].parent >= 0}
-        above = rig.joints[partition.joint].parent
-        while above >= 0:
-            found.add(above)
-            above = rig.joints[above].parent
+        if sags:
+            above = rig.joints[partition.joint].parent
+            while above >= 0:
+                found.add(above)
+                above = rig.joints[above].parent
+        elif len({_root_of(rig, joint) for joint in found}) == 1:
+            found -= {_root_of(rig, partition.joint)}
         joints[partition.joint] = tuple(sorted(found))
     controls = {partition.joint: tuple(range(len(rig.controls))) for partition in partitions}
     merged = {joint: partition.joint for partition in partitions for joint in partition.merged}
     return make_partitions(rig, joints, controls, merged)
+
+
+def _root_of(rig: Rig, joint: int) -> int:
+    while rig.joints[joint].parent >= 0:
+        joint = rig.joints[joint].parent
+    return joint
 
 
 def residual_changes(partitions: tuple[Partition, ...], moved: np.ndarray, base: np.ndarray) -> np.ndarray:

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Of a surface from a file or a simulation, training finds out whether it depends on which way is down."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdda_addon.core.partition import make_partitions, nearby_influences
+from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
+from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.recording.target import FRAMES, POSE, SIMULATION, RecordedTarget
+from trainer.data import Split
+from trainer.sagging import without_needless_down
+
+from .chain import LIMIT, chain_residuals, chain_rig, pose_chain
+
+POSES = 200
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def of_chain(follows: str, sag: float) -> Recording:
+    """A chain that bends and turns as a whole, and whose surface sags by so many metres."""
+    rig = chain_rig(joints=4)
+    angles = np.random.default_rng(0).uniform(-LIMIT, LIMIT, (POSES, 4, 2))
+    matrices = pose_chain(rig, angles)
+    residuals = chain_residuals(rig, angles)
+    bare = make_partitions(rig, {joint: () for joint in range(4)})
+    for partition in bare:
+        rotations = matrices[:, partition.joint, :3, :3] @ rig.rest_matrices[partition.joint, :3, :3].T
+        residuals[:, partition.vertices] += (sag * DOWN @ rotations).astype(np.float32)[:, None]
+    info = RecordingInfo(
+        POSES, POSES, "chain.blend", "chain", "5.2.0", Sampling(0, 1.0, (), (Source("random", POSES),)),
+        target=RecordedTarget("flesh", follows, 0),
+    )  # fmt: skip
+    partitions = nearby_influences(rig, bare)
+    return Recording(Path(), info, rig, partitions, matrices, residuals, np.zeros((POSES, 0), np.float32))
+
+
+def split() -> Split:
+    return Split(np.arange(0, 160), np.arange(160, 180), np.arange(180, POSES))
+
+
+@pytest.mark.parametrize("follows", [FRAMES, SIMULATION])
+def test_a_surface_that_does_not_sag_is_not_told_which_way_is_down(follows):
+    found = without_needless_down(of_chain(follows, sag=0.0), split())
+    assert [partition.influencing for partition in found.partitions] == [(1,), (1, 2), (1, 2, 3), (1, 2, 3)]
+
+
+@pytest.mark.parametrize("follows", [FRAMES, SIMULATION])
+def test_a_surface_that_sags_is_told(follows):
+    recording = of_chain(follows, sag=0.01)
+    assert [partition.influencing for partition in recording.partitions] == [
+        (0, 1),
+        (0, 1, 2),
+        (0, 1, 2, 3),
+        (0, 1, 2, 3),
+    ]
+    assert without_needless_down(recording, split()) is recording
+
+
+def test_what_follows_the_pose_at_once_keeps_the_influences_that_were_found():
+    recording = of_chain(POSE, sag=0.0)
+    assert without_needless_down(recording, split()) is recording
+
+
+def test_poses_that_are_held_out_do_not_matter():
+    recording = of_chain(FRAMES, sag=0.0)
+    recording.residuals[split().held_out] = np.nan
+    assert without_needless_down(recording, split()) is not recording
+
+
+def test_roots_that_move_against_each_other_stay():
+    rig = chain_rig(joints=2)
+    apart = type(rig)(
+        tuple(type(joint)(joint.name, -1) for joint in rig.joints), rig.rest_positions, rig.rest_matrices,
+        rig.skin_joints, rig.skin_weights, rig.fingerprint, rig.face_starts, rig.face_vertices,
+    )  # fmt: skip
+    found = nearby_influences(apart, make_partitions(apart, {0: (), 1: ()}), sags=False)
+    assert [partition.influencing for partition in found] == [(0, 1), (0, 1)]
