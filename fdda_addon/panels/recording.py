@@ -112,8 +112,8 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         draw_sentence(
             layout, context, f"'{path.name}' is complete: {content.poses:,} poses. Train on it next.", "CHECKMARK"
         )
-        if content.fit:
-            draw_sentence(layout, context, content.fit.sentence())
+        for sentence in content.measured:
+            draw_sentence(layout, context, sentence)
         if content.sentence:
             draw_sentence(layout, context, content.sentence, "INFO")
     else:

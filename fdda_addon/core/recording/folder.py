@@ -9,7 +9,6 @@ from pathlib import Path
 from ..errors import OutputError, RecordingError
 from ..output import is_left_over
 from ..rig import Fingerprint, Rig, differences, read_joints
-from ..skin_fit import SkinFit
 from .arrays import ARRAYS
 from .index import INDEX, REFINED, read_index, read_info
 from .lock import RecordingLock
@@ -36,13 +35,20 @@ class FolderState(enum.Enum):
 
 @dataclass(frozen=True)
 class FolderContent:
-    """What a folder holds: poses of the recording in it, a sentence where it is not as it should be, its fit if any."""
+    """What a folder holds.
+
+    Attributes:
+        state: in short.
+        complete, poses: of the recording in it, how many there are and how many there will be.
+        sentence: where it is not as it should be.
+        measured: sentences of what was measured with the poses: the gain of fitted weights, two ways to the same pose.
+    """
 
     state: FolderState
     complete: int = 0
     poses: int = 0
     sentence: str = ""
-    fit: SkinFit | None = None
+    measured: tuple[str, ...] = ()
 
 
 def read_folder(
@@ -72,13 +78,15 @@ def read_folder(
             f"'{path.name}' holds a recording of another rig: {'; '.join(found)}. Choose another folder, or remove it.",
         )
     found = different_keys(_as_recorded_first(index["sampling"]), sampling) if sampling is not None else []
-    fit = read_info(index).fit
+    info = read_info(index)
+    fit = info.fit
     if fit_linear is not None and fit_linear != (fit.kind if fit else ""):
         found.append("fit")
     names = ", ".join(sorted({SETTINGS.get(key.partition(".")[0], key) for key in found}))
     if counts[0] == counts[1]:
         sentence = f"It was recorded with other settings than those above: {names}." if found else ""
-        return FolderContent(FolderState.COMPLETE, *counts, sentence, fit)
+        measured = tuple(part.sentence() for part in (fit, info.repeats) if part)
+        return FolderContent(FolderState.COMPLETE, *counts, sentence, measured)
     if found:
         return FolderContent(
             FolderState.OTHER,
