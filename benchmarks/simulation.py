@@ -18,14 +18,16 @@ sys.path.insert(0, str(ROOT))
 import bpy  # noqa: E402
 
 import fdda_addon  # noqa: E402
+from blend_fixtures.flesh import FLESH, add_flesh, make_cloth, make_soft_body  # noqa: E402
 from fdda_addon.arm.rig import build_arm  # noqa: E402
 from fdda_addon.cli.main import main as run_verb  # noqa: E402
 from fdda_addon.scene.blend_file import save_copy  # noqa: E402
 
-FLESH = "flesh"
+FLESHY = ("shoulder", "elbow")
+"""Upper arm and forearm. There is little flesh on a hand; `--kind whole-arm` is soft there as well."""
 FRAMES = 60
 """Frames that are timed."""
-PICTURED = 10
+PICTURED = 20
 """Held-out poses, of another seed, of which three are drawn."""
 
 
@@ -33,35 +35,13 @@ def build(path: Path, kind: str) -> None:
     """The arm, which keeps its Armature modifier alone, and a copy of it that is flesh."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     build_arm()
-    arm = next(o for o in bpy.context.scene.objects if o.type == "MESH")
-    for modifier in [m for m in arm.modifiers if m.type != "ARMATURE"]:
-        arm.modifiers.remove(modifier)
-    flesh = arm.copy()
-    flesh.data, flesh.name = arm.data.copy(), FLESH
-    bpy.context.scene.collection.objects.link(flesh)
-    if kind == "soft-body":
-        make_soft_body(flesh)
-    else:
+    flesh = add_flesh(next(o for o in bpy.context.scene.objects if o.type == "MESH"))
+    if kind == "cloth":
         make_cloth(flesh)
+    else:
+        make_soft_body(flesh, FLESHY if kind == "soft-body" else [group.name for group in flesh.vertex_groups])
     bpy.context.scene.frame_set(1)
     save_copy(path)
-
-
-def make_soft_body(flesh: bpy.types.Object) -> None:
-    """Springs along the edges, goals at the skin of the bones."""
-    flesh.modifiers.new("Softbody", "SOFT_BODY")
-    soft = flesh.soft_body
-    soft.use_goal, soft.goal_default, soft.goal_spring, soft.goal_friction = True, 0.9, 0.9, 30.0
-    soft.use_edges, soft.pull, soft.push, soft.damping, soft.bend = True, 0.3, 0.3, 50.0, 0.2
-    soft.mass = 0.3
-
-
-def make_cloth(flesh: bpy.types.Object) -> None:
-    """Cloth that is pinned by half everywhere: gravity and the stretch of its edges do the rest."""
-    pin = flesh.vertex_groups.new(name="pin")
-    pin.add(range(len(flesh.data.vertices)), 0.5, "REPLACE")
-    settings = flesh.modifiers.new("Cloth", "CLOTH").settings
-    settings.vertex_group_mass, settings.quality, settings.air_damping = "pin", 5, 10.0
 
 
 def frame_ms(path: Path, shown: str, hidden: str) -> float:
@@ -88,7 +68,7 @@ def verb(*arguments: object) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--kind", choices=("soft-body", "cloth"), default="soft-body")
+    parser.add_argument("--kind", choices=("soft-body", "whole-arm", "cloth"), default="soft-body")
     parser.add_argument("--poses", type=int, default=300)
     parser.add_argument("--held-out", type=int, default=50)
     parser.add_argument("--settle", type=int, default=60)

@@ -17,12 +17,18 @@ BELOW = 16
 GAP = 12
 MANUAL = {
     "manual_prepare": ("03_measure_the_rig", "04_show_a_random_pose", "07_record"),
+    "simulation_sections": ("target", "flesh_recorded"),
     "manual_play": ("09_train", "12_measure_the_model", "14_evaluate"),
 }
 """Pictures of sections beside each other, and the steps that they come from."""
 BESIDE = {"sidebar_poses": "04_show_a_random_pose", "sidebar_training": "training"}
 """Pictures of a section with a part of the view."""
-WHOLE = {"sidebar_evaluation": "17_mark_the_worst_frames", "manual_heat_map": "16_show_the_heat_map"}
+WHOLE = {
+    "sidebar_evaluation": "17_mark_the_worst_frames",
+    "manual_heat_map": "16_show_the_heat_map",
+    "simulation_settling": "settling",
+    "simulation_plays": "flesh_plays",
+}
 
 
 def height_of_sections(picture: Image.Image) -> int:

@@ -16,9 +16,11 @@ from pathlib import Path
 import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.append(str(Path(__file__).resolve().parents[2]))
 
 import cast_story
 import endure_story
+import flesh_story
 import leave_story
 import path_story
 import ranges_story
@@ -34,6 +36,7 @@ STEPS = {
     "shot": shot_story.STEPS,
     "cast": cast_story.STEPS,
     "ranges": ranges_story.STEPS,
+    "flesh": flesh_story.STEPS,
     "session": session_story.STEPS,
     "endure": endure_story.STEPS,
     "leave": leave_story.LEAVE,

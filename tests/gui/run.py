@@ -26,10 +26,10 @@ WIDTH, HEIGHT = 1600, 1200
 INSTALL_SECONDS, SECONDS, END_SECONDS = 60, 600, 5
 LACKING = 3
 FEW_VALUES = 32
-STORIES = ("path", "work", "shot", "cast", "ranges", "session", "leave", "back")
+STORIES = ("path", "work", "shot", "cast", "ranges", "flesh", "session", "leave", "back")
 """Each in a Blender of its own, with the files of those before: the path of a first model, the work with it, what a
-shot takes, several characters, ranges of motion, what a long session must not spoil, a Blender that is closed while it
-trains, and the next one."""
+shot takes, several characters, ranges of motion, a simulation that is learnt, what a long session must not spoil, a
+Blender that is closed while it trains, and the next one."""
 LONG = ("endure",)
 """Run by name alone: five minutes of work with one character."""
 
