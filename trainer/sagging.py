@@ -45,21 +45,21 @@ def without_needless_down(recording: Recording, split: Split) -> Recording:
     controls = [_squared_distances(values[:, None]) for values in recording.controls[poses].T.astype(np.float64)]
     errors = np.zeros(2)
     for both in zip(recording.partitions, plain, strict=True):
-        values = _principal(recording.residuals[poses][:, both[0].vertices])
+        values = _principal(recording.residuals[np.ix_(poses, both[0].vertices)])
         errors += [_error(_mean_distances(joints, controls, partition), values) for partition in both]
     return replace(recording, partitions=plain) if errors[1] < errors[0] else recording
 
 
 def _squared_distances(features: np.ndarray) -> np.ndarray | None:
-    """(n, n) between poses, of the features (n, f) of a joint or control, each in its standard deviations; None where
-    none of them varies."""
+    """(n, n) float32 between poses, of the features (n, f) of a joint or control, each in its standard deviations; None
+    where none of them varies."""
     spread = features.std(axis=0)
     moves = spread > 1e-6 * max(1.0, np.abs(features).max())
     if not moves.any():
         return None
     scaled = (features[:, moves] - features[:, moves].mean(axis=0)) / (spread[moves] * np.sqrt(moves.sum()))
     squares = (scaled**2).sum(axis=1)
-    return np.maximum(squares[:, None] + squares - 2 * scaled @ scaled.T, 0)
+    return np.maximum(squares[:, None] + squares - 2 * scaled @ scaled.T, 0).astype(np.float32)
 
 
 def _mean_distances(
@@ -68,7 +68,7 @@ def _mean_distances(
     """(n, n) mean of those of the joints and controls that influence a partition; a 0 where none of them moves."""
     influencing = [joints[joint] for joint in partition.influencing] + [controls[c] for c in partition.controls]
     found = [distances for distances in influencing if distances is not None]
-    return np.mean(found, axis=0) if found else np.zeros(())
+    return np.mean(found, axis=0, dtype=np.float64) if found else np.zeros(())
 
 
 def _principal(residuals: np.ndarray) -> np.ndarray:
