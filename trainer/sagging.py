@@ -15,7 +15,7 @@ from fdda_addon.core.partition import Partition, nearby_influences
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.target import POSE
 
-from .data import Split
+from .data import MIN_SPREAD, Split
 
 MOST_POSES, SHAPES = 300, 16
 """So much is looked at: poses, and principal components of the residuals of each partition."""
@@ -54,7 +54,7 @@ def _squared_distances(features: np.ndarray) -> np.ndarray | None:
     """(n, n) float32 between poses, of the features (n, f) of a joint or control, each in its standard deviations; None
     where none of them varies."""
     spread = features.std(axis=0)
-    moves = spread > 1e-6 * max(1.0, np.abs(features).max())
+    moves = spread > MIN_SPREAD * max(1.0, np.abs(features).max())
     if not moves.any():
         return None
     scaled = (features[:, moves] - features[:, moves].mean(axis=0)) / (spread[moves] * np.sqrt(moves.sum()))

@@ -71,7 +71,6 @@ def train_model(
     check_training_outputs(model_path, overwrite)
     recording = read_recording(recording_path)
     split = split_recording(recording, config)
-    recording = without_needless_down(recording, split)
     held_back = held_back_digest(recording, split)
     last = _last_weights(model_path, recording, held_back, config) if warm_start else None
     device = choose_device()
@@ -85,6 +84,7 @@ def train_model(
     announcer.say(MessageType.LOG, text=sizes_in_words(recording))
     warnings = _check(recording, announcer, strict)
     _check_stop(should_stop)
+    recording = without_needless_down(recording, split)
     inputs = inputs_of_rig(recording.rig, middles(recording.rig, recording.partitions), recording.partitions)
     prepared = _prepare(recording, inputs, split, config, announcer, should_stop)
     seen = [columns[partition.columns] for columns, partition in zip(inputs.columns, prepared, strict=True)]

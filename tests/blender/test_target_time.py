@@ -227,6 +227,14 @@ def test_frames_of_an_action_are_repeated_on_the_way_back(options, tmp_path):
     def lags() -> None:
         targets.target_geometry_nodes()
         bpy.context.scene.frame_start = 5 if options else 1
+        rig = bpy.data.objects["elbow"].modifiers["Armature"].object
+        for frame, value in ((1, 0.1), (FRAMES, 0.9)):
+            rig["soft"] = value
+            rig.keyframe_insert('["soft"]', frame=frame)
+        driver = bpy.data.objects["flesh"].modifiers["Mush"].driver_add("factor").driver
+        variable = driver.variables.new()
+        variable.targets[0].id, variable.targets[0].data_path = rig, '["soft"]'
+        driver.expression = variable.name
         for curve in animation_curves(bpy.data.actions[ACTION]):
             for point in curve.keyframe_points:
                 point.co[0] += 5 if options else 0

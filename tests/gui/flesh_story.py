@@ -36,11 +36,7 @@ def choose_the_target(folder: Path) -> Iterator[float]:
     settings = arm().fdda.settings
     settings.poses, settings.epochs = POSES, EPOCHS
     yield from sidebar.open_section("recording")
-    x, y = yield from sidebar.find("settings.target", across=0.7)
-    yield from click(x, y)
-    yield 0.5
-    yield from press(*FLESH)
-    yield 0.3
+    yield from sidebar.type_into("settings.target", FLESH)
     yield from press("Return")
     yield from until(lambda: settings.target == FLESH, 5, f"the field has '{settings.target}'")
     x, y = yield from sidebar.find("settings.settle", across=0.7)

@@ -49,11 +49,7 @@ def choose_a_mask(folder: Path) -> Iterator[float]:
     weights = along < np.median(along)
     arm().vertex_groups.new(name=GROUP).add(np.flatnonzero(weights).tolist(), 1.0, "REPLACE")
     yield from sidebar.open_section("playback")
-    x, y = yield from sidebar.find("fdda.mask", across=0.7)
-    yield from click(x, y)
-    yield 0.5
-    yield from press(*GROUP)
-    yield 0.3
+    yield from sidebar.type_into("fdda.mask", GROUP)
     yield from picture(folder / "mask_search.png")
     yield from press("Return")
     yield from until(lambda: binding.mask == GROUP, 5, f"the field has '{binding.mask}'")

@@ -8,7 +8,7 @@ Command" does: so the mouse goes down the sidebar until that is the button that 
 from collections.abc import Iterator
 
 import bpy
-from window import below_mouse, check, click, move, over, redraw, region, settle, view_area
+from window import below_mouse, check, click, move, over, press, redraw, region, settle, view_area
 
 SECTIONS = ("rig", "poses", "recording", "training", "playback", "evaluation", "models")
 """From the top."""
@@ -101,6 +101,15 @@ def find(what: str, across: float = 0.5) -> Iterator[float]:
             _places[what] = y
             return x, y
     check(False, f"there is no button {what} in the sidebar")
+
+
+def type_into(what: str, text: str) -> Iterator[float]:
+    """Click a field in which one searches by name, as `find` finds it, and type; Return would choose what is found."""
+    x, y = yield from find(what, across=0.7)
+    yield from click(x, y)
+    yield 0.5
+    yield from press(*text)
+    yield 0.3
 
 
 def push(what: str, across: float = 0.5) -> Iterator[float]:
