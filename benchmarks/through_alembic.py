@@ -18,21 +18,16 @@ sys.path.insert(0, str(ROOT))
 
 import bpy  # noqa: E402
 import numpy as np  # noqa: E402
+from simulation import verb  # noqa: E402
 
 import fdda_addon  # noqa: E402
+from blend_fixtures.flesh import keep_armature_modifier  # noqa: E402
 from fdda_addon.arm.rig import build_arm  # noqa: E402
-from fdda_addon.cli.main import main as run_verb  # noqa: E402
 from fdda_addon.core.recording.reader import read_recording  # noqa: E402
 from fdda_addon.scene.blend_file import save_copy  # noqa: E402
 
 ACTION = "arm_drive"
 SEEDS = (0, 1, 2)
-
-
-def verb(*arguments: object) -> None:
-    """Run a verb of the command line; ends the program where it fails."""
-    if status := run_verb([str(argument) for argument in arguments], "fdda"):
-        raise SystemExit(status)
 
 
 def build(rig: Path, bare: Path, cache: Path) -> None:
@@ -46,8 +41,7 @@ def build(rig: Path, bare: Path, cache: Path) -> None:
         scene_object.select_set(scene_object == arm)
     first, last = (round(frame) for frame in bpy.data.actions[ACTION].frame_range)
     bpy.ops.wm.alembic_export(filepath=str(cache), selected=True, start=first, end=last, flatten=False)
-    for modifier in [m for m in arm.modifiers if m.type != "ARMATURE"]:
-        arm.modifiers.remove(modifier)
+    keep_armature_modifier(arm)
     save_copy(bare)
 
 

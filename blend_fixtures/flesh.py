@@ -10,10 +10,15 @@ GOAL = 0.9
 """How strongly flesh is held where it sags."""
 
 
-def add_flesh(mesh_object: bpy.types.Object) -> bpy.types.Object:
-    """Leave a mesh its Armature modifier alone, and add a copy of it to the scene; returns the copy."""
+def keep_armature_modifier(mesh_object: bpy.types.Object) -> None:
+    """Remove all modifiers of a mesh but the Armature: what is left is linear skinning."""
     for modifier in [m for m in mesh_object.modifiers if m.type != "ARMATURE"]:
         mesh_object.modifiers.remove(modifier)
+
+
+def add_flesh(mesh_object: bpy.types.Object) -> bpy.types.Object:
+    """Leave a mesh its Armature modifier alone, and add a copy of it to the scene; returns the copy."""
+    keep_armature_modifier(mesh_object)
     flesh = mesh_object.copy()
     flesh.data, flesh.name = mesh_object.data.copy(), FLESH
     bpy.context.scene.collection.objects.link(flesh)
