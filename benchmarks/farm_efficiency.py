@@ -3,7 +3,7 @@
 
     .venv-farm/bin/python benchmarks/farm_efficiency.py out/efficiency
 
-Efficiency is the time of the verbs one after the other over twice the time of two workers; what the engine costs is the
+Efficiency is the time of the verbs one after the other over twice the time of two workers, of several rounds the median; what the engine costs is the
 part of the time of one worker in which no verb runs. Processor time says how much else the machine did, and how many
 cores the verbs use by themselves.
 """
@@ -13,6 +13,7 @@ import json
 import os
 import resource
 import shutil
+import statistics
 import subprocess
 import sys
 import time
@@ -48,17 +49,30 @@ def main() -> int:
     parser.add_argument("--epochs", type=int, default=20)
     parser.add_argument("--densities", type=int, nargs="+", default=[1, 1, 2, 3], help="of the arms")
     parser.add_argument("--shards", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=1, help="do all of it so many times, in turns")
     parser.add_argument("--without-one", action="store_true", help="leave the run on one worker out")
     options = parser.parse_args()
     out = options.out.absolute()
     out.mkdir(parents=True, exist_ok=True)
     build_rigs(out)
-    results = {"cores": os.cpu_count(), "load": os.getloadavg()[0]}
+    rounds = []
+    for _ in range(options.rounds):
+        rounds.append(one_round(out, options))
+        print(json.dumps(rounds[-1], indent=1), flush=True)
+    names = [name for name, value in rounds[0].items() if isinstance(value, float)]
+    medians = {name: round(statistics.median(own[name] for own in rounds), 3) for name in names}
+    (out / "efficiency.json").write_text(json.dumps({"rounds": rounds, "medians": medians}, indent=1) + "\n")
+    print(json.dumps(medians, indent=1))
+    return 0
+
+
+def one_round(out: Path, options: argparse.Namespace) -> dict:
+    """Every way to run the tasks, once."""
+    results: dict = {"cores": os.cpu_count(), "load": os.getloadavg()[0]}
     for name, workers in (("verbs", 0), ("two workers", 2), ("one worker", 1)):
         if workers == 1 and options.without_one:
             continue
         results[name] = measure(out, name.replace(" ", "_"), workers, options)
-        print(name, json.dumps(results[name]), flush=True)
     verbs, two = results["verbs"], results["two workers"]
     results["efficiency of two workers"] = round(verbs["seconds"] / (2 * two["seconds"]), 3)
     for name, workers in (("one worker", 1), ("two workers", 2)):
@@ -66,9 +80,7 @@ def main() -> int:
             part = 1 - own["seconds of verbs"] / (workers * own["seconds"])
             results[f"part of the time of {name} without a verb"] = round(part, 3)
     results["cores that verbs use one after the other"] = round(verbs["processor seconds"] / verbs["seconds"], 2)
-    (out / "efficiency.json").write_text(json.dumps(results, indent=1) + "\n")
-    print(json.dumps(results, indent=1))
-    return 0
+    return results
 
 
 def build_rigs(out: Path) -> None:

@@ -31,6 +31,15 @@ KEEP_SECONDS, ABSENCES = 3.0, 6
 """How often workers are counted, and how often one may be missed before there is another in its place."""
 LOST_WORKERS = 1_000
 """A task may lose so many workers: it goes on where it was, whatever ended them."""
+SETTINGS = {
+    "distributed": {
+        "scheduler": {"unknown-task-duration": "30s", "work-stealing-interval": "100ms"},
+        "worker": {"profile": {"enabled": False}},
+        "admin": {"tick": {"interval": "1s"}, "system-monitor": {"interval": "5s"}},
+    }
+}
+"""Dask's own are for tasks of milliseconds. With them a task waits for a worker that is at another one for seconds beside
+one that has nothing to do, and what Dask does to watch itself takes an eighth of a core on two workers."""
 
 
 class ClusterError(TryAgainError):
@@ -68,6 +77,7 @@ def connected(farm: Farm, scheduler: str, workers: int, host: str, port: int) ->
             f"The farm needs the Python package '{error.name}'; make farm sets an environment up that has it."
         ) from error
     dask.config.set({"distributed.scheduler.allowed-failures": LOST_WORKERS})
+    dask.config.update_defaults(SETTINGS)
     with contextlib.ExitStack() as stack:
         try:
             if scheduler:

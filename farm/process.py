@@ -20,6 +20,9 @@ from .stamps import ROOT
 WAIT_SECONDS = 0.2
 SENTENCE_BYTES = 64 << 10
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+ENGINES_OWN = ("MALLOC_TRIM_THRESHOLD_",)
+"""What Dask sets for its workers and a verb is not to inherit. With it all memory that is freed goes back to the system
+at once, and comes back page by page: a training takes a fifth longer, an evaluation of 50,618 vertices a third."""
 POSIX_MB = 1024 if sys.platform != "darwin" else 1024 * 1024
 """What the system counts peak memory in, in parts of a MB: kB on Linux, bytes on macOS."""
 
@@ -66,14 +69,15 @@ def verb_command(farm: Farm, verb: tuple[str, ...]) -> list[str]:
 
 
 def verb_environment(farm: Farm, verb: tuple[str, ...]) -> dict[str, str]:
-    """The environment of a verb."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *_paths()])}
+    """The environment of a verb: that of whoever started the farm, the same whatever engine runs it."""
+    is_training = verb[0] == "train"
+    environment = {name: value for name, value in os.environ.items() if name not in ENGINES_OWN}
+    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), *_paths()])
+    environment |= dict.fromkeys(THREADS, str(farm.threads) if is_training else "1")
     if farm.trainer_python:
         environment["FDDA_TRAINER_PYTHON"] = farm.trainer_python
-    if verb[0] == "train":
-        environment |= dict.fromkeys(THREADS, str(farm.threads))
-        if not farm.gpu:
-            environment["CUDA_VISIBLE_DEVICES"] = ""
+    if is_training and not farm.gpu:
+        environment["CUDA_VISIBLE_DEVICES"] = ""
     return environment
 
 
