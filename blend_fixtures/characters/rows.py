@@ -8,7 +8,7 @@ from blend_fixtures.elbow import ACTION
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.rig.target_time import TargetSettings
 
-from . import control_rigs, controls, meshes, skinning, stacks, targets, transforms
+from . import control_rigs, controls, face, meshes, skinning, stacks, targets, transforms
 
 SKINNING, MODIFIERS, CONTROL_RIGS, INPUTS, MESHES, TARGETS = (
     "Skinning",
@@ -145,6 +145,14 @@ ROWS: tuple[Row, ...] = (
         controls.dial,
         "another object's place, which drives a shape key",
         recording=_recording(controls=("object:dial/location[0]=0:0.5",)),
+    ),
+    Row(
+        "face",
+        INPUTS,
+        "a face of 22 bones and 22 shape keys set by hand, with 12 correctives",
+        face.face,
+        _recording(poses=200, spread=10, controls=("shape_keys",)),
+        meshes=(face.MESH,),
     ),
     Row(
         "body_and_sleeve",
