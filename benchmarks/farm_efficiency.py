@@ -3,9 +3,9 @@
 
     .venv-farm/bin/python benchmarks/farm_efficiency.py out/efficiency
 
-Efficiency is the time of the verbs one after the other over twice the time of two workers, of several rounds the median; what the engine costs is the
-part of the time of one worker in which no verb runs. Processor time says how much else the machine did, and how many
-cores the verbs use by themselves.
+Efficiency is the time of the verbs one after the other over twice the time of two workers, the median of several
+rounds; what the engine costs is the part of the time of one worker in which no verb runs. Processor time says how much
+else the machine did, and how many cores the verbs use by themselves.
 """
 
 import argparse

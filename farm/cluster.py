@@ -38,8 +38,8 @@ SETTINGS = {
         "admin": {"tick": {"interval": "1s"}, "system-monitor": {"interval": "5s"}},
     }
 }
-"""Dask's own are for tasks of milliseconds. With them a task waits for a worker that is at another one for seconds beside
-one that has nothing to do, and what Dask does to watch itself takes an eighth of a core on two workers."""
+"""Dask's own are for tasks of milliseconds. With them a task waits up to 11 s for a worker that is at another one,
+beside one that has nothing to do, and what Dask does to watch itself takes an eighth of a core on two workers."""
 
 
 class ClusterError(TryAgainError):
