@@ -7,6 +7,8 @@ worst, and trains on.
 """
 
 import argparse
+import contextlib
+import os
 import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +18,7 @@ from ..core.errors import WrongUsageError
 from ..core.messages import WARNING_LINE, MessageType
 from ..core.recording.folder import recordings_in
 from ..core.report import Verdict
+from ..training.environment.choice import PYTHON_VARIABLE
 from ..training.process import Training, trainer_command
 from .progress import ProgressPrinter
 
@@ -30,6 +33,10 @@ MAX_ROUNDS = 20
 def run(arguments: list[str]) -> int:
     """Train; `arguments` are those of `python -m trainer` and of `_refinement_parser`. Returns the exit status."""
     parser = _refinement_parser()
+    if PYTHON_VARIABLE not in os.environ:
+        # Where Blender is, the environment that it made may be the one that trains; to look takes a second.
+        with contextlib.suppress(ModuleNotFoundError):
+            import bpy  # noqa: F401
     if not arguments or {"-h", "--help"} & set(arguments):
         command, environment = trainer_command(arguments)
         status = subprocess.run(command, env=environment, check=False).returncode
@@ -99,7 +106,7 @@ def _train_to_target(arguments: list[str], options: argparse.Namespace) -> int:
             f"--refine takes one mesh, and '{recording}' holds recordings of several; give one of them, its model and "
             "--object NAME."
         )
-    # A training that refines nothing starts without Blender, in a tenth of the time.
+    # A training that refines nothing needs no Blender.
     from .registered import registered
 
     with registered():

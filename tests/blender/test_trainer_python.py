@@ -2,6 +2,8 @@
 """What a Python answers when it is asked whether it can train, or be the base of an environment."""
 
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -11,11 +13,12 @@ from fdda_addon.training.environment import bases, check
 from fdda_addon.training.environment.answer import Answer
 from fdda_addon.training.environment.bases import ask, find_bases
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
-from fdda_addon.training.environment.folder import PACKAGES
+from fdda_addon.training.environment.folder import MARK, PACKAGES
 
 from .conftest import run
 from .tiny_wheels import TORCH
 
+ROOT = Path(__file__).resolve().parents[2]
 ADVICE = "do this"
 
 
@@ -147,3 +150,15 @@ def test_what_a_base_lacks(tmp_path: Path, answer: list, lacks: str):
 def test_blenders_own_python_is_the_first(monkeypatch: pytest.MonkeyPatch):
     assert next(bases.usual_candidates()) == [sys.executable]
     assert next(find_bases()).path == sys.executable
+
+
+def test_a_training_without_blenders_program_finds_the_environment_that_blender_made(tmp_path: Path):
+    own = tmp_path / "datafiles" / "fdda" / "trainer"
+    (own / "bin").mkdir(parents=True)
+    (own / MARK).write_text("made with other versions\n")
+    script(own / "bin" / "python", "echo the own environment")
+    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    environment.pop(PYTHON_VARIABLE, None)
+    command = [sys.executable, "-m", "fdda_addon", "train", "--help"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.startswith("the own environment\n"), done.stderr
