@@ -65,6 +65,7 @@ def render_worst(scene_rig: SceneRig, model: Path, evaluation: Evaluation, count
         true, fdda = errors.positions[pose], network.positions(matrices, controls)[0].copy()
         print(f"pose {pose}: vertex {vertex} is {errors.fdda[pose, vertex] * 1000:.1f} mm off", flush=True)
         set_mesh_positions(mesh, true)
+        mesh.update()
         aim(scene.camera, mesh, vertex, float(np.ptp(true, axis=0).max()))
         both = np.zeros((2 * SIZE + 3 * GAP, SIZE + GAP, 4), np.float32)
         for top, positions in ((GAP, true), (SIZE + 2 * GAP, fdda)):

@@ -29,7 +29,7 @@ VERBS = {
 OF_ANOTHER_PROCESS = {"train", "farm"}
 """Verbs whose options are read by the process that they start."""
 WITHOUT_BLENDER = {"merge-recordings"}
-"""Verbs that run where there is no Blender."""
+"""Verbs that run in this process, where there is no Blender."""
 INTERRUPTED = 130
 
 

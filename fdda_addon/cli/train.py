@@ -33,9 +33,9 @@ MAX_ROUNDS = 20
 def run(arguments: list[str]) -> int:
     """Train; `arguments` are those of `python -m trainer` and of `_refinement_parser`. Returns the exit status."""
     parser = _refinement_parser()
-    if PYTHON_VARIABLE not in os.environ:
+    if not os.environ.get(PYTHON_VARIABLE):
         # Where Blender is, the environment that it made may be the one that trains; to look takes a second.
-        with contextlib.suppress(ModuleNotFoundError):
+        with contextlib.suppress(ImportError):
             import bpy  # noqa: F401
     if not arguments or {"-h", "--help"} & set(arguments):
         command, environment = trainer_command(arguments)

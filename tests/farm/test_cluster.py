@@ -48,13 +48,13 @@ def listening(process: psutil.Process) -> set[str]:
     return found
 
 
-def verbs(process: psutil.Process) -> list[dict[str, str]]:
+def verb_environments(process: psutil.Process) -> list[dict[str, str]]:
     """The environments of the verbs that run, of all that a process has started."""
     found = []
     for one in process.children(recursive=True):
         try:
-            if "fdda_addon" in one.cmdline():
-                found.append(one.environ())
+            if "fdda_addon" in one.cmdline() and (environment := one.environ()):
+                found.append(environment)
         except psutil.Error:
             continue
     return found
@@ -68,12 +68,13 @@ def test_a_farm(farm_started, tmp_path):
     for line in process.stdout:
         lines.append(line)
         addresses |= listening(psutil.Process(process.pid))
-        environments += verbs(psutil.Process(process.pid))
+        environments += verb_environments(psutil.Process(process.pid))
     text = "".join(lines)
     assert process.wait() == 1, text
     assert addresses == {"127.0.0.1"}, "nobody else may send code to the scheduler"
-    assert environments and {one.get("OMP_NUM_THREADS") for one in environments} == {"1"}
-    assert not any("MALLOC_TRIM_THRESHOLD_" in one for one in environments), "Dask's memory settings slow verbs down"
+    assert environments and not any("MALLOC_TRIM_THRESHOLD_" in one for one in environments), (
+        "Dask's memory settings slow verbs down"
+    )
     for task in make_tasks(plan).values():
         if task.character == "elbow":
             check_outputs(task)

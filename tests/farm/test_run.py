@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from farm import process
-from farm.characters import read_plan
-from farm.process import TryAgainError, VerbError, held, run_verb
+from farm.characters import Farm, read_plan
+from farm.process import TryAgainError, VerbError, held, run_verb, verb_environment
 from farm.run import AGAIN, DONE, FAILED, NOT_NEEDED, UP_TO_DATE, run_task
 from farm.stamps import Keys, read_stamp, to_do
 from farm.tasks import make_tasks
@@ -235,6 +235,17 @@ def test_how_a_verb_ended(tmp_path, monkeypatch, code, error, words):
     with pytest.raises(error) as raised:
         ended(tmp_path, monkeypatch, code)
     assert str(raised.value).startswith(words) and type(raised.value) is error
+
+
+def test_what_a_verb_inherits(tmp_path, monkeypatch):
+    monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "65536")
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.setenv("OF_THE_USER", "yes")
+    farm = Farm(tmp_path, threads=3)
+    training, recording = (verb_environment(farm, (verb,)) for verb in ("train", "record"))
+    assert (training["OMP_NUM_THREADS"], recording["OMP_NUM_THREADS"]) == ("3", "1")
+    assert training["CUDA_VISIBLE_DEVICES"] == "" and training["OF_THE_USER"] == recording["OF_THE_USER"] == "yes"
+    assert "MALLOC_TRIM_THRESHOLD_" not in {*training, *recording}, "it slows verbs down by a third"
 
 
 def test_a_rig_that_is_broken_fails_with_its_sentence(written, tmp_path):

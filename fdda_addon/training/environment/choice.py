@@ -40,7 +40,7 @@ def chosen_python() -> TrainerPython:
     """The Python that runs the trainer.
 
     The first of: what the preferences name, the environment variable, the add-on's own environment, and the Python
-    that runs this. The own environment is Blender's business: where bpy was not imported, nobody made one.
+    that runs this. The own environment is Blender's business: it is looked for where bpy was imported.
     """
     if preferred_python is not None and (preferred := preferred_python()):
         folder = Path(preferred)
