@@ -7,8 +7,6 @@ worst, and trains on.
 """
 
 import argparse
-import contextlib
-import os
 import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +16,6 @@ from ..core.errors import WrongUsageError
 from ..core.messages import WARNING_LINE, MessageType
 from ..core.recording.folder import recordings_in
 from ..core.report import Verdict
-from ..training.environment.choice import PYTHON_VARIABLE
 from ..training.process import Training, trainer_command
 from .progress import ProgressPrinter
 
@@ -33,10 +30,6 @@ MAX_ROUNDS = 20
 def run(arguments: list[str]) -> int:
     """Train; `arguments` are those of `python -m trainer` and of `_refinement_parser`. Returns the exit status."""
     parser = _refinement_parser()
-    if not os.environ.get(PYTHON_VARIABLE):
-        # Where Blender is, the environment that it made may be the one that trains; to look takes a second.
-        with contextlib.suppress(ImportError):
-            import bpy  # noqa: F401
     if not arguments or {"-h", "--help"} & set(arguments):
         command, environment = trainer_command(arguments)
         status = subprocess.run(command, env=environment, check=False).returncode

@@ -5,6 +5,7 @@ import enum
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,15 +41,16 @@ def chosen_python() -> TrainerPython:
     """The Python that runs the trainer.
 
     The first of: what the preferences name, the environment variable, the add-on's own environment, and the Python
-    that runs this. The own environment is Blender's business: it is looked for where bpy was imported.
+    that runs this. Blender says where the own environment lies: where bpy cannot be imported, nobody made one.
     """
     if preferred_python is not None and (preferred := preferred_python()):
         folder = Path(preferred)
         return TrainerPython(str(python_in(folder)) if folder.is_dir() else preferred, Origin.PREFERENCES)
     if named := os.environ.get(PYTHON_VARIABLE):
         return TrainerPython(named, Origin.VARIABLE)
-    if "bpy" in sys.modules and (own := own_python()):
-        return TrainerPython(own, Origin.OWN)
+    with suppress(ImportError):
+        if own := own_python():
+            return TrainerPython(own, Origin.OWN)
     return TrainerPython(sys.executable, Origin.THIS)
 
 
