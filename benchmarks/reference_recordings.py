@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The trainer on the reference recordings of a Maya arm, beside the published networks trained on the same poses.
 
-    python -m benchmarks.reference_recordings [DATA] [--json OUT.json] [--choose] [training settings]
+    python -m benchmarks.reference_recordings [DATA] [--json OUT.json] [--choose] [--listed] [training settings]
+
+The recordings list the joints that influence a partition, as the reference work found them, and leave some out. Here
+every network is offered all joints that were recorded, and finds out which matter; with `--listed` those of its list
+alone.
 
 Trains on poses 0 to 699 of eight partitions and measures on poses 700 to 1000, which no setting was chosen on: with
 `--choose` it measures on a fifth of the 700 instead, the rest of which it trains on. Errors are in centimetres, as
@@ -73,36 +77,49 @@ class ReferencePartition:
     poses: np.ndarray
 
 
-def read_partition(arrays: dict, name: str, influencing: list[str]) -> ReferencePartition:
+def recorded_joints(arrays: dict, entries: list[dict]) -> dict[str, np.ndarray]:
+    """(N, 3, 4) float32 local matrices of all joints that are listed for any partition, cm."""
+    joints = {}
+    for entry in entries:
+        matrices = arrays[f"{entry['partition']}.local_matrices"]
+        joints |= {joint: matrices[:, number] for number, joint in enumerate(entry["joints"])}
+    return joints
+
+
+def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarray) -> ReferencePartition:
     """One partition with the features that the trainer makes of a recording.
 
-    The recordings give influencing joints only. The joints between them stay at the identity: their motion is
-    unknown, and the inputs leave out every pair that depends on it.
+    Args:
+        name: of the main joint.
+        joints: the joints to see, and the (N, 3, 4) local matrices of each, cm.
+        residuals: (N, Vp, 3) float32, cm.
+
+    Not every joint was recorded. Those between others stay at the identity: their motion is unknown, and the inputs
+    leave out every pair that depends on it.
     """
     names = ["elbow"]
-    for joint in [name, *influencing]:
+    for joint in [name, *joints]:
         chain = []
         while joint and joint not in names:
             chain.append(joint)
             joint = parent_of(joint)
         names += reversed(chain)
-    local = arrays[f"{name}.local_matrices"]
-    poses = np.tile(np.eye(4), (len(local), len(names), 1, 1))
+    poses = np.tile(np.eye(4), (len(residuals), len(names), 1, 1))
     # Where the surface is was not recorded: three points around each joint stand for it, a centimetre off.
     points = np.tile(np.eye(3) * CM, (len(names), 1, 1))
-    for number, joint in enumerate(influencing):
+    for joint, local in joints.items():
         place = names.index(joint)
-        poses[:, place, :3] = local[:, number]
+        poses[:, place, :3] = local
         poses[:, place, :3, 3] *= CM
         # Half-way to the joint that it carries is the middle of what a joint moves.
-        points[names.index(parent_of(joint))] += local[0, number, :, 3] / 2 * CM
+        points[names.index(parent_of(joint))] += local[0, :, 3] / 2 * CM
     parents = np.array([names.index(parent_of(joint)) if parent_of(joint) else -1 for joint in names])
     for place in range(1, len(names)):
         poses[:, place] = poses[:, parents[place]] @ poses[:, place]
-    own = Partition(names.index(name), tuple(names.index(joint) for joint in influencing), np.zeros(0, np.int32))
+    own = Partition(names.index(name), tuple(names.index(joint) for joint in joints), np.zeros(0, np.int32))
     inputs: Inputs = make_inputs(parents, points, [own])
     features = inputs.features(poses.astype(np.float32), np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1)))
-    residuals = arrays[f"{name}.residuals"] * np.float32(CM)
+    residuals = residuals * np.float32(CM)
     data = PartitionData(
         name,
         features[:, inputs.columns[0]],
@@ -125,13 +142,17 @@ def measure(
     return float(errors.mean() / CM), float(errors.max() / CM), float(np.linalg.norm(truth, axis=2).mean() / CM)
 
 
-def run(folder: Path, config: TrainingConfig, choose: bool) -> dict:
+def run(folder: Path, config: TrainingConfig, choose: bool, listed: bool) -> dict:
     """Train, measure, and compare; what `--json` writes."""
-    names = json.loads((folder / "recording.json").read_text(encoding="utf-8"))["partitions"]
+    entries = json.loads((folder / "recording.json").read_text(encoding="utf-8"))["partitions"]
     with np.load(folder / "recording.npz", allow_pickle=False) as arrays:
         arrays = dict(arrays)
     started = time.perf_counter()
-    every = [read_partition(arrays, entry["partition"], entry["joints"]) for entry in names]
+    known = recorded_joints(arrays, entries)
+    every = []
+    for entry in entries:
+        name, own = entry["partition"], {joint: known[joint] for joint in entry["joints"]}
+        every.append(read_partition(name, own if listed else own | known, arrays[f"{name}.residuals"]))
     poses = len(every[0].poses)
     if choose:
         order = np.random.default_rng(config.seed + 1000).permutation(TRAINING_POSES)
@@ -160,6 +181,7 @@ def run(folder: Path, config: TrainingConfig, choose: bool) -> dict:
     totals |= {key: max(row[key] for row in rows) for key in ("max", "relu_max")}
     return {
         "unit": "cm",
+        "joints": "listed" if listed else "all",
         "poses": "a fifth of 0-699" if choose else "700-1000",
         "partitions": rows,
         "all": totals,
@@ -187,6 +209,7 @@ def main() -> int:
     parser.add_argument("data", type=Path, nargs="?", default=DATA, help="folder of recording.npz")
     parser.add_argument("--json", type=Path, help="write the result here")
     parser.add_argument("--choose", action="store_true", help="measure on a part of the 700 training poses")
+    parser.add_argument("--listed", action="store_true", help="see the joints listed for a partition alone")
     add_options(parser)
     parser.set_defaults(**SETTINGS)
     options = parser.parse_args()
@@ -194,7 +217,7 @@ def main() -> int:
         print(f"Skipped: the reference recordings are not at '{options.data}'; give their folder as an argument.")
         return 0
     assert set(SETTINGS) <= {field.name for field in fields(TrainingConfig)}
-    result = run(options.data, config_from_arguments(options), options.choose)
+    result = run(options.data, config_from_arguments(options), options.choose, options.listed)
     print_table(result)
     if options.json:
         options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The training loop: all partitions at once."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,7 +17,12 @@ from .process import Cancelled
 
 WARM_UP = 0.15
 """Part of the steps in which the learning rate rises."""
-
+WEIGHED_AFTER = (0.1, 0.2)
+"""After these parts of the epochs, inputs are weighed by what they do (`_Loop.weigh_inputs`)."""
+WEIGHED_BY = 1000
+"""So many of the training poses say what inputs do."""
+LEAST_WEIGHT = 1e-3
+"""Of an input that does nothing, where their root mean square is 1."""
 
 SMOOTHING = 1e-6
 """Added to squared relative errors: the loss is a distance, without the kink at zero."""
@@ -93,7 +99,8 @@ def train(
         loop = _Loop([partitions[number] for number in learning], split, config, device)
         if initial is not None:
             loop.start_from([initial[number] for number in learning])
-        loop.run([curves[number] for number in learning], progress, should_stop, partitions)
+        weighed = {round(part * config.epochs) for part in WEIGHED_AFTER} - {0} if initial is None else ()
+        loop.run([curves[number] for number in learning], progress, should_stop, partitions, weighed)
         for number, network in zip(learning, loop.best_networks(), strict=True):
             networks[number] = network
     return Trained(tuple(networks), curves)
@@ -127,13 +134,44 @@ class _Loop:
             config.dropout,
             torch.Generator().manual_seed(config.seed),
         ).to(device)
-        self.averaged = [parameter.detach().clone() for parameter in self.model.parameters()]
+        self._start_average()
         self.best = [average.clone() for average in self.averaged]
         self.best_mm = torch.full((len(partitions),), torch.inf, device=device)
+        # (P, F): what the standardised features have been multiplied by.
+        self.input_weights = torch.ones_like(self.x[:, 0])
+
+    @torch.enable_grad()
+    def weigh_inputs(self) -> torch.Tensor:
+        """Multiply each input by how far it moves the outputs now, and give these (P, 1, F) factors.
+
+        What a partition hardly depends on is hardly seen from then on, and nothing is read out of what it has in common
+        with the residuals by chance. Such a weight for each input is what automatic relevance determination finds for
+        a kernel (MacKay, 1994); here the networks themselves say it, by their root mean square gradients.
+        """
+        generator = torch.Generator().manual_seed(self.config.seed + 3)
+        inputs = self.x[:, :: -(-self.x.shape[1] // WEIGHED_BY)].clone().requires_grad_(True)
+        with self._averaged_weights():
+            outputs = self.model(inputs)
+        # Along random directions: the mean square over poses is that of all outputs together.
+        directions = torch.randn(outputs.shape, generator=generator).to(self.device)
+        (gradients,) = torch.autograd.grad(outputs, inputs, directions)
+        squared = gradients.square().mean(dim=1, keepdim=True)
+        used = torch.tensor([p.inputs.shape[1] for p in self.partitions], device=self.device)[:, None, None]
+        mean = squared.sum(dim=2, keepdim=True) / used
+        weights = torch.where(mean > 0, (squared / mean).sqrt(), 1.0).clamp(min=LEAST_WEIGHT)
+        self.x *= weights
+        self.x_validation *= weights
+        self.input_weights *= weights[:, 0]
+        # The best answers so far stay what they are.
+        self.best[0] /= weights.transpose(1, 2)
+        return weights
 
     @torch.no_grad()
     def start_from(self, networks: list[Network | None]) -> None:
-        """Take the initial weights from networks, as `best_networks` gives them, where there are any."""
+        """Take the initial weights from networks, as `best_networks` gives them, where there are any.
+
+        Inputs are weighed once, and the networks answer as before: this is no time to change what they know.
+        """
         for number, (network, scale) in enumerate(zip(networks, self.scales, strict=True)):
             if network is None:
                 continue
@@ -143,6 +181,12 @@ class _Loop:
                 rows, columns = weight.shape
                 self.model.weights[layer][number, :rows, :columns] = torch.from_numpy(weight * factor)
                 self.model.biases[layer][number, 0, :columns] = torch.from_numpy(bias * factor)
+        self._start_average()
+        weights = self.weigh_inputs()
+        self.model.weights[0] /= weights.transpose(1, 2)
+        self._start_average()
+
+    def _start_average(self) -> None:
         self.averaged = [parameter.detach().clone() for parameter in self.model.parameters()]
 
     def run(
@@ -151,7 +195,9 @@ class _Loop:
         progress: Callable[[Progress], None] | None,
         should_stop: Callable[[], bool],
         everything: Sequence[PreparedPartition],
+        weighed: Collection[int],
     ) -> None:
+        """Train; `weighed` are the epochs after which inputs are weighed."""
         config, poses = self.config, self.x.shape[1]
         steps = -(-poses // config.batch_size)
         optimizer = torch.optim.AdamW(
@@ -167,6 +213,8 @@ class _Loop:
         constant_mm = sum(float(p.validation_truncation.mean()) * p.mm_per_unit * p.vertices for p in constant)
         learning_vertices = np.array([p.vertices for p in self.partitions])
         for epoch in range(1, config.epochs + 1):
+            if epoch - 1 in weighed:
+                self.weigh_inputs()
             order = torch.randperm(poses, generator=order_generator).to(self.device)
             training_mm = torch.zeros(len(self.partitions), device=self.device)
             for step in range(steps):
@@ -221,15 +269,20 @@ class _Loop:
         decay = min(self.config.averaging, (1 + step) / (10 + step)) if self.config.averaging else 0.0
         torch._foreach_lerp_(self.averaged, list(self.model.parameters()), 1 - decay)
 
-    @torch.no_grad()
-    def _validate(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """(P,) mean error of the validation poses with the averaged weights, and that of the worst of them, mm."""
+    @contextmanager
+    def _averaged_weights(self) -> Iterator[None]:
         own = [parameter.data for parameter in self.model.parameters()]
         for parameter, average in zip(self.model.parameters(), self.averaged, strict=True):
             parameter.data = average
-        squared = (self.model(self.x_validation) - self.y_validation).square().sum(dim=2) * self.to_mm.square()
+        yield
         for parameter, data in zip(self.model.parameters(), own, strict=True):
             parameter.data = data
+
+    @torch.no_grad()
+    def _validate(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """(P,) mean error of the validation poses with the averaged weights, and that of the worst of them, mm."""
+        with self._averaged_weights():
+            squared = (self.model(self.x_validation) - self.y_validation).square().sum(dim=2) * self.to_mm.square()
         errors = (squared + self.truncation_mm.square()).sqrt()
         return errors.mean(dim=1), errors.max(dim=1).values
 
@@ -245,11 +298,13 @@ class _Loop:
         """The best weights of each partition without padding, the coefficients in mesh units again."""
         layers = len(self.model.weights)
         weights, biases = ([t.cpu().numpy() for t in self.best[i * layers : (i + 1) * layers]] for i in range(2))
+        input_weights = self.input_weights.cpu().numpy()
         networks = []
         for number, (partition, scale) in enumerate(zip(self.partitions, self.scales, strict=True)):
             own_weights, own_biases = ([a[number].copy() for a in arrays] for arrays in (weights, biases))
             outputs = len(partition.basis.shapes)
-            own_weights[0] = own_weights[0][: partition.inputs.shape[1]]
+            inputs = partition.inputs.shape[1]
+            own_weights[0] = own_weights[0][:inputs] * input_weights[number, :inputs, None]
             own_weights[-1] = own_weights[-1][:, :outputs] * np.float32(scale)
             own_biases[-1] = own_biases[-1][:, :outputs] * np.float32(scale)
             networks.append(Network(tuple(own_weights), tuple(bias[0] for bias in own_biases)))

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The batched network and its loop: padding changes nothing, training learns, and a seed decides everything."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from trainer.config import TrainingConfig
 from trainer.data import PartitionData, prepare, split_poses
-from trainer.loop import train
+from trainer.loop import _Loop, train
 from trainer.model import ACTIVATIONS, PartitionNetworks
 from trainer.process import Cancelled
 
@@ -101,6 +103,47 @@ def test_penalties_shrink_the_weights():
 
     assert size(l1=1e-2) < 0.9 * size()
     assert size(l2=1e-2) < 0.9 * size()
+
+
+def test_inputs_that_say_nothing_are_found_out(monkeypatch):
+    said = partition(4, 12, 8, poses=200)
+    needless = np.random.default_rng(9).normal(size=(200, 80)).astype(np.float32)
+    crowded = replace(said, features=np.concatenate([said.features, needless], axis=1))
+    config = replace(CONFIG, validation_fraction=0.3, weight_decay=0.2)
+
+    def error() -> float:
+        return min(learn([crowded], config)[1].curves[0].validation_mm)
+
+    weighed = error()
+    monkeypatch.setattr("trainer.loop.WEIGHED_AFTER", ())
+    assert weighed < 0.7 * error()
+
+
+def test_weighing_inputs_changes_no_best_answer(monkeypatch):
+    partitions = [partition(3, 10, 2), partition(5, 7, 1)]
+    config = replace(CONFIG, epochs=3, averaging=0)
+    before = learn(partitions, config)[1]
+    loop_run = _Loop.run
+
+    def run_and_weigh(loop: _Loop, *arguments) -> None:
+        loop_run(loop, *arguments)
+        loop.weigh_inputs()
+
+    monkeypatch.setattr(_Loop, "run", run_and_weigh)
+    prepared, after = learn(partitions, config)
+    for data, one, other in zip(prepared, before.networks, after.networks, strict=True):
+        expected, given = (network.coefficients(data.inputs, "silu") for network in (one, other))
+        np.testing.assert_allclose(given, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_a_training_from_networks_starts_with_their_answers():
+    partitions = [partition(3, 10, 2), partition(5, 7, 1)]
+    prepared, first = learn(partitions)
+    still = replace(CONFIG, epochs=10, learning_rate=1e-12, averaging=0)
+    again = learn(partitions, still, initial=first.networks)[1]
+    for data, one, other in zip(prepared, first.networks, again.networks, strict=True):
+        expected, given = (network.coefficients(data.inputs, "silu") for network in (one, other))
+        np.testing.assert_allclose(given, expected, atol=1e-5 * np.abs(expected).max())
 
 
 def test_patience_stops_early():
