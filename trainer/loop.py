@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The training loop: all partitions at once."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from torch.func import functional_call
 
 from fdda_addon.core.errors import TrainingError
 
@@ -99,8 +99,7 @@ def train(
         loop = _Loop([partitions[number] for number in learning], split, config, device)
         if initial is not None:
             loop.start_from([initial[number] for number in learning])
-        weighed = {round(part * config.epochs) for part in WEIGHED_AFTER} - {0} if initial is None else ()
-        loop.run([curves[number] for number in learning], progress, should_stop, partitions, weighed)
+        loop.run([curves[number] for number in learning], progress, should_stop, partitions)
         for number, network in zip(learning, loop.best_networks(), strict=True):
             networks[number] = network
     return Trained(tuple(networks), curves)
@@ -150,8 +149,7 @@ class _Loop:
         """
         generator = torch.Generator().manual_seed(self.config.seed + 3)
         inputs = self.x[:, :: -(-self.x.shape[1] // WEIGHED_BY)].clone().requires_grad_(True)
-        with self._averaged_weights():
-            outputs = self.model(inputs)
+        outputs = self._averaged_outputs(inputs)
         # Along random directions: the mean square over poses is that of all outputs together.
         directions = torch.randn(outputs.shape, generator=generator).to(self.device)
         (gradients,) = torch.autograd.grad(outputs, inputs, directions)
@@ -183,8 +181,8 @@ class _Loop:
                 self.model.biases[layer][number, 0, :columns] = torch.from_numpy(bias * factor)
         self._start_average()
         weights = self.weigh_inputs()
-        self.model.weights[0] /= weights.transpose(1, 2)
-        self._start_average()
+        for first_layer in (self.model.weights[0], self.averaged[0]):
+            first_layer /= weights.transpose(1, 2)
 
     def _start_average(self) -> None:
         self.averaged = [parameter.detach().clone() for parameter in self.model.parameters()]
@@ -195,9 +193,7 @@ class _Loop:
         progress: Callable[[Progress], None] | None,
         should_stop: Callable[[], bool],
         everything: Sequence[PreparedPartition],
-        weighed: Collection[int],
     ) -> None:
-        """Train; `weighed` are the epochs after which inputs are weighed."""
         config, poses = self.config, self.x.shape[1]
         steps = -(-poses // config.batch_size)
         optimizer = torch.optim.AdamW(
@@ -212,6 +208,7 @@ class _Loop:
         constant = [p for p in everything if not len(p.basis.shapes)]
         constant_mm = sum(float(p.validation_truncation.mean()) * p.mm_per_unit * p.vertices for p in constant)
         learning_vertices = np.array([p.vertices for p in self.partitions])
+        weighed = {round(part * config.epochs) for part in WEIGHED_AFTER} - {0}
         for epoch in range(1, config.epochs + 1):
             if epoch - 1 in weighed:
                 self.weigh_inputs()
@@ -269,20 +266,15 @@ class _Loop:
         decay = min(self.config.averaging, (1 + step) / (10 + step)) if self.config.averaging else 0.0
         torch._foreach_lerp_(self.averaged, list(self.model.parameters()), 1 - decay)
 
-    @contextmanager
-    def _averaged_weights(self) -> Iterator[None]:
-        own = [parameter.data for parameter in self.model.parameters()]
-        for parameter, average in zip(self.model.parameters(), self.averaged, strict=True):
-            parameter.data = average
-        yield
-        for parameter, data in zip(self.model.parameters(), own, strict=True):
-            parameter.data = data
+    def _averaged_outputs(self, inputs: torch.Tensor) -> torch.Tensor:
+        names = [name for name, _ in self.model.named_parameters()]
+        return functional_call(self.model, dict(zip(names, self.averaged, strict=True)), (inputs,))
 
     @torch.no_grad()
     def _validate(self) -> tuple[torch.Tensor, torch.Tensor]:
         """(P,) mean error of the validation poses with the averaged weights, and that of the worst of them, mm."""
-        with self._averaged_weights():
-            squared = (self.model(self.x_validation) - self.y_validation).square().sum(dim=2) * self.to_mm.square()
+        difference = self._averaged_outputs(self.x_validation) - self.y_validation
+        squared = difference.square().sum(dim=2) * self.to_mm.square()
         errors = (squared + self.truncation_mm.square()).sqrt()
         return errors.mean(dim=1), errors.max(dim=1).values
 

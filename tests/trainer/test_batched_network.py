@@ -141,6 +141,8 @@ def test_a_training_from_networks_starts_with_their_answers():
     prepared, first = learn(partitions)
     still = replace(CONFIG, epochs=10, learning_rate=1e-12, averaging=0)
     again = learn(partitions, still, initial=first.networks)[1]
+    for curve, begun in zip(again.curves, first.curves, strict=True):
+        np.testing.assert_allclose(curve.validation_mm, min(begun.validation_mm), rtol=1e-3)
     for data, one, other in zip(prepared, first.networks, again.networks, strict=True):
         expected, given = (network.coefficients(data.inputs, "silu") for network in (one, other))
         np.testing.assert_allclose(given, expected, atol=1e-5 * np.abs(expected).max())
