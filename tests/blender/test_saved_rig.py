@@ -40,7 +40,7 @@ def test_without_the_addon_the_file_shows_and_renders_the_rig(keyed, tmp_path, u
     true = evaluated(keyed)
     keyed.fdda.mode = "FDDA"
     playing = evaluated(keyed)
-    assert np.abs(playing - true).max() > 1e-4
+    assert np.abs(playing - true).max() > 1e-5
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"), copy=True)
     fdda_addon.unregister()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
