@@ -1,29 +1,33 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What each network sees: its joints relative to their parents, its controls, and where its neighbours are.
+"""What each network sees: its joints relative to their parents, its controls, where its neighbours are, and deltas.
 
 A smoothed surface depends on where the surface around it is. From the parent-relative transforms a network would have
-to multiply its way to that; so it is also given the middle of the partitions around it, seen from its main joint.
+to multiply its way to that; so it is also given the middle of the partitions around it, seen from its main joint, and
+where the rig smooths, how some vertices stand out of the smoothed surface (`deltas`).
 docs/training.md has the errors with and without.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
 from fdda_addon.core.partition import Partition
+from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import UNMOVED, Rig
+
+from .deltas import FEATURES_PER_DELTA, NO_DELTAS, Deltas
 
 FEATURES_PER_PAIR = 3
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """All features that networks see, F = 12 J + C + 3 Q of them in a row, and which of them each network sees.
+    """All features that networks see, F = 12 J + C + 3 Q + 3 D of them in a row, and which of them each network sees.
 
     First the J joints relative to their parents (`core.features`); then the C controls, each in its own unit; then Q
-    points y of joints b as seen from joints a, P_a^-1 P_b y, in mesh units.
+    points y of joints b as seen from joints a, P_a^-1 P_b y, in mesh units; then D deltas, in mesh units.
 
     Attributes:
         parents: (J,) int32, parent of each joint, -1 for a root.
@@ -32,6 +36,7 @@ class Inputs:
         point_joints: (M,) int64, their joints b.
         pair_references, pair_points: (Q,) int64, joints a and points y of each pair.
         columns: for each partition, (F_p,) int64 indices of the features that its network is offered.
+        deltas: D of them.
     """
 
     parents: np.ndarray
@@ -41,6 +46,7 @@ class Inputs:
     pair_references: np.ndarray
     pair_points: np.ndarray
     columns: tuple[np.ndarray, ...]
+    deltas: Deltas = NO_DELTAS
 
     @property
     def joint_columns(self) -> int:
@@ -52,11 +58,28 @@ class Inputs:
         """12 J + C, where the pairs begin; they follow from what stands before them."""
         return self.joint_columns + self.control_count
 
+    @property
+    def first_delta(self) -> int:
+        """12 J + C + 3 Q, where the deltas begin; they follow from the poses, too."""
+        return self.own_columns + FEATURES_PER_PAIR * len(self.pair_points)
+
+    @property
+    def size(self) -> int:
+        """F."""
+        return self.first_delta + FEATURES_PER_DELTA * len(self.deltas)
+
     def are_lengths(self) -> np.ndarray:
         """(F,) bool, the features that are in the unit of length of mesh-object space."""
-        own, pairs = self.own_columns, FEATURES_PER_PAIR * len(self.pair_points)
-        number = np.arange(own + pairs)
-        return (number >= own) | ((number < self.joint_columns) & (number % 4 == 3))
+        number = np.arange(self.size)
+        return (number >= self.own_columns) | ((number < self.joint_columns) & (number % 4 == 3))
+
+    def with_deltas(self, deltas: Deltas, partitions: Sequence[Partition]) -> "Inputs":
+        """The same, and each network is offered the deltas that its main joint sees."""
+        columns = []
+        for partition, own in zip(partitions, self.columns, strict=True):
+            seen = np.flatnonzero(deltas.seen_from == partition.joint)
+            columns.append(np.concatenate([own, *(_columns(self.first_delta, d, FEATURES_PER_DELTA) for d in seen)]))
+        return replace(self, columns=tuple(columns), deltas=deltas)
 
     def features(
         self, pose_matrices: np.ndarray, rest_matrices: np.ndarray, controls: np.ndarray | None = None
@@ -83,12 +106,18 @@ class Inputs:
         apart = there[:, self.pair_points] - poses[:, :, :3, 3][:, self.pair_references]
         seen = np.einsum("nqab,nqb->nqa", np.linalg.inv(poses[:, :, :3, :3])[:, self.pair_references], apart)
         parts = [joints, values.astype(np.float32), seen.reshape(len(poses), -1).astype(np.float32)]
-        return np.concatenate(parts, axis=1)
+        return np.concatenate([*parts, self.deltas.seen(pose_matrices)], axis=1)
 
 
 def inputs_of_rig(rig: Rig, points: np.ndarray, partitions: Sequence[Partition]) -> Inputs:
     """Choose what the networks of a rig see; `points` and `partitions` as in `make_inputs`."""
     return make_inputs(rig.parents, points, partitions, len(rig.controls), unmoved_joints(rig))
+
+
+def inputs_of_recording(recording: Recording, deltas: Deltas) -> Inputs:
+    """Choose what the networks of a recording see, some deltas among it."""
+    rig, partitions = recording.rig, recording.partitions
+    return inputs_of_rig(rig, middles(rig, partitions), partitions).with_deltas(deltas, partitions)
 
 
 def make_inputs(

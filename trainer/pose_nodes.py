@@ -4,7 +4,8 @@
 Every three features are one vector as a frame sees it, R^-1 (d - t): the columns of a joint's matrix as the joint sees
 them that its parent carries along, and the points of other joints as a main joint sees them. So all are one gather of
 frames, one of vectors and a product. Where no recorded bone is sheared the columns of R are orthogonal, whatever the
-scale, and R^-1 is its transpose, each row divided by its squared length: a third of the nodes of an inverse.
+scale, and R^-1 is its transpose, each row divided by its squared length: a third of the nodes of an inverse. Deltas
+(`delta_nodes`) come behind them.
 """
 
 from dataclasses import dataclass
@@ -15,11 +16,10 @@ from fdda_addon.core.features import FEATURES_PER_JOINT
 from fdda_addon.core.model import CONTROLS_INPUT, POSE_INPUT, TRUST_OUTPUT
 
 from .deformation import Deformation
-from .inputs import FEATURES_PER_PAIR
+from .delta_nodes import add_deltas
+from .deltas import SMALLEST
 from .nodes import Graph
 
-SMALLEST = 1e-18
-"""Added to what is divided by: a joint that is scaled to nothing gives numbers, not NaN."""
 VECTOR = 3
 """Features are gathered by so many."""
 COLUMNS, ZERO, WHOLE, INVERSE = 4, 4, 5, 6
@@ -32,7 +32,7 @@ class Features:
     """The features in the graph.
 
     Attributes:
-        name: (N, B, 3), of the controls first, then of the joints, then of the pairs.
+        name: (N, B, 3), of the controls first, then of the joints, then of the pairs, then the deltas.
         own: how many of the B vectors are of controls and joints; the others follow from these.
         size: 3 B.
         place: (F,) int64, where each feature of `Inputs` is among the 3 B; -1 where it is not needed.
@@ -92,20 +92,20 @@ def add_features(graph: Graph, deformation: Deformation) -> Features:
         lengths = graph.add("MatMul", [squared, sums], "lengths")
         safe = graph.add("Add", [lengths, graph.floats("smallest_length", SMALLEST)], "safe_lengths")
         name = graph.add("Div", [name, safe], "seen_vectors")
-    place = np.full(inputs.own_columns + FEATURES_PER_PAIR * len(inputs.pair_points), -1, np.int64)
+    place, before = np.full(inputs.size, -1, np.int64), []
     if count := inputs.control_count:
         # Three times, to fill vectors; only the first is looked at.
         thrice = graph.add("Concat", [CONTROLS_INPUT] * VECTOR, "controls_thrice", axis=1)
-        name = graph.add(
-            "Concat", [graph.reshape(thrice, [0, count, VECTOR], "controls_in_vectors"), name], "features", axis=1
-        )
+        before.append(graph.reshape(thrice, [0, count, VECTOR], "controls_in_vectors"))
         place[inputs.joint_columns : inputs.own_columns] = np.arange(count)
+    pose_rows = rows * (frames.first_joint + np.arange(len(inputs.parents))) + WHOLE
+    behind = [add_deltas(graph, inputs.deltas, table, pose_rows)] if len(inputs.deltas) else []
+    name = graph.join([*before, name, *behind], "features", axis=1)
     own, by_column = count + COLUMNS * len(joints), np.arange(FEATURES_PER_JOINT).reshape(VECTOR, COLUMNS).T.ravel()
     place[(FEATURES_PER_JOINT * joints[:, None] + by_column).ravel()] = np.arange(VECTOR * count, VECTOR * own)
-    pairs = VECTOR * len(inputs.pair_points)
-    place[inputs.own_columns :] = np.arange(VECTOR * own, VECTOR * own + pairs)
-    itself = frames.first_joint + np.arange(len(inputs.parents))
-    return Features(name, own, VECTOR * own + pairs, place, table, rows * itself + WHOLE)
+    size = VECTOR * own + inputs.size - inputs.own_columns
+    place[inputs.own_columns :] = np.arange(VECTOR * own, size)
+    return Features(name, own, size, place, table, pose_rows)
 
 
 def _joints_needed(deformation: Deformation) -> np.ndarray:

@@ -25,8 +25,9 @@ from .announcements import Announcer
 from .config import TrainingConfig
 from .data import PreparedPartition, Split, held_back_digest, partitions_of, prepare_together, split_recording
 from .deformation import Deformation, is_sheared
+from .delta_fit import find_deltas
 from .export import build_model, measure, measure_surface, write_model
-from .inputs import Inputs, inputs_of_rig, middles
+from .inputs import Inputs, inputs_of_recording
 from .loop import Trained, choose_device, train
 from .outputs import check_training_outputs, training_outputs
 from .page import render_html
@@ -85,7 +86,9 @@ def train_model(
     warnings = _check(recording, announcer, strict)
     _check_stop(should_stop)
     recording = without_needless_down(recording, split)
-    inputs = inputs_of_rig(recording.rig, middles(recording.rig, recording.partitions), recording.partitions)
+    # What is gone on with goes on to see the same.
+    deltas = last.deltas if last else find_deltas(recording, split, config.tolerance_mm)
+    inputs = inputs_of_recording(recording, deltas)
     prepared = _prepare(recording, inputs, split, config, announcer, should_stop)
     seen = [columns[partition.columns] for columns, partition in zip(inputs.columns, prepared, strict=True)]
     trained = train(
@@ -198,6 +201,8 @@ def _last_weights(model_path: Path, recording: Recording, held_back: str, config
         raise TrainingError(f"The last weights '{path}' are of another rig; train without --warm-start.")
     if last.controls != tuple(control.name for control in recording.rig.controls):
         raise TrainingError(f"The last weights '{path}' are of other controls; train without --warm-start.")
+    if not last.deltas.fit(recording.rig):
+        raise TrainingError(f"The last weights '{path}' are damaged; train without --warm-start.")
     if last.held_back != held_back:
         raise TrainingError(
             f"The last weights '{path}' are of another recording or seed, and may have been trained on poses that are "

@@ -9,7 +9,7 @@ import json
 import os
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 
@@ -22,9 +22,10 @@ from fdda_addon.core.rig import Fingerprint
 
 from .data import PreparedPartition
 from .deformation import Deformation
+from .deltas import NO_DELTAS, Deltas
 from .model import Network
 
-VERSION = 2
+VERSION, WITHOUT_DELTAS = 3, 2
 DAMAGE = (
     *(OSError, ValueError, KeyError, AttributeError, OverflowError, EOFError, zipfile.BadZipFile, zlib.error),
     *(RuntimeError, IndexError, *HEADER_ERRORS),
@@ -62,6 +63,7 @@ class LastWeights:
         hidden, activation: of the networks.
         history: held-out errors of this training and those before it, oldest first: `{"poses", "p999"}`, in mm.
         partitions: in the order of the recording.
+        deltas: that the networks saw.
     """
 
     fingerprint: Fingerprint
@@ -71,6 +73,7 @@ class LastWeights:
     activation: str
     history: tuple[dict, ...]
     partitions: tuple[LastPartition, ...]
+    deltas: Deltas = NO_DELTAS
 
 
 def write_weights(
@@ -91,6 +94,7 @@ def write_weights(
         "partitions": len(deformation.partitions),
     }
     arrays = {"about": np.frombuffer(json.dumps(about).encode(), np.uint8)}
+    arrays |= {f"deltas/{name}": array for name, array in vars(deformation.inputs.deltas).items()}
     for number, (prepared, network) in enumerate(zip(deformation.prepared, deformation.networks, strict=True)):
         own = {
             "columns": deformation.seen_columns(number),
@@ -134,7 +138,7 @@ def read_weights(path: Path) -> LastWeights:
 
 def _read(arrays: np.lib.npyio.NpzFile) -> LastWeights:
     about = json.loads(arrays["about"].tobytes())
-    if about["version"] != VERSION:
+    if about["version"] not in (VERSION, WITHOUT_DELTAS):
         raise ValueError(f"version {about['version']!r}")
     hidden = tuple(int(units) for units in about["hidden"])
     partitions = []
@@ -155,7 +159,23 @@ def _read(arrays: np.lib.npyio.NpzFile) -> LastWeights:
         str(about["activation"]),
         history,
         tuple(partitions),
+        NO_DELTAS if about["version"] == WITHOUT_DELTAS else _read_deltas(arrays),
     )
+
+
+def _read_deltas(arrays: np.lib.npyio.NpzFile) -> Deltas:
+    deltas = Deltas(**{field.name: arrays[f"deltas/{field.name}"] for field in fields(Deltas)})
+    count, corners = deltas.lengths.shape
+    shapes = {"vertices": (count,), "seen_from": (count,), "corners": (2, count, corners), "least": (count, corners)}
+    for name, array in vars(deltas).items():
+        integers = name in ("vertices", "seen_from", "corners")
+        if array.dtype != (np.int64 if integers else np.float64) or array.shape != shapes.get(name, array.shape):
+            raise ValueError("its arrays contradict each other")
+        if not (np.abs(array) <= LARGEST).all() or (integers and array.min(initial=0) < 0):
+            raise ValueError("its arrays hold values that are not numbers")
+    if deltas.edges.ndim != 2 or (count and deltas.corners.max() >= len(deltas.edges)) or not (deltas.least > 0).all():
+        raise ValueError("its arrays contradict each other")
+    return deltas
 
 
 def _check(partition: LastPartition, hidden: tuple[int, ...]) -> None:

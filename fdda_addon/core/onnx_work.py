@@ -192,7 +192,7 @@ def _quantize(call: _Call) -> list[Shape]:
 
 RULES: dict[str, Callable[[_Call], list[Shape]]] = {
     **dict.fromkeys(("Add", "Sub", "Mul", "Div", "Max", "Min"), _elementwise),
-    **dict.fromkeys(("Relu", "Sigmoid", "Tanh", "Erf"), _same),
+    **dict.fromkeys(("Relu", "Sigmoid", "Tanh", "Erf", "Sqrt"), _same),
     **dict.fromkeys(("MatMul", "MatMulInteger"), _matmul),
     **{"Gemm": _gemm, "Cast": _cast, "DequantizeLinear": _same, "DynamicQuantizeLinear": _quantize},
     **{"Transpose": _transpose, "Reshape": _reshape, "Concat": _concat, "Split": _split, "Slice": _slice},
