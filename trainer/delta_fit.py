@@ -31,16 +31,18 @@ COMMON_CORNERS = 0.75
 ITERATIONS = (2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 56, 64)
 FACTOR = 0.5
 """Of each iteration: one of twice the factor smooths about as much as two."""
-LEAST_EXPLAINED = 0.8
-"""Part of a vertex's squared residual, of what the joints leave, that its normals have to explain."""
+LEAST_EXPLAINED, SMOOTHS = 0.8, 0.95
+"""Part of a vertex's squared residual, of what the joints leave, that its normals have to explain; and that they
+explain somewhere on a rig that smooths. Shape keys and lattices that bend with the joints come to 0.9 by chance."""
 DAMPING = 0.01
 """What `Deltas.least` is of the area of the corner in the rest pose: a normal that rounding would turn fades."""
 TRIED = 24
 """Vertices that say how smooth the surface is."""
 SMALLEST_AREA = 1e-18
 """Square mesh units; of a corner without any."""
-CONDITION = 0.05
-"""Sums of normals smaller than this part of the largest are none: they fit what is not there by long lengths."""
+RIDGE = 0.03
+"""Normals, and sums of them, that turn by fewer radians against the joints fit next to nothing: it would take lengths
+with which their rounding counts."""
 RANK = 1e-5
 """Directions of the joints' rows that are smaller than this part of the largest are none."""
 
@@ -146,7 +148,7 @@ def find_deltas(recording: Recording, split: Split, tolerance_mm: float) -> Delt
     candidates.sort(key=lambda own: (own.partition, own.vertex))
     deltas = next(deltas for number, deltas in smoothed.deltas(candidates) if number == iterations)
     lengths, parts = _fit(deltas, candidates, poses)
-    return replace(deltas, lengths=lengths).chosen(parts >= LEAST_EXPLAINED)
+    return replace(deltas, lengths=lengths).chosen(parts >= LEAST_EXPLAINED) if parts.max() >= SMOOTHS else NO_DELTAS
 
 
 def _corners(rig: Rig) -> _Corners:
@@ -277,7 +279,8 @@ def _fit(deltas: Deltas, candidates: Sequence[_Candidate], poses: _Poses) -> tup
         used = np.flatnonzero(deltas.lengths[number])
         values = normals[number].reshape(len(own.left), -1)[:, used]
         values = _without(poses.directions[own.partition], values)
-        lengths[number, used], *_ = np.linalg.lstsq(values, own.left, rcond=CONDITION)
+        products = values.T @ values + RIDGE**2 * len(poses.matrices) * np.eye(len(used))
+        lengths[number, used] = np.linalg.solve(products, values.T @ own.left)
         left = own.left - values @ lengths[number, used]
         parts[number] = 1 - left @ left / (own.left @ own.left)
     return lengths, parts

@@ -88,6 +88,8 @@ def train_model(
     recording = without_needless_down(recording, split)
     # What is gone on with goes on to see the same.
     deltas = last.deltas if last else find_deltas(recording, split, config.tolerance_mm)
+    if len(deltas):
+        announcer.say(MessageType.LOG, text=f"The rig smooths: networks see the deltas of {len(deltas)} vertices.")
     inputs = inputs_of_recording(recording, deltas)
     prepared = _prepare(recording, inputs, split, config, announcer, should_stop)
     seen = [columns[partition.columns] for columns, partition in zip(inputs.columns, prepared, strict=True)]

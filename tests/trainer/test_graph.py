@@ -128,8 +128,7 @@ def test_a_recording_with_sheared_bones_plays_them(tmp_path, monkeypatch):
 def test_the_graph_has_few_nodes(trained):
     """Half a microsecond each, and most of one in a frame."""
     info, graph = read_model_info(trained / "model.onnx"), onnx.load(trained / "model.onnx").graph
-    of_deltas = 28 if any(node.name == "seen_deltas" for node in graph.node) else 0
-    assert len(graph.node) <= 56 + of_deltas + len(info.partitions)
+    assert len(graph.node) <= 56 + len(info.partitions)
 
 
 def test_constants_are_the_matrices_and_little_else(trained, deformation, report):
