@@ -10,7 +10,7 @@ VECTOR = 3
 
 
 def add_deltas(graph: Graph, deltas: Deltas, table: str, pose_rows: np.ndarray) -> str:
-    """Add the deltas in mesh-object space.
+    """Add the deltas.
 
     Args:
         deltas: at least one.

@@ -256,7 +256,7 @@ def test_the_shapes_are_those_that_the_runtime_finds():
         helper.make_node("Gemm", ["w", "r"], ["gt"], transA=1, transB=1),
         *(helper.make_node(name, ["y", "b"], [name]) for name in ("Add", "Sub", "Mul", "Div")),
         *(helper.make_node(name, ["y", "b", "y"], [name]) for name in ("Max", "Min")),
-        *(helper.make_node(name, ["y"], [name]) for name in ("Relu", "Sigmoid", "Tanh", "Erf")),
+        *(helper.make_node(name, ["y"], [name]) for name in ("Relu", "Sigmoid", "Tanh", "Erf", "Sqrt")),
         helper.make_node("Transpose", ["y"], ["t"], perm=[2, 0, 1]),
         helper.make_node("Transpose", ["y"], ["all_turned"]),
         helper.make_node("Concat", ["y", "x"], ["c"], axis=-1),
