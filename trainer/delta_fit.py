@@ -16,18 +16,20 @@ from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
+from fdda_addon.core.surface import corners_beside
 
 from .data import Split
-from .deltas import NO_DELTAS, Deltas
+from .deltas import MOST_PARTS, NO_DELTAS, Deltas
 from .joint_fit import surroundings_of_rig
 
 MOST_POSES = 400
 """So many of the training poses are looked at."""
 MOST_PER_PARTITION, MEAN_PER_PARTITION = 8, 3
-MOST_PARTS = 1 << 12
-"""Joints times vertices, at most: as many parts the edges at the vertices have, and a frame reads them all."""
-COMMON_CORNERS = 0.75
-"""Where more faces meet than at this part of the vertices, there is no candidate: all others are padded to it."""
+COMMON_CORNERS, MOST_CORNERS = 0.75, 16
+"""A vertex with more corners than this part of the vertices have, or than so many, is no candidate: all that are chosen
+are padded to the one with most."""
+EQUATIONS = 4
+"""Poses give at least so many equations for each number of the joints around a partition: with few all is explained."""
 ITERATIONS = (2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 56, 64)
 FACTOR = 0.5
 """Of each iteration: one of twice the factor smooths about as much as two."""
@@ -44,7 +46,7 @@ RIDGE = 0.03
 """Normals, and sums of them, that turn by fewer radians against the joints fit next to nothing: it would take lengths
 with which their rounding counts."""
 RANK = 1e-5
-"""Directions of the joints' rows that are smaller than this part of the largest are none."""
+"""Directions that are smaller than this part of the largest are none."""
 
 
 @dataclass(frozen=True)
@@ -107,12 +109,12 @@ class _Poses:
     Attributes:
         matrices: (n, J, 4, 4) pose matrices, mesh-object space, mesh units.
         axes: (n, J, 3, 3) float64, turn a vector of mesh-object space into the frame of a main joint's residuals.
-        directions: of each partition (3 n, r), an orthonormal basis of what the joints around it explain.
+        directions: of partitions by their number (3 n, r), an orthonormal basis of what the joints around explain.
     """
 
     matrices: np.ndarray
     axes: np.ndarray
-    directions: Sequence[np.ndarray]
+    directions: dict[int, np.ndarray]
 
 
 def find_deltas(recording: Recording, split: Split, tolerance_mm: float) -> Deltas:
@@ -129,17 +131,20 @@ def find_deltas(recording: Recording, split: Split, tolerance_mm: float) -> Delt
     training = split.training[np.unique(np.linspace(0, len(split.training) - 1, MOST_POSES).astype(np.int64))]
     matrices, corners = np.array(recording.pose_matrices[training]), _corners(rig)
     skin = skin_matrices(matrices, rig.rest_matrices)
-    directions = [_directions(surroundings_of_rig(rig, own, skin).rows) for own in recording.partitions]
-    poses = _Poses(matrices, np.linalg.inv(skin[:, :, :3, :3].astype(np.float64)), directions)
     count = np.diff(corners.starts)
-    usable = (count > 0) & (count <= np.quantile(count, COMMON_CORNERS))
-    candidates = []
-    for number, (partition, own) in enumerate(zip(recording.partitions, directions, strict=True)):
-        if 2 * own.shape[1] <= len(own):
-            residuals = np.asarray(recording.residuals[np.ix_(training, partition.vertices)], np.float32)
-            candidates += _candidates(residuals, own, partition, number, usable[partition.vertices])
+    usable = (count > 0) & (count <= min(np.quantile(count[count > 0], COMMON_CORNERS), MOST_CORNERS))
     least = (tolerance_mm / (1000 * rig.metres_per_unit)) ** 2
-    candidates = sorted((own for own in candidates if own.score > least), key=lambda own: -own.score)
+    candidates, directions = [], {}
+    for number, partition in enumerate(recording.partitions):
+        rows = surroundings_of_rig(rig, partition, skin).rows
+        if EQUATIONS * rows.shape[2] <= 3 * len(rows):
+            own = _directions(rows)
+            residuals = np.asarray(recording.residuals[np.ix_(training, partition.vertices)], np.float32)
+            found = _candidates(residuals, own, partition, number, usable[partition.vertices])
+            candidates += [candidate for candidate in found if candidate.score > least]
+            directions[number] = own
+    poses = _Poses(matrices, np.linalg.inv(skin[:, :, :3, :3].astype(np.float64)), directions)
+    candidates.sort(key=lambda own: -own.score)
     candidates = candidates[: min(MEAN_PER_PARTITION * len(recording.partitions), MOST_PARTS // len(rig.joints))]
     if not candidates:
         return NO_DELTAS
@@ -152,14 +157,10 @@ def find_deltas(recording: Recording, split: Split, tolerance_mm: float) -> Delt
 
 
 def _corners(rig: Rig) -> _Corners:
-    counts = np.diff(rig.face_starts, append=len(rig.face_vertices))
-    following = np.arange(1, len(rig.face_vertices) + 1)
-    following[rig.face_starts + counts - 1] = rig.face_starts
-    before = np.empty_like(rig.face_vertices)
-    before[following] = rig.face_vertices
     order = np.argsort(rig.face_vertices, kind="stable")
     starts = np.searchsorted(rig.face_vertices[order], np.arange(rig.vertex_count + 1))
-    return _Corners(starts, before[order], rig.face_vertices[following][order])
+    beside = corners_beside(rig.face_starts, rig.face_vertices)
+    return _Corners(starts, *(rig.face_vertices[corners[order]] for corners in beside))
 
 
 def _directions(rows: np.ndarray) -> np.ndarray:
@@ -187,6 +188,7 @@ def _candidates(
         usable: (Vp,) bool, whether a vertex can be one.
     """
     flat = residuals.transpose(0, 2, 1).reshape(-1, residuals.shape[1])
+    usable = usable.copy()
     whole = _without(directions.astype(np.float32), flat).reshape(len(residuals), 3, -1)
     left, found = whole.copy(), []
     score = np.einsum("nav,nav->v", left, left) / len(left) * usable

@@ -18,6 +18,8 @@ from fdda_addon.core.rig import Rig
 FEATURES_PER_DELTA = 3
 SMALLEST = 1e-18
 """Added to squared lengths that are divided by: a joint that is scaled to nothing gives numbers, not NaN."""
+MOST_PARTS = 1 << 12
+"""Joints times deltas, at most: a frame reads a number of each joint for the edges at each vertex."""
 BLOCK_FLOATS = 1 << 22
 """Poses are looked at in blocks of so many coordinates."""
 
@@ -49,18 +51,23 @@ class Deltas:
     def __len__(self) -> int:
         return len(self.vertices)
 
-    def fit(self, rig: Rig) -> bool:
-        """Whether they can be of a rig."""
+    def may_be_of(self, rig: Rig) -> bool:
+        """Whether a rig can have them."""
         joints, vertices = len(rig.joints), rig.vertex_count
         known = self.seen_from.max(initial=0) < joints and self.vertices.max(initial=0) < vertices
-        return known and (not len(self) or self.edges.shape[1] == 4 * joints)
+        few = len(self) * joints <= MOST_PARTS
+        return known and few and (not len(self) or self.edges.shape[1] == 4 * joints)
 
     def chosen(self, which: np.ndarray) -> "Deltas":
         """Those of them that (D,) bool says."""
-        own = (array[which] for array in (self.vertices, self.seen_from))
-        used, corners = np.unique(self.corners[:, which], return_inverse=True)
-        corners = corners.reshape(2, -1, self.corners.shape[2])
-        return Deltas(*own, self.edges[used], corners, self.least[which], self.lengths[which])
+        used = (self.lengths[which] != 0).any(axis=0)
+        corners = self.corners[:, which][:, :, used]
+        edges, places = np.unique(corners, return_inverse=True)
+        return Deltas(
+            *(self.vertices[which], self.seen_from[which]),
+            *(self.edges[edges], places.reshape(corners.shape)),
+            *(self.least[which][:, used], self.lengths[which][:, used]),
+        )
 
     def seen(self, pose_matrices: np.ndarray) -> np.ndarray:
         """The deltas in poses, along the axes of their main joints: the same for a character that is scaled as a whole.
@@ -84,7 +91,8 @@ class Deltas:
     def normals(self, pose_matrices: np.ndarray) -> np.ndarray:
         """(N, J, 4, 4) pose matrices to (N, D, K, 3) float64 normals of the corners, mesh-object space."""
         columns = pose_matrices[:, :, :3].astype(np.float64).swapaxes(2, 3).reshape(len(pose_matrices), -1, 3)
-        before, after = ((self.edges @ columns)[:, own] for own in self.corners)
+        edges = self.edges @ columns
+        before, after = (edges[:, own] for own in self.corners)
         crossed = np.cross(before, after)
         squared = (crossed**2).sum(axis=3) + self.least**2
         return crossed / np.sqrt(squared)[..., None]

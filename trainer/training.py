@@ -203,7 +203,7 @@ def _last_weights(model_path: Path, recording: Recording, held_back: str, config
         raise TrainingError(f"The last weights '{path}' are of another rig; train without --warm-start.")
     if last.controls != tuple(control.name for control in recording.rig.controls):
         raise TrainingError(f"The last weights '{path}' are of other controls; train without --warm-start.")
-    if not last.deltas.fit(recording.rig):
+    if not last.deltas.may_be_of(recording.rig):
         raise TrainingError(f"The last weights '{path}' are damaged; train without --warm-start.")
     if last.held_back != held_back:
         raise TrainingError(

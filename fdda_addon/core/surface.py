@@ -24,6 +24,19 @@ def are_faces(face_starts: np.ndarray, face_vertices: np.ndarray, vertex_count: 
     )
 
 
+def corners_beside(face_starts: np.ndarray, face_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The corner before and the corner after each, along its face: (C,) int64 both.
+
+    Args:
+        face_starts, face_vertices: (F,) and (C,) int32 as in `Rig`, at least one face.
+    """
+    after = np.arange(1, len(face_vertices) + 1)
+    after[np.append(face_starts[1:], len(face_vertices)) - 1] = face_starts
+    before = np.empty_like(after)
+    before[after] = np.arange(len(face_vertices))
+    return before, after
+
+
 class Surface:
     """The faces of a mesh, made ready to give the normals of one pose after another.
 
@@ -39,10 +52,7 @@ class Surface:
         counts = np.diff(face_starts, append=len(face_vertices))
         self._starts, self._corners = face_starts, face_vertices
         self._face_of_corner = np.repeat(np.arange(len(face_starts)), counts)
-        self._next = np.arange(1, len(face_vertices) + 1)
-        self._next[face_starts + counts - 1] = face_starts
-        self._previous = np.empty_like(self._next)
-        self._previous[self._next] = np.arange(len(face_vertices))
+        self._previous, self._next = corners_beside(face_starts, face_vertices)
         # Corners in the order of their vertices: the sums at a vertex are then sums of neighbours.
         self._by_vertex = np.argsort(face_vertices, kind="stable")
         self.vertices, self._vertex_starts = np.unique(face_vertices[self._by_vertex], return_index=True)

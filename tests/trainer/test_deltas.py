@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Deltas: found where a rig smooths, as it smooths, and nowhere else; the same in the graph and without it."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -95,11 +96,17 @@ def delta_mush(rig: Rig, skinned: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def write_tube(path, per_metre: float = 1.0, away: float = 0.0, smooths: bool = True) -> Recording:
+INFLUENCING = {joint: tuple(i for i in (joint, joint + 1) if 0 < i < JOINTS) for joint in range(JOINTS)}
+
+
+def write_tube(
+    path, per_metre: float = 1.0, away: float = 0.0, smooths: bool = True, sheared: bool = False, poses: int = POSES
+) -> Recording:
     """A recording of the tube with delta mush, or with bulges that follow the joints in another way."""
-    plain, rig, angles = tube(), tube(per_metre, away), chain_angles(POSES, JOINTS, seed=1, reach=1.5)
-    influencing = {joint: tuple(i for i in (joint, joint + 1) if 0 < i < JOINTS) for joint in range(JOINTS)}
-    matrices, layer = pose_chain(plain, angles), LinearLayer(plain, make_partitions(plain, influencing))
+    plain, rig, angles = tube(), tube(per_metre, away), chain_angles(poses, JOINTS, seed=1, reach=1.5)
+    matrices, layer = pose_chain(plain, angles), LinearLayer(plain)
+    if sheared:
+        matrices[:, -1, :3, 0] += 0.4 * np.sin(angles[:, -1, :1]) * matrices[:, -1, :3, 1]
     if smooths:
         residuals = layer.local_residuals(matrices, delta_mush(plain, layer.positions(matrices)))
     else:
@@ -107,7 +114,7 @@ def write_tube(path, per_metre: float = 1.0, away: float = 0.0, smooths: bool = 
         residuals = 0.01 * np.einsum("nj,jva->nva", np.sin(7 * angles[:, 1]), waves)
     matrices = matrices.astype(np.float64)
     matrices[:, :, :3, 3] = per_metre * (matrices[:, :, :3, 3] + away)
-    with RecordingWriter(path, rig, make_partitions(rig, influencing), chain_info(POSES)) as writer:
+    with RecordingWriter(path, rig, make_partitions(rig, INFLUENCING), chain_info(poses)) as writer:
         writer.append(matrices.astype(np.float32), (per_metre * residuals).astype(np.float32))
     return read_recording(path)
 
@@ -189,6 +196,22 @@ def test_what_normals_explain_by_chance_counts_for_nothing(tmp_path):
     assert found_in(read_recording(tmp_path / "chain")) is NO_DELTAS
 
 
+def test_a_dozen_poses_say_nothing_of_smoothing(tmp_path):
+    assert found_in(write_tube(tmp_path / "tube", poses=12)) is NO_DELTAS
+
+
+def test_vertices_without_faces_are_none_and_change_nothing(recording, deltas):
+    rig, more = recording.rig, 4 * recording.rig.vertex_count
+    extended = {
+        name: np.concatenate([getattr(rig, name), np.repeat(getattr(rig, name)[-1:], more, axis=0)])
+        for name in ("rest_positions", "skin_joints", "skin_weights")
+    }
+    rig = replace(rig, **extended)
+    residuals = np.concatenate([recording.residuals, np.ones((POSES, more, 3), np.float32)], axis=1)
+    found = found_in(replace(recording, rig=rig, residuals=residuals, partitions=make_partitions(rig, INFLUENCING)))
+    assert found.vertices.tolist() == deltas.vertices.tolist()
+
+
 def test_without_faces_there_are_none(recording):
     none = np.zeros(0, np.int32)
     assert found_in(replace(recording, rig=replace(recording.rig, face_starts=none, face_vertices=none))) is NO_DELTAS
@@ -217,6 +240,24 @@ def test_the_model_has_them(trained):
     names = {node.name for node in onnx.load(trained).graph.node}
     assert "seen_deltas" in names
     assert len(names) <= 56 + 28 + JOINTS
+
+
+@pytest.mark.parametrize("way", [{"per_metre": 1000.0, "away": 100.0}, {"sheared": True}], ids=["far away", "sheared"])
+def test_the_graph_agrees_with_pytorch_in_other_rigs(tmp_path, way):
+    write_tube(tmp_path / "tube", **way)
+    assert main([str(tmp_path / "tube"), str(tmp_path / "tube.onnx"), *QUICK, "--epochs", "4"]) == 0
+    assert "seen_deltas" in {node.name for node in onnx.load(tmp_path / "tube.onnx").graph.node}
+
+
+def test_weights_of_before_have_none(trained, tmp_path):
+    with np.load(weights_path(trained)) as arrays:
+        kept = {name: array for name, array in arrays.items() if not name.startswith("deltas/")}
+    about = json.loads(kept["about"].tobytes())
+    assert about["version"] == 3
+    kept["about"] = np.frombuffer(json.dumps({**about, "version": 2}).encode(), np.uint8)
+    with open(tmp_path / "old.npz", "wb") as file:
+        np.savez(file, **kept)
+    assert read_weights(tmp_path / "old.npz").deltas is NO_DELTAS
 
 
 def test_a_training_goes_on_with_the_same(recording, deltas, trained, capsys):
