@@ -27,13 +27,15 @@ def add_deltas(graph: Graph, deltas: Deltas, table: str, pose_rows: np.ndarray) 
     # An edge for each corner on either side: to gather them takes longer than to multiply twice.
     edges = graph.floats("edges_of_poses", deltas.edges[deltas.corners.ravel()].T)
     edges = graph.add("MatMul", [columns, edges], "edges")
-    both = graph.split(edges, [count * corners] * 2, ["before", "after"], axis=2)
+    both = graph.split(edges, [count * corners] * 2, ["edges_before", "edges_after"], axis=2)
     # b x a = (b_y a_z, b_z a_x, b_x a_y) - (b_z a_y, b_x a_z, b_y a_x)
     turned = [
         graph.add("Gather", [edge, graph.integers(f"{edge}_axes", axes)], f"{edge}_turned", axis=1)
         for edge, axes in zip(both, ([1, 2, 0, 2, 0, 1], [2, 0, 1, 1, 2, 0]), strict=True)
     ]
-    terms = graph.split(graph.add("Mul", turned, "terms_of_cross"), [VECTOR] * 2, ["added", "taken"], axis=1)
+    terms = graph.split(
+        graph.add("Mul", turned, "terms_of_cross"), [VECTOR] * 2, ["cross_added", "cross_taken"], axis=1
+    )
     crossed = graph.add("Sub", terms, "crossed")
     normals = _shortened(graph, crossed, deltas.least.ravel() ** 2, "normals")
     parts = graph.add("Mul", [normals, graph.floats("delta_lengths", deltas.lengths.ravel())], "delta_parts")

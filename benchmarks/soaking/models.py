@@ -2,6 +2,7 @@
 """Mutated models, bound and played in Blender: each is refused in a sentence, or what is shown is what it says."""
 
 import json
+import math
 from pathlib import Path
 
 import bpy
@@ -23,7 +24,7 @@ from .odd_values import json_text, mutated_bytes, mutated_json
 OPERATORS = (
     "Loop", "If", "Scan", "ConstantOfShape", "Expand", "Tile", "Range", "RandomNormal", "Identity", "Concat", "MatMul",
     "Gemm", "Einsum", "Pad", "Resize", "NonZero", "Gather", "Slice", "Reshape", "Cast", "Exp", "Div", "Mul", "Where",
-    "OneHot", "CumSum", "Trilu", "Multinomial", "StringNormalizer", "Optional", "SequenceConstruct", "LSTM", "Sqrt",
+    "OneHot", "CumSum", "Trilu", "Multinomial", "StringNormalizer", "Optional", "SequenceConstruct", "LSTM", "Log",
 )  # fmt: skip
 FRAMES = (1, 9, 22)
 NEAR = 1e-6
@@ -162,13 +163,19 @@ def _constants(random: np.random.Generator, model: onnx.ModelProto) -> None:
         elif kind == 4:
             tensor.data_location = TensorProto.EXTERNAL
             tensor.external_data.add(key="location", value=str(random.choice(["/etc/passwd", "w.bin", "../x", ""])))
-        elif tensor.data_type == TensorProto.INT64:
+        elif _are_integers(tensor):
             array = numpy_helper.to_array(tensor).copy()
             if array.size:
                 array.reshape(-1)[random.integers(array.size)] = int(
                     random.choice([-2, -1, 0, 1, 2, 100, 2**31, 2**62])
                 )
                 tensor.CopyFrom(numpy_helper.from_array(array, tensor.name))
+
+
+def _are_integers(tensor: onnx.TensorProto) -> bool:
+    """Whether a constant still holds integers, whatever was changed of it before."""
+    inside = tensor.data_location != TensorProto.EXTERNAL and len(tensor.raw_data) == 8 * math.prod(tensor.dims)
+    return tensor.data_type == TensorProto.INT64 and inside
 
 
 def _weights(random: np.random.Generator, model: onnx.ModelProto) -> None:
