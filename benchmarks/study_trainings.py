@@ -19,6 +19,7 @@ from fdda_addon.core.skinning import skin_matrices
 from trainer.config import TrainingConfig
 from trainer.data import partitions_of, prepare, split_poses
 from trainer.deformation import Deformation, is_sheared
+from trainer.delta_fit import find_deltas
 from trainer.export import Measured, build_model, measure, write_model
 from trainer.inputs import Inputs, inputs_of_rig, middles
 from trainer.loop import Curves, train
@@ -27,8 +28,15 @@ from trainer.trust import make_trust_range
 
 @dataclass(frozen=True)
 class Material:
-    """What every training shares: both recordings, cut down to the partitions, and what their networks see."""
+    """What every training shares.
 
+    Attributes:
+        whole: the training recording.
+        training, held_out: both recordings, cut down to the partitions.
+        inputs: what their networks see besides deltas, which follow from the split.
+    """
+
+    whole: Recording
     training: Recording
     held_out: Recording
     inputs: Inputs
@@ -79,14 +87,18 @@ def read_material(training: Path, held_out: Path, names: tuple[str, ...]) -> Mat
     small = cut(whole, names)
     # The neighbours' middles are those of the whole mesh: the networks see what they see when all partitions train.
     inputs = inputs_of_rig(whole.rig, middles(whole.rig, whole.partitions), small.partitions)
-    return Material(small, cut(other, names), inputs)
+    return Material(whole, small, cut(other, names), inputs)
 
 
 def train_once(material: Material, config: TrainingConfig, model_path: Path) -> dict:
     """Train, export and measure; writes the model and returns what is known of it, as docs/study.md has it."""
-    recording, inputs = material.training, material.inputs
+    recording = material.training
     wall, processor = time.perf_counter(), time.process_time()
     split = split_poses(np.arange(len(recording.pose_matrices)), config.validation_fraction, config.seed)
+    # Chosen among those of all partitions, as when all of them train.
+    deltas = find_deltas(material.whole, split, config.tolerance_mm)
+    own = np.isin(deltas.seen_from, [partition.joint for partition in recording.partitions])
+    inputs = material.inputs.with_deltas(deltas.chosen(own), recording.partitions)
     data = partitions_of(recording, inputs)
     prepared = [prepare(partition, split, config.tolerance_mm, config.seed) for partition in data]
     trained = train(prepared, split, config, torch.device("cpu"))

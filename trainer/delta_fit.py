@@ -2,17 +2,16 @@
 """Chooses the vertices whose deltas networks see, and fits them to the recording.
 
 Nothing is asked of the modifiers: a rig may smooth by others, or by nodes. What skinning to the joints around leaves of
-the residuals is compared with the normals of the linear layer's surface, smoothed more and more; a rig that smooths
+the residuals is compared with the corners of the linear layer's surface, smoothed more and more; a rig that smooths
 answers to one of these, another to none.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 
-from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
@@ -21,6 +20,7 @@ from fdda_addon.core.surface import corners_beside
 from .data import Split
 from .deltas import MOST_PARTS, NO_DELTAS, Deltas
 from .joint_fit import surroundings_of_rig
+from .process import Cancelled
 
 MOST_POSES = 400
 """So many of the training poses are looked at."""
@@ -34,17 +34,19 @@ ITERATIONS = (2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 56, 64)
 FACTOR = 0.5
 """Of each iteration: one of twice the factor smooths about as much as two."""
 LEAST_EXPLAINED, SMOOTHS = 0.8, 0.95
-"""Part of a vertex's squared residual, of what the joints leave, that its normals have to explain; and that they
-explain somewhere on a rig that smooths. Shape keys and lattices that bend with the joints come to 0.9 by chance."""
+"""Part of a vertex's squared residual, of what the joints leave, that its corners have to explain, on a rig that
+smooths those of half the vertices; and that they explain somewhere on it. What bends with the joints comes to 0.94 by
+chance."""
 DAMPING = 0.01
-"""What `Deltas.least` is of the area of the corner in the rest pose: a normal that rounding would turn fades."""
+"""What `Deltas.least` is of the longer tangent of the corner in the rest pose, of the normal of its square: a vector
+that rounding would turn fades."""
 TRIED = 24
 """Vertices that say how smooth the surface is."""
-SMALLEST_AREA = 1e-18
-"""Square mesh units; of a corner without any."""
+SMALLEST_EXTENT = 1e-18
+"""Of a corner without any."""
 RIDGE = 0.03
-"""Normals, and sums of them, that turn by fewer radians against the joints fit next to nothing: it would take lengths
-with which their rounding counts."""
+"""Tangents and normals, and sums of them, that turn by fewer radians against the joints fit next to nothing: it would
+take lengths with which their rounding counts."""
 RANK = 1e-5
 """Directions that are smaller than this part of the largest are none."""
 
@@ -81,28 +83,6 @@ class _Corners:
 
 
 @dataclass(frozen=True)
-class _Fan:
-    """The faces around a vertex.
-
-    Attributes:
-        vertex: its number.
-        ends: (E,) the vertices beside it, ascending.
-        before, after: (K,) of each corner, among the ends.
-    """
-
-    vertex: int
-    ends: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-
-    @staticmethod
-    def at(corners: _Corners, vertex: int) -> "_Fan":
-        own = slice(corners.starts[vertex], corners.starts[vertex + 1])
-        ends, places = np.unique(np.concatenate([corners.before[own], corners.after[own]]), return_inverse=True)
-        return _Fan(vertex, ends, *np.split(places, 2))
-
-
-@dataclass(frozen=True)
 class _Poses:
     """The poses that are looked at, n of them.
 
@@ -117,13 +97,19 @@ class _Poses:
     directions: dict[int, np.ndarray]
 
 
-def find_deltas(recording: Recording, split: Split, tolerance_mm: float) -> Deltas:
+def find_deltas(
+    recording: Recording, split: Split, tolerance_mm: float, should_stop: Callable[[], bool] = lambda: False
+) -> Deltas:
     """Choose vertices of each partition that say most of its residuals, and fit their deltas.
 
     Args:
         recording: with the faces of its mesh, or there are none to find.
         split: its poses; only those that train are looked at.
         tolerance_mm: as in `TrainingConfig`: vertices that the joints alone place so well are left out.
+        should_stop: asked before every partition.
+
+    Raises:
+        Cancelled: `should_stop` said so.
     """
     rig = recording.rig
     if not len(rig.face_starts):
@@ -136,12 +122,14 @@ def find_deltas(recording: Recording, split: Split, tolerance_mm: float) -> Delt
     least = (tolerance_mm / (1000 * rig.metres_per_unit)) ** 2
     candidates, directions = [], {}
     for number, partition in enumerate(recording.partitions):
+        if should_stop():
+            raise Cancelled
         rows = surroundings_of_rig(rig, partition, skin).rows
         if EQUATIONS * rows.shape[2] <= 3 * len(rows):
             own = _directions(rows)
-            residuals = np.asarray(recording.residuals[np.ix_(training, partition.vertices)], np.float32)
-            found = _candidates(residuals, own, partition, number, usable[partition.vertices])
-            candidates += [candidate for candidate in found if candidate.score > least]
+            vertices = partition.vertices[usable[partition.vertices]]
+            residuals = np.asarray(recording.residuals[np.ix_(training, vertices)], np.float32)
+            candidates += _candidates(residuals, own, vertices, number, partition.joint, least)
             directions[number] = own
     poses = _Poses(matrices, np.linalg.inv(skin[:, :, :3, :3].astype(np.float64)), directions)
     candidates.sort(key=lambda own: -own.score)
@@ -153,7 +141,8 @@ def find_deltas(recording: Recording, split: Split, tolerance_mm: float) -> Delt
     candidates.sort(key=lambda own: (own.partition, own.vertex))
     deltas = next(deltas for number, deltas in smoothed.deltas(candidates) if number == iterations)
     lengths, parts = _fit(deltas, candidates, poses)
-    return replace(deltas, lengths=lengths).chosen(parts >= LEAST_EXPLAINED) if parts.max() >= SMOOTHS else NO_DELTAS
+    smooths = parts.max() >= SMOOTHS and np.median(parts) >= LEAST_EXPLAINED
+    return replace(deltas, lengths=lengths).chosen(parts >= LEAST_EXPLAINED) if smooths else NO_DELTAS
 
 
 def _corners(rig: Rig) -> _Corners:
@@ -177,32 +166,33 @@ def _without(directions: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _candidates(
-    residuals: np.ndarray, directions: np.ndarray, partition: Partition, number: int, usable: np.ndarray
+    residuals: np.ndarray, directions: np.ndarray, vertices: np.ndarray, number: int, joint: int, least: float
 ) -> list[_Candidate]:
     """The vertices of a partition one after the other that are worst when the former are known.
 
     Args:
-        residuals: (n, Vp, 3) float32, local, mesh units.
+        residuals: (n, v, 3) float32, local, mesh units; of those vertices that can be one.
         directions: (3 n, r) what the joints explain.
-        partition, number: whose they are.
-        usable: (Vp,) bool, whether a vertex can be one.
+        vertices: (v,) their numbers.
+        number, joint: of the partition.
+        least: mean square that is to be left of a vertex, square mesh units.
     """
-    flat = residuals.transpose(0, 2, 1).reshape(-1, residuals.shape[1])
-    usable = usable.copy()
-    whole = _without(directions.astype(np.float32), flat).reshape(len(residuals), 3, -1)
-    left, found = whole.copy(), []
-    score = np.einsum("nav,nav->v", left, left) / len(left) * usable
-    while len(found) < MOST_PER_PARTITION and (most := float(score.max(initial=0))) > 0:
-        worst = int(score.argmax())
-        own = left[:, :, worst].astype(np.float64)
-        vertex, alone = int(partition.vertices[worst]), whole[:, :, worst].ravel().astype(np.float64)
-        found.append(_Candidate(vertex, number, partition.joint, most, alone))
-        products = own.T @ own
+    poses, found = len(residuals), []
+    flat = residuals.transpose(0, 2, 1).reshape(3 * poses, -1)
+    whole = _without(directions.astype(np.float32), flat)
+    left = whole.reshape(poses, -1).copy()
+    by_axis = left.reshape(poses, 3, -1)
+    while len(found) < min(MOST_PER_PARTITION, len(vertices)):
+        scores = np.einsum("nav,nav->v", by_axis, by_axis) / poses
+        worst = int(scores.argmax())
+        if scores[worst] <= least:
+            break
+        alone = whole[:, worst].astype(np.float64)
+        found.append(_Candidate(int(vertices[worst]), number, joint, float(scores[worst]), alone))
+        own = by_axis[:, :, worst].copy()
+        products = own.T.astype(np.float64) @ own
         products += RANK**2 * np.trace(products) * np.eye(3)
-        known = np.linalg.solve(products, np.einsum("na,nbv->abv", own, left).reshape(3, -1))
-        left -= (own @ known).reshape(left.shape).astype(np.float32)
-        usable[worst] = False
-        score = np.einsum("nav,nav->v", left, left) / len(left) * usable
+        left -= own @ np.linalg.solve(products, own.T @ left).astype(np.float32)
     return found
 
 
@@ -228,38 +218,32 @@ class _SmoothedSurface:
 
     def deltas(self, candidates: Sequence[_Candidate]) -> Iterator[tuple[int, Deltas]]:
         """The deltas of some vertices with lengths of 1, each of `ITERATIONS` with what it makes of the surface."""
-        fans = [_Fan.at(self._corners, own.vertex) for own in candidates]
-        around = np.unique(np.concatenate([[own.vertex for own in candidates], *(fan.ends for fan in fans)]))
+        vertices, joints = np.array([(own.vertex, own.joint) for own in candidates], np.int64).T
+        starts, counts = self._corners.starts[vertices], np.diff(self._corners.starts)[vertices]
+        number = np.arange(counts.max())
+        there, corner = number < counts[:, None], starts[:, None] + np.minimum(number, counts[:, None] - 1)
+        # Padded corners lie between the vertex and itself.
+        ends = np.where(there, (self._corners.before[corner], self._corners.after[corner]), vertices[:, None])
+        around, places = np.unique(np.append(ends.ravel(), vertices), return_inverse=True)
         size, done = (len(around), self._step.shape[0]), 0
         rows = sparse.csr_array((np.ones(len(around)), (np.arange(len(around)), around)), size)
         for iterations in ITERATIONS:
             for _ in range(iterations - done):
                 rows = rows @ self._step
             done = iterations
-            weighted = (rows @ self._weighted).toarray().reshape(len(around), -1, 4)
-            yield iterations, self._deltas(candidates, fans, around, weighted)
-
-    def _deltas(
-        self, candidates: Sequence[_Candidate], fans: Sequence[_Fan], around: np.ndarray, rows: np.ndarray
-    ) -> Deltas:
-        size, most = len(candidates), max(len(fan.before) for fan in fans)
-        corners = np.zeros((2, size, most), np.int64)
-        least, lengths, edges = np.ones((size, most)), np.zeros((size, most)), []
-        for number, fan in enumerate(fans):
-            own = np.stack([fan.before, fan.after])
-            corners[:, number, : len(fan.before)] = sum(map(len, edges)) + own
-            edges.append(np.subtract(*(rows[np.searchsorted(around, ends)] for ends in (fan.ends, [fan.vertex]))))
-            # In the rest pose skin matrices are the identity, and the parts of an edge add up to it.
-            area = np.linalg.norm(np.cross(*edges[-1][..., :3].sum(axis=1)[own]), axis=1)
-            least[number, : len(area)] = np.maximum(DAMPING * area, SMALLEST_AREA)
-            lengths[number, : len(area)] = 1
-        numbers = (np.array([getattr(own, name) for own in candidates], np.int64) for name in ("vertex", "joint"))
-        posed = np.einsum("jab,ejb->eja", self._inverse_rest, np.concatenate(edges))
-        return Deltas(*numbers, posed.reshape(len(posed), -1), corners, least, lengths)
+            parts = (rows @ self._weighted).toarray()[places]
+            before, after = parts[: ends.size].reshape(*ends.shape, -1) - parts[ends.size :, None]
+            tangents = np.stack([before + after, after - before])
+            by_joint = tangents.reshape(*tangents.shape[:3], -1, 4)
+            # In the rest pose skin matrices are the identity, and the parts of a tangent add up to it.
+            extent = np.linalg.norm(by_joint[..., :3].sum(axis=3), axis=3).max(axis=0)
+            least = np.maximum(DAMPING * np.stack([extent, extent, extent**2]), SMALLEST_EXTENT)
+            posed = np.einsum("jab,fdkjb->fdkja", self._inverse_rest, by_joint).reshape(tangents.shape)
+            yield iterations, Deltas(vertices, joints, posed, least, np.tile(there, (3, 1, 1)).astype(np.float64))
 
 
 def _how_smooth(smoothed: _SmoothedSurface, candidates: Sequence[_Candidate], poses: _Poses) -> int:
-    """How many times to smooth the surface, so that its normals explain most."""
+    """How many times to smooth the surface, so that its corners explain most."""
     squares = np.array([own.left @ own.left for own in candidates])
     parts = {
         iterations: float(_fit(deltas, candidates, poses)[1] @ squares / squares.sum())
@@ -269,20 +253,19 @@ def _how_smooth(smoothed: _SmoothedSurface, candidates: Sequence[_Candidate], po
 
 
 def _fit(deltas: Deltas, candidates: Sequence[_Candidate], poses: _Poses) -> tuple[np.ndarray, np.ndarray]:
-    """Fit what normals count for to what joints leave.
+    """Fit what tangents and normals count for to what joints leave.
 
     Returns:
-        (D, K) lengths, mesh units, and (D,) the part of the squared residual that they explain.
+        (3, D, K) lengths, mesh units, and (D,) the part of the squared residual that they explain.
     """
     axes = poses.axes[:, deltas.seen_from]
-    normals = np.einsum("ndab,ndcb->dnac", axes, deltas.normals(poses.matrices))
-    lengths, parts = np.zeros(deltas.lengths.shape), np.zeros(len(deltas))
+    frames = np.einsum("ndab,nfdkb->dnafk", axes, deltas.frames(poses.matrices))
+    lengths, parts = np.zeros_like(deltas.lengths), np.zeros(len(deltas))
     for number, own in enumerate(candidates):
-        used = np.flatnonzero(deltas.lengths[number])
-        values = normals[number].reshape(len(own.left), -1)[:, used]
-        values = _without(poses.directions[own.partition], values)
-        products = values.T @ values + RIDGE**2 * len(poses.matrices) * np.eye(len(used))
-        lengths[number, used] = np.linalg.solve(products, values.T @ own.left)
-        left = own.left - values @ lengths[number, used]
+        used = deltas.lengths[:, number] != 0
+        values = _without(poses.directions[own.partition], frames[number][..., used].reshape(len(own.left), -1))
+        products = values.T @ values + RIDGE**2 * len(poses.matrices) * np.eye(used.sum())
+        lengths[:, number][used] = np.linalg.solve(products, values.T @ own.left)
+        left = own.left - values @ lengths[:, number][used]
         parts[number] = 1 - left @ left / (own.left @ own.left)
     return lengths, parts

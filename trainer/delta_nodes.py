@@ -3,55 +3,46 @@
 
 import numpy as np
 
+from fdda_addon.core.model import POSE_INPUT
+
 from .deltas import SMALLEST, Deltas
 from .nodes import Graph
 
-VECTOR = 3
+ROWS = 4
+"""Of a pose matrix. The last is carried along, which costs less than to take it off; it counts for nothing."""
 
 
-def add_deltas(graph: Graph, deltas: Deltas, table: str, pose_rows: np.ndarray) -> str:
-    """Add the deltas.
-
-    Args:
-        deltas: at least one.
-        table: (N, ·, 12), in which the poses are, by columns of three numbers.
-        pose_rows: (J,) int64, where they are in it.
-
-    Returns:
-        (N, D, 3) as their main joints see them.
-    """
-    count, corners = deltas.lengths.shape
-    poses = graph.add("Gather", [table, graph.integers("all_poses", pose_rows)], "all_poses_whole", axis=1)
-    columns = graph.reshape(poses, [0, 4 * len(pose_rows), VECTOR], "pose_columns")
-    columns = graph.add("Transpose", [columns], "columns_by_axis", perm=[0, 2, 1])
-    # An edge for each corner on either side: to gather them takes longer than to multiply twice.
-    edges = graph.floats("edges_of_poses", deltas.edges[deltas.corners.ravel()].T)
-    edges = graph.add("MatMul", [columns, edges], "edges")
-    both = graph.split(edges, [count * corners] * 2, ["edges_before", "edges_after"], axis=2)
-    # b x a = (b_y a_z, b_z a_x, b_x a_y) - (b_z a_y, b_x a_z, b_y a_x)
+def add_deltas(graph: Graph, deltas: Deltas) -> str:
+    """Add the deltas, at least one: (N, D, 3) as their main joints see them."""
+    (count, corners), columns = deltas.lengths.shape[1:], deltas.tangents.shape[3]
+    rows = graph.add("Transpose", [POSE_INPUT], "poses_by_row", perm=[0, 2, 1, 3])
+    poses = graph.reshape(rows, [0, ROWS, columns], "pose_columns")
+    picked = graph.floats("tangents_of_poses", deltas.tangents.reshape(-1, columns).T)
+    tangents = graph.add("MatMul", [poses, picked], "tangents")
+    both = graph.split(tangents, [count * corners] * 2, ["first_tangents", "second_tangents"], axis=2)
+    # a x b = (a_y b_z, a_z b_x, a_x b_y) - (a_z b_y, a_x b_z, a_y b_x)
     turned = [
-        graph.add("Gather", [edge, graph.integers(f"{edge}_axes", axes)], f"{edge}_turned", axis=1)
-        for edge, axes in zip(both, ([1, 2, 0, 2, 0, 1], [2, 0, 1, 1, 2, 0]), strict=True)
+        graph.add("Gather", [own, graph.integers(f"{own}_axes", axes)], f"{own}_turned", axis=1)
+        for own, axes in zip(both, ([1, 2, 0, 3, 2, 0, 1, 3], [2, 0, 1, 3, 1, 2, 0, 3]), strict=True)
     ]
-    terms = graph.split(
-        graph.add("Mul", turned, "terms_of_cross"), [VECTOR] * 2, ["cross_added", "cross_taken"], axis=1
-    )
-    crossed = graph.add("Sub", terms, "crossed")
-    normals = _shortened(graph, crossed, deltas.least.ravel() ** 2, "normals")
-    parts = graph.add("Mul", [normals, graph.floats("delta_lengths", deltas.lengths.ravel())], "delta_parts")
-    parts = graph.reshape(parts, [0, VECTOR, count, corners], "delta_parts_by_vertex")
-    sums = graph.add("ReduceSum", [parts, graph.integers("last_of_four", [3])], "deltas", keepdims=1)
-    own = (4 * deltas.seen_from[:, None] + np.arange(VECTOR)).ravel()
-    axes = _shortened(graph, columns, np.array(SMALLEST), "axes")
-    axes = graph.add("Gather", [axes, graph.integers("delta_columns", own)], "delta_axes", axis=2)
-    axes = graph.reshape(axes, [0, VECTOR, count, VECTOR], "axes_by_delta")
-    seen = graph.add("Mul", [axes, sums], "along_axes")
-    return graph.add("ReduceSum", [seen, graph.integers("space_of_four", [1])], "seen_deltas", keepdims=0)
-
-
-def _shortened(graph: Graph, vectors: str, least: np.ndarray, output: str) -> str:
-    """(N, 3, ·) vectors v in columns to v / sqrt(|v|^2 + least)."""
-    squared = graph.add("Mul", [vectors, vectors], f"{output}_squared")
-    squared = graph.add("ReduceSum", [squared, graph.integers(f"{output}_space", [1])], f"{output}_sums", keepdims=1)
-    squared = graph.add("Add", [squared, graph.floats(f"{output}_least", least)], f"{output}_safe")
-    return graph.add("Div", [vectors, graph.add("Sqrt", [squared], f"{output}_lengths")], output)
+    terms = graph.split(graph.add("Mul", turned, "cross_terms"), [ROWS] * 2, ["cross_added", "cross_taken"], axis=1)
+    vectors = [tangents, graph.add("Sub", terms, "crossed"), poses]
+    # The axes of the joints go with the corners' vectors through the same nodes.
+    vectors = graph.add("Concat", vectors, "vectors_of_deltas", axis=2)
+    least = np.append(deltas.least.ravel() ** 2, np.full(columns, SMALLEST))
+    squared = graph.add("Mul", [vectors, vectors], "vectors_squared")
+    # Skin weights add up to 1 but for rounding, so the last row of a tangent is only nearly 0.
+    in_space = graph.floats("rows_in_space", [[1, 1, 1, 0]])
+    squared = graph.add("MatMul", [in_space, squared], "vector_sums")
+    safe = graph.add("Add", [squared, graph.floats("least_squares", least)], "vectors_safe")
+    wanted = graph.floats("vector_lengths", np.append(deltas.lengths.ravel(), np.ones(columns)))
+    factor = graph.add("Div", [wanted, graph.add("Sqrt", [safe], "lengths_of_vectors")], "vector_factors")
+    vectors = graph.add("Mul", [vectors, factor], "vectors_as_long")
+    parts, axes = graph.split(vectors, [deltas.lengths.size, columns], ["delta_parts", "axes"], axis=2)
+    parts = graph.reshape(parts, [0, ROWS, *deltas.lengths.shape], "parts_by_delta")
+    sums = graph.add("ReduceSum", [parts, graph.integers("kinds_and_corners", [2, 4])], "deltas", keepdims=0)
+    # Along the axes of all joints, of which each delta takes its own: a product is quicker than to gather the axes.
+    axes = graph.add("Transpose", [axes], "axes_by_row", perm=[0, 2, 1])
+    seen = graph.reshape(graph.add("MatMul", [axes, sums], "along_axes"), [0, columns * count], "along_axes_in_row")
+    own = count * (4 * deltas.seen_from[:, None] + np.arange(3)) + np.arange(count)[:, None]
+    return graph.add("Gather", [seen, graph.integers("own_axes", own)], "seen_deltas", axis=1)

@@ -98,13 +98,13 @@ def add_features(graph: Graph, deformation: Deformation) -> Features:
         thrice = graph.add("Concat", [CONTROLS_INPUT] * VECTOR, "controls_thrice", axis=1)
         before.append(graph.reshape(thrice, [0, count, VECTOR], "controls_in_vectors"))
         place[inputs.joint_columns : inputs.own_columns] = np.arange(count)
-    pose_rows = rows * (frames.first_joint + np.arange(len(inputs.parents))) + WHOLE
-    behind = [add_deltas(graph, inputs.deltas, table, pose_rows)] if len(inputs.deltas) else []
+    behind = [add_deltas(graph, inputs.deltas)] if len(inputs.deltas) else []
     name = graph.join([*before, name, *behind], "features", axis=1)
     own, by_column = count + COLUMNS * len(joints), np.arange(FEATURES_PER_JOINT).reshape(VECTOR, COLUMNS).T.ravel()
     place[(FEATURES_PER_JOINT * joints[:, None] + by_column).ravel()] = np.arange(VECTOR * count, VECTOR * own)
     size = VECTOR * own + inputs.size - inputs.own_columns
     place[inputs.own_columns :] = np.arange(VECTOR * own, size)
+    pose_rows = rows * (frames.first_joint + np.arange(len(inputs.parents))) + WHOLE
     return Features(name, own, size, place, table, pose_rows)
 
 

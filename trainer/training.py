@@ -87,7 +87,7 @@ def train_model(
     _check_stop(should_stop)
     recording = without_needless_down(recording, split)
     # What is gone on with goes on to see the same.
-    deltas = last.deltas if last else find_deltas(recording, split, config.tolerance_mm)
+    deltas = last.deltas if last else find_deltas(recording, split, config.tolerance_mm, should_stop)
     if len(deltas):
         announcer.say(MessageType.LOG, text=f"The rig smooths: networks see the deltas of {len(deltas)} vertices.")
     inputs = inputs_of_recording(recording, deltas)

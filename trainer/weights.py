@@ -25,7 +25,7 @@ from .deformation import Deformation
 from .deltas import NO_DELTAS, Deltas
 from .model import Network
 
-VERSION, WITHOUT_DELTAS = 3, 2
+VERSION, WITHOUT_DELTAS = 4, 2
 DAMAGE = (
     *(OSError, ValueError, KeyError, AttributeError, OverflowError, EOFError, zipfile.BadZipFile, zlib.error),
     *(RuntimeError, IndexError, *HEADER_ERRORS),
@@ -165,15 +165,16 @@ def _read(arrays: np.lib.npyio.NpzFile) -> LastWeights:
 
 def _read_deltas(arrays: np.lib.npyio.NpzFile) -> Deltas:
     deltas = Deltas(**{field.name: arrays[f"deltas/{field.name}"] for field in fields(Deltas)})
-    count, corners = deltas.lengths.shape
-    shapes = {"vertices": (count,), "seen_from": (count,), "corners": (2, count, corners), "least": (count, corners)}
+    _, count, corners = deltas.lengths.shape
+    shapes = {"vertices": (count,), "seen_from": (count,), "tangents": (2, count, corners, *deltas.tangents.shape[3:4])}
     for name, array in vars(deltas).items():
-        integers = name in ("vertices", "seen_from", "corners")
-        if array.dtype != (np.int64 if integers else np.float64) or array.shape != shapes.get(name, array.shape):
+        integers = name in ("vertices", "seen_from")
+        known = array.dtype == (np.int64 if integers else np.float64)
+        if not known or array.shape != shapes.get(name, (3, count, corners)):
             raise ValueError("its arrays contradict each other")
         if not (np.abs(array) <= LARGEST).all() or (integers and array.min(initial=0) < 0):
             raise ValueError("its arrays hold values that are not numbers")
-    if deltas.edges.ndim != 2 or (count and deltas.corners.max() >= len(deltas.edges)) or not (deltas.least > 0).all():
+    if deltas.tangents.ndim != 4 or not (deltas.least > 0).all():
         raise ValueError("its arrays contradict each other")
     return deltas
 

@@ -4,20 +4,24 @@
 import json
 
 import numpy as np
+import onnx
 import pytest
 
 from benchmarks.study import Plan, main, study
 from benchmarks.study_tables import tables
-from benchmarks.study_trainings import Trainings, cut, read_material
+from benchmarks.study_trainings import Material, Trainings, cut, read_material, train_once
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.metrics import error_statistics
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.skinning import LinearLayer
 from fdda_addon.runtime.network import Network
 from trainer.config import TrainingConfig
+from trainer.data import split_poses
+from trainer.delta_fit import find_deltas
 from trainer.inputs import inputs_of_rig, middles
 
 from .chain import write_chain
+from .tube import write_tube
 
 NAMES = ("bone_1", "bone_2")
 PLAN = Plan(
@@ -66,6 +70,19 @@ def test_every_configuration_is_trained_with_every_seed(result):
                 assert left["held_out"] < errors["mean"] < linear["mean"]
                 assert left["validation"] < min(partition["curve"]["validation"])
     assert result["poses"] == {"training": 120, "held_out": 40}
+
+
+def test_networks_see_deltas_where_the_rig_smooths(tmp_path):
+    tube = write_tube(tmp_path / "tube")
+    names = ("bone_1",)
+    small = cut(tube, names)
+    inputs = inputs_of_rig(tube.rig, middles(tube.rig, tube.partitions), small.partitions)
+    model = tmp_path / "tube.onnx"
+    train_once(Material(tube, small, small, inputs), TrainingConfig(epochs=1, hidden=(8, 8)), model)
+    seen = next(info for info in onnx.load(model).graph.initializer if info.name == "own_axes").dims
+    split = split_poses(np.arange(len(tube.pose_matrices)), 0.05, 0)
+    of_all = find_deltas(tube, split, TrainingConfig().tolerance_mm)
+    assert seen[0] == (of_all.seen_from == 1).sum() < len(of_all)
 
 
 def test_the_learning_rate_is_the_one_of_the_least_validation_error(studied, result):
