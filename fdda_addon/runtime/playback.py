@@ -17,6 +17,7 @@ from . import cache as caches
 from . import nodes, rig_check, switch
 from .changed import Changed
 from .crowd import Crowds, is_hub
+from .evaluation_threads import keep_thread
 from .live_binding import LiveBinding
 from .model_files import network_of
 
@@ -34,6 +35,7 @@ _is_given_back = False
 
 def play(driven: bpy.types.Object) -> None:
     """Give an evaluated cache object, or all of a hub, the positions of the pose. Nothing is raised."""
+    keep_thread()
     uid = driven.original.session_uid
     player = _live.get(uid) or _crowds.by_hub.get(uid)
     if player is not None:

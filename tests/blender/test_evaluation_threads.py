@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Python keeps the state of the threads on which Blender evaluates, and of few others."""
+
+import threading
+from collections import Counter
+
+import bpy
+import pytest
+
+from fdda_addon.runtime import evaluation_threads, playback
+
+from .conftest import assert_plays, pose
+
+MOST_POSES = 2000
+
+
+def test_python_knows_the_threads_that_evaluate(bound, elbow, monkeypatch):
+    """What is local to a thread goes with the state that Python has of it."""
+    calls, remembered, own = Counter(), {}, threading.local()
+    play = playback.play
+
+    def counted(driven: bpy.types.Object) -> None:
+        play(driven)
+        calls[threading.get_ident()] += 1
+        own.calls = getattr(own, "calls", 0) + 1
+        remembered[threading.get_ident()] = own.calls
+
+    monkeypatch.setattr(playback, "play", counted)
+    main = threading.get_ident()
+    for number in range(MOST_POSES):
+        pose(angle=number / MOST_POSES)
+        if max((count for thread, count in calls.items() if thread != main), default=0) >= 10:
+            break
+    else:
+        pytest.skip("Blender evaluates on one thread here")
+    assert remembered == calls
+    assert_plays(bound, elbow.model)
+
+
+def test_states_of_threads_that_end_are_few(monkeypatch):
+    monkeypatch.setattr(evaluation_threads, "_kept", {threading.get_ident()})
+    count, ended = evaluation_threads.MOST_KEPT + 5, []
+    # Threads that are there at once are told apart; the next one has the name of one that has ended.
+    all_there = threading.Barrier(count)
+
+    def short() -> None:
+        all_there.wait(10)
+        evaluation_threads.keep_thread()
+        evaluation_threads.keep_thread()
+        ended.append(threading.get_ident())
+
+    at_once = [threading.Thread(target=short) for _ in range(count)]
+    for thread in at_once:
+        thread.start()
+    for thread in at_once:
+        thread.join(10)
+    assert len(ended) == count and not any(thread.is_alive() for thread in at_once)
+    assert len(evaluation_threads._kept) == evaluation_threads.MOST_KEPT
