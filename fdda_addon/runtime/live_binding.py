@@ -341,5 +341,6 @@ def _mute_shape_keys(mesh_object: bpy.types.Object) -> None:
     Blender copies the shape keys anew. Shape keys that another object has too stay as they are.
     """
     keys = mesh_object.data.shape_keys
-    if keys is not None and mesh_object.original.data.users == 1:
+    # Where the first is muted, all have been since they were copied, or the user muted it: then the others are mixed.
+    if keys is not None and not keys.key_blocks[0].mute and mesh_object.original.data.users == 1:
         write(keys.key_blocks, MUTE, np.ones(len(keys.key_blocks), bool))

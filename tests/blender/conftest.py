@@ -92,6 +92,14 @@ def pair(library) -> list[bpy.types.Object]:
     return [override(collection, angle) for angle in ANGLES]
 
 
+def rig_positions(mesh_object: bpy.types.Object) -> np.ndarray:
+    """What the rig of a playing character shows; it plays on."""
+    mesh_object.fdda.mode = "RIG"
+    positions = evaluated(mesh_object)
+    mesh_object.fdda.mode = "FDDA"
+    return positions
+
+
 def pose(armature_name: str = ELBOW_RIG, angle: float = 1.0, bone: str = "lower") -> None:
     """Bend a bone about X and evaluate."""
     bpy.data.objects[armature_name].pose.bones[bone].rotation_euler[0] = angle

@@ -9,19 +9,12 @@ import fdda_addon
 from fdda_addon.runtime import nodes
 from fdda_addon.scene.scene_rig import armature_modifier
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, predicted
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, predicted, rig_positions
 from .test_crowd import crowd_of
-from .test_evaluations import handler, keyed, shown_in
+from .test_evaluations import handler, shown_in
 from .test_renders import FRAME, animation, set_camera
 
 RENDER_HANDLERS = ("render_pre", "render_post", "render_write")
-
-
-def rig_positions(mesh_object: bpy.types.Object) -> np.ndarray:
-    mesh_object.fdda.mode = "RIG"
-    positions = evaluated(mesh_object)
-    mesh_object.fdda.mode = "FDDA"
-    return positions
 
 
 def in_memory() -> tuple[int, int]:
@@ -155,32 +148,6 @@ def test_a_strength_that_is_animated(bound, elbow, is_driven):
         bound.fdda.strength = 0
         linear, strength = evaluated(bound), min(1, frame / 20)
         assert np.abs(positions - (linear + strength * (playing - linear))).max() < 1e-6
-
-
-def test_shape_keys_are_back_with_the_rig(bound, elbow):
-    keyed(bound)
-    pose(angle=1.1)
-    assert_plays(bound, elbow.model)
-    shown = rig_positions(bound)
-    bound.data.shape_keys.key_blocks["bulge"].value = 0
-    bpy.context.view_layer.update()
-    assert_plays(bound, elbow.model)
-    assert np.abs(rig_positions(bound) - shown).max() > 1e-3
-    assert not bound.show_only_shape_key and not any(key.mute for key in bound.data.shape_keys.key_blocks)
-
-
-def test_shape_keys_of_two_objects(bound, elbow):
-    """One plays, the other shows the rig of the same mesh."""
-    keyed(bound)
-    pose(angle=0.9)
-    expected = rig_positions(bound)
-    other = bound.copy()
-    bpy.context.scene.collection.objects.link(other)
-    other.fdda.mode = "RIG"
-    for angle in (1.4, 0.9):
-        pose(angle=angle)
-    assert np.abs(evaluated(other) - expected).max() < 1e-6
-    assert_plays(bound, elbow.model)
 
 
 def test_duplicates_and_deletions_leave_nothing(bound, tmp_path):

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Shape keys of a playing character: not mixed while a model plays, and back with the rig."""
+
+import bpy
+import numpy as np
+
+from .conftest import assert_plays, evaluated, pose, rig_positions
+from .test_evaluations import keyed
+
+
+def test_shape_keys_are_back_with_the_rig(bound, elbow):
+    keyed(bound)
+    pose(angle=1.1)
+    assert_plays(bound, elbow.model)
+    shown = rig_positions(bound)
+    bound.data.shape_keys.key_blocks["bulge"].value = 0
+    bpy.context.view_layer.update()
+    assert_plays(bound, elbow.model)
+    assert np.abs(rig_positions(bound) - shown).max() > 1e-3
+    assert not bound.show_only_shape_key and not any(key.mute for key in bound.data.shape_keys.key_blocks)
+
+
+def test_shape_keys_are_not_mixed_while_a_model_plays(bound):
+    keyed(bound)
+    bulge = bound.data.shape_keys.key_blocks["bulge"]
+
+    def muted() -> list[bool]:
+        keys = bound.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.shape_keys
+        return [key.mute for key in keys.key_blocks]
+
+    for angle, value in ((0.4, 1.0), (0.8, 1.0), (0.8, 0.5), (1.2, 0.5)):
+        bulge.value = value
+        pose(angle=angle)
+        # What was set has been copied anew.
+        pose(angle=angle + 0.01)
+        assert muted() == [True] * len(bound.data.shape_keys.key_blocks)
+    bound.fdda.mode = "RIG"
+    bpy.context.view_layer.update()
+    bulge.value = 1.0
+    bpy.context.view_layer.update()
+    assert not any(muted())
+
+
+def test_shape_keys_of_two_objects(bound, elbow):
+    """One plays, the other shows the rig of the same mesh."""
+    keyed(bound)
+    pose(angle=0.9)
+    expected = rig_positions(bound)
+    other = bound.copy()
+    bpy.context.scene.collection.objects.link(other)
+    other.fdda.mode = "RIG"
+    for angle in (1.4, 0.9):
+        pose(angle=angle)
+    assert np.abs(evaluated(other) - expected).max() < 1e-6
+    assert_plays(bound, elbow.model)
