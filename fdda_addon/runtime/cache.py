@@ -69,11 +69,17 @@ def sources_of(cache: bpy.types.Object, scene_rig: SceneRig, controls: Iterable[
 
 
 def further_inputs(scene_rig: SceneRig, joints: Iterable[str]) -> list[Variable]:
-    """What the positions follow from besides: mode, strength, and the joints of the model."""
+    """What the positions follow from besides: mode, strength, and the joints of the model.
+
+    Blender evaluates a bone after those above it, so the last of each chain stand for all.
+    """
+    bones = scene_rig.armature_object.data.bones
+    known = [name for name in joints if name != UNMOVED]
+    above = {bone.name for name in known for bone in bones[name].parent_recursive}
     return [
         ("SINGLE_PROP", scene_rig.mesh_object, "fdda.mode"),
         ("SINGLE_PROP", scene_rig.mesh_object, "fdda.strength"),
-        *(("TRANSFORMS", scene_rig.armature_object, name) for name in joints if name != UNMOVED),
+        *(("TRANSFORMS", scene_rig.armature_object, name) for name in known if name not in above),
     ]
 
 

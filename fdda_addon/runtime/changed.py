@@ -9,6 +9,7 @@ armature's data are always reported so when it is posed; its object is only when
 from dataclasses import dataclass
 
 import bpy
+from bpy.types import Armature, Key, Mesh, Object
 
 
 @dataclass(frozen=True)
@@ -28,25 +29,36 @@ class Changed:
     @staticmethod
     def by(depsgraph: bpy.types.Depsgraph) -> "Changed":
         """Read what an evaluation has changed, right after it."""
-        changed = Changed([], {}, {})
-        driven_keys: set[bpy.types.ID] = set()
+        changed = Changed([], {}, changed_meshes(depsgraph))
         # With the relations of the scene; on 4.5 that is all that says that a vertex group has gone.
         any_relation = depsgraph.id_type_updated("SCENE")
         for update in depsgraph.updates:
-            found, is_shape, is_moved = update.id.original, update.is_updated_geometry, update.is_updated_transform
-            if isinstance(found, bpy.types.Object):
-                if found.type == "MESH":
-                    changed.mesh_objects.append((found, is_shape, any_relation or is_moved or not is_shape))
-                elif found.type == "ARMATURE" and is_shape and is_moved:
-                    changed.armatures[found.data.session_uid] = True
-            elif isinstance(found, bpy.types.Armature):
-                is_posed = is_shape and is_moved
-                changed.armatures[found.session_uid] = changed.armatures.get(found.session_uid, False) or not is_posed
-            elif isinstance(found, bpy.types.Mesh) and (is_shape or is_moved):
-                changed.meshes[found.session_uid] = is_moved
-            elif isinstance(found, bpy.types.Key) and is_shape and not is_moved:
-                driven_keys.add(found.user)
-        for mesh in driven_keys:
-            if changed.meshes.get(mesh.session_uid) is False:
-                del changed.meshes[mesh.session_uid]
+            found, is_shape, is_moved = update.id, update.is_updated_geometry, update.is_updated_transform
+            if isinstance(found, Object):
+                original = found.original
+                if original.type == "MESH":
+                    changed.mesh_objects.append((original, is_shape, any_relation or is_moved or not is_shape))
+                elif original.type == "ARMATURE" and is_shape and is_moved:
+                    changed.armatures[original.data.session_uid] = True
+            elif isinstance(found, Armature):
+                uid, is_posed = found.original.session_uid, is_shape and is_moved
+                changed.armatures[uid] = changed.armatures.get(uid, False) or not is_posed
         return changed
+
+
+def changed_meshes(depsgraph: bpy.types.Depsgraph) -> dict[int, bool]:
+    """The `meshes` of `Changed` alone: in most frames there are none, and that is all that has to be known."""
+    meshes: dict[int, bool] = {}
+    driven_keys = []
+    for update in depsgraph.updates:
+        found = update.id
+        if isinstance(found, Mesh):
+            if update.is_updated_geometry or update.is_updated_transform:
+                meshes[found.original.session_uid] = update.is_updated_transform
+        elif isinstance(found, Key) and update.is_updated_geometry and not update.is_updated_transform:
+            driven_keys.append(found)
+    for key in driven_keys:
+        uid = key.original.user.session_uid
+        if meshes.get(uid) is False:
+            del meshes[uid]
+    return meshes

@@ -19,13 +19,14 @@ _count_without_bound = -1
 def _playback() -> ModuleType | None:
     """The module `playback`; None while nothing was ever bound in this session."""
     global _count_without_bound
-    if _PLAYBACK not in sys.modules:
-        count = len(bpy.data.objects)
-        if count == _count_without_bound:
-            return None
-        if not any(o.type == "MESH" and o.fdda.is_bound for o in bpy.data.objects):
-            _count_without_bound = count
-            return None
+    if _PLAYBACK in sys.modules:
+        return sys.modules[_PLAYBACK]
+    count = len(bpy.data.objects)
+    if count == _count_without_bound:
+        return None
+    if not any(o.type == "MESH" and o.fdda.is_bound for o in bpy.data.objects):
+        _count_without_bound = count
+        return None
     from . import playback
 
     return playback

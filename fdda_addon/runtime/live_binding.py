@@ -4,7 +4,8 @@
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import bpy
 import numpy as np
@@ -17,21 +18,19 @@ from ..scene.arrays import MUTE, write
 from ..scene.controls import ControlReader
 from ..scene.mask import mask_key, read_mask
 from ..scene.mesh import set_mesh_positions
-from ..scene.scene_rig import SceneRig, armature_of, is_flat
+from ..scene.scene_rig import SceneRig, armature_of
 from . import cache as caches
 from . import rig_check
 from .model_files import network_of
 from .network import Execution
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """A pose to execute: pose matrices (J, 4, 4) and controls (C,), float32; strength, 0 for the linear layer alone."""
 
     pose: np.ndarray
     controls: np.ndarray
     strength: float
-    scene_rig: SceneRig
 
 
 class LiveBinding:
@@ -228,15 +227,18 @@ class LiveBinding:
             Whether there is something to show.
         """
         self.job = None
-        if armature_object is None or mesh_object is None or is_flat(mesh_object) or is_flat(armature_object):
-            # Animators hide a character with a scale of zero.
+        if armature_object is None or mesh_object is None:
             return False
         if not self._reader.fits(armature_object):
             self.is_outdated = True
             return False
         self._check_vertices(mesh_object.original)
         binding = mesh_object.fdda
-        pose = self._reader.read(mesh_object, armature_object)
+        try:
+            pose = self._reader.read(mesh_object, armature_object)
+        except RigError:
+            # Animators hide a character with a scale of zero.
+            return False
         controls = self._controls.values(owners)
         # Where its mode says the rig, it is about to be switched, or has just been.
         strength = 0.0 if binding.mode == "LINEAR" else binding.strength
@@ -245,8 +247,10 @@ class LiveBinding:
             self._news = ""
             if not np.isfinite(pose).all():
                 pose = self._mended(pose, armature_object.name)
+            if self._blend is None and (strength < 1 or self._mask is not None):
+                self._blend = self._make_blend(SceneRig(mesh_object.original, armature_object.original))
             self._shown = shown
-            self.job = Job(pose, controls, strength, SceneRig(mesh_object.original, armature_object.original))
+            self.job = Job(pose, controls, strength)
             self.was_executed = True
         return True
 
@@ -265,8 +269,8 @@ class LiveBinding:
         self.execution, self._positions = execution, execution.positions[place]
         self._look_for_numbers(self._positions)
         if self.job.strength < 1 or self._mask is not None:
-            strengths, blend = np.array([self.job.strength], np.float32), self._make_blend(self.job.scene_rig)
-            self._positions = blend.apply(execution.positions[place : place + 1], self.job.pose[None], strengths)[0]
+            playing, strengths = execution.positions[place : place + 1], np.array([self.job.strength], np.float32)
+            self._positions = self._blend.apply(playing, self.job.pose[None], strengths)[0]
 
     def write(self, cache: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
         """Give an evaluated cache object the positions, also those it had: it may show those of the rest pose again."""
@@ -290,18 +294,13 @@ class LiveBinding:
         return (skin @ info.rest_matrices).astype(np.float32)
 
     def _make_blend(self, scene_rig: SceneRig) -> Blend:
-        """What blends the model with the linear layer, made when it is needed first."""
-        if self._blend is None:
-            rig = self.network.linear_rig(read_model_rig(scene_rig, self.network.info))
-            # The rest pose of the model: the objects may have moved since, and pose matrices refer to it.
-            self._blend = Blend(replace(rig, rest_matrices=self.network.info.rest_matrices), self._mask)
-        return self._blend
+        """What blends the model with the linear layer."""
+        rig = self.network.linear_rig(read_model_rig(scene_rig, self.network.info))
+        # The rest pose of the model: the objects may have moved since, and pose matrices refer to it.
+        return Blend(replace(rig, rest_matrices=self.network.info.rest_matrices), self._mask)
 
     def _look_for_numbers(self, positions: np.ndarray) -> None:
-        # A sum is the quickest way to find one that is none among many.
-        with np.errstate(all="ignore"):
-            total = positions.sum()
-        if not np.isfinite(total):
+        if not np.isfinite(positions).all():
             self._news = f"The model '{self.network.path.name}' gives positions that are not numbers; train it again."
 
     def _check_vertices(self, mesh_object: bpy.types.Object) -> None:

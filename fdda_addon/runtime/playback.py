@@ -15,7 +15,7 @@ from ..core.errors import FDDAError, ModelError
 from ..scene.compatibility import curves_of
 from . import cache as caches
 from . import nodes, rig_check, switch
-from .changed import Changed
+from .changed import Changed, changed_meshes
 from .crowd import Crowds, is_hub
 from .evaluation_threads import keep_thread
 from .live_binding import LiveBinding
@@ -87,10 +87,12 @@ def _know_viewport(depsgraph: bpy.types.Depsgraph) -> None:
     """Tell the live bindings that have shape keys what evaluates for a viewport: a getter does not learn for whom."""
     if depsgraph.mode != "VIEWPORT":
         return
-    for live in _live.values():
+    # Other relations may have made other copies.
+    key, all_anew = depsgraph.as_pointer(), depsgraph.id_type_updated("SCENE")
+    for live in [live for live in _live.values() if all_anew or key not in live.viewports]:
         mesh_object = live.find()
-        if mesh_object is not None and mesh_object.data.shape_keys is not None:
-            live.viewports[depsgraph.as_pointer()] = mesh_object.evaluated_get(depsgraph).as_pointer()
+        has_keys = mesh_object is not None and mesh_object.data.shape_keys is not None
+        live.viewports[key] = mesh_object.evaluated_get(depsgraph).as_pointer() if has_keys else 0
 
 
 def _follow_mode(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
@@ -114,21 +116,7 @@ def _follow_mode(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) 
 
 def note_changes(depsgraph: bpy.types.Depsgraph) -> None:
     """Look anew at the bound objects, and at the rigs, that an evaluation has changed."""
-    _note(Changed.by(depsgraph), depsgraph)
-
-
-def note_data(depsgraph: bpy.types.Depsgraph) -> None:
-    """As `note_changes`, with a frame; one in which nothing has changed but poses and shape keys costs nothing."""
-    updated = depsgraph.id_type_updated
-    if updated("ARMATURE") or updated("SCENE"):
-        note_changes(depsgraph)
-    elif updated("MESH"):
-        changed = Changed.by(depsgraph)
-        if changed.meshes:
-            _note(changed, depsgraph)
-
-
-def _note(changed: Changed, depsgraph: bpy.types.Depsgraph) -> None:
+    changed = Changed.by(depsgraph)
     for mesh_object, is_mesh, is_whole in changed.mesh_objects:
         if not mesh_object.fdda.is_bound:
             continue
@@ -150,6 +138,13 @@ def _note(changed: Changed, depsgraph: bpy.types.Depsgraph) -> None:
     # A render's own graph takes everything for new.
     if depsgraph.mode != "RENDER":
         _note_rigs(changed)
+
+
+def note_data(depsgraph: bpy.types.Depsgraph) -> None:
+    """As `note_changes`, with a frame; one in which nothing has changed but poses and shape keys costs nothing."""
+    updated = depsgraph.id_type_updated
+    if updated("ARMATURE") or updated("SCENE") or (updated("MESH") and changed_meshes(depsgraph)):
+        note_changes(depsgraph)
 
 
 def _note_rigs(changed: Changed) -> None:

@@ -2,6 +2,7 @@
 """A bound mesh shows the model's output for the evaluated pose, however the pose came about."""
 
 import shutil
+from itertools import pairwise
 
 import bpy
 import numpy as np
@@ -28,6 +29,26 @@ def test_posing(bound, elbow):
     first = assert_plays(bound, elbow.model)
     pose(angle=1.6)
     assert np.abs(assert_plays(bound, elbow.model) - first).max() > 1e-2
+
+
+def test_each_bone_of_a_chain(bound, elbow):
+    """The driver names the last bone alone: Blender evaluates it after those above, with a solver too."""
+    cache = nodes.cache_of(nodes.find_modifier(bound))
+    variables = cache.animation_data.drivers[0].driver.variables
+    assert {v.targets[0].bone_target for v in variables if v.type == "TRANSFORMS"} == {"", "lower"}
+    shown = [assert_plays(bound, elbow.model)]
+    for angle, bone in ((0.7, "upper"), (0.5, "lower"), (-0.3, "upper")):
+        pose(angle=angle, bone=bone)
+        shown.append(assert_plays(bound, elbow.model))
+    target = bpy.data.objects.new("target", None)
+    bpy.context.scene.collection.objects.link(target)
+    constraint = bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints.new("IK")
+    constraint.target, constraint.chain_count = target, 2
+    for place in ((0.3, 0.2, 0.4), (-0.2, 0.4, 0.1)):
+        target.location = place
+        bpy.context.view_layer.update()
+        shown.append(assert_plays(bound, elbow.model))
+    assert all(np.abs(after - before).max() > 1e-2 for before, after in pairwise(shown))
 
 
 def test_playing_differs_from_the_rig(bound, elbow):
