@@ -15,32 +15,35 @@ ROWS = 4
 def add_deltas(graph: Graph, deltas: Deltas) -> str:
     """Add the deltas, at least one: (N, D, 3) as their main joints see them."""
     (count, corners), columns = deltas.lengths.shape[1:], deltas.tangents.shape[3]
+    # Corner by corner: sums over what lies next to each other go number by number.
+    tangents_of, least, lengths = (array.swapaxes(1, 2) for array in (deltas.tangents, deltas.least, deltas.lengths))
     rows = graph.add("Transpose", [POSE_INPUT], "poses_by_row", perm=[0, 2, 1, 3])
     poses = graph.reshape(rows, [0, ROWS, columns], "pose_columns")
-    picked = graph.floats("tangents_of_poses", deltas.tangents.reshape(-1, columns).T)
-    tangents = graph.add("MatMul", [poses, picked], "tangents")
-    both = graph.split(tangents, [count * corners] * 2, ["first_tangents", "second_tangents"], axis=2)
+    tangents = [
+        graph.add("MatMul", [poses, graph.floats(f"{kind}_of_poses", own.reshape(-1, columns).T)], f"{kind}_tangents")
+        for kind, own in zip(("first", "second"), tangents_of, strict=True)
+    ]
     # a x b = (a_y b_z, a_z b_x, a_x b_y) - (a_z b_y, a_x b_z, a_y b_x)
     turned = [
         graph.add("Gather", [own, graph.integers(f"{own}_axes", axes)], f"{own}_turned", axis=1)
-        for own, axes in zip(both, ([1, 2, 0, 3, 2, 0, 1, 3], [2, 0, 1, 3, 1, 2, 0, 3]), strict=True)
+        for own, axes in zip(tangents, ([1, 2, 0, 2, 0, 1], [2, 0, 1, 1, 2, 0]), strict=True)
     ]
-    terms = graph.split(graph.add("Mul", turned, "cross_terms"), [ROWS] * 2, ["cross_added", "cross_taken"], axis=1)
-    vectors = [tangents, graph.add("Sub", terms, "crossed"), poses]
+    signs = graph.floats("cross_signs", np.pad(np.hstack([np.eye(3), -np.eye(3)]), ((0, ROWS - 3), (0, 0))))
+    crossed = graph.add("MatMul", [signs, graph.add("Mul", turned, "cross_terms")], "crossed")
     # The axes of the joints go with the corners' vectors through the same nodes.
-    vectors = graph.add("Concat", vectors, "vectors_of_deltas", axis=2)
-    least = np.append(deltas.least.ravel() ** 2, np.full(columns, SMALLEST))
+    vectors = graph.add("Concat", [*tangents, crossed, poses], "vectors_of_deltas", axis=2)
+    least = np.append(least.ravel() ** 2, np.full(columns, SMALLEST))
     squared = graph.add("Mul", [vectors, vectors], "vectors_squared")
     # Skin weights add up to 1 but for rounding, so the last row of a tangent is only nearly 0.
     in_space = graph.floats("rows_in_space", [[1, 1, 1, 0]])
     squared = graph.add("MatMul", [in_space, squared], "vector_sums")
     safe = graph.add("Add", [squared, graph.floats("least_squares", least)], "vectors_safe")
-    wanted = graph.floats("vector_lengths", np.append(deltas.lengths.ravel(), np.ones(columns)))
+    wanted = graph.floats("vector_lengths", np.append(lengths.ravel(), np.ones(columns)))
     factor = graph.add("Div", [wanted, graph.add("Sqrt", [safe], "lengths_of_vectors")], "vector_factors")
     vectors = graph.add("Mul", [vectors, factor], "vectors_as_long")
-    parts, axes = graph.split(vectors, [deltas.lengths.size, columns], ["delta_parts", "axes"], axis=2)
-    parts = graph.reshape(parts, [0, ROWS, *deltas.lengths.shape], "parts_by_delta")
-    sums = graph.add("ReduceSum", [parts, graph.integers("kinds_and_corners", [2, 4])], "deltas", keepdims=0)
+    parts, axes = graph.split(vectors, [lengths.size, columns], ["delta_parts", "axes"], axis=2)
+    parts = graph.reshape(parts, [0, ROWS, len(lengths) * corners, count], "parts_by_delta")
+    sums = graph.add("ReduceSum", [parts, graph.integers("kinds_and_corners", [2])], "deltas", keepdims=0)
     # Along the axes of all joints, of which each delta takes its own: a product is quicker than to gather the axes.
     axes = graph.add("Transpose", [axes], "axes_by_row", perm=[0, 2, 1])
     seen = graph.reshape(graph.add("MatMul", [axes, sums], "along_axes"), [0, columns * count], "along_axes_in_row")

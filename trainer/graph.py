@@ -27,9 +27,9 @@ def build_graph(deformation: Deformation) -> onnx.ModelProto:
     """Build the model, without metadata."""
     graph = Graph()
     features = add_features(graph, deformation)
-    clamped, trust = add_range(graph, features, deformation)
+    clamped, outside = add_range(graph, features, deformation)
     coefficients, places = add_networks(graph, features, clamped, deformation)
-    add_playback(graph, features, coefficients, places, trust, deformation)
+    add_playback(graph, features, coefficients, places, outside, deformation)
     inputs = [helper.make_tensor_value_info(POSE_INPUT, TensorProto.FLOAT, ["N", len(deformation.rig.joints), 4, 4])]
     if count := deformation.inputs.control_count:
         inputs.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", count]))

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The part of the graph that evaluates the networks, in groups of similar size, padded to the largest of the group.
 
-What the networks' first layer would standardise is in its weights, and the last layer's bias in the mean residual.
+What the networks' first layer would standardise is in its weights, as its bias is; the last layer's is in the mean
+residual.
 """
 
 import numpy as np
@@ -71,45 +72,47 @@ def _group(
 ) -> str:
     """(N, Pg K) coefficients of a group, padded."""
     layers = [_first_layer(features, deformation, n) for n in group]
-    most = max(len(vectors) for vectors, _, _ in layers)
+    most = max(len(vectors) for vectors, _ in layers)
     networks = [deformation.networks[n] for n in group]
     seen = np.zeros((len(group), most), np.int64)
     widths = [max(network.weights[layer].shape[1] for network in networks) for layer in range(len(networks[0].weights))]
     sizes = [VECTOR * most, *widths]
     weights = [np.zeros((len(group), sizes[n], sizes[n + 1])) for n in range(len(widths))]
-    biases = [np.zeros((len(group), 1, width)) for width in widths[:-1]]
-    for place, (network, (vectors, weight, bias)) in enumerate(zip(networks, layers, strict=True)):
+    biases = {layer: np.zeros((len(group), 1, width)) for layer, width in enumerate(widths[1:-1], 1)}
+    for place, (network, (vectors, weight)) in enumerate(zip(networks, layers, strict=True)):
         seen[place, : len(vectors)] = vectors
         for layer, own in enumerate((weight, *network.weights[1:])):
             weights[layer][place, : own.shape[0], : own.shape[1]] = own
-        for layer, own in enumerate((bias, *network.biases[1:-1])):
-            biases[layer][place, 0, : len(own)] = own
+        for layer in biases:
+            biases[layer][place, 0, : len(network.biases[layer])] = network.biases[layer]
     values = graph.add("Gather", [clamped, graph.integers(f"seen_vectors{suffix}", seen)], f"seen{suffix}", axis=1)
     values = graph.reshape(values, [0, len(group), VECTOR * most], f"seen_rows{suffix}")
     values = graph.add("Transpose", [values], f"inputs{suffix}", perm=[1, 0, 2])
     for layer, weight in enumerate(weights):
         name = f"_{layer}{suffix}"
         values = graph.add("MatMul", [values, graph.floats(f"weights{name}", weight)], f"product{name}")
-        if layer < len(biases):
+        if layer in biases:
             values = graph.add("Add", [values, graph.floats(f"biases{name}", biases[layer])], f"layer{name}")
+        if layer < len(weights) - 1:
             values = _activation(graph, values, deformation.activation, f"hidden{name}")
     values = graph.add("Transpose", [values], f"coefficients{suffix}", perm=[1, 0, 2])
     return graph.reshape(values, [0, len(group) * widths[-1]], f"coefficient_row{suffix}")
 
 
-def _first_layer(features: Features, deformation: Deformation, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _first_layer(features: Features, deformation: Deformation, n: int) -> tuple[np.ndarray, np.ndarray]:
     """The vectors that a network sees, and its first layer for these as they are, not standardised.
 
     Returns:
-        (Bn,) int64 vectors, (3 Bn, H) float64 weights and (H,) float64 bias.
+        (Bn,) int64 vectors, the last of them ones; (3 Bn, H) float64 weights, in which the bias is that of a one.
     """
     prepared, network = deformation.prepared[n], deformation.networks[n]
     place = features.place[deformation.seen_columns(n)]
     vectors, which = np.unique(place // VECTOR, return_inverse=True)
     scaled = network.weights[0].astype(np.float64) / prepared.feature_scale[:, None]
-    weight = np.zeros((VECTOR * len(vectors), scaled.shape[1]))
+    weight = np.zeros((VECTOR * (len(vectors) + 1), scaled.shape[1]))
     weight[VECTOR * which + place % VECTOR] = scaled
-    return vectors, weight, network.biases[0] - prepared.feature_mean.astype(np.float64) @ scaled
+    weight[-1] = network.biases[0] - prepared.feature_mean.astype(np.float64) @ scaled
+    return np.append(vectors, features.one), weight
 
 
 def _activation(graph: Graph, value: str, activation: str, output: str) -> str:

@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The part of the graph that plays: one product with a constant matrix for each partition."""
+"""The part of the graph that plays: a product with a constant matrix for each partition, or for a few small ones."""
 
 import numpy as np
 
-from fdda_addon.core.model import POSITIONS_OUTPUT
+from fdda_addon.core.model import POSITIONS_OUTPUT, TRUST_OUTPUT
 from fdda_addon.core.skinning import SkinBlock
 
 from .deformation import Deformation
 from .nodes import Graph
-from .pose_nodes import COLUMNS, Features
+from .pose_nodes import COLUMNS, VECTOR, Features
 from .vertex_order import vertex_order
+
+PADDING_FLOATS = 6_000
+"""More zeros than this in the matrix of several partitions take more of a frame than another product."""
 
 
 def add_playback(
@@ -17,7 +20,7 @@ def add_playback(
     features: Features,
     coefficients: list[str],
     places: dict[int, np.ndarray],
-    trust: str,
+    outside: str,
     deformation: Deformation,
 ) -> None:
     """Add everything from the coefficients to the output `positions`.
@@ -30,31 +33,64 @@ def add_playback(
     Args:
         features: has the poses.
         coefficients, places: of the networks, as `add_networks` gives them.
-        trust: (N, P + 1), behind the trust a 1.
+        outside: (N, 3 own), as `add_range` gives it: it has a 1 for what needs no trust.
     """
-    count = len(deformation.partitions)
-    skins = [SkinBlock(deformation.rig, partition) for partition in deformation.partitions]
+    partitions, prepared, shapes = deformation.partitions, deformation.prepared, deformation.shape_counts()
+    # The ones are the last vector outside, right before the trust.
+    count, one = len(partitions), VECTOR * features.one
+    skins = [SkinBlock(deformation.rig, partition) for partition in partitions]
+    wholes = [len(skin.joints) + len(own.fit.joints) for skin, own in zip(skins, prepared, strict=True)]
+    sizes = [COLUMNS * whole + (COLUMNS - 1) * own for whole, own in zip(wholes, shapes, strict=True)]
+    products = _products([(size, len(own.vertices)) for size, own in zip(sizes, partitions, strict=True)])
+    ordered = [n for product in products for n in product]
     joints, factors, trusts, columns = [], [], [], []
-    for n, (partition, skin) in enumerate(zip(deformation.partitions, skins, strict=True)):
-        fitted, shapes = deformation.prepared[n].fit.joints, deformation.shape_counts()[n]
-        whole = len(skin.joints) + len(fitted)
-        columns.append(_columns(len(joints), whole, shapes))
-        joints += [*skin.joints.tolist(), *fitted.tolist(), *[partition.joint] * shapes]
-        factors += [count] * whole + ((count + 1 + places[n]).tolist() if shapes else [])
-        trusts += [count] * len(skin.joints) + [n] * (len(fitted) + shapes)
-    scaled = _scaled_poses(graph, features, [trust, *coefficients], joints, factors, trusts)
+    for n in ordered:
+        fitted = prepared[n].fit.joints
+        columns.append(_columns(len(joints), wholes[n], shapes[n]))
+        joints += [*skins[n].joints.tolist(), *fitted.tolist(), *[partitions[n].joint] * shapes[n]]
+        factors += [one] * wholes[n] + ((one + VECTOR + count + places[n]).tolist() if shapes[n] else [])
+        trusts += [one] * len(skins[n].joints) + [one + VECTOR + n] * (len(fitted) + shapes[n])
+    scaled = _scaled_poses(graph, features, [outside, TRUST_OUTPUT, *coefficients], joints, factors, trusts)
     # Of each matrix the columns that are needed; a column is one piece of memory.
     rows = graph.add("Gather", [scaled, graph.integers("row_columns", np.concatenate(columns))], "rows", axis=1)
     rows = graph.add("Transpose", [rows], "rows_by_axis", perm=[0, 2, 1])
-    parts = graph.split(rows, [len(own) for own in columns], [f"rows_{n}" for n in range(count)], axis=2)
-    order = vertex_order([partition.vertices for partition in deformation.partitions])
+    lengths = [sum(sizes[n] for n in product) for product in products]
+    parts = graph.split(rows, lengths, [f"rows_{number}" for number in range(len(products))], axis=2)
+    order = vertex_order([partitions[n].vertices for n in ordered])
+    matrices = {
+        n: _in_order(_matrix(deformation, n, skins[n]), partitions[n].vertices, own)
+        for n, own in zip(ordered, order.columns, strict=True)
+    }
     blocks = []
-    for n, (part, own) in enumerate(zip(parts, order.columns, strict=True)):
-        matrix = _in_order(_matrix(deformation, n, skins[n]), deformation.partitions[n].vertices, own)
-        blocks.append(graph.add("MatMul", [part, graph.floats(f"matrix_{n}", matrix)], f"block_{n}"))
+    for number, (part, product) in enumerate(zip(parts, products, strict=True)):
+        matrix = _block_diagonal([matrices[n] for n in product])
+        blocks.append(graph.add("MatMul", [part, graph.floats(f"matrix_{number}", matrix)], f"block_{number}"))
     joined = graph.join(blocks, "blocks", axis=2)
     joined = graph.add("Transpose", [joined], "positions_by_partition", perm=[0, 2, 1])
     order.add(graph, joined, POSITIONS_OUTPUT)
+
+
+def _products(sizes: list[tuple[int, int]]) -> list[list[int]]:
+    """Which matrices, of so many rows and columns, go into one product: small ones, with few zeros beside them."""
+    products: list[list[int]] = []
+    rows = columns = 0
+    for n in sorted(range(len(sizes)), key=lambda n: (sizes[n][0] * sizes[n][1], n)):
+        if products and sizes[n][0] * columns + sizes[n][1] * rows < PADDING_FLOATS:
+            products[-1].append(n)
+        else:
+            products.append([n])
+            rows = columns = 0
+        rows, columns = rows + sizes[n][0], columns + sizes[n][1]
+    return products
+
+
+def _block_diagonal(matrices: list[np.ndarray]) -> np.ndarray:
+    """One matrix of all, with zeros beside them."""
+    rows, columns = np.cumsum([(0, 0), *(matrix.shape for matrix in matrices)], axis=0).T
+    joined = np.zeros((rows[-1], columns[-1]))
+    for number, matrix in enumerate(matrices):
+        joined[rows[number] : rows[number + 1], columns[number] : columns[number + 1]] = matrix
+    return joined
 
 
 def _scaled_poses(
@@ -66,7 +102,9 @@ def _scaled_poses(
         graph.add("Gather", [joined, graph.integers(f"row_{name}", np.array(numbers)[:, None])], f"by_{name}", axis=1)
         for name, numbers in (("factor", factors), ("trust", trusts))
     ]
-    scale = graph.add("Mul", chosen, "scale")
+    # Spread over the twelve numbers by a product: to multiply numbers by their row's takes four times as long.
+    spread = [graph.add("Mul", chosen, "scale"), graph.floats("twelve_ones", np.ones((1, 12)))]
+    scale = graph.add("MatMul", spread, "scale_of_poses")
     poses = graph.integers("row_poses", features.pose_rows[joints])
     scaled = graph.add("Gather", [features.table, poses], "unscaled", axis=1)
     scaled = graph.add("Mul", [scaled, scale], "scaled")

@@ -32,8 +32,8 @@ class Features:
     """The features in the graph.
 
     Attributes:
-        name: (N, B, 3), of the controls first, then of the joints, then of the pairs, then the deltas.
-        own: how many of the B vectors are of controls and joints; the others follow from these.
+        name: (N, B, 3), of the controls first, then of the joints, then a zero, then of the pairs, then the deltas.
+        own: how many of the B vectors are of controls and joints, with the zero; the others follow from these.
         size: 3 B.
         place: (F,) int64, where each feature of `Inputs` is among the 3 B; -1 where it is not needed.
         table: (N, ·, 12), in which also the poses are, by columns of three numbers.
@@ -47,11 +47,18 @@ class Features:
     table: str
     pose_rows: np.ndarray
 
-    def constant(self, values: np.ndarray, missing: float) -> np.ndarray:
-        """(F,) values in the order of the graph, (B, 3) float64."""
-        ordered = np.full(self.size, missing, np.float64)
+    @property
+    def one(self) -> int:
+        """Which of the vectors is clamped to ones: a constant among what changes, for biases."""
+        return self.own - 1
+
+    def bound(self, values: np.ndarray) -> np.ndarray:
+        """(F,) bounds of the range in the order of the graph, (B, 3) float64."""
+        ordered = np.zeros(self.size)
         ordered[self.place[self.place >= 0]] = values[self.place >= 0]
-        return ordered.reshape(-1, VECTOR)
+        ordered = ordered.reshape(-1, VECTOR)
+        ordered[self.one] = 1
+        return ordered
 
 
 @dataclass(frozen=True)
@@ -85,13 +92,11 @@ def add_features(graph: Graph, deformation: Deformation) -> Features:
     ends = [graph.add("Gather", [table, graph.integers("vector_there", there)], "vectors_there", axis=1)]
     ends.append(graph.add("Gather", [table, graph.integers("vector_origin", origin)], "vectors_origin", axis=1))
     apart = graph.add("Sub", ends, "apart")
-    sums = graph.floats("row_sums", np.kron(np.eye(3), [[1], [1], [1], [0]]))
+    sums = graph.floats("row_sums", np.kron(np.eye(3), np.ones((4, 1))))
     name = graph.add("MatMul", [graph.add("Mul", [turned, apart], "terms"), sums], "vectors")
     if not deformation.sheared:
         squared = graph.add("Mul", [turned, turned], "frames_squared")
-        lengths = graph.add("MatMul", [squared, sums], "lengths")
-        safe = graph.add("Add", [lengths, graph.floats("smallest_length", SMALLEST)], "safe_lengths")
-        name = graph.add("Div", [name, safe], "seen_vectors")
+        name = graph.add("Div", [name, graph.add("MatMul", [squared, sums], "lengths")], "seen_vectors")
     place, before = np.full(inputs.size, -1, np.int64), []
     if count := inputs.control_count:
         # Three times, to fill vectors; only the first is looked at.
@@ -100,8 +105,8 @@ def add_features(graph: Graph, deformation: Deformation) -> Features:
         place[inputs.joint_columns : inputs.own_columns] = np.arange(count)
     behind = [add_deltas(graph, inputs.deltas)] if len(inputs.deltas) else []
     name = graph.join([*before, name, *behind], "features", axis=1)
-    own, by_column = count + COLUMNS * len(joints), np.arange(FEATURES_PER_JOINT).reshape(VECTOR, COLUMNS).T.ravel()
-    place[(FEATURES_PER_JOINT * joints[:, None] + by_column).ravel()] = np.arange(VECTOR * count, VECTOR * own)
+    own, by_column = count + COLUMNS * len(joints) + 1, np.arange(FEATURES_PER_JOINT).reshape(VECTOR, COLUMNS).T.ravel()
+    place[(FEATURES_PER_JOINT * joints[:, None] + by_column).ravel()] = np.arange(VECTOR * count, VECTOR * (own - 1))
     size = VECTOR * own + inputs.size - inputs.own_columns
     place[inputs.own_columns :] = np.arange(VECTOR * own, size)
     pose_rows = rows * (frames.first_joint + np.arange(len(inputs.parents))) + WHOLE
@@ -146,6 +151,8 @@ def _table_picks(rows: int) -> np.ndarray:
             picks[4 * inner + column, column, row, inner] = 1
         if rows > INVERSE:
             picks[4 * inner + row, INVERSE, row, inner] = 1
+            # Behind each row, from the 1 in the corner of the matrix: no length is zero.
+            picks[-1, INVERSE, row, 3] = np.sqrt(SMALLEST)
     for column, row in np.ndindex(COLUMNS, 3):
         picks.reshape(16, rows, -1)[4 * row + column, WHOLE, 3 * column + row] = 1
     return picks.reshape(16, -1)
@@ -163,11 +170,12 @@ def _vectors(deformation: Deformation, frames: _Frames) -> tuple[np.ndarray, ...
     origin = np.where(columns == COLUMNS - 1, rows * carried[:, None] + COLUMNS - 1, ZERO).ravel()
     references = frames.first_joint + inputs.pair_references
     points = len(frames.joints) + np.searchsorted(frames.points, inputs.pair_points)
-    seen_from = np.append(np.repeat(carried, COLUMNS), references)
+    # Behind the joints a vector that is zero, whatever sees it.
+    seen_from = np.concatenate([np.repeat(carried, COLUMNS), carried[:1], references])
     return (
         seen_from if deformation.sheared else rows * seen_from + INVERSE,
-        np.append((rows * itself[:, None] + columns).ravel(), rows * points + COLUMNS - 1),
-        np.append(origin, rows * references + COLUMNS - 1),
+        np.concatenate([(rows * itself[:, None] + columns).ravel(), [ZERO], rows * points + COLUMNS - 1]),
+        np.concatenate([origin, [ZERO], rows * references + COLUMNS - 1]),
     )
 
 
@@ -197,22 +205,21 @@ def add_range(graph: Graph, features: Features, deformation: Deformation) -> tup
     """Clamp the features to the training range, and add the output `trust`.
 
     Returns:
-        (N, B, 3) features, clamped, and (N, P + 1) trust, behind it a 1 for what needs no trust.
+        (N, B, 3) features, clamped, and (N, 3 own) squares of how far the own ones are outside; those of `Features.one`
+        are ones.
     """
     trust, size = deformation.trust, VECTOR * features.own
-    low, high = (features.constant(bound, 0) for bound in (trust.low, trust.high))
-    raised = graph.add("Max", [features.name, graph.floats("range_low", low)], "raised")
-    clamped = graph.add("Min", [raised, graph.floats("range_high", high)], "clamped")
+    raised = graph.add("Max", [features.name, graph.floats("range_low", features.bound(trust.low))], "raised")
+    clamped = graph.add("Min", [raised, graph.floats("range_high", features.bound(trust.high))], "clamped")
     outside = graph.add("Sub", [features.name, clamped], "outside")
     if features.size > size:
         outside = graph.slice(outside, 0, features.own, 1, "own_outside")
     outside = graph.reshape(outside, [0, size], "outside_row")
     squared = graph.add("Mul", [outside, outside], "outside_squared")
-    counts = np.zeros((size, len(trust.counts) + 1))
+    counts = np.zeros((size, len(trust.counts)))
     own = features.place[: len(trust.width)]
-    counts[own[own >= 0], :-1] = (trust.counts / trust.width.astype(np.float64) ** 2).T[own >= 0]
-    left = [squared, graph.floats("counts", counts), graph.floats("one", np.ones(1))]
+    counts[own[own >= 0]] = (trust.counts / trust.width.astype(np.float64) ** 2).T[own >= 0]
+    left = [squared, graph.floats("counts", counts), graph.floats("all_trust", np.ones(1))]
     root = graph.add("Relu", [graph.add("Gemm", left, "trust_left", alpha=-1.0)], "trust_root")
-    both = graph.add("Mul", [root, root], "trust_and_one")
-    graph.slice(both, 0, len(trust.counts), 1, TRUST_OUTPUT)
-    return clamped, both
+    graph.add("Mul", [root, root], TRUST_OUTPUT)
+    return clamped, squared

@@ -15,6 +15,7 @@ from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.skinning import LinearLayer
 from fdda_addon.runtime.network import Network
+from trainer import playback_nodes
 from trainer.__main__ import main
 from trainer.deformation import Deformation, is_sheared
 from trainer.export import open_session, reference_positions
@@ -131,14 +132,39 @@ def test_the_graph_has_few_nodes(trained):
     assert len(graph.node) <= 56 + len(info.partitions)
 
 
-def test_constants_are_the_matrices_and_little_else(trained, deformation, report):
-    info, graph = read_model_info(trained / "model.onnx"), onnx.load(trained / "model.onnx").graph
-    arrays = [onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer]
-    assert info.constant_bytes == report["constant_bytes"] == sum(array.nbytes for array in arrays)
+def test_small_partitions_share_a_product(deformation, monkeypatch):
+    poses = pose_chain(chain_rig(), chain_angles(5, 3, 3))
+    together, _ = played(deformation, poses)
+    monkeypatch.setattr(playback_nodes, "PADDING_FLOATS", 0)
+    apart, _ = played(deformation, poses)
+    np.testing.assert_allclose(together, apart, atol=2e-6)
+    products = [name for name in (c.name for c in build_graph(deformation).graph.initializer) if "matrix_" in name]
+    assert len(products) == len(deformation.partitions) == 3
+
+
+def test_only_small_partitions_share_a_product():
+    small, large = (20, 40), (90, 3000)
+    assert playback_nodes._products([large, small, small, large, small]) == [[1, 2, 4], [0], [3]]
+    # With every one that joins, more zeros stand beside it.
+    assert [len(product) for product in playback_nodes._products([small] * 12)] == [4, 4, 4]
+
+
+def constant_bytes(model: onnx.ModelProto) -> int:
+    return sum(onnx.numpy_helper.to_array(tensor).nbytes for tensor in model.graph.initializer)
+
+
+def test_constants_are_the_matrices_and_little_else(trained, deformation, report, monkeypatch):
+    info = read_model_info(trained / "model.onnx")
+    assert info.constant_bytes == report["constant_bytes"] == constant_bytes(onnx.load(trained / "model.onnx"))
     assert f"{info.constant_bytes:,}" in (trained / "report.html").read_text()
     networks = sum(a.size for network in deformation.networks for a in (*network.weights, *network.biases))
     matrices = sum((4 * 2 + 4 * len(p.fit.joints) + 3 * len(p.basis.shapes)) * p.vertices for p in deformation.prepared)
-    assert info.constant_bytes < 1.5 * 4 * (networks + matrices) + 16_000
+    together = constant_bytes(build_graph(deformation))
+    monkeypatch.setattr(playback_nodes, "PADDING_FLOATS", 0)
+    apart = constant_bytes(build_graph(deformation))
+    assert apart < 1.5 * 4 * (networks + matrices) + 16_000
+    # Zeros beside the second matrix and beside the third.
+    assert apart < together < apart + 2 * 4 * 6_000
 
 
 def test_a_model_of_the_first_version_still_plays():
