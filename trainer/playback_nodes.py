@@ -102,7 +102,7 @@ def _scaled_poses(
         graph.add("Gather", [joined, graph.integers(f"row_{name}", np.array(numbers)[:, None])], f"by_{name}", axis=1)
         for name, numbers in (("factor", factors), ("trust", trusts))
     ]
-    # Spread over the twelve numbers by a product: to multiply numbers by their row's takes four times as long.
+    # Spread over the twelve numbers by a product: to multiply each pose by one number takes three times as long.
     spread = [graph.add("Mul", chosen, "scale"), graph.floats("twelve_ones", np.ones((1, 12)))]
     scale = graph.add("MatMul", spread, "scale_of_poses")
     poses = graph.integers("row_poses", features.pose_rows[joints])
