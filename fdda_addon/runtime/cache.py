@@ -12,7 +12,6 @@ from collections.abc import Iterable
 import bpy
 
 from ..core.controls import Control
-from ..core.rig import UNMOVED
 from ..scene.controls import owner_of
 from ..scene.mesh import mesh_positions, set_mesh_positions
 from ..scene.scene_rig import MODIFIER_NAME, SceneRig
@@ -74,7 +73,8 @@ def further_inputs(scene_rig: SceneRig, joints: Iterable[str]) -> list[Variable]
     Blender evaluates a bone after those above it, so the last of each chain stand for all.
     """
     bones = scene_rig.armature_object.data.bones
-    known = [name for name in joints if name != UNMOVED]
+    # Joints that are gone are asked for no more; whoever reads the pose notices.
+    known = [name for name in joints if name in bones]
     above = {bone.name for name in known for bone in bones[name].parent_recursive}
     return [
         ("SINGLE_PROP", scene_rig.mesh_object, "fdda.mode"),

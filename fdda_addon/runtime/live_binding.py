@@ -46,8 +46,8 @@ class LiveBinding:
         was_executed: it had a job, since whoever asked set it back.
         execution: where its positions lie.
         graphs: addresses of the dependency graphs that know of it.
-        viewports: address of its evaluated mesh object in each graph of a viewport, by the address of the graph; kept
-            where it has shape keys.
+        viewports: address of its evaluated mesh object in each graph of a viewport, by the address of the graph; 0
+            where it has no shape keys.
         lock: to be held from `read` to `write`.
     """
 

@@ -204,3 +204,16 @@ def test_the_first_frame_of_a_dense_mesh_comes_within_a_second(dense):
     measured = json.loads(done.stdout.strip().splitlines()[-1])
     assert not measured["onnxruntime_at_start_up"]
     assert measured["is_right"] and measured["seconds"] < COLD_START_SECONDS
+
+
+def test_a_crowd_that_loses_a_joint(bound, calls):
+    """Their armatures share their bones."""
+    crowd = crowd_of(bound, 4)
+    animate(crowd)
+    for frame in range(1, 5):
+        bpy.context.scene.frame_set(frame)
+    assert calls[-1] == 4
+    armature_modifier(bound).object.data.bones["lower"].name = "elsewhere"
+    bpy.context.scene.frame_set(5)
+    for mesh_object in crowd:
+        assert mesh_object.fdda.mode == "RIG" and "lacks the joint 'lower'" in mesh_object.fdda.status

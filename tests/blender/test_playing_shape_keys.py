@@ -41,6 +41,18 @@ def test_shape_keys_are_not_mixed_while_a_model_plays(bound):
     assert not any(muted())
 
 
+def test_shape_keys_that_come_while_a_model_plays(bound, elbow):
+    pose(angle=0.3)
+    assert_plays(bound, elbow.model)
+    bound.shape_key_add(name="Basis")
+    bound.shape_key_add(name="bulge").value = 1
+    for angle in (0.5, 0.7, 0.9):
+        pose(angle=angle)
+    keys = bound.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.shape_keys
+    assert [key.mute for key in keys.key_blocks] == [True, True]
+    assert_plays(bound, elbow.model)
+
+
 def test_shape_keys_of_two_objects(bound, elbow):
     """One plays, the other shows the rig of the same mesh."""
     keyed(bound)
