@@ -11,12 +11,12 @@ from fdda_addon.core.features import rounding
 from fdda_addon.core.recording.index import RANDOM, REFINED, Source
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Fingerprint
-from fdda_addon.core.skinning import skin_matrices
 
 from .basis import FINER, Basis, make_basis, share_shapes
 from .config import TrainingConfig
 from .inputs import Inputs
 from .joint_fit import JointFit, Surroundings, surroundings_of_rig
+from .turns import fit_matrices
 
 MIN_POSES = 10
 BLOCK_FRAMES = 10
@@ -223,11 +223,11 @@ def held_back_digest(recording: Recording, split: Split) -> str:
     )
 
 
-def partitions_of(recording: Recording, inputs: Inputs) -> list[PartitionData]:
-    """The partitions of a recording, their features as `inputs` chose them."""
+def partitions_of(recording: Recording, inputs: Inputs, turns: bool = False) -> list[PartitionData]:
+    """The partitions of a recording, their features as `inputs` chose them, fitted to turn matrices or not."""
     rig = recording.rig
     features = inputs.features(recording.pose_matrices, rig.rest_matrices, recording.controls)
-    skin = skin_matrices(recording.pose_matrices, rig.rest_matrices)
+    matrices = fit_matrices(recording.pose_matrices, rig, turns)
     of_lengths = max(MIN_SPREAD / rig.metres_per_unit, rounding(recording.pose_matrices))
     least = np.where(inputs.are_lengths(), of_lengths, MIN_SPREAD)
     return [
@@ -236,7 +236,7 @@ def partitions_of(recording: Recording, inputs: Inputs) -> list[PartitionData]:
             features[:, inputs.columns[number]],
             lambda vertices=partition.vertices: recording.residuals[:, vertices],
             len(partition.vertices),
-            lambda partition=partition: surroundings_of_rig(rig, partition, skin),
+            lambda partition=partition: surroundings_of_rig(rig, partition, matrices),
             least[inputs.columns[number]],
         )
         for number, partition in enumerate(recording.partitions)

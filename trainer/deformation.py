@@ -53,6 +53,11 @@ class Deformation:
         """The features that a network sees, of those that it is offered, in its order."""
         return self.inputs.columns[partition][self.prepared[partition].columns]
 
+    def turns(self) -> np.ndarray:
+        """(H,) int64 ascending, the joints to whose turn matrices some partition is fitted."""
+        fitted = np.unique(np.concatenate([prepared.fit.joints for prepared in self.prepared]))
+        return fitted[fitted >= len(self.rig.parents)] - len(self.rig.parents)
+
     def shape_counts(self) -> list[int]:
         """K of each partition."""
         return [len(prepared.basis.shapes) for prepared in self.prepared]

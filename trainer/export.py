@@ -27,11 +27,12 @@ from fdda_addon.core.model import (
 from fdda_addon.core.onnx_file import read_onnx
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.skin_fit import skin_to_text
-from fdda_addon.core.skinning import LinearLayer, skin_matrices
+from fdda_addon.core.skinning import LinearLayer
 from fdda_addon.core.surface import Surface, SurfaceComparison, surface_errors, surface_json
 
 from .deformation import Deformation
 from .graph import build_graph
+from .turns import fit_matrices
 
 MAX_DIFFERENCE = 1e-5
 """Metres. An export that differs more from the reference fails; scaled up for rigs larger than a metre, and what
@@ -73,7 +74,7 @@ def reference_positions(
     mean, scale = deformation.standardisation()
     clamped = np.clip(features, trust_range.low, trust_range.high)
     inputs = ((clamped - mean) / scale).astype(np.float32)
-    skin = skin_matrices(pose_matrices, rig.rest_matrices)
+    matrices = fit_matrices(pose_matrices, rig, len(deformation.turns()) > 0)
     local, offsets = (np.zeros((len(features), rig.vertex_count, 3), np.float32) for _ in range(2))
     for number, (partition, prepared, network) in enumerate(
         zip(deformation.partitions, deformation.prepared, deformation.networks, strict=True)
@@ -81,7 +82,7 @@ def reference_positions(
         coefficients = network.coefficients(inputs[:, deformation.seen_columns(number)], deformation.activation)
         residuals = prepared.basis.residuals(coefficients) * trust[:, number, None]
         local[:, partition.vertices] = residuals.reshape(len(features), -1, 3)
-        offsets[:, partition.vertices] = prepared.fit.offsets(skin) * trust[:, number, None, None]
+        offsets[:, partition.vertices] = prepared.fit.offsets(matrices) * trust[:, number, None, None]
     return LinearLayer(rig, deformation.partitions).complex_positions(pose_matrices, local) + offsets, trust
 
 

@@ -4,7 +4,7 @@
 Most of what smoothing does near a joint is that vertices follow the joints on both sides, each by its part. That is
 linear in the poses of these joints, so a least squares fit finds it, and the networks learn what is left: a fraction of
 the residual, and a smooth one. How much of delta mush can be had in this way: Le and Lewis, Direct Delta Mush Skinning
-and Variants, 2019.
+and Variants, 2019. Of a rig that preserves volume, most is linear in the joints' turn matrices besides (`turns`).
 """
 
 from dataclasses import dataclass, replace
@@ -31,16 +31,18 @@ class JointFit:
     Moving all joints together moves nothing: the last numbers of all u_vj of a vertex sum to zero.
 
     Attributes:
-        joints: (Jf,) int64, the main joint first; none where nothing is known of the joints.
-        factors: (4 Jf, Vp) float32, u_vj: three mesh units and a number, joint by joint.
+        joints: (Jf,) int64, the main joint first; none where nothing is known of the joints. J + j, behind all others,
+            stands for the turn matrix of joint j, in place of its skin matrix.
+        factors: (4 Jf, Vp) float32, u_vj: three mesh units and a number, joint by joint; the number is 0 for turns.
     """
 
     joints: np.ndarray
     factors: np.ndarray
 
-    def offsets(self, skin: np.ndarray) -> np.ndarray:
-        """Skin matrices (N, J, 4, 4) to (N, Vp, 3) offsets from the linear layer, mesh-object space, mesh units."""
-        rows = skin[:, self.joints, :3].transpose(0, 2, 1, 3).reshape(len(skin), 3, -1)
+    def offsets(self, matrices: np.ndarray) -> np.ndarray:
+        """Matrices as in `make_surroundings` to (N, Vp, 3) offsets from the linear layer, mesh-object space, mesh
+        units."""
+        rows = matrices[:, self.joints, :3].transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1)
         return (rows.astype(np.float64) @ self.factors).transpose(0, 2, 1)
 
 
@@ -49,7 +51,7 @@ class Surroundings:
     """The joints around a partition as its main joint sees them.
 
     Attributes:
-        joints: (Jf,) int64, the main joint first.
+        joints: (Jf,) int64, the main joint first, turns last, as in `JointFit`.
         centre: (3,) float64, middle of the partition at rest, mesh-object space, mesh units.
         rows: (N, 3, 4 Jf) float64, R_m^-1 S_j of each joint; the last column of each says how the centre moves, which
             keeps the fit well conditioned far away from the origin.
@@ -137,17 +139,17 @@ def _useful(products: np.ndarray, moments: np.ndarray, total: float) -> np.ndarr
     return kept
 
 
-def surroundings_of_rig(rig: Rig, partition: Partition, skin: np.ndarray) -> Surroundings:
-    """The joints around a partition of a rig; `skin` as in `make_surroundings`."""
+def surroundings_of_rig(rig: Rig, partition: Partition, matrices: np.ndarray) -> Surroundings:
+    """The joints around a partition of a rig; `matrices` as in `make_surroundings`."""
     centre = rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
-    surroundings = make_surroundings(rig.parents, partition, skin, centre, unmoved_joints(rig))
+    surroundings = make_surroundings(rig.parents, partition, matrices, centre, unmoved_joints(rig))
     return replace(surroundings, metres_per_unit=rig.metres_per_unit)
 
 
 def make_surroundings(
     parents: np.ndarray,
     partition: Partition,
-    skin: np.ndarray,
+    matrices: np.ndarray,
     centre: np.ndarray,
     unmoved: frozenset[int] = frozenset(),
 ) -> Surroundings:
@@ -156,20 +158,22 @@ def make_surroundings(
     Args:
         parents: (J,) parent index of each joint, -1 for a root.
         partition: with its main joint and the influencing ones.
-        skin: (N, J, 4, 4) skin matrices of all poses, mesh units; any fixed matrices may stand in for the rest pose,
-            the fit takes them up.
+        matrices: (N, J, 3, 4) skin matrices of all poses, mesh units, or (N, 2 J, 3, 4) with turn matrices behind them
+            (`turns.fit_matrices`); any fixed matrices may stand in for the rest pose, the fit takes them up.
         centre: (3,) middle of the partition where all skin matrices are the identity, mesh units.
         unmoved: joints that never move.
     """
-    influencing = set(partition.influencing)
+    influencing, main, count = set(partition.influencing), partition.joint, len(parents)
+    between = [joints_between(parents, main, joint) for joint in range(count)]
+    # A turn is seen where the joint's parent is, and turns with the joint.
+    between += [{joint} | (between[parent] if parent >= 0 else {-1}) for joint, parent in enumerate(parents.tolist())]
     others = [
-        joint
-        for joint in range(len(parents))
-        if joint != partition.joint and joints_between(parents, partition.joint, joint) - unmoved <= influencing
+        number for number in range(matrices.shape[1]) if number != main and between[number] - unmoved <= influencing
     ]
-    joints = np.array([partition.joint, *others], np.int64)
-    apart = skin[:, joints, :3].astype(np.float64)
-    apart[:, :, :, 3] -= skin[:, partition.joint, None, :3, 3]
-    relative = np.linalg.inv(skin[:, partition.joint, None, :3, :3].astype(np.float64)) @ apart
-    relative[:, :, :, 3] += relative[:, :, :, :3] @ centre - centre
-    return Surroundings(joints, centre, relative.transpose(0, 2, 1, 3).reshape(len(skin), 3, -1))
+    joints = np.array([main, *others], np.int64)
+    moves_along = (joints < count)[:, None]
+    apart = matrices[:, joints, :3].astype(np.float64)
+    apart[:, :, :, 3] -= moves_along * matrices[:, main, None, :3, 3]
+    relative = np.linalg.inv(matrices[:, main, None, :3, :3].astype(np.float64)) @ apart
+    relative[:, :, :, 3] += moves_along * (relative[:, :, :, :3] @ centre - centre)
+    return Surroundings(joints, centre, relative.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1))

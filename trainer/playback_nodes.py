@@ -26,9 +26,10 @@ def add_playback(
     """Add everything from the coefficients to the output `positions`.
 
     The rows of partition p, of main joint m, are
-    [ P_j of the joints that skin it | t P_j of those that it is fitted to, m among them | t c_k P_m ]; its matrix is
-    [ w_vj B_j^-1 (x_v, 1) | B_j^-1 u_vj, for m with the mean | shapes turned by B_m^-1 ]: the inverse rest matrices are
-    in the constants.
+    [ P_j of the joints that skin it | t P_j of those that it is fitted to, m among them | t Q_j A_j of those to whose
+    turns it is fitted (`turns`) | t c_k P_m ]; its matrix is
+    [ w_vj B_j^-1 (x_v, 1) | B_j^-1 u_vj, for m with the mean | B_j^-1 u_vj | shapes turned by B_m^-1 ]: the inverse
+    rest matrices are in the constants.
 
     Args:
         features: has the poses.
@@ -39,17 +40,19 @@ def add_playback(
     # The ones are the last vector outside, right before the trust.
     count, one = len(partitions), VECTOR * features.one
     skins = [SkinBlock(deformation.rig, partition) for partition in partitions]
-    wholes = [len(skin.joints) + len(own.fit.joints) for skin, own in zip(skins, prepared, strict=True)]
-    sizes = [COLUMNS * whole + (COLUMNS - 1) * own for whole, own in zip(wholes, shapes, strict=True)]
+    turns = [int((own.fit.joints >= len(deformation.rig.joints)).sum()) for own in prepared]
+    fits = [len(own.fit.joints) for own in prepared]
+    wholes = [len(skin.joints) + fit - turn for skin, fit, turn in zip(skins, fits, turns, strict=True)]
+    partial = [turn + own for turn, own in zip(turns, shapes, strict=True)]
+    sizes = [COLUMNS * whole + (COLUMNS - 1) * own for whole, own in zip(wholes, partial, strict=True)]
     products = _products([(size, len(own.vertices)) for size, own in zip(sizes, partitions, strict=True)])
     ordered = [n for product in products for n in product]
     joints, factors, trusts, columns = [], [], [], []
     for n in ordered:
-        fitted = prepared[n].fit.joints
-        columns.append(_columns(len(joints), wholes[n], shapes[n]))
-        joints += [*skins[n].joints.tolist(), *fitted.tolist(), *[partitions[n].joint] * shapes[n]]
-        factors += [one] * wholes[n] + ((one + VECTOR + count + places[n]).tolist() if shapes[n] else [])
-        trusts += [one] * len(skins[n].joints) + [one + VECTOR + n] * (len(fitted) + shapes[n])
+        columns.append(_columns(len(joints), wholes[n], partial[n]))
+        joints += [*skins[n].joints.tolist(), *prepared[n].fit.joints.tolist(), *[partitions[n].joint] * shapes[n]]
+        factors += [one] * (wholes[n] + turns[n]) + ((one + VECTOR + count + places[n]).tolist() if shapes[n] else [])
+        trusts += [one] * len(skins[n].joints) + [one + VECTOR + n] * (fits[n] + shapes[n])
     scaled = _scaled_poses(graph, features, [outside, TRUST_OUTPUT, *coefficients], joints, factors, trusts)
     # Of each matrix the columns that are needed; a column is one piece of memory.
     rows = graph.add("Gather", [scaled, graph.integers("row_columns", np.concatenate(columns))], "rows", axis=1)
@@ -96,7 +99,7 @@ def _block_diagonal(matrices: list[np.ndarray]) -> np.ndarray:
 def _scaled_poses(
     graph: Graph, features: Features, scalars: list[str], joints: list[int], factors: list[int], trusts: list[int]
 ) -> str:
-    """(N, 4 M, 3) columns of the pose matrices of M joints, each times two of the scalars."""
+    """(N, 4 M, 3) columns of M pose matrices, or of joints' turns, each times two of the scalars."""
     joined = graph.join(scalars, "scalars", axis=1)
     chosen = [
         graph.add("Gather", [joined, graph.integers(f"row_{name}", np.array(numbers)[:, None])], f"by_{name}", axis=1)
@@ -116,14 +119,14 @@ def _in_order(matrix: np.ndarray, vertices: np.ndarray, columns: np.ndarray) -> 
     return np.where(columns >= 0, matrix[:, np.searchsorted(vertices, np.maximum(columns, vertices[0]))], 0)
 
 
-def _columns(start: int, whole: int, shapes: int) -> np.ndarray:
+def _columns(start: int, whole: int, partial: int) -> np.ndarray:
     """The columns of matrices one after the other: all of the first, and of the others each three, column by column."""
-    turned = COLUMNS * (start + whole + np.arange(shapes)) + np.arange(COLUMNS - 1)[:, None]
+    turned = COLUMNS * (start + whole + np.arange(partial)) + np.arange(COLUMNS - 1)[:, None]
     return np.append(COLUMNS * start + np.arange(COLUMNS * whole), turned.ravel())
 
 
 def _matrix(deformation: Deformation, n: int, skin: SkinBlock) -> np.ndarray:
-    """(4 Jp + 4 Jf + 3 K, Vp) float64 constant matrix of a partition."""
+    """(4 Jp + 4 Jf + 3 H + 3 K, Vp) float64 constant matrix of a partition fitted to Jf joints and to H turns."""
     inverse_rest = np.linalg.inv(deformation.rig.rest_matrices.astype(np.float64))
     partition, basis, fit = deformation.partitions[n], deformation.prepared[n].basis, deformation.prepared[n].fit
     count, own = len(partition.vertices), len(basis.shapes)
@@ -135,6 +138,7 @@ def _matrix(deformation: Deformation, n: int, skin: SkinBlock) -> np.ndarray:
         # The last bias of the network moves by the same always.
         mean = mean + deformation.networks[n].biases[-1].astype(np.float64) @ basis.shapes
     factors[np.flatnonzero(fit.joints == partition.joint), :3] += mean.reshape(count, 3).T
-    fitted = (inverse_rest[fit.joints] @ factors).reshape(-1, count)
+    fitted, whole = inverse_rest[fit.joints % len(inverse_rest)] @ factors, fit.joints < len(inverse_rest)
     turned = np.einsum("ab,kvb->akv", inverse_rest[partition.joint, :3, :3], basis.shapes.reshape(own, count, 3))
-    return np.concatenate([linear, fitted, turned.reshape(-1, count)])
+    turned = np.concatenate([fitted[~whole, :3].swapaxes(0, 1), turned], axis=1)
+    return np.concatenate([linear, fitted[whole].reshape(-1, count), turned.reshape(-1, count)])

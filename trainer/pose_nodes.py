@@ -5,7 +5,7 @@ Every three features are one vector as a frame sees it, R^-1 (d - t): the column
 them that its parent carries along, and the points of other joints as a main joint sees them. So all are one gather of
 frames, one of vectors and a product. Where no recorded bone is sheared the columns of R are orthogonal, whatever the
 scale, and R^-1 is its transpose, each row divided by its squared length: a third of the nodes of an inverse. Deltas
-(`delta_nodes`) come behind them.
+(`delta_nodes`) come behind them; turn matrices, where residuals are fitted to them, follow from what their parents see.
 """
 
 from dataclasses import dataclass
@@ -19,6 +19,7 @@ from .deformation import Deformation
 from .delta_nodes import add_deltas
 from .deltas import SMALLEST
 from .nodes import Graph
+from .turn_nodes import add_turns
 
 VECTOR = 3
 """Features are gathered by so many."""
@@ -36,8 +37,8 @@ class Features:
         own: how many of the B vectors are of controls and joints, with the zero; the others follow from these.
         size: 3 B.
         place: (F,) int64, where each feature of `Inputs` is among the 3 B; -1 where it is not needed.
-        table: (N, ·, 12), in which also the poses are, by columns of three numbers.
-        pose_rows: (J,) int64, where they are in it.
+        table: (N, ·, 12), in which also the poses are, and the turns, by columns of three numbers.
+        pose_rows: (2 J,) int64, where the poses are in it, and behind them the turns; -1 where there is none.
     """
 
     name: str
@@ -97,6 +98,7 @@ def add_features(graph: Graph, deformation: Deformation) -> Features:
     if not deformation.sheared:
         squared = graph.add("Mul", [turned, turned], "frames_squared")
         name = graph.add("Div", [name, graph.add("MatMul", [squared, sums], "lengths")], "seen_vectors")
+    table, pose_rows = _add_turns(graph, deformation, frames, name, table)
     place, before = np.full(inputs.size, -1, np.int64), []
     if count := inputs.control_count:
         # Three times, to fill vectors; only the first is looked at.
@@ -109,17 +111,17 @@ def add_features(graph: Graph, deformation: Deformation) -> Features:
     place[(FEATURES_PER_JOINT * joints[:, None] + by_column).ravel()] = np.arange(VECTOR * count, VECTOR * (own - 1))
     size = VECTOR * own + inputs.size - inputs.own_columns
     place[inputs.own_columns :] = np.arange(VECTOR * own, size)
-    pose_rows = rows * (frames.first_joint + np.arange(len(inputs.parents))) + WHOLE
     return Features(name, own, size, place, table, pose_rows)
 
 
 def _joints_needed(deformation: Deformation) -> np.ndarray:
-    """(Ju,) joints whose features some network sees, or that count for some partition's trust."""
+    """(Ju,) joints that some network sees, that count for some partition's trust, or whose turns are needed."""
     inputs = deformation.inputs
     needed = deformation.trust.counts[:, : inputs.joint_columns].any(axis=0)
     for number in range(len(deformation.partitions)):
         columns = deformation.seen_columns(number)
         needed[columns[columns < inputs.joint_columns]] = True
+    needed.reshape(-1, FEATURES_PER_JOINT)[deformation.turns()] = True
     joints = np.flatnonzero(needed.reshape(-1, FEATURES_PER_JOINT).any(axis=1))
     # Something has to be there to be looked at.
     return joints if len(joints) else np.zeros(1, np.int64)
@@ -177,6 +179,23 @@ def _vectors(deformation: Deformation, frames: _Frames) -> tuple[np.ndarray, ...
         np.concatenate([(rows * itself[:, None] + columns).ravel(), [ZERO], rows * points + COLUMNS - 1]),
         np.concatenate([origin, [ZERO], rows * references + COLUMNS - 1]),
     )
+
+
+def _add_turns(
+    graph: Graph, deformation: Deformation, frames: _Frames, vectors: str, table: str
+) -> tuple[str, np.ndarray]:
+    """Put the turn matrices that are needed behind the table; its name, and `Features.pose_rows`."""
+    joints, turned = len(deformation.rig.joints), deformation.turns()
+    rows = INVERSE + (not deformation.sheared)
+    pose_rows = np.append(rows * (frames.first_joint + np.arange(joints)) + WHOLE, np.full(joints, -1))
+    if len(turned):
+        pose_rows[joints + turned] = rows * (frames.first_joint + joints) + np.arange(len(turned))
+        carried = np.searchsorted(frames.joints, turned)[:, None]
+        against = np.append(
+            COLUMNS * carried + np.arange(3), np.full_like(carried, COLUMNS * len(frames.joints)), axis=1
+        )
+        table = add_turns(graph, vectors, against, table, COLUMNS * (rows * carried + WHOLE) + np.arange(3))
+    return table, pose_rows
 
 
 def _inverses(graph: Graph, flat: str) -> str:

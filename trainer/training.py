@@ -35,6 +35,7 @@ from .process import Cancelled
 from .sagging import without_needless_down
 from .target import Outcome, judge
 from .trust import make_trust_range
+from .turns import turns_help
 from .weights import LastWeights, initial_networks, read_weights, write_weights
 from .worst import find_worst
 
@@ -90,8 +91,12 @@ def train_model(
     deltas = last.deltas if last else find_deltas(recording, split, config.tolerance_mm, should_stop)
     if len(deltas):
         announcer.say(MessageType.LOG, text=f"The rig smooths: networks see the deltas of {len(deltas)} vertices.")
+    # Deltas say what turns would, and more.
+    turns = not len(deltas) and turns_help(recording, split.training, should_stop)
+    if turns:
+        announcer.say(MessageType.LOG, text="The rig blends rotations: residuals are fitted to turns of joints, too.")
     inputs = inputs_of_recording(recording, deltas)
-    prepared = _prepare(recording, inputs, split, config, announcer, should_stop)
+    prepared = _prepare(recording, inputs, turns, split, config, announcer, should_stop)
     seen = [columns[partition.columns] for columns, partition in zip(inputs.columns, prepared, strict=True)]
     trained = train(
         prepared,
@@ -229,6 +234,7 @@ def _shorter(config: TrainingConfig) -> TrainingConfig:
 def _prepare(
     recording: Recording,
     inputs: Inputs,
+    turns: bool,
     split: Split,
     config: TrainingConfig,
     announcer: Announcer,
@@ -239,7 +245,7 @@ def _prepare(
         _check_stop(should_stop)
 
     return prepare_together(
-        partitions_of(recording, inputs),
+        partitions_of(recording, inputs, turns),
         split,
         config.tolerance_mm,
         config.seed,

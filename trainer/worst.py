@@ -9,11 +9,11 @@ from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.refinement import nearest_distances
-from fdda_addon.core.skinning import skin_matrices
 
 from .causes import CORNERS, EVEN, POSES, SHAPES, STEEP
 from .data import PreparedPartition, Split
 from .deformation import Deformation
+from .turns import fit_matrices
 
 WORST = 5e-3
 """The largest errors are this part of those of the held-out vertices, at least one a partition."""
@@ -163,9 +163,10 @@ def _truncated(
     rows = held_out[different]
     left = np.array(recording.residuals[rows])[:, own].astype(np.float64)
     if len(prepared.fit.joints):
-        skin = skin_matrices(np.array(recording.pose_matrices[rows], np.float64), recording.rig.rest_matrices)
-        turned = np.linalg.inv(skin[:, prepared.fit.joints[0], :3, :3])
-        left -= prepared.fit.offsets(skin) @ turned.transpose(0, 2, 1)
+        turns = prepared.fit.joints.max() >= len(recording.rig.joints)
+        matrices = fit_matrices(np.array(recording.pose_matrices[rows]), recording.rig, turns)
+        turned = np.linalg.inv(matrices[:, prepared.fit.joints[0], :, :3].astype(np.float64))
+        left -= prepared.fit.offsets(matrices) @ turned.transpose(0, 2, 1)
     left -= prepared.basis.residuals(prepared.coefficients[rows]).reshape(left.shape)
     apart = np.linalg.norm(left, axis=2)[where, vertices] * recording.rig.metres_per_unit
     return min(1.0, _over(float((apart**2).sum()), float((errors[poses, vertices] ** 2).sum())))
