@@ -14,7 +14,8 @@ from .model import Network
 from .trust import TrustRange
 
 ORTHOGONAL = 1e-5
-"""Cosine of two columns of a pose matrix from which on it is sheared; float32 alone makes a tenth of it."""
+"""Cosine of two columns of a pose matrix from which on it is sheared; float32 alone makes a tenth of it. Nearly locked
+joints notice 3e-5: to take their bones for orthogonal takes trust off them."""
 BLOCK_POSES = 256
 
 

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The part of the graph that evaluates the networks, in groups of similar size, padded to the largest of the group.
+"""The part of the graph that evaluates the networks, all at once.
 
-What the networks' first layer would standardise is in its weights, as its bias is; the last layer's is in the mean
-residual.
+Networks differ in what they see and in how many shapes they have; in one product for all, each would be padded to the
+largest. So first and last layers are cut into pieces of the same size: a network has as many as it needs, and what the
+pieces of a first layer come to is summed. What the first layer would standardise is in its weights, as its bias is; the
+last layer's is in the mean residual.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,38 +15,8 @@ from .deformation import Deformation
 from .nodes import Graph
 from .pose_nodes import VECTOR, Features
 
-GROUP_FLOATS = 100_000
-"""A group of its own costs as much time as reading so many constants."""
-MAX_GROUPS = 8
-
-
-def make_groups(deformation: Deformation) -> list[list[int]]:
-    """Cut the partitions that have shapes, ordered by how many, into groups such that padding and groups cost least."""
-    shapes = deformation.shape_counts()
-    learned = [number for number, count in enumerate(shapes) if count]
-    order = sorted(learned, key=lambda n: (shapes[n], len(deformation.prepared[n].columns), n))
-    first = max((deformation.networks[n].weights[0].shape[1] for n in order), default=0)
-
-    def cost(start: int, end: int) -> float:
-        members = order[start:end]
-        most = max(shapes[n] for n in members)
-        inputs = max(len(deformation.prepared[n].columns) for n in members)
-        last = max(deformation.networks[n].weights[-1].shape[0] for n in members)
-        padded = len(members) * (inputs * first + last * most)
-        return GROUP_FLOATS + padded
-
-    # The cheapest way to cut the first `end` partitions, for every number of groups.
-    best = {(0, 0): (0.0, [])}
-    for groups in range(1, MAX_GROUPS + 1):
-        for end in range(groups, len(order) + 1):
-            ways = [
-                (best[start, groups - 1][0] + cost(start, end), [*best[start, groups - 1][1], (start, end)])
-                for start in range(groups - 1, end)
-                if (start, groups - 1) in best
-            ]
-            best[end, groups] = min(ways, key=lambda way: way[0])
-    cuts = min((way for (end, _), way in best.items() if end == len(order)), key=lambda way: way[0])[1]
-    return [order[start:end] for start, end in cuts]
+PIECE_FLOATS, CUT_FLOATS = 800, 15_000
+"""A piece costs as much time as reading so many constants, and so much more do the nodes that put pieces together."""
 
 
 def add_networks(
@@ -54,64 +28,103 @@ def add_networks(
         clamped: (N, B, 3) features.
 
     Returns:
-        For each group its coefficients without the last bias, (N, ·) in metres; and for each partition that has shapes
-        where its own are among those of all groups, one behind the other.
+        The coefficients without the last bias, (N, ·) in metres, nothing where no partition has shapes; and for each
+        partition that has, where its own are.
     """
-    outputs, places, start = [], {}, 0
-    for number, group in enumerate(make_groups(deformation)):
-        shapes = max(deformation.shape_counts()[n] for n in group)
-        outputs.append(_group(graph, features, clamped, deformation, group, f"_{number}"))
-        for place, n in enumerate(group):
-            places[n] = start + place * shapes + np.arange(deformation.shape_counts()[n])
-        start += len(group) * shapes
-    return outputs, places
+    shapes = deformation.shape_counts()
+    learned = [n for n, count in enumerate(shapes) if count]
+    if not learned:
+        return [], {}
+    networks = [deformation.networks[n] for n in learned]
+    first = [_first_layer(features, deformation, n) for n in learned]
+    hidden = [np.stack(layers) for layers in zip(*(network.weights[1:-1] for network in networks), strict=True)]
+    biases = [np.stack(layers)[:, None] for layers in zip(*(network.biases[1:-1] for network in networks), strict=True)]
+    values = _add_first_layer(graph, clamped, first)
+    values = _activation(graph, values, deformation.activation, "hidden_0")
+    for layer, (weights, bias) in enumerate(zip(hidden, biases, strict=True), 1):
+        values = graph.add("MatMul", [values, graph.floats(f"weights_{layer}", weights)], f"product_{layer}")
+        values = graph.add("Add", [values, graph.floats(f"biases_{layer}", bias)], f"layer_{layer}")
+        values = _activation(graph, values, deformation.activation, f"hidden_{layer}")
+    coefficients, places = _add_last_layer(graph, values, [network.weights[-1] for network in networks])
+    return [coefficients], dict(zip(learned, places, strict=True))
 
 
-def _group(
-    graph: Graph, features: Features, clamped: str, deformation: Deformation, group: list[int], suffix: str
-) -> str:
-    """(N, Pg K) coefficients of a group, padded."""
-    layers = [_first_layer(features, deformation, n) for n in group]
-    most = max(len(vectors) for vectors, _ in layers)
-    networks = [deformation.networks[n] for n in group]
-    seen = np.zeros((len(group), most), np.int64)
-    widths = [max(network.weights[layer].shape[1] for network in networks) for layer in range(len(networks[0].weights))]
-    sizes = [VECTOR * most, *widths]
-    weights = [np.zeros((len(group), sizes[n], sizes[n + 1])) for n in range(len(widths))]
-    biases = {layer: np.zeros((len(group), 1, width)) for layer, width in enumerate(widths[1:-1], 1)}
-    for place, (network, (vectors, weight)) in enumerate(zip(networks, layers, strict=True)):
-        seen[place, : len(vectors)] = vectors
-        for layer, own in enumerate((weight, *network.weights[1:])):
-            weights[layer][place, : own.shape[0], : own.shape[1]] = own
-        for layer in biases:
-            biases[layer][place, 0, : len(network.biases[layer])] = network.biases[layer]
-    values = graph.add("Gather", [clamped, graph.integers(f"seen_vectors{suffix}", seen)], f"seen{suffix}", axis=1)
-    values = graph.reshape(values, [0, len(group), VECTOR * most], f"seen_rows{suffix}")
-    values = graph.add("Transpose", [values], f"inputs{suffix}", perm=[1, 0, 2])
-    for layer, weight in enumerate(weights):
-        name = f"_{layer}{suffix}"
-        values = graph.add("MatMul", [values, graph.floats(f"weights{name}", weight)], f"product{name}")
-        if layer in biases:
-            values = graph.add("Add", [values, graph.floats(f"biases{name}", biases[layer])], f"layer{name}")
-        if layer < len(weights) - 1:
-            values = _activation(graph, values, deformation.activation, f"hidden{name}")
-    values = graph.add("Transpose", [values], f"coefficients{suffix}", perm=[1, 0, 2])
-    return graph.reshape(values, [0, len(group) * widths[-1]], f"coefficient_row{suffix}")
+def _piece_size(sizes: Sequence[int], width: int, joint: int) -> int:
+    """How large to make the pieces, so that a frame takes least time.
+
+    Args:
+        sizes: of the layers.
+        width: numbers for each unit of size.
+        joint: numbers that a piece takes to be put together with others.
+    """
+
+    def cost(size: int) -> int:
+        pieces = sum(-(-own // size) for own in sizes)
+        together = CUT_FLOATS + pieces * joint if pieces > len(sizes) else 0
+        return pieces * (size * width + PIECE_FLOATS) + together
+
+    return min(range(1, max(sizes) + 1), key=cost)
+
+
+def _pieces(sizes: Sequence[int], size: int) -> list[tuple[int, slice]]:
+    """The pieces of layers: whose they are, and which part."""
+    return [(n, slice(start, start + size)) for n, own in enumerate(sizes) for start in range(0, own, size)]
+
+
+def _add_first_layer(graph: Graph, clamped: str, layers: list[tuple[np.ndarray, np.ndarray]]) -> str:
+    """(L, N, H) what first layers, as `_first_layer` gives them, say of (N, B, 3) features."""
+    sizes, units = [len(vectors) for vectors, _ in layers], layers[0][1].shape[2]
+    size = _piece_size(sizes, VECTOR * units, len(layers))
+    pieces = _pieces(sizes, size)
+    seen, weights = np.zeros((len(pieces), size), np.int64), np.zeros((len(pieces), size, VECTOR, units))
+    owners = np.zeros((len(layers), len(pieces)))
+    for number, (n, part) in enumerate(pieces):
+        vectors, own = (array[part] for array in layers[n])
+        seen[number, : len(vectors)], weights[number, : len(vectors)] = vectors, own
+        owners[n, number] = 1
+    weights = graph.floats("weights_0", weights.reshape(len(pieces), -1, units))
+    values = graph.add("Gather", [clamped, graph.integers("vectors_of_pieces", seen)], "seen", axis=1)
+    values = graph.reshape(values, [0, len(pieces), VECTOR * size], "seen_rows")
+    values = graph.add("Transpose", [values], "inputs", perm=[1, 0, 2])
+    values = graph.add("MatMul", [values, weights], "layer_0")
+    if len(pieces) > len(layers):
+        values = graph.reshape(values, [len(pieces), -1], "layer_pieces")
+        values = graph.add("MatMul", [graph.floats("owners", owners), values], "layer_sums")
+        values = graph.reshape(values, [len(layers), -1, units], "summed_layer")
+    return values
+
+
+def _add_last_layer(graph: Graph, values: str, layers: list[np.ndarray]) -> tuple[str, list[np.ndarray]]:
+    """(L, N, H) values of hidden units to (N, ·) coefficients, and where those of each network are."""
+    sizes, units = [weights.shape[1] for weights in layers], len(layers[0])
+    size = _piece_size(sizes, units, units)
+    pieces = _pieces(sizes, size)
+    weights, places = np.zeros((len(pieces), units, size)), [[] for _ in layers]
+    for number, (n, part) in enumerate(pieces):
+        own = layers[n][:, part]
+        weights[number, :, : own.shape[1]] = own
+        places[n] += (number * size + np.arange(own.shape[1])).tolist()
+    if len(pieces) > len(layers):
+        owners = graph.integers("piece_owners", [n for n, _ in pieces])
+        values = graph.add("Gather", [values, owners], "hidden_of_pieces", axis=0)
+    values = graph.add("MatMul", [values, graph.floats("last_weights", weights)], "coefficients_by_piece")
+    values = graph.add("Transpose", [values], "coefficients", perm=[1, 0, 2])
+    return graph.reshape(values, [0, len(pieces) * size], "coefficient_row"), [np.array(own) for own in places]
 
 
 def _first_layer(features: Features, deformation: Deformation, n: int) -> tuple[np.ndarray, np.ndarray]:
     """The vectors that a network sees, and its first layer for these as they are, not standardised.
 
     Returns:
-        (Bn,) int64 vectors, the last of them ones; (3 Bn, H) float64 weights, in which the bias is that of a one.
+        (Bn,) int64 vectors, the last of them ones; (Bn, 3, H) float64 weights, in which the bias is that of a one.
     """
     prepared, network = deformation.prepared[n], deformation.networks[n]
     place = features.place[deformation.seen_columns(n)]
     vectors, which = np.unique(place // VECTOR, return_inverse=True)
     scaled = network.weights[0].astype(np.float64) / prepared.feature_scale[:, None]
-    weight = np.zeros((VECTOR * (len(vectors) + 1), scaled.shape[1]))
-    weight[VECTOR * which + place % VECTOR] = scaled
-    weight[-1] = network.biases[0] - prepared.feature_mean.astype(np.float64) @ scaled
+    weight = np.zeros((len(vectors) + 1, VECTOR, scaled.shape[1]))
+    weight[which, place % VECTOR] = scaled
+    weight[-1, -1] = network.biases[0] - prepared.feature_mean.astype(np.float64) @ scaled
     return np.append(vectors, features.one), weight
 
 

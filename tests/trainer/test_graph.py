@@ -15,7 +15,7 @@ from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.skinning import LinearLayer
 from fdda_addon.runtime.network import Network
-from trainer import playback_nodes
+from trainer import network_nodes, playback_nodes
 from trainer.__main__ import main
 from trainer.deformation import Deformation, is_sheared
 from trainer.export import open_session, reference_positions
@@ -108,6 +108,10 @@ def test_shear_is_found_and_scale_is_none(recording):
     assert not is_sheared(poses @ np.diag([3, 0.2, 1, 1]).astype(np.float32))
     poses[299, 1] = poses[299, 1] @ SHEAR.astype(np.float32)
     assert is_sheared(poses)
+    # As little as a control rig makes of a bone that stretches.
+    little = np.eye(4)
+    little[0, 1] = 3e-5
+    assert is_sheared((pose_chain(chain_rig(), chain_angles(20, 3, 0)) @ little).astype(np.float32))
 
 
 def test_a_recording_with_sheared_bones_plays_them(tmp_path, monkeypatch):
@@ -151,6 +155,24 @@ def test_only_small_partitions_share_a_product():
     assert playback_nodes._products([large, small, small, large, small]) == [[1, 2, 4], [0], [3]]
     # With every one that joins, more zeros stand beside it.
     assert [len(product) for product in playback_nodes._products([small] * 12)] == [4, 4, 4]
+
+
+@pytest.mark.parametrize("piece, cut", [(0, 0), (100, 0), (0, 10**9)])
+def test_networks_in_pieces_say_the_same(deformation, monkeypatch, piece, cut):
+    """Pieces of one input and one shape, some of several, and one for each network."""
+    poses = pose_chain(deformation.rig, chain_angles(5, 3, 3))
+    expected, _ = played(deformation, poses)
+    monkeypatch.setattr(network_nodes, "PIECE_FLOATS", piece)
+    monkeypatch.setattr(network_nodes, "CUT_FLOATS", cut)
+    np.testing.assert_allclose(played(deformation, poses)[0], expected, atol=2e-6)
+    assert ("layer_sums" in {node.name for node in build_graph(deformation).graph.node}) == (cut == 0)
+
+
+def test_pieces_are_as_large_as_costs_least():
+    # One network sees a hundred times as much as nine others: not all are padded to it.
+    assert 30 <= network_nodes._piece_size([3000, *[30] * 9], 192, 10) <= 60
+    assert network_nodes._piece_size([30, 29, 28, 30], 192, 4) == 30
+    assert network_nodes._pieces([5, 2], 2) == [(0, slice(0, 2)), (0, slice(2, 4)), (0, slice(4, 6)), (1, slice(0, 2))]
 
 
 def constant_bytes(model: onnx.ModelProto) -> int:
