@@ -23,7 +23,7 @@ LEAST_DIVISOR = 1.0
 MOST_POSES, MOST_VERTICES = 800, 64
 """So many of the training poses, and so many vertices of each partition, say whether turn matrices help."""
 HELPFUL = 0.7
-"""They help when the fit leaves at most this part of the squared residuals that it leaves without them."""
+"""They help when the fit leaves less than this part of the squared residuals that it leaves without them."""
 
 
 def turn_matrices(pose_matrices: np.ndarray, rig: Rig) -> np.ndarray:
@@ -92,4 +92,4 @@ def turns_help(recording: Recording, training: np.ndarray, should_stop: Callable
         for number, matrices in enumerate((without, with_turns)):
             _, rest = surroundings_of_rig(rig, partition, matrices).fit(residuals, fitted)
             left[number] += len(partition.vertices) * float((rest[measured].astype(np.float64) ** 2).mean())
-    return bool(left[1] <= HELPFUL * left[0])
+    return bool(left[1] < HELPFUL * left[0])
