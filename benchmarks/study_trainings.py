@@ -99,7 +99,7 @@ def train_once(material: Material, config: TrainingConfig, model_path: Path) -> 
     deltas = find_deltas(material.whole, split, config.tolerance_mm)
     own = np.isin(deltas.seen_from, [partition.joint for partition in recording.partitions])
     inputs = material.inputs.with_deltas(deltas.chosen(own), recording.partitions)
-    data = partitions_of(recording, inputs)
+    data = partitions_of(recording, recording.partitions, inputs)
     prepared = [prepare(partition, split, config.tolerance_mm, config.seed) for partition in data]
     trained = train(prepared, split, config, torch.device("cpu"))
     seconds = {"processor": time.process_time() - processor, "wall": time.perf_counter() - wall}

@@ -8,9 +8,11 @@ import numpy as np
 
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.features import rounding
+from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.index import RANDOM, REFINED, Source
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Fingerprint
+from fdda_addon.core.skinning import skin_matrices
 
 from .basis import FINER, Basis, make_basis, share_shapes
 from .config import TrainingConfig
@@ -223,7 +225,35 @@ def held_back_digest(recording: Recording, split: Split) -> str:
     )
 
 
-def partitions_of(recording: Recording, inputs: Inputs, turns: bool = False) -> list[PartitionData]:
+def residuals_of(recording: Recording, partition: Partition, poses: np.ndarray | None = None) -> np.ndarray:
+    """Local residuals of the vertices of a partition, whichever main joints they have, as its own main joint sees them.
+
+    Args:
+        recording: of the rig.
+        partition: of the recording, or one with vertices of others.
+        poses: (n,) indices, all when left out.
+
+    Returns:
+        (n, Vp, 3) float32, mesh units.
+    """
+    vertices, rest_matrices = partition.vertices, recording.rig.rest_matrices
+    rows = slice(None) if poses is None else poses
+    residuals = recording.residuals[:, vertices] if poses is None else recording.residuals[np.ix_(poses, vertices)]
+    main = np.empty(recording.rig.vertex_count, np.int64)
+    for own in recording.partitions:
+        main[own.vertices] = own.joint
+    for joint in np.setdiff1d(main[vertices], partition.joint).tolist():
+        pair = [partition.joint, joint]
+        skin = skin_matrices(recording.pose_matrices[rows][:, pair], rest_matrices[pair])[:, :, :3, :3]
+        seen = np.linalg.inv(skin[:, 0].astype(np.float64)) @ skin[:, 1]
+        theirs = main[vertices] == joint
+        residuals[:, theirs] = residuals[:, theirs] @ seen.astype(np.float32).transpose(0, 2, 1)
+    return residuals
+
+
+def partitions_of(
+    recording: Recording, partitions: Sequence[Partition], inputs: Inputs, turns: bool = False
+) -> list[PartitionData]:
     """The partitions of a recording, their features as `inputs` chose them, fitted to turn matrices or not."""
     rig = recording.rig
     features = inputs.features(recording.pose_matrices, rig.rest_matrices, recording.controls)
@@ -234,12 +264,12 @@ def partitions_of(recording: Recording, inputs: Inputs, turns: bool = False) -> 
         PartitionData(
             rig.joints[partition.joint].name,
             features[:, inputs.columns[number]],
-            lambda vertices=partition.vertices: recording.residuals[:, vertices],
+            lambda partition=partition: residuals_of(recording, partition),
             len(partition.vertices),
             lambda partition=partition: surroundings_of_rig(rig, partition, matrices),
             least[inputs.columns[number]],
         )
-        for number, partition in enumerate(recording.partitions)
+        for number, partition in enumerate(partitions)
     ]
 
 

@@ -19,7 +19,7 @@ from fdda_addon.core.surface import corners_beside
 
 from .data import Split
 from .deltas import MOST_PARTS, NO_DELTAS, Deltas
-from .joint_fit import surroundings_of_rig
+from .joint_fit import RANK, surroundings_of_rig
 from .process import Cancelled
 
 MOST_POSES = 400
@@ -28,8 +28,6 @@ MOST_PER_PARTITION, MEAN_PER_PARTITION = 8, 3
 COMMON_CORNERS, MOST_CORNERS = 0.75, 16
 """A vertex with more corners than this part of the vertices have, or than so many, is no candidate: all that are chosen
 are padded to the one with most."""
-EQUATIONS = 4
-"""Poses give at least so many equations for each number of the joints around a partition: with few all is explained."""
 ITERATIONS = (2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 56, 64)
 FACTOR = 0.5
 """Of each iteration: one of twice the factor smooths about as much as two."""
@@ -47,8 +45,6 @@ SMALLEST_EXTENT = 1e-18
 RIDGE = 0.03
 """Tangents and normals, and sums of them, that turn by fewer radians against the joints fit next to nothing: it would
 take lengths with which their rounding counts."""
-RANK = 1e-5
-"""Directions that are smaller than this part of the largest are none."""
 
 
 @dataclass(frozen=True)
@@ -124,9 +120,9 @@ def find_deltas(
     for number, partition in enumerate(recording.partitions):
         if should_stop():
             raise Cancelled
-        rows = surroundings_of_rig(rig, partition, skin).rows
-        if EQUATIONS * rows.shape[2] <= 3 * len(rows):
-            own = _directions(rows)
+        surroundings = surroundings_of_rig(rig, partition, skin)
+        if surroundings.are_determined():
+            own = surroundings.directions()
             vertices = partition.vertices[usable[partition.vertices]]
             residuals = np.asarray(recording.residuals[np.ix_(training, vertices)], np.float32)
             candidates += _candidates(residuals, own, vertices, number, partition.joint, least)
@@ -150,14 +146,6 @@ def _corners(rig: Rig) -> _Corners:
     starts = np.searchsorted(rig.face_vertices[order], np.arange(rig.vertex_count + 1))
     beside = corners_beside(rig.face_starts, rig.face_vertices)
     return _Corners(starts, *(rig.face_vertices[corners[order]] for corners in beside))
-
-
-def _directions(rows: np.ndarray) -> np.ndarray:
-    """(n, 3, 4 Jf) rows to an orthonormal basis (3 n, r) of what they span."""
-    flat = rows.reshape(-1, rows.shape[2])
-    flat = flat / np.maximum(np.linalg.norm(flat, axis=0), np.finfo(np.float64).tiny)
-    left, sizes, _ = np.linalg.svd(flat, full_matrices=False)
-    return left[:, sizes > RANK * sizes[0]]
 
 
 def _without(directions: np.ndarray, values: np.ndarray) -> np.ndarray:

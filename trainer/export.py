@@ -114,7 +114,7 @@ def measure(
     """Errors of the exported model on poses of the recording, through the whole pipeline."""
     vertices = recording.rig.vertex_count
     fdda, linear = (np.empty((len(poses), vertices), np.float32) for _ in range(2))
-    layer = LinearLayer(recording.rig, deformation.partitions)
+    layer = LinearLayer(recording.rig, recording.partitions)
     for block in _blocks(len(poses), vertices):
         inputs = _inputs(recording, poses[block])
         matrices = inputs[POSE_INPUT]
@@ -132,7 +132,7 @@ def measure_surface(
     rig, rows = recording.rig, []
     if not len(rig.face_starts):
         return surface_json(None, None)
-    layer = LinearLayer(rig, deformation.partitions)
+    layer = LinearLayer(rig, recording.partitions)
     comparison = SurfaceComparison(
         Surface(rig.face_starts, rig.face_vertices), rig.rest_positions, deformation.partitions
     )
@@ -187,14 +187,18 @@ def model_info(recording: Recording, deformation: Deformation, held_out: np.ndar
         training: settings, versions and times.
     """
     rig, low, high = recording.rig, deformation.trust.low, deformation.trust.high
+    partitions = zip(deformation.partitions, recording.partitions, deformation.shape_counts(), strict=True)
     return ModelInfo(
         rig.joints,
         rig.rest_matrices,
         rig.vertex_count,
         rig.fingerprint,
         tuple(
-            ModelPartition(p.joint, p.influencing, len(p.vertices), len(prepared.basis.shapes), p.controls, p.merged)
-            for p, prepared in zip(deformation.partitions, deformation.prepared, strict=True)
+            ModelPartition(
+                *(p.joint, p.influencing, len(p.vertices), shapes, p.controls, p.merged),
+                tuple(np.setdiff1d(p.vertices, recorded.vertices).tolist()),
+            )
+            for p, recorded, shapes in partitions
         ),
         *(bound[: deformation.inputs.joint_columns].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
         deformation.trust.controls,

@@ -14,7 +14,6 @@ import numpy as np
 
 from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
 from fdda_addon.core.partition import Partition
-from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import UNMOVED, Rig
 
 from .deltas import FEATURES_PER_DELTA, NO_DELTAS, Deltas
@@ -114,9 +113,8 @@ def inputs_of_rig(rig: Rig, points: np.ndarray, partitions: Sequence[Partition])
     return make_inputs(rig.parents, points, partitions, len(rig.controls), unmoved_joints(rig))
 
 
-def inputs_of_recording(recording: Recording, deltas: Deltas) -> Inputs:
-    """Choose what the networks of a recording see, some deltas among it."""
-    rig, partitions = recording.rig, recording.partitions
+def inputs_with_deltas(rig: Rig, partitions: Sequence[Partition], deltas: Deltas) -> Inputs:
+    """Choose what the networks of a rig see, the middles of its partitions and some deltas among it."""
     return inputs_of_rig(rig, middles(rig, partitions), partitions).with_deltas(deltas, partitions)
 
 

@@ -20,6 +20,10 @@ RIDGE = 1e-6
 """Added to the mean squares of the rows: joints that move alike share the fit, and no factor grows large."""
 MAX_PRUNING_LOSS = 0.01
 """Joints are left out, the least useful first, while the error grows by no larger part than this over that of all."""
+EQUATIONS = 4
+"""Poses give at least so many equations for each number of the joints around a partition: with few all is explained."""
+RANK = 1e-5
+"""Directions that are smaller than this part of the largest are none."""
 BLOCK_FLOATS = 1 << 22
 """Residuals are fitted in blocks of so many coordinates."""
 
@@ -66,6 +70,18 @@ class Surroundings:
     def alone(self) -> "Surroundings":
         """The main joint alone, seen from which nothing moves."""
         return Surroundings(self.joints[:1], self.centre, self.rows[:, :, :4], self.metres_per_unit)
+
+    def are_determined(self) -> bool:
+        """Whether there are poses enough for a fit to say something of others."""
+        poses, _, width = self.rows.shape
+        return EQUATIONS * width <= 3 * poses
+
+    def directions(self) -> np.ndarray:
+        """(3 N, r) float64, an orthonormal basis of what the joints explain of the local residuals of a vertex."""
+        flat = self.rows.reshape(-1, self.rows.shape[2])
+        flat = flat / np.maximum(np.linalg.norm(flat, axis=0), np.finfo(np.float64).tiny)
+        left, sizes, _ = np.linalg.svd(flat, full_matrices=False)
+        return left[:, sizes > RANK * sizes[0]]
 
     def fit(self, residuals: np.ndarray, training: np.ndarray) -> tuple[JointFit, np.ndarray]:
         """Fit local residuals.

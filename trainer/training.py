@@ -15,6 +15,7 @@ from fdda_addon.core.checks.warning import RecordingWarning, refuse
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.output import replacing_all
+from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.estimate import sizes_in_words
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.report import report_text, weights_path
@@ -22,12 +23,13 @@ from fdda_addon.core.rig import UNMOVED_LABEL
 
 from . import report
 from .announcements import Announcer
+from .borders import better_borders, partition_of
 from .config import TrainingConfig
 from .data import PreparedPartition, Split, held_back_digest, partitions_of, prepare_together, split_recording
 from .deformation import Deformation, is_sheared
 from .delta_fit import find_deltas
 from .export import build_model, measure, measure_surface, write_model
-from .inputs import Inputs, inputs_of_recording
+from .inputs import Inputs, inputs_with_deltas
 from .loop import Trained, choose_device, train
 from .outputs import check_training_outputs, training_outputs
 from .page import render_html
@@ -95,8 +97,14 @@ def train_model(
     turns = not len(deltas) and turns_help(recording, split.training, should_stop)
     if turns:
         announcer.say(MessageType.LOG, text="The rig blends rotations: residuals are fitted to turns of joints, too.")
-    inputs = inputs_of_recording(recording, deltas)
-    prepared = _prepare(recording, inputs, turns, split, config, announcer, should_stop)
+    if last:
+        partitions = last.cut(recording.partitions)
+    else:
+        partitions = better_borders(recording, split, turns, config.tolerance_mm, config.hidden[-1], should_stop)
+    if moved := int((partition_of(partitions) != partition_of(recording.partitions)).sum()):
+        announcer.say(MessageType.LOG, text=f"Borders moved: {moved} vertices count to the partition beside their own.")
+    inputs = inputs_with_deltas(recording.rig, partitions, deltas)
+    prepared = _prepare(recording, partitions, inputs, turns, split, config, announcer, should_stop)
     seen = [columns[partition.columns] for columns, partition in zip(inputs.columns, prepared, strict=True)]
     trained = train(
         prepared,
@@ -113,7 +121,7 @@ def train_model(
         should_stop,
         initial_networks(last, prepared, seen) if last else None,
     )
-    deformation = _deformation(recording, inputs, split, prepared, trained, config)
+    deformation = _deformation(recording, partitions, inputs, split, prepared, trained, config)
     _check_stop(should_stop)
     settings = {
         **config.to_json(),
@@ -233,6 +241,7 @@ def _shorter(config: TrainingConfig) -> TrainingConfig:
 
 def _prepare(
     recording: Recording,
+    partitions: tuple[Partition, ...],
     inputs: Inputs,
     turns: bool,
     split: Split,
@@ -245,7 +254,7 @@ def _prepare(
         _check_stop(should_stop)
 
     return prepare_together(
-        partitions_of(recording, inputs, turns),
+        partitions_of(recording, partitions, inputs, turns),
         split,
         config.tolerance_mm,
         config.seed,
@@ -257,6 +266,7 @@ def _prepare(
 
 def _deformation(
     recording: Recording,
+    partitions: tuple[Partition, ...],
     inputs: Inputs,
     split: Split,
     prepared: list[PreparedPartition],
@@ -268,11 +278,11 @@ def _deformation(
     features = inputs.features(matrices, rig.rest_matrices, controls)
     return Deformation(
         rig,
-        recording.partitions,
+        partitions,
         inputs,
         tuple(prepared),
         trained.networks,
-        make_trust_range(features, rig, recording.partitions),
+        make_trust_range(features, rig, partitions),
         config.activation,
         is_sheared(recording.pose_matrices),
     )

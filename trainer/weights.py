@@ -17,20 +17,23 @@ import numpy as np
 
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.input_file import open_input
+from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.arrays import HEADER_ERRORS, LARGEST
 from fdda_addon.core.rig import Fingerprint
 
+from .borders import partition_of, recut
 from .data import PreparedPartition
 from .deformation import Deformation
 from .deltas import NO_DELTAS, Deltas
 from .model import Network
 
-VERSION, WITHOUT_DELTAS = 4, 2
+VERSION, WITHOUT_BORDERS, WITHOUT_DELTAS = 5, 4, 2
 DAMAGE = (
     *(OSError, ValueError, KeyError, AttributeError, OverflowError, EOFError, zipfile.BadZipFile, zlib.error),
     *(RuntimeError, IndexError, *HEADER_ERRORS),
 )
 """What numpy and zipfile raise for a damaged file: a RuntimeError where it asks for a password."""
+OTHER_PARTITIONS = "The last weights are of other partitions; train without --warm-start."
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,8 @@ class LastWeights:
         history: held-out errors of this training and those before it, oldest first: `{"poses", "p999"}`, in mm.
         partitions: in the order of the recording.
         deltas: that the networks saw.
+        partition_of: (V,) int64, the number of each vertex's partition; None in files of before these could differ from
+            the recording's.
     """
 
     fingerprint: Fingerprint
@@ -74,6 +79,20 @@ class LastWeights:
     history: tuple[dict, ...]
     partitions: tuple[LastPartition, ...]
     deltas: Deltas = NO_DELTAS
+    partition_of: np.ndarray | None = None
+
+    def cut(self, partitions: tuple[Partition, ...]) -> tuple[Partition, ...]:
+        """The partitions of a recording as they were cut.
+
+        Raises:
+            TrainingError: they are not those of the last training.
+        """
+        if self.partition_of is None:
+            return partitions
+        vertices = sum(len(partition.vertices) for partition in partitions)
+        if (len(self.partitions), len(self.partition_of)) != (len(partitions), vertices):
+            raise TrainingError(OTHER_PARTITIONS)
+        return recut(partitions, self.partition_of)
 
 
 def write_weights(
@@ -95,6 +114,7 @@ def write_weights(
     }
     arrays = {"about": np.frombuffer(json.dumps(about).encode(), np.uint8)}
     arrays |= {f"deltas/{name}": array for name, array in vars(deformation.inputs.deltas).items()}
+    arrays["partition_of"] = partition_of(deformation.partitions)
     for number, (prepared, network) in enumerate(zip(deformation.prepared, deformation.networks, strict=True)):
         own = {
             "columns": deformation.seen_columns(number),
@@ -138,7 +158,7 @@ def read_weights(path: Path) -> LastWeights:
 
 def _read(arrays: np.lib.npyio.NpzFile) -> LastWeights:
     about = json.loads(arrays["about"].tobytes())
-    if about["version"] not in (VERSION, WITHOUT_DELTAS):
+    if about["version"] not in (VERSION, WITHOUT_BORDERS, WITHOUT_DELTAS):
         raise ValueError(f"version {about['version']!r}")
     hidden = tuple(int(units) for units in about["hidden"])
     partitions = []
@@ -160,7 +180,17 @@ def _read(arrays: np.lib.npyio.NpzFile) -> LastWeights:
         history,
         tuple(partitions),
         NO_DELTAS if about["version"] == WITHOUT_DELTAS else _read_deltas(arrays),
+        _read_cut(arrays["partition_of"], partitions) if about["version"] == VERSION else None,
     )
+
+
+def _read_cut(partition_of: np.ndarray, partitions: list[LastPartition]) -> np.ndarray:
+    if partition_of.dtype != np.int64 or partition_of.ndim != 1 or partition_of.min(initial=0) < 0:
+        raise ValueError("its arrays contradict each other")
+    sizes = [len(partition.basis_mean) for partition in partitions]
+    if (3 * np.bincount(partition_of, minlength=len(sizes))).tolist() != sizes:
+        raise ValueError("its arrays contradict each other")
+    return partition_of
 
 
 def _read_deltas(arrays: np.lib.npyio.NpzFile) -> Deltas:
@@ -220,7 +250,7 @@ def initial_networks(
     """
     sizes = [3 * partition.vertices for partition in prepared]
     if sizes != [len(partition.basis_mean) for partition in last.partitions]:
-        raise TrainingError("The last weights are of other partitions; train without --warm-start.")
+        raise TrainingError(OTHER_PARTITIONS)
     return [_carried_over(*each) for each in zip(last.partitions, prepared, columns, strict=True)]
 
 

@@ -11,7 +11,7 @@ from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.refinement import nearest_distances
 
 from .causes import CORNERS, EVEN, POSES, SHAPES, STEEP
-from .data import PreparedPartition, Split
+from .data import PreparedPartition, Split, residuals_of
 from .deformation import Deformation
 from .turns import fit_matrices
 
@@ -90,7 +90,7 @@ def find_worst(
         near = nearest_distances(values, recorded) if values.shape[1] else np.zeros(len(values))
         distance = _over(float(near[poses].mean()), float(np.median(near)))
         name, extreme = _furthest(recording, partition, values, recorded, poses)
-        shapes = _truncated(recording, prepared, own, split.held_out, poses, vertices, errors)
+        shapes = _truncated(recording, partition, prepared, split.held_out, poses, vertices, errors)
         ratio = _over(*(float(np.percentile(e, 99.9)) for e in (errors, on_training[:, own])))
         border = None
         if beside is not None and beside[own].any():
@@ -151,8 +151,8 @@ def _furthest(
 
 def _truncated(
     recording: Recording,
+    partition: Partition,
     prepared: PreparedPartition,
-    own: np.ndarray,
     held_out: np.ndarray,
     poses: np.ndarray,
     vertices: np.ndarray,
@@ -161,7 +161,7 @@ def _truncated(
     """The part of the squared errors that the shapes do not reach."""
     different, where = np.unique(poses, return_inverse=True)
     rows = held_out[different]
-    left = np.array(recording.residuals[rows])[:, own].astype(np.float64)
+    left = residuals_of(recording, partition, rows).astype(np.float64)
     if len(prepared.fit.joints):
         turns = prepared.fit.joints.max() >= len(recording.rig.joints)
         matrices = fit_matrices(np.array(recording.pose_matrices[rows]), recording.rig, turns)

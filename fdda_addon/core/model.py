@@ -38,7 +38,8 @@ CHECKSUM_KEY = "fdda_checksum"
 
 @dataclass(frozen=True)
 class ModelPartition:
-    """What a model says of one partition: as `Partition`, but of its vertices only how many; number of basis shapes."""
+    """What a model says of one partition: as `Partition`, but of its vertices only how many, and which are `taken`, of
+    other main joints; number of basis shapes."""
 
     joint: int
     influencing: tuple[int, ...]
@@ -46,10 +47,11 @@ class ModelPartition:
     basis: int
     controls: tuple[int, ...] = ()
     merged: tuple[int, ...] = ()
+    taken: tuple[int, ...] = ()
 
     def to_json(self) -> dict:
         value = asdict(self)
-        return {key: value[key] for key in value if value[key] or key not in ("controls", "merged")}
+        return {key: value[key] for key in value if value[key] or key not in ("controls", "merged", "taken")}
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,7 @@ class ModelInfo:
             {p.joint: p.influencing for p in self.partitions},
             {p.joint: p.controls for p in self.partitions},
             {joint: p.joint for p in self.partitions for joint in p.merged},
+            {p.joint: p.taken for p in self.partitions},
         )
 
     def explained(self) -> Explained:
@@ -166,7 +169,7 @@ def _read_info(value: dict) -> ModelInfo:
     partitions = tuple(
         ModelPartition(
             *(int(p["joint"]), tuple(map(int, p["influencing"])), int(p["vertices"]), int(p["basis"])),
-            *(tuple(map(int, p.get(key, ()))) for key in ("controls", "merged")),
+            *(tuple(map(int, p.get(key, ()))) for key in ("controls", "merged", "taken")),
         )
         for p in value["partitions"]
     )
@@ -178,6 +181,9 @@ def _read_info(value: dict) -> ModelInfo:
         raise ValueError("a partition names a control that is none of its controls")
     if not partitions or not all(p.vertices > 0 and p.basis >= 0 for p in partitions):
         raise ValueError("it has no partitions, or one without vertices")
+    taken = [vertex for p in partitions for vertex in p.taken]
+    if len(set(taken)) < len(taken) or not all(0 <= vertex < int(value["vertices"]) for vertex in taken):
+        raise ValueError("a partition has taken a vertex that is none of its vertices, or another's")
     if sum(p.vertices for p in partitions) != int(value["vertices"]):
         raise ValueError("the partitions do not add up to the vertices")
     rest_matrices = np.array(value["rest_matrices"], np.float32).reshape(count, 4, 4)

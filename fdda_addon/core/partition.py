@@ -2,6 +2,7 @@
 """Partitions: the vertices that share a main joint, and the joints that move their residuals."""
 
 import colorsys
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +52,7 @@ def make_partitions(
     influencing: dict[int, tuple[int, ...]] | None = None,
     controls: dict[int, tuple[int, ...]] | None = None,
     merged: dict[int, int] | None = None,
+    taken: dict[int, Sequence[int]] | None = None,
 ) -> tuple[Partition, ...]:
     """Cut the mesh by main joint, in ascending order of the joints.
 
@@ -59,20 +61,23 @@ def make_partitions(
         influencing: influencing joints by main joint; none for all partitions when left out.
         controls: influencing controls by main joint; none for all partitions when left out.
         merged: main joints whose vertices count to the partition of another, and that other one.
+        taken: by main joint the vertices of other partitions that count to its own.
     """
     main = main_joints(rig.skin_joints, rig.skin_weights)
     influencing, controls, merged = influencing or {}, controls or {}, merged or {}
-    taken: dict[int, list[int]] = {}
+    gone: dict[int, list[int]] = {}
     for joint, other in sorted(merged.items()):
         main[main == joint] = other
-        taken.setdefault(other, []).append(joint)
+        gone.setdefault(other, []).append(joint)
+    for joint, vertices in (taken or {}).items():
+        main[list(vertices)] = joint
     return tuple(
         Partition(
             joint,
             tuple(influencing.get(joint, ())),
             np.flatnonzero(main == joint).astype(np.int32),
             tuple(controls.get(joint, ())),
-            tuple(taken.get(joint, ())),
+            tuple(gone.get(joint, ())),
         )
         for joint in np.unique(main).tolist()
     )

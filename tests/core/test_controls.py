@@ -74,7 +74,10 @@ def test_controls_that_are_missing_or_no_numbers_are_refused(controlled):
 def test_a_model_says_its_controls():
     info = tiny_info(
         controls=(SMILE, FIST),
-        partitions=(ModelPartition(0, (), 1, 0), ModelPartition(2, (1,), 3, 17, controls=(0, 1), merged=(1,))),
+        partitions=(
+            ModelPartition(0, (), 1, 0),
+            ModelPartition(2, (1,), 3, 17, controls=(0, 1), merged=(1,), taken=(0, 2)),
+        ),
     )
     again = ModelInfo.from_json(info.to_json())
     assert (again.controls, again.partitions) == (info.controls, info.partitions)

@@ -146,14 +146,21 @@ def test_metadata_that_is_none(tmp_path, text):
     refused(save(tmp_path, tiny_model(text)), "cannot be used: its metadata ")
 
 
+PARTITION = {"joint": 0, "influencing": [], "vertices": 4, "basis": 1}
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
         ({"joints": [{"name": "a", "parent": 0}]}, "a joint stands before its parent"),
         ({"joints": [{"name": "a", "parent": -2}]}, "a joint stands before its parent"),
-        ({"partitions": [{"joint": 3, "influencing": [], "vertices": 4, "basis": 1}]}, "none of its joints"),
-        ({"partitions": [{"joint": 0, "influencing": [9], "vertices": 4, "basis": 1}]}, "none of its joints"),
+        ({"partitions": [{**PARTITION, "joint": 3}]}, "none of its joints"),
+        ({"partitions": [{**PARTITION, "influencing": [9]}]}, "none of its joints"),
         ({"vertices": 5}, "the partitions do not add up to the vertices"),
+        ({"partitions": [{**PARTITION, "taken": [4]}]}, "a vertex that is none of its vertices, or another's"),
+        ({"partitions": [{**PARTITION, "taken": [-1]}]}, "a vertex that is none of its vertices, or another's"),
+        ({"partitions": [{**PARTITION, "taken": [1, 1]}]}, "a vertex that is none of its vertices, or another's"),
+        ({"partitions": [{**PARTITION, "taken": 1}]}, "its metadata cannot be read"),
         ({"rest_matrices": [[float("nan")] * 16] * 3}, "its rest pose holds values that are not numbers"),
         ({"rest_matrices": [[0.0] * 16] * 2}, "cannot reshape"),
     ],

@@ -31,6 +31,16 @@ def test_influencing_joints_may_be_left_out():
     assert all(p.influencing == () for p in make_partitions(make_rig()))
 
 
+def test_a_partition_may_have_taken_vertices():
+    rig = make_rig()
+    first, second, *others = partitions_of(rig)
+    taken = second.vertices[:2].tolist()
+    cut = make_partitions(rig, INFLUENCING, taken={first.joint: taken})
+    assert cut[0].vertices.tolist() == sorted([*first.vertices.tolist(), *taken])
+    assert cut[1].vertices.tolist() == second.vertices[2:].tolist()
+    assert [p.vertices.tolist() for p in cut[2:]] == [p.vertices.tolist() for p in others]
+
+
 def test_residual_changes_are_the_largest_distance_in_each_partition():
     partitions = partitions_of(make_rig())
     base = np.random.default_rng(0).normal(size=(2, VERTICES, 3)).astype(np.float32)

@@ -17,7 +17,7 @@ from trainer.config import TrainingConfig
 from trainer.data import split_recording
 from trainer.delta_fit import LEAST_EXPLAINED, find_deltas
 from trainer.deltas import NO_DELTAS, Deltas
-from trainer.inputs import inputs_of_recording
+from trainer.inputs import inputs_with_deltas
 from trainer.process import Cancelled
 from trainer.weights import read_weights
 
@@ -178,7 +178,7 @@ def test_weights_of_before_have_none(trained, tmp_path):
     with np.load(weights_path(trained)) as arrays:
         kept = {name: array for name, array in arrays.items() if not name.startswith("deltas/")}
     about = json.loads(kept["about"].tobytes())
-    assert about["version"] == 4
+    assert about["version"] == 5
     kept["about"] = np.frombuffer(json.dumps({**about, "version": 2}).encode(), np.uint8)
     with open(tmp_path / "old.npz", "wb") as file:
         np.savez(file, **kept)
@@ -189,7 +189,7 @@ def test_a_training_goes_on_with_the_same(recording, deltas, trained, capsys):
     last = read_weights(weights_path(trained)).deltas
     for name, array in vars(deltas).items():
         assert np.array_equal(getattr(last, name), array), name
-    offered = inputs_of_recording(recording, last).columns
+    offered = inputs_with_deltas(recording.rig, recording.partitions, last).columns
     assert [len(own) % 3 for own in offered] == [0] * JOINTS
     assert main([str(recording.path), str(trained), *QUICK, "--warm-start"]) == 0
     assert f"The rig smooths: networks see the deltas of {len(deltas)} vertices." in capsys.readouterr().out

@@ -72,7 +72,7 @@ def prepared(recording) -> list:
     config = TrainingConfig(seed=0)
     rig, split = recording.rig, split_recording(recording, config)
     inputs = inputs_of_rig(rig, middles(rig, recording.partitions), recording.partitions)
-    partitions = partitions_of(recording, inputs)
+    partitions = partitions_of(recording, recording.partitions, inputs)
     return [prepare(p, split, config.tolerance_mm, config.seed, rig.metres_per_unit) for p in partitions]
 
 

@@ -11,11 +11,11 @@ import pytest
 from fdda_addon.core.features import joint_features
 from fdda_addon.core.metrics import distances
 from fdda_addon.core.model import check_rig, read_model_info
-from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearLayer
 from trainer.__main__ import main
+from trainer.borders import partition_of
 from trainer.config import ACTIVATIONS, TrainingConfig
 from trainer.data import split_recording
 
@@ -86,14 +86,14 @@ def test_trust_fades_outside(session, rig):
     assert np.abs(np.diff(trust, axis=0)).max() < 0.05, "the fade is a jump"
 
 
-def test_far_outside_the_linear_layer_is_left(session, rig):
+def test_far_outside_the_linear_layer_is_left(session, rig, trained):
     poses = pose_chain(rig, np.zeros((3, 3, 2)))
     poses[:, 1:, :3, :3] *= np.float32([1, 5, 50])[:, None, None, None]
     positions, trust = play(session, poses)
     assert (trust[0] == 1).all() and (np.diff(trust[:, :2], axis=0) <= 0).all()
     gone = np.flatnonzero(trust[2] == 0)
     assert len(gone), "a joint fifty times its size is still trusted"
-    partitions = make_partitions(rig)
+    partitions = read_model_info(trained / "model.onnx").partitions_of(rig)
     linear = LinearLayer(rig).positions(poses)
     for number in gone:
         vertices = partitions[number].vertices
@@ -180,7 +180,7 @@ def test_a_rig_of_one_joint_has_nothing_to_learn_and_plays(tmp_path):
     assert trust.tolist() == [[1.0]]
 
 
-def test_report_says_what_shading_shows(report, recording, session):
+def test_report_says_what_shading_shows(report, recording, session, trained):
     source = read_recording(recording)
     normals, edges = report["normals"], report["edges"]
     assert 0 < normals["fdda"]["mean"] < normals["linear"]["mean"] < normals["linear"]["p99"]
@@ -188,7 +188,8 @@ def test_report_says_what_shading_shows(report, recording, session):
     layer, split = LinearLayer(source.rig), split_recording(source, TrainingConfig())
     triangles = source.rig.face_vertices.reshape(-1, 3)
     pairs = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    crossing = source_partition(source)[pairs[:, 0]] != source_partition(source)[pairs[:, 1]]
+    number = partition_of(read_model_info(trained / "model.onnx").partitions_of(source.rig))
+    crossing = number[pairs[:, 0]] != number[pairs[:, 1]]
     rest = np.linalg.norm(np.subtract(*source.rig.rest_positions[pairs.T]), axis=1)
     errors = []
     for pose in split.held_out:
@@ -199,11 +200,3 @@ def test_report_says_what_shading_shows(report, recording, session):
         errors.append(np.abs(lengths[0] - lengths[1]) / rest)
     assert edges["fdda"]["across"] == pytest.approx(np.mean(errors, axis=0)[crossing].mean(), rel=1e-3)
     assert edges["fdda"]["inside"] == pytest.approx(np.mean(errors, axis=0)[~crossing].mean(), rel=1e-3)
-
-
-def source_partition(source) -> np.ndarray:
-    """(V,) number of the partition of each vertex."""
-    found = np.empty(source.rig.vertex_count, int)
-    for number, partition in enumerate(source.partitions):
-        found[partition.vertices] = number
-    return found

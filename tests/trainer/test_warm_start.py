@@ -15,7 +15,7 @@ from fdda_addon.core.report import weights_path
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data import partitions_of, prepare, split_recording
-from trainer.inputs import inputs_of_recording
+from trainer.inputs import inputs_with_deltas
 from trainer.weights import initial_networks, read_weights
 
 from .chain import chain_angles, chain_residuals, pose_chain, write_chain
@@ -45,18 +45,20 @@ def model(trained, tmp_path):
     return tmp_path / "model.onnx"
 
 
-def prepared_of(path, config, deltas):
+def prepared_of(path, config, last):
     recording = read_recording(path)
     split = split_recording(recording, config)
-    inputs = inputs_of_recording(recording, deltas)
-    prepared = [prepare(p, split, config.tolerance_mm, config.seed) for p in partitions_of(recording, inputs)]
+    partitions = last.cut(recording.partitions)
+    inputs = inputs_with_deltas(recording.rig, partitions, last.deltas)
+    data = partitions_of(recording, partitions, inputs)
+    prepared = [prepare(p, split, config.tolerance_mm, config.seed) for p in data]
     return split, prepared, [c[p.columns] for c, p in zip(inputs.columns, prepared, strict=True)]
 
 
 def test_networks_start_with_nearly_the_answers_they_gave(recording, trained, grown):
     config = TrainingConfig(tolerance_mm=1e-4)
     last = read_weights(weights_path(trained / "model.onnx"))
-    _, prepared, columns = prepared_of(grown, config, last.deltas)
+    _, prepared, columns = prepared_of(grown, config, last)
     networks = initial_networks(last, prepared, columns)
     compared = 0
     for before, now, network in zip(last.partitions, prepared, networks, strict=True):

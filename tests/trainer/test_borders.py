@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Borders of partitions move to where fewer numbers say the same, and everything that asks for partitions follows."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdda_addon.core.errors import TrainingError
+from fdda_addon.core.model import read_model_info
+from fdda_addon.core.partition import Partition, make_partitions
+from fdda_addon.core.recording.reader import Recording, read_recording
+from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.report import weights_path
+from fdda_addon.core.skinning import LinearLayer
+from trainer import borders, training
+from trainer.__main__ import main
+from trainer.borders import better_borders, partition_of, recut
+from trainer.config import TrainingConfig
+from trainer.data import residuals_of, split_recording
+from trainer.process import Cancelled
+from trainer.weights import read_weights
+
+from .chain import chain_angles, chain_info, pose_chain
+from .conftest import QUICK
+from .tube import AROUND, INFLUENCING, JOINTS, RINGS, tube, write_tube
+
+POSES, WAVES = 200, 4
+ODD = np.arange(RINGS // JOINTS, RINGS // JOINTS + 3)
+"""Rings that are weighted to the middle joint, and do as those of the first one do."""
+
+
+def write_odd(path: Path, per_metre: float = 1.0, away: float = 0.0) -> Recording:
+    """A tube in which the surface around the first joint reaches further than its weights."""
+    plain, rig, angles = tube(), tube(per_metre, away), chain_angles(POSES, JOINTS, seed=3, reach=1.5)
+    matrices, layer = pose_chain(plain, angles), LinearLayer(plain)
+    ring = np.arange(plain.vertex_count) // AROUND
+    follows = np.where(np.isin(ring, ODD), 0, plain.skin_joints[:, 0])
+    waves = np.random.default_rng(2).normal(size=(JOINTS, WAVES, plain.vertex_count, 3))
+    residuals = np.zeros((POSES, plain.vertex_count, 3), np.float32)
+    for joint in range(JOINTS):
+        bend = angles[:, min(joint + 1, JOINTS - 1), 0]
+        sines = np.sin(bend[:, None] * np.arange(3, 3 + WAVES))
+        own = follows == joint
+        residuals[:, own] = 0.004 * np.einsum("nk,kva->nva", sines, waves[joint][:, own])
+    cut = recut(make_partitions(plain), follows)
+    positions = LinearLayer(plain, cut).complex_positions(matrices, residuals)
+    matrices = matrices.astype(np.float64)
+    matrices[:, :, :3, 3] = per_metre * (matrices[:, :, :3, 3] + away)
+    residuals = per_metre * layer.local_residuals(pose_chain(plain, angles), positions)
+    with RecordingWriter(path, rig, make_partitions(rig, INFLUENCING), chain_info(POSES)) as writer:
+        writer.append(matrices.astype(np.float32), residuals.astype(np.float32))
+    return read_recording(path)
+
+
+def moved(recording: Recording, tolerance_mm: float = 0.2) -> tuple[Partition, ...]:
+    return better_borders(recording, split_recording(recording, TrainingConfig()), False, tolerance_mm, 24)
+
+
+def odd_vertices() -> np.ndarray:
+    return (AROUND * ODD[:, None] + np.arange(AROUND)).ravel()
+
+
+@pytest.fixture(scope="module")
+def odd(tmp_path_factory) -> Recording:
+    return write_odd(tmp_path_factory.mktemp("odd") / "tube")
+
+
+@pytest.fixture(scope="module")
+def trained(odd, tmp_path_factory) -> Path:
+    model = tmp_path_factory.mktemp("trained") / "tube.onnx"
+    assert main([str(odd.path), str(model), *QUICK, "--tolerance-mm", "0.2"]) == 0
+    return model
+
+
+@pytest.mark.parametrize(("per_metre", "away"), [(1.0, 0.0), (1000.0, 0.0), (1.0, 100.0)])
+def test_vertices_change_over_to_what_they_follow(tmp_path, per_metre, away):
+    recording = write_odd(tmp_path / "tube", per_metre, away)
+    partitions = moved(recording)
+    assert np.array_equal(np.setdiff1d(partitions[0].vertices, recording.partitions[0].vertices), odd_vertices())
+    assert np.array_equal(partitions[2].vertices, recording.partitions[2].vertices)
+    assert [replace(p, vertices=None) for p in partitions] == [replace(p, vertices=None) for p in recording.partitions]
+    assert np.array_equal(np.sort(np.concatenate([p.vertices for p in partitions])), np.arange(RINGS * AROUND))
+
+
+def test_where_weights_say_it_well_nothing_moves(tmp_path):
+    recording = write_tube(tmp_path / "tube")
+    for partition, recorded in zip(moved(recording), recording.partitions, strict=True):
+        assert np.array_equal(partition.vertices, recorded.vertices)
+
+
+def test_without_faces_or_beside_nothing_that_learns_nothing_moves(odd):
+    none = np.zeros(0, np.int32)
+    assert moved(replace(odd, rig=replace(odd.rig, face_starts=none, face_vertices=none))) is odd.partitions
+    deaf = tuple(replace(p, influencing=()) if p.joint == 1 else p for p in odd.partitions)
+    assert np.array_equal(partition_of(moved(replace(odd, partitions=deaf))), partition_of(odd.partitions))
+
+
+@pytest.mark.parametrize(("limit", "most"), [("MOST_POSES", 8), ("MOST_FLOATS", 8 * 3 * RINGS * AROUND)])
+def test_few_poses_say_nothing(odd, monkeypatch, limit, most):
+    monkeypatch.setattr(borders, limit, most)
+    assert np.array_equal(partition_of(moved(odd)), partition_of(odd.partitions))
+
+
+def test_a_partition_keeps_some_vertices(odd):
+    few = odd_vertices()[:20]
+    main_joints = np.where(np.isin(np.arange(RINGS * AROUND), few), 1, np.where(odd.rig.skin_joints[:, 0] == 2, 2, 0))
+    rig = replace(odd.rig, skin_joints=main_joints[:, None].astype(np.int32))
+    layer = LinearLayer(odd.rig)
+    positions = layer.complex_positions(odd.pose_matrices, odd.residuals)
+    small = replace(
+        odd,
+        rig=rig,
+        partitions=make_partitions(rig, INFLUENCING),
+        residuals=LinearLayer(rig).local_residuals(odd.pose_matrices, positions),
+    )
+    assert len(small.partitions[1].vertices) == len(few)
+    assert np.array_equal(moved(small)[1].vertices, few)
+
+
+def test_residuals_are_seen_from_the_partition_that_they_count_to(odd):
+    cut = moved(odd)
+    poses = np.array([3, 50, 120])
+    local = np.empty((len(poses), RINGS * AROUND, 3), np.float32)
+    for partition in cut:
+        local[:, partition.vertices] = residuals_of(odd, partition, poses)
+        assert np.array_equal(residuals_of(odd, partition)[poses], local[:, partition.vertices])
+    matrices = odd.pose_matrices[poses]
+    expected = LinearLayer(odd.rig, odd.partitions).complex_positions(matrices, odd.residuals[poses])
+    assert np.abs(LinearLayer(odd.rig, cut).complex_positions(matrices, local) - expected).max() < 2e-6
+
+
+def test_a_model_says_whose_vertices_it_took(odd, trained):
+    info = read_model_info(trained)
+    assert [p.taken for p in info.partitions] == [tuple(odd_vertices().tolist()), (), ()]
+    assert [len(p.vertices) for p in info.partitions_of(odd.rig)] == [p.vertices for p in info.partitions]
+    for ours, theirs in zip(info.partitions_of(odd.rig), moved(odd), strict=True):
+        assert np.array_equal(ours.vertices, theirs.vertices)
+
+
+def test_it_takes_fewer_numbers_for_no_larger_error(odd, trained, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(borders, "MOST_ROUNDS", 0)
+    plain = tmp_path / "plain" / "tube.onnx"
+    plain.parent.mkdir()
+    assert main([str(odd.path), str(plain), *QUICK, "--tolerance-mm", "0.2"]) == 0
+    assert "Borders moved" not in capsys.readouterr().out
+    before, now = (json.loads((model.parent / "report.json").read_text()) for model in (plain, trained))
+    numbers = [sum(p["vertices"] * p["basis"] for p in report["partitions"]) for report in (before, now)]
+    assert numbers[1] < 0.9 * numbers[0] and now["model_bytes"] < before["model_bytes"]
+    assert now["fdda"]["held_out"]["mean"] < before["fdda"]["held_out"]["mean"]
+    assert all(p.taken == () for p in read_model_info(plain).partitions)
+
+
+def test_a_training_goes_on_with_the_same_borders(odd, trained, tmp_path, monkeypatch, capsys):
+    last = read_weights(weights_path(trained))
+    assert np.array_equal(last.partition_of, partition_of(moved(odd)))
+    before = json.loads((trained.parent / "report.json").read_text())["fdda"]["held_out"]["mean"]
+    model = tmp_path / "tube.onnx"
+    weights_path(model).write_bytes(weights_path(trained).read_bytes())
+    monkeypatch.setattr(training, "better_borders", None)
+    assert main([str(odd.path), str(model), *QUICK, "--tolerance-mm", "0.2", "--epochs", "2", "--warm-start"]) == 0
+    assert "Borders moved: 36 vertices count to the partition beside their own." in capsys.readouterr().out
+    assert read_model_info(model).partitions[0].taken == tuple(odd_vertices().tolist())
+    after = json.loads((tmp_path / "report.json").read_text())["fdda"]["held_out"]["mean"]
+    assert after < 1.5 * before
+
+
+def changed_weights(trained: Path, path: Path, **changes) -> Path:
+    with np.load(weights_path(trained)) as arrays:
+        kept = {**arrays, **changes}
+    with open(path, "wb") as file:
+        np.savez(file, **kept)
+    return path
+
+
+def test_weights_of_before_have_the_borders_of_the_recording(odd, trained, tmp_path):
+    with np.load(weights_path(trained)) as arrays:
+        about = json.loads(arrays["about"].tobytes())
+    assert about["version"] == 5
+    old = np.frombuffer(json.dumps({**about, "version": 4}).encode(), np.uint8)
+    last = read_weights(changed_weights(trained, tmp_path / "old.npz", about=old))
+    assert last.partition_of is None and last.cut(odd.partitions) is odd.partitions
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda own: own.astype(np.float64),
+        lambda own: own[None],
+        lambda own: own - 1,
+        lambda own: np.where(own == 2, 7, own),
+        lambda own: own[:-1],
+        lambda own: np.zeros_like(own),
+    ],
+)
+def test_damaged_borders_are_refused(trained, tmp_path, change):
+    with np.load(weights_path(trained)) as arrays:
+        own = arrays["partition_of"]
+    with pytest.raises(TrainingError, match="its arrays contradict each other"):
+        read_weights(changed_weights(trained, tmp_path / "bad.npz", partition_of=change(own)))
+
+
+def test_borders_of_another_mesh_are_refused(odd, trained):
+    last = read_weights(weights_path(trained))
+    with pytest.raises(TrainingError, match="are of other partitions; train without --warm-start"):
+        last.cut(odd.partitions[:2])
+
+
+def test_it_can_be_stopped(odd):
+    split = split_recording(odd, TrainingConfig())
+    with pytest.raises(Cancelled):
+        better_borders(odd, split, False, 0.2, 24, lambda: True)
