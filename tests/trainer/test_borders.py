@@ -91,6 +91,11 @@ def test_where_weights_say_it_well_nothing_moves(tmp_path):
         assert np.array_equal(partition.vertices, recorded.vertices)
 
 
+def test_for_too_little_nothing_moves(odd, monkeypatch):
+    monkeypatch.setattr(borders, "NEEDED", 0.5)
+    assert moved(odd) is odd.partitions
+
+
 def test_without_faces_or_beside_nothing_that_learns_nothing_moves(odd):
     none = np.zeros(0, np.int32)
     assert moved(replace(odd, rig=replace(odd.rig, face_starts=none, face_vertices=none))) is odd.partitions
