@@ -20,15 +20,17 @@ def biceps_offsets(points: np.ndarray, normals: np.ndarray, peak: float) -> np.n
     The muscle shortens: it peaks past the middle of the upper arm, at `peak` metres, falls off steeply towards the
     elbow into its tendon, thins out at both ends, and a furrow parts its two heads. The triceps opposite is drawn flat.
     """
-    x = points[:, 0]
-    angle = np.arctan2(points[:, 2], -points[:, 1])  # 0 at the crease side, positive to the back of the hand
+    # Contiguous, or the last bit of an angle hangs on where memory lies: past a strided array's end NumPy may see
+    # another, and then leaves its vector code (two machines' arms would differ, and two builds on one).
+    x, y, z = np.ascontiguousarray(points.T)
+    angle = np.arctan2(z, -y)  # 0 at the crease side, positive to the back of the hand
     long_head = _bump(x, 0.166, 0.045, 0.040) * np.exp(-0.5 * ((angle - 0.34) / 0.42) ** 2)
     short_head = 0.95 * _bump(x, 0.178, 0.048, 0.036) * np.exp(-0.5 * ((angle + 0.38) / 0.42) ** 2)
     belly = np.maximum(long_head, short_head) + 0.20 * np.minimum(long_head, short_head)
     furrow = 0.30 * _bump(x, 0.172, 0.050, 0.040) * np.exp(-0.5 * ((angle + 0.02) / 0.13) ** 2)
     ends = 0.14 * _bump(x, 0.256, 0.018, 0.020) + 0.10 * _bump(x, 0.075, 0.022, 0.022)
     ends *= np.exp(-0.5 * (angle / 0.7) ** 2)
-    back = np.abs(np.arctan2(points[:, 2], points[:, 1]))
+    back = np.abs(np.arctan2(z, y))
     flat = 0.10 * _bump(x, 0.150, 0.060, 0.050) * np.exp(-0.5 * (back / 0.7) ** 2)
     height = belly - furrow - ends - flat
     height[np.abs(height) < 1e-3] = 0.0
