@@ -55,4 +55,4 @@ def test_blocks_only_where_neighbours_are_of_one_partition(strip, blocks):
 
 
 def test_few_vertices_are_gathered_one_by_one():
-    assert vertex_order(in_strips(1_000, 100, 3)).size == 1
+    assert vertex_order(in_strips(300, 30, 3)).size == 1
