@@ -28,8 +28,8 @@ def build_graph(deformation: Deformation) -> onnx.ModelProto:
     graph = Graph()
     features = add_features(graph, deformation)
     clamped, outside = add_range(graph, features, deformation)
-    coefficients, places = add_networks(graph, features, clamped, deformation)
-    add_playback(graph, features, coefficients, places, outside, deformation)
+    coefficients = add_networks(graph, features, clamped, deformation)
+    add_playback(graph, features, coefficients, outside, deformation)
     inputs = [helper.make_tensor_value_info(POSE_INPUT, TensorProto.FLOAT, ["N", len(deformation.rig.joints), 4, 4])]
     if count := deformation.inputs.control_count:
         inputs.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", count]))

@@ -8,8 +8,11 @@ last layer's is in the mean residual.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+
+from fdda_addon.core.model import TRUST_OUTPUT
 
 from .deformation import Deformation
 from .nodes import Graph
@@ -19,22 +22,28 @@ PIECE_FLOATS, CUT_FLOATS = 800, 15_000
 """A piece costs as much time as reading so many constants, and so much more do the nodes that put pieces together."""
 
 
-def add_networks(
-    graph: Graph, features: Features, clamped: str, deformation: Deformation
-) -> tuple[list[str], dict[int, np.ndarray]]:
-    """Evaluate the networks.
+@dataclass(frozen=True)
+class Coefficients:
+    """What the networks say, times the trust.
+
+    Attributes:
+        name: (N, ·) coefficients without the last bias, mesh units.
+        first: by partition that has shapes, where its first one is; the others follow.
+    """
+
+    name: str
+    first: dict[int, int]
+
+
+def add_networks(graph: Graph, features: Features, clamped: str, deformation: Deformation) -> Coefficients | None:
+    """Evaluate the networks, if there are any.
 
     Args:
         clamped: (N, B, 3) features.
-
-    Returns:
-        The coefficients without the last bias, (N, ·) in metres, nothing where no partition has shapes; and for each
-        partition that has, where its own are.
     """
-    shapes = deformation.shape_counts()
-    learned = [n for n, count in enumerate(shapes) if count]
+    learned = [n for n, count in enumerate(deformation.shape_counts()) if count]
     if not learned:
-        return [], {}
+        return None
     networks = [deformation.networks[n] for n in learned]
     first = [_first_layer(features, deformation, n) for n in learned]
     hidden = [np.stack(layers) for layers in zip(*(network.weights[1:-1] for network in networks), strict=True)]
@@ -45,8 +54,7 @@ def add_networks(
         values = graph.add("MatMul", [values, graph.floats(f"weights_{layer}", weights)], f"product_{layer}")
         values = graph.add("Add", [values, graph.floats(f"biases_{layer}", bias)], f"layer_{layer}")
         values = _activation(graph, values, deformation.activation, f"hidden_{layer}")
-    coefficients, places = _add_last_layer(graph, values, [network.weights[-1] for network in networks])
-    return [coefficients], dict(zip(learned, places, strict=True))
+    return _add_last_layer(graph, values, {n: deformation.networks[n].weights[-1] for n in learned})
 
 
 def _piece_size(sizes: Sequence[int], width: int, joint: int) -> int:
@@ -94,22 +102,24 @@ def _add_first_layer(graph: Graph, clamped: str, layers: list[tuple[np.ndarray, 
     return values
 
 
-def _add_last_layer(graph: Graph, values: str, layers: list[np.ndarray]) -> tuple[str, list[np.ndarray]]:
-    """(L, N, H) values of hidden units to (N, ·) coefficients, and where those of each network are."""
-    sizes, units = [weights.shape[1] for weights in layers], len(layers[0])
+def _add_last_layer(graph: Graph, values: str, layers: dict[int, np.ndarray]) -> Coefficients:
+    """(L, N, H) values of hidden units to coefficients; `layers` has the last weights by partition."""
+    sizes, units = [weights.shape[1] for weights in layers.values()], next(iter(layers.values())).shape[0]
     size = _piece_size(sizes, units, units)
-    pieces = _pieces(sizes, size)
-    weights, places = np.zeros((len(pieces), units, size)), [[] for _ in layers]
+    pieces, partitions = _pieces(sizes, size), list(layers)
+    owners, weights = [n for n, _ in pieces], np.zeros((len(pieces), units, size))
     for number, (n, part) in enumerate(pieces):
-        own = layers[n][:, part]
+        own = layers[partitions[n]][:, part]
         weights[number, :, : own.shape[1]] = own
-        places[n] += (number * size + np.arange(own.shape[1])).tolist()
     if len(pieces) > len(layers):
-        owners = graph.integers("piece_owners", [n for n, _ in pieces])
-        values = graph.add("Gather", [values, owners], "hidden_of_pieces", axis=0)
+        values = graph.add("Gather", [values, graph.integers("piece_owners", owners)], "hidden_of_pieces", axis=0)
     values = graph.add("MatMul", [values, graph.floats("last_weights", weights)], "coefficients_by_piece")
     values = graph.add("Transpose", [values], "coefficients", perm=[1, 0, 2])
-    return graph.reshape(values, [0, len(pieces) * size], "coefficient_row"), [np.array(own) for own in places]
+    trust = graph.integers("trust_of_pieces", np.array([[partitions[n]] for n in owners]))
+    trust = graph.add("Gather", [TRUST_OUTPUT, trust], "trust_by_piece", axis=1)
+    values = graph.add("Mul", [values, trust], "trusted_coefficients")
+    name = graph.reshape(values, [0, len(pieces) * size], "coefficient_row")
+    return Coefficients(name, {partition: size * owners.index(n) for n, partition in enumerate(layers)})
 
 
 def _first_layer(features: Features, deformation: Deformation, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -164,7 +164,7 @@ def test_the_model_has_them(trained):
     """That the graph gives what PyTorch gives, the training has checked."""
     names = {node.name for node in onnx.load(trained).graph.node}
     assert "seen_deltas" in names
-    assert len(names) <= 52 + 23 + JOINTS
+    assert len(names) <= 55 + 23 + JOINTS
 
 
 @pytest.mark.parametrize("way", [{"per_metre": 1000.0, "away": 100.0}, {"sheared": True}], ids=["far away", "sheared"])
