@@ -18,6 +18,7 @@ from .basis import FINER, Basis, make_basis, share_shapes
 from .config import TrainingConfig
 from .inputs import Inputs
 from .joint_fit import JointFit, Surroundings, surroundings_of_rig
+from .patterns import find_patterns, may_have_patterns
 from .turns import fit_matrices
 
 MIN_POSES = 10
@@ -42,8 +43,8 @@ class PartitionData:
         read_residuals: gives the (N, Vp, 3) float32 local residuals, mesh units; called once, so that not all
             partitions need to be in memory at a time.
         vertices: Vp.
-        read_surroundings: gives what the residuals are fitted to first; called once. None when nothing is known of the
-            joints.
+        read_surroundings: gives what the residuals are fitted to first; called twice at most. None when nothing is
+            known of the joints.
         least_spread: (F,) float64, what a feature spreads at least that counts as varying, or one for all.
     """
 
@@ -94,6 +95,7 @@ class PreparedPartition:
             mesh units.
         validation: (n,) indices of these poses.
         mm_per_unit: what lengths above have to be multiplied by to be in mm, as in `Rig.metres_per_unit`.
+        patterns: (r, Vp) float32, of which fit and basis are made (`patterns`); None where they are of any numbers.
     """
 
     name: str
@@ -109,6 +111,7 @@ class PreparedPartition:
     validation_truncation: np.ndarray
     validation: np.ndarray
     mm_per_unit: float = 1000.0
+    patterns: np.ndarray | None = None
 
     def with_shapes(self, count: int) -> "PreparedPartition":
         """The same with the first `count` shapes alone."""
@@ -338,8 +341,33 @@ def prepare_together(
         found.append(prepare(partition, split, tolerance_mm / FINER, seed, metres_per_unit))
         prepared(len(found))
     left, vertices = [own.basis.left for own in found], [own.vertices for own in found]
-    counts = share_shapes(left, vertices, tolerance_mm / (1000 * metres_per_unit), units + 1)
-    return [own.with_shapes(count) for own, count in zip(found, counts, strict=True)]
+    tolerance = tolerance_mm / (1000 * metres_per_unit)
+    counts = share_shapes(left, vertices, tolerance, units + 1)
+    return [
+        _made_of_patterns(own.with_shapes(count), partition.read_surroundings, split, tolerance)
+        for own, count, partition in zip(found, counts, partitions, strict=True)
+    ]
+
+
+def _made_of_patterns(
+    own: PreparedPartition, read_surroundings: Callable[[], Surroundings] | None, split: Split, tolerance: float
+) -> PreparedPartition:
+    """The same made of patterns, where those are fewer numbers."""
+    if not may_have_patterns(own.fit, own.basis):
+        return own
+    weights, surroundings = split.weights(MARGIN_WEIGHT), read_surroundings()
+    found = find_patterns(own.fit, own.basis, own.coefficients, surroundings, split.training, weights, tolerance)
+    if found is None:
+        return own
+    truncation = np.hypot(own.validation_truncation, found.left)
+    return replace(
+        own,
+        fit=found.fit,
+        basis=found.basis,
+        coefficients=found.coefficients,
+        validation_truncation=truncation,
+        patterns=found.numbers,
+    )
 
 
 def _mean_square(residuals: np.ndarray, mean: np.ndarray, poses: np.ndarray) -> float:

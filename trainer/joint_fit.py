@@ -71,6 +71,11 @@ class Surroundings:
         """The main joint alone, seen from which nothing moves."""
         return Surroundings(self.joints[:1], self.centre, self.rows[:, :, :4], self.metres_per_unit)
 
+    def rows_of(self, joints: np.ndarray) -> np.ndarray:
+        """(N, 3, 4 n) float64 rows of some of the joints, in the order given."""
+        places = np.argsort(self.joints)[np.searchsorted(np.sort(self.joints), joints)]
+        return self.rows[:, :, (4 * places[:, None] + np.arange(4)).ravel()]
+
     def are_determined(self) -> bool:
         """Whether there are poses enough for a fit to say something of others."""
         poses, _, width = self.rows.shape

@@ -45,6 +45,13 @@ class _Rows:
     def size(self) -> int:
         return 3 * (self.shapes + len(self.turns)) + COLUMNS * len(self.joints) + self.spare
 
+    def are_skinning(self) -> np.ndarray:
+        """(size,) bool, which are of the joints that skin it."""
+        joints = np.arange(len(self.joints)) < self.skinning
+        early, late = np.split(joints, [self.early])
+        others = np.zeros(3 * (self.shapes + len(self.turns)), bool)
+        return np.concatenate([early, others, np.repeat(joints, 3), late, np.zeros(self.spare, bool)])
+
 
 def add_playback(
     graph: Graph, features: Features, coefficients: Coefficients | None, outside: str, deformation: Deformation
@@ -56,7 +63,8 @@ def add_playback(
     t P_j of those that it is fitted to, m among them ]: first what moves its `early` joints, then all that turns, only
     turning for shapes and turns, then what moves the other joints. In the same order its matrix is of
     [ shapes turned by B_m^-1 | B_j^-1 u_vj | w_vj B_j^-1 (x_v, 1) and B_j^-1 u_vj, for m with the mean ]: the inverse
-    rest matrices are in the constants.
+    rest matrices are in the constants. All but what skins is made of patterns in a large partition: a matrix that has
+    few columns comes first there.
 
     Args:
         features: has the poses.
@@ -76,14 +84,19 @@ def add_playback(
     lengths = [sum(rows[n].size for n in product) for product in products]
     parts = graph.split(gathered, lengths, [f"rows_{number}" for number in range(len(products))], axis=2)
     order = vertex_order([partitions[n].vertices for n in ordered])
-    matrices = {
-        n: _in_order(_matrix(deformation, n, skins[n], rows[n]), partitions[n].vertices, own)
-        for n, own in zip(ordered, order.columns, strict=True)
-    }
+    columns = dict(zip(ordered, order.columns, strict=True))
     blocks = []
     for number, (part, product) in enumerate(zip(parts, products, strict=True)):
-        matrix = _block_diagonal([matrices[n] for n in product])
-        blocks.append(graph.add("MatMul", [part, graph.floats(f"matrix_{number}", matrix)], f"block_{number}"))
+        matrices = [_matrix(deformation, n, skins[n], rows[n]) for n in product]
+        patterns = deformation.prepared[product[0]].patterns
+        if len(product) == 1 and patterns is not None:
+            to_patterns, matrices[0] = _through_patterns(matrices[0], rows[product[0]], patterns)
+            to_patterns = graph.floats(f"weights_of_patterns_{number}", to_patterns)
+            part = graph.add("MatMul", [part, to_patterns], f"patterns_{number}")
+        for place, n in enumerate(product):
+            matrices[place] = _in_order(matrices[place], partitions[n].vertices, columns[n])
+        matrix = graph.floats(f"matrix_{number}", _block_diagonal(matrices))
+        blocks.append(graph.add("MatMul", [part, matrix], f"block_{number}"))
     joined = graph.join(blocks, "blocks", axis=2)
     joined = graph.add("Transpose", [joined], "positions_by_partition", perm=[0, 2, 1])
     order.add(graph, joined, POSITIONS_OUTPUT)
@@ -185,6 +198,16 @@ def _block_diagonal(matrices: list[np.ndarray]) -> np.ndarray:
 def _in_order(matrix: np.ndarray, vertices: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """A matrix of some vertices with its columns in another order, with zeros for -1 in it."""
     return np.where(columns >= 0, matrix[:, np.searchsorted(vertices, np.maximum(columns, vertices[0]))], 0)
+
+
+def _through_patterns(matrix: np.ndarray, rows: _Rows, patterns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The matrix of a partition as two: from its rows to those that skin it and its patterns, and from these."""
+    skins = rows.are_skinning()
+    count, patterns = skins.sum(), patterns.astype(np.float64)
+    first = np.zeros((len(matrix), count + len(patterns)))
+    first[skins, :count] = np.eye(count)
+    first[~skins, count:] = matrix[~skins] @ patterns.T
+    return first, np.concatenate([matrix[skins], patterns])
 
 
 def _matrix(deformation: Deformation, n: int, skin: SkinBlock, rows: _Rows) -> np.ndarray:
