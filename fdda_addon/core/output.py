@@ -128,7 +128,7 @@ def replacing_all(*paths: Path) -> Iterator[tuple[Path, ...]]:
             temporaries.append(_new_file(path))
         yield tuple(temporaries)
         for temporary in temporaries:
-            with open(temporary, "rb") as file:
+            with open(temporary, "r+b") as file:  # Windows flushes only what is open for writing
                 os.fsync(file.fileno())
         for temporary, path in zip(temporaries, paths, strict=True):
             os.replace(temporary, path)
