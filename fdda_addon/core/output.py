@@ -84,14 +84,27 @@ def check_folder_writable(path: Path) -> None:
     """Fail before the work rather than after it when files could not be written into a folder that may not exist yet.
 
     Raises:
-        OutputError: the folder, or the nearest one above it that exists, cannot be written, or it is a file.
+        OutputError: the folder, or the nearest one above it that exists, cannot be written, or is a file, or no folder
+            above it exists.
     """
-    folder = path
-    while not os.path.exists(folder):
-        folder = folder.parent
+    folder = nearest_folder(path)
     if not os.path.isdir(folder):
         raise OutputError(f"Cannot write into '{path}': '{folder}' is a file; choose another folder.")
     _probe(path, folder)
+
+
+def nearest_folder(path: Path) -> Path:
+    """Find what exists of a path: the path itself, or the nearest folder above it.
+
+    Raises:
+        OutputError: nothing exists, for instance because the drive is not connected.
+    """
+    folder = path
+    while not os.path.exists(folder):
+        if folder == folder.parent:
+            raise OutputError(f"Cannot write into '{path}': '{folder}' does not exist; choose another folder.")
+        folder = folder.parent
+    return folder
 
 
 def _probe(path: Path, folder: Path) -> None:

@@ -2,7 +2,6 @@
 """What a refused command line must look like: one sentence, exit status 1, no file touched."""
 
 import re
-import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +11,7 @@ import pytest
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import SceneRig
 
+from .. import systems
 from .conftest import run
 from .scene_state import fresh_elbow
 
@@ -56,6 +56,7 @@ def save_elbow(path: Path, change: Callable[[SceneRig], object] = lambda rig: No
 @contextmanager
 def small_files(limit: int) -> Iterator[None]:
     """No file grows beyond so many bytes: what a full disk looks like to the one who writes."""
+    resource = pytest.importorskip("resource", reason=systems.NO_FILE_SIZE_LIMITS)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
     try:

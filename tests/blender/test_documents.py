@@ -4,6 +4,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -45,7 +46,7 @@ def run_code(name: str, folder: Path, python: str = sys.executable, arguments: t
 def folder(elbow, tmp_path_factory) -> Path:
     """The files of the elbow under the names that the pages use."""
     folder = tmp_path_factory.mktemp("documents")
-    (folder / "recording").symlink_to(elbow.recording)
+    shutil.copytree(elbow.recording, folder / "recording")
     (folder / "model.onnx").write_bytes(elbow.model.read_bytes())
     for verb, name in (("evaluate", "evaluation.json"), ("benchmark", "benchmark.json")):
         count = ("--poses", 5) if verb == "evaluate" else ("--frames", 5)
@@ -78,7 +79,7 @@ def test_evaluation_code(folder):
 
 
 def test_messages_code(folder, tmp_path):
-    (tmp_path / "recording").symlink_to(folder / "recording")
+    shutil.copytree(folder / "recording", tmp_path / "recording")
     lines = run_code("messages", tmp_path, trainer_python()).splitlines()
     assert len(lines) == 3 and lines[1].startswith("2/2: ") and lines[2] == "finished 0"
 

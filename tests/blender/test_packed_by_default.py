@@ -11,6 +11,7 @@ from fdda_addon.operators import playback
 from fdda_addon.runtime import model_files, packed
 from fdda_addon.scene import model_trust
 
+from .. import systems
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose, run
 
 
@@ -105,6 +106,7 @@ def test_a_trusted_folder_is_followed_and_no_other(bound, elbow, model, tmp_path
     assert model_files.model_path(bound) == model_files.Path(model)
 
 
+@systems.symbolic_links
 def test_a_link_out_of_a_trusted_folder_is_not_followed(elbow, tmp_path, monkeypatch):
     trusted = tmp_path / "trusted"
     trusted.mkdir()
@@ -169,6 +171,7 @@ def test_what_is_given_in_full_stays_so_unless_it_lies_below_the_file(followed, 
     assert named_paths(followed)[:2] == [stored or str(model)] * 2
 
 
+@systems.symbolic_links
 def test_a_file_that_is_bound_through_a_link_has_its_model_below(elbow, tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")

@@ -9,6 +9,7 @@ from fdda_addon.core import file_kind
 from fdda_addon.core.errors import OutputError
 from fdda_addon.core.output import check_outputs, json_text
 
+from .. import systems
 from .tiny_model import tiny_model
 
 SAMPLES = {
@@ -60,6 +61,7 @@ def test_what_is_of_the_kind_or_not_there_is_written(tmp_path):
     check_outputs({old: file_kind.EVALUATION, tmp_path / "new.png": file_kind.PICTURE}, [tmp_path / "rig.blend"])
 
 
+@systems.named_pipes
 def test_what_cannot_be_read_is_not_written_over(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(OutputError, match="it is no ordinary file"):

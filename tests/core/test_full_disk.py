@@ -14,6 +14,7 @@ from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
+from .. import systems
 from .conftest import SMALL_DISK
 from .limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
 
@@ -81,7 +82,7 @@ for job in (lambda: record_limb(folder / "recording", 500), lambda: write_text(f
 """
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no such limit")
+@systems.file_size_limits
 def test_files_that_may_not_grow(tmp_path):
     (tmp_path / "old.txt").write_text("old")
     command = [sys.executable, "-c", LIMITED, str(tmp_path)]

@@ -15,6 +15,7 @@ from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.reader import check_resumable, read_recording
 from fdda_addon.core.recording.writer import RecordingWriter, check_recordable
 
+from .. import systems
 from .damage import array_file, edit, refused
 from .good_recording import good_recording
 from .limb import make_rig, partitions_of, random_poses, random_residuals, recording_info
@@ -25,7 +26,10 @@ NO_FILE = "it is no ordinary file"
 
 @pytest.fixture(autouse=True)
 def _patience():
-    """What blocks is a failure, not a test that never ends."""
+    """What blocks is a failure, not a test that never ends. Windows has no alarm, and nothing here that blocks."""
+    if not hasattr(signal, "SIGALRM"):
+        yield
+        return
 
     def give_up(*_):
         raise TimeoutError("it blocks")
@@ -42,6 +46,7 @@ def resume(path, complete=12):
     return RecordingWriter(path, rig, partitions_of(rig), recording_info(complete), resume=True)
 
 
+@systems.named_pipes
 @pytest.mark.parametrize("name", FILES)
 def test_a_pipe(recording, name):
     (recording / name).unlink()
@@ -51,6 +56,7 @@ def test_a_pipe(recording, name):
         resume(recording)
 
 
+@systems.symbolic_links
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("target", ["/dev/zero", "/dev/stdin", "/etc/passwd", "another recording"])
 def test_a_link_out_of_the_folder(recording, tmp_path, name, target):
@@ -64,6 +70,7 @@ def test_a_link_out_of_the_folder(recording, tmp_path, name, target):
         check_recordable(recording, resume=True)
 
 
+@systems.symbolic_links
 @pytest.mark.parametrize("name", ["residuals.npy", "rest_positions.npy", "recording.json"])
 def test_a_resumed_recording_writes_through_no_link(recording, tmp_path, name):
     """Where no pose is complete all arrays are written anew."""
@@ -88,6 +95,7 @@ def test_a_resumed_recording_writes_through_no_link(recording, tmp_path, name):
     assert victim.read_text() == "precious"
 
 
+@systems.symbolic_links
 def test_an_extension_writes_through_no_link(recording, tmp_path):
     read = read_recording(recording)
     victim = shutil.move(recording / "residuals.npy", tmp_path / "victim.npy")
@@ -217,6 +225,7 @@ def test_sentences_are_of_a_readable_length_and_steer_no_terminal(recording):
     assert "\\x1b[2J" in text and text.endswith("this add-on reads version 1; record again.")
 
 
+@systems.sparse_files
 def test_a_recording_that_is_huge_and_hollow_takes_no_memory(recording):
     """Sparse files cost nothing to make: 100 GB of skin weights that are none."""
     vertices = 1 << 31

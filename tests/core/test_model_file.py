@@ -14,6 +14,7 @@ from fdda_addon.core.errors import ModelError
 from fdda_addon.core.model import ModelInfo, ModelPartition, check_rig, read_model, read_model_info
 from fdda_addon.core.poses import Channel
 
+from .. import systems
 from .limb import make_rig
 from .tiny_model import constant, external, in_subgraph, tiny_info, tiny_model
 
@@ -76,13 +77,14 @@ def test_metadata_without_numbers_is_not_written():
 
 
 def test_no_file(tmp_path):
-    refused(tmp_path / "none.onnx", "cannot be read: No such file or directory; give one that train made")
+    refused(tmp_path / "none.onnx", f"cannot be read: {systems.NOT_FOUND}; give one that train made")
 
 
 def test_a_folder(tmp_path):
     refused(tmp_path, "cannot be read: Is a directory")
 
 
+@systems.devices
 def test_a_device_that_never_ends():
     refused(Path("/dev/zero"), "cannot be read: it is no ordinary file")
 

@@ -4,6 +4,7 @@
 import errno
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +21,9 @@ from fdda_addon.core.output import (
     write_json,
     write_text,
 )
+from fdda_addon.core.recording.estimate import check_room
+
+from .. import systems
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -58,6 +62,7 @@ def test_json_without_numbers_leaves_the_old_file(tmp_path):
     assert names(tmp_path) == ["a.json"]
 
 
+@systems.symbolic_links
 def test_names_of_temporary_files_cannot_be_foreseen_and_no_link_is_followed(tmp_path, monkeypatch):
     path, victim = tmp_path / "a.json", tmp_path / "victim"
     victim.write_text("precious")
@@ -144,7 +149,7 @@ def test_a_folder_is_no_file(tmp_path):
 
 
 def test_a_device_is_no_file():
-    with pytest.raises(OutputError, match="'/dev/null': it is no ordinary file"):
+    with pytest.raises(OutputError, match=f"'{os.devnull}': it is no ordinary file"):
         check_writable(Path(os.devnull))
 
 
@@ -157,11 +162,21 @@ def test_a_folder_below_a_file(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match=r"the folder .* does not exist"):
         check_writable(tmp_path / "file" / "a.txt")
-    with pytest.raises(OutputError, match=r"Cannot write into '.*below/deep': '.*/file' is a file; choose another"):
+    with pytest.raises(OutputError, match=r"Cannot write into '.*below.deep': '.*file' is a file; choose another"):
         check_folder_writable(tmp_path / "file" / "below" / "deep")
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+@systems.drives
+def test_a_drive_that_is_not_connected():
+    drive = next(f"{letter}:\\" for letter in "QRSTUVWXY" if not os.path.exists(f"{letter}:\\"))
+    words = re.escape(f"Cannot write into '{drive}a\\b': '{drive}' does not exist; choose another folder.")
+    with pytest.raises(OutputError, match=words):
+        check_folder_writable(Path(drive, "a", "b"))
+    with pytest.raises(OutputError, match=words):
+        check_room([(Path(drive, "a", "b"), 1000)])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Only Linux has /proc.")
 def test_a_folder_that_takes_no_files():
     """Permissions do not stop root; /proc stops everyone."""
     for check, path in ((check_writable, Path("/proc/a.json")), (check_folder_writable, Path("/proc/a/b"))):
@@ -183,7 +198,7 @@ for check, path in ((check_writable, sys.argv[1]), (check_folder_writable, sys.a
 """
 
 
-@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root may become someone else")
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="Only root may become someone else.")
 def test_a_folder_that_may_not_be_entered(tmp_path):
     """Asking whether something inside it exists is an error of its own in older Pythons."""
     closed = tmp_path / "closed"

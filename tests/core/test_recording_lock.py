@@ -3,6 +3,7 @@
 
 import json
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ from fdda_addon.core.recording.lock import LOCK, RecordingLock
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
+from .. import systems
 from .limb import make_rig, partitions_of, record_limb, recording_info
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -90,6 +92,7 @@ def test_the_lock_of_a_process_that_is_gone_is_taken_over(other, tmp_path):
     assert LOCK not in [path.name for path in tmp_path.iterdir()]
 
 
+@systems.forks
 def test_of_several_takers_of_a_dead_lock_one_gets_it(tmp_path):
     (tmp_path / LOCK).write_text("{}")
     command = [sys.executable, "-c", TAKERS, str(tmp_path)]
@@ -103,7 +106,7 @@ def test_of_several_takers_of_a_dead_lock_one_gets_it(tmp_path):
 
 OTHERS_LOCKS = {
     "of another machine": json.dumps({"pid": 1, "host": "render-07"}),
-    "of the same number": json.dumps({"pid": os.getpid(), "host": os.uname().nodename}),
+    "of the same number": json.dumps({"pid": os.getpid(), "host": socket.gethostname()}),
     "empty, from a full disk": "",
     "damaged": '{"pid": "x", "host": 1}',
 }
@@ -160,6 +163,7 @@ def test_a_lock_that_is_not_held_is_not_released(tmp_path):
     assert not lock.is_held and (tmp_path / LOCK).exists()
 
 
+@systems.symbolic_links
 def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path):
     victim = tmp_path / "victim"
     victim.write_text("precious")
@@ -170,6 +174,7 @@ def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path):
     assert victim.read_text() == "precious" and victim.exists()
 
 
+@systems.named_pipes
 def test_a_pipe_in_place_of_the_lock_blocks_nobody(tmp_path):
     os.mkfifo(tmp_path / LOCK)
     with pytest.raises(OutputError, match=rf"'{LOCK}' is no ordinary file"):

@@ -13,6 +13,7 @@ import pytest
 
 from trainer.report import main
 
+from .. import systems
 from .conftest import REPOSITORY
 
 PNG = base64.b64decode(
@@ -132,6 +133,7 @@ def test_a_hostile_evaluation_is_refused(report, tmp_path, capsys, key, new):
     assert not (tmp_path / "report.html").exists()
 
 
+@systems.named_pipes
 def test_pipes_block_nobody(report, tmp_path, capsys):
     os.mkfifo(tmp_path / "pipe.png")
     for name in ("report.json", "pipe.png"):

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import NoRoomError
+from ..output import nearest_folder
 from ..rig import UNMOVED_LABEL, Rig
 from .arrays import array_shapes
 from .reader import Recording
@@ -72,14 +73,12 @@ def check_room(sizes: Iterable[tuple[Path, int]]) -> None:
 
     Raises:
         NoRoomError: says how much there is and how much it takes.
+        OutputError: no folder above one of them exists.
     """
     sizes = list(sizes)
     needed = sum(size - min(size, _taken(folder)) for folder, size in sizes)
     folder = sizes[0][0]
-    existing = folder
-    while not os.path.exists(existing):
-        existing = existing.parent
-    free = shutil.disk_usage(existing).free
+    free = shutil.disk_usage(nearest_folder(folder)).free
     if needed > free:
         raise NoRoomError(
             f"Cannot write the recording '{folder}': it takes {size_in_words(needed)} and the disk has "

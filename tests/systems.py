@@ -1,0 +1,25 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What only some operating systems have: marks that skip a test elsewhere and give the reason."""
+
+import os
+import sys
+
+import pytest
+
+WINDOWS = sys.platform == "win32"
+NO_FILE_SIZE_LIMITS = "Windows does not limit the size of a process's files."
+
+try:
+    os.stat("a file that does not exist")
+except FileNotFoundError as error:
+    NOT_FOUND = error.strerror
+    """The words of the system for a file that does not exist; Windows and the C library have different ones."""
+
+symbolic_links = pytest.mark.skipif(WINDOWS, reason="Windows lets only administrators make symbolic links.")
+named_pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders.")
+devices = pytest.mark.skipif(WINDOWS, reason="Windows has no devices in folders.")
+forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows does not fork processes.")
+file_size_limits = pytest.mark.skipif(WINDOWS, reason=NO_FILE_SIZE_LIMITS)
+file_modes = pytest.mark.skipif(WINDOWS, reason="Windows has access control lists in place of file modes.")
+sparse_files = pytest.mark.skipif(WINDOWS, reason="Python on Windows writes every zero of a hollow file to the disk.")
+drives = pytest.mark.skipif(not WINDOWS, reason="Only Windows has drives in paths.")
