@@ -7,8 +7,8 @@ import numpy as np
 
 from .defaults import SPREAD
 
-ROTATION, LOCATION, SCALE, CONTROL = "rotation", "location", "scale", "control"
-KINDS = (ROTATION, LOCATION, SCALE, CONTROL)
+ROTATION, ROTATION_VECTOR, LOCATION, SCALE, CONTROL = "rotation", "rotation_vector", "location", "scale", "control"
+KINDS = (ROTATION, ROTATION_VECTOR, LOCATION, SCALE, CONTROL)
 """Kinds of channels."""
 DEFAULT_RANGE = (-np.pi / 4, np.pi / 4)
 """Range of a rotation axis that the rig neither limits nor locks, radians."""
@@ -31,8 +31,9 @@ class Channel:
 
     Attributes:
         name: of the bone, or of the control (`Control.name`).
-        kind: `ROTATION` (Euler angle, radians), `LOCATION` (metres) or `SCALE` (factor) of a bone, relative to the rest
-            pose, or `CONTROL` (the unit of its property).
+        kind: `ROTATION` (Euler angle, radians), `ROTATION_VECTOR` (one of three components of axis times angle,
+            radians), `LOCATION` (metres) or `SCALE` (factor) of a bone, relative to the rest pose, or `CONTROL` (the
+            unit of its property).
         axis: 0, 1 or 2; 0 for a control.
         low, high: the range of motion.
     """
@@ -47,6 +48,12 @@ class Channel:
     def rest(self) -> float:
         """The value of the rest pose, or what comes nearest to it in the range."""
         return min(max(1.0 if self.kind == SCALE else 0.0, self.low), self.high)
+
+    @property
+    def changes(self) -> bool:
+        """Whether the channel ever is elsewhere than in the rest pose."""
+        rest = 1.0 if self.kind == SCALE else 0.0
+        return self.high - rest > RANGE_TOLERANCE or rest - self.low > RANGE_TOLERANCE
 
     def to_json(self) -> dict:
         """As files have it: there the name is called `bone`, also that of a control."""

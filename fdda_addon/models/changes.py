@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import bpy
 
 from ..core.model import ModelInfo
-from ..core.poses import Channel, range_changes
+from ..core.poses import ROTATION_VECTOR, Channel, range_changes
 from ..core.rig import Rig, differences
 from ..poses.sampling import sampled_channels
 from ..rig.reading import read_model_rig
@@ -57,10 +57,11 @@ def changes(name: str, info: ModelInfo, rig: Rig, channels: tuple[Channel, ...])
     Args:
         name, info: the model.
         rig: with the joints of the model (`rig.reading.read_model_rig`).
-        channels: of the rig as it stands. The ranges of control bones were chosen by the user and are not compared.
+        channels: of the rig as it stands. The ranges of control bones and those of actions were chosen by the user and
+            are not compared.
     """
     clauses = differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
-    is_own = all(channel.name in rig.joint_names for channel in info.limits)
+    is_own = all(c.name in rig.joint_names and c.kind != ROTATION_VECTOR for c in info.limits)
     return Changes(name, tuple(clauses), tuple(range_changes(info.limits, channels)) if info.limits and is_own else ())
 
 

@@ -179,6 +179,9 @@ class FDDA_OT_limits_from_actions(OnPose, bpy.types.Operator):
         stated = {limit.bone for limit in limits if not limit.why_not}
         left = [limit for limit in limits if limit.why_not]
         others = f"; {len(left)} axes were left as they are ('{left[0].bone}' {left[0].why_not})" if left else ""
+        if wide := list(dict.fromkeys(limit.bone for limit in limits if limit.is_wide)):
+            others += f"; {len(wide)} ('{wide[0]}') rotate near gimbal lock, less far than these say: Ticked Actions,"
+            others += " above the list, samples what the actions do"
         return f"{len(stated)} bones have the ranges of {', '.join(names)}{others}."
 
 

@@ -108,9 +108,9 @@ def sampled_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None":
 
 def _sampled_text(channels: "list[Channel]", is_wide: bool) -> str:
     """The ranges about the axes, and by which other channels the bone is moved."""
-    from ..core.poses import LOCATION, ROTATION
+    from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR
 
-    turns = {channel.axis: channel for channel in channels if channel.kind == ROTATION}
+    turns = {channel.axis: channel for channel in channels if channel.kind in {ROTATION, ROTATION_VECTOR}}
     moves = "".join("XYZ"[channel.axis] for channel in channels if channel.kind == LOCATION)
     texts = [
         _degrees(turns[axis].low, turns[axis].high, is_wide) if axis in turns else "fixed" for axis in range(3) if turns

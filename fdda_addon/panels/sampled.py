@@ -73,16 +73,16 @@ def _many(count: int, noun: str) -> str:
 
 def draw_channels(box: bpy.types.UILayout, bone: bpy.types.PoseBone, channels: "list[Channel]") -> None:
     """How a bone is sampled that was chosen: nothing to edit, for the ranges may come from actions."""
-    from ..core.poses import LOCATION, ROTATION
+    from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR
 
     box.label(text=f"{bone.name}, as it is sampled", icon="BONE_DATA")
     column = box.column(align=True)
-    verbs = {ROTATION: "Turn", LOCATION: "Move"}
+    verbs = {ROTATION: "Turn", ROTATION_VECTOR: "Turn", LOCATION: "Move"}
     for channel in channels:
         row = column.split(factor=0.4)
         row.label(text=f"{verbs.get(channel.kind, 'Scale')} {'XYZ'[channel.axis]}")
         low, high = channel.low, channel.high
-        if channel.kind == ROTATION:
+        if channel.kind in {ROTATION, ROTATION_VECTOR}:
             row.label(text=f"{math.degrees(low):.0f}…{math.degrees(high):.0f}°")
         else:
             row.label(text=f"{low:.3g}…{high:.3g}")

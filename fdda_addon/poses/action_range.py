@@ -7,6 +7,7 @@ Nothing is evaluated and the scene is not touched.
 import hashlib
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import bpy
 import numpy as np
@@ -14,7 +15,8 @@ from mathutils import Euler, Quaternion, Vector
 
 from ..core.controls import ARMATURE, ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS, Control
 from ..core.errors import RigError
-from ..core.poses import LOCATION, RANGE_TOLERANCE, ROTATION, SCALE
+from ..core.poses import LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE
+from ..core.rotations import euler_angles, rotation_vectors, total_width
 from ..scene.arrays import KEYFRAME, read
 from ..scene.compatibility import curves_of
 from ..scene.controls import make_control, owner_of
@@ -31,8 +33,10 @@ _REST = {
 }
 """What an action leaves a channel at that it does not key."""
 
-MAX_MEASURED = 100
-"""The number of actions whose measured ranges are kept."""
+MAX_MEASURED_BYTES = 64_000_000
+"""Rotations of actions that are kept; beyond so many bytes all are measured again."""
+CONTINUOUS_PREFERENCE = 0.9
+"""Angles that follow on from frame to frame are taken unless others have ranges that are narrower by this factor."""
 
 Ranges = dict[tuple[str, str, int], tuple[float, float]]
 """Lowest and highest value by bone, kind and axis."""
@@ -40,8 +44,24 @@ Ranges = dict[tuple[str, str, int], tuple[float, float]]
 Curves = dict[str, dict[int, bpy.types.FCurve]]
 """F-curves of a bone by channel and index."""
 
-_measured: dict[tuple[int, int], tuple[tuple | None, Ranges]] = {}
-"""By session_uid of the armature object and of the action: what was measured, and of which keys."""
+
+@dataclass(frozen=True)
+class _Measured:
+    """What an action keys.
+
+    Attributes:
+        content: the keys that it was measured of; None where it follows from more than the keys.
+        ranges: of all channels, Euler angles as they follow on from frame to frame.
+        rotations: (F, 4) float32 quaternions of the bones that are not keyed as Euler angles.
+    """
+
+    content: tuple | None
+    ranges: Ranges
+    rotations: dict[str, np.ndarray]
+
+
+_measured: dict[tuple[int, int], _Measured] = {}
+"""By session_uid of the armature object and of the action."""
 
 
 def action_frames(action: bpy.types.Action) -> range:
@@ -62,29 +82,63 @@ def measured_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.typ
         Euler angles as `armature.Poser` sets them (in the order of the bone, of quaternions and axis angles XYZ, and
         turning on beyond a half turn), `LOCATION` in metres and `SCALE` as factors, relative to the rest pose.
     """
+    return moved_ranges(keyed_ranges(armature_object, actions))
+
+
+def moved_ranges(keyed: Ranges) -> Ranges:
+    """Of the ranges that `keyed_ranges` returns those of `measured_ranges`."""
+    return {key: bounds for key, bounds in keyed.items() if key[1] != ROTATION_VECTOR and is_moved(bounds)}
+
+
+def is_moved(bounds: tuple[float, float]) -> bool:
+    """Whether a range is more than a point."""
+    return bounds[1] - bounds[0] > RANGE_TOLERANCE
+
+
+def keyed_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action]) -> Ranges:
+    """As `measured_ranges`, also of what is keyed and stands still, and with `ROTATION_VECTOR`s.
+
+    Bones that are keyed as quaternions or axis angles have rotation vectors beside their Euler angles. Three Euler
+    angles wrap, and widen near gimbal lock. The ranges of rotation vectors are about as wide as the motion.
+    """
     found: Ranges = {}
-    for action in actions:
-        for key, (low, high) in _ranges_of(armature_object, action).items():
+    rotations: dict[str, list[np.ndarray]] = {}
+    for measured in [_measure(armature_object, action) for action in actions]:
+        for key, (low, high) in measured.ranges.items():
             lowest, highest = found.get(key, (np.inf, -np.inf))
             found[key] = min(lowest, low), max(highest, high)
-    return {key: (low, high) for key, (low, high) in found.items() if high - low > RANGE_TOLERANCE}
+        for bone, own in measured.rotations.items():
+            rotations.setdefault(bone, []).append(own)
+    for bone, parts in rotations.items():
+        quaternions = np.concatenate(parts)
+        angles = euler_angles(quaternions)
+        width = sum(high - low for low, high in (found[bone, ROTATION, axis] for axis in range(3)))
+        if total_width(angles) < CONTINUOUS_PREFERENCE * width:
+            found |= _by_axis(bone, ROTATION, angles)
+        found |= _by_axis(bone, ROTATION_VECTOR, rotation_vectors(quaternions))
+    return found
 
 
-def _ranges_of(armature_object: bpy.types.Object, action: bpy.types.Action) -> Ranges:
-    """Ranges of an action; measured again when its keys have changed, for one of many bones takes a second."""
+def _by_axis(bone: str, kind: str, values: np.ndarray) -> Ranges:
+    bounds = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
+    return {(bone, kind, axis): ends for axis, ends in enumerate(bounds)}
+
+
+def _measure(armature_object: bpy.types.Object, action: bpy.types.Action) -> _Measured:
+    """Measure an action; again when its keys have changed, for one of many bones takes a second."""
     frames, curves = action_frames(action), _curves_by_bone(armature_object, action)
     content = _content(armature_object, frames, curves)
     place = armature_object.session_uid, action.session_uid
-    if content is None or _measured.get(place, (None,))[0] != content:
-        found = {
-            (bone, kind, axis): (float(values.min()), float(values.max()))
-            for bone, own in curves.items()
-            for kind, axis, values in _channels(armature_object.pose.bones[bone], own, frames)
-        }
-        if len(_measured) >= MAX_MEASURED:
+    known = _measured.get(place)
+    if content is None or known is None or known.content != content:
+        known = _Measured(content, {}, {})
+        for bone, own in curves.items():
+            for kind, axis, values in _channels(armature_object.pose.bones[bone], own, frames, known.rotations):
+                known.ranges[bone, kind, axis] = float(values.min()), float(values.max())
+        if sum(array.nbytes for each in _measured.values() for array in each.rotations.values()) > MAX_MEASURED_BYTES:
             _measured.clear()
-        _measured[place] = content, found
-    return _measured[place][1]
+        _measured[place] = known
+    return known
 
 
 def _content(
@@ -99,7 +153,7 @@ def _content(
                 if curve.modifiers or not points:
                     return None
                 places.append((bone, armature_object.pose.bones[bone].rotation_mode, channel, index, len(points)))
-                places.append((curve.extrapolation, curve.mute))
+                places.append(curve.extrapolation)
                 for element in KEYFRAME:
                     digest.update(read(points, element))
     return frames, digest.digest(), tuple(places)
@@ -120,14 +174,14 @@ def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) 
         frames = action_frames(action)
         for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
             datablock = owner_of(scene_rig, owner)
-            for curve in curves_of(action, datablock) if datablock else ():
+            for curve in _playing_curves(action, datablock) if datablock else ():
                 if _CONTROL.fullmatch(curve.data_path):
                     values = [curve.evaluate(frame) for frame in frames]
                     low, high = found.get((owner, curve.data_path), (np.inf, -np.inf))
                     found[owner, curve.data_path] = min(low, *values), max(high, *values)
     controls = []
     for (owner, path), (low, high) in found.items():
-        if high - low > RANGE_TOLERANCE:
+        if is_moved((low, high)):
             try:
                 controls.append(make_control(scene_rig, owner, path, (low, high)))
             except RigError:
@@ -137,7 +191,7 @@ def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) 
 
 def _curves_by_bone(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, Curves]:
     found: dict[str, Curves] = {}
-    for curve in curves_of(action, armature_object):
+    for curve in _playing_curves(action, armature_object):
         match = _OF_BONE.fullmatch(curve.data_path)
         name = bpy.utils.unescape_identifier(match["bone"]) if match else ""
         if match and match["channel"] in _REST and name in armature_object.pose.bones:
@@ -145,8 +199,17 @@ def _curves_by_bone(armature_object: bpy.types.Object, action: bpy.types.Action)
     return found
 
 
-def _channels(bone: bpy.types.PoseBone, curves: Curves, frames: range) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Kind, axis and (F,) values over the frames of what is keyed."""
+def _playing_curves(action: bpy.types.Action, datablock: bpy.types.ID) -> Iterator[bpy.types.FCurve]:
+    """The F-curves of a datablock that are not muted, by themselves or with their group."""
+    for curve in curves_of(action, datablock):
+        if not (curve.mute or (curve.group and curve.group.mute)):
+            yield curve
+
+
+def _channels(
+    bone: bpy.types.PoseBone, curves: Curves, frames: range, rotations: dict[str, np.ndarray]
+) -> Iterator[tuple[str, int, np.ndarray]]:
+    """Kind, axis and (F,) values over the frames of what is keyed; quaternions are put into `rotations`."""
     for kind in (LOCATION, SCALE):
         for axis in curves.get(kind, {}):
             yield kind, axis, _values(curves[kind], kind, frames)[:, axis]
@@ -154,7 +217,11 @@ def _channels(bone: bpy.types.PoseBone, curves: Curves, frames: range) -> Iterat
     channel = channel or "rotation_euler"
     keyed = curves.get(channel)
     if keyed:
-        angles = _continuous_angles(channel, bone.rotation_mode, _values(keyed, channel, frames))
+        values = _values(keyed, channel, frames)
+        if channel != "rotation_euler":
+            values = values if channel == "rotation_quaternion" else np.array([_of_axis_angle(v) for v in values])
+            rotations[bone.name] = values.astype(np.float32)
+        angles = _continuous_angles(channel, bone.rotation_mode, values)
         for axis in keyed if channel == "rotation_euler" else range(3):
             yield ROTATION, axis, angles[:, axis]
 
@@ -176,7 +243,7 @@ def _continuous_angles(channel: str, mode: str, values: np.ndarray) -> np.ndarra
             if place:
                 previous.make_compatible(Euler(angles[place - 1], mode))
         else:
-            turned = Quaternion(value) if channel == "rotation_quaternion" else _of_axis_angle(value)
+            turned = Quaternion(value)
             # A quaternion of length 0 turns nothing, in Blender as well.
             previous = (turned.normalized() if turned.magnitude else Quaternion()).to_euler("XYZ", previous)
         angles[place] = previous

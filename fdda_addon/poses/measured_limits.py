@@ -3,15 +3,15 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import bpy
 
 from ..core.errors import RigError
-from ..core.poses import LOCATION, ROTATION, SCALE
+from ..core.poses import LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE
 from ..scene.scene_rig import SceneRig
 from ..scene.unit import metres_per_unit
-from .action_range import measured_ranges
+from .action_range import Ranges, keyed_ranges, moved_ranges
 from .motion_range import (
     AXES,
     DEFAULT,
@@ -26,7 +26,11 @@ from .motion_range import (
 DEFAULT_MARGIN = 0.1
 """Part of the width of a measured range that is added at each end."""
 
+MAX_WIDENING = 1.5
+"""Angles about X, Y and Z that are together wider than the rotations by this factor are near gimbal lock."""
+
 LIMIT_OF = {ROTATION: "LIMIT_ROTATION", LOCATION: "LIMIT_LOCATION", SCALE: "LIMIT_SCALE"}
+WIDE_NOTE = "; wider than it rotates, as it comes near gimbal lock: sample the action itself, not these ranges"
 _WORDS = {ROTATION: ("turns", "°", 1), LOCATION: ("moves", " mm", 1), SCALE: ("scales", "", 2)}
 
 
@@ -38,6 +42,7 @@ class MeasuredLimit:
         bone, kind, axis: as of `Channel`.
         low, high: radians, metres or factors; the range that is stated now.
         why_not: why it was left as it was; empty when it is stated.
+        is_wide: the bone turns less far than its three angles say, which are near gimbal lock (`MAX_WIDENING`).
     """
 
     bone: str
@@ -46,6 +51,7 @@ class MeasuredLimit:
     low: float
     high: float
     why_not: str = ""
+    is_wide: bool = False
 
 
 def state_measured_limits(
@@ -76,10 +82,12 @@ def state_measured_limits(
             f"'{armature_object.name}' is linked and its limits belong to another file; set them there, or give it a "
             "library override."
         )
-    measured = measured_ranges(armature_object, actions)
+    keyed = keyed_ranges(armature_object, actions)
+    measured = moved_ranges(keyed)
     if not measured:
         names = ", ".join(f"'{action.name}'" for action in actions) or "none"
         raise RigError(f"The actions ({names}) move no bone of '{armature_object.name}'; choose actions of this rig.")
+    wide = _wide_bones(keyed)
     # An IK solver would take the limits of any bone that it moves.
     has_ik = any(constraint.type == "IK" for bone in armature_object.pose.bones for constraint in bone.constraints)
     found: list[MeasuredLimit] = []
@@ -93,8 +101,17 @@ def state_measured_limits(
                     state_rotation_range(bone, limit.axis, limit.low, limit.high)
             elif stated:
                 _state_without_holding(bone, kind, stated)
-        found += limits
+        found += [replace(limit, is_wide=bone.name in wide and limit.kind == ROTATION) for limit in limits]
     return tuple(found)
+
+
+def _wide_bones(keyed: Ranges) -> set[str]:
+    """Bones whose ranges of Euler angles let them rotate much farther than the actions do."""
+    widths: dict[tuple[str, str], float] = {}
+    for (bone, kind, _), (low, high) in keyed.items():
+        widths[bone, kind] = widths.get((bone, kind), 0.0) + high - low
+    vectors = [(bone, width) for (bone, kind), width in widths.items() if kind == ROTATION_VECTOR]
+    return {bone for bone, width in vectors if widths[bone, ROTATION] > MAX_WIDENING * width + RANGE_TOLERANCE}
 
 
 def _limit(bone: bpy.types.PoseBone, kind: str, axis: int, bounds: tuple[float, float], margin: float) -> MeasuredLimit:
@@ -136,7 +153,7 @@ def _state_without_holding(bone: bpy.types.PoseBone, kind: str, limits: list[Mea
 def limit_lines(armature_object: bpy.types.Object, limits: Iterable[MeasuredLimit]) -> list[str]:
     """A line for each bone, in degrees and millimetres."""
     factors = {ROTATION: 180 / math.pi, LOCATION: 1000 * metres_per_unit(armature_object), SCALE: 1.0}
-    by_bone: dict[str, list[str]] = {}
+    limits, by_bone = list(limits), dict[str, list[str]]()
     for limit in limits:
         (verb, unit, digits), factor = _WORDS[limit.kind], factors[limit.kind]
         # Adding zero makes -0 a 0.
@@ -144,4 +161,5 @@ def limit_lines(armature_object: bpy.types.Object, limits: Iterable[MeasuredLimi
         ends = f"{low:.{digits}f} to {high:.{digits}f}{unit}"
         why_not = f" ({limit.why_not})" if limit.why_not else ""
         by_bone.setdefault(limit.bone, []).append(f"{verb} {AXES[limit.axis].upper()} {ends}{why_not}")
-    return [f"{bone}: {', '.join(texts)}" for bone, texts in by_bone.items()]
+    wide = {limit.bone for limit in limits if limit.is_wide}
+    return [f"{bone}: {', '.join(texts)}{WIDE_NOTE if bone in wide else ''}" for bone, texts in by_bone.items()]

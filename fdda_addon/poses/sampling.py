@@ -9,14 +9,14 @@ import bpy
 from ..core.controls import Control
 from ..core.errors import RigError
 from ..core.model import ModelInfo
-from ..core.poses import CONTROL, KINDS, LOCATION, ROTATION, SCALE, Channel
+from ..core.poses import CONTROL, KINDS, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.rig import Rig
 from ..scene.compatibility import is_selected
 from ..scene.controls import is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
-from .action_range import measured_controls, measured_ranges
+from .action_range import is_moved, keyed_ranges, measured_controls
 from .clip import find_action
-from .motion_range import DEFAULT, location_ranges, rotation_ranges, scale_ranges
+from .motion_range import DEFAULT, RotationRange, location_ranges, rotation_ranges, scale_ranges
 
 LIMITS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
 SELECTED, COLLECTION, ACTION, BONE = "selected", "collection:", "action:", "bone:"
@@ -32,8 +32,8 @@ class Choice:
 
     Attributes:
         bones: names of the control bones; None for the bones of the rig as it stands (`own_channels`).
-        measured: ranges of actions, for what the rig states no range of; of the bones that are chosen by action, only
-            what is in here is sampled.
+        measured: ranges of what actions key. Bones that are chosen by action move in these, as far as the rig's limits
+            let them; other chosen bones do where the rig states no range.
         by_action: names of the bones that are chosen by action alone.
         controls: the controls, stated or keyed.
     """
@@ -66,11 +66,11 @@ def choose(scene_rig: SceneRig, texts: Iterable[str], controls: tuple[Control, .
             actions.append(find_action(text.removeprefix(ACTION)))
         else:
             chosen |= _bones_of(scene_rig, text)
-    measured = measured_ranges(scene_rig.armature_object, actions)
+    measured = keyed_ranges(scene_rig.armature_object, actions)
     own = {control.name: control for control in measured_controls(scene_rig, actions)}
     own |= {control.name: control for control in controls}
     keyed = {bone for bone, _, _ in measured}
-    if not chosen | keyed and not own:
+    if not chosen and not own and not any(map(is_moved, measured.values())):
         raise RigError(f"Nothing is chosen to sample by {', '.join(texts)}; choose bones that an animator poses.")
     return Choice(frozenset(chosen | keyed), tuple(measured.items()), frozenset(keyed - chosen), tuple(own.values()))
 
@@ -146,12 +146,37 @@ def model_channels(scene_rig: SceneRig, rig: Rig, info: ModelInfo) -> tuple[Chan
 
 
 def states_channels(scene_rig: SceneRig, channels: tuple[Channel, ...]) -> bool:
-    """Whether a rig still has the ranges that channels have, as far as it states them."""
-    bones = frozenset(channel.name for channel in channels)
-    now = {(c.name, c.kind, c.axis): c for c in chosen_channels(scene_rig.armature_object, Choice(bones))}
-    stated = [c for c in channels if (c.name, c.kind, c.axis) in now]
-    locked = [c for c in channels if c.kind == ROTATION and (c.name, c.kind, c.axis) not in now]
-    return not locked and all(now[c.name, c.kind, c.axis] == c for c in stated)
+    """Whether a rig still has the ranges that channels have, as far as it states them.
+
+    A range of an action may be narrower than the limit of its bone.
+    """
+    bones = scene_rig.armature_object.pose.bones
+    return all(_lets(bones[channel.name], channel) for channel in channels if channel.kind != CONTROL)
+
+
+def _lets(bone: bpy.types.PoseBone, channel: Channel) -> bool:
+    """Whether the limits and locks of a bone let a channel have its range."""
+    rotations = rotation_ranges(bone)
+    if channel.kind == ROTATION_VECTOR:
+        return _are_free(rotations)
+    if channel.kind == ROTATION:
+        stated = rotations[channel.axis]
+        if stated.is_locked:
+            return False
+        bounds = None if stated.source == DEFAULT else (stated.low, stated.high)
+    else:
+        locks = {LOCATION: bone.lock_location, SCALE: bone.lock_scale}[channel.kind]
+        if locks[channel.axis]:
+            return False
+        bounds = _stated_bounds(bone).get((channel.kind, channel.axis))
+    if bounds is None:
+        return True
+    return bounds[0] - RANGE_TOLERANCE <= channel.low and channel.high <= bounds[1] + RANGE_TOLERANCE
+
+
+def _are_free(rotations: tuple[RotationRange, ...]) -> bool:
+    """Whether no axis of a bone is locked or limited."""
+    return all(stated.source == DEFAULT and not stated.is_locked for stated in rotations)
 
 
 def own_channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Channel, ...]:
@@ -176,26 +201,63 @@ def own_channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Ch
 
 
 def chosen_channels(armature_object: bpy.types.Object, choice: Choice) -> tuple[Channel, ...]:
-    """As `own_channels`, of the bones that a user chose, whatever constraints they have."""
-    measured, found = dict(choice.measured), []
+    """As `own_channels`, of the bones that a user chose, whatever constraints they have.
+
+    Of the bones that are chosen by action only what the action keys is sampled, in the ranges of the action. Limits
+    narrow these. What is keyed elsewhere than in the rest pose and stands still has a range of one value.
+    """
+    measured: dict[str, Measured] = {}
+    for key, bounds in choice.measured:
+        measured.setdefault(key[0], {})[key] = bounds
+    found = []
     for bone in armature_object.pose.bones:
         if bone.name not in choice.bones:
             continue
-        rotations: dict[int, tuple[float, float]] = {}
-        for axis, stated in enumerate(rotation_ranges(bone)):
-            own = measured.get((bone.name, ROTATION, axis))
-            if not stated.is_locked and stated.source == DEFAULT and own:
-                rotations[axis] = own
-            elif stated.moves and not (bone.name in choice.by_action and own is None):
-                rotations[axis] = (stated.low, stated.high)
-        found += _rotations(bone, rotations)
-        stated_others = {(c.kind, c.axis): c for c in _stated_others(bone)}
-        locks = {LOCATION: bone.lock_location, SCALE: bone.lock_scale}
-        for (name, kind, axis), (low, high) in measured.items():
-            if name == bone.name and kind in locks and not locks[kind][axis]:
-                stated_others.setdefault((kind, axis), Channel(name, kind, axis, low, high))
-        found += stated_others.values()
+        keyed, by_action = measured.get(bone.name, {}), bone.name in choice.by_action
+        if not by_action:
+            keyed = {key: bounds for key, bounds in keyed.items() if is_moved(bounds)}
+        found += (*_chosen_rotations(bone, keyed, by_action), *_chosen_others(bone, keyed, by_action))
     return tuple(found)
+
+
+def _chosen_rotations(bone: bpy.types.PoseBone, keyed: Measured, by_action: bool) -> list[Channel]:
+    stated = rotation_ranges(bone)
+    vectors = {key[2]: bounds for key, bounds in keyed.items() if key[1] == ROTATION_VECTOR}
+    if vectors and _are_free(stated):
+        return _changing(Channel(bone.name, ROTATION_VECTOR, axis, *bounds) for axis, bounds in vectors.items())
+    ranges: dict[int, tuple[float, float]] = {}
+    for axis, limit in enumerate(stated):
+        own = keyed.get((bone.name, ROTATION, axis))
+        if limit.is_locked:
+            continue
+        if own and limit.source == DEFAULT:
+            ranges[axis] = own
+        elif own and by_action:
+            ranges[axis] = _narrowed(own, (limit.low, limit.high))
+        elif limit.moves and not by_action:
+            ranges[axis] = (limit.low, limit.high)
+    return _changing(_rotations(bone, ranges))
+
+
+def _chosen_others(bone: bpy.types.PoseBone, keyed: Measured, by_action: bool) -> list[Channel]:
+    """Channels of locations and scales."""
+    stated = {} if by_action else {(c.kind, c.axis): c for c in _stated_others(bone)}
+    limits, locks = _stated_bounds(bone), {LOCATION: bone.lock_location, SCALE: bone.lock_scale}
+    for (name, kind, axis), bounds in keyed.items():
+        # A connected bone stays where its parent ends.
+        if kind in locks and not locks[kind][axis] and not (kind == LOCATION and bone.bone.use_connect):
+            own = _narrowed(bounds, limits[kind, axis]) if (kind, axis) in limits else bounds
+            stated.setdefault((kind, axis), Channel(name, kind, axis, *own))
+    return _changing(stated.values())
+
+
+def _narrowed(bounds: tuple[float, float], limit: tuple[float, float]) -> tuple[float, float]:
+    """What a limit leaves of a range; its nearest end where it leaves nothing."""
+    return tuple(min(max(end, limit[0]), limit[1]) for end in bounds)
+
+
+def _changing(channels: Iterable[Channel]) -> list[Channel]:
+    return [channel for channel in channels if channel.changes]
 
 
 def locked_channels(armature_object: bpy.types.Object, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
@@ -217,14 +279,18 @@ def _rotations(bone: bpy.types.PoseBone, ranges: dict[int, tuple[float, float]])
 
 def _stated_others(bone: bpy.types.PoseBone) -> list[Channel]:
     """Channels of the locations and scales that a bone states a range of."""
-    locations = {} if bone.bone.use_connect else location_ranges(bone)
-    kinds = ((LOCATION, locations, bone.lock_location), (SCALE, scale_ranges(bone), bone.lock_scale))
+    locks = {LOCATION: bone.lock_location, SCALE: bone.lock_scale}
     return [
         Channel(bone.name, kind, axis, low, high)
-        for kind, ranges, locks in kinds
-        for axis, (low, high) in ranges.items()
-        if not locks[axis] and low < high
+        for (kind, axis), (low, high) in _stated_bounds(bone).items()
+        if not locks[kind][axis] and low < high and not (kind == LOCATION and bone.bone.use_connect)
     ]
+
+
+def _stated_bounds(bone: bpy.types.PoseBone) -> dict[tuple[str, int], tuple[float, float]]:
+    """Ranges of locations and scales that a bone states, by kind and axis."""
+    kinds = ((LOCATION, location_ranges(bone)), (SCALE, scale_ranges(bone)))
+    return {(kind, axis): bounds for kind, ranges in kinds for axis, bounds in ranges.items()}
 
 
 def is_moved_by_constraints(bone: bpy.types.PoseBone) -> bool:

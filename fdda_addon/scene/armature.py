@@ -3,9 +3,9 @@
 
 import bpy
 import numpy as np
-from mathutils import Euler
+from mathutils import Euler, Quaternion
 
-from ..core.poses import CONTROL, LOCATION, ROTATION, SCALE, Channel
+from ..core.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.rig import UNMOVED
 from .arrays import POSE_CHANNELS, POSE_MATRIX, Reader, write
 from .controls import set_control
@@ -79,14 +79,15 @@ class Poser:
             angles = [0.0, 0.0, 0.0]
             for place, axis in places:
                 angles[axis] = values[place]
-            bone = bones[name]
-            if bone.rotation_mode == "QUATERNION":
-                bone.rotation_quaternion = Euler(angles).to_quaternion()
-            elif bone.rotation_mode == "AXIS_ANGLE":
-                axis_vector, angle = Euler(angles).to_quaternion().to_axis_angle()
-                bone.rotation_axis_angle = (angle, *axis_vector)
+            if bones[name].rotation_mode in {"QUATERNION", "AXIS_ANGLE"}:
+                _rotate(bones[name], Euler(angles).to_quaternion())
             else:
-                bone.rotation_euler = angles
+                bones[name].rotation_euler = angles
+        for name, places in self._places.get(ROTATION_VECTOR, {}).items():
+            vector = [0.0, 0.0, 0.0]
+            for place, axis in places:
+                vector[axis] = values[place]
+            _rotate(bones[name], Quaternion(vector))
         for kind in (LOCATION, SCALE):
             for name, places in self._places.get(kind, {}).items():
                 values_of_bone = getattr(bones[name], kind)
@@ -94,3 +95,14 @@ class Poser:
                     values_of_bone[axis] = values[place]
         for name, places in self._places.get(CONTROL, {}).items():
             set_control(self._scene_rig, name, float(values[places[0][0]]))
+
+
+def _rotate(bone: bpy.types.PoseBone, rotation: Quaternion) -> None:
+    """Rotate a bone relative to its rest pose, in whichever mode it rotates."""
+    if bone.rotation_mode == "QUATERNION":
+        bone.rotation_quaternion = rotation
+    elif bone.rotation_mode == "AXIS_ANGLE":
+        axis, angle = rotation.to_axis_angle()
+        bone.rotation_axis_angle = (angle, *axis)
+    else:
+        bone.rotation_euler = rotation.to_euler(bone.rotation_mode)

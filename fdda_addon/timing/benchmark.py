@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import RigError
-from ..core.poses import CONTROL, ROTATION, Channel, sample_pose
+from ..core.poses import CONTROL, ROTATION, ROTATION_VECTOR, Channel, sample_pose
 from ..core.progress import Progress
 from ..poses.action_range import action_frames
 from ..poses.sampling import model_channels, sampled_channels
@@ -187,7 +187,7 @@ def random_action(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> bp
         poser.set(sample_pose(channels, 0, index))
         for name, kind in {(channel.name, channel.kind) for channel in channels}:
             bone = armature_object.pose.bones[name]
-            path = paths.get(bone.rotation_mode, "rotation_euler") if kind == ROTATION else kind
+            path = paths.get(bone.rotation_mode, "rotation_euler") if kind in {ROTATION, ROTATION_VECTOR} else kind
             bone.keyframe_insert(path, frame=1 + index * KEY_STEP)
     return armature_object.animation_data.action
 

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Rotations as three numbers, without jumps: rotation vectors and Euler angles of many quaternions together.
+
+One rotation has several triples. Of each quaternion the triple is chosen that lies nearest to those of the others, so
+that a range over all of them is as narrow as the rotations are.
+"""
+
+import numpy as np
+
+TURN = 2 * np.pi
+MAX_ITERATIONS = 10
+"""The center of a range settles after a few choices of the nearest triples."""
+STARTS = 8
+"""Ranges wider than a half turn are looked for around so many of the rotations."""
+LOCKED = 1e-12
+"""Euler angles are in gimbal lock where the sine of the middle one is this near to 1."""
+MIN_ANGLE = 1e-9
+"""Radians. A rotation by less has no axis."""
+
+
+def rotation_vectors(quaternions: np.ndarray) -> np.ndarray:
+    """Compute rotation vectors (axis times angle) that lie near each other.
+
+    Args:
+        quaternions: (F, 4), w first, of any length; those of length 0 do not rotate.
+
+    Returns:
+        (F, 3) float64, radians. The range of a motion does not break at a half turn from the rest pose.
+    """
+    unit = _normalized(quaternions)
+    vectors = _logarithm(unit)
+    angles = np.linalg.norm(vectors, axis=1, keepdims=True)
+    # The same rotation the other way round.
+    others = np.where(angles > MIN_ANGLE, vectors * (1 - TURN / np.maximum(angles, MIN_ANGLE)), vectors)
+    return _nearest(np.stack([vectors, others], axis=1), _logarithm(_mean(unit)[None])[0])
+
+
+def euler_angles(quaternions: np.ndarray) -> np.ndarray:
+    """Compute XYZ Euler angles that lie near each other.
+
+    Args:
+        quaternions: as for `rotation_vectors`.
+
+    Returns:
+        (F, 3) float64, radians.
+    """
+    unit = _normalized(quaternions)
+    angles = _xyz(unit)
+    others = angles * (1, -1, 1) + np.pi
+    return _nearest(np.stack([angles, others], axis=1), _xyz(_mean(unit)[None])[0], TURN)
+
+
+def total_width(values: np.ndarray) -> float:
+    """Sum of the widths of the ranges of (F, 3) values."""
+    return float(np.ptp(values, axis=0).sum())
+
+
+def _nearest(candidates: np.ndarray, mean: np.ndarray, period: float = 0.0) -> np.ndarray:
+    """(F, 3) of (F, 2, 3) candidates the ones whose ranges are narrow, about the rest pose where that is possible."""
+    best = _nearest_to(np.zeros(3), candidates, period)
+    if np.ptp(best, axis=0).max() <= np.pi:
+        return best
+    some = candidates[np.linspace(0, len(candidates) - 1, STARTS).astype(int), 0]
+    for center in (mean, *some):
+        values = _nearest_to(center, candidates, period)
+        if total_width(values) < total_width(best) - MIN_ANGLE:
+            best = values
+    return best
+
+
+def _nearest_to(center: np.ndarray, candidates: np.ndarray, period: float) -> np.ndarray:
+    """(F, 3) the candidates nearest to the middle of their own range; `center` is where the search begins."""
+    best = None
+    for _ in range(MAX_ITERATIONS):
+        shifted = candidates - period * np.round((candidates - center) / period) if period else candidates
+        nearest = np.square(shifted - center).sum(axis=2).argmin(axis=1)
+        values = shifted[np.arange(len(shifted)), nearest]
+        if best is not None and total_width(values) >= total_width(best) - MIN_ANGLE:
+            break
+        best, center = values, (values.min(axis=0) + values.max(axis=0)) / 2
+    return best
+
+
+def _normalized(quaternions: np.ndarray) -> np.ndarray:
+    values = np.asarray(quaternions, np.float64)
+    lengths = np.linalg.norm(values, axis=1, keepdims=True)
+    return np.where(lengths > 0, values / np.where(lengths > 0, lengths, 1), (1.0, 0.0, 0.0, 0.0))
+
+
+def _mean(unit: np.ndarray) -> np.ndarray:
+    """(4,) the rotation with the least sum of squared distances, whatever the signs of the quaternions are."""
+    return np.linalg.eigh(unit.T @ unit)[1][:, -1]
+
+
+def _logarithm(unit: np.ndarray) -> np.ndarray:
+    """(F, 3) rotation vectors no longer than a half turn."""
+    unit = np.where(unit[:, :1] < 0, -unit, unit)
+    sines = np.linalg.norm(unit[:, 1:], axis=1, keepdims=True)
+    angles = 2 * np.arctan2(sines, unit[:, :1])
+    return unit[:, 1:] * np.where(sines > MIN_ANGLE, angles / np.maximum(sines, MIN_ANGLE), 2.0)
+
+
+def _xyz(unit: np.ndarray) -> np.ndarray:
+    """(F, 3) XYZ Euler angles, the middle one within a quarter turn."""
+    w, x, y, z = unit.T
+    sine = np.clip(2 * (y * w - x * z), -1, 1)
+    first = np.arctan2(2 * (y * z + x * w), 1 - 2 * (x * x + y * y))
+    last = np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z))
+    # In gimbal lock the first and the last angle turn about one axis.
+    is_locked = np.abs(sine) > 1 - LOCKED
+    return np.stack(
+        [np.where(is_locked, 2 * np.arctan2(x, w), first), np.arcsin(sine), np.where(is_locked, 0, last)], 1
+    )
