@@ -6,7 +6,16 @@ import sys
 
 import pytest
 
+
+def _missing_drive() -> str:
+    return next(f"{letter}:\\" for letter in "QRSTUVWXY" if not os.path.exists(f"{letter}:\\"))
+
+
 WINDOWS = sys.platform == "win32"
+KILLED = 1 if WINDOWS else -9
+"""What `subprocess` says of a process after its method `kill`."""
+UNWRITABLE = f"{_missing_drive()}fdda" if WINDOWS else "/proc/fdda"
+"""A path at which nothing can be made, not even by an administrator."""
 NO_FILE_SIZE_LIMITS = "Windows does not limit the size of a process's files."
 
 try:

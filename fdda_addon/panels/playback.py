@@ -10,6 +10,7 @@ from ..models.entries import bound_name, chosen_entry
 from ..scene.kept import kept
 from ..scene.model_trust import is_trusted
 from ..scene.scene_rig import SceneRig, armature_of
+from ..scene.stored_paths import resolved
 from ..timing import frame_times
 from .names import shown_name
 from .section import Section, draw_button, draw_job, draw_sentence, panel_rig, together
@@ -24,7 +25,7 @@ MODES = (("RIG", "Rig"), ("LINEAR", "Linear Layer"), ("FDDA", "FDDA"))
 @kept
 def lies_outside(mesh_object: bpy.types.Object) -> bool:
     """Whether the bound model plays in this session only, as its file may not be followed from this one."""
-    path = Path(bpy.path.abspath(mesh_object.fdda.model, library=mesh_object.library)).resolve()
+    path = resolved(mesh_object.fdda.model, mesh_object.library).resolve()
     file = Path(bpy.data.filepath).resolve()
     return bool(bpy.data.filepath) and not path.is_relative_to(file.parent) and not is_trusted(path)
 

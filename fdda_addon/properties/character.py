@@ -21,6 +21,7 @@ from bpy.props import (
 from ..core.defaults import EPOCHS, MARGIN, MIN_VERTICES, POSES, SPREAD, TARGET_MM, TOLERANCE_MM
 from ..core.errors import OutputError
 from ..scene.scene_rig import SceneRig, armature_of
+from ..scene.stored_paths import resolved
 
 
 class FDDA_PG_bone(bpy.types.PropertyGroup):
@@ -256,4 +257,4 @@ def _path(stated: str, beside: str, what: str) -> Path:
         raise OutputError(
             f"The .blend file has not been saved, so there is no place beside it; save it, or name a {what}."
         )
-    return Path(bpy.path.abspath(stated or f"//{beside}"))
+    return resolved(stated or f"//{beside}")

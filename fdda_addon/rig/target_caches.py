@@ -12,6 +12,7 @@ from ..core.errors import PointCacheError, RigError
 from ..core.mesh_cache import mesh_cache_frames
 from ..scene.node_groups import SIMULATION_NODES, time_node
 from ..scene.scene_rig import SceneRig, read_objects
+from ..scene.stored_paths import resolved
 from .modifier_stack import IN_TIME
 
 ALEMBIC, USD = {".abc"}, {".usd", ".usda", ".usdc", ".usdz"}
@@ -148,7 +149,7 @@ def _usd_frames(path: Path) -> tuple[float, float] | None:
 
 
 def _existing(filepath: str, words: str, owner: bpy.types.ID) -> Path:
-    path = Path(bpy.path.abspath(filepath, library=owner.library)).resolve() if filepath else None
+    path = resolved(filepath, owner.library).resolve() if filepath else None
     if path is None or not path.is_file():
         raise RigError(
             f"{words[0].upper()}{words[1:]} plays the file '{path or filepath}', which is not there; put it there, "

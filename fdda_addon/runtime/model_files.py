@@ -8,7 +8,7 @@ import bpy
 
 from ..core.errors import ModelError
 from ..scene.model_trust import is_trusted
-from ..scene.stored_paths import absolute_path, origin
+from ..scene.stored_paths import absolute_path, origin, resolved
 from . import packed
 from .network import Network
 
@@ -68,7 +68,7 @@ def allowed_path(mesh_object: bpy.types.Object, stored: str) -> Path:
     """
     path = absolute_path(mesh_object, stored)
     library = origin(mesh_object, stored).library
-    file = bpy.path.abspath(library.filepath) if library else bpy.data.filepath
+    file = str(resolved(library.filepath)) if library else bpy.data.filepath
     # Resolved: the way from the open file to the model leads through "..".
     in_folder = not file or path.resolve().is_relative_to(Path(file).resolve().parent)
     if not (in_folder or path.resolve() in _chosen or is_trusted(path)):

@@ -18,10 +18,23 @@ _rebased: list[tuple[bpy.types.PropertyGroup, str, str]] = []
 _saved_from = ""
 
 
+def resolved(stored: str, library: bpy.types.Library | None = None) -> Path:
+    """Make a path of a .blend file absolute, as Blender does.
+
+    Args:
+        stored: the path; `//` stands for the folder of the file.
+        library: the linked file that has the path; the open file when it is left out.
+    """
+    folder = resolved(library.filepath).parent if library else Path(bpy.data.filepath).parent
+    if stored.startswith(RELATIVE):
+        # Blender on Windows separates folders by backslashes, and reads both on every system.
+        stored = stored.replace("\\", "/")
+    return Path(bpy.path.abspath(stored, start=str(folder)))
+
+
 def absolute_path(mesh_object: bpy.types.Object, stored: str) -> Path:
     """Where a path leads that is stored with an object, whether it is followed or not."""
-    library = origin(mesh_object, stored).library
-    return Path(os.path.normpath(bpy.path.abspath(stored, library=library)))
+    return Path(os.path.normpath(resolved(stored, origin(mesh_object, stored).library)))
 
 
 def stored_path(path: Path) -> str:
@@ -89,7 +102,7 @@ def _on_save_begins(file: str = "", *_: object) -> None:
         return
     for mesh_object, owner, name in _own_paths():
         stored = getattr(owner, name)
-        path = Path(os.path.normpath(bpy.path.abspath(stored)))
+        path = Path(os.path.normpath(resolved(stored)))
         # What is given in full stays so, but for what goes wherever the file goes.
         if (stored.startswith(RELATIVE) and _saved_from) or path.is_relative_to(folder):
             _rebased.append((owner, name, stored))

@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 import pytest
 
+from .. import systems
 from .refusals import Refusal, files, save_elbow, small_files
 
 
@@ -177,7 +178,7 @@ def test_an_output_below_a_file(refusal, writing, tmp_path):
 
 
 def test_an_output_where_nothing_can_be_written(refusal, writing):
-    assert refusal(*writing("/proc/fdda")).startswith("Cannot write")
+    assert refusal(*writing(systems.UNWRITABLE)).startswith("Cannot write")
 
 
 def test_an_output_in_a_folder_that_is_not_there(refusal, writing, tmp_path):

@@ -184,10 +184,9 @@ def test_a_python_without_scipy_leaves_no_recording(refusal, tmp_path, monkeypat
 
 def test_a_fit_that_dies_is_reported(refusal, tmp_path, monkeypatch):
     path = save_elbow(tmp_path / "elbow.blend")
-    python = tmp_path / "python"
-    python.write_text("#!/bin/sh\nexit 3\n")
-    python.chmod(0o755)
-    monkeypatch.setenv(PYTHON_VARIABLE, str(python))
+    (tmp_path / "sitecustomize.py").write_text("import os\nos._exit(3)\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
     assert refusal("record", path, tmp_path / "recording", "--poses", 12, "--fit-linear", "smooth") == (
         "The trainer ended with status 3 before it was done; no skin weights were fitted, record again."
     )

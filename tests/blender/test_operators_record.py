@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """From the sample arm to a model with operators alone, without a window: values, sentences, cancelling and undo."""
 
-import fcntl
 import json
 import math
 import os
+import socket
 from pathlib import Path
 
 import bpy
@@ -15,6 +15,7 @@ from fdda_addon.core.model import read_model_info
 from fdda_addon.core.poses import sample_pose
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.lock import LOCK
+from fdda_addon.core.recording.lock import _lock as lock_file
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.jobs import job
 from fdda_addon.operators.rig import cost_of
@@ -256,10 +257,10 @@ class TestRecording:
     def test_another_blender_is_recording_there(self, saved, tmp_path):
         recorded_folder(tmp_path).mkdir()
         lock = recorded_folder(tmp_path) / LOCK
-        lock.write_text(json.dumps({"pid": os.getppid(), "host": os.uname().nodename}))
-        with lock.open() as held:
+        lock.write_text(json.dumps({"pid": os.getppid(), "host": socket.gethostname()}))
+        with lock.open("r+b") as held:
             # The system's lock is of the open file, so this is another's also in one process.
-            fcntl.flock(held, fcntl.LOCK_EX)
+            assert lock_file(held.fileno())
             with pytest.raises(RuntimeError, match=rf"Another Blender \(process {os.getppid()}\) is recording into"):
                 self.record(saved)
         assert lock.exists()

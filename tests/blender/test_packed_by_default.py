@@ -8,6 +8,7 @@ import pytest
 
 from fdda_addon.core.errors import ModelError
 from fdda_addon.operators import playback
+from fdda_addon.properties import character
 from fdda_addon.runtime import model_files, packed
 from fdda_addon.scene import model_trust
 
@@ -140,6 +141,16 @@ def test_a_model_outside_is_found_after_save_as(followed, elbow, tmp_path):
     assert named_paths(mesh_object) == there
     pose(angle=1.1)
     assert_plays(mesh_object, elbow.model)
+
+
+def test_paths_that_blender_on_windows_has_stored_are_followed(followed, tmp_path):
+    settings = followed.fdda.settings
+    followed.fdda.model = followed.fdda.models[0].path = r"//models\elbow.onnx"
+    settings.recording, settings.model = r"//poses\elbow", r"//models\trained.onnx"
+    assert model_files.model_path(followed) == tmp_path / "models" / "elbow.onnx"
+    assert character.recording_folder(followed) == tmp_path / "poses" / "elbow"
+    there = ["//../models/elbow.onnx"] * 2 + ["//../poses/elbow", "//../models/trained.onnx"]
+    assert named_paths(save_elsewhere(tmp_path)) == there
 
 
 def test_a_copy_finds_the_model_and_the_open_file_too(followed, elbow, tmp_path):

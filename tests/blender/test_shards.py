@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Recordings in shards: joined, they are bit for bit the recording of one run, whatever the poses are made of."""
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -167,7 +168,7 @@ def test_influences_of_something_else_are_refused(elbow, tmp_path, capfd):
     text = refusal(*of_shard, found, "--poses", 11)
     assert "not those of this recording: they were found with another sources, poses." in text
     assert "with another seed" in refusal(*of_shard, found, "--poses", 10, "--seed", 1)
-    assert "'none' is not a recording" in refusal(*of_shard, tmp_path / "none").replace(f"{tmp_path}/", "")
+    assert "'none' is not a recording" in refusal(*of_shard, tmp_path / "none").replace(f"{tmp_path}{os.sep}", "")
     other = saved(waving, tmp_path / "other.blend")
     text = refusal("record", other, tmp_path / "s", "--shard", "1/2", "--influences", found, "--poses", 10)
     assert "are of other partitions than those of 'body'; find them with the same rig and options" in text

@@ -2,6 +2,7 @@
 """Shards that are joined: bit for bit the recording of one run, whatever their order and whatever interrupts it."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -101,7 +102,9 @@ def test_what_is_missing_or_twice_is_named(shards, tmp_path):
         f"'{shards[2]}' and '{shards[2]}' have poses in common; give each shard once."
     )
     assert sentence([], path) == "There is nothing to merge; give the folders of the shards."
-    assert "'none' is not a recording" in sentence([*shards, tmp_path / "none"], path).replace(f"{tmp_path}/", "")
+    assert "'none' is not a recording" in sentence([*shards, tmp_path / "none"], path).replace(
+        f"{tmp_path}{os.sep}", ""
+    )
 
 
 def test_shards_of_other_recordings_are_refused(shards, tmp_path):
