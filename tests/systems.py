@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What only some operating systems have: marks that skip a test elsewhere and give the reason."""
 
+import errno
 import os
 import sys
 
@@ -23,6 +24,9 @@ try:
 except FileNotFoundError as error:
     NOT_FOUND = error.strerror
     """The words of the system for a file that does not exist; Windows and the C library have different ones."""
+
+BELOW_A_FILE = os.strerror(errno.ENOENT if WINDOWS else errno.ENOTDIR)
+"""Its words for a path that leads through a file."""
 
 symbolic_links = pytest.mark.skipif(WINDOWS, reason="Windows lets only administrators make symbolic links.")
 named_pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders.")

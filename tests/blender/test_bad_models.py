@@ -15,6 +15,7 @@ from fdda_addon.core.onnx_file import read_onnx
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import find_rig
 
+from .. import systems
 from .conftest import run
 from .refusals import Refusal, save_elbow
 
@@ -100,7 +101,7 @@ def test_a_model_of_another_rig(refusal, verb, elbow, tmp_path, change, words):
 def test_no_model(refusal, verb, elbow, tmp_path):
     path = tmp_path / "none.onnx"
     text = refusal(*verb(elbow.rig, path))
-    assert text.startswith(f"The model '{path}' cannot be read: No such file or directory; ")
+    assert text.startswith(f"The model '{path}' cannot be read: {systems.NOT_FOUND}; ")
 
 
 @pytest.mark.parametrize("content", [b"", b"text, not a model\n" * 50, bytes(5000)])

@@ -10,6 +10,7 @@ from fdda_addon.core.errors import ModelError
 from fdda_addon.models.entries import bound_entry, megabytes
 from fdda_addon.runtime import packed
 
+from .. import systems
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose
 from .test_operators_playback import refused
 
@@ -277,7 +278,7 @@ def test_what_the_section_says_of_the_models(bound, elbow):
     assert icon == "INFO" and sentence.startswith("The range of motion of 'lower' has changed")
     bound.fdda.models[0].path = "//away.onnx"
     ((icon, sentence),) = section._models.now(bound).values()
-    assert icon == "ERROR" and "cannot be read: No such file or directory; find it, or choose another." in sentence
+    assert icon == "ERROR" and f"cannot be read: {systems.NOT_FOUND}; find it, or choose another." in sentence
 
 
 def test_megabytes():

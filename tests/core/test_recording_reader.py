@@ -11,6 +11,7 @@ from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 
+from .. import systems
 from .damage import array_file, edit, refused
 
 FIST = {"owner": "mesh_object", "path": '["fist"]', "low": 0, "high": 1}
@@ -135,7 +136,7 @@ def test_truncated(recording, name):
 @pytest.mark.parametrize("name", ["skin_weights", "face_starts", "face_vertices"])
 def test_missing_array(recording, name):
     (recording / f"{name}.npy").unlink()
-    refused(recording, f"{name}.npy' cannot be used", "No such file")
+    refused(recording, f"{name}.npy' cannot be used", systems.NOT_FOUND)
 
 
 @pytest.mark.parametrize("name", ["residuals", "pose_matrices"])

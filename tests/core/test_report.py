@@ -62,7 +62,7 @@ def damaged(place: tuple, value: object) -> dict:
 
 def test_what_lies_beside_a_model():
     model = Path("folder/arm.onnx")
-    assert [str(path(model)) for path in (report_path, page_path, weights_path)] == [
+    assert [path(model).as_posix() for path in (report_path, page_path, weights_path)] == [
         *("folder/report.json", "folder/report.html", "folder/arm.weights.npz")
     ]
 

@@ -23,6 +23,7 @@ from trainer.process import Cancelled
 from trainer.skin_fit import main
 from trainer.skin_solver import SkinSolver, simplex_weights
 
+from .. import systems
 from .chain import rotation
 from .conftest import REPOSITORY
 
@@ -247,7 +248,11 @@ def damage() -> Iterator:
         array[3, 5, 1] = np.nan
         return array
 
-    yield "missing", lambda folder: (folder / "parents.npy").unlink(), "'parents.npy' cannot be read (No such file"
+    yield (
+        "missing",
+        lambda folder: (folder / "parents.npy").unlink(),
+        f"'parents.npy' cannot be read ({systems.NOT_FOUND}",
+    )
     yield "truncated", truncate, "'positions.npy' is no array, or truncated"
     yield (
         "no array",
