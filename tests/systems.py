@@ -19,14 +19,10 @@ UNWRITABLE = f"{_missing_drive()}fdda" if WINDOWS else "/proc/fdda"
 """A path at which nothing can be made, not even by an administrator."""
 NO_FILE_SIZE_LIMITS = "Windows does not limit the size of a process's files."
 
-try:
-    os.stat("a file that does not exist")
-except FileNotFoundError as error:
-    NOT_FOUND = error.strerror
-    """The words of the system for a file that does not exist; Windows and the C library have different ones."""
-
+NOT_FOUND = os.strerror(errno.ENOENT)
+"""What a sentence says of a file that does not exist."""
 BELOW_A_FILE = os.strerror(errno.ENOENT if WINDOWS else errno.ENOTDIR)
-"""Its words for a path that leads through a file."""
+"""What it says of a path that leads through a file."""
 
 symbolic_links = pytest.mark.skipif(WINDOWS, reason="Windows lets only administrators make symbolic links.")
 named_pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes in folders.")

@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from ..core import file_kind
-from ..core.errors import FDDAError, OutputError, WrongUsageError
+from ..core.errors import FDDAError, OutputError, WrongUsageError, os_reason
 from ..core.mask import Blend
 from ..core.output import check_outputs, replacing, replacing_all
 from ..core.point_cache import PointCacheWriter, read_point_cache
@@ -249,4 +249,4 @@ def _scratch(out: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix=".fdda-", dir=out.parent, ignore_cleanup_errors=True) as folder:
             yield Path(folder) / f"positions{POINT_CACHE}"
     except OSError as error:
-        raise OutputError(f"Cannot write '{out}': {error.strerror or error}; nothing was changed.") from error
+        raise OutputError(f"Cannot write '{out}': {os_reason(error)}; nothing was changed.") from error

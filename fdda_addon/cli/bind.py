@@ -3,6 +3,7 @@
 
 import argparse
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from ..core.file_kind import BLEND
+    from ..core.open_files import remove_file
     from ..core.output import check_outputs
     from ..scene.blend_file import save_copy
     from .folders import open_rigs
@@ -40,7 +42,8 @@ def run(options: argparse.Namespace) -> None:
         save_copy(options.out)
     except BaseException:
         for place in copied:
-            place.unlink()
+            with suppress(OSError):
+                remove_file(place)
         raise
     for place, model in copied.items():
         print(f"{place}: a copy of {model}, beside the file that plays it")

@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError
-from ..scene.blend_file import quiet, reason
+from ..scene.blend_file import blender_path, quiet, reason
 from ..scene.scene_rig import SceneRig, find_rig
 
 
@@ -42,6 +42,6 @@ def open_file(path: Path) -> None:
         raise FDDAError(f"There is no file '{path}'; give the path of a .blend file.")
     try:
         with quiet():
-            bpy.ops.wm.open_mainfile(filepath=str(path.absolute()), load_ui=False)
+            bpy.ops.wm.open_mainfile(filepath=blender_path(path), load_ui=False)
     except RuntimeError as error:
         raise FDDAError(f"Blender cannot open '{path}' ({reason(error)}); give a .blend file.") from error

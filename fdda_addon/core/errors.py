@@ -7,6 +7,7 @@ Any other exception is a bug and propagates.
 """
 
 import errno
+import os
 import re
 
 TRY_AGAIN = 75
@@ -21,6 +22,14 @@ MACHINE = {
     if hasattr(errno, name)
 }
 """What the system says when a disk, the memory or a shared folder gave out, and not when a path is wrong."""
+MACHINE_WINDOWS = {8, 14, 21, 32, 33, 39, 53, 59, 64, 112, 121, 1117, 1224, 1231, 1450, 1455}
+"""The same as Windows numbers it, and that another program has a file open; Python knows few of these by `errno`."""
+_WINDOWS_WORDS = {
+    **dict.fromkeys((32, 33, 1224), "another program has it open"),
+    **dict.fromkeys((39, 112), os.strerror(errno.ENOSPC)),
+    **dict.fromkeys((8, 14, 1450, 1455), os.strerror(errno.ENOMEM)),
+    206: os.strerror(errno.ENAMETOOLONG),
+}
 LONGEST = 1000
 """Letters of a sentence. What a file of somebody else's says is quoted in it, and may be a million letters long."""
 _CONTROL = r"[\x00-\x1f\x7f-\x9f\u2028\u2029]"
@@ -32,6 +41,16 @@ def one_line(text: str) -> str:
         half = LONGEST // 2
         text = f"{text[:half]} […] {text[-half:]}"
     return re.sub(_CONTROL, lambda found: repr(found.group())[1:-1], text)
+
+
+def os_reason(error: OSError) -> str:
+    """What the system says of an error, in English; Windows says it in its own language."""
+    number = getattr(error, "winerror", None)
+    if not number:
+        return error.strerror or str(error)
+    # What Python has no number of its own for is EINVAL.
+    words = f"error {number} of Windows" if error.errno == errno.EINVAL else os.strerror(error.errno)
+    return _WINDOWS_WORDS.get(number, words)
 
 
 class FDDAError(Exception):
@@ -50,10 +69,14 @@ def exit_status(error: BaseException) -> int:
         return status
     cause: BaseException | None = error
     while cause is not None:
-        if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in MACHINE):
+        if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and _is_of_machine(cause)):
             return TRY_AGAIN
         cause = cause.__cause__
     return status
+
+
+def _is_of_machine(error: OSError) -> bool:
+    return error.errno in MACHINE or getattr(error, "winerror", None) in MACHINE_WINDOWS
 
 
 class WrongUsageError(FDDAError):

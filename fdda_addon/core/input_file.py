@@ -7,6 +7,8 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
+from .open_files import open_patiently
+
 NOT_ORDINARY = "it is no ordinary file"
 LINK = "it is a link to another place"
 # A pipe that took the place of the file meanwhile must not block. Windows has neither flag, nor pipes in folders.
@@ -25,6 +27,10 @@ def open_input(path: Path, mode: str = "rb", follow: bool = True) -> BinaryIO:
     Raises:
         OSError: it cannot be opened, or is a pipe, a device, a folder or, unless `follow`, a link; `strerror` says so.
     """
+    return open_patiently(lambda: _open(path, mode, follow))
+
+
+def _open(path: Path, mode: str, follow: bool) -> BinaryIO:
     if "x" not in mode:
         _check(os.stat(path, follow_symlinks=follow), path)
     flags = _FLAGS | (0 if follow else _NO_LINK)

@@ -4,7 +4,7 @@
 import struct
 from pathlib import Path
 
-from .errors import PointCacheError
+from .errors import PointCacheError, os_reason
 from .input_file import open_input
 from .point_cache import read_point_cache
 
@@ -24,7 +24,7 @@ def mesh_cache_frames(path: Path) -> int:
         with open_input(path) as file:
             head, size = file.read(_MDD.size), path.stat().st_size
     except OSError as error:
-        raise PointCacheError(f"The point cache '{path}' cannot be read: {error.strerror or error}.") from error
+        raise PointCacheError(f"The point cache '{path}' cannot be read: {os_reason(error)}.") from error
     frames, points = _MDD.unpack(head) if len(head) == _MDD.size else (0, 0)
     if frames < 1 or points < 1 or size != _MDD.size + 4 * frames + 12 * frames * points:
         raise PointCacheError(

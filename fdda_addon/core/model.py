@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from .controls import Control, read_controls
-from .errors import ModelError
+from .errors import ModelError, os_reason
 from .input_file import read_input
 from .model_graph import Explained, check_ends, check_graph, explain
 from .onnx_file import read_onnx
@@ -226,7 +226,7 @@ def read_model(path: Path) -> tuple[ModelInfo, bytes]:
         data = read_input(path, MAX_BYTES)
     except OSError as error:
         raise ModelError(
-            f"The model '{path}' cannot be read: {error.strerror}; give one that train made, or train it first."
+            f"The model '{path}' cannot be read: {os_reason(error)}; give one that train made, or train it first."
         ) from error
     return check_model(data, path), data
 

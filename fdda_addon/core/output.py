@@ -1,19 +1,26 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Writing files so that a reader finds the old one, the new one, or none; never a half."""
 
+import errno
 import json
 import os
 import re
 import secrets
+import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 
-from .errors import OutputError
+from .errors import NoRoomError, OutputError, os_reason
 from .file_kind import FileKind
+from .open_files import remove_file, replace_file
+from .path_limits import check_path, is_windows, same_place
 
 TEMPORARY = ".fdda-"
+KEPT = "new-"
+"""Begins the name of a file that could not take the place of another."""
 _LEFT_OVER = r"\.fdda-[0-9a-f]{12}(\..*)?|\.\d+-recording\.json"
 """Names that `replacing` gives, and those that earlier versions gave to the index of a recording."""
 
@@ -38,7 +45,7 @@ def check_outputs(
     inputs, places = list(inputs), {}
     for path, kind in outputs:
         check_writable(path)
-        place = os.path.realpath(path)
+        place = same_place(path)
         if place in places:
             raise OutputError(f"Cannot write '{path}': it would be {places[place]} and {kind.name}; give two names.")
         places[place] = kind.name
@@ -58,7 +65,7 @@ def _is_of(path: Path, kind: FileKind) -> bool:
         return kind.is_of(path)
     except OSError as error:
         raise OutputError(
-            f"Cannot write '{path}': another file is there, {error.strerror}; give another name."
+            f"Cannot write '{path}': another file is there, {os_reason(error)}; give another name."
         ) from error
 
 
@@ -66,8 +73,11 @@ def check_writable(path: Path) -> None:
     """Fail before the work rather than after it when a file could not be written.
 
     Raises:
-        OutputError: the folder does not exist or cannot be written, or the path is a folder or a device.
+        OutputError: the folder does not exist or cannot be written, the path is a folder or a device, or `check_path`
+            refuses it.
     """
+    # Blender, too, writes beside the file that it is told to write, with a letter more.
+    check_path(path, path, path.parent / f"{_temporary_name(path)}@")
     # os.path: the methods of Path raise for a folder that may not be entered.
     folder = path.parent
     if os.path.isdir(path):
@@ -75,18 +85,26 @@ def check_writable(path: Path) -> None:
     if os.path.exists(path) and not os.path.isfile(path):
         # A rename would put a file in the place of /dev/null.
         raise OutputError(f"Cannot write '{path}': it is no ordinary file; give the name of a file.")
+    if is_windows() and os.path.exists(path) and not os.access(path, os.W_OK):
+        raise OutputError(f"Cannot write '{path}': it is write-protected; give another name, or let it be written.")
     if not os.path.isdir(folder):
         raise OutputError(f"Cannot write '{path}': the folder '{folder}' does not exist; create it first.")
     _probe(path, folder)
 
 
-def check_folder_writable(path: Path) -> None:
+def check_folder_writable(path: Path, names: Iterable[str] = ()) -> None:
     """Fail before the work rather than after it when files could not be written into a folder that may not exist yet.
 
+    Args:
+        path: the folder.
+        names: of files that are written into it, with those of folders in it.
+
     Raises:
-        OutputError: the folder, or the nearest one above it that exists, cannot be written, or is a file, or no folder
-            above it exists.
+        OutputError: the folder, or the nearest one above it that exists, cannot be written, or is a file; no folder
+            above it exists; or `check_path` refuses it.
     """
+    files = [path / name for name in names]
+    check_path(path, path, *files, *(file.with_name(_temporary_name(file)) for file in files))
     folder = nearest_folder(path)
     if not os.path.isdir(folder):
         raise OutputError(f"Cannot write into '{path}': '{folder}' is a file; choose another folder.")
@@ -111,31 +129,42 @@ def _probe(path: Path, folder: Path) -> None:
     try:
         handle, probe = tempfile.mkstemp(prefix=TEMPORARY, dir=folder)
     except OSError as error:
-        raise OutputError(f"Cannot write '{path}': {error.strerror}; choose a folder that you may write.") from error
+        raise OutputError(f"Cannot write '{path}': {os_reason(error)}; choose a folder that you may write.") from error
     os.close(handle)
-    os.unlink(probe)
+    with suppress(OSError):
+        remove_file(Path(probe))
+
+
+def temporary_failed(error: OSError) -> NoRoomError:
+    """The error where the system's temporary folder takes no file; Python looks for one that does."""
+    return NoRoomError(
+        f"No temporary file can be written ({os_reason(error)}); make room there, or name another folder in TMPDIR."
+    )
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, keep: bool = True) -> Iterator[Path]:
     """Give a temporary file beside `path`, and rename it to `path` when the block ends without an error.
+
+    Args:
+        path: the file.
+        keep: where the file is written but cannot be renamed, keep it under another name beside `path`.
 
     Raises:
         OutputError: the file cannot be written or renamed, for instance because the disk is full.
     """
-    with replacing_all(path) as (temporary,):
+    with replacing_all(path, keep=keep) as (temporary,):
         yield temporary
 
 
 @contextmanager
-def replacing_all(*paths: Path) -> Iterator[tuple[Path, ...]]:
-    """As `replacing`, of files that belong together: when one cannot be written, none is changed.
+def replacing_all(*paths: Path, keep: bool = True) -> Iterator[tuple[Path, ...]]:
+    """As `replacing`, of files that belong together: when one cannot be written or renamed, none is changed.
 
     Raises:
         OutputError: one cannot be written or renamed.
     """
     temporaries: list[Path] = []
-    renamed: list[str] = []
     try:
         for path in paths:
             temporaries.append(_new_file(path))
@@ -143,17 +172,86 @@ def replacing_all(*paths: Path) -> Iterator[tuple[Path, ...]]:
         for temporary in temporaries:
             with open(temporary, "r+b") as file:  # Windows flushes only what is open for writing
                 os.fsync(file.fileno())
-        for temporary, path in zip(temporaries, paths, strict=True):
-            os.replace(temporary, path)
-            renamed.append(f"'{path.name}'")
     except OSError as error:
-        beside = f" with {', '.join(repr(path.name) for path in paths[1:])}" if len(paths) > 1 else ""
-        changed = f"{', '.join(renamed)} was replaced, and no other" if renamed else "nothing was changed"
-        raise OutputError(f"Cannot write '{paths[0]}'{beside}: {error.strerror or error}; {changed}.") from error
+        beside = f" with {_quoted(paths[1:])}" if len(paths) > 1 else ""
+        raise OutputError(f"Cannot write '{paths[0]}'{beside}: {os_reason(error)}; nothing was changed.") from error
+    else:
+        _put_in_place(temporaries, paths, keep)
     finally:
         for temporary in temporaries:
             with suppress(OSError):
-                temporary.unlink()
+                remove_file(temporary)
+
+
+def _put_in_place(temporaries: list[Path], paths: tuple[Path, ...], keep: bool) -> None:
+    """Rename all files, or none."""
+    backups: dict[Path, Path | None] = {}
+    replaced: list[tuple[Path, Path]] = []
+    try:
+        for path in paths[:-1]:
+            backups[path] = _backup(path)
+        for temporary, path in zip(temporaries, paths, strict=True):
+            replace_file(temporary, path)
+            replaced.append((temporary, path))
+    except BaseException as error:
+        refused = paths[len(replaced) % len(paths)]
+        changed = [path for temporary, path in reversed(replaced) if not _restore(temporary, path, backups[path])]
+        if not isinstance(error, OSError):
+            raise
+        text = f"{_quoted(changed)} was replaced, and no other" if changed else "nothing was changed"
+        if keep and not changed and (kept := _keep(temporaries, paths)):
+            rename = f"rename {'it' if len(kept) == 1 else 'them'}"
+            way = f"close what has '{refused.name}' open, and" if error.errno == errno.EBUSY else "then"
+            text += f", and what was made is kept as {_quoted(kept)}; {way} {rename}"
+        raise OutputError(f"Cannot write '{refused}': {os_reason(error)}; {text}.") from error
+    finally:
+        for path, backup in backups.items():
+            if backup and os.path.lexists(path):
+                with suppress(OSError):
+                    remove_file(backup)
+
+
+def _backup(path: Path) -> Path | None:
+    """A second name for a file, which it keeps when another takes its place; None where there is no file."""
+    if not os.path.lexists(path):
+        return None
+    backup = path.with_name(_temporary_name(path))
+    try:
+        os.link(path, backup)
+    except OSError:
+        # Not every disk knows second names.
+        shutil.copy2(path, backup)
+    return backup
+
+
+def _restore(temporary: Path, path: Path, backup: Path | None) -> bool:
+    """Take a file back that was renamed to `path`; returns whether that succeeded."""
+    try:
+        replace_file(path, temporary)
+        if backup:
+            replace_file(backup, path)
+    except OSError:
+        return False
+    return True
+
+
+def _keep(temporaries: list[Path], paths: tuple[Path, ...]) -> list[Path]:
+    """Give files that could not take their place names beside it; returns the names."""
+    for number in count(1):
+        prefix = KEPT if number == 1 else f"{KEPT}{number}-"
+        places = [path.with_name(f"{prefix}{path.name}") for path in paths]
+        if not any(os.path.lexists(place) for place in places):
+            break
+    kept = []
+    for temporary, place in zip(temporaries, places, strict=True):
+        with suppress(OSError):
+            replace_file(temporary, place)
+            kept.append(place)
+    return kept
+
+
+def _quoted(paths: Iterable[Path]) -> str:
+    return ", ".join(f"'{path.name}'" for path in paths)
 
 
 def _new_file(path: Path) -> Path:
@@ -161,9 +259,13 @@ def _new_file(path: Path) -> Path:
 
     As `tempfile.mkstemp` makes them, but with the permissions of any other new file.
     """
-    temporary = path.with_name(f"{TEMPORARY}{secrets.token_hex(6)}{path.suffix}")
+    temporary = path.with_name(_temporary_name(path))
     os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666))
     return temporary
+
+
+def _temporary_name(path: Path) -> str:
+    return f"{TEMPORARY}{secrets.token_hex(6)}{path.suffix}"
 
 
 def is_left_over(name: str) -> bool:

@@ -8,7 +8,7 @@ import enum
 import json
 from pathlib import Path
 
-from .errors import TrainingError
+from .errors import TrainingError, os_reason
 from .input_file import read_input
 from .output import json_text, write_text
 
@@ -134,7 +134,7 @@ def read_report(path: Path) -> dict:
     try:
         report = json.loads(read_input(path, MAX_BYTES))
     except OSError as error:
-        raise TrainingError(f"The report '{path}' cannot be read ({error.strerror or error}); train again.") from error
+        raise TrainingError(f"The report '{path}' cannot be read ({os_reason(error)}); train again.") from error
     except (ValueError, RecursionError) as error:
         raise TrainingError(f"The report '{path}' cannot be read ({error}); train again.") from error
     if not isinstance(report, dict) or (report.get("format"), report.get("version")) != (FORMAT, VERSION):

@@ -18,6 +18,7 @@ from ..core.errors import OutputError
 from ..core.metrics import HEAT_NONE, HEAT_STOPS, heat_colors
 from ..core.output import replacing
 from ..scene.arrays import COLOR, LOOP_START, VERTEX_INDEX, write
+from ..scene.blend_file import blender_path
 from ..scene.mesh import set_mesh_positions, topology
 
 PIXELS_WIDE = 1440
@@ -220,7 +221,7 @@ class _Picture:
         scene.world = world
         self._made.append(world)
         with replacing(path) as temporary:
-            scene.render.filepath = str(temporary.absolute())
+            scene.render.filepath = blender_path(temporary)
             try:
                 bpy.ops.render.render(write_still=True, scene=scene.name)
             except RuntimeError as error:

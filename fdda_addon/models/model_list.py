@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import ModelError, OutputError
+from ..core.errors import ModelError, OutputError, os_reason
 from ..core.model import MAX_BYTES, ModelInfo, check_model, read_model, read_model_info
 from ..core.output import check_writable, replacing
 from ..evaluation import last_evaluation
@@ -219,7 +219,9 @@ def info_of(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> Mo
     try:
         status = os.stat(path)
     except OSError as error:
-        raise ModelError(f"The model '{path}' cannot be read: {error.strerror}; find it, or choose another.") from error
+        raise ModelError(
+            f"The model '{path}' cannot be read: {os_reason(error)}; find it, or choose another."
+        ) from error
     key = (path, status.st_mtime_ns, status.st_size)
     if key not in _infos:
         for old in [old for old in _infos if old[0] == path]:

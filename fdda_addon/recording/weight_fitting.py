@@ -11,6 +11,7 @@ import numpy as np
 
 from ..core.errors import RecordingError, RigError, TrainingError
 from ..core.messages import MessageType
+from ..core.output import temporary_failed
 from ..core.progress import Progress
 from ..core.recording.fit_folder import MIN_POSES, FitPosesWriter, read_fitted
 from ..core.rig import UNMOVED, Rig
@@ -66,7 +67,12 @@ def fit_weights(rig: Rig, kind: str, poses: Iterator[None], count: int, evaluato
         TrainingError: the trainer's Python cannot fit.
         OutputError: there is no room for the poses.
     """
-    with tempfile.TemporaryDirectory(prefix="fdda-fit-") as name:
+    try:
+        # On Windows a virus scanner may still read what is to be removed.
+        temporary = tempfile.TemporaryDirectory(prefix="fdda-fit-", ignore_cleanup_errors=True)
+    except OSError as error:
+        raise temporary_failed(error) from error
+    with temporary as name:
         folder = Path(name)
         with FitPosesWriter(folder, rig, count) as writer:
             for number, _ in enumerate(poses, 1):

@@ -9,7 +9,10 @@ from pathlib import Path
 
 import bpy
 
+from ..core.errors import FDDAError
+from ..core.open_files import remove_file
 from ..core.output import check_writable, replacing
+from ..core.path_limits import too_long
 
 SEEK_TABLE_END = bytes.fromhex("b1ea928f")
 """Last bytes of a compressed .blend file, which is one of Zstandard's seekable format."""
@@ -24,17 +27,29 @@ def save_copy(path: Path) -> None:
     check_writable(path)
     with replacing(path) as temporary:
         # Blender keeps a second copy of a file that it saves over.
-        temporary.unlink()
+        remove_file(temporary)
         try:
             with quiet():
                 bpy.ops.wm.save_as_mainfile(
-                    filepath=str(temporary.absolute()), copy=True, compress=True, check_existing=False
+                    filepath=blender_path(temporary), copy=True, compress=True, check_existing=False
                 )
         except RuntimeError as error:
             raise OSError(reason(error)) from error
         # Blender 4.5 saves half a compressed file to a full disk and calls it finished.
         if temporary.read_bytes()[-len(SEEK_TABLE_END) :] != SEEK_TABLE_END:
             raise OSError("Blender wrote only a part of it, the disk may be full")
+
+
+def blender_path(path: Path) -> str:
+    """A path as it is handed to Blender, which cuts one that is too long, and reads or writes another file then.
+
+    Raises:
+        FDDAError: it is too long.
+    """
+    absolute = path.absolute()
+    if limit := too_long(absolute):
+        raise FDDAError(f"Blender cannot open or write '{path}': {limit}; choose a shorter folder.")
+    return str(absolute)
 
 
 def reason(error: RuntimeError) -> str:

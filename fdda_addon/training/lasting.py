@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 from typing import BinaryIO
 
-from ..core.errors import OutputError
+from ..core.errors import OutputError, os_reason
 from ..core.output import write_json
 from .environment.folder import user_folder
 from .process import Training
@@ -122,7 +122,7 @@ class _Record:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             file = self.messages.open("wb")
         except OSError as error:
-            raise OutputError(f"Cannot write '{self.messages}': {error.strerror}; make room there.") from error
+            raise OutputError(f"Cannot write '{self.messages}': {os_reason(error)}; make room there.") from error
         if sys.platform != "win32":
             import fcntl
 

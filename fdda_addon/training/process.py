@@ -13,8 +13,9 @@ import time
 from collections.abc import Iterator
 from typing import Self
 
-from ..core.errors import TrainingDiedError, TrainingError, WrongUsageError
+from ..core.errors import TrainingDiedError, TrainingError, WrongUsageError, os_reason
 from ..core.messages import Message, MessageType
+from ..core.output import temporary_failed
 from .environment.choice import chosen_python
 from .environment.folder import ROOT
 
@@ -65,16 +66,20 @@ class TrainerProcess:
 
         Raises:
             TrainingError: the interpreter cannot be started.
+            OutputError: no temporary file can be written.
         """
         advice = chosen_python().origin.value if python is None else "name a Python that has torch"
         command, environment = trainer_command(arguments, python, self.module)
-        self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - __exit__ closes it
+        try:
+            self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - __exit__ closes it
+        except OSError as error:
+            raise temporary_failed(error) from error
         try:
             self._process = self._start(command, environment)
         except OSError as error:
             self._errors.close()
             raise TrainingError(
-                f"The trainer's Python '{command[0]}' cannot be started ({error.strerror}); {advice}."
+                f"The trainer's Python '{command[0]}' cannot be started ({os_reason(error)}); {advice}."
             ) from error
         self._follow()
 

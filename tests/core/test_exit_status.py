@@ -14,6 +14,7 @@ from fdda_addon.core.errors import (
     TrainingDiedError,
     WrongUsageError,
     exit_status,
+    os_reason,
 )
 from fdda_addon.core.output import replacing
 
@@ -29,6 +30,21 @@ def caused_by(cause: BaseException) -> OutputError:
 def test_what_the_machine_caused_may_be_tried_again(number):
     assert exit_status(caused_by(OSError(number, "text"))) == TRY_AGAIN
     assert exit_status(caused_by(caused_by(OSError(number, "text")))) == TRY_AGAIN
+
+
+@pytest.mark.parametrize("number", [32, 33, 39, 112, 1224, 1455])
+def test_what_windows_says_of_the_machine(number):
+    error = OSError(errno.EINVAL, "in the language of the system")
+    error.winerror = number
+    assert exit_status(caused_by(error)) == TRY_AGAIN
+    assert os_reason(error) != error.strerror and os_reason(error).isascii()
+
+
+def test_what_windows_says_is_not_quoted():
+    error = PermissionError(errno.EACCES, "Zugriff verweigert")
+    error.winerror = 5
+    assert os_reason(error) == "Permission denied" and exit_status(caused_by(error)) == 1
+    assert os_reason(OSError(errno.EINVAL, "it is no ordinary file")) == "it is no ordinary file"
 
 
 @pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES, errno.EISDIR, errno.EROFS, errno.ENAMETOOLONG])

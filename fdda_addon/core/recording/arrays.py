@@ -9,7 +9,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ..errors import RecordingError
+from ..errors import RecordingError, os_reason
 from ..input_file import open_input
 from ..skinning import have_inverse
 
@@ -94,7 +94,7 @@ def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -
                 raise ValueError(f"it is truncated: {size} of {expected} bytes")
             return np.memmap(file, dtype, "r", start, mapped)
     except OSError as error:
-        raise RecordingError(f"'{path}' cannot be used: {error.strerror or error}; record again.") from error
+        raise RecordingError(f"'{path}' cannot be used: {os_reason(error)}; record again.") from error
     except ValueError as error:
         raise RecordingError(f"'{path}' cannot be used: {error}; record again.") from error
     except HEADER_ERRORS as error:

@@ -7,14 +7,13 @@ from dataclasses import asdict
 
 import numpy as np
 
-from ..errors import BusyError, OutputError, RecordingError
+from ..errors import BusyError, OutputError, RecordingError, os_reason
 from ..input_file import open_input
-from ..output import write_json
 from .arrays import STREAMED, array_shapes, streamed_arrays
-from .index import INDEX, REFINED, Source, read_index
+from .index import REFINED, Source, read_index
 from .lock import RecordingLock
 from .reader import Recording
-from .writer import array_header, check_finite
+from .writer import array_header, check_finite, write_index
 
 
 class RecordingExtension:
@@ -83,7 +82,8 @@ class RecordingExtension:
         """
         arrays = streamed_arrays(pose_matrices, residuals, controls, len(self._index["controls"]))
         check_finite(arrays, self.complete)
-        total = self.complete + len(pose_matrices)
+        before = self.complete
+        total = before + len(pose_matrices)
         try:
             for name, array in arrays.items():
                 self._write(name, array)
@@ -92,6 +92,7 @@ class RecordingExtension:
             self.complete = total
             self._write_index()
         except OSError as error:
+            self.complete = before
             raise self._failed(error) from error
 
     def _write(self, name: str, array: np.ndarray) -> None:
@@ -122,11 +123,11 @@ class RecordingExtension:
         sources = [*(before[:-1] if self._is_continued else before), asdict(source)]
         sampling = {**self._index["sampling"], "sources": sources}
         index = {**self._index, "poses": self.complete, "complete": self.complete, "sampling": sampling}
-        write_json(self.path / INDEX, index)
+        write_index(self.path, index)
 
     def _failed(self, error: OSError) -> OutputError:
         return OutputError(
-            f"Cannot add poses to the recording '{self.path}': {error.strerror or error}; it holds {self.complete} "
+            f"Cannot add poses to the recording '{self.path}': {os_reason(error)}; it holds {self.complete} "
             "poses and can be trained on as it is."
         )
 

@@ -10,7 +10,7 @@ from types import TracebackType
 
 import numpy as np
 
-from ..errors import OutputError, RecordingError
+from ..errors import OutputError, RecordingError, os_reason
 from ..input_file import open_input
 from ..rig import Fingerprint, Joint, Rig
 from ..skin_fit import INFLUENCES, are_skin_weights
@@ -94,9 +94,7 @@ class FitPosesWriter:
             raise self._failed(error) from error
 
     def _failed(self, error: OSError) -> OutputError:
-        return OutputError(
-            f"Cannot write the poses to fit into '{self._folder}': {error.strerror or error}; make room there."
-        )
+        return OutputError(f"Cannot write the poses to fit into '{self._folder}': {os_reason(error)}; make room there.")
 
     def close(self) -> None:
         """Close the files.
@@ -163,7 +161,7 @@ def write_fitted(folder: Path, joints: np.ndarray, weights: np.ndarray) -> None:
         np.save(folder / "fitted_joints.npy", joints, allow_pickle=False)
         np.save(folder / "fitted_weights.npy", weights, allow_pickle=False)
     except OSError as error:
-        raise OutputError(f"Cannot write the fitted weights into '{folder}': {error.strerror or error}.") from error
+        raise OutputError(f"Cannot write the fitted weights into '{folder}': {os_reason(error)}.") from error
 
 
 def read_fitted(folder: Path, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
@@ -194,7 +192,7 @@ def _read_array(path: Path, dimensions: int, dtype: type) -> np.ndarray:
         open_input(path, follow=False).close()
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except OSError as error:
-        raise _damaged(path.parent, f"'{path.name}' cannot be read ({error.strerror or error})") from error
+        raise _damaged(path.parent, f"'{path.name}' cannot be read ({os_reason(error)})") from error
     except (ValueError, *HEADER_ERRORS) as error:
         raise _damaged(path.parent, f"'{path.name}' is no array, or truncated") from error
     # A zip file of arrays is none either.

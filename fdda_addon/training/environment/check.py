@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 
+from ...core.errors import os_reason
 from .answer import Answer
 from .folder import PACKAGES, ROOT
 
@@ -54,7 +55,7 @@ def check(python: str, advice: str) -> Answer:
             **hidden(),
         )
     except OSError as error:
-        return Answer("ERROR", f"The trainer's Python '{python}' cannot be started ({error.strerror}); {advice}.")
+        return Answer("ERROR", f"The trainer's Python '{python}' cannot be started ({os_reason(error)}); {advice}.")
     except subprocess.TimeoutExpired:
         return Answer("ERROR", f"The trainer's Python '{python}' did not answer in {TIMEOUT_SECONDS:.0f} s; {advice}.")
     said = result.stdout.decode("utf-8", "replace").strip().splitlines()

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from ...core.errors import TrainerEnvironmentError
+from ...core.errors import TrainerEnvironmentError, os_reason
 from ...core.progress import Progress
 from .answer import Answer
 from .bases import BasePython, ask, clean_environment, find_bases
@@ -53,7 +53,7 @@ class Creation:
             yield from self._steps()
         except OSError as error:
             raise TrainerEnvironmentError(
-                f"The trainer environment cannot be written ({error.strerror}: '{error.filename or self.folder}'); "
+                f"The trainer environment cannot be written ({os_reason(error)}: '{error.filename or self.folder}'); "
                 "make room or see to the permissions, and create it again."
             ) from error
 
@@ -246,7 +246,7 @@ def _written(log: Path) -> Iterator[IO[str]]:
     try:
         file = log.open("w", encoding="utf-8")
     except OSError as error:
-        raise TrainerEnvironmentError(f"The log '{log}' cannot be written ({error.strerror}); remove it.") from error
+        raise TrainerEnvironmentError(f"The log '{log}' cannot be written ({os_reason(error)}); remove it.") from error
     with file:
         yield file
 

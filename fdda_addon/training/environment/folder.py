@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ...core.errors import TrainerEnvironmentError
+from ...core.errors import TrainerEnvironmentError, os_reason
 
 EXTENSION = __package__.rpartition(".fdda_addon")[0]
 """The extension's module, "bl_ext.REPOSITORY.fdda"; empty where the add-on was imported and not installed."""
@@ -118,7 +118,7 @@ def remove(folder: Path) -> None:
             shutil.rmtree(folder)
     except OSError as error:
         raise TrainerEnvironmentError(
-            f"The trainer environment cannot be removed ({error.strerror}: '{error.filename}'); end what uses it, a "
+            f"The trainer environment cannot be removed ({os_reason(error)}: '{error.filename}'); end what uses it, a "
             f"training perhaps, or remove the folder '{folder}' yourself."
         ) from error
 
@@ -136,8 +136,8 @@ def claimed(folder: Path) -> Iterator[None]:
         file = lock.open("a+b")
     except OSError as error:
         raise TrainerEnvironmentError(
-            f"The folder '{folder.parent}' cannot be written ({error.strerror}); see to its permissions, or choose an "
-            "existing Python that has torch."
+            f"The folder '{folder.parent}' cannot be written ({os_reason(error)}); see to its permissions, or choose "
+            "an existing Python that has torch."
         ) from error
     with file:
         try:

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Replacing, removing and opening files that other programs may have open.
+
+Windows refuses all three while a virus scanner, an indexer or another Blender has the file open, often for a moment.
+"""
+
+import errno
+import os
+import random
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+PATIENCE_SECONDS = 10.0
+OPEN_PATIENCE_SECONDS = 1.0
+"""How long it takes until a file counts as in use. Who only reads is told sooner: the file may simply be forbidden."""
+MAX_PAUSE_SECONDS = 0.1
+IN_USE = "another program has it open"
+SHARING_ERRORS = {5, 32, 33, 1224}
+"""Windows' access denied, sharing violation, lock violation, and user-mapped file."""
+
+Result = TypeVar("Result")
+
+
+def replace_file(source: Path, target: Path) -> None:
+    """Rename a file to a path where another may be.
+
+    Raises:
+        OSError: as `os.replace`; EBUSY where another program has one of them open for longer than `PATIENCE_SECONDS`.
+    """
+    _insist(lambda: os.replace(source, target), target)
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file, where there is one.
+
+    Raises:
+        OSError: as `os.unlink`; EBUSY where another program has it open for longer than `PATIENCE_SECONDS`.
+    """
+    _insist(lambda: path.unlink(missing_ok=True), path)
+
+
+def open_patiently(opened: Callable[[], Result]) -> Result:
+    """Call what opens a file, again for a moment where Windows refuses it.
+
+    Raises:
+        OSError: as `opened`.
+    """
+    end = time.monotonic() + OPEN_PATIENCE_SECONDS
+    while True:
+        try:
+            return opened()
+        except PermissionError:
+            # `open` does not say which error of Windows it was.
+            if sys.platform != "win32" or time.monotonic() > end:
+                raise
+        _pause()
+
+
+def _insist(action: Callable[[], None], path: Path) -> None:
+    end = time.monotonic() + PATIENCE_SECONDS
+    while True:
+        try:
+            return action()
+        except PermissionError as error:
+            if getattr(error, "winerror", None) not in SHARING_ERRORS or _is_forbidden(path):
+                raise
+            if time.monotonic() > end:
+                raise OSError(errno.EBUSY, IN_USE, str(path)) from error
+        _pause()
+
+
+def _is_forbidden(path: Path) -> bool:
+    """Whether Windows refuses a path for what it is, and patience does not help."""
+    return os.path.isdir(path) or (os.path.lexists(path) and not os.access(path, os.W_OK))
+
+
+def _pause() -> None:
+    # Of no fixed length: who opens the file at regular times would be met every time.
+    time.sleep(random.uniform(0.1, 1) * MAX_PAUSE_SECONDS)
