@@ -93,6 +93,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--resume", action="store_true", help="continue what was interrupted; nothing is done twice")
     parser.add_argument(
+        "--overwrite", action="store_true", help="replace the recording that is in the folder, whole or damaged"
+    )
+    parser.add_argument(
         "--shard",
         type=_shard,
         metavar="K/N",
@@ -167,6 +170,8 @@ def run(options: argparse.Namespace) -> None:
         raise WrongUsageError("--refine takes one mesh; give --object NAME once, and the recording and model of it.")
     if options.all and options.object:
         raise WrongUsageError("--all records all meshes, and --object those that it names; give one of them.")
+    if options.overwrite and (options.resume or options.refine):
+        raise WrongUsageError("--overwrite makes a new recording; leave --resume and --refine out.")
     open_file(options.rig)
     rigs = _rigs(options)
     start = time.monotonic()
@@ -223,6 +228,7 @@ def _steps(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> 
         margin=options.margin,
         actions=tuple(options.action),
         resume=options.resume,
+        overwrite=options.overwrite,
         sample=tuple(options.sample),
         controls=tuple(options.control),
         fit_linear=options.fit_linear,

@@ -44,5 +44,6 @@ PAGE = FileKind("the page of a training report", rb"<!doctype html>.*training re
 EVALUATION = FileKind("the JSON of an evaluation", _OF_OBJECTS + rb'"unit":\s*"mm"')
 BENCHMARK = FileKind("the JSON of a benchmark", _OF_OBJECTS + rb'"unit":\s*"ms"')
 WARNINGS = FileKind("the JSON of a check", rb'\s*\{\s*"warnings":')
+RECORDING = FileKind("the index of a recording", rb'\s*\{\s*"format":\s*"fdda-recording"')
 PICTURE = FileKind("a PNG picture", rb"\x89PNG\r\n")
 POINT_CACHE = FileKind("a point cache", rb"POINTCACHE2\0")

@@ -118,7 +118,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
             draw_sentence(layout, context, content.sentence, "INFO")
     else:
         draw_sentence(layout, context, content.sentence, "ERROR")
-    if content.poses:
+    if content.is_recording:
         layout.operator("fdda.remove_recording", text="Remove Recording", icon="TRASH").object = rig.mesh_object.name
 
 

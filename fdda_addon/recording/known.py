@@ -85,7 +85,7 @@ def check_found_for(path: Path, rig: Rig, info: RecordingInfo) -> None:
     if found.shard is None or info.shard is None or found.shard.total != info.shard.total:
         keys.append("poses")
     if keys:
-        different.append(f"they were found with another {', '.join(keys)}")
+        different.append(f"they were found with other settings ({', '.join(keys)})")
     if different:
         raise RecordingError(
             f"The influences in '{path}' are not those of this recording: {'; '.join(different)}. Find them with the "

@@ -35,6 +35,7 @@ class RecordingSettings:
         influence_poses: how often each joint is moved alone to find the partitions that it influences.
         influence_tolerance: part of the character's size by which a joint moves the residuals that it influences.
         resume: continue a recording that was interrupted.
+        overwrite: replace a recording that is in the folder.
         sample: which control bones the random poses move, as `sampling.choose` reads it; empty for those of the rig.
         fit_linear: kind of the skin weights that are fitted (`core.skin_fit.KINDS`); empty for those of the rig.
         controls: which numbers are inputs and are sampled beside those that are found, as `stated_controls` reads it.
@@ -64,6 +65,7 @@ class RecordingSettings:
     influences_only: bool = False
     influences: Path | None = None
     target: TargetSettings = OWN_SURFACE
+    overwrite: bool = False
 
 
 def planned_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:

@@ -10,15 +10,15 @@ from typing import TypeVar
 import bpy
 
 from ..core.errors import RecordingError
-from ..core.output import check_folder_writable
 from ..core.partition import GOLDEN_RATIO, merged_partitions, nearby_influences
 from ..core.poses import sample_pose
 from ..core.progress import Progress
 from ..core.recording.estimate import check_room, recording_bytes
 from ..core.recording.index import INDEX, RecordingInfo
+from ..core.recording.place import check_recordable
 from ..core.recording.shard import Shard, shard_poses
 from ..core.recording.target import POSE
-from ..core.recording.writer import RecordingWriter, check_recordable
+from ..core.recording.writer import RecordingWriter
 from ..core.skinning import LinearLayer
 from ..poses.clip import Clip, find_clips
 from ..poses.clip_player import ClipPlayer
@@ -111,8 +111,7 @@ def _plan(
     for (scene_rig, path), own in zip(rigs, controls, strict=True):
         check_evaluable(scene_rig)
         read.append(planned_rig(scene_rig, replace(settings, controls=own)))
-        check_folder_writable(path)
-        check_recordable(path, settings.resume)
+        check_recordable(path, settings.resume, settings.overwrite)
     channels = [(scene_rig, own) for scene_rig, (_, own) in zip(meshes, read, strict=True)]
     approach = make_approach(meshes[0], settings.target, clips, settings.poses)
     plan = PosePlan(channels, settings, clips, approach)
@@ -215,7 +214,11 @@ def _record_poses(
         appenders = []
         for mesh in meshes:
             info = replace(_info(mesh, settings, plan, wanted), target=plan.approach.recorded)
-            writer = RecordingWriter(mesh.fitted.planned.path, mesh.fitted.rig, mesh.partitions, info, settings.resume)
+            writer = RecordingWriter(
+                mesh.fitted.planned.path,
+                *(mesh.fitted.rig, mesh.partitions, info),
+                *(settings.resume, settings.overwrite),
+            )
             layer = LinearLayer(mesh.fitted.rig, mesh.partitions)
             appenders.append(Appender(mesh.evaluator, layer, stack.enter_context(writer), plan.approach))
         first, settler = min(appender.done for appender in appenders), plan.approach.settler

@@ -143,9 +143,9 @@ def test_resuming_with_other_options(refusal, elbow, tmp_path):
     path = shutil.copytree(elbow.recording, tmp_path / "recording")
     set_index(complete=40)(path)
     text = refusal("record", elbow.rig, path, "--poses", 150, "--seed", 1, "--resume")
-    assert "it was recorded with another sampling.seed;" in text
+    assert "it was recorded differently (sampling.seed);" in text
     text = refusal("record", elbow.rig, path, "--poses", 160, "--resume")
-    assert "it was recorded with another poses, sampling.sources;" in text
+    assert "it was recorded differently (poses, sampling.sources);" in text
 
 
 @pytest.fixture(params=["build-arm", "record", "bind", "evaluate", "heatmap", "benchmark"])

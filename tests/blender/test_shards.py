@@ -166,7 +166,7 @@ def test_influences_of_something_else_are_refused(elbow, tmp_path, capfd):
     assert run("record", elbow.rig, found, "--poses", 10, "--influences-only") == 0
     of_shard = ("record", elbow.rig, tmp_path / "s", "--shard", "1/2", "--influences")
     text = refusal(*of_shard, found, "--poses", 11)
-    assert "not those of this recording: they were found with another sources, poses." in text
+    assert "not those of this recording: they were found with other settings (sources, poses)." in text
     assert "with another seed" in refusal(*of_shard, found, "--poses", 10, "--seed", 1)
     assert "'none' is not a recording" in refusal(*of_shard, tmp_path / "none").replace(f"{tmp_path}{os.sep}", "")
     other = saved(waving, tmp_path / "other.blend")
@@ -178,5 +178,5 @@ def test_a_shard_of_another_rig_is_not_resumed(elbow, tmp_path):
     settings = RecordingSettings(poses=6, influence_poses=1, shard=(1, 2))
     drain(record(opened(elbow.rig), tmp_path / "s", settings))
     other = opened(saved(waving, tmp_path / "other.blend"))
-    with pytest.raises(RecordingError, match=r"Cannot resume .* it was recorded with another"):
+    with pytest.raises(RecordingError, match=r"Cannot resume .* it was recorded differently"):
         drain(record(other, tmp_path / "s", replace(settings, resume=True)))

@@ -12,8 +12,9 @@ import pytest
 
 from fdda_addon.core.errors import FDDAError, RecordingError
 from fdda_addon.core.recording.extension import RecordingExtension
+from fdda_addon.core.recording.place import check_recordable
 from fdda_addon.core.recording.reader import check_resumable, read_recording
-from fdda_addon.core.recording.writer import RecordingWriter, check_recordable
+from fdda_addon.core.recording.writer import RecordingWriter
 
 from .. import systems
 from .damage import array_file, edit, refused

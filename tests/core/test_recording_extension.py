@@ -121,5 +121,5 @@ def test_poses_that_another_process_added_meanwhile_are_not_written_over(recordi
 
 def test_a_grown_recording_is_not_resumed_as_another(recording):
     extend(recording)
-    with pytest.raises(RecordingError, match=r"recorded with another poses, sampling\.sources"):
+    with pytest.raises(RecordingError, match=r"recorded differently \(poses, sampling\.sources\)"):
         RecordingWriter(recording, make_rig(), partitions_of(make_rig()), recording_info(POSES), resume=True)

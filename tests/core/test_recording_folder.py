@@ -37,12 +37,13 @@ def test_something_else_is_in_it(tmp_path):
     content = look(tmp_path)
     assert (content.state, content.poses) == (FolderState.FOREIGN, 0)
     assert content.sentence == f"'{tmp_path.name}' is not an empty folder; choose another."
+    assert not content.is_recording
     assert look(tmp_path / "letters.txt").state is FolderState.FOREIGN
 
 
 def test_a_recording_that_is_complete(tmp_path):
     record_limb(tmp_path / "r", POSES)
-    assert look(tmp_path / "r") == FolderContent(FolderState.COMPLETE, POSES, POSES)
+    assert look(tmp_path / "r") == FolderContent(FolderState.COMPLETE, POSES, POSES, is_recording=True)
     other = look(tmp_path / "r", limits=[], spread=0.5)
     assert other.state is FolderState.COMPLETE
     assert other.sentence == "It was recorded with other settings than those above: range of motion, spread."
@@ -59,7 +60,7 @@ def test_what_was_measured_with_a_recording_is_said(tmp_path):
 
 def test_a_recording_that_was_broken_off(tmp_path):
     record_limb(tmp_path / "r", POSES, 5)
-    assert look(tmp_path / "r") == FolderContent(FolderState.INCOMPLETE, 5, POSES)
+    assert look(tmp_path / "r") == FolderContent(FolderState.INCOMPLETE, 5, POSES, is_recording=True)
     other = look(tmp_path / "r", seed=9)
     assert other.state is FolderState.OTHER
     assert other.sentence.startswith("'r' was begun with other settings (seed) and has 5 of 12 poses.")
@@ -80,6 +81,9 @@ def test_a_recording_that_is_damaged(tmp_path):
     (tmp_path / "r" / "recording.json").write_text("{")
     content = look(tmp_path / "r")
     assert content.state is FolderState.FOREIGN and "cannot be read" in content.sentence
+    assert content.is_recording and content.sentence.endswith("record again with --overwrite.")
+    (tmp_path / "r" / "residuals.npy").unlink()
+    assert not look(tmp_path / "r").is_recording, "a '{' and some file may be anything"
 
 
 def test_removing_leaves_nothing_of_it_and_all_else(tmp_path):

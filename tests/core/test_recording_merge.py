@@ -110,10 +110,10 @@ def test_what_is_missing_or_twice_is_named(shards, tmp_path):
 def test_shards_of_other_recordings_are_refused(shards, tmp_path):
     path = tmp_path / "merged"
     other = record_shard(tmp_path / "other", range(9, 12), seed=4)
-    assert "with another sampling.seed; record all shards" in sentence([*shards[:5], other], path)
+    assert "recorded differently (sampling.seed); record all shards" in sentence([*shards[:5], other], path)
     rest = np.load(shards[3] / "rest_positions.npy")
     np.save(shards[3] / "rest_positions.npy", rest + np.float32(1e-6))
-    assert "with another rest_positions; record" in sentence(shards, path)
+    assert "differently (rest_positions); record" in sentence(shards, path)
     record_limb(tmp_path / "whole", POSES)
     assert "is no shard, but a recording by itself" in sentence([*shards[:3], tmp_path / "whole"], path)
 

@@ -9,6 +9,7 @@ import pytest
 
 from fdda_addon.core.errors import FDDAError, OutputError, RecordingError
 from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.place import check_recordable
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
@@ -164,9 +165,31 @@ def test_a_mesh_without_faces(tmp_path):
 
 def test_a_recording_is_not_overwritten(recording):
     before = files(recording)
-    with pytest.raises(RecordingError, match="holds a recording already; continue it with --resume or choose another"):
+    with pytest.raises(RecordingError, match="already; continue it with --resume, replace it with --overwrite, or cho"):
         record_limb(recording)
     assert files(recording) == before
+
+
+@pytest.mark.parametrize("index", ["", '{\n "format": "fdda-recording",\n "ver', '{"poses"', "whole"])
+def test_a_recording_is_replaced_where_that_is_asked_for(recording, index):
+    """One whose index is torn, too: it can be neither resumed nor recorded into."""
+    other, place = recording.with_name("other"), recording / "recording.json"
+    record_limb(other, POSES - 2)
+    (recording / "notes.txt").write_text("mine")
+    place.write_text(place.read_text() if index == "whole" else index)
+    check_recordable(recording, resume=False, overwrite=True)
+    rig = make_rig()
+    info = recording_info(POSES - 2)
+    with RecordingWriter(recording, rig, partitions_of(rig), info, overwrite=True) as writer:
+        writer.append(random_poses(POSES - 2), random_residuals(POSES - 2))
+    assert files(recording) == {**files(other), "notes.txt": b"mine"}
+
+
+def test_the_index_of_something_else_is_not_replaced(tmp_path):
+    (tmp_path / "recording.json").write_text('{"songs": []}')
+    with pytest.raises(OutputError, match=r"its 'recording\.json' is of something else; choose another folder"):
+        check_recordable(tmp_path, resume=False, overwrite=True)
+    assert files(tmp_path) == {"recording.json": b'{"songs": []}'}
 
 
 def test_another_folder_is_not_recorded_into(tmp_path):
@@ -213,7 +236,7 @@ def test_resuming_something_else_names_what_differs(tmp_path, keys, value, named
     change(content, *keys, value=value)
     index.write_text(json.dumps(content))
     before = files(tmp_path / "r")
-    with pytest.raises(RecordingError, match=rf"it was recorded with another {named}; record with the same rig"):
+    with pytest.raises(RecordingError, match=rf"it was recorded differently \({named}\); record with the same rig"):
         record_limb(tmp_path / "r", POSES, resume=True)
     assert files(tmp_path / "r") == before
 

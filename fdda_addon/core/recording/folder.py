@@ -3,16 +3,15 @@
 
 import enum
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ..errors import OutputError, RecordingError
-from ..output import is_left_over
+from ..errors import OutputError, RecordingError, os_reason
 from ..rig import Fingerprint, Rig, differences, read_joints
-from .arrays import ARRAYS
 from .index import INDEX, REFINED, read_index, read_info
 from .lock import RecordingLock
-from .writer import different_keys, is_free
+from .place import is_free, is_recording, remove_files
+from .writer import different_keys
 
 SETTINGS = {"limits": "range of motion", "sources": "number of poses or actions", "fit": "linear layer"}
 """What people call the keys of a sampling."""
@@ -42,6 +41,7 @@ class FolderContent:
         complete, poses: of the recording in it, how many there are and how many there will be.
         sentence: where it is not as it should be.
         measured: sentences of what was measured with the poses: the gain of fitted weights, two ways to the same pose.
+        is_recording: there is a recording in it, however damaged, that can be removed.
     """
 
     state: FolderState
@@ -49,6 +49,7 @@ class FolderContent:
     poses: int = 0
     sentence: str = ""
     measured: tuple[str, ...] = ()
+    is_recording: bool = False
 
 
 def read_folder(
@@ -62,6 +63,11 @@ def read_folder(
         sampling: `Sampling.to_json` of what would be recorded; None leaves the comparison out.
         fit_linear: kind of the skin weights that would be fitted, empty for the rig's own; None leaves it out.
     """
+    content = _content(path, rig, sampling, fit_linear)
+    return replace(content, is_recording=content.state is not FolderState.FREE and is_recording(path))
+
+
+def _content(path: Path, rig: Rig | None, sampling: dict | None, fit_linear: str | None) -> FolderContent:
     if not os.path.exists(path / INDEX):
         if not is_free(path):
             return FolderContent(FolderState.FOREIGN, sentence=f"'{path.name}' is not an empty folder; choose another.")
@@ -128,14 +134,14 @@ def remove_recording(path: Path) -> None:
     lock = RecordingLock(path)
     try:
         lock.acquire()
-        # The index last: what is left of an interruption is still seen to be a recording.
-        left_over = [name for name in os.listdir(path) if is_left_over(name)]
-        for name in (*(f"{array}.npy" for array in ARRAYS), *left_over, INDEX):
-            (path / name).unlink(missing_ok=True)
+        remove_files(path)
         lock.release()
         if not os.listdir(path):
             path.rmdir()
     except OSError as error:
-        raise OutputError(f"Cannot remove the recording '{path}': {error.strerror or error}.") from error
+        name = f", '{os.path.basename(error.filename)}'" if error.filename else ""
+        raise OutputError(
+            f"Cannot remove the recording '{path}'{name}: {os_reason(error)}; end what uses it, a training for example."
+        ) from error
     finally:
         lock.release()

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ..controls import read_controls
-from ..errors import RecordingError
+from ..errors import RecordingError, os_reason
 from ..input_file import read_input
 from ..poses import Channel, Margin
 from ..rig import Fingerprint, read_joints, read_name
@@ -107,9 +107,9 @@ def read_index(path: Path) -> dict:
     except FileNotFoundError as error:
         raise RecordingError(f"'{path}' is not a recording: it has no {INDEX}; make one with record.") from error
     except OSError as error:
-        raise RecordingError(f"'{index_path}' cannot be read ({error.strerror or error}); record again.") from error
+        raise RecordingError(f"'{index_path}' cannot be read ({os_reason(error)}); record again.") from error
     except (ValueError, RecursionError) as error:
-        raise RecordingError(f"'{index_path}' cannot be read ({error}); record again.") from error
+        raise RecordingError(f"'{index_path}' cannot be read ({error}); record again with --overwrite.") from error
     if not isinstance(index, dict) or index.get("format") != FORMAT:
         raise RecordingError(f"'{index_path}' is not the index of a recording; give a folder that record made.")
     if index.get("version") != VERSION:
@@ -175,7 +175,7 @@ def _check_numbers(values: list, what: str, count: int, owner: str = "a partitio
         if type(value) is not int or not 0 <= value < count:
             raise ValueError(f"{owner} has {what} {value!r} of {count}")
     if len(set(values)) != len(values):
-        raise ValueError(f"{owner} has a {what} twice")
+        raise ValueError(f"{owner} has the same {what} twice")
 
 
 def _sampling(value: dict) -> Sampling:

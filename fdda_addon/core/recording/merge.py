@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import RecordingError
+from ..output import check_folder_writable
 from ..progress import Progress
 from .arrays import STREAMED, array_shapes, open_array
 from .estimate import check_room, recording_bytes
 from .folder import recordings_in
 from .index import INDEX, read_index
+from .place import FILES
 from .reader import Recording, open_recording
 from .writer import RecordingWriter, different_keys
 
@@ -42,6 +44,8 @@ def merge_recordings(shards: Sequence[Path], path: Path) -> Iterator[Progress]:
     """
     names = _names_of_meshes(shards)
     plans = [(path / name, _ordered([shard / name for shard in shards])) for name in names]
+    for own, _ in plans:
+        check_folder_writable(own, (*FILES, INDEX))
     check_room([(own, recording_bytes(parts[0].rig, parts[0].info.shard.total)) for own, parts in plans])
     for name, (own, parts) in zip(names, plans, strict=True):
         yield from _merge(parts, own, f"merge of '{name}'" if name else "merge")
@@ -103,8 +107,8 @@ def _check_alike(parts: Sequence[Recording]) -> None:
             different = [name for name, pair in zip(fixed, arrays, strict=True) if not np.array_equal(*pair)]
         if different:
             raise RecordingError(
-                f"'{parts[0].path}' and '{part.path}' are shards of different recordings: they were recorded with "
-                f"another {', '.join(different)}; record all shards with the same rig and options."
+                f"'{parts[0].path}' and '{part.path}' are shards of different recordings: they were recorded "
+                f"differently ({', '.join(different)}); record all shards with the same rig and options."
             )
 
 

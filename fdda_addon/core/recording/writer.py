@@ -12,16 +12,18 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import OutputError, RecordingError
+from ..errors import OutputError, RecordingError, os_reason
 from ..input_file import open_input
-from ..output import is_left_over, write_json
+from ..open_files import remove_file
+from ..output import json_text, replacing
 from ..partition import Partition
 from ..rig import Rig, are_same_rest
 from ..unit import read_unit, unit_json
 from .arrays import ARRAYS, STREAMED, array_shapes, bad_pose, open_array, streamed_arrays
 from .index import FORMAT, INDEX, VERSION, RecordingInfo, read_index
-from .lock import LOCK, RecordingLock
-from .reader import check_poses, check_resumable, partitions_json
+from .lock import RecordingLock
+from .place import check_place, remove_files, remove_left_over
+from .reader import check_poses, partitions_json
 from .target import Repeats
 
 GROWS = ("complete", "unsettled", "repeats")
@@ -37,7 +39,13 @@ class RecordingWriter:
     """
 
     def __init__(
-        self, path: Path, rig: Rig, partitions: tuple[Partition, ...], info: RecordingInfo, resume: bool = False
+        self,
+        path: Path,
+        rig: Rig,
+        partitions: tuple[Partition, ...],
+        info: RecordingInfo,
+        resume: bool = False,
+        overwrite: bool = False,
     ):
         """Start or resume a recording.
 
@@ -46,9 +54,10 @@ class RecordingWriter:
             rig, partitions: what is recorded.
             info: `complete` is ignored.
             resume: continue the recording at `path` where it stopped.
+            overwrite: remove the recording at `path`.
 
         Raises:
-            RecordingError: there is a recording already and `resume` is not set, it is of something else, or another
+            RecordingError: there is a recording already and neither is set, it is of something else, or another
                 process writes it.
             OutputError: the folder cannot be written.
         """
@@ -60,15 +69,17 @@ class RecordingWriter:
         self._files: dict[str, io.BufferedRandom] = {}
         self._is_new = False
         self._new_folders = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
-        _check_place(path, resume)
+        check_place(path, resume, overwrite)
         self._lock = RecordingLock(path)
         try:
             path.mkdir(parents=True, exist_ok=True)
             self._lock.acquire()
             # Once more: before it was locked, another process may have recorded.
-            _check_place(path, resume)
+            check_place(path, resume, overwrite)
+            if overwrite:
+                remove_files(path)
             self._is_new = not os.path.exists(path / INDEX)
-            _remove_left_over(path)
+            remove_left_over(path)
             if not self._is_new:
                 self.complete = self._check_resumable()
             # The index first: a folder with arrays and no index could be neither resumed nor recorded into.
@@ -93,7 +104,7 @@ class RecordingWriter:
         own = self._index()
         if different := [key for key in different_keys(previous, own) if key.partition(".")[0] not in GROWS]:
             raise RecordingError(
-                f"Cannot resume '{self.path}': it was recorded with another {', '.join(different)}; "
+                f"Cannot resume '{self.path}': it was recorded differently ({', '.join(different)}); "
                 "record with the same rig and options, or into another folder."
             )
         self.unsettled = list(previous.get("unsettled", ()))
@@ -112,7 +123,7 @@ class RecordingWriter:
             path = self.path / f"{name}.npy"
             if not self.complete:
                 # Not written through what might be a link.
-                path.unlink(missing_ok=True)
+                remove_file(path)
             if name not in STREAMED:
                 array = getattr(self.rig, name).astype(dtype)
                 if not self.complete:
@@ -185,7 +196,8 @@ class RecordingWriter:
         }
 
     def _write_index(self) -> None:
-        write_json(self.path / INDEX, self._index())
+        """Raises OSError, as all that `_failed` is for."""
+        write_index(self.path, self._index())
 
     def append(
         self,
@@ -208,16 +220,18 @@ class RecordingWriter:
         """
         arrays = streamed_arrays(pose_matrices, residuals, controls, len(self.rig.controls))
         check_finite(arrays, self.complete)
+        before = self.complete, self.unsettled
         try:
             for name, array in arrays.items():
                 self._files[name].write(np.ascontiguousarray(array, np.float32).data)
                 self._files[name].flush()
                 os.fsync(self._files[name].fileno())
+            self.unsettled = [*self.unsettled, *(self.complete + number for number in unsettled)]
+            self.complete += len(pose_matrices)
+            self._write_index()
         except OSError as error:
+            self.complete, self.unsettled = before
             raise self._failed(error) from error
-        self.unsettled += [self.complete + number for number in unsettled]
-        self.complete += len(pose_matrices)
-        self._write_index()
 
     def note_repeats(self, repeats: Repeats) -> None:
         """Write what poses that were approached twice came to.
@@ -234,7 +248,7 @@ class RecordingWriter:
     def _failed(self, error: OSError) -> OutputError:
         kept = f"{self.complete} of {self.info.poses} poses are complete, continue with --resume"
         return OutputError(
-            f"Cannot write the recording '{self.path}': {error.strerror or error}; "
+            f"Cannot write the recording '{self.path}': {os_reason(error)}; "
             f"{kept if self.complete else 'make room or choose another folder'}."
         )
 
@@ -259,52 +273,24 @@ class RecordingWriter:
             return
         for path in (self.path / INDEX, *(self.path / f"{name}.npy" for name in ARRAYS)):
             with contextlib.suppress(OSError):
-                path.unlink()
+                remove_file(path)
         self._lock.release()
         for folder in self._new_folders:
             with contextlib.suppress(OSError):
                 folder.rmdir()
 
 
-def check_recordable(path: Path, resume: bool) -> None:
-    """Fail before the work where a recording cannot be begun, or what is to be resumed is damaged.
+def write_index(path: Path, index: dict) -> None:
+    """Replace the index of a recording.
 
     Raises:
-        OutputError: the folder holds something else.
-        RecordingError: there is a recording and `resume` is not set, it is damaged, or another process writes it.
+        OSError: it cannot be written.
     """
-    _check_place(path, resume)
-    if os.path.lexists(path / LOCK):
-        lock = RecordingLock(path)
-        try:
-            lock.acquire()
-        except OSError as error:
-            raise OutputError(f"Cannot record into '{path}': {error.strerror or error}; choose another.") from error
-        lock.release()
-    if os.path.exists(path / INDEX):
-        check_resumable(path)
-
-
-def _check_place(path: Path, resume: bool) -> None:
-    if not os.path.exists(path / INDEX):
-        if not is_free(path):
-            raise OutputError(f"Cannot record into '{path}': it is not an empty folder; choose another.")
-    elif not resume:
-        raise RecordingError(f"'{path}' holds a recording already; continue it with --resume or choose another folder.")
-
-
-def is_free(path: Path) -> bool:
-    """Whether a folder can be recorded into: it is not there, or holds nothing but what an interruption has left."""
-    if not os.path.exists(path):
-        return True
-    return os.path.isdir(path) and all(name == LOCK or is_left_over(name) for name in os.listdir(path))
-
-
-def _remove_left_over(path: Path) -> None:
-    """Remove what a process has left that was ended while it wrote the index."""
-    for name in os.listdir(path):
-        if is_left_over(name):
-            (path / name).unlink()
+    try:
+        with replacing(path / INDEX, keep=False) as temporary:
+            temporary.write_text(json_text(index), encoding="utf-8")
+    except OutputError as error:
+        raise error.__cause__ from None
 
 
 def check_finite(arrays: dict[str, np.ndarray], first: int) -> None:
