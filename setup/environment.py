@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Makes a virtual environment with the pinned requirements; started by `setup/environment`, which finds the Python.
+"""Makes a virtual environment with the pinned requirements, for the Python that runs this.
+
+On Windows `py -3.13 setup\\environment.py make .venv everything` starts it, elsewhere `setup/environment`, which finds
+the Python.
 
 An environment is complete when its stamp is there, and the stamp is written last: whatever was interrupted, or made
 from other requirements or by another Python, is made anew.
@@ -8,15 +11,17 @@ from other requirements or by another Python, is made anew.
 import argparse
 import ast
 import ctypes
-import fcntl
+import errno
 import hashlib
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import IO
 
 ROOT = Path(__file__).resolve().parent.parent
 STAMP = "fdda-complete"
+PYTHONS = ("3.13", "3.11")
 SYSTEM_LIBRARIES = ROOT / "setup" / "system-libraries.txt"
 
 # The dependency groups of pyproject.toml that an environment holds, and the imports that prove that it works.
@@ -45,9 +50,28 @@ class SetupError(Exception):
     """The environment cannot be made; the text says what to do about it."""
 
 
+def program(folder: Path, name: str) -> Path:
+    """Return the path of a program in the virtual environment `folder`."""
+    return folder / "Scripts" / f"{name}.exe" if os.name == "nt" else folder / "bin" / name
+
+
 def pins() -> Path:
     """The file that pins every package for the Python that runs this."""
     return ROOT / "requirements" / "python-{}.{}.txt".format(*sys.version_info)
+
+
+def check_python() -> None:
+    """Refuse a Python that no Blender LTS line runs on.
+
+    Raises:
+        SetupError: naming the versions to start this with.
+    """
+    version = "{}.{}".format(*sys.version_info)
+    if version not in PYTHONS:
+        raise SetupError(
+            f"FDDA needs Python {' or '.join(PYTHONS)} and this is {version}; on Windows 'py -{PYTHONS[0]}' starts the "
+            "right one, elsewhere setup/environment finds it."
+        )
 
 
 def fingerprint(contents: str) -> str:
@@ -57,9 +81,9 @@ def fingerprint(contents: str) -> str:
     return digest.hexdigest()
 
 
-def is_current(folder: Path, contents: str, python: str) -> bool:
-    """Whether `folder`, whose Python runs this, is complete and made by `python`, where one was asked for."""
-    if python and os.path.realpath(sys.executable) != python:
+def is_current(folder: Path, contents: str, python: str = "") -> bool:
+    """Whether `folder` is complete, and made by the Python that runs this: by `python`, where one was asked for."""
+    if not program(folder, "python").exists() or (python and os.path.realpath(sys.executable) != python):
         return False
     stamp = folder / STAMP
     return stamp.is_file() and stamp.read_text() == fingerprint(contents)
@@ -69,21 +93,26 @@ def check_own(folder: Path) -> None:
     """Refuse to make an environment anew that lies elsewhere: `venv --clear` empties what a link leads to.
 
     Raises:
-        SetupError: the folder is a link, as in a second working tree that shares an environment.
+        SetupError: the folder is a link or a junction, as in a second working tree that shares an environment.
     """
-    if folder.is_symlink():
-        raise SetupError(
-            f"{folder.name} is a link to '{os.readlink(folder)}' and is not up to date; make it anew there, or remove "
-            "the link to have one here."
-        )
+    try:
+        target = os.readlink(folder)
+    except OSError:  # not a link
+        return
+    raise SetupError(
+        f"{folder.name} is a link to '{target}' and is not up to date; make it anew there, or remove the link to have "
+        "one here."
+    )
 
 
 def check_system_libraries(listing: Path = SYSTEM_LIBRARIES) -> None:
-    """Ask before hundreds of megabytes are fetched, not after.
+    """Ask before hundreds of megabytes are fetched, not after; elsewhere than on Linux the wheels bring all they load.
 
     Raises:
         SetupError: naming the Debian packages of all the libraries that cannot be loaded.
     """
+    if sys.platform != "linux":
+        return
     missing = []
     for line in listing.read_text().splitlines():
         if line.startswith("#"):
@@ -123,6 +152,24 @@ def run(*command: str | Path, why: str, env: dict[str, str] | None = None) -> No
         raise SetupError(why)
 
 
+def lock(file: IO[str]) -> None:
+    """Wait until no other process has `file` locked, and lock it until it is closed."""
+    if os.name != "nt":
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX)
+        return
+    import msvcrt
+
+    while True:
+        try:
+            msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)
+            return
+        except OSError as error:
+            if error.errno != errno.EDEADLOCK:  # it tries for ten seconds
+                raise
+
+
 def make(folder: Path, contents: str) -> None:
     """Make `folder` a complete environment for the Python that runs this.
 
@@ -133,13 +180,13 @@ def make(folder: Path, contents: str) -> None:
     check_own(folder)
     check_system_libraries()
     print(f"Setting up {folder.name} with Python {sys.version.split()[0]}: {', '.join(groups)} …", flush=True)
-    python = folder / "bin" / "python"
+    python = program(folder, "python")
     why = "The Python packages could not be installed (see above): is the package index reachable, the disk full?"
     (folder / STAMP).unlink(missing_ok=True)  # first: --clear may be interrupted half-way too
     run(sys.executable, "-m", "venv", "--clear", folder, why=f"{folder.name} could not be made a virtual environment.")
     run(python, "-m", "pip", "install", "--quiet", "--constraint", pins(), "uv", why=why)
     options = [f"--group=pyproject.toml:{group}" for group in groups]
-    uv = [folder / "bin" / "uv", "pip", "install", "--python", python, "--constraint", pins()]
+    uv = [program(folder, "uv"), "pip", "install", "--python", python, "--constraint", pins()]
     run(*uv, *options, why=why, env=uv_environment(python))
     run(python, "-c", f"import {', '.join(imports)}", why="The packages are installed but do not import (see above).")
     (folder / STAMP).write_text(fingerprint(contents))
@@ -156,10 +203,10 @@ def main() -> int:
     if arguments.action == "is-current":
         return 0 if is_current(folder, arguments.contents, arguments.python) else 1
     try:
-        with open(f"{folder}.lock", "w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # two makes in one tree take turns
-            check = [folder / "bin" / "python", __file__, "is-current", folder, arguments.contents]
-            if not check[0].exists() or subprocess.run(check, stderr=subprocess.DEVNULL, check=False).returncode:
+        check_python()
+        with open(f"{folder}.lock", "w") as file:
+            lock(file)  # two makes in one tree take turns
+            if not is_current(folder, arguments.contents):
                 make(folder, arguments.contents)
     except SetupError as error:
         print(error, file=sys.stderr)

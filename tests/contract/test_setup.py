@@ -4,6 +4,7 @@
 import importlib.util
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -27,6 +28,14 @@ def load(name: str) -> ModuleType:
 
 environment = load("environment")
 package = load("package")
+with_a_shell = pytest.mark.skipif(os.name == "nt", reason="POSIX: setup/environment is a script of the shell")
+
+
+def stamp(folder: Path, contents: str = "blender") -> None:
+    """Make `folder` look like an environment that this Python has made."""
+    for path in (environment.program(folder, "python"), folder / environment.STAMP):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(environment.fingerprint(contents))
 
 
 def script(path: Path, text: str) -> Path:
@@ -43,6 +52,7 @@ def set_up(tmp_path: Path, version: str, **variables: str) -> subprocess.Complet
     return subprocess.run(command, env=clean | variables, capture_output=True, text=True, check=False)
 
 
+@with_a_shell
 def test_without_a_python_one_sentence_names_the_packages(tmp_path: Path):
     result = set_up(tmp_path, "3.99")
     assert result.returncode == 3 and result.stdout == ""
@@ -50,6 +60,7 @@ def test_without_a_python_one_sentence_names_the_packages(tmp_path: Path):
     assert "Python 3.99" in result.stderr and "python3.11-venv" in result.stderr
 
 
+@with_a_shell
 def test_a_python_without_its_venv_module_is_named_with_the_package(tmp_path: Path):
     script(tmp_path / "bin/python3.99", "exit 3")
     result = set_up(tmp_path, "3.99")
@@ -58,6 +69,7 @@ def test_a_python_without_its_venv_module_is_named_with_the_package(tmp_path: Pa
     assert "apt-get install python3.99-venv libx11-6" in result.stderr
 
 
+@with_a_shell
 def test_a_name_on_path_that_does_not_run_is_passed_over(tmp_path: Path):
     script(tmp_path / "bin/python3.99", "echo 'this version is not selected' >&2; exit 127")
     real = script(tmp_path / "real/python", 'echo "set up by the real one: $*"')
@@ -67,6 +79,7 @@ def test_a_name_on_path_that_does_not_run_is_passed_over(tmp_path: Path):
     assert result.stdout == f"set up by the real one: setup/environment.py make {tmp_path}/venv blender\n"
 
 
+@with_a_shell
 def test_a_python_that_is_asked_for_must_fit(tmp_path: Path):
     wrong = script(tmp_path / "python", "exit 2")
     command = [ROOT / "setup/environment", tmp_path / "venv", "everything"]
@@ -75,6 +88,7 @@ def test_a_python_that_is_asked_for_must_fit(tmp_path: Path):
     assert f"PYTHON={wrong} is not a Python 3.13 or 3.11" in result.stderr
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux: elsewhere the wheels bring what they load")
 def test_a_missing_system_library_is_named_with_its_package(tmp_path: Path):
     listing = tmp_path / "libraries.txt"
     listing.write_text("# comment\nlibc.so.6 libc6\nlibfdda-missing.so.1 libfdda1\nlibfdda-gone.so.2 libfdda2\n")
@@ -85,7 +99,7 @@ def test_a_missing_system_library_is_named_with_its_package(tmp_path: Path):
 def test_an_environment_counts_only_with_the_stamp_of_these_requirements(tmp_path: Path):
     python = os.path.realpath(sys.executable)
     assert not environment.is_current(tmp_path, "blender", "")
-    (tmp_path / environment.STAMP).write_text(environment.fingerprint("blender"))
+    stamp(tmp_path)
     assert environment.is_current(tmp_path, "blender", "")
     assert environment.is_current(tmp_path, "blender", python)
     assert not environment.is_current(tmp_path, "blender", "/usr/bin/another-python")
@@ -93,22 +107,65 @@ def test_an_environment_counts_only_with_the_stamp_of_these_requirements(tmp_pat
 
 
 def test_a_set_up_that_fails_leaves_no_stamp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / environment.STAMP).write_text(environment.fingerprint("blender"))
-    monkeypatch.setattr(sys, "executable", script(tmp_path / "python", "exit 1"))
+    stamp(tmp_path)
+    monkeypatch.setenv("PYTHONHOME", str(tmp_path / "nowhere"))  # the Python that is started ends at once
     monkeypatch.setattr(environment, "check_system_libraries", lambda: None)
     with pytest.raises(environment.SetupError, match="could not be made a virtual environment"):
         environment.make(tmp_path, "blender")
     assert not (tmp_path / environment.STAMP).exists()
 
 
-def test_a_folder_without_a_python_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    made: list[tuple[Path, str]] = []
-    monkeypatch.setattr(environment, "make", lambda folder, contents: made.append((folder, contents)))
-    monkeypatch.setattr(sys, "argv", ["environment.py", "make", str(tmp_path), "blender"])
+def made(folder: Path, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Whether environment.py makes `folder` anew."""
+    calls: list[tuple[Path, str]] = []
+    monkeypatch.setattr(environment, "make", lambda *arguments: calls.append(arguments))
+    monkeypatch.setattr(sys, "argv", ["environment.py", "make", str(folder), "blender"])
     assert environment.main() == 0
-    assert made == [(tmp_path, "blender")]
+    return calls == [(folder, "blender")]
 
 
+def test_only_an_environment_that_this_python_has_made_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = tmp_path / "venv"
+    assert made(folder, monkeypatch), "there is none"
+    stamp(folder)
+    assert not made(folder, monkeypatch)
+    environment.program(folder, "python").unlink()
+    assert made(folder, monkeypatch), "without a Python"
+    stamp(folder)
+    monkeypatch.setattr(sys, "version", sys.version + " of another build")
+    assert made(folder, monkeypatch), "of another Python"
+
+
+def test_a_python_that_no_blender_has_is_refused(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "version_info", (3, 12, 4))
+    monkeypatch.setattr(sys, "argv", ["environment.py", "make", "nowhere", "blender"])
+    assert environment.main() == 1
+    assert re.fullmatch(r"FDDA needs Python 3\.13 or 3\.11 and this is 3\.12; .*\n", capsys.readouterr().err)
+
+
+def test_two_set_ups_of_a_folder_take_turns(tmp_path: Path):
+    waits = (
+        "import importlib.util, sys\n"
+        "spec = importlib.util.spec_from_file_location('environment', sys.argv[1])\n"
+        "environment = importlib.util.module_from_spec(spec)\n"
+        "spec.loader.exec_module(environment)\n"
+        "with open(sys.argv[2], 'w') as file:\n"
+        "    print('begins', flush=True)\n"
+        "    environment.lock(file)\n"
+        "    print('goes on', flush=True)\n"
+    )
+    command = [sys.executable, "-c", waits, environment.__file__, tmp_path / "venv.lock"]
+    with open(tmp_path / "venv.lock", "w") as file:
+        environment.lock(file)
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+            assert other.stdout.readline() == "begins\n"
+            with pytest.raises(subprocess.TimeoutExpired):
+                other.wait(0.3)
+            file.close()
+            assert other.communicate(timeout=60)[0] == "goes on\n"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows: links need a privilege")
 def test_an_environment_that_a_link_leads_to_is_left_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Working trees may share one: making it anew through the link would empty it for all of them."""
     shared, link = tmp_path / "shared", tmp_path / ".venv"
@@ -166,6 +223,7 @@ def test_the_farm_is_in_no_environment_but_its_own():
     assert "farm" not in (ROOT / "setup/package.py").read_text(), "nor in the extension"
 
 
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not here: Windows has none")
 def test_make_alone_prints_a_line_for_each_target():
     # Without the flags that a make around these tests hands down.
     outside = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
