@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What becomes of the extension in a Blender of its own: `python extension_life.py live|install|start [ZIP]`.
+"""The extension in a Blender of its own: `python extension_life.py live|install|play|start [ZIP [BOUND]]`.
 
 `live` installs the zip, enables, disables, installs again, uninstalls, and prints what Blender holds after each;
-`install` installs and enables it; `start` says what it costs to enable it, once it is installed. The last line is JSON.
+`install` installs and enables it; `play` then opens a bound file and poses it; `start` says what it costs
+to enable it, once it is installed. The last line is JSON.
 BLENDER_USER_RESOURCES names the folder for all that. Blender itself runs it too: `blender -b --python … -- live ZIP`.
 """
 
@@ -11,6 +12,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from types import ModuleType
 
 import bpy
 
@@ -64,7 +66,7 @@ def loaded_commands() -> list[str]:
 
 def files(user: Path) -> list[str]:
     """What lies in the user's folder, but for caches of Blender's own and the list of extensions."""
-    paths = (str(path.relative_to(user)) for path in user.rglob("*") if path.is_file())
+    paths = (path.relative_to(user).as_posix() for path in user.rglob("*") if path.is_file())
     return sorted(path for path in paths if "__pycache__" not in path and "/.cache/" not in path)
 
 
@@ -89,6 +91,30 @@ def start() -> dict:
     return {"seconds": seconds, "wall_seconds": wall_seconds, "modules": modules}
 
 
+def installed_onnxruntime() -> ModuleType:
+    """Import what the zip brought, ahead of another one, which the bpy wheel's environment may have."""
+    user = Path(os.environ["BLENDER_USER_RESOURCES"])
+    sys.path.insert(0, str(next(user.glob("extensions/.local/lib/*/site-packages"))))
+    import onnxruntime
+
+    return onnxruntime
+
+
+def play(package: str, bound: str) -> dict:
+    """Install the zip and play a bound file: what the elbow shows when it is bent."""
+    install(package, True)
+    onnxruntime = installed_onnxruntime()
+    bpy.ops.wm.open_mainfile(filepath=bound)
+    bpy.data.objects["elbow_rig"].pose.bones["lower"].rotation_euler[0] = 1.0
+    bpy.context.view_layer.update()
+    elbow = bpy.data.objects["elbow"].evaluated_get(bpy.context.evaluated_depsgraph_get())
+    return {
+        "status": bpy.data.objects["elbow"].fdda.status,
+        "onnxruntime": Path(onnxruntime.__file__).as_posix(),
+        "positions": [vertex.co[:] for vertex in elbow.data.vertices],
+    }
+
+
 def live(package: str) -> dict[str, dict]:
     """The whole life: what Blender holds after each step."""
     user = Path(os.environ["BLENDER_USER_RESOURCES"])
@@ -106,10 +132,7 @@ def live(package: str) -> dict[str, dict]:
     bpy.ops.preferences.addon_enable(module=MODULE)
     own = Path(bpy.utils.extension_path_user(MODULE, create=True)) / "kept"
     own.write_text("what the user has made")
-    # Ahead of another one, which the bpy wheel's environment may have.
-    sys.path.insert(0, str(next(user.glob("extensions/.local/lib/*/site-packages"))))
-    import onnxruntime
-
+    onnxruntime = installed_onnxruntime()
     note("used", onnxruntime=onnxruntime.__file__, providers=onnxruntime.get_available_providers())
     note("updated", result=install(package, True), kept=own.is_file())
     repositories = bpy.context.preferences.extensions.repos
@@ -119,11 +142,13 @@ def live(package: str) -> dict[str, dict]:
     return story
 
 
-def main(action: str, *package: str) -> None:
+def main(action: str, *files: str) -> None:
     if action == "live":
-        told = live(*package)
+        told = live(*files)
     elif action == "install":
-        told = {"result": install(*package, True)}
+        told = {"result": install(*files, True)}
+    elif action == "play":
+        told = play(*files)
     else:
         told = start()
     print(json.dumps(told))

@@ -11,16 +11,19 @@ import zipfile
 from pathlib import Path
 
 import bpy
+import numpy as np
 import pytest
 
 from fdda_addon.runtime import model_files
 
-from .conftest import pose
+from .conftest import assert_plays, pose
 
 ROOT = Path(__file__).resolve().parents[2]
 LIFE = Path(__file__).with_name("extension_life.py")
 VERSION = tomllib.loads((ROOT / "blender_manifest.toml").read_text())["version"]
 PACKAGE = ROOT / "dist" / f"fdda_addon-{VERSION}.zip"
+FOR_WINDOWS = PACKAGE.with_name(f"fdda_addon-{VERSION}-windows_x64.zip")
+PLATFORM = "windows" if os.name == "nt" else {"darwin": "macos"}.get(sys.platform, sys.platform)
 OF_DISTRIBUTIONS = PACKAGE.with_name(f"fdda_addon-{VERSION}-python3.14.zip")
 START_SECONDS, START = 0.05, 0.65
 """Seconds of the processor; and on a machine that is slow just now, the part of what `PYTHONS_OWN` takes on it."""
@@ -35,19 +38,29 @@ print(time.process_time() - begin)
 STATE = ("classes", "operators", "properties", "handlers", "keymap_items", "additions", "commands", "preferences")
 
 
+def manifest(path: Path) -> dict:
+    """The manifest in a zip."""
+    with zipfile.ZipFile(path) as archive:
+        return tomllib.loads(archive.read("blender_manifest.toml").decode())
+
+
+def stale(path: Path) -> list[str]:
+    """The source files in a zip that are not those under test."""
+    with zipfile.ZipFile(path) as archive:
+        code = {name: archive.read(name) for name in archive.namelist() if name.startswith(("fdda_addon/", "trainer/"))}
+    return [name for name in code if not (ROOT / name).is_file() or code[name] != (ROOT / name).read_bytes()]
+
+
 @pytest.fixture(scope="module")
 def package() -> Path:
-    """The zip, if it holds the code that is under test."""
-    if not PACKAGE.is_file():
-        pytest.skip(f"{PACKAGE.name} is not built: make package")
-    with zipfile.ZipFile(PACKAGE) as archive:
-        code = [name for name in archive.namelist() if name.startswith(("fdda_addon/", "trainer/"))]
-        stale = [
-            name for name in code if not (ROOT / name).is_file() or archive.read(name) != (ROOT / name).read_bytes()
-        ]
-    if stale:
-        pytest.skip(f"{PACKAGE.name} was built from other sources ({stale[0]} differs): make package")
-    return PACKAGE
+    """The zip for this platform, if it holds the code that is under test."""
+    built = [path for path in (PACKAGE, FOR_WINDOWS) if path.is_file() and PLATFORM in manifest(path)["platforms"][0]]
+    if not built:
+        pytest.skip(f"{PACKAGE.name} is not built for {PLATFORM}: make package")
+    for path in built:
+        if not (differing := stale(path)):
+            return path
+    pytest.skip(f"{path.name} was built from other sources ({differing[0]} differs): make package")
 
 
 def blender(*arguments: object, user: Path) -> subprocess.CompletedProcess[str]:
@@ -98,6 +111,16 @@ def test_blender_starts_as_fast_with_it(package: Path, tmp_path: Path):
     assert min(start["seconds"] for start in starts) < max(START_SECONDS, START * min(own))
 
 
+def test_installed_with_its_wheels_it_plays_a_bound_file(package: Path, elbow, bound, tmp_path: Path):
+    pose(angle=1.0)
+    shown = assert_plays(bound, elbow.model)
+    result = blender("play", package, elbow.bound, user=tmp_path)
+    assert result.returncode == 0, result.stdout + result.stderr
+    played = json.loads(result.stdout.splitlines()[-1])
+    assert played["status"] == "" and "extensions/.local/lib" in played["onnxruntime"]
+    assert np.abs(np.array(played["positions"]) - shown).max() < 1e-5
+
+
 def test_disabled_it_leaves_nothing_registered(story: dict):
     assert state(story["disabled"]) == state(story["before"])
 
@@ -119,9 +142,9 @@ def test_uninstalled_it_leaves_nothing(story: dict):
     assert story["uninstalled"]["files"] == story["before"]["files"] and not story["uninstalled"]["kept"]
 
 
-def pythons(manifest: dict) -> list[str]:
-    """Which Pythons the wheels are for."""
-    return [wheel.split("-")[2] for wheel in manifest["wheels"]]
+def pythons(told: dict) -> list[str]:
+    """Which Pythons the wheels are for, by a manifest."""
+    return [wheel.split("-")[2] for wheel in told["wheels"]]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Blender has a Python of its own")
@@ -132,18 +155,16 @@ def test_distributions_have_a_zip_of_their_own(package: Path):
         with zipfile.ZipFile(path) as archive:
             names = {name for name in archive.namelist() if not name.startswith("wheels/")} - {"blender_manifest.toml"}
             contents.append({name: archive.read(name) for name in names})
-            manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
     assert contents[0] == contents[1]
-    assert pythons(manifest) == ["cp314"] and OF_DISTRIBUTIONS.stat().st_size < 60e6
+    assert pythons(manifest(OF_DISTRIBUTIONS)) == ["cp314"] and OF_DISTRIBUTIONS.stat().st_size < 60e6
 
 
 def test_it_is_small_enough_and_says_what_it_may_do(package: Path):
     assert package.stat().st_size < 60e6
     with zipfile.ZipFile(package) as archive:
-        manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
         names = archive.namelist()
-    assert set(manifest["permissions"]) == {"files", "network"}
-    assert pythons(manifest) == ["cp311", "cp313"]
+    assert set(manifest(package)["permissions"]) == {"files", "network"}
+    assert pythons(manifest(package)) == ["cp311", "cp313"]
     assert not [name for name in names if "__pycache__" in name]
 
 
