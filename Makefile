@@ -47,6 +47,11 @@ test-farm: .venv-farm  ## the tests of the farm: its graph on a cluster, and wha
 test-gui: package  ## press the buttons of the sidebar in a Blender with a window (BLENDER=/path/to/blender), into out/gui
 	.venv/bin/python tests/gui/run.py out/gui $(BLENDER)
 
+test-windows: .venv  ## the tests in Python for Windows under Wine, as root on Debian (LINE=5.2: on one LTS line; 40 minutes)
+	setup/windows/setup $(PYTHON_$(LINE))
+	.venv/bin/python setup/package.py windows-x64
+	.venv/bin/python tests/windows/run.py $(LINE)
+
 test-all: test  ## as test, and the core and Blender tiers on the other LTS line
 	@$(MAKE) test-line LINE=$(OTHER_LINE)
 
@@ -103,4 +108,4 @@ requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
 clean:  ## remove what was built and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-examples test-gui test-all test-line bench sampling soak study simulation characters pictures map fixtures lint package requirements clean
+.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-examples test-gui test-windows test-all test-line bench sampling soak study simulation characters pictures map fixtures lint package requirements clean

@@ -13,6 +13,8 @@ from types import ModuleType
 
 import pytest
 
+from ..systems import WINDOWS, symbolic_links
+
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PINS = {version: (ROOT / f"requirements/python-{version}.txt").read_text() for version in ("3.11", "3.13", "3.14")}
@@ -28,7 +30,7 @@ def load(name: str) -> ModuleType:
 
 environment = load("environment")
 package = load("package")
-with_a_shell = pytest.mark.skipif(os.name == "nt", reason="POSIX: setup/environment is a script of the shell")
+with_a_shell = pytest.mark.skipif(WINDOWS, reason="POSIX: setup/environment is a script of the shell")
 
 
 def stamp(folder: Path, contents: str = "blender") -> None:
@@ -165,7 +167,7 @@ def test_two_set_ups_of_a_folder_take_turns(tmp_path: Path):
             assert other.communicate(timeout=60)[0] == "goes on\n"
 
 
-@pytest.mark.skipif(os.name == "nt", reason="Windows: links need a privilege")
+@symbolic_links
 def test_an_environment_that_a_link_leads_to_is_left_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Working trees may share one: making it anew through the link would empty it for all of them."""
     shared, link = tmp_path / "shared", tmp_path / ".venv"

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The target that tests under Wine: what it runs exists, and what pytest reports is counted."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ..systems import WINDOWS
+
+ROOT = Path(__file__).resolve().parents[2]
+spec = importlib.util.spec_from_file_location("windows_run", ROOT / "tests/windows/run.py")
+windows = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(windows)
+
+
+@pytest.mark.parametrize("small", (True, False))
+@pytest.mark.parametrize("line", windows.PYTHONS)
+def test_what_it_runs_exists(line: str, small: bool):
+    named = [arguments[0] for _, arguments in windows.parts(line, small)]
+    assert len(named) > 1 and [path for path in named if not (ROOT / path).exists()] == []
+
+
+def test_the_report_of_pytest_is_counted(tmp_path: Path):
+    tests = tmp_path / "test_it.py"
+    tests.write_text(
+        "import pytest\n"
+        "@pytest.fixture\n"
+        "def broken():\n    raise OSError\n"
+        "@pytest.mark.parametrize('value', ('a - b', 'c'))\n"
+        "def test_fails(value):\n    assert value == 'c'\n"
+        "def test_errs(broken):\n    pass\n"
+        "def test_skips():\n    pytest.skip('elsewhere')\n",
+        encoding="utf-8",
+    )
+    report = tmp_path / "report.xml"
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--junit-xml={report}", tests]
+    assert subprocess.run(command, cwd=tmp_path, capture_output=True, check=False).returncode == 1
+    counts, failed = windows.outcome(report)
+    assert counts == {"passed": 1, "failed": 2, "skipped": 1}
+    assert failed == ("test_it::test_fails[a - b]", "test_it::test_errs")
+
+
+@pytest.mark.skipif(WINDOWS, reason="POSIX: setup/windows/run is a script of the shell")
+def test_without_a_windows_python_it_names_what_makes_one(tmp_path: Path):
+    command = [ROOT / "setup/windows/run", "3.13", "-c", "pass"]
+    result = subprocess.run(command, env={**os.environ, "FDDA_WINDOWS": str(tmp_path)}, capture_output=True, text=True)
+    assert result.returncode == 2 and result.stderr.count("\n") == 1
+    assert os.getuid() or "make it: setup/windows/setup 3.13" in result.stderr
+    assert subprocess.run([*command[:1], "3.12", "-c", "pass"], capture_output=True).returncode == 2
