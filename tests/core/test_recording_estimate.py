@@ -52,12 +52,12 @@ def test_a_disk_without_room(tmp_path):
     free = shutil.disk_usage(tmp_path).free
     check_room([(tmp_path / "a", 1000), (tmp_path / "b", 1000)])
     with pytest.raises(
-        OutputError, match=r"Cannot write the recording '.*/a/b': it takes .* GB and the disk has .* left"
+        OutputError, match=r"Cannot write the recording '.*a.b': it takes .* GB and the disk has .* left"
     ):
         check_room([(tmp_path / "a" / "b", free), (tmp_path / "c", 10**9)])
 
 
-@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="files grow as they are written")
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="Windows reserves no room for files.")
 def test_what_a_recording_has_already_needs_no_room(small_disk):
     record_limb(small_disk / "r", poses=20, complete=5)
     size = recording_bytes(make_rig(), 20)

@@ -92,7 +92,10 @@ def test_removing_leaves_nothing_of_it_and_all_else(tmp_path):
     (tmp_path / "with_notes" / "notes.txt").write_text("mine")
     for name in ("r", "with_notes"):
         remove_recording(tmp_path / name)
-    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == ["with_notes", "with_notes/notes.txt"]
+    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == [
+        "with_notes",
+        "with_notes/notes.txt",
+    ]
 
 
 def test_every_array_is_removed(tmp_path):

@@ -182,7 +182,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems count peak memory in other units")
+@pytest.mark.skipif(sys.platform != "linux", reason="Other systems than Linux count peak memory in other units.")
 def test_memory_stays_bounded(tmp_path):
     """Two shards of 60 MB each take no more than three pieces."""
     rig, total = make_rig(), 160_000

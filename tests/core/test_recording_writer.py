@@ -2,6 +2,7 @@
 """Writing a recording: what is written is read back, and an interruption leaves a recording that resumes."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from fdda_addon.core.errors import FDDAError, OutputError, RecordingError
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.place import check_recordable
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.recording.writer import RecordingWriter, array_header
 
 from .. import systems
 from .limb import (
@@ -115,9 +116,10 @@ def test_a_torn_write_is_never_read(tmp_path, recording):
     """What lies behind the complete poses may be anything: a batch was being written when the power went."""
     path = tmp_path / "torn"
     record_limb(path, POSES, 5)
-    for name, row in (("pose_matrices", 4 * 4 * 4 * 4), ("residuals", 40 * 3 * 4)):
+    for name, shape in (("pose_matrices", (4, 4, 4)), ("residuals", (40, 3))):
+        row = 4 * math.prod(shape)
         with open(path / f"{name}.npy", "r+b") as file:
-            file.seek(-(POSES - 5) * row, 2)
+            file.seek(len(array_header((POSES, *shape), np.float32)) + 5 * row)
             file.write(b"\xff" * 2 * row)
     record_limb(path, POSES, resume=True)
     assert files(path) == files(recording)
