@@ -224,8 +224,8 @@ def _positions(mesh: bpy.types.Mesh) -> np.ndarray:
 
 
 def _memory() -> float:
-    """MB that the process holds in memory now."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+    """MB that the process holds in memory now; NaN where the system is not Linux."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6 if sys.platform == "linux" else np.nan
 
 
 def main() -> int:

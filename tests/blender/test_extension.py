@@ -147,7 +147,7 @@ def pythons(told: dict) -> list[str]:
     return [wheel.split("-")[2] for wheel in told["wheels"]]
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Blender has a Python of its own")
+@pytest.mark.skipif(sys.platform != "linux", reason="Elsewhere than on Linux Blender has a Python of its own.")
 def test_distributions_have_a_zip_of_their_own(package: Path):
     """The same but for the wheels."""
     contents = []

@@ -25,6 +25,7 @@ def folder(elbow, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="The soak measures memory by /proc, which only Linux has.")
 @pytest.mark.parametrize(
     ("part", "count"), [("models", 60), ("kills", 3), ("disks", 4), ("frames", 200), ("undo", 40), ("loads", 6)]
 )

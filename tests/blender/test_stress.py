@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """A short run of `benchmarks/stress_playback.py`: characters show what their model says, whatever is done to them."""
 
+import sys
+
 import bpy
 import pytest
 
@@ -15,4 +17,5 @@ def test_whatever_is_done_at_random(bound, elbow, tmp_path, seed):
     assert outcome.compared > 750 and len(outcome.operations) == len(WEIGHTS)
     # What was allocated once stays; a character more or less is below a megabyte.
     half = len(outcome.memory) // 2
-    assert outcome.memory[-1] - outcome.memory[half] < 10
+    # Only Linux says what a process holds.
+    assert sys.platform != "linux" or outcome.memory[-1] - outcome.memory[half] < 10
