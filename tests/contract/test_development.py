@@ -81,7 +81,7 @@ def test_every_thread_timer_and_handler_is_in_the_table():
     for file in sorted([*ADDON.rglob("*.py"), *(ROOT / "trainer").rglob("*.py")]):
         text = file.read_text(encoding="utf-8")
         if re.search(f"{TIMERS}|{HANDLERS}|{THREADS}", text, re.MULTILINE):
-            rows = [row for row in table.splitlines() if f"`{file.relative_to(ROOT)}`" in row]
+            rows = [row for row in table.splitlines() if f"`{file.relative_to(ROOT).as_posix()}`" in row]
             names = [name for name in _handlers(text) if not any(f"`{name}`" in row for row in rows)]
             missing += [module_of(file)] * (not rows) + [f"{module_of(file)}: {name}" for name in names]
     assert missing == []

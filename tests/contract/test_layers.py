@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from .. import systems
 from .floors import ADDON, FLOORS, ROOT, import_graph, imported_names, module_of, room_graph
 
 STANDARD = sys.stdlib_module_names
@@ -68,6 +69,7 @@ def test_the_farm_uses_only_the_core_of_the_addon():
     assert names and [name for name in sorted(names) if not name.startswith("fdda_addon.core.")] == []
 
 
+@pytest.mark.skipif(systems.WINDOWS, reason="The farm does not run on Windows.")
 def test_importing_the_farm_needs_no_dask():
     """`farm --task` runs on the workers of other engines, and the add-on's verb starts it only when it is asked to."""
     modules = [module_of(file) for file in python_files("farm") if file.name != "__main__.py"]
@@ -79,8 +81,8 @@ def test_importing_the_farm_needs_no_dask():
 
 def without_blender(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run a verb in a Python that has no bpy; the trainer's Python is one that says its name and nothing else."""
-    trainer = folder / "python"
-    trainer.write_text("#!/bin/sh\necho the trainer\n")
+    trainer = folder / ("python.cmd" if systems.WINDOWS else "python")
+    trainer.write_text("@echo the trainer\n" if systems.WINDOWS else "#!/bin/sh\necho the trainer\n")
     trainer.chmod(0o755)
     blocked = f"import sys; sys.modules.update(dict.fromkeys({sorted(BLENDER)}))"
     call = f"from fdda_addon.cli.main import main; sys.exit(main({list(arguments)}, 'fdda'))"
