@@ -9,6 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from fdda_addon.core.output import check_temporary_folder
 from fdda_addon.core.terminal import show_all_names
 
 from .announcements import Announcer, MessageLines, Text
@@ -28,6 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _train(options: argparse.Namespace, announcer: Announcer, stop: StopRequest) -> None:
     config = config_from_arguments(options)
+    check_temporary_folder()  # torch fails without one
     try:
         from fdda_addon.core.recording.folder import recordings_in
 

@@ -7,7 +7,7 @@ import sys
 import traceback
 from collections.abc import Callable
 
-from fdda_addon.core.errors import TRY_AGAIN, FDDAError, TrainingError, exit_status
+from fdda_addon.core.errors import TRY_AGAIN, FDDAError, TrainingError, exit_status, machine_sentence
 from fdda_addon.core.messages import MessageType
 
 from .announcements import Announcer
@@ -60,6 +60,8 @@ def run_announced(work: Callable[[], None], announcer: Announcer) -> int:
             if _lacks_memory(error):
                 text = f"The training lacks memory ({error}); free some, or train on a larger machine."
                 return _failed(" ".join(text.split()), announcer, TRY_AGAIN)
+            if text := machine_sentence(error):
+                return _failed(text, announcer, TRY_AGAIN)
             traceback.print_exc()
             return _failed(f"The trainer stopped on an error of its own ({error!r}); please report it.", announcer)
     except BrokenPipeError:

@@ -9,7 +9,7 @@ import argparse
 import sys
 from importlib import import_module
 
-from ..core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status
+from ..core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status, machine_sentence
 from ..core.terminal import show_all_names
 
 VERBS = {
@@ -72,8 +72,10 @@ def main(arguments: list[str], program: str) -> int:
         status = exit_status(error)
         print(f"Error: {error}" if status != WrongUsageError.exit_status else error, file=sys.stderr)
         return status
-    except MemoryError:
-        print("Error: The memory of this machine is used up; free some, or use a larger one.", file=sys.stderr)
+    except (MemoryError, OSError) as error:
+        if not (text := machine_sentence(error)):
+            raise
+        print(f"Error: {text}", file=sys.stderr)
         return TRY_AGAIN
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)

@@ -75,6 +75,16 @@ def exit_status(error: BaseException) -> int:
     return status
 
 
+def machine_sentence(error: BaseException) -> str:
+    """What to say of an error that nobody foresaw where the machine caused it; empty where it may be a bug."""
+    if isinstance(error, MemoryError):
+        return "The memory of this machine is used up; free some, or use a larger one."
+    if isinstance(error, OSError) and _is_of_machine(error):
+        name = f"'{error.filename}': " if error.filename else ""
+        return f"{name}{os_reason(error)}; make room, end other programs, or try again."
+    return ""
+
+
 def _is_of_machine(error: OSError) -> bool:
     return error.errno in MACHINE or getattr(error, "winerror", None) in MACHINE_WINDOWS
 

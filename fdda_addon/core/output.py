@@ -135,6 +135,18 @@ def _probe(path: Path, folder: Path) -> None:
         remove_file(Path(probe))
 
 
+def check_temporary_folder() -> None:
+    """Fail where the system's temporary folder takes no file: packages that are imported may need one.
+
+    Raises:
+        NoRoomError: it takes none.
+    """
+    try:
+        tempfile.gettempdir()
+    except OSError as error:
+        raise temporary_failed(error) from error
+
+
 def temporary_failed(error: OSError) -> NoRoomError:
     """The error where the system's temporary folder takes no file; Python looks for one that does."""
     return NoRoomError(

@@ -6,6 +6,7 @@ Bad models are in test_bad_models.py, bad trainers in test_bad_trainers.py.
 
 import json
 import shutil
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -186,6 +187,25 @@ def test_an_output_in_a_folder_that_is_not_there(refusal, writing, tmp_path):
         pytest.skip("record makes its folder")
     text = refusal(*writing(tmp_path / "none" / "out"))
     assert f"the folder '{tmp_path / 'none'}' does not exist; create it first" in text
+
+
+def deep(folder: Path) -> Path:
+    """A path of more bytes than Blender takes, which is cut within the name of one of its folders."""
+    return folder.joinpath(*(letter * 200 for letter in "abcdef"))
+
+
+def test_an_output_whose_path_blender_would_cut(refusal, writing, tmp_path):
+    """It would write over a file that has what is left of the path."""
+    text = refusal(*writing(deep(tmp_path) / "out.blend"))
+    assert text.startswith("Cannot write") and "bytes, and Blender takes 1,023; choose a shorter folder." in text
+
+
+def test_a_rig_whose_path_blender_would_cut(refusal, verb, elbow, tmp_path):
+    path = deep(tmp_path) / "rig.blend"
+    path.parent.mkdir(parents=True)
+    shutil.copy(elbow.rig, path)
+    text = refusal(*verb(path))
+    assert text.startswith("Blender cannot open or write") and "bytes, and Blender takes 1,023; choose a sh" in text
 
 
 def test_an_output_that_is_a_folder(refusal, writing, tmp_path):

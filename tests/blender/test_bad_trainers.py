@@ -5,6 +5,7 @@ import os
 import re
 import stat
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -101,6 +102,20 @@ def test_a_trainer_that_complains_and_ends(train, tmp_path, monkeypatch):
         "The trainer ended with status 1 before it was done (ImportError: libtorch.so); no model was written, "
         "train again."
     )
+
+
+@pytest.mark.parametrize("verb", ["train", "record"])
+def test_no_temporary_folder_takes_a_file(refusal, elbow, tmp_path, monkeypatch, verb):
+    arguments = {
+        "train": ["train", elbow.recording, tmp_path / "m.onnx"],
+        "record": ["record", elbow.rig, tmp_path / "r", "--poses", 20, "--fit-linear", "hard"],
+    }[verb]
+    with monkeypatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", None)
+        patch.setattr(tempfile, "_candidate_tempdir_list", lambda: [str(tmp_path / "none")])
+        text = refusal(*arguments, status=TRY_AGAIN)
+    assert text.startswith("No temporary file can be written (No usable temporary directory found in [")
+    assert text.endswith("); make room there, or name another folder in TMPDIR.")
 
 
 def test_a_trainer_that_is_killed(train, tmp_path, monkeypatch):

@@ -40,6 +40,7 @@ def test_help(arguments, capfd):
         ["record", "a.blend", "b", "--spread", "nan"],
         ["record", "a.blend", "b", "--spread", "inf"],
         ["record", "a.blend", "b", "--colour"],
+        ["record", "a.blend", "b", "--overwrite", "--resume"],
         ["record", "a.blend", "b", "--settle", "3"],
         ["record", "a.blend", "b", "--pre-roll", "3"],
         ["record", "a.blend", "b", "--target", "flesh", "--settle", "-1"],

@@ -7,6 +7,8 @@ import shutil
 
 import pytest
 
+from fdda_addon.core.recording.reader import read_recording
+
 from .. import systems
 from .conftest import run
 from .refusals import Refusal, files
@@ -115,6 +117,20 @@ def test_a_bound_file_does_not_take_the_name_of_the_copied_model(place, capfd, m
     (place / "there").mkdir()
     text = Refusal(place, capfd)("bind", "rig.blend", "m.onnx", "there/m.onnx")
     assert text == "Cannot write 'there/m.onnx': the copy of the model beside it has that name; give another name."
+
+
+def test_a_torn_recording_is_replaced(place, capfd, monkeypatch):
+    """Neither a new recording nor `--resume` takes it; their sentences say what does."""
+    monkeypatch.chdir(place)
+    index = place / "recording" / "recording.json"
+    index.write_bytes(index.read_bytes()[:200])
+    refusal = Refusal(place, capfd)
+    record = ("record", "rig.blend", "recording", "--poses", "10")
+    assert "replace it with --overwrite, or" in refusal(*record)
+    assert "; record again with --overwrite." in refusal(*record, "--resume")
+    assert "; record again with --overwrite." in refusal("train", "recording", "new.onnx")
+    assert run(*record, "--overwrite") == 0
+    assert read_recording(place / "recording").info.complete == 10
 
 
 def done(line: str) -> bool:
