@@ -2,12 +2,14 @@
 """The command line of the farm: `python -m fdda_addon farm characters.toml`, or `python -m farm characters.toml`.
 
 Exit status: 0 all characters are done, 1 one failed, each with a sentence, 2 wrong usage, 75 it ended for a reason of
-the machines', so that the same command goes on, 130 interrupted.
+the machines', so that the same command goes on, 130 interrupted, 143 and 129 ended by SIGTERM and SIGHUP.
 """
 
 import argparse
+import contextlib
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 from fdda_addon.core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status
 
@@ -22,9 +24,10 @@ def main(arguments: list[str] | None = None) -> int:
         status = exit_status(error)
         print(f"Error: {error}" if status != WrongUsageError.exit_status else error, file=sys.stderr)
         return status
-    except KeyboardInterrupt:
-        print("Interrupted; run the same command to go on.", file=sys.stderr)
-        return INTERRUPTED
+    except KeyboardInterrupt as stop:
+        with contextlib.suppress(OSError):  # The terminal may be the one that was closed.
+            print("Interrupted; run the same command to go on.", file=sys.stderr, flush=True)
+        return getattr(stop, "exit_status", INTERRUPTED)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -151,5 +154,12 @@ def _say(outcome, done: int, total: int) -> None:
     print(f"[{done}/{total}] {outcome.task} {outcome.state}{seconds}{text}", flush=True)
 
 
+def program() -> NoReturn:
+    """Run the farm as a program: what it has started ends with it."""
+    from .stopping import ending_all
+
+    ending_all(main)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

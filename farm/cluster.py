@@ -40,6 +40,8 @@ SETTINGS = {
 }
 """Dask's own are for tasks of milliseconds. With them a task waits up to 11 s for a worker that is at another one,
 beside one that has nothing to do, and what Dask does to watch itself takes an eighth of a core on two workers."""
+_left_open: list[contextlib.ExitStack] = []
+"""Kept until the program ends: what would be closed when it is collected."""
 
 
 class ClusterError(TryAgainError):
@@ -89,7 +91,12 @@ def connected(farm: Farm, scheduler: str, workers: int, host: str, port: int) ->
         except (OSError, ValueError, RuntimeError) as error:
             where = f"There is no scheduler at '{scheduler}'" if scheduler else "The local cluster did not start"
             raise ClusterError(f"{where} ({error}).") from error
-        yield stack.enter_context(client)
+        try:
+            yield stack.enter_context(client)
+        except KeyboardInterrupt:
+            # Dask takes ten seconds to close what `stopping` ends at once.
+            _left_open.append(stack.pop_all())
+            raise
 
 
 @contextlib.contextmanager

@@ -8,6 +8,6 @@ from pathlib import Path
 sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
 if __name__ == "__main__":
-    from farm.__main__ import main
+    from farm.__main__ import program
 
-    sys.exit(main())
+    program()

@@ -8,4 +8,8 @@ from .core.terminal import use_utf8
 
 if __name__ == "__main__":
     use_utf8()
+    if sys.argv[1:2] == ["farm"]:
+        from .cli.farm import become_farm
+
+        become_farm(sys.argv[2:])
     sys.exit(main(sys.argv[1:], "python -m fdda_addon"))

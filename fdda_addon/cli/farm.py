@@ -18,10 +18,26 @@ def run(arguments: list[str]) -> int:
     Raises:
         FDDAError: it is not there.
     """
-    if not (ROOT / "farm" / "__main__.py").is_file():
+    if not _is_there():
         raise FDDAError(
             "The farm is no part of the extension; run it from the project: python -m fdda_addon farm PLAN."
         )
+    command, environment = _command(arguments)
+    return subprocess.run(command, env=environment, check=False).returncode
+
+
+def become_farm(arguments: list[str]) -> None:
+    """Run the farm in place of this program, so that signals reach it; returns where that is not possible."""
+    # On Windows the program would end at once, and the farm go on without it.
+    if os.name == "posix" and _is_there():
+        command, environment = _command(arguments)
+        os.execve(command[0], command, environment)
+
+
+def _is_there() -> bool:
+    return (ROOT / "farm" / "__main__.py").is_file()
+
+
+def _command(arguments: list[str]) -> tuple[list[str], dict[str, str]]:
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-    command = [sys.executable, "-P", "-m", "farm", *arguments]
-    return subprocess.run(command, env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)}, check=False).returncode
+    return [sys.executable, "-P", "-m", "farm", *arguments], {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}

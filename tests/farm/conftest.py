@@ -10,7 +10,7 @@ import pytest
 
 from farm.characters import Plan, read_plan
 from farm.run import Outcome, run_task
-from farm.tasks import make_tasks
+from farm.tasks import KINDS, make_tasks
 
 ROOT = Path(__file__).resolve().parents[2]
 ELBOW = ROOT / "blend_fixtures" / "elbow.blend"
@@ -46,10 +46,10 @@ def written(tmp_path: Path) -> Callable[[str], Plan]:
     return write
 
 
-def do_all(plan: Plan) -> dict[str, Outcome]:
-    """All tasks of a plan in this process."""
+def do_all(plan: Plan, kinds: tuple[str, ...] = KINDS) -> dict[str, Outcome]:
+    """All tasks of a plan, or those of some kinds, in this process."""
     tasks = make_tasks(plan)
-    return {name: run_task(plan.farm, tasks, name) for name in tasks}
+    return {name: run_task(plan.farm, tasks, name) for name, task in tasks.items() if task.kind in kinds}
 
 
 def states(outcomes: dict[str, Outcome]) -> dict[str, str]:
