@@ -9,11 +9,16 @@ import argparse
 import contextlib
 import sys
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from fdda_addon.core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status
 
+if TYPE_CHECKING:
+    from .characters import Plan
+    from .tasks import Task
+
 INTERRUPTED = 130
+WINDOWS = "win32"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -24,6 +29,12 @@ def main(arguments: list[str] | None = None) -> int:
         status = exit_status(error)
         print(f"Error: {error}" if status != WrongUsageError.exit_status else error, file=sys.stderr)
         return status
+    except (OSError, MemoryError) as error:
+        if exit_status(error) != TRY_AGAIN:
+            raise
+        reason = getattr(error, "strerror", None) or "The memory of this machine is used up"
+        print(f"Error: {reason}; make room, and run the same command to go on.", file=sys.stderr)
+        return TRY_AGAIN
     except KeyboardInterrupt as stop:
         with contextlib.suppress(OSError):  # The terminal may be the one that was closed.
             print("Interrupted; run the same command to go on.", file=sys.stderr, flush=True)
@@ -38,6 +49,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--only", action="append", default=[], metavar="NAME", help="this character alone; may be given again"
+    )
+    parser.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="write over files of another kind, and over a bound file that somebody has changed",
     )
     what = parser.add_argument_group("in place of running it").add_mutually_exclusive_group()
     what.add_argument("--task", metavar="NAME", help="do one task, for engines that have the graph from below")
@@ -62,37 +78,57 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> int:
+    if sys.platform == WINDOWS:
+        raise FDDAError(
+            "The farm needs Linux or macOS, for locks that Windows does not have; on Windows use record, train and "
+            "bind, or run the farm in WSL."
+        )
+    from fdda_addon.core.output import check_folder_writable
+
     from .characters import read_plan
+    from .outputs import FARM_PAGE, FARM_REPORT, check_farm_outputs
     from .tasks import make_tasks
 
     plan = read_plan(options.plan)
     tasks = make_tasks(plan)
     if options.task:
-        return _one(plan.farm, tasks, options.task)
+        return _one(plan, tasks, options)
     if unknown := sorted(set(options.only) - {character.name for character in plan.characters}):
         raise WrongUsageError(f"The plan has no character '{unknown[0]}'.")
     if options.only:
         tasks = {name: task for name, task in tasks.items() if task.character in options.only}
-    if options.openjd:
-        from .openjd import write_template
-
-        return write_template(plan, tasks, options.openjd)
-    if options.flamenco:
-        from .flamenco import write_job
-
-        return write_job(plan, tasks, options.flamenco)
+    if options.openjd or options.flamenco:
+        return _write_graph(plan, tasks, options)
     if options.dry_run:
         from .simulation import print_estimate
 
         return print_estimate(plan.farm, tasks, _counts(options.workers))
     page = options.report or plan.path.with_name("report.html")
+    report = [(page, FARM_PAGE), (page.with_suffix(".json"), FARM_REPORT)]
     if options.report_only:
         from .report import write_report
 
+        check_farm_outputs(plan, tasks.values(), report, options.overwrite)
         write_report(plan, tasks, {}, page)
         print(f"{page}: the report")
         return 0
+    if not options.list:
+        check_farm_outputs(plan, tasks.values(), report, options.overwrite, runs=True)
+        check_folder_writable(plan.farm.work)
     return _all(options, plan, tasks, page)
+
+
+def _write_graph(plan: "Plan", tasks: dict[str, "Task"], options: argparse.Namespace) -> int:
+    """Write the graph for another engine; returns the exit status."""
+    from .flamenco import write_job
+    from .openjd import write_template
+    from .outputs import JOB, TEMPLATE, check_farm_outputs
+
+    path, kind, write = (
+        (options.openjd, TEMPLATE, write_template) if options.openjd else (options.flamenco, JOB, write_job)
+    )
+    check_farm_outputs(plan, tasks.values(), [(path, kind)], options.overwrite)
+    return write(plan, tasks, path)
 
 
 def _counts(text: str) -> list[int]:
@@ -102,13 +138,16 @@ def _counts(text: str) -> list[int]:
     return counts
 
 
-def _one(farm, tasks: dict, name: str) -> int:
+def _one(plan: "Plan", tasks: dict[str, "Task"], options: argparse.Namespace) -> int:
     """Do one task for another engine, which has done those before it."""
+    from .outputs import check_farm_outputs
     from .run import AGAIN, GOOD, run_task
 
+    name = options.task
     if name not in tasks:
         raise WrongUsageError(f"The plan has no task '{name}'; --list names them.")
-    outcome = run_task(farm, tasks, name)
+    check_farm_outputs(plan, [tasks[name]], (), options.overwrite, runs=True)
+    outcome = run_task(plan.farm, tasks, name, options.overwrite)
     print(f"{name}: {outcome.state}{f', {outcome.sentence}' if outcome.sentence else ''}")
     if outcome.state in GOOD:
         return 0
@@ -116,7 +155,7 @@ def _one(farm, tasks: dict, name: str) -> int:
     return TRY_AGAIN if outcome.state == AGAIN else 1
 
 
-def _all(options: argparse.Namespace, plan, tasks: dict, page: Path) -> int:
+def _all(options: argparse.Namespace, plan: "Plan", tasks: dict[str, "Task"], page: Path) -> int:
     from .cluster import connected, local_workers, run_on
     from .report import write_report
     from .run import AGAIN, FAILED, GOOD, Outcome
@@ -136,7 +175,7 @@ def _all(options: argparse.Namespace, plan, tasks: dict, page: Path) -> int:
             plan.farm.work.mkdir(parents=True, exist_ok=True)
             with connected(plan.farm, options.scheduler, workers, options.host, options.dashboard_port) as client:
                 print(f"{len(names)} of {len(tasks)} tasks to do; {client.dashboard_link} shows them", flush=True)
-                for outcome in run_on(client, plan.farm, tasks, names):
+                for outcome in run_on(client, plan.farm, tasks, names, options.overwrite):
                     outcomes[outcome.task] = outcome
                     _say(outcome, len(outcomes), len(names) + len(unreadable))
     finally:
@@ -156,6 +195,8 @@ def _say(outcome, done: int, total: int) -> None:
 
 def program() -> NoReturn:
     """Run the farm as a program: what it has started ends with it."""
+    if sys.platform == WINDOWS:
+        sys.exit(main())
     from .stopping import ending_all
 
     ending_all(main)

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from fdda_addon.core.errors import FDDAError
+from fdda_addon.core.errors import TRY_AGAIN, FDDAError, exit_status
 
 from .characters import Farm
 from .process import TryAgainError
@@ -133,13 +133,16 @@ def _keep_workers(cluster: object, stop: threading.Event) -> None:
             cluster.scale(len(cluster.worker_spec))
 
 
-def run_on(client: "Client", farm: Farm, tasks: dict[str, Task], names: list[str]) -> Iterator[Outcome]:
+def run_on(
+    client: "Client", farm: Farm, tasks: dict[str, Task], names: list[str], overwrite: bool = False
+) -> Iterator[Outcome]:
     """Run tasks on a cluster, each when those before it are done.
 
     Args:
         client: of the cluster.
         farm, tasks: the graph.
         names: of the tasks to run, each after those that it needs.
+        overwrite: as of `run_task`.
 
     Yields:
         The outcome of each task as it ends.
@@ -161,6 +164,7 @@ def run_on(client: "Client", farm: Farm, tasks: dict[str, Task], names: list[str
             own,
             name,
             [futures[other] for other in task.after if other in futures],
+            overwrite,
             key=f"{name}-{run_id}",
             retries=farm.retries,
             resources={GPU if needs_gpu else CPU: 1} if farm.gpu else None,
@@ -191,12 +195,22 @@ def _ancestors(tasks: dict[str, Task], name: str) -> list[str]:
     return list(found)
 
 
-def _run(farm: Farm, tasks: dict[str, Task], name: str, before: list[Outcome]) -> Outcome:
+def _run(farm: Farm, tasks: dict[str, Task], name: str, before: list[Outcome], overwrite: bool) -> Outcome:
     """What a worker does."""
+    from distributed import get_worker
+
     for outcome in before:
         if outcome.state not in GOOD:
             return Outcome(name, BLOCKED, f"'{outcome.task}' is not done.")
-    outcome = run_task(farm, tasks, name)
+    worker = get_worker()
+    key = worker.get_current_task()
+
+    def is_wanted() -> bool:
+        # Of a farm that is gone, the scheduler takes the tasks back.
+        own = worker.state.tasks.get(key)
+        return own is not None and own.state != "cancelled"
+
+    outcome = run_task(farm, tasks, name, overwrite, is_wanted)
     if outcome.state == AGAIN:
         # Dask counts the attempts; the disk or the memory may come back meanwhile.
         time.sleep(farm.retry_seconds)
@@ -210,5 +224,5 @@ def _outcome(name: str, future: object) -> Outcome:
     if future.status != "error":
         return Outcome(name, AGAIN, "The scheduler is gone.")
     error = future.exception()
-    is_again = isinstance(error, TryAgainError) or type(error).__name__ == "KilledWorker"
+    is_again = exit_status(error) == TRY_AGAIN or type(error).__name__ == "KilledWorker"
     return Outcome(name, AGAIN if is_again else FAILED, str(error) or repr(error))

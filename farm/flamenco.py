@@ -5,7 +5,7 @@ import json
 import sys
 from pathlib import Path
 
-from fdda_addon.core.output import check_writable, write_json
+from fdda_addon.core.output import write_json
 
 from .characters import Plan
 from .stamps import ROOT
@@ -22,7 +22,6 @@ def write_job(plan: Plan, tasks: dict[str, Task], path: Path) -> int:
     Raises:
         OutputError: the file cannot be written.
     """
-    check_writable(path)
     write_json(path, make_job(plan, tasks))
     print(f"{path}: a job of {len(tasks) + 1} tasks")
     return 0

@@ -4,7 +4,7 @@
 import sys
 from pathlib import Path
 
-from fdda_addon.core.output import check_writable, write_json
+from fdda_addon.core.output import write_json
 
 from .characters import Plan
 from .stamps import ROOT
@@ -20,7 +20,6 @@ def write_template(plan: Plan, tasks: dict[str, Task], path: Path) -> int:
     Raises:
         OutputError: the file cannot be written.
     """
-    check_writable(path)
     template = make_template(plan, tasks, path.absolute().parent)
     write_json(path, template)
     print(f"{path}: a template of {len(template['steps'])} steps")

@@ -4,11 +4,13 @@
 import contextlib
 import fcntl
 import os
+import resource
 import shlex
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +19,8 @@ from fdda_addon.core.errors import TRY_AGAIN, FDDAError
 from .characters import Farm
 from .stamps import ROOT
 
-WAIT_SECONDS = 0.2
+WAIT_SECONDS = 0.05
+ENDED_BY_SIGNAL = 128
 SENTENCE_BYTES = 64 << 10
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 ENGINES_OWN = ("MALLOC_TRIM_THRESHOLD_",)
@@ -85,7 +88,9 @@ def _paths() -> list[str]:
     return [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path and path != str(ROOT)]
 
 
-def run_verb(farm: Farm, verb: tuple[str, ...], folder: Path, log: Path, lock: int) -> Ended:
+def run_verb(
+    farm: Farm, verb: tuple[str, ...], folder: Path, log: Path, lock: int, is_wanted: Callable[[], bool] = lambda: True
+) -> Ended:
     """Run a verb until it ends.
 
     Args:
@@ -94,6 +99,7 @@ def run_verb(farm: Farm, verb: tuple[str, ...], folder: Path, log: Path, lock: i
         folder: that relative paths are in.
         log: what it prints is added to this file.
         lock: a descriptor that its process holds as well (`held`).
+        is_wanted: asked now and then; the verb is ended once it says no.
 
     Raises:
         VerbError: it failed, with its own sentence.
@@ -120,18 +126,37 @@ def run_verb(farm: Farm, verb: tuple[str, ...], folder: Path, log: Path, lock: i
         except OSError as error:
             raise VerbError(f"'{command[0]}' cannot be started ({error.strerror}); see [farm] in the plan.") from error
         try:
-            _, status, usage = os.wait4(process.pid, 0)
+            status, usage = _wait(process.pid, is_wanted)
         except BaseException:
-            with contextlib.suppress(OSError):
-                os.killpg(process.pid, 15)
+            _end(process.pid)
             raise
     process.returncode = code = os.waitstatus_to_exitcode(status)
-    if code < 0:
-        raise TryAgainError(f"{verb[0]} was ended by signal {-code}.")
+    if code < 0 or code > ENDED_BY_SIGNAL:
+        # Of a verb that tidied up first, or of a shell around it.
+        raise TryAgainError(f"{verb[0]} was ended by signal {-code if code < 0 else code - ENDED_BY_SIGNAL}.")
     if code:
         sentence = _sentence(log, begin) or f"{verb[0]} ended with status {code}; see '{log}'."
         raise (TryAgainError if code == TRY_AGAIN else VerbError)(sentence)
     return Ended(time.monotonic() - started, usage.ru_maxrss / POSIX_MB)
+
+
+def _wait(process: int, is_wanted: Callable[[], bool]) -> tuple[int, resource.struct_rusage]:
+    """Wait for a verb; its status, and what it used."""
+    is_asked = False
+    while True:
+        ended, status, usage = os.wait4(process, os.WNOHANG)
+        if ended:
+            return status, usage
+        if not is_asked and not is_wanted():
+            is_asked = True
+            _end(process)
+        time.sleep(WAIT_SECONDS)
+
+
+def _end(process: int) -> None:
+    """Ask a verb, and what it started, to end."""
+    with contextlib.suppress(OSError):
+        os.killpg(process, signal.SIGTERM)
 
 
 def _sentence(log: Path, begin: int) -> str:

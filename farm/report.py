@@ -1,22 +1,34 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What became of all characters: `report.json`, and the page made of it. docs/farm.md has the keys."""
 
-import json
 import time
 from pathlib import Path
+from typing import Any
 
 from fdda_addon.core.output import write_json, write_text
 
 from .characters import Character, Plan
 from .page import render_page
 from .run import BLOCKED, GOOD, Outcome
-from .stamps import Stamp, read_stamp
+from .stamps import LARGEST, Stamp, read_json, read_stamp
 from .tasks import BIND, EVALUATE, EVALUATION, KINDS, PICTURE, REFINE, REPORT, Task
 
 FORMAT, VERSION = "fdda-farm-report", 1
-MAX_REPORT_BYTES = 64 << 20
 BOUND, UNFINISHED, BROKEN = "done", "not done", "failed"
 MAX_PICTURE_BYTES = 8 << 20
+ERRORS = {str: float}
+MODEL = {
+    **{"name": str, "file": str, "round": int, "rounds": int, "poses_added": bool, "vertices": int},
+    **{"fdda": ERRORS, "linear": ERRORS, "verdict": str, "warnings": [str]},
+}
+FAILURE = {"task": str, "state": str, "sentence": str}
+SUMMARY = {"state": str, "models": [MODEL], "seconds": {str: float}, "failures": [FAILURE]}
+CHARACTER = {
+    **SUMMARY,
+    **{"rig": str, "output": str, "target_mm": float, "peak_mb": float, "hosts": [str], "tasks": int, "ran_now": int},
+    **{"key": str, "before": (SUMMARY, None)},
+}
+"""What a report says of a character: lists of, dictionaries of, or one of several."""
 
 
 def write_report(plan: Plan, tasks: dict[str, Task], outcomes: dict[str, Outcome], page: Path) -> None:
@@ -90,7 +102,10 @@ def _models(tasks: dict[str, Task], bind: Task, stamp: Stamp) -> list[dict]:
     """Of each model that is bound: its errors, and the round that it is of."""
     found = []
     for place, rounds in bind.choices:
-        train = str(stamp.notes.get("bound", {}).get(place, rounds[0][0]))
+        bound = stamp.notes.get("bound")
+        train = bound.get(place) if isinstance(bound, dict) else None
+        if train not in [name for name, _ in rounds]:
+            train = rounds[0][0]
         errors = _read_json(bind.folder / Path(place).with_name(EVALUATION))
         report = _read_json(bind.folder / Path(place).with_name(REPORT[0]))
         refined = [name for name, task in tasks.items() if task.kind == REFINE and not _was_skipped(task)]
@@ -104,11 +119,11 @@ def _models(tasks: dict[str, Task], bind: Task, stamp: Stamp) -> list[dict]:
                 "round": int(train.rpartition("-")[2]),
                 "rounds": rounds_done,
                 "poses_added": len(refined) > 0,
-                "vertices": errors.get("vertices", 0),
-                "fdda": errors.get("fdda", {}),
-                "linear": errors.get("linear", {}),
-                "verdict": report.get("target", {}).get("verdict", ""),
-                "warnings": [str(warning.get("text", "")) for warning in report.get("warnings", [])],
+                "vertices": _taken(errors.get("vertices"), int, 0),
+                "fdda": _errors(errors.get("fdda")),
+                "linear": _errors(errors.get("linear")),
+                "verdict": _taken(_taken(report.get("target"), dict, {}).get("verdict"), str, ""),
+                "warnings": [own["text"] for own in _taken(report.get("warnings"), [{"text": str}], [])],
             }
         )
     return found
@@ -143,18 +158,44 @@ def _summary(last: dict) -> dict | None:
 
 
 def _read(path: Path) -> dict:
+    """What the last report says of characters; nothing of those that this one could not have written."""
     value = _read_json(path)
     characters = value.get("characters")
     if (value.get("format"), value.get("version")) != (FORMAT, VERSION) or not isinstance(characters, dict):
         return {}
-    return {name: own for name, own in characters.items() if isinstance(own, dict)}
+    return {name: own for name, own in characters.items() if _is_a(own, CHARACTER)}
 
 
 def _read_json(path: Path) -> dict:
     try:
-        if path.stat().st_size > MAX_REPORT_BYTES:
-            return {}
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        return read_json(path)
+    except (OSError, ValueError):
         return {}
-    return value if isinstance(value, dict) else {}
+
+
+def _errors(value: object) -> dict[str, float]:
+    values = _taken(value, dict, {})
+    return {key: values[key] for key in ("mean", "p999", "max") if _is_a(values.get(key), float)}
+
+
+def _taken(value: object, kind: Any, otherwise: Any) -> Any:
+    return value if _is_a(value, kind) else otherwise
+
+
+def _is_a(value: object, kind: Any) -> bool:
+    """Whether a value of JSON is of a kind, as `CHARACTER` is one."""
+    if isinstance(kind, tuple):
+        return any(_is_a(value, one) for one in kind)
+    if isinstance(kind, list):
+        return isinstance(value, list) and all(_is_a(one, kind[0]) for one in value)
+    if isinstance(kind, dict):
+        of_all = kind.get(str)
+        return isinstance(value, dict) and (
+            all(_is_a(one, of_all) for one in value.values())
+            if of_all
+            else all(_is_a(value.get(name), one) for name, one in kind.items())
+        )
+    if kind in (int, float):
+        is_number = isinstance(value, (int, kind)) and not isinstance(value, bool)
+        return is_number and abs(value) < LARGEST
+    return value is None if kind is None else isinstance(value, kind)

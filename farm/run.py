@@ -6,11 +6,11 @@ done again, and no two processes do the same task at a time.
 """
 
 import contextlib
-import json
 import os
 import shutil
 import socket
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,8 +18,20 @@ from fdda_addon.core.errors import FDDAError, exit_status
 from fdda_addon.core.output import is_left_over, replacing, write_text
 
 from .characters import Farm
-from .process import TryAgainError, held, run_verb
-from .stamps import Keys, Stamp, StampError, check_outputs, digest_outputs, is_up_to_date, read_stamp, write_stamp
+from .outputs import check_published, check_unclaimed
+from .process import Ended, TryAgainError, held, run_verb
+from .stamps import (
+    Keys,
+    Stamp,
+    StampError,
+    check_outputs,
+    digest_outputs,
+    float_of,
+    is_up_to_date,
+    read_json,
+    read_stamp,
+    write_stamp,
+)
 from .tasks import BIND, EVALUATION, REPORT, Task
 
 DONE, UP_TO_DATE, NOT_NEEDED, FAILED, AGAIN, BLOCKED = (
@@ -29,6 +41,7 @@ GOOD = (DONE, UP_TO_DATE, NOT_NEEDED)
 KEY = ".fdda-farm-key"
 """In the folder of a task: what the files in it are made for."""
 EXHAUSTED = "exhausted"
+IN_ITS_PLACE = (IsADirectoryError, NotADirectoryError, FileExistsError, PermissionError)
 
 
 @dataclass(frozen=True)
@@ -51,8 +64,16 @@ class Outcome:
     host: str = ""
 
 
-def run_task(farm: Farm, tasks: dict[str, Task], name: str) -> Outcome:
+def run_task(
+    farm: Farm, tasks: dict[str, Task], name: str, overwrite: bool = False, is_wanted: Callable[[], bool] = lambda: True
+) -> Outcome:
     """Do a task of a graph, unless it is up to date.
+
+    Args:
+        farm, tasks: the graph.
+        name: of the task.
+        overwrite: as of `outputs.check_published`.
+        is_wanted: as of `process.run_verb`.
 
     Returns:
         How it ended; errors of the add-on are outcomes, any other is a bug and propagates.
@@ -67,15 +88,17 @@ def run_task(farm: Farm, tasks: dict[str, Task], name: str) -> Outcome:
             if skipped := _skipped(tasks, task):
                 write_stamp(task, Stamp(key, {}, skipped, host=host))
                 return Outcome(name, NOT_NEEDED, skipped, host=host)
-            stamp = _do(farm, tasks, task, key, lock)
+            check_published(task, overwrite)
+            stamp = _do(tasks, task, key, lambda verb: run_verb(farm, verb, task.folder, task.log, lock, is_wanted))
             write_stamp(task, stamp)
         return Outcome(name, DONE, "", stamp.seconds, stamp.peak_mb, host)
     except FDDAError as error:
         state = AGAIN if exit_status(error) == TryAgainError.exit_status else FAILED
         return Outcome(name, state, str(error), host=host)
     except OSError as error:
-        # Of the shared folder; a path that is wrong was found when the plan was read.
-        return Outcome(name, AGAIN, f"'{error.filename}': {error.strerror or error}.", host=host)
+        # Of the shared folder, unless something else is in its place.
+        state = FAILED if isinstance(error, IN_ITS_PLACE) else AGAIN
+        return Outcome(name, state, f"'{error.filename}': {error.strerror or error}.", host=host)
 
 
 def _skipped(tasks: dict[str, Task], task: Task) -> str:
@@ -91,8 +114,7 @@ def _skipped(tasks: dict[str, Task], task: Task) -> str:
     reached = reached_mm(tasks[task.round.evaluate])
     if reached <= task.round.target_mm:
         return f"99.9 % of the vertices are within {reached:.3g} mm, and the target is {task.round.target_mm:g} mm."
-    verdict = _read_json(train.folder / REPORT[0]).get("target", {}).get("verdict", "")
-    if verdict == EXHAUSTED:
+    if _verdict(train) == EXHAUSTED:
         return f"More poses no longer help: 99.9 % of the vertices are within {reached:.3g} mm."
     return ""
 
@@ -104,20 +126,26 @@ def reached_mm(evaluate: Task) -> float:
         StampError: it does not say.
     """
     try:
-        return float(_read_json(evaluate.folder / EVALUATION)["fdda"]["p999"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise StampError(f"The evaluation of '{evaluate.name}' is damaged; remove '{evaluate.stamp}'.") from error
+        return float_of(read_json(evaluate.folder / EVALUATION)["fdda"]["p999"])
+    except (OSError, LookupError, TypeError, ValueError, ArithmeticError) as error:
+        raise _damaged(evaluate, EVALUATION, error) from error
 
 
-def _read_json(path: Path) -> dict:
+def _verdict(train: Task) -> object:
+    """Whether more poses would help, by the report of a training; None where it had no target."""
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise StampError(f"'{path}' cannot be read ({error}); run the farm again.") from error
-    return value if isinstance(value, dict) else {}
+        return read_json(train.folder / REPORT[0]).get("target", {}).get("verdict")
+    except (OSError, AttributeError, ValueError) as error:
+        raise _damaged(train, REPORT[0], error) from error
 
 
-def _do(farm: Farm, tasks: dict[str, Task], task: Task, key: str, lock: int) -> Stamp:
+def _damaged(task: Task, name: str, error: Exception) -> StampError:
+    """What to say of a file that a task left; from now on the task is not done."""
+    task.stamp.unlink(missing_ok=True)
+    return StampError(f"'{task.folder / name}' is damaged ({error}); run the farm again, and it is made again.")
+
+
+def _do(tasks: dict[str, Task], task: Task, key: str, run: Callable[[tuple[str, ...]], Ended]) -> Stamp:
     notes = {}
     _check_before(tasks, task)
     _prepare(task, key)
@@ -127,7 +155,7 @@ def _do(farm: Farm, tasks: dict[str, Task], task: Task, key: str, lock: int) -> 
         _copy(source, task.folder / name)
     started, peak = time.monotonic(), 0.0
     for verb in task.verbs:
-        peak = max(peak, run_verb(farm, verb, task.folder, task.log, lock).peak_mb)
+        peak = max(peak, run(verb).peak_mb)
     seconds = time.monotonic() - started
     outputs = digest_outputs(task)
     for name, place in task.publishes:
@@ -156,21 +184,23 @@ def _is_in(file: str, names: tuple[str, ...]) -> bool:
 
 def _prepare(task: Task, key: str) -> None:
     """Make the folder of a task ready: what was made for something else goes, what was begun for the same stays."""
-    task.stamp.unlink(missing_ok=True)
     begun = task.folder / KEY
+    if not begun.is_file():
+        check_unclaimed(task)
+    task.stamp.unlink(missing_ok=True)
     # Nobody else holds the task: what is half is of processes that were killed, on whatever machine.
     for half in (
         *task.folder.parent.glob(f".new-{task.folder.name}-*"),
         *task.folder.parent.glob(f".old-{task.folder.name}-*"),
     ):
         shutil.rmtree(half, ignore_errors=True)
-    for path in task.folder.rglob("*") if task.folder.exists() else ():
-        if is_left_over(path.name) or path.name == "recording.lock":
-            path.unlink(missing_ok=True)
-    if task.folder.exists() and (not begun.exists() or begun.read_text(encoding="utf-8") != key):
+    if task.folder.exists() and begun.read_bytes() != key.encode():
         old = task.folder.with_name(f".old-{task.folder.name}-{os.getpid()}")
         os.replace(task.folder, old)
         shutil.rmtree(old, ignore_errors=True)
+    for path in task.folder.rglob("*") if task.folder.exists() else ():
+        if is_left_over(path.name) or path.name == "recording.lock":
+            path.unlink(missing_ok=True)
     if not task.folder.exists():
         new = task.folder.with_name(f".new-{task.folder.name}-{os.getpid()}")
         new.mkdir(parents=True)

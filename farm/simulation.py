@@ -154,7 +154,7 @@ def _advice(farm: Farm, tasks: dict[str, Task], seconds: dict[str, float], runs:
     )
     kinds = {kind: sum(seconds[name] for name in path if tasks[name].kind == kind) for kind in KINDS}
     kind = max(kinds, key=kinds.get)
-    lines.append(f"Most of it, {100 * kinds[kind] / shortest:.0f} %, is {kind}: {_remedy(farm, kind)}.")
+    lines.append(f"Most of it, {100 * kinds[kind] / max(shortest, 1e-9):.0f} %, is {kind}: {_remedy(farm, kind)}.")
     return lines
 
 

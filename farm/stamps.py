@@ -3,6 +3,7 @@
 
 import hashlib
 import json
+import math
 import tomllib
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
@@ -10,13 +11,15 @@ from functools import cache
 from pathlib import Path
 
 from fdda_addon.core.errors import FDDAError
+from fdda_addon.core.input_file import read_input
 from fdda_addon.core.output import is_left_over, write_json
 
 from .characters import Farm
 from .tasks import TRAIN, Task
 
 FORMAT, VERSION = "fdda-farm-task", 1
-MAX_STAMP_BYTES = 64 << 20
+MAX_JSON_BYTES = 64 << 20
+LARGEST = 1e12
 ROOT = Path(__file__).resolve().parent.parent
 PIECE = 4 << 20
 
@@ -48,25 +51,48 @@ class Stamp:
     notes: dict = field(default_factory=dict)
 
 
-def read_stamp(task: Task) -> Stamp | None:
-    """The stamp of a task; None where there is none that can be read."""
+def read_json(path: Path) -> dict:
+    """The object that a file of JSON holds; no number in it is NaN or infinite.
+
+    Raises:
+        OSError: the file cannot be read, or is too large.
+        ValueError: it holds something else.
+    """
     try:
-        if task.stamp.stat().st_size > MAX_STAMP_BYTES:
-            return None
-        value = json.loads(task.stamp.read_text(encoding="utf-8"))
+        value = json.loads(read_input(path, MAX_JSON_BYTES), parse_constant=float_of, parse_float=float_of)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    if not isinstance(value, dict):
+        raise ValueError("it is no object")
+    return value
+
+
+def float_of(value: object) -> float:
+    """A number as a float.
+
+    Raises:
+        ValueError: it is none, NaN, or infinite.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float | str) or not math.isfinite(number := float(value)):
+        raise ValueError(f"{value!r} is no number")
+    return number
+
+
+def read_stamp(task: Task) -> Stamp | None:
+    """The stamp of a task; None where there is none that can be read: the task is not done."""
+    try:
+        value = read_json(task.stamp)
         if (value["format"], value["version"]) != (FORMAT, VERSION):
             return None
-        outputs = {str(name): (int(size), str(digest)) for name, (size, digest) in value["outputs"].items()}
-        return Stamp(
-            str(value["key"]),
-            outputs,
-            str(value["skipped"]),
-            float(value["seconds"]),
-            float(value["peak_mb"]),
-            str(value["host"]),
-            dict(value["notes"]),
-        )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        outputs = {name: (int(size), str(digest)) for name, (size, digest) in value["outputs"].items()}
+        texts = [value[name] for name in ("key", "skipped", "host")]
+        if not all(isinstance(text, str) for text in texts) or not isinstance(value["notes"], dict):
+            return None
+        seconds, peak_mb = float_of(value["seconds"]), float_of(value["peak_mb"])
+        if not (0 <= seconds < LARGEST and 0 <= peak_mb < LARGEST):
+            return None
+        return Stamp(texts[0], outputs, texts[1], seconds, peak_mb, texts[2], value["notes"])
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError):
         return None
 
 
@@ -120,11 +146,14 @@ def digest_outputs(task: Task) -> dict[str, tuple[int, str]]:
         raise StampError(f"'{task.name}' ended without '{error.filename}' ({error.strerror}).") from error
 
 
-def are_there(task: Task, stamp: Stamp) -> bool:
-    """Whether the outputs are there in the sizes that they had; what they hold is not read."""
+def are_intact(task: Task, stamp: Stamp) -> bool:
+    """Whether the outputs, and what was published of them, hold what they held when the task was done."""
+    published = {place: stamp.outputs.get(name) for name, place in task.publishes if not stamp.skipped}
+    expected = {task.folder / name: output for name, output in stamp.outputs.items()} | published
     try:
-        return all((task.folder / name).stat().st_size == size for name, (size, _) in stamp.outputs.items()) and all(
-            place.exists() for _, place in task.publishes
+        # Most of what differs is not there, or has another size: nothing large is read for that.
+        return all(output and path.stat().st_size == output[0] for path, output in expected.items()) and all(
+            digest_file(path) == output for path, output in expected.items()
         )
     except OSError:
         return False
@@ -236,4 +265,4 @@ def to_do(tasks: dict[str, Task], keys: Keys) -> tuple[list[str], dict[str, str]
 def is_up_to_date(task: Task, key: str) -> bool:
     """Whether a task is done, with what it depends on now."""
     stamp = read_stamp(task)
-    return stamp is not None and stamp.key == key and are_there(task, stamp)
+    return stamp is not None and stamp.key == key and are_intact(task, stamp)
