@@ -4,6 +4,7 @@
 import os
 import secrets
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -95,3 +96,36 @@ def test_what_a_farm_has_started_ends_with_it(in_training, arguments, number, st
     assert not make_tasks(in_training)["elbow/train-0"].stamp.exists()
     assert "Traceback" not in text and "Warning" not in text
     assert ("Interrupted; run the same command to go on.\n" in text) == (number != signal.SIGKILL)
+
+
+def dask(mark: str, *arguments: str) -> subprocess.Popen:
+    """A program of Dask's with a mark in its environment."""
+    command = [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:], "--host", "127.0.0.1"]
+    environment = {**os.environ, "OF_THIS_TEST": mark, "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(
+        command, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are found by /proc")
+def test_a_cluster_that_was_there_ends_the_verbs_of_a_farm_that_is_gone(in_training, tmp_path):
+    mark = secrets.token_hex()
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    address = f"tcp://127.0.0.1:{port}"
+    try:
+        dask(mark, "scheduler", "--port", str(port), "--no-dashboard")
+        worker = dask(mark, "worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard")
+        command = [sys.executable, "-m", "farm", in_training.path, "--scheduler", address]
+        with open(tmp_path / "printed", "wb") as printed:
+            farm = subprocess.Popen(command, cwd=ROOT, stdout=printed, stderr=printed)
+        wait_for(lambda: any("-m trainer" in line for line in processes(mark).values()) or farm.poll() is not None)
+        assert farm.poll() is None, (tmp_path / "printed").read_text()
+        farm.kill()
+        farm.wait()
+        wait_for(lambda: not any("trainer" in line or "fdda_addon" in line for line in processes(mark).values()))
+        assert worker.poll() is None, "the worker is not the farm's"
+    finally:
+        for process in processes(mark):
+            os.kill(process, signal.SIGKILL)
