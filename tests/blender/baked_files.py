@@ -32,7 +32,7 @@ for job in jobs:
     for time in times:
         bpy.context.scene.frame_set(int(time // 1), subframe=time % 1)
         mesh = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
-        found[f"{path} {time:g}"] = np.array([vertex.co[:] for vertex in mesh.vertices])
+        found[f"{len(found)}"] = np.array([vertex.co[:] for vertex in mesh.vertices])
 np.savez(out, **found)
 """
 
@@ -44,7 +44,8 @@ def plain_blender(folder: Path, *jobs: tuple[Path, list[float]]) -> dict[tuple[P
     result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
     with np.load(out) as arrays:
-        found = {(path, time): arrays[f"{path} {time:g}"] for path, times in jobs for time in times}
+        asked = [(path, time) for path, times in jobs for time in times]
+        found = {one: arrays[f"{number}"] for number, one in enumerate(asked)}
     out.unlink()
     return found
 

@@ -207,22 +207,24 @@ def test_frames_that_a_file_does_not_have(build, refusal, tmp_path):
 
 
 def test_a_file_that_is_missing(refusal, capfd, tmp_path):
+    gone = tmp_path.resolve() / "nowhere"
+
     def lose() -> None:
-        bpy.data.objects["flesh"].modifiers["Cache"].filepath = "/nowhere/flesh.pc2"
+        bpy.data.objects["flesh"].modifiers["Cache"].filepath = str(gone / "flesh.pc2")
 
     rig = change(targets.target_pc2, lose, tmp_path / "rig.blend")
     assert refused(refusal, rig) == (
-        "The modifier 'Cache' of 'flesh' plays the file '/nowhere/flesh.pc2', which is not there; put it there, or "
+        f"The modifier 'Cache' of 'flesh' plays the file '{gone / 'flesh.pc2'}', which is not there; put it there, or "
         "choose another file in the modifier."
     )
 
     def lose_file() -> None:
-        bpy.data.cache_files[0].filepath = "/nowhere/flesh.abc"
+        bpy.data.cache_files[0].filepath = str(gone / "flesh.abc")
 
     rig = change(targets.target_alembic, lose_file, tmp_path / "other.blend")
     assert run("record", rig, tmp_path / "recording", "--object", "elbow", "--target", "flesh", "--action", ACTION) == 1
     # Blender says something itself.
-    assert "plays the file '/nowhere/flesh.abc', which is not there" in capfd.readouterr().err.splitlines()[-1]
+    assert f"plays the file '{gone / 'flesh.abc'}', which is not there" in capfd.readouterr().err.splitlines()[-1]
     assert not (tmp_path / "recording").exists()
 
 

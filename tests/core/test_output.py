@@ -137,8 +137,11 @@ def test_replacing_below_a_file(tmp_path):
 
 def test_a_name_that_is_too_long(tmp_path):
     check_folder_writable(tmp_path / ("a" * 100))
+    words = "a name in it has 300 bytes, and 255 are the most; shorten it"
+    if systems.WINDOWS:  # unless long paths are enabled
+        words = f"{words}|Windows takes 259; choose a shorter folder"
     for check in (check_writable, check_folder_writable):
-        with pytest.raises(OutputError, match="a name in it has 300 bytes, and 255 are the most; shorten it"):
+        with pytest.raises(OutputError, match=words):
             check(tmp_path / ("a" * 298 + "é"))
 
 
