@@ -4,6 +4,7 @@
 import json
 import os
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -80,7 +81,7 @@ VERBS = {
 def test_a_verb_refuses(place, capfd, monkeypatch, line, path, kind):
     monkeypatch.chdir(place)
     words = IS_OTHER.format(kind) if kind else IS_READ
-    assert Refusal(place, capfd)(*line.split()) == f"Cannot write '{path}': {words}"
+    assert Refusal(place, capfd)(*line.split()) == f"Cannot write '{Path(path)}': {words}"
 
 
 def test_a_point_cache_beside_is_looked_at_too(place, capfd, monkeypatch):
@@ -115,8 +116,9 @@ def test_two_outputs_of_one_name(place, capfd, monkeypatch):
 def test_a_bound_file_does_not_take_the_name_of_the_copied_model(place, capfd, monkeypatch):
     monkeypatch.chdir(place)
     (place / "there").mkdir()
-    text = Refusal(place, capfd)("bind", "rig.blend", "m.onnx", "there/m.onnx")
-    assert text == "Cannot write 'there/m.onnx': the copy of the model beside it has that name; give another name."
+    out = Path("there", "m.onnx")
+    text = Refusal(place, capfd)("bind", "rig.blend", "m.onnx", out)
+    assert text == f"Cannot write '{out}': the copy of the model beside it has that name; give another name."
 
 
 def test_a_torn_recording_is_replaced(place, capfd, monkeypatch):
