@@ -43,7 +43,7 @@ def run(folder: Path, verb: str, *arguments: object) -> str:
         capture_output=True,
         encoding="utf-8",
         check=False,
-        timeout=600,
+        timeout=1800,
     )
     assert result.returncode == 0, result.stdout + result.stderr
     assert "Traceback" not in result.stderr and "Warning" not in result.stderr, result.stderr
