@@ -47,6 +47,7 @@ PARTS = (
     Part("recordings", 2000, 500),
     Part("kills", 45, 45),
     Part("disks", 40, 40),
+    Part("outputs", 60, 60),
     Part("frames", 10_000, 10_000),
     Part("undo", 1000, 1000),
     Part("loads", 200, 200),
@@ -60,6 +61,8 @@ def work(part: str, folder: Path, seed: int, first: int, end: int) -> None:
         from benchmarks.soaking.recordings import run
     elif part == "models":
         from benchmarks.soaking.models import run
+    elif part == "outputs":
+        from benchmarks.soaking.outputs import run
     elif part in ("kills", "disks"):
         from benchmarks.soaking import interruptions
 

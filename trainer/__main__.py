@@ -37,7 +37,7 @@ def _train(options: argparse.Namespace, announcer: Announcer, stop: StopRequest)
 
         # What is wrong with the files is said before torch is loaded, which takes seconds.
         if recordings := recordings_in(options.recording):
-            check_several(recordings, options.model)
+            check_several(recordings, options.model, options.overwrite)
         else:
             check_training_outputs(options.model, options.overwrite)
         from .training import train_model

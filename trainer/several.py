@@ -13,6 +13,7 @@ from fdda_addon.core.recording.index import read_index
 
 from .announcements import Announcer
 from .config import TrainingConfig
+from .outputs import check_training_outputs, training_outputs
 
 
 class _OneOfSeveral:
@@ -29,19 +30,23 @@ class _OneOfSeveral:
         self._announcer.say(kind, **values)
 
 
-def check_several(recordings: list[Path], folder: Path) -> None:
+def check_several(recordings: list[Path], folder: Path, overwrite: bool = False) -> None:
     """Fail before the first training, which may take long; torch is not needed to see it.
 
     Raises:
         RecordingError: a recording is not complete.
-        OutputError: the folder is none, or cannot be written.
+        OutputError: the folder is none, or cannot be written, or one of the models as `check_training_outputs`.
     """
     if folder.suffix == ".onnx":
         raise OutputError(
             f"'{recordings[0].parent}' holds {len(recordings)} recordings, and '{folder}' is the name of one model; "
             "give a folder for the models."
         )
-    check_folder_writable(folder)
+    for recording in recordings:
+        model = _model_path(recording, folder)
+        check_folder_writable(model.parent, [path.name for path in training_outputs(model)])
+        if model.parent.is_dir():
+            check_training_outputs(model, overwrite)
     for recording in recordings:
         index = read_index(recording)
         if index["complete"] < index["poses"]:
@@ -49,6 +54,10 @@ def check_several(recordings: list[Path], folder: Path) -> None:
                 f"The recording '{recording}' is incomplete: {index['complete']} of {index['poses']} poses; finish it "
                 "with record --resume."
             )
+
+
+def _model_path(recording: Path, folder: Path) -> Path:
+    return folder / recording.name / f"{recording.name}.onnx"
 
 
 def train_models(
@@ -72,17 +81,15 @@ def train_models(
     from .training import train_model
 
     started = time.perf_counter()
-    check_several(recordings, folder)
+    check_several(recordings, folder, overwrite)
     each = _OneOfSeveral(announcer)
     for recording in recordings:
-        own = folder / recording.name
-        own.mkdir(parents=True, exist_ok=True)
+        model = _model_path(recording, folder)
+        model.parent.mkdir(parents=True, exist_ok=True)
         try:
-            train_model(
-                recording, own / f"{recording.name}.onnx", config, each, should_stop, warm_start, strict, overwrite
-            )
+            train_model(recording, model, config, each, should_stop, warm_start, strict, overwrite)
         finally:
-            for empty in (own, folder):
+            for empty in (model.parent, folder):
                 with suppress(OSError):
                     empty.rmdir()
     announcer.say(

@@ -27,7 +27,8 @@ def folder(elbow, tmp_path_factory) -> Path:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="The soak measures memory by /proc, which only Linux has.")
 @pytest.mark.parametrize(
-    ("part", "count"), [("models", 60), ("kills", 3), ("disks", 4), ("frames", 200), ("undo", 40), ("loads", 6)]
+    ("part", "count"),
+    [("models", 60), ("kills", 3), ("disks", 4), ("outputs", 12), ("frames", 200), ("undo", 40), ("loads", 6)],
 )
 def test_a_short_soak(folder, part, count):
     from benchmarks.soaking.cases import FELL_SHORT, heard
