@@ -234,7 +234,7 @@ def answer_nan_when_bent(model) -> None:
     last = next(node for node in model.graph.node if "positions" in node.output)
     last.output[list(last.output).index("positions")] = "good"
     for name, value in (("from", [1, 2, 1]), ("to", [2, 3, 2]), ("axes", [1, 2, 3]), ("one", [-1, 1, 1])):
-        model.graph.initializer.append(numpy_helper.from_array(np.array(value), f"my_{name}"))
+        model.graph.initializer.append(numpy_helper.from_array(np.array(value, np.int64), f"my_{name}"))
     model.graph.initializer.append(numpy_helper.from_array(np.float32([0]), "my_zero"))
     for node in (
         ("Slice", ["pose_matrices", "my_from", "my_to", "my_axes"], ["my_element"]),
@@ -265,7 +265,7 @@ def answer_fewer(model) -> None:
     last = next(node for node in model.graph.node if "positions" in node.output)
     last.output[list(last.output).index("positions")] = "all"
     for name, value in (("from", [0]), ("to", [7]), ("axis", [1])):
-        model.graph.initializer.append(numpy_helper.from_array(np.array(value), name))
+        model.graph.initializer.append(numpy_helper.from_array(np.array(value, np.int64), name))
     model.graph.node.append(helper.make_node("Slice", ["all", "from", "to", "axis"], ["positions"]))
 
 
