@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from fdda_addon.core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status
+from fdda_addon.core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status, machine_sentence
 
 if TYPE_CHECKING:
     from .characters import Plan
@@ -30,10 +30,9 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"Error: {error}" if status != WrongUsageError.exit_status else error, file=sys.stderr)
         return status
     except (OSError, MemoryError) as error:
-        if exit_status(error) != TRY_AGAIN:
+        if not (text := machine_sentence(error)):
             raise
-        reason = getattr(error, "strerror", None) or "The memory of this machine is used up"
-        print(f"Error: {reason}; make room, and run the same command to go on.", file=sys.stderr)
+        print(f"Error: {text}", file=sys.stderr)
         return TRY_AGAIN
     except KeyboardInterrupt as stop:
         with contextlib.suppress(OSError):  # The terminal may be the one that was closed.
@@ -156,6 +155,8 @@ def _one(plan: "Plan", tasks: dict[str, "Task"], options: argparse.Namespace) ->
 
 
 def _all(options: argparse.Namespace, plan: "Plan", tasks: dict[str, "Task"], page: Path) -> int:
+    from fdda_addon.core.output import check_temporary_folder
+
     from .cluster import connected, local_workers, run_on
     from .report import write_report
     from .run import AGAIN, FAILED, GOOD, Outcome
@@ -172,6 +173,7 @@ def _all(options: argparse.Namespace, plan: "Plan", tasks: dict[str, "Task"], pa
     workers = _counts(options.workers)[0] if options.workers else local_workers()
     try:
         if names:
+            check_temporary_folder()
             plan.farm.work.mkdir(parents=True, exist_ok=True)
             with connected(plan.farm, options.scheduler, workers, options.host, options.dashboard_port) as client:
                 print(f"{len(names)} of {len(tasks)} tasks to do; {client.dashboard_link} shows them", flush=True)
