@@ -29,6 +29,5 @@ named_pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has 
 devices = pytest.mark.skipif(WINDOWS, reason="Windows has no devices in folders.")
 forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows does not fork processes.")
 file_size_limits = pytest.mark.skipif(WINDOWS, reason=NO_FILE_SIZE_LIMITS)
-file_modes = pytest.mark.skipif(WINDOWS, reason="Windows has access control lists in place of file modes.")
 sparse_files = pytest.mark.skipif(WINDOWS, reason="Python on Windows writes every zero of a hollow file to the disk.")
 drives = pytest.mark.skipif(not WINDOWS, reason="Only Windows has drives in paths.")
