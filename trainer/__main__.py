@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from fdda_addon.core.output import check_temporary_folder
+from fdda_addon.core.temporary import check_temporary_folder
 from fdda_addon.core.terminal import show_all_names
 
 from .announcements import Announcer, MessageLines, Text

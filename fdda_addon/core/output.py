@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
-from .errors import NoRoomError, OutputError, os_reason
+from .errors import OutputError, os_reason
 from .file_kind import FileKind
 from .open_files import remove_file, replace_file
 from .path_limits import check_path, is_windows, same_place
@@ -133,25 +133,6 @@ def _probe(path: Path, folder: Path) -> None:
     os.close(handle)
     with suppress(OSError):
         remove_file(Path(probe))
-
-
-def check_temporary_folder() -> None:
-    """Fail where the system's temporary folder takes no file: packages that are imported may need one.
-
-    Raises:
-        NoRoomError: it takes none.
-    """
-    try:
-        tempfile.gettempdir()
-    except OSError as error:
-        raise temporary_failed(error) from error
-
-
-def temporary_failed(error: OSError) -> NoRoomError:
-    """The error where the system's temporary folder takes no file; Python looks for one that does."""
-    return NoRoomError(
-        f"No temporary file can be written ({os_reason(error)}); make room there, or name another folder in TMPDIR."
-    )
 
 
 @contextmanager

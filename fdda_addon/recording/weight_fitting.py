@@ -11,11 +11,11 @@ import numpy as np
 
 from ..core.errors import RecordingError, RigError, TrainingError
 from ..core.messages import MessageType
-from ..core.output import temporary_failed
 from ..core.progress import Progress
 from ..core.recording.fit_folder import MIN_POSES, FitPosesWriter, read_fitted
 from ..core.rig import UNMOVED, Rig
 from ..core.skin_fit import SkinFit
+from ..core.temporary import temporary_failed
 from ..rig.reading import PoseEvaluator
 from ..scene.scene_rig import SceneRig
 from ..training.process import TrainerProcess

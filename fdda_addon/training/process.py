@@ -15,7 +15,7 @@ from typing import Self
 
 from ..core.errors import TrainingDiedError, TrainingError, WrongUsageError, os_reason
 from ..core.messages import Message, MessageType
-from ..core.output import temporary_failed
+from ..core.temporary import temporary_failed
 from .environment.choice import chosen_python
 from .environment.folder import ROOT
 

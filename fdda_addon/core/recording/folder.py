@@ -3,6 +3,7 @@
 
 import enum
 import os
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -136,7 +137,8 @@ def remove_recording(path: Path) -> None:
         lock.acquire()
         remove_files(path)
         lock.release()
-        if not os.listdir(path):
+        # It stays where something is in it, or another program has it open.
+        with suppress(OSError):
             path.rmdir()
     except OSError as error:
         name = f", '{os.path.basename(error.filename)}'" if error.filename else ""
