@@ -22,7 +22,9 @@ PROGRESS = re.compile(
 
 def files(folder: Path) -> dict[str, bytes | None]:
     """Content of every file below a folder by path; None for a folder."""
-    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")
+    }
 
 
 class Refusal:
