@@ -23,6 +23,7 @@ from ..rig.borrowed_rig import borrowed_rig
 from ..rig.modifier_stack import check_evaluable
 from ..rig.reading import PoseEvaluator
 from ..rig.target_time import DIRECT, OWN_SURFACE, Approach, TargetSettings, make_approach, way
+from ..rig.time_inputs import check_inputs
 from ..runtime.network import Network
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser, clear_pose
@@ -171,7 +172,7 @@ def evaluate(
         raise RigError("There is nothing to evaluate: 0 poses and no action; give --poses or --action.")
     random = settings.poses or len(settings.beyond) or len(settings.named)
     approach = make_approach(scene_rig, settings.target, clips, random)
-    network, layer = _prepare(scene_rig, model)
+    network, layer = _prepare(scene_rig, model, is_own=not settings.target.name)
     rig = layer.rig
     # A rig that is posed by actions alone may have nothing to sample.
     channels = model_channels(scene_rig, rig, network.info) if settings.poses or settings.beyond else ()
@@ -218,10 +219,13 @@ def evaluate_action(
         yield step
 
 
-def _prepare(scene_rig: SceneRig, model: Path | Network) -> tuple[Network, LinearLayer]:
-    check_evaluable(scene_rig)
+def _prepare(scene_rig: SceneRig, model: Path | Network, is_own: bool) -> tuple[Network, LinearLayer]:
+    """Open a model, and check the rig as far as its own surface is compared."""
+    stack = check_evaluable(scene_rig)
     opened = open_model(scene_rig, model)
     rig = opened.linear_rig
+    if is_own:
+        check_inputs(scene_rig, rig.controls, stack)
     return opened.network, LinearLayer(rig, opened.network.info.partitions_of(rig))
 
 

@@ -4,6 +4,8 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import bpy
+
 from ..core.defaults import INFLUENCE_POSES, MARGIN, MIN_VERTICES, POSES, SPREAD
 from ..core.partition import INFLUENCE_TOLERANCE
 from ..core.poses import Channel, Margin, margin_of
@@ -98,11 +100,16 @@ def planned_choice(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Ch
     Raises:
         RigError: the rig lacks what the settings name.
     """
-    dependencies = read_dependencies(scene_rig)
+    dependencies = read_dependencies(scene_rig, planned_actions(settings))
     controls = {control.name: control for control in dependencies.controls}
     controls |= {control.name: control for control in stated_controls(scene_rig, settings.controls)}
     choice = choose(scene_rig, settings.sample, tuple(controls.values()))
     return choice, None if choice.bones is None else dependencies.bones
+
+
+def planned_actions(settings: RecordingSettings) -> tuple[bpy.types.Action, ...]:
+    """The actions whose frames these settings record, as far as the file has them."""
+    return tuple(bpy.data.actions[name] for name in settings.actions if name in bpy.data.actions)
 
 
 def planned_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]) -> Sampling:

@@ -25,6 +25,7 @@ from ..poses.sampling import model_channels, states_channels
 from ..rig.borrowed_rig import borrowed_rig
 from ..rig.modifier_stack import check_evaluable
 from ..rig.reading import PoseEvaluator
+from ..rig.time_inputs import check_inputs
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
@@ -78,9 +79,10 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
             f"The recording '{path}' is of the target '{recording.info.target.object_name}', and poses are added of "
             "rigs alone; record more poses of the target into another folder."
         )
-    check_evaluable(scene_rig)
+    stack = check_evaluable(scene_rig)
     opened = open_model(scene_rig, model)
     network, rig = opened.network, opened.rig
+    check_inputs(scene_rig, rig.controls, stack)
     channels = model_channels(scene_rig, rig, network.info)
     _check_recording(scene_rig, recording, rig, channels)
     added = _added_since(recording, model, network.info) if settings.resume else 0

@@ -10,9 +10,10 @@ from ..core.rig import Rig
 from ..poses.sampling import sampled_channels
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..rig.reading import read_rig
+from ..rig.time_inputs import check_inputs
 from ..scene.controls import stated_controls
 from ..scene.scene_rig import SceneRig
-from .plan import RecordingSettings, depends_on_time, planned_choice
+from .plan import RecordingSettings, depends_on_time, planned_actions, planned_choice
 
 DEFAULTS = RecordingSettings()
 
@@ -51,14 +52,20 @@ def check(scene_rig: SceneRig, settings: RecordingSettings = DEFAULTS) -> RigChe
 def _check(scene_rig: SceneRig, settings: RecordingSettings, before: RigCheck | None) -> RigCheck:
     result = RigCheck((), None, ())
     problems: list[str] = []
+    stack = None
     if not scene_rig.mesh_object.fdda.is_playing:
         try:
-            check_evaluable(scene_rig)
+            stack = check_evaluable(scene_rig)
         except RigError as error:
             problems.append(str(error))
     try:
         result = replace(result, replaced=tuple(m.name for m in deforming_modifiers(scene_rig.mesh_object)))
         choice, besides = planned_choice(scene_rig, settings)
+        if stack is not None and not settings.target.name:
+            try:
+                check_inputs(scene_rig, choice.controls, stack, planned_actions(settings))
+            except RigError as error:
+                problems.append(str(error))
         with_unmoved = depends_on_time(scene_rig, settings)
         read_with = besides, with_unmoved
         if before is not None and before.rig is not None and (before.besides, before.with_unmoved) == read_with:

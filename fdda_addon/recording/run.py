@@ -25,16 +25,18 @@ from ..poses.clip_player import ClipPlayer
 from ..rig.borrowed_rig import borrowed_rigs
 from ..rig.modifier_stack import check_evaluable
 from ..rig.target_time import make_approach
+from ..rig.time_inputs import check_inputs
 from ..scene.scene_rig import SceneRig
 from .appender import Appender, append_poses
 from .influences import Search, find_influences
 from .known import check_found_for, recorded_partitions, recorded_weights
 from .mesh_group import common_armature, controls_of_each, in_passes
 from .phases import Fitted, Found, Planned, TimedEvaluator, estimate
-from .plan import RecordingSettings, planned_rig, planned_sampling
+from .plan import RecordingSettings, planned_actions, planned_rig, planned_sampling
 from .pose_plan import PosePlan
 from .repeats import measure_repeats
 from .target_check import check_moves
+from .time_check import check_follows_pose
 from .weight_fitting import check_has_weights, fit_weights, poses_to_fit
 
 Before, After = TypeVar("Before", Planned, Fitted), TypeVar("After")
@@ -93,6 +95,7 @@ def _record_planned(
         with borrowed_rigs([posed[number] for number in numbers], clips, others) as player:
             if plan.approach.target:
                 yield from check_moves(together[0], plan, player)
+            check_follows_pose(together, plan, player)
             found = yield from _in_turn(together, lambda mesh: _find_influences(mesh, settings, clips, player))
             yield from _record_poses(found, settings, plan, player)
 
@@ -109,8 +112,10 @@ def _plan(
         raise RecordingError("A target is one of one mesh; record the meshes one by one, each with its target.")
     read = []
     for (scene_rig, path), own in zip(rigs, controls, strict=True):
-        check_evaluable(scene_rig)
+        stack = check_evaluable(scene_rig)
         read.append(planned_rig(scene_rig, replace(settings, controls=own)))
+        if not settings.target.name:
+            check_inputs(scene_rig, read[-1][0].controls, stack, planned_actions(settings))
         check_recordable(path, settings.resume, settings.overwrite)
     channels = [(scene_rig, own) for scene_rig, (_, own) in zip(meshes, read, strict=True)]
     approach = make_approach(meshes[0], settings.target, clips, settings.poses)

@@ -134,9 +134,9 @@ def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     for name in (m.name for m in mesh_object.modifiers if m.show_viewport):
         modifier = mesh_object.modifiers[name]
         what = f"Modifier '{name}' of '{mesh_object.name}'"
-        if name in stack.replaced + stack.misplaced and (in_time := _in_time(modifier)):
+        if name in stack.replaced + stack.misplaced and (verb := in_time(modifier)):
             raise RigError(
-                f"{what} {in_time}, so its result does not follow from the pose; switch it off in the viewport, or "
+                f"{what} {verb}, so its result does not follow from the pose; switch it off in the viewport, or "
                 "remove it."
             )
         if _is_unbound(modifier):
@@ -155,8 +155,8 @@ def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     return stack
 
 
-def check_evaluable(scene_rig: SceneRig) -> None:
-    """Fail when what the graph evaluates the mesh to could not be compared with the mesh.
+def check_evaluable(scene_rig: SceneRig) -> ModifierStack:
+    """Fail when what the graph evaluates the mesh to could not be compared with the mesh; gives its modifiers.
 
     Raises:
         RigError: edit mode, the NLA's tweak mode, a hidden object, an Armature modifier that is off, or a modifier
@@ -177,6 +177,7 @@ def check_evaluable(scene_rig: SceneRig) -> None:
     stack = check_stack(mesh_object)
     if not stack.live:
         _check_count(mesh_object, stack)
+    return stack
 
 
 @contextmanager
@@ -233,11 +234,13 @@ def _kind(modifier: bpy.types.Modifier) -> _Kind:
     return _Kind.GENERATES if modifier.type in TOPOLOGY_CHANGING else _Kind.NEUTRAL
 
 
-def _in_time(modifier: bpy.types.Modifier) -> str:
-    """What a modifier does that depends on time, empty when it does not."""
+def in_time(modifier: bpy.types.Modifier) -> str:
+    """Say what a modifier does that depends on time, empty when it does not."""
     if modifier.type == "NODES":
         node = time_node(modifier.node_group)
         return f"changes with time (node '{node.name}' of '{node.id_data.name}')" if node else ""
+    if _kind(modifier) is _Kind.NEUTRAL:
+        return ""
     return IN_TIME.get(modifier.type, "")
 
 

@@ -11,9 +11,11 @@ from ..core.alembic import time_range
 from ..core.errors import PointCacheError, RigError, os_reason
 from ..core.mesh_cache import mesh_cache_frames
 from ..scene.node_groups import SIMULATION_NODES, time_node
-from ..scene.scene_rig import SceneRig, read_objects
+from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import resolved
 from .modifier_stack import IN_TIME
+from .sources import Sources
+from .time_inputs import time_inputs
 
 ALEMBIC, USD = {".abc"}, {".usd", ".usda", ".usdc", ".usdz"}
 
@@ -42,15 +44,9 @@ def read_caches(scene_rig: SceneRig, target_object: bpy.types.Object) -> tuple[C
     Raises:
         RigError: a file is missing or damaged.
     """
-    seen = [target_object]
-    rig_objects = {scene_rig.armature_object, scene_rig.mesh_object}
-    found: list[Cache] = []
-    for scene_object in seen:
-        found += _caches_of(scene_object)
-        constraints = [c for c in scene_object.constraints if not c.mute]
-        reads = (*read_objects(scene_object), scene_object.parent, *(getattr(c, "target", None) for c in constraints))
-        seen += [o for o in dict.fromkeys(reads) if o is not None and o not in seen and o not in rig_objects]
-    return tuple(dict.fromkeys(found))
+    sources = Sources(scene_rig, target_object, [modifier.name for modifier in target_object.modifiers])
+    found = [cache for scene_object in sources.objects for cache in _caches_of(scene_object)]
+    return tuple(dict.fromkeys([*found, *(Cache(moving.words) for moving in time_inputs(sources))]))
 
 
 def _caches_of(scene_object: bpy.types.Object) -> Iterator[Cache]:
@@ -61,17 +57,6 @@ def _caches_of(scene_object: bpy.types.Object) -> Iterator[Cache]:
     for constraint in scene_object.constraints:
         if constraint.type == "TRANSFORM_CACHE" and constraint.cache_file and not constraint.mute:
             yield _of_file(constraint.cache_file, f"the constraint '{constraint.name}' of '{name}'")
-    if scene_object.type == "ARMATURE":
-        return
-    data = scene_object.data
-    for owner, what in (
-        (scene_object, f"the animation of '{name}'"),
-        (data, f"the animation of the data of '{name}'"),
-        (getattr(data, "shape_keys", None), f"the animation of the shape keys of '{name}'"),
-    ):
-        animation = getattr(owner, "animation_data", None)
-        if animation and (animation.action or any(not track.mute for track in animation.nla_tracks)):
-            yield Cache(what)
 
 
 def _of_modifier(modifier: bpy.types.Modifier, words: str) -> Iterator[Cache]:

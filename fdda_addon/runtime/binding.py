@@ -9,6 +9,7 @@ import bpy
 
 from ..core.errors import RigError
 from ..rig.modifier_stack import check_stack
+from ..rig.time_inputs import check_inputs
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import path_for
 from . import cache as caches
@@ -36,9 +37,11 @@ def bind(
     if mesh_object.mode == "EDIT":
         raise RigError(f"'{mesh_object.name}' is in edit mode; leave it first.")
     model = model.absolute()
-    open_model(scene_rig, model_files.load_network(model) if packed_model is None else packed.load(packed_model))
+    network = model_files.load_network(model) if packed_model is None else packed.load(packed_model)
+    opened = open_model(scene_rig, network)
     with true_rig(mesh_object):
         stack = check_stack(mesh_object)
+        check_inputs(scene_rig, opened.rig.controls, stack)
     if mesh_object.fdda.is_bound:
         unbind(mesh_object)
 

@@ -25,7 +25,7 @@ def slot_of(action: bpy.types.Action, datablock: bpy.types.ID) -> "bpy.types.Act
     if len(known) == 1:
         chosen += slots
     if not chosen and getattr(datablock, "type", "") == "ARMATURE":
-        chosen = [s for s in slots if any(c.data_path.startswith("pose.bones[") for c in _curves_of_slot(action, s))]
+        chosen = [s for s in slots if any(c.data_path.startswith("pose.bones[") for c in curves_of_slot(action, s))]
     return chosen[0] if chosen else None
 
 
@@ -34,10 +34,11 @@ def curves_of(action: bpy.types.Action, datablock: bpy.types.ID) -> list[bpy.typ
     if not hasattr(action, "slots"):
         return list(action.fcurves) if action.id_root == datablock.id_type else []
     slot = slot_of(action, datablock)
-    return [] if slot is None else _curves_of_slot(action, slot)
+    return [] if slot is None else curves_of_slot(action, slot)
 
 
-def _curves_of_slot(action: bpy.types.Action, slot: "bpy.types.ActionSlot") -> list[bpy.types.FCurve]:
+def curves_of_slot(action: bpy.types.Action, slot: "bpy.types.ActionSlot") -> list[bpy.types.FCurve]:
+    """The F-curves of a slot of an action."""
     bags = (strip.channelbag(slot) for layer in action.layers for strip in layer.strips)
     return [curve for bag in bags if bag is not None for curve in bag.fcurves]
 

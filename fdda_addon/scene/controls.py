@@ -105,10 +105,10 @@ def _meant(scene_rig: SceneRig, name: str) -> list[tuple[str, str]]:
 
 def is_driven(datablock: bpy.types.ID, path: str) -> bool:
     """Whether a driver sets a number."""
-    array, index = _element(path)
-    animation = datablock.animation_data
+    owner, array, index = place_of(datablock, path)
+    animation = owner.animation_data
     return animation is not None and any(
-        curve.data_path == array and (index is None or curve.array_index == index) for curve in animation.drivers
+        (curve.data_path, curve.array_index) == (array, index) for curve in animation.drivers
     )
 
 
@@ -130,6 +130,20 @@ def parent_and_name(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.bpy_s
     else:
         owner, _, name = array.rpartition(".")
     return datablock.path_resolve(owner) if owner else datablock, name, index
+
+
+def place_of(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.ID, str, int]:
+    """A number as F-curves name it: the datablock that has it, the path there, the place in an array, else 0.
+
+    A path may lead to another datablock: from a lattice object to the shape keys of its data.
+    """
+    array, place = _element(path)
+    try:
+        struct, name, _ = parent_and_name(datablock, path)
+        prefix = "" if struct == struct.id_data else struct.path_from_id()
+    except ValueError:
+        return datablock, array, place or 0
+    return struct.id_data, prefix + name if is_custom(name) or not prefix else f"{prefix}.{name}", place or 0
 
 
 def is_custom(name: str) -> bool:
@@ -234,8 +248,9 @@ def borrowed_controls(scene_rig: SceneRig, names: Iterable[str]) -> Iterator[Non
     What animates the armature object is not touched: `borrow.borrowed_pose` takes care of it.
     """
     names = list(names)
-    owners = {name.partition("/")[0] for name in names} - {ARMATURE_OBJECT}
-    animations = [a for a in (owner_of(scene_rig, owner).animation_data for owner in owners) if a is not None]
+    places = [(owner_of(scene_rig, owner), path) for owner, _, path in (name.partition("/") for name in names)]
+    owners = {place_of(*place)[0] for place in places} - {scene_rig.armature_object}
+    animations = [a for a in (owner.animation_data for owner in owners) if a is not None]
     kept = [(a, a.action, getattr(a, "action_slot", None), a.use_nla) for a in animations]
     values = {name: owner_of(scene_rig, name.partition("/")[0]).path_resolve(name.partition("/")[2]) for name in names}
     for animation in animations:

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Whether surfaces follow from the pose: the same pose, held in several frames, has to show the same surface."""
+
+from collections.abc import Sequence
+from contextlib import closing
+
+import bpy
+import numpy as np
+
+from ..core.errors import RigError
+from ..core.features import ROUNDING
+from ..core.partition import INFLUENCE_TOLERANCE
+from ..core.recording.target import POSE
+from ..poses.clip_player import ClipPlayer
+from ..scene.armature import clear_pose
+from .phases import Fitted
+from .pose_plan import PosePlan
+
+POSE_TOLERANCE = 1e-5
+"""Matrices and controls that differ by less are those of one pose (no unit, or mesh units)."""
+
+
+def check_follows_pose(meshes: Sequence[Fitted], plan: PosePlan, player: ClipPlayer) -> None:
+    """Fail where a mesh shows other surfaces in other frames while its pose and its controls are the same.
+
+    Two poses of the plan are held at the ends and in the middle of the scene. Targets that depend on time are left out.
+    Where the pose itself changes with the frame, nothing can be compared.
+
+    Args:
+        meshes: that are evaluated together, borrowed.
+        plan: of the poses.
+        player: plays its clips.
+
+    Raises:
+        RigError: says by how much, and between which frames.
+    """
+    target = plan.approach.target
+    if target and target.follows != POSE:
+        return
+    scene = bpy.context.scene
+    frame, subframe = scene.frame_current, scene.frame_subframe
+    others = {scene.frame_start, (scene.frame_start + scene.frame_end) // 2, scene.frame_end} - {frame}
+    evaluators = [mesh.planned.evaluator(mesh.rig) for mesh in meshes]
+    try:
+        for number in {plan.total // 3, plan.total - 1}:
+            with closing(plan.poses(player, {number})) as poses:
+                next(poses)
+                shown = player.shown
+                player.put(shown, frame)
+                first = [evaluator.evaluate() for evaluator in evaluators]
+                for other in sorted(others):
+                    player.put(shown, other)
+                    for mesh, evaluator, before in zip(meshes, evaluators, first, strict=True):
+                        _compare(mesh, (frame, other), before, evaluator.evaluate())
+    finally:
+        player.stop()
+        clear_pose(meshes[0].planned.scene_rig.armature_object)
+        player.give_back_numbers()
+        scene.frame_set(frame, subframe=subframe)
+
+
+def _compare(mesh: Fitted, frames: tuple[int, int], before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> None:
+    (pose, positions, controls), (other_pose, other_positions, other_controls) = before, after
+    if not all(
+        np.allclose(*pair, rtol=POSE_TOLERANCE, atol=POSE_TOLERANCE)
+        for pair in ((pose, other_pose), (controls, other_controls))
+    ):
+        return
+    apart = float(np.linalg.norm(positions - other_positions, axis=1).max())
+    mesh_object = mesh.planned.scene_rig.mesh_object
+    extent = max(float(np.abs(mesh.rig.rest_positions).max()), *map(abs, mesh_object.matrix_world.translation))
+    if apart > max(INFLUENCE_TOLERANCE * mesh.rig.size, 4 * ROUNDING * extent):
+        raise RigError(
+            f"The surface of '{mesh.name}' differs by {apart * mesh.rig.metres_per_unit * 1000:.2g} mm between frames "
+            f"{frames[0]} and {frames[1]} in the same pose, so it does not follow from the pose; look for what reads "
+            "the frame (keys, drivers, Geometry Nodes, what a constraint follows), and make it a control or switch it "
+            "off."
+        )

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Bones of other armatures that deform a mesh: which of their channels are controls, and which would have to be."""
+
+from collections.abc import Iterable, Iterator
+
+import bpy
+
+from ..core.controls import OTHER_OBJECT, Control
+from ..core.errors import RigError
+from ..core.poses import LOCATION, ROTATION, SCALE
+from ..poses.motion_range import location_ranges, rotation_ranges, scale_ranges
+from ..scene.controls import make_control, place_of
+from ..scene.scene_rig import SceneRig
+from .sources import Sources, bone_of_path, is_bone_channel
+
+_COPIES = {"COPY_LOCATION": LOCATION, "COPY_ROTATION": ROTATION, "COPY_SCALE": SCALE}
+_FOUR_NUMBERS = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
+_VERBS = {ROTATION: "turn", LOCATION: "move", SCALE: "scale"}
+
+Ranges = dict[int, tuple[float, float] | None]
+"""Range by axis of what is free to move; None where a bone states none."""
+
+
+def controls_of_other_armatures(scene_rig: SceneRig, sources: Sources) -> Iterator[Control]:
+    """Channels of the bones of other armatures that deform a mesh, in their ranges of motion.
+
+    Rotations are Euler angles: the four numbers of a quaternion have no ranges, and two quaternions are one rotation.
+    """
+    for armature_object, bone in _bones(scene_rig, sources):
+        for _, channel, ranges in _free_channels(bone):
+            for axis, bounds in ranges.items():
+                if bounds is not None and bounds[0] < bounds[1]:
+                    owner = f"{OTHER_OBJECT}{armature_object.name}"
+                    yield make_control(scene_rig, owner, f"{bone.path_from_id()}.{channel}[{axis}]", bounds)
+    for armature_object, bone, path in _channels_read(scene_rig, sources):
+        bounds = _bounds_of(bone, path)
+        if bounds is not None and bounds[0] < bounds[1]:
+            yield make_control(scene_rig, f"{OTHER_OBJECT}{armature_object.name}", path, bounds)
+
+
+def check_other_armatures(
+    scene_rig: SceneRig, sources: Sources, controls: Iterable[tuple[bpy.types.ID, str, int]]
+) -> None:
+    """Fail where bones of other armatures can deform a mesh by channels that are no controls.
+
+    Args:
+        scene_rig: the rig.
+        sources: of its mesh object.
+        controls: as `scene.controls.place_of` gives them.
+
+    Raises:
+        RigError: names a bone and its armature.
+    """
+    told = {*controls, *sources.drivers}
+    for armature_object, bone in _bones(scene_rig, sources):
+        path = bone.path_from_id()
+        untold = [
+            kind
+            for kind, channel, ranges in _free_channels(bone)
+            if any((armature_object, f"{path}.{channel}", axis) not in told for axis in ranges if _varies(ranges[axis]))
+        ]
+        if untold:
+            raise RigError(
+                f"'{scene_rig.mesh_object.name}' follows the bone '{bone.name}' of a second armature, "
+                f"'{armature_object.name}', which can {' and '.join(_VERBS[kind] for kind in untold)} without the "
+                f"model being told; {' and '.join(_remedies(bone, untold))}, or join the armatures."
+            )
+    for armature_object, _, path in _channels_read(scene_rig, sources):
+        if place_of(armature_object, path) not in told:
+            raise RigError(
+                f"A driver of '{scene_rig.mesh_object.name}' reads '{path}' of a second armature, "
+                f"'{armature_object.name}', without the model being told; name it as a control with a range "
+                f"(--control '{OTHER_OBJECT}{armature_object.name}/{path}=LOW:HIGH'), or lock it."
+            )
+
+
+def _remedies(bone: bpy.types.PoseBone, untold: list[str]) -> Iterator[str]:
+    if ROTATION in untold:
+        four = bone.rotation_mode in _FOUR_NUMBERS
+        yield "set its rotation mode to XYZ Euler" if four else "name its rotation as controls"
+    if others := [kind for kind in untold if kind != ROTATION]:
+        limits = " and ".join(f"Limit {kind.title()}" for kind in others)
+        yield f"lock its {' and '.join(others)} (or add {limits} in local space)"
+
+
+def _bones(scene_rig: SceneRig, sources: Sources) -> Iterator[tuple[bpy.types.Object, bpy.types.PoseBone]]:
+    for armature_object, names in sources.bones.items():
+        if armature_object != scene_rig.armature_object:
+            yield from ((armature_object, bone) for bone in armature_object.pose.bones if bone.name in names)
+
+
+def _channels_read(scene_rig: SceneRig, sources: Sources) -> Iterator[tuple[bpy.types.Object, bpy.types.PoseBone, str]]:
+    """Channels of bones of other armatures that drivers read by their paths and that are not locked."""
+    for datablock, path in sources.numbers:
+        name, rest = bone_of_path(path)
+        if name and datablock != scene_rig.armature_object and is_bone_channel(rest):
+            bone = datablock.pose.bones.get(name)
+            if bone is not None and _varies(_bounds_of(bone, path)):
+                yield datablock, bone, path
+
+
+def _bounds_of(bone: bpy.types.PoseBone, path: str) -> tuple[float, float] | None:
+    """The range of one number of a channel, whether or not it moves the bone; the empty range where it is locked."""
+    channel, axis = path.rpartition(".")[2][:-3], int(path[-2])
+    if channel == LOCATION:
+        return (0.0, 0.0) if bone.lock_location[axis] else location_ranges(bone).get(axis)
+    if channel == SCALE:
+        return (0.0, 0.0) if bone.lock_scale[axis] else scale_ranges(bone).get(axis)
+    if channel == "rotation_euler" and bone.rotation_mode not in _FOUR_NUMBERS:
+        stated = rotation_ranges(bone)[axis]
+        return (stated.low, stated.high) if stated.moves else (0.0, 0.0)
+    return (0.0, 0.0) if all(bone.lock_rotation) else None
+
+
+def _varies(bounds: tuple[float, float] | None) -> bool:
+    return bounds is None or bounds[0] < bounds[1]
+
+
+def _free_channels(bone: bpy.types.PoseBone) -> Iterator[tuple[str, str, Ranges]]:
+    """What is free to move a bone: kind, property and ranges."""
+    if bone.rotation_mode in _FOUR_NUMBERS:
+        if not all(bone.lock_rotation) and not _is_replaced(bone, ROTATION):
+            yield ROTATION, _FOUR_NUMBERS[bone.rotation_mode], dict.fromkeys(range(4))
+    elif not _is_replaced(bone, ROTATION):
+        yield (
+            ROTATION,
+            "rotation_euler",
+            {axis: (r.low, r.high) for axis, r in enumerate(rotation_ranges(bone)) if r.moves},
+        )
+    others = [(SCALE, bone.lock_scale, scale_ranges(bone))]
+    if not (bone.parent and bone.bone.use_connect):
+        others.insert(0, (LOCATION, bone.lock_location, location_ranges(bone)))
+    for kind, locks, stated in others:
+        if not _is_replaced(bone, kind):
+            yield kind, kind, {axis: stated.get(axis) for axis in range(3) if not locks[axis]}
+
+
+def _is_replaced(bone: bpy.types.PoseBone, kind: str) -> bool:
+    """Whether a constraint sets what these channels would set."""
+    return any(
+        constraint.type == "COPY_TRANSFORMS" or (_COPIES.get(constraint.type) == kind and _copies_all(constraint))
+        for constraint in bone.constraints
+        if not constraint.mute and constraint.influence == 1 and getattr(constraint, "mix_mode", "REPLACE") == "REPLACE"
+    )
+
+
+def _copies_all(constraint: bpy.types.Constraint) -> bool:
+    return all(getattr(constraint, f"use_{axis}") for axis in "xyz") and not getattr(constraint, "use_offset", False)

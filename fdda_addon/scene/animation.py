@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which F-curves animate a datablock now, and whether they change it."""
+
+from collections.abc import Iterable, Iterator
+
+import bpy
+import numpy as np
+
+from .arrays import KEYFRAME, read
+from .compatibility import curves_of, curves_of_slot
+
+MIN_CHANGE = 1e-6
+"""Keys whose values lie no farther apart hold one value."""
+
+
+def active_curves(datablock: bpy.types.ID) -> list[bpy.types.FCurve]:
+    """The F-curves that animate a datablock now: those of its action and of its NLA that are not muted."""
+    animation = datablock.animation_data
+    if animation is None:
+        return []
+    owners = [animation]
+    if animation.use_nla:
+        tracks = [track for track in animation.nla_tracks if track.is_solo] or animation.nla_tracks
+        owners += [strip for track in tracks if not track.mute for strip in _flat_strips(track.strips)]
+    pairs = [(owner.action, owner.action_slot) for owner in owners]
+    found = [curve for action, slot in pairs if action and slot for curve in curves_of_slot(action, slot)]
+    return [curve for curve in found if not curve.mute]
+
+
+def _flat_strips(strips: Iterable[bpy.types.NlaStrip]) -> Iterator[bpy.types.NlaStrip]:
+    for strip in strips:
+        if not strip.mute:
+            yield strip
+            yield from _flat_strips(strip.strips)
+
+
+def played_curves(datablock: bpy.types.ID, actions: Iterable[bpy.types.Action]) -> list[bpy.types.FCurve]:
+    """The F-curves that animate a datablock now, or would if these actions were played."""
+    return [*active_curves(datablock), *(curve for action in actions for curve in curves_of(action, datablock))]
+
+
+def varies(curve: bpy.types.FCurve) -> bool:
+    """Whether an F-curve changes what it animates, as far as its keys tell."""
+    if any(not modifier.mute for modifier in curve.modifiers) or len(curve.sampled_points):
+        return True
+    points = curve.keyframe_points
+    if len(points) < 2 and curve.extrapolation == "CONSTANT":
+        return False
+    values = np.concatenate([read(points, element).reshape(len(points), -1)[:, 1] for element in KEYFRAME[:3]])
+    return bool(len(points)) and float(np.ptp(values)) > MIN_CHANGE
+
+
+def value_range(curve: bpy.types.FCurve) -> tuple[float, float]:
+    """Lowest and highest value of an F-curve over its whole frames."""
+    first, last = curve.range()
+    values = [curve.evaluate(frame) for frame in range(int(first), int(last) + 1)]
+    return min(values), max(values)
