@@ -52,6 +52,8 @@ PARTS = (
     Part("undo", 1000, 1000),
     Part("loads", 200, 200),
     Part("paths", 17, 17),
+    Part("time", 300, 100),
+    Part("armatures", 200, 100),
 )
 
 
@@ -67,6 +69,10 @@ def work(part: str, folder: Path, seed: int, first: int, end: int) -> None:
         from benchmarks.soaking import interruptions
 
         run = interruptions.run_kills if part == "kills" else interruptions.run_full_disks
+    elif part in ("time", "armatures"):
+        from benchmarks.soaking import inputs
+
+        run = inputs.run_time if part == "time" else inputs.run_armatures
     else:
         from benchmarks.soaking import playback
 

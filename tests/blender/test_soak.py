@@ -28,8 +28,11 @@ def folder(elbow, tmp_path_factory) -> Path:
 @pytest.mark.skipif(sys.platform != "linux", reason="The soak measures memory by /proc, which only Linux has.")
 @pytest.mark.parametrize(
     ("part", "count"),
-    [("models", 60), ("kills", 3), ("disks", 4), ("outputs", 12), ("frames", 200), ("undo", 40), ("loads", 6)],
-)
+    [
+        ("models", 60), ("kills", 3), ("disks", 4), ("outputs", 12), ("frames", 200), ("undo", 40), ("loads", 6),
+        ("time", 8), ("armatures", 6),
+    ],
+)  # fmt: skip
 def test_a_short_soak(folder, part, count):
     from benchmarks.soaking.cases import FELL_SHORT, heard
 
