@@ -155,7 +155,7 @@ def _one(plan: "Plan", tasks: dict[str, "Task"], options: argparse.Namespace) ->
 
 
 def _all(options: argparse.Namespace, plan: "Plan", tasks: dict[str, "Task"], page: Path) -> int:
-    from fdda_addon.core.output import check_temporary_folder
+    from fdda_addon.core.temporary import check_temporary_folder
 
     from .cluster import connected, local_workers, run_on
     from .report import write_report
