@@ -48,6 +48,7 @@ PARTS = (
     Part("kills", 45, 45),
     Part("disks", 40, 40),
     Part("outputs", 60, 60),
+    Part("signals", 20, 20),
     Part("frames", 10_000, 10_000),
     Part("undo", 1000, 1000),
     Part("loads", 200, 200),
@@ -61,6 +62,8 @@ def work(part: str, folder: Path, seed: int, first: int, end: int) -> None:
     """Be the process of a part."""
     if part == "recordings":
         from benchmarks.soaking.recordings import run
+    elif part == "signals":
+        from benchmarks.soaking.signals import run
     elif part == "models":
         from benchmarks.soaking.models import run
     elif part == "outputs":

@@ -3,10 +3,13 @@
 
 import sys
 
-from .cli.main import main
-from .core.terminal import use_utf8
+from .core.stop_signals import exit_when_asked
 
 if __name__ == "__main__":
+    exit_when_asked()
+    from .cli.main import main
+    from .core.terminal import use_utf8
+
     use_utf8()
     if sys.argv[1:2] == ["farm"]:
         from .cli.farm import become_farm

@@ -9,8 +9,13 @@ import argparse
 import sys
 from pathlib import Path
 
+from fdda_addon.core.stop_signals import exit_when_asked
 from fdda_addon.core.temporary import check_temporary_folder
 from fdda_addon.core.terminal import show_all_names
+
+if __name__ == "__main__":
+    # Before the rest is imported: until `main` a request to stop would end in a traceback.
+    exit_when_asked()
 
 from .announcements import Announcer, MessageLines, Text
 from .config import add_options, config_from_arguments
@@ -40,7 +45,8 @@ def _train(options: argparse.Namespace, announcer: Announcer, stop: StopRequest)
             check_several(recordings, options.model, options.overwrite)
         else:
             check_training_outputs(options.model, options.overwrite)
-        from .training import train_model
+        with stop.at_once(announcer):
+            from .training import train_model
     except ModuleNotFoundError as error:
         raise missing_package("Training", error) from error
     settings = (config, announcer, stop, options.warm_start, options.strict, options.overwrite)

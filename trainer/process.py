@@ -1,18 +1,26 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What each process of the trainer does beside its work: it hears a request to stop, and ends with one last message."""
+"""What each process of the trainer does beside its work: notice a request to stop, and end with one last message."""
 
+import errno
 import os
-import signal
 import sys
+import threading
+import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
-from fdda_addon.core.errors import TRY_AGAIN, FDDAError, TrainingError, exit_status, machine_sentence
-from fdda_addon.core.messages import MessageType
+from fdda_addon.core.errors import TRY_AGAIN, FDDAError, TrainingError, exit_status, machine_sentence, one_line
+from fdda_addon.core.messages import STOP_FILE_VARIABLE, MessageType
+from fdda_addon.core.native_library import runtime_advice
+from fdda_addon.core.stop_signals import INTERRUPTED, handle_stop_signals
 
 from .announcements import Announcer
 
-INTERRUPTED = 130
+LOOK_SECONDS = 0.1
+"""How often the stop file is looked for, at most."""
+NO_MEMORY = ("can't allocate memory", "not enough memory", "bad allocation", "bad_alloc", "WinError 1455")
+"""What torch and ONNX Runtime say, on Linux and on Windows; 1455 is a paging file that is too small."""
 # Threads of OpenMP that wait by spinning make training ten times slower on a machine that is busy with something else,
 # and no faster on one that is not. Read when torch loads.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -25,18 +33,50 @@ class Cancelled(Exception):  # noqa: N818 - no error
 
 
 class StopRequest:
-    """True once the process was asked to end: Ctrl-C, or SIGTERM from the add-on."""
+    """True once the process was asked to stop: by a signal (Ctrl-C, SIGTERM, …) or by the add-on's stop file."""
 
     def __init__(self):
         self.requested = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._request)
+        self._file = os.environ.get(STOP_FILE_VARIABLE, "")
+        self._next_look = 0.0
+        handle_stop_signals(self._request)
 
     def _request(self, *_) -> None:
         self.requested = True
 
     def __call__(self) -> bool:
+        if not self.requested and self._file and (now := time.monotonic()) >= self._next_look:
+            self._next_look = now + LOOK_SECONDS
+            self.requested = os.path.exists(self._file)
+            if self.requested:
+                # Heard; whoever has created it may be gone.
+                with suppress(OSError):
+                    os.unlink(self._file)
         return self.requested
+
+    @contextmanager
+    def at_once(self, announcer: Announcer) -> Iterator[None]:
+        """Inside, where nothing is written yet, a request ends the process: torch can take half a minute to load.
+
+        Raises:
+            Cancelled: it was asked before.
+        """
+        if self():
+            raise Cancelled
+        is_over = threading.Event()
+
+        def watch() -> None:
+            while not is_over.wait(LOOK_SECONDS):
+                if self():
+                    os._exit(_end(announcer, INTERRUPTED, MessageType.CANCELLED))
+
+        watcher = threading.Thread(target=watch, daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            is_over.set()
+            watcher.join()
 
 
 def run_announced(work: Callable[[], None], announcer: Announcer) -> int:
@@ -47,40 +87,62 @@ def run_announced(work: Callable[[], None], announcer: Announcer) -> int:
         announcer: receives the messages.
     """
     try:
-        try:
-            work()
-        except Cancelled:
-            announcer.say(MessageType.CANCELLED)
-            return INTERRUPTED
-        except FDDAError as error:
-            return _failed(str(error), announcer, exit_status(error))
-        except BrokenPipeError:
-            raise
-        except Exception as error:  # The boundary: the add-on waits for a last message, whatever happened.
-            if _lacks_memory(error):
-                text = f"The training lacks memory ({error}); free some, or train on a larger machine."
-                return _failed(" ".join(text.split()), announcer, TRY_AGAIN)
-            if text := machine_sentence(error):
-                return _failed(text, announcer, TRY_AGAIN)
-            traceback.print_exc()
-            return _failed(f"The trainer stopped on an error of its own ({error!r}); please report it.", announcer)
+        work()
+    except Cancelled:
+        return _end(announcer, INTERRUPTED, MessageType.CANCELLED)
     except BrokenPipeError:
-        # Whoever started the process is gone. Python would complain once more when it closes stdout.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _close_output()
         return 1
+    except Exception as error:  # The boundary: the add-on waits for a last message, whatever happened.
+        text, status = _explain(error)
+        values = {"text": text, **({"try_again": True} if status == TRY_AGAIN else {})}
+        status = _end(announcer, status, MessageType.FAILED, **values)
+        with suppress(OSError):
+            print(text, file=sys.stderr)
+        return status
     return 0
 
 
-def _lacks_memory(error: Exception) -> bool:
+def _end(announcer: Announcer, status: int, kind: MessageType, **values) -> int:
+    """Announce the last message, as far as there is room for it; returns the exit status."""
+    try:
+        announcer.say(kind, **values)
+    except OSError as error:
+        _close_output()
+        return 1 if isinstance(error, BrokenPipeError) else status
+    return status
+
+
+def _close_output() -> None:
+    """Drop what stdout still holds: Python would complain once more when it closes it, and change the exit status."""
+    with suppress(OSError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _explain(error: Exception) -> tuple[str, int]:
+    """The sentence for an error that ended the work, and the exit status."""
+    if isinstance(error, FDDAError):
+        return str(error), exit_status(error)
+    cause: BaseException = error
+    while cause.__cause__ is not None and not isinstance(cause, OSError | MemoryError):
+        cause = cause.__cause__
+    if _lacks_memory(cause):
+        return one_line(f"The training lacks memory ({cause}); free some, or train on a larger machine."), TRY_AGAIN
+    if text := machine_sentence(cause):
+        return text, TRY_AGAIN
+    if advice := runtime_advice(str(error)):
+        return one_line(f"A library of '{sys.executable}' cannot be loaded ({error}); {advice}."), 1
+    with suppress(OSError):
+        traceback.print_exc()
+    return f"The trainer stopped on an error of its own ({error!r}); please report it.", 1
+
+
+def _lacks_memory(error: BaseException) -> bool:
     """Whether numpy or torch found no memory. torch is not imported here: it may be what is missing."""
     kinds = {kind.__name__ for kind in type(error).__mro__}
-    return bool(kinds & {"MemoryError", "OutOfMemoryError"}) or "can't allocate memory" in str(error)
-
-
-def _failed(text: str, announcer: Announcer, status: int = 1) -> int:
-    announcer.say(MessageType.FAILED, text=text, **({"try_again": True} if status == TRY_AGAIN else {}))
-    print(text, file=sys.stderr)
-    return status
+    if kinds & {"MemoryError", "OutOfMemoryError"} or getattr(error, "errno", None) == errno.ENOMEM:
+        return True
+    return any(words in str(error) for words in NO_MEMORY)
 
 
 def missing_package(work: str, error: ModuleNotFoundError) -> TrainingError:

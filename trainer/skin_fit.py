@@ -29,7 +29,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _fit(options: argparse.Namespace, announcer: Announcer, stop: StopRequest) -> None:
     try:
-        from .fitted_skin import fit_folder
+        with stop.at_once(announcer):
+            from .fitted_skin import fit_folder
     except ModuleNotFoundError as error:
         raise missing_package("Fitting skin weights", error) from error
     fit_folder(options.folder, options.kind, announcer, stop, options.metres_per_unit)

@@ -3,6 +3,7 @@
 
 import contextlib
 import json
+import os
 import re
 import time
 import traceback
@@ -103,5 +104,7 @@ def _peak_mb() -> float:
 
 
 def _status(name: str) -> float:
+    if not os.path.exists("/proc/self/status"):
+        return 0.0
     (line,) = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name)]
     return int(line.split()[1]) / 1024

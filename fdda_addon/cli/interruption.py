@@ -1,57 +1,54 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ctrl-C while a verb runs.
+"""Ctrl-C, and other requests to stop, while a verb runs.
 
-Blender prints an exception that leaves a handler or a property's update function, and goes on. A Ctrl-C that strikes
-there would be lost, so it is kept until the verb is back in code of its own.
+Blender prints an exception that leaves a handler or a property's update function, and goes on; numpy turns one that
+strikes while it is imported into an ImportError. So a request that comes there is repeated until the verb is elsewhere.
 """
 
-import signal
 import threading
-from collections.abc import Iterator
+from _thread import interrupt_main
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from ..core.stop_signals import handle_stop_signals, restore_handlers
+
+RETRY_SECONDS = 0.01
 _ADDON = __name__.rsplit(".", 2)[0]
+_MAIN = f"{_ADDON}.cli.main"
 _UPDATES_AND_DRAWING = {f"{_ADDON}.properties.binding", f"{_ADDON}.evaluation.overlay"}
 
 _called_by_blender: set[str] = set()
 """Modules whose functions Blender calls."""
-_pending = False
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Inside, Ctrl-C raises KeyboardInterrupt, at once or from the next `raise_pending`."""
-    global _pending, _called_by_blender
-    # Not above: verbs that need no Blender show progress too.
-    from ..registration import handler_table
-
-    _pending = False
-    _called_by_blender = {handler.__module__ for _, handler in handler_table()} | _UPDATES_AND_DRAWING
+    """Inside, a request to stop raises KeyboardInterrupt(signal), at once or as soon as it does not get lost."""
     if threading.current_thread() is not threading.main_thread():
         # Only the main thread may say what a signal does; it is not this job that Ctrl-C ends.
         yield
         return
-    previous = signal.signal(signal.SIGINT, _on_interrupt)
+    previous = handle_stop_signals(_on_request)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, previous or signal.default_int_handler)
+        restore_handlers(previous)
 
 
-def raise_pending() -> None:
-    """Raise the KeyboardInterrupt that had to wait, if there is one."""
-    global _pending
-    if _pending:
-        _pending = False
-        raise KeyboardInterrupt
+def note_callbacks(modules: Iterable[str]) -> None:
+    """Let no KeyboardInterrupt be raised in functions of these modules, which Blender calls."""
+    global _called_by_blender
+    _called_by_blender = {*modules} | _UPDATES_AND_DRAWING
 
 
-def _on_interrupt(_number: int, frame: FrameType | None) -> None:
-    global _pending
-    while frame is not None:
-        if frame.f_globals.get("__name__") in _called_by_blender:
-            _pending = True
+def _on_request(number: int, frame: FrameType | None) -> None:
+    while frame is not None and frame.f_globals.get("__name__") != _MAIN:
+        is_import = frame.f_code.co_filename.startswith("<frozen importlib")
+        if is_import or frame.f_globals.get("__name__") in _called_by_blender:
+            timer = threading.Timer(RETRY_SECONDS, interrupt_main, (number,))
+            timer.daemon = True
+            timer.start()
             return
         frame = frame.f_back
-    raise KeyboardInterrupt
+    raise KeyboardInterrupt(number)

@@ -10,7 +10,9 @@ import sys
 from importlib import import_module
 
 from ..core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status, machine_sentence
+from ..core.stop_signals import INTERRUPTED
 from ..core.terminal import show_all_names
+from .interruption import interruptible
 
 VERBS = {
     "build-arm": ("build_arm", "build the example rig: an arm with a hand"),
@@ -30,7 +32,6 @@ OF_ANOTHER_PROCESS = {"train", "farm"}
 """Verbs whose options are read by the process that they start."""
 WITHOUT_BLENDER = {"merge-recordings"}
 """Verbs that run in this process, where there is no Blender."""
-INTERRUPTED = 130
 
 
 def main(arguments: list[str], program: str) -> int:
@@ -44,6 +45,15 @@ def main(arguments: list[str], program: str) -> int:
         The exit status.
     """
     show_all_names()
+    try:
+        with interruptible():
+            return _run(arguments, program)
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _run(arguments: list[str], program: str) -> int:
     verb = arguments[0] if arguments and arguments[0] in VERBS else None
     parser = argparse.ArgumentParser(prog=program, description="Fast and Deep Deformation Approximations.")
     verbs = parser.add_subparsers(metavar="VERB", required=True)
@@ -77,6 +87,3 @@ def main(arguments: list[str], program: str) -> int:
             raise
         print(f"Error: {text}", file=sys.stderr)
         return TRY_AGAIN
-    except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr)
-        return INTERRUPTED

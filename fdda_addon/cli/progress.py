@@ -5,8 +5,6 @@ import sys
 import time
 from typing import TextIO
 
-from .interruption import raise_pending
-
 WIDTH = 30
 PLAIN_PARTS = 10
 """Plain output has a line for each tenth of a stage."""
@@ -21,12 +19,7 @@ class ProgressPrinter:
         self._stage, self._part, self._start, self._open = "", -1, 0.0, False
 
     def show(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Show `done` of `total` steps of a stage.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C was pressed where it had to wait.
-        """
-        raise_pending()
+        """Show `done` of `total` steps of a stage."""
         if stage != self._stage:
             self.end_line()
             self._stage, self._part, self._start = stage, -1, time.monotonic()

@@ -5,17 +5,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from .. import registration
-from .interruption import interruptible
+from .interruption import note_callbacks
 
 
 @contextmanager
 def registered() -> Iterator[None]:
-    """Inside, the add-on is registered and Ctrl-C ends the work; it stays registered where Blender had enabled it."""
+    """Inside, the add-on is registered; it stays registered where Blender had enabled it."""
     was_registered = registration.is_registered()
     registration.register()
+    note_callbacks(handler.__module__ for _, handler in registration.handler_table())
     try:
-        with interruptible():
-            yield
+        yield
     finally:
         if not was_registered:
             registration.unregister()

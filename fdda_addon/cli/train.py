@@ -16,13 +16,13 @@ from ..core.errors import WrongUsageError
 from ..core.messages import WARNING_LINE, MessageType
 from ..core.recording.folder import recordings_in
 from ..core.report import Verdict
+from ..core.stop_signals import INTERRUPTED
 from ..training.process import Training, trainer_command
 from .progress import ProgressPrinter
 
 if TYPE_CHECKING:
     from ..scene.scene_rig import SceneRig
 
-INTERRUPTED = 130
 WARM_START, TARGET = "--warm-start", "--target-mm"
 MAX_ROUNDS = 20
 

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What the trainer says while it works: one JSON object a line on its stdout.
 
-Direction: trainer to add-on. Every training ends with exactly one of `FINISHED`, `CANCELLED` and `FAILED`.
+Direction: trainer to add-on. Every training ends with exactly one of `FINISHED`, `CANCELLED` and `FAILED`. The add-on
+asks the trainer to stop by creating the file that `STOP_FILE_VARIABLE` names: no signal does that on Windows.
 """
 
 import enum
 import json
 from dataclasses import dataclass, field
 
+STOP_FILE_VARIABLE = "FDDA_STOP_FILE"
+"""Environment variable of the trainer: path of a file that does not exist until the trainer is to stop."""
 WARNING_LINE = "Warning ({name}): {text}"
 """A warning for people, from its values."""
 

@@ -31,6 +31,8 @@ class TrainsModels(OnRig):
         Raises:
             FDDAError: the recording is not complete, or the training fails.
         """
+        from ..core.messages import MessageType
+
         # Nothing of Blender's data is used after this: the user may do as they like.
         uid, began = mesh_object.session_uid, time.monotonic()
         state = self.state
@@ -41,6 +43,9 @@ class TrainsModels(OnRig):
                     if state.cancel_requested:
                         training.cancel()
                     if message is not None:
+                        if message.type is MessageType.FINISHED:
+                            # Perhaps after Cancel: what is being written is written to its end.
+                            self.trained.append((uid, model))
                         yield self._note(message)
                         continue
                     if not state.total:
@@ -52,8 +57,6 @@ class TrainsModels(OnRig):
                     # Another file is opened, or Blender is closed.
                     training.leave()
                 raise
-        if not state.cancel_requested:
-            self.trained.append((uid, model))
 
     def _training(self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool) -> object:
         from ..training.lasting import FollowedTraining, LastingTraining, is_known

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..core.errors import ModelError
 from ..core.model import CONTROLS_INPUT, POSE_INPUT, POSITIONS_OUTPUT, TRUST_OUTPUT, check_model, read_model, read_skin
+from ..core.native_library import runtime_advice
 from ..core.rig import Rig
 
 THREADED_VERTICES = 100_000
@@ -45,10 +46,11 @@ class Network:
             import onnxruntime
         except ImportError as error:
             version = ".".join(map(str, sys.version_info[:2]))
-            raise ModelError(
-                f"ONNX Runtime cannot be loaded by Python {version} ({error}); install the extension's zip for this "
-                f"platform and for Python {version}: 3.11 and 3.13 are in one, 3.14 has its own."
-            ) from error
+            advice = runtime_advice(str(error)) or (
+                f"install the extension's zip for this platform and for Python {version}: 3.11 and 3.13 are in one, "
+                "3.14 has its own"
+            )
+            raise ModelError(f"ONNX Runtime cannot be loaded by Python {version} ({error}); {advice}.") from error
         onnxruntime.set_default_logger_severity(3)
         onnxruntime.disable_telemetry_events()
         options = onnxruntime.SessionOptions()

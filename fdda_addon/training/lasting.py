@@ -8,6 +8,7 @@ where it has ended meanwhile. No file beside a model, which may be anyone's, is 
 
 import contextlib
 import hashlib
+import io
 import json
 import os
 import signal
@@ -15,11 +16,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TextIO
 
 from ..core.errors import OutputError, os_reason
 from ..core.output import write_json
 from .environment.folder import user_folder
+from .environment.subprocesses import hidden
 from .process import Training
 
 POLL_SECONDS = 0.1
@@ -46,15 +48,29 @@ class LastingTraining(Training):
         self._record, self._is_left = _Record(model), False
         super().__init__(arguments)
         _started[self._process.pid] = self._process
-        self._record.name(self._process.pid)
+        try:
+            self._record.name(self._process.pid)
+        except OutputError:
+            # Nobody would find it again.
+            self.__exit__()
+            raise
+
+    def _new_stop_file(self) -> Path:
+        self._record.remove()
+        return self._record.stop_file
+
+    def _new_errors(self) -> TextIO:
+        return self._record.new_errors()
 
     def _start(self, command: list[str], environment: dict[str, str]) -> subprocess.Popen:
-        own: dict[str, object] = {"start_new_session": True}
-        if sys.platform == "win32":
-            own = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW}
         with self._record.new_messages() as file:
             return subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=file, stderr=self._errors, env=environment, **own
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=self._errors,
+                env=environment,
+                **hidden(own_session=True),
             )
 
     def _read(self) -> None:
@@ -62,9 +78,14 @@ class LastingTraining(Training):
         while not self._is_left:
             # Asked before reading: what was written before it ended is read.
             is_alive = self._process.poll() is None
-            with self._record.messages.open("rb") as file:
-                file.seek(place)
-                read = file.read()
+            try:
+                with self._record.messages.open("rb") as file:
+                    file.seek(place)
+                    read = file.read()
+            except PermissionError:
+                # On Windows, while `is_written` of another thread tries the file.
+                time.sleep(POLL_SECONDS)
+                continue
             place += len(read)
             *lines, rest = (rest + read).split(b"\n")
             for line in lines:
@@ -77,6 +98,8 @@ class LastingTraining(Training):
     def leave(self) -> None:
         """Let it go on when the block ends."""
         self._is_left = True
+        if self._abandoned is not None:
+            self._abandoned.detach()
 
     def __exit__(self, *error: object) -> None:
         if self._is_left:
@@ -93,7 +116,7 @@ class FollowedTraining(LastingTraining):
     def __init__(self, model: Path):
         """Follow the training of a model; `is_known` has to be true."""
         self._record, self._is_left = _Record(model), False
-        self._errors = open(os.devnull, "w+", encoding="utf-8")  # noqa: SIM115 - __exit__ closes it
+        self._stop_file, self._errors = self._record.stop_file, self._record.errors()
         pid = self._record.process
         self._process = _started.get(pid) or _OtherProcess(pid, self._record)
         self._follow()
@@ -108,9 +131,11 @@ class _Record:
     """What is known of the training of a model, on the disk: its process, and what that has said."""
 
     def __init__(self, model: Path):
-        name = hashlib.sha256(str(model.resolve()).encode()).hexdigest()[:24]
+        name = hashlib.sha256(os.path.normcase(model.resolve()).encode("utf-8", "surrogateescape")).hexdigest()[:24]
         self._path = user_folder() / "trainings" / f"{name}.json"
         self.messages = self._path.with_suffix(".messages")
+        self.stop_file = self._path.with_suffix(".stop")
+        self._errors = self._path.with_suffix(".errors")
 
     def new_messages(self) -> BinaryIO:
         """The file for what a process says, which holds it locked as long as it lives.
@@ -118,11 +143,7 @@ class _Record:
         Raises:
             OutputError: it cannot be written.
         """
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            file = self.messages.open("wb")
-        except OSError as error:
-            raise OutputError(f"Cannot write '{self.messages}': {os_reason(error)}; make room there.") from error
+        file = self._new(self.messages)
         if sys.platform != "win32":
             import fcntl
 
@@ -130,8 +151,26 @@ class _Record:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return file
 
+    def new_errors(self) -> TextIO:
+        """The file for what a process writes to stderr; raises as `new_messages`."""
+        return io.TextIOWrapper(self._new(self._errors), encoding="utf-8", errors="replace")
+
+    def errors(self) -> TextIO:
+        """What a process wrote to stderr."""
+        try:
+            return self._errors.open(encoding="utf-8", errors="replace")
+        except OSError:
+            return io.StringIO()
+
+    def _new(self, path: Path) -> BinaryIO:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            return path.open("w+b")
+        except OSError as error:
+            raise OutputError(f"Cannot write '{path}': {os_reason(error)}; make room there.") from error
+
     def name(self, process: int) -> None:
-        """Keep the number of the process."""
+        """Keep the number of the process; raises OutputError."""
         write_json(self._path, {"process": process})
 
     @property
@@ -163,29 +202,28 @@ class _Record:
         return False
 
     def remove(self) -> None:
-        for path in (self._path, self.messages):
+        for path in (self._path, self.messages, self.stop_file, self._errors):
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
 
 
 class _OtherProcess:
-    """A process that another Blender has started, as far as `Training` uses one."""
+    """A process that another Blender has started, as far as `Training` uses one. Its exit status is not known."""
 
     stdout = None
 
     def __init__(self, pid: int, record: _Record):
         self.pid, self._record = pid, record
 
-    def poll(self) -> int | None:
-        return None if self._record.is_written() else 0
+    def poll(self) -> str | None:
+        return None if self._record.is_written() else "ended"
 
-    def wait(self, seconds: float = float("inf")) -> int:
+    def wait(self, seconds: float = float("inf")) -> None:
         end = time.monotonic() + seconds
         while self.poll() is None:
             if time.monotonic() > end:
                 raise subprocess.TimeoutExpired(str(self.pid), seconds)
             time.sleep(POLL_SECONDS)
-        return 0
 
     def terminate(self) -> None:
         self._send(signal.SIGTERM)
@@ -194,6 +232,7 @@ class _OtherProcess:
         self._send(getattr(signal, "SIGKILL", signal.SIGTERM))
 
     def _send(self, number: int) -> None:
-        if self.poll() is None:
+        # Its number alone may be that of another process by now.
+        if self._record.is_written():
             with contextlib.suppress(OSError):
                 os.kill(self.pid, number)

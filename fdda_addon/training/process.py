@@ -6,22 +6,34 @@ torch never enters Blender's process: it would bring its own threads and librari
 
 import os
 import queue
+import secrets
+import shutil
 import subprocess
 import tempfile
 import threading
 import time
+import weakref
 from collections.abc import Iterator
-from typing import Self
+from contextlib import suppress
+from pathlib import Path
+from typing import Self, TextIO
 
-from ..core.errors import TrainingDiedError, TrainingError, WrongUsageError, os_reason
-from ..core.messages import Message, MessageType
+from ..core.errors import TRY_AGAIN, TrainingDiedError, TrainingError, WrongUsageError, os_reason
+from ..core.messages import STOP_FILE_VARIABLE, Message, MessageType
+from ..core.native_library import runtime_advice
+from ..core.stop_signals import INTERRUPTED
 from ..core.temporary import temporary_failed
+from .endings import explain_status
 from .environment.choice import chosen_python
 from .environment.folder import ROOT
+from .environment.subprocesses import UTF8_OUTPUT, hidden
 
 CANCEL_SECONDS = 20.0
 """A trainer that was asked to stop is killed after so long."""
 READER_SECONDS = 1.0
+WAIT_SECONDS = 0.05
+FULL_BYTES = 1 << 16
+"""Free space of a disk that counts as full."""
 
 
 def trainer_python() -> str:
@@ -54,6 +66,7 @@ class TrainerProcess:
     """
 
     module = "trainer"
+    _abandoned: weakref.finalize | None = None
     failed = "The training failed."
     lost = "no model was written, train again"
 
@@ -66,22 +79,33 @@ class TrainerProcess:
 
         Raises:
             TrainingError: the interpreter cannot be started.
-            OutputError: no temporary file can be written.
+            OutputError: there is no room for what it writes to stderr.
         """
         advice = chosen_python().origin.value if python is None else "name a Python that has torch"
         command, environment = trainer_command(arguments, python, self.module)
         try:
-            self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - __exit__ closes it
+            self._stop_file, self._errors = self._new_stop_file(), self._new_errors()
         except OSError as error:
             raise temporary_failed(error) from error
+        environment |= {STOP_FILE_VARIABLE: str(self._stop_file), **UTF8_OUTPUT}
+        # Ctrl-C may strike between the start of the process and the block that ends it.
+        self._abandoned = weakref.finalize(self, Path.touch, self._stop_file)
         try:
             self._process = self._start(command, environment)
         except OSError as error:
+            self._abandoned.detach()
             self._errors.close()
             raise TrainingError(
                 f"The trainer's Python '{command[0]}' cannot be started ({os_reason(error)}); {advice}."
             ) from error
         self._follow()
+
+    def _new_stop_file(self) -> Path:
+        # Nobody else can guess the name, and no file is there until the trainer is to stop.
+        return Path(tempfile.gettempdir(), f"fdda-stop-{secrets.token_hex(12)}")
+
+    def _new_errors(self) -> TextIO:
+        return tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
 
     def _start(self, command: list[str], environment: dict[str, str]) -> subprocess.Popen:
         return subprocess.Popen(
@@ -92,6 +116,8 @@ class TrainerProcess:
             env=environment,
             text=True,
             encoding="utf-8",
+            errors="replace",
+            **hidden(),
         )
 
     def _follow(self) -> None:
@@ -108,8 +134,13 @@ class TrainerProcess:
 
     def cancel(self) -> None:
         """Ask the trainer to stop; `messages` ends when it has. Does not wait."""
-        if self._cancelled_at is None:
-            self._cancelled_at = time.monotonic()
+        if self._cancelled_at is not None:
+            return
+        self._cancelled_at = time.monotonic()
+        try:
+            self._stop_file.touch()
+        except OSError:
+            # A full disk. On Windows this gives it no time.
             self._process.terminate()
 
     def messages(self, wait: bool = True) -> Iterator[Message | None]:
@@ -124,12 +155,14 @@ class TrainerProcess:
         """
         last = None
         while True:
+            if self._cancelled_at is not None and time.monotonic() > self._cancelled_at + CANCEL_SECONDS:
+                self._process.kill()
             try:
-                line = self._lines.get(block=wait)
+                # Not for longer: Windows takes no Ctrl-C to a thread that waits.
+                line = self._lines.get(block=wait, timeout=WAIT_SECONDS)
             except queue.Empty:
-                if self._cancelled_at is not None and time.monotonic() > self._cancelled_at + CANCEL_SECONDS:
-                    self._process.kill()
-                yield None
+                if not wait:
+                    yield None
                 continue
             if line is None:
                 break
@@ -143,21 +176,42 @@ class TrainerProcess:
                 raise kind(str(message.values.get("text", self.failed)))
             yield message
             last = message
-        while not wait and self._process.poll() is None:
-            yield None
+        while self._process.poll() is None:
+            if wait:
+                time.sleep(WAIT_SECONDS)
+            else:
+                yield None
         status = self._process.wait()
         if self._cancelled_at is not None:
             return
         if status == WrongUsageError.exit_status and last is None:
             raise WrongUsageError(self._error_text().strip())
         if last is None or not last.type.is_last:
-            raise (TrainingDiedError if status < 0 else TrainingError)(self._death(status))
+            if status == INTERRUPTED:
+                # It was asked to stop while it was starting.
+                yield Message(MessageType.CANCELLED)
+                return
+            raise self._death(status)
 
-    def _death(self, status: int) -> str:
+    def _death(self, status: int | None) -> TrainingError:
         text = self._error_text().strip().splitlines()
         reason = f" ({text[-1].strip()})" if text else ""
-        how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
-        return f"The trainer {how} before it was done{reason}; {self.lost}."
+        ending = explain_status(status, not text)
+        if status == TRY_AGAIN and (full := self._full_disk()):
+            # It could not even say so.
+            return TrainingDiedError(f"The disk of '{full}' is full; {self.lost} when there is room.")
+        kind = TrainingDiedError if ending.is_machines else TrainingError
+        if advice := runtime_advice(reason):
+            return kind(f"The trainer {ending.text}{reason}; {advice}, and train again.")
+        return kind(f"The trainer {ending.text}{reason}; {self.lost}.")
+
+    def _full_disk(self) -> Path | None:
+        """The folder that the process writes to whose disk is full, if one is."""
+        for folder in (self._stop_file.parent, Path(tempfile.gettempdir())):
+            with suppress(OSError):
+                if shutil.disk_usage(folder).free < FULL_BYTES:
+                    return folder
+        return None
 
     def _error_text(self) -> str:
         self._errors.seek(0)
@@ -167,13 +221,20 @@ class TrainerProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._process.poll() is None:
-            self._process.terminate()
-            try:
-                self._process.wait(CANCEL_SECONDS)
-            except subprocess.TimeoutExpired:
+        try:
+            if self._process.poll() is None:
+                self.cancel()
+                with suppress(subprocess.TimeoutExpired):
+                    self._process.wait(CANCEL_SECONDS)
+        finally:
+            # Also when Ctrl-C is pressed once more meanwhile.
+            if self._process.poll() is None:
                 self._process.kill()
                 self._process.wait()
+            if self._abandoned is not None:
+                self._abandoned.detach()
+            with suppress(OSError):
+                self._stop_file.unlink(missing_ok=True)
         # A process that the trainer has started may hold its output open: then it is left to the thread.
         self._reader.join(READER_SECONDS)
         if not self._reader.is_alive() and self._process.stdout is not None:

@@ -3,12 +3,10 @@
 
 import os
 import re
-import stat
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -18,6 +16,7 @@ from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 
 from .conftest import run
 from .refusals import Refusal
+from .stand_ins import say, stand_in_trainer
 
 
 @pytest.fixture
@@ -33,19 +32,6 @@ def train(refusal, elbow, tmp_path):
         return refusal("train", elbow.recording, tmp_path / "m.onnx", *options, status=status)
 
     return run_train
-
-
-def stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, *lines: str) -> Path:
-    """A script that is started in place of the trainer's Python."""
-    path = folder / "python"
-    path.write_text("\n".join(["#!/bin/sh", *lines, ""]))
-    path.chmod(path.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setenv(PYTHON_VARIABLE, str(path))
-    return path
-
-
-def say(kind: MessageType, **values) -> str:
-    return f"echo '{Message(kind, values).encode()}'"
 
 
 STARTED = say(MessageType.STARTED, partitions=1, poses=1, vertices=1, device="cpu")
@@ -65,7 +51,12 @@ def test_a_python_without_torch(train, tmp_path, monkeypatch):
 
 
 def test_a_python_that_finds_no_trainer(train, tmp_path, monkeypatch):
-    stand_in(tmp_path, monkeypatch, f'exec "{sys.executable}" -I -S "$@"')
+    stand_in_trainer(
+        tmp_path,
+        monkeypatch,
+        "import subprocess",
+        "status = subprocess.call([sys.executable, '-I', '-S', *sys.orig_argv[1:]])",
+    )
     assert re.match(
         r"The trainer ended with status 1 before it was done \(.*trainer.*\); no model was written", train()
     )
@@ -73,9 +64,10 @@ def test_a_python_that_finds_no_trainer(train, tmp_path, monkeypatch):
 
 def test_a_python_that_is_not_there(train, monkeypatch):
     monkeypatch.setenv(PYTHON_VARIABLE, "/none/python")
-    assert train() == (
-        "The trainer's Python '/none/python' cannot be started (No such file or directory); set FDDA_TRAINER_PYTHON to "
-        "a Python that has torch."
+    assert re.fullmatch(
+        r"The trainer's Python '/none/python' cannot be started \(No such file or directory.*\); set "
+        "FDDA_TRAINER_PYTHON to a Python that has torch.",
+        train(),
     )
 
 
@@ -83,24 +75,24 @@ def test_a_python_that_is_no_program(train, tmp_path, monkeypatch):
     path = tmp_path / "python"
     path.write_text("")
     monkeypatch.setenv(PYTHON_VARIABLE, str(path))
-    assert "cannot be started (Permission denied)" in train()
+    assert "cannot be started (" in train()
 
 
 def test_a_trainer_that_ends_without_a_word(train, tmp_path, monkeypatch):
-    stand_in(tmp_path, monkeypatch, "exit 3")
+    stand_in_trainer(tmp_path, monkeypatch, status=3)
     assert train() == "The trainer ended with status 3 before it was done; no model was written, train again."
 
 
 def test_a_trainer_that_ends_well_without_a_word(train, tmp_path, monkeypatch):
-    stand_in(tmp_path, monkeypatch, STARTED, "exit 0")
+    stand_in_trainer(tmp_path, monkeypatch, STARTED)
     assert "The trainer ended with status 0 before it was done;" in train()
 
 
 def test_a_trainer_that_complains_and_ends(train, tmp_path, monkeypatch):
-    stand_in(tmp_path, monkeypatch, "echo first >&2; echo 'ImportError: libtorch.so' >&2; exit 1")
+    stand_in_trainer(tmp_path, monkeypatch, "sys.stderr.write('first\\nImportError: Jürgen 李\\n')", status=1)
     assert train() == (
-        "The trainer ended with status 1 before it was done (ImportError: libtorch.so); no model was written, "
-        "train again."
+        "The trainer ended with status 1 before it was done (ImportError: Jürgen 李); no model was written, train "
+        "again."
     )
 
 
@@ -118,53 +110,84 @@ def test_no_temporary_folder_takes_a_file(refusal, elbow, tmp_path, monkeypatch,
     assert text.endswith("); make room there, or name another folder in TMPDIR.")
 
 
+def test_a_trainer_that_lacks_a_library(train, tmp_path, monkeypatch):
+    error = "ImportError: DLL load failed while importing _C: Das angegebene Modul wurde nicht gefunden."
+    stand_in_trainer(tmp_path, monkeypatch, f"sys.stderr.write({error!r})", status=1)
+    text = train()
+    assert f"({error}); install Microsoft's Visual C++ runtime from https://aka.ms/vs/17/release/vc_redist." in text
+
+
 def test_a_trainer_that_is_killed(train, tmp_path, monkeypatch):
-    stand_in(tmp_path, monkeypatch, STARTED, PROGRESS, "kill -9 $$")
-    sentence = "The trainer was ended by signal 9 before it was done; no model was written, train again."
-    assert train(status=TRY_AGAIN) == sentence
+    """On Windows the Task Manager gives a process status 1, and nothing else says that it was killed."""
+    kill = "os.kill(os.getpid(), getattr(signal, 'SIGKILL', 15))"
+    stand_in_trainer(tmp_path, monkeypatch, STARTED, PROGRESS, kill)
+    how = "was ended from outside" if os.name == "nt" else "was ended by signal 9"
+    assert train(status=TRY_AGAIN) == f"The trainer {how} before it was done; no model was written, train again."
+
+
+def test_a_trainer_that_crashes(train, tmp_path, monkeypatch):
+    stand_in_trainer(tmp_path, monkeypatch, STARTED, "import faulthandler", "faulthandler._read_null()")
+    how = "crashed: access violation, status 0xC0000005" if os.name == "nt" else "was ended by signal 11"
+    assert train(status=TRY_AGAIN).startswith(f"The trainer {how}")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="/dev/full is Linux's")
+@pytest.mark.parametrize("is_silent", [False, True])
+def test_a_trainer_whose_disk_is_full(elbow, train, tmp_path, monkeypatch, is_silent):
+    """It cannot say a word, or only on stderr."""
+    lines = ["os.dup2(os.open('/dev/full', os.O_WRONLY), 1)", *(["os.dup2(1, 2)"] if is_silent else [])]
+    packages = tmp_path / "packages"
+    packages.mkdir()
+    code = "\n".join(["import os, sys", "if 'trainer' in sys.orig_argv:", *(f"    {line}" for line in lines), ""])
+    (packages / "sitecustomize.py").write_text(code)
+    monkeypatch.setenv("PYTHONPATH", str(packages))
+    text = train("--epochs", 1, status=TRY_AGAIN)
+    assert is_silent or "No space left on device; make room, end other programs, or try again." in text
 
 
 def test_a_trainer_that_fails_in_a_sentence(train, tmp_path, monkeypatch):
-    stand_in(tmp_path, monkeypatch, STARTED, say(MessageType.FAILED, text="The sky fell; wait."), "exit 1")
+    stand_in_trainer(tmp_path, monkeypatch, STARTED, say(MessageType.FAILED, text="The sky fell; wait."), status=1)
     assert train() == "The sky fell; wait."
 
 
 def test_lines_that_are_no_messages_are_passed_over(train, tmp_path, monkeypatch):
-    stand_in(
-        tmp_path, monkeypatch, "echo a warning", "echo {}", STARTED, "echo", say(MessageType.FAILED, text="Enough.")
-    )
+    noise = ["print('a warning')", "print('{}')", "sys.stdout.buffer.write(b'\\xfc\\n')", STARTED, "print()"]
+    stand_in_trainer(tmp_path, monkeypatch, *noise, say(MessageType.FAILED, text="Enough."))
     assert train() == "Enough."
 
 
-def test_a_trainer_that_is_cancelled_by_someone_else(elbow, tmp_path, monkeypatch, capsys):
-    stand_in(tmp_path, monkeypatch, STARTED, say(MessageType.CANCELLED), "exit 130")
+@pytest.mark.parametrize("lines", [(STARTED, say(MessageType.CANCELLED)), ()])
+def test_a_trainer_that_is_cancelled_by_someone_else(elbow, tmp_path, monkeypatch, lines):
+    stand_in_trainer(tmp_path, monkeypatch, *lines, status=130)
     assert run("train", elbow.recording, tmp_path / "m.onnx") == 130
     assert not (tmp_path / "m.onnx").exists()
 
 
-def test_a_trainer_that_does_not_stop_is_stopped(elbow, tmp_path, monkeypatch):
-    """Leaving the block ends the process, also one that would go on for an hour."""
-    from fdda_addon.training.process import Training
+def test_a_trainer_that_does_not_stop_is_stopped(tmp_path, monkeypatch):
+    """Leaving the block ends the process, also one that would go on for an hour and heeds nothing."""
+    from fdda_addon.training import process
 
-    stand_in(tmp_path, monkeypatch, f"echo $$ > '{tmp_path}/pid'", STARTED, "exec sleep 3600")
-    with Training([]) as training:
+    monkeypatch.setattr(process, "CANCEL_SECONDS", 0.5)
+    stand_in_trainer(tmp_path, monkeypatch, STARTED, "time.sleep(3600)")
+    with process.Training([]) as training:
         assert next(training.messages()).type is MessageType.STARTED
-    with pytest.raises(ProcessLookupError):
-        os.kill(int((tmp_path / "pid").read_text()), 0)
+        popen = training._process
+    assert popen.returncode not in (None, 0) and not training._stop_file.exists()
 
 
 def test_nobody_waits_for_a_trainer_that_is_silent(tmp_path, monkeypatch):
     """As a window has it: a poll is answered at once, and a cancelled trainer ends without an error."""
-    from fdda_addon.training.process import Training
+    from fdda_addon.training import process
 
-    stand_in(tmp_path, monkeypatch, STARTED, "exec sleep 3600")
-    with Training([]) as training:
+    stand_in_trainer(tmp_path, monkeypatch, STARTED, "time.sleep(3600)")
+    with process.Training([]) as training:
         messages = training.messages(wait=False)
         seen = first_of(messages)
         assert seen.type is MessageType.STARTED
         start = time.monotonic()
         assert [next(messages) for _ in range(100)] == [None] * 100
         assert time.monotonic() - start < 0.05
+        monkeypatch.setattr(process, "CANCEL_SECONDS", 0.5)
         training.cancel()
         assert first_of(messages) is None
 

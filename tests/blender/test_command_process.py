@@ -20,22 +20,41 @@ from .refusals import files
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def start(*arguments: object) -> subprocess.Popen:
+INTERRUPT = "CTRL_BREAK_EVENT" if os.name == "nt" else "SIGINT"
+REQUESTS = ("CTRL_BREAK_EVENT",) if os.name == "nt" else ("SIGINT", "SIGTERM", "SIGHUP")
+HOOK = """
+import signal, sys
+def hook(event, arguments):
+    global done
+    if event == "import" and arguments[0] == {module!r} and not done:
+        done = True
+        signal.raise_signal(signal.SIGINT)
+done = not "fdda_addon" in sys.orig_argv
+sys.addaudithook(hook)
+"""
+
+
+def start(*arguments: object, **environment: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "fdda_addon", *map(str, arguments)]
+    if os.name == "nt":
+        own = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    else:
+        # A script that runs the tests in the background has them ignore Ctrl-C.
+        own = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}
     return subprocess.Popen(
         command,
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-        # A script that runs the tests in the background has them ignore Ctrl-C.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        errors="replace",
+        env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
+        **own,
     )
 
 
-def finish(*arguments: object) -> tuple[int, str, str]:
-    process = start(*arguments)
+def finish(*arguments: object, **environment: str) -> tuple[int, str, str]:
+    process = start(*arguments, **environment)
     out, err = process.communicate(timeout=120)
     return process.returncode, out, err
 
@@ -92,7 +111,7 @@ def test_an_interrupted_recording_resumes(elbow, tmp_path):
     path = tmp_path / "interrupted"
     process = start("record", elbow.rig, path, *options)
     wait_for(lambda: complete(path) > 0, process)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(getattr(signal, INTERRUPT))
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert out.count("\n") == 1 and err.splitlines()[-1] == "Interrupted." and "Traceback" not in err
@@ -110,23 +129,43 @@ def test_a_recording_that_is_killed_resumes(elbow, tmp_path):
     wait_for(lambda: complete(path) > 0, process)
     process.kill()
     process.communicate(timeout=60)
-    assert process.returncode == -signal.SIGKILL
+    assert process.returncode == (1 if os.name == "nt" else -signal.SIGKILL)
     assert 0 < complete(path) < poses
     assert run("record", elbow.rig, path, "--poses", poses, "--resume") == 0
     assert run("record", elbow.rig, tmp_path / "whole", "--poses", poses) == 0
     assert files(path) == files(tmp_path / "whole")
 
 
-def test_an_interrupted_training_leaves_no_model(elbow, tmp_path):
+@pytest.mark.parametrize("request_", REQUESTS)
+def test_an_interrupted_training_leaves_neither_model_nor_trainer(elbow, tmp_path, request_):
+    """Also where the request reaches the verb alone, as that of a batch system does."""
     process = start("train", elbow.recording, tmp_path / "m.onnx", "--epochs", 1_000_000)
     for line in process.stderr:
         if line.startswith("training: "):
             break
-    process.send_signal(signal.SIGINT)
+    process.send_signal(getattr(signal, request_))
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert "Traceback" not in err and out == ""
     assert files(tmp_path) == {}
+    commands = [path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if path.is_file()]
+    assert not any(os.fsencode(tmp_path) in command for command in commands)
+
+
+@pytest.mark.parametrize(("module", "error"), [("argparse", ""), ("numpy", "Interrupted.\n")])
+def test_ctrl_c_while_modules_are_imported(tmp_path, module, error):
+    (tmp_path / "sitecustomize.py").write_text(HOOK.format(module=module))
+    verb = ("record", tmp_path / "none.blend", tmp_path / "r")
+    assert finish(*verb, PYTHONPATH=str(tmp_path)) == (130, "", error)
+
+
+def test_names_on_a_console_of_another_country(tmp_path):
+    """What the code page lacks is written out."""
+    path = tmp_path / "Jürgen Müller 李.blend"
+    for encoding in ("cp1252", "cp850"):
+        status, out, err = finish("record", path, tmp_path / "r", PYTHONIOENCODING=encoding, PYTHONUTF8="0")
+        assert (status, out, "Traceback" in err) == (1, "", False)
+        assert r"\u674e.blend" in err
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"]])

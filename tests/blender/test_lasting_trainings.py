@@ -82,6 +82,22 @@ def test_one_that_is_followed_can_be_cancelled(elbow, tmp_path):
         training.cancel()
         assert list(messages)[-1].type is MessageType.CANCELLED
     assert not model.exists() and not lasting.is_known(model)
+    assert list((tmp_path / "user" / "trainings").iterdir()) == []
+
+
+def test_one_that_died_says_why_to_another_blender(tmp_path):
+    record = lasting._Record(tmp_path / "m.onnx")
+    with record.new_messages(), record.new_errors() as errors:
+        errors.write("Traceback\nImportError: Jürgen 李\n")
+    record.name(1)
+    with (
+        lasting.FollowedTraining(tmp_path / "m.onnx") as training,
+        pytest.raises(
+            TrainingError, match=r"The trainer ended before it was done \(ImportError: Jürgen 李\); no model"
+        ),
+    ):
+        list(training.messages())
+    assert not lasting.is_known(tmp_path / "m.onnx")
 
 
 def test_one_that_is_not_left_ends_with_its_block(elbow, tmp_path):

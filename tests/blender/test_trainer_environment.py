@@ -21,6 +21,7 @@ from fdda_addon.training.environment.creation import Creation
 from fdda_addon.training.environment.folder import FolderState
 
 from .conftest import run
+from .stand_ins import program
 from .tiny_wheels import pinned, write_wheel, write_wheels
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -174,13 +175,16 @@ def test_a_full_disk_is_noticed_before(user: Path, own: Path, monkeypatch: pytes
 
 
 def test_a_python_that_cannot_make_one(user: Path, wheels: Path, tmp_path: Path):
-    broken = tmp_path / "python"
-    broken.write_text(
-        f'#!/bin/sh\nif [ "$2" = -c ]; then "{sys.executable}" "$@" | sed "s|{sys.executable}|$0|"; exit; fi\n'
-        "echo 'Error: no room for it'; exit 1\n"
+    said = [sys.version_info[:2], True, []]
+    broken = program(
+        tmp_path / "python",
+        "if '-c' in sys.argv:",
+        f"    print(json.dumps([*{said!r}, {str(tmp_path / 'python')!r} + '.cmd' * (os.name == 'nt')]))",
+        "else:",
+        "    print('Error: no room for it')",
+        "    sys.exit(1)",
     )
-    broken.chmod(0o755)
-    text = refused(bpy.ops.fdda.create_trainer_environment, python=str(broken), wheels=str(wheels))
+    text = refused(bpy.ops.fdda.create_trainer_environment, python=broken, wheels=str(wheels))
     assert "can make the trainer environment" in text and "Error: no room for it" in text and "install Python 3" in text
     assert "'/none/python' is no Python that runs; " in refused(
         bpy.ops.fdda.create_trainer_environment, python="/none/python", wheels=str(wheels)
@@ -271,7 +275,7 @@ def test_an_environment_whose_python_is_gone(own: Path, elbow, tmp_path: Path, c
 
 
 def test_an_environment_whose_torch_is_gone(own: Path):
-    shutil.rmtree(next(own.rglob("site-packages/torch")))
+    shutil.rmtree(own / "torch")
     text = refused(bpy.ops.fdda.check_trainer)
     assert text.endswith("lacks torch; create the trainer environment again, in the add-on's preferences.")
     assert session.answer.level == "ERROR" and "torch is missing" in session.answer.details

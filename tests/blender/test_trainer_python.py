@@ -3,30 +3,26 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from fdda_addon.training.environment import bases, check
+from fdda_addon.core.errors import TrainerEnvironmentError
+from fdda_addon.training.environment import bases, check, creation
 from fdda_addon.training.environment.answer import Answer
 from fdda_addon.training.environment.bases import ask, find_bases
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
-from fdda_addon.training.environment.folder import MARK, PACKAGES
+from fdda_addon.training.environment.folder import MARK, PACKAGES, missing_letters, python_in
 
 from .conftest import run
+from .stand_ins import program
 from .tiny_wheels import TORCH
 
 ROOT = Path(__file__).resolve().parents[2]
 ADVICE = "do this"
-
-
-def script(path: Path, *lines: str) -> str:
-    """A program in place of a Python."""
-    path.write_text("\n".join(["#!/bin/sh", *lines, ""]))
-    path.chmod(0o755)
-    return str(path)
 
 
 def asked(python: object) -> Answer:
@@ -58,9 +54,10 @@ def test_the_command_line_says_it_too(packages: Path, monkeypatch: pytest.Monkey
     assert capfd.readouterr().out.splitlines()[-1].startswith("Ready to train on the processor: ")
     monkeypatch.setenv(PYTHON_VARIABLE, "/none/python")
     assert run("check-trainer") == 1
-    assert capfd.readouterr().err == (
-        "Error: The trainer's Python '/none/python' cannot be started (No such file or directory); set "
-        "FDDA_TRAINER_PYTHON to a Python that has torch.\n"
+    assert re.fullmatch(
+        r"Error: The trainer's Python '/none/python' cannot be started \(No such file or directory.*\); set "
+        r"FDDA_TRAINER_PYTHON to a Python that has torch\.\n",
+        capfd.readouterr().err,
     )
 
 
@@ -99,37 +96,41 @@ def test_a_package_is_broken(packages: Path):
 
 def test_an_old_python(tmp_path: Path):
     said = json.dumps({"version": [3, 9, 18], "packages": {}, "broken": {}})
-    answer = asked(script(tmp_path / "python3.9", f"echo '{said}'"))
-    assert answer.message == f"'{tmp_path}/python3.9' is Python 3.9.18, and the trainer needs 3.11 or later; do this."
+    python = program(tmp_path / "python3.9", f"print({said!r})")
+    assert asked(python).message == f"'{python}' is Python 3.9.18, and the trainer needs 3.11 or later; do this."
 
 
 def test_it_is_not_there():
-    assert asked("/none/python").message == (
-        "The trainer's Python '/none/python' cannot be started (No such file or directory); do this."
-    )
+    sentence = r"The trainer's Python '/none/python' cannot be started \(No such file or directory.*\); do this\."
+    assert re.fullmatch(sentence, asked("/none/python").message)
 
 
-@pytest.mark.parametrize("lines", [["exit 0"], ["echo hello"], ["echo 5"], ["echo '{}'"], ["echo '{\"version\": 3}'"]])
-def test_it_is_no_python(tmp_path: Path, lines: list[str]):
-    answer = asked(script(tmp_path / "program", *lines))
+@pytest.mark.parametrize("said", ["", "hello", "5", "{}", '{"version": 3}'])
+def test_it_is_no_python(tmp_path: Path, said: str):
+    python = program(tmp_path / "program", f"print({said!r})")
+    answer = asked(python)
     assert answer.level == "ERROR"
-    assert answer.message.startswith(f"'{tmp_path}/program' does not answer as a Python does (status 0); do this.")
+    assert answer.message.startswith(f"'{python}' does not answer as a Python does (status 0); do this.")
 
 
 def test_it_says_why_it_fails(tmp_path: Path):
-    answer = asked(script(tmp_path / "program", "echo 'wrong machine' >&2; exit 1"))
-    assert "(wrong machine)" in answer.message
+    answer = asked(program(tmp_path / "program", "sys.exit('wrong machine of Jürgen 李')"))
+    assert "(wrong machine of Jürgen 李)" in answer.message
+    answer = asked(program(tmp_path / "crashes", "import faulthandler", "faulthandler._read_null()"))
+    assert ("(crashed: access violation" if os.name == "nt" else "(was ended by signal 11") in answer.message
 
 
 def test_it_never_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(check, "TIMEOUT_SECONDS", 0.5)
-    assert asked(script(tmp_path / "program", "exec sleep 60")).message.endswith("did not answer in 0 s; do this.")
+    assert asked(program(tmp_path / "program", "time.sleep(5)")).message.endswith("did not answer in 0 s; do this.")
 
 
 def test_a_base_is_run_and_not_just_found(tmp_path: Path):
-    shim = script(tmp_path / "python3.13", "echo 'this version is not selected' >&2; exit 127")
-    hangs = script(tmp_path / "hangs", "exit 0")
-    real = script(tmp_path / "real", f'exec "{sys.executable}" "$@"')
+    shim = program(tmp_path / "python3.13", "sys.exit('this version is not selected')")
+    hangs = program(tmp_path / "hangs")
+    python, real = sys.executable, sys.executable
+    if os.name != "nt":
+        real = program(tmp_path / "real", f"os.execv({python!r}, [{python!r}, *sys.argv[1:]])")
     found = list(find_bases(iter([[shim], [hangs], ["/none"], [real], [sys.executable]])))
     assert [(base.path, base.version, base.lacks) for base in found] == [(sys.executable, sys.version_info[:2], "")]
 
@@ -143,7 +144,7 @@ def test_a_base_is_run_and_not_just_found(tmp_path: Path):
     ],
 )
 def test_what_a_base_lacks(tmp_path: Path, answer: list, lacks: str):
-    base = ask([script(tmp_path / "python", f"echo '{json.dumps(answer)}'")])
+    base = ask([program(tmp_path / "python", f"print({json.dumps(answer)!r})")])
     assert base.lacks == lacks and str(base) == f"'/p' (Python {answer[0][0]}.{answer[0][1]})"
 
 
@@ -154,11 +155,105 @@ def test_blenders_own_python_is_the_first(monkeypatch: pytest.MonkeyPatch):
 
 def test_a_training_without_blenders_program_finds_the_environment_that_blender_made(tmp_path: Path):
     own = tmp_path / "datafiles" / "fdda" / "trainer"
-    (own / "bin").mkdir(parents=True)
+    python = python_in(own)
+    python.parent.mkdir(parents=True)
     (own / MARK).write_text("made with other versions\n")
-    script(own / "bin" / "python", "echo the own environment")
+    python.write_text("no program")
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path), "PYTHONPATH": str(ROOT)}
     environment.pop(PYTHON_VARIABLE, None)
-    command = [sys.executable, "-m", "fdda_addon", "train", "--help"]
+    command = [sys.executable, "-m", "fdda_addon", "check-trainer"]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.stdout.startswith("the own environment\n"), done.stderr
+    assert done.stderr.startswith(f"Error: The trainer's Python '{python}' cannot be started ("), done.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "is_runtime"),
+    [
+        ("ImportError('DLL load failed while importing onnxruntime_pybind11_state: Le module est introuvable.')", True),
+        ("OSError('[WinError 126] Das angegebene Modul wurde nicht gefunden. Error loading \"c10.dll\"')", True),
+        ("OSError('libtorch.so: cannot open shared object file')", False),
+    ],
+)
+def test_a_missing_runtime_of_windows_is_named(packages: Path, error: str, is_runtime: bool):
+    (packages / "torch/__init__.py").write_text(f"raise {error}\n")
+    advice = "install Microsoft's Visual C++ runtime from https://aka.ms/vs/17/release/vc_redist."
+    assert (advice in asked(sys.executable).message) is is_runtime
+
+
+@pytest.fixture
+def windows_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folders as Windows has them, with Pythons of every kind."""
+    names = {
+        "LOCALAPPDATA": "Local",
+        "APPDATA": "Roaming",
+        "ProgramFiles": "Program Files",
+        "ProgramW6432": "Program Files",
+        "SYSTEMDRIVE": "C",
+        "PYENV_ROOT": "pyenv-win",
+    }
+    for variable, name in names.items():
+        monkeypatch.setenv(variable, str(tmp_path / name))
+    monkeypatch.delenv("UV_PYTHON_INSTALL_DIR", raising=False)
+    monkeypatch.setattr(bases, "_registered", lambda version: iter([tmp_path / f"of_registry/{version}/python.exe"]))
+    monkeypatch.setenv(
+        "PATH", os.pathsep.join(str(tmp_path / name) for name in ("Local/Microsoft/WindowsApps", "path"))
+    )
+    for name in (
+        "of_registry/3.13/python.exe",
+        "Local/Programs/Python/Python313/python.exe",
+        "Program Files/Python311/python.exe",
+        "Roaming/uv/python/cpython-3.12.9-windows-x86_64-none/python.exe",
+        "pyenv-win/versions/3.11.9/python.exe",
+        "Local/Microsoft/WindowsApps/python.exe",
+        "Local/Microsoft/WindowsApps/python3.13.exe",
+        "path/python.exe",
+        "path/py.exe",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    return tmp_path
+
+
+def test_pythons_of_windows_are_looked_for(windows_folders: Path):
+    """Of python.org for one and for all, the launcher, uv and pyenv-win; never the Store's, which opens the shop."""
+    found = [(Path(path).relative_to(windows_folders).as_posix(), *rest) for path, *rest in bases._windows_candidates()]
+    assert found == [
+        ("of_registry/3.13/python.exe",),
+        ("Local/Programs/Python/Python313/python.exe",),
+        ("path/py.exe", "-3.13"),
+        ("Program Files/Python311/python.exe",),
+        ("pyenv-win/versions/3.11.9/python.exe",),
+        ("path/py.exe", "-3.11"),
+        ("Roaming/uv/python/cpython-3.12.9-windows-x86_64-none/python.exe",),
+        ("path/py.exe", "-3.12"),
+        ("path/python.exe",),
+    ]
+
+
+@pytest.mark.skipif(os.name != "nt", reason="the registry is Windows'")
+def test_a_python_of_the_registry_is_found(tmp_path: Path):
+    import winreg
+
+    key = r"Software\Python\FDDATest"
+    with winreg.CreateKey(winreg.HKEY_CURRENT_USER, rf"{key}\3.13-64\InstallPath") as opened:
+        winreg.SetValue(opened, "", winreg.REG_SZ, str(tmp_path))
+    try:
+        assert tmp_path / "python.exe" in bases._registered("3.13") and not [*bases._registered("3.1")]
+    finally:
+        for name in (rf"{key}\3.13-64\InstallPath", rf"{key}\3.13-64", key):
+            winreg.DeleteKey(winreg.HKEY_CURRENT_USER, name)
+
+
+def test_paths_that_are_too_long_for_windows_are_noticed_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    extension = r"AppData\Roaming\Blender Foundation\Blender\5.2\extensions\.user\user_default\fdda\trainer"
+    temporary = r"AppData\Local\Temp\fdda-12345678"
+
+    def missing(name: str) -> int:
+        return missing_letters(*(Path(rf"C:\Users\{name}\{rest}") for rest in (extension, temporary)))
+
+    assert [missing(letters * "x") for letters in (15, 33, 34, 60)] == [0, 0, 1, 27]
+    monkeypatch.setattr(creation, "has_path_limit", lambda: True)
+    monkeypatch.setattr(creation, "missing_letters", lambda *_: 7)
+    with pytest.raises(TrainerEnvironmentError, match=r"would be 7 letters too long for Windows; allow long paths \("):
+        list(creation.Creation(tmp_path / "trainer", tmp_path / "log").steps())
+    assert not (tmp_path / "trainer").exists()

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The command line of the trainer: messages, exit statuses, and what is left behind when it does not finish."""
 
+import errno
 import json
-import resource
+import os
 import shutil
 import signal
 import subprocess
@@ -11,8 +12,10 @@ import sys
 import numpy as np
 import pytest
 
-from fdda_addon.core.messages import Message, MessageType
+from fdda_addon.core.messages import STOP_FILE_VARIABLE, Message, MessageType
 from trainer.__main__ import main
+from trainer.announcements import MessageLines
+from trainer.process import run_announced
 
 from .chain import write_chain
 from .conftest import QUICK, REPOSITORY, start_trainer
@@ -135,6 +138,8 @@ def test_a_full_disk_leaves_nothing(recording, trained, tmp_path, limit):
         sizes = sorted(path.stat().st_size for path in trained.iterdir())
         limit = (sizes[-2] + sizes[-1]) // 2
 
+    resource = pytest.importorskip("resource")
+
     def small_files() -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
@@ -151,19 +156,59 @@ def test_a_full_disk_leaves_nothing(recording, trained, tmp_path, limit):
     assert (tmp_path / "m.onnx").read_bytes() == old
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_cancels_and_leaves_nothing(recording, tmp_path, number):
-    process = start_trainer(recording, tmp_path / "m.onnx", "--epochs", "100000", "--messages")
+@pytest.mark.parametrize("request_", ["file", *(("SIGTERM", "SIGINT", "SIGHUP") if os.name == "posix" else ())])
+def test_a_request_to_stop_leaves_nothing(recording, tmp_path, monkeypatch, request_):
+    stop_file, folder = tmp_path / "stop", tmp_path / "models"
+    folder.mkdir()
+    monkeypatch.setenv(STOP_FILE_VARIABLE, str(stop_file))
+    process = start_trainer(recording, folder / "m.onnx", "--epochs", "100000", "--messages")
     lines = []
     for line in process.stdout:
         lines.append(line)
         if len(lines) == 5:
-            process.send_signal(number)
+            stop_file.touch() if request_ == "file" else process.send_signal(getattr(signal, request_))
     process.wait(timeout=30)
     assert process.returncode == 130, process.stderr.read()
     messages = decode("".join(lines))
     assert messages[-1] == Message(MessageType.CANCELLED)
+    assert list(folder.iterdir()) == []
+
+
+def test_a_request_that_was_there_first(recording, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv(STOP_FILE_VARIABLE, str(recording))
+    assert main([str(recording), str(tmp_path / "m.onnx"), "--messages"]) == 130
+    assert decode(capsys.readouterr().out)[-1] == Message(MessageType.CANCELLED)
     assert list(tmp_path.iterdir()) == []
+
+
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "x")
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "text"),
+    [
+        (FULL, 75, f"'x': {FULL.strerror}; make room, end other programs, or try again."),
+        (OSError(errno.EIO, "Input/output error"), 75, "Input/output error; make room, end other"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), 75, "The training lacks memory ("),
+        (MemoryError(), 75, "The training lacks memory ("),
+        (RuntimeError("DefaultCPUAllocator: not enough memory: you tried"), 75, "The training lacks memory ("),
+        (
+            ImportError("DLL load failed while importing _C: …"),
+            1,
+            "runtime from https://aka.ms/vs/17/release/vc_redist.",
+        ),
+        (KeyError("x"), 1, "The trainer stopped on an error of its own (KeyError('x')); please report it."),
+    ],
+)
+def test_errors_that_end_the_work(error, status, text, capsys):
+    def work():
+        raise error
+
+    assert run_announced(work, MessageLines()) == status
+    out, err = capsys.readouterr()
+    values = Message.decode(out).values
+    assert text in values["text"] and values.get("try_again", False) is (status == 75)
+    assert err.splitlines()[-1] == values["text"]
 
 
 def test_missing_torch_says_what_to_install(recording, tmp_path):

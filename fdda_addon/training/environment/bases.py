@@ -5,20 +5,24 @@ A name proves nothing: it may start a version manager's shim for a Python that w
 venv module. So every candidate is run.
 """
 
+import contextlib
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from .check import hidden
 from .folder import PINS
+from .subprocesses import clean_environment, hidden
 
 TIMEOUT_SECONDS = 30.0
 # Newest first, but those that Blender itself has before the one between.
 VERSIONS = ("3.13", "3.11", "3.12")
+NO_DOWNLOADS = {"PYTHON_MANAGER_AUTOMATIC_INSTALL": "false"}
+"""Keeps the launcher `py` from installing a Python that it does not find."""
 
 _QUESTION = """
 import json, sys
@@ -66,7 +70,7 @@ def ask(command: list[str]) -> BasePython | None:
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=TIMEOUT_SECONDS,
-            env=clean_environment(),
+            env=clean_environment() | NO_DOWNLOADS,
             check=True,
             **hidden(),
         )
@@ -88,10 +92,11 @@ def usual_candidates() -> Iterator[list[str]]:
     """Command lines that may start a Python: Blender's own, those on the path, those of installers."""
     if sys.executable:
         yield [sys.executable]
-    for version in VERSIONS:
-        yield [f"python{version}"]
-        if os.name == "nt":
-            yield ["py", f"-{version}"]
+    yield from _windows_candidates() if os.name == "nt" else _unix_candidates()
+
+
+def _unix_candidates() -> Iterator[list[str]]:
+    yield from ([f"python{version}"] for version in VERSIONS)
     # On macOS the name in /usr/bin asks to install the developer tools.
     if sys.platform != "darwin":
         yield from (["python3"], ["python"])
@@ -109,7 +114,73 @@ def usual_candidates() -> Iterator[list[str]]:
                 yield [str(place)]
 
 
-def clean_environment() -> dict[str, str]:
-    """This process's environment without what would lead another Python to wrong modules."""
-    wrong = {"PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP", "VIRTUAL_ENV", "__PYVENV_LAUNCHER__"}
-    return {name: value for name, value in os.environ.items() if name not in wrong}
+def _windows_candidates() -> Iterator[list[str]]:
+    """Those that the registry lists, of the launcher, of python.org, uv and pyenv-win in their folders, on the path."""
+    home = Path.home()
+    local = Path(os.environ.get("LOCALAPPDATA") or home / "AppData/Local")
+    roaming = Path(os.environ.get("APPDATA") or home / "AppData/Roaming")
+    programs = dict.fromkeys(
+        Path(folder) for name in ("ProgramFiles", "ProgramW6432") if (folder := os.environ.get(name))
+    )
+    drive = Path(os.environ.get("SYSTEMDRIVE", "C:") + "/")
+    pyenv = Path(os.environ.get("PYENV_ROOT") or os.environ.get("PYENV") or home / ".pyenv/pyenv-win")
+    uv = [roaming / "uv/python", roaming / "uv/data/python"]
+    if folder := os.environ.get("UV_PYTHON_INSTALL_DIR"):
+        uv.insert(0, Path(folder))
+    for version in VERSIONS:
+        digits = version.replace(".", "")
+        for place in (
+            *_registered(version),
+            *(folder / f"Python{digits}/python.exe" for folder in (local / "Programs/Python", *programs, drive)),
+            local / f"Python/pythoncore-{version}-64/python.exe",
+            *(place for folder in uv for place in sorted(folder.glob(f"cpython-{version}.*/python.exe"))),
+            *sorted(pyenv.glob(f"versions/{version}.*/python.exe")),
+        ):
+            if place.is_file() and not _is_of_store(place):
+                yield [str(place)]
+        if launcher := _on_path("py.exe"):
+            yield [launcher, f"-{version}"]
+    for name in (*(f"python{version}.exe" for version in VERSIONS), "python3.exe", "python.exe"):
+        if found := _on_path(name):
+            yield [found]
+
+
+def _registered(version: str) -> Iterator[Path]:
+    """Pythons of a version that installers have registered (PEP 514), of python.org and of others."""
+    import winreg
+
+    for root in (winreg.HKEY_CURRENT_USER, winreg.HKEY_LOCAL_MACHINE):
+        for company in _subkeys(root, r"Software\Python"):
+            for tag in _subkeys(root, rf"Software\Python\{company}"):
+                if not re.match(rf"\D*{re.escape(version)}(?!\d)", tag):
+                    continue
+                with contextlib.suppress(OSError):
+                    folder = winreg.QueryValue(root, rf"Software\Python\{company}\{tag}\InstallPath")
+                    yield Path(folder) / "python.exe"
+
+
+def _subkeys(root: int, key: str) -> list[str]:
+    import winreg
+
+    try:
+        with winreg.OpenKey(root, key) as opened:
+            return [winreg.EnumKey(opened, number) for number in range(winreg.QueryInfoKey(opened)[0])]
+    except OSError:
+        return []
+
+
+def _on_path(name: str) -> str:
+    """The program of a name on the path, empty for none. Windows itself would look in the current folder first."""
+    for folder in map(Path, filter(None, os.environ.get("PATH", "").split(os.pathsep))):
+        place = folder / name
+        if folder.is_absolute() and place.is_file() and not _is_of_store(place):
+            return str(place)
+    return ""
+
+
+def _is_of_store(place: Path) -> bool:
+    """Whether a program is Microsoft Store's. Its python.exe opens the shop where no Python is installed.
+
+    One that is installed keeps to itself what it writes to AppData, and with it the environment that it makes there.
+    """
+    return "windowsapps" in (part.lower() for part in place.parts)

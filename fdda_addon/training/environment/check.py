@@ -6,8 +6,11 @@ import os
 import subprocess
 
 from ...core.errors import os_reason
+from ...core.native_library import runtime_advice
+from ..endings import explain_status
 from .answer import Answer
 from .folder import PACKAGES, ROOT
+from .subprocesses import UTF8_OUTPUT, hidden
 
 OLDEST = (3, 11)
 TIMEOUT_SECONDS = 180.0
@@ -51,6 +54,7 @@ def check(python: str, advice: str) -> Answer:
             capture_output=True,
             timeout=TIMEOUT_SECONDS,
             cwd=ROOT,
+            env={**os.environ, **UTF8_OUTPUT},
             check=False,
             **hidden(),
         )
@@ -64,13 +68,10 @@ def check(python: str, advice: str) -> Answer:
         return _judge(python, answer, advice)
     except (IndexError, ValueError, TypeError, KeyError):
         text = result.stderr.decode("utf-8", "replace").strip().splitlines()
-        reason = text[-1].strip() if text else f"status {result.returncode}"
+        ending = explain_status(result.returncode, is_silent=True)
+        reason = ending.text if ending.is_machines else f"status {result.returncode}"
+        reason = text[-1].strip() if text else reason
         return Answer("ERROR", f"'{python}' does not answer as a Python does ({reason}); {advice}.")
-
-
-def hidden() -> dict:
-    """Options of `subprocess` that keep a console window from opening."""
-    return {"creationflags": subprocess.CREATE_NO_WINDOW} if os.name == "nt" else {}
 
 
 def _judge(python: str, answer: dict, advice: str) -> Answer:
@@ -88,6 +89,7 @@ def _judge(python: str, answer: dict, advice: str) -> Answer:
         return Answer("ERROR", f"'{python}' (Python {version}) lacks {names}; {advice}.", tuple(details))
     if broken:
         name, reason = next(iter(broken.items()))
+        advice = runtime_advice(reason) or advice
         return Answer("ERROR", f"{name} of '{python}' cannot be imported ({reason}); {advice}.", tuple(details))
     device = answer["device"]
     details.append(f"Device: {'the processor' if device == 'cpu' else f'{device} (CUDA)'}")

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,12 +17,25 @@ from typing import IO
 from ...core.errors import TrainerEnvironmentError, os_reason
 from ...core.progress import Progress
 from .answer import Answer
-from .bases import BasePython, ask, clean_environment, find_bases
-from .check import check, hidden
-from .folder import PACKAGES, claimed, pins, python_in, remove, write_mark
+from .bases import BasePython, ask, find_bases
+from .check import check
+from .folder import (
+    PACKAGES,
+    claimed,
+    has_path_limit,
+    missing_letters,
+    pins,
+    python_in,
+    remove,
+    site_packages,
+    write_mark,
+)
+from .subprocesses import clean_environment, hidden
 
 NEEDED_GB = 9 if sys.platform.startswith("linux") else 2
 """Free space to begin with: the packages and the downloads, which lie there at the same time. On Linux with CUDA."""
+TEMPORARY = "fdda-12345678"
+"""Such is the name of the folder for temporary files on Windows."""
 PIP_WITH_RAW_PROGRESS = (24, 1)
 
 
@@ -89,6 +103,12 @@ class Creation:
                 _end(self._process)
 
     def _check_source(self) -> None:
+        if has_path_limit() and (letters := missing_letters(self.folder, Path(tempfile.gettempdir(), TEMPORARY))):
+            raise TrainerEnvironmentError(
+                f"Paths in the trainer environment '{self.folder}' would be {letters} letters too long for Windows; "
+                "allow long paths (https://pip.pypa.io/warnings/enable-long-paths), or choose an existing Python that "
+                "has torch."
+            )
         if self.wheels is None:
             free = shutil.disk_usage(self.folder.parent).free / 1e9
             if free < NEEDED_GB:
@@ -148,10 +168,29 @@ class Creation:
         )
 
     def _install(self, base: BasePython, log: IO[str]) -> Iterator[Progress]:
-        temporary = self.folder / "temporary"
-        temporary.mkdir()
+        with self._temporary() as temporary:
+            yield from self._install_with(temporary, base, log)
+
+    @contextmanager
+    def _temporary(self) -> Iterator[Path]:
+        """A folder for gigabytes, more than a /tmp in memory holds. On Windows a short path counts for more."""
+        if os.name == "nt":
+            path = Path(tempfile.mkdtemp(prefix=TEMPORARY[:-8]))
+        else:
+            path = self.folder / "temporary"
+            path.mkdir()
+        try:
+            yield path
+        finally:
+            shutil.rmtree(path, ignore_errors=True)
+
+    def _install_with(self, temporary: Path, base: BasePython, log: IO[str]) -> Iterator[Progress]:
+        packages = site_packages(self.folder, base.version)
+        # The folder itself, found through a .pth file: paths in site-packages would be 18 letters longer.
+        (packages / "fdda.pth").write_text(os.path.relpath(self.folder, packages) + "\n", encoding="ascii")
         pip = [str(python_in(self.folder)), "-I", "-m", "pip"]
         command = [*pip, "install", "--no-input", "--disable-pip-version-check", "--no-cache-dir"]
+        command += ["--target", str(self.folder)]
         command += ["--only-binary=:all:", "--constraint", str(pins(base.version)), *PACKAGES]
         if (yield from self._run([*pip, "--version"], log)) == 0:
             version = re.search(r"pip (\d+)\.(\d+)", "\n".join(self._last_lines))
@@ -165,7 +204,6 @@ class Creation:
             raise TrainerEnvironmentError(
                 f"The packages {what} could not be installed ({self._last_words()}); {then}; the log is '{self.log}'."
             )
-        shutil.rmtree(temporary, ignore_errors=True)
 
     def _pip_environment(self, temporary: Path) -> dict[str, str]:
         environment = clean_environment()
@@ -173,7 +211,6 @@ class Creation:
             # That folder and no other: pip's settings may name more.
             environment = {name: value for name, value in environment.items() if not name.startswith("PIP_")}
             environment["PIP_CONFIG_FILE"] = os.devnull
-        # Gigabytes, more than a /tmp in memory holds; what is killed leaves them, to be removed with the rest.
         return environment | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
 
     def _check(self, log: IO[str]) -> Answer:
@@ -198,8 +235,7 @@ class Creation:
                     stderr=subprocess.STDOUT,
                     env=environment or clean_environment(),
                     cwd=self.folder.parent,
-                    start_new_session=True,
-                    **hidden(),
+                    **hidden(own_session=True),
                 )
             except OSError as error:
                 self._last_lines.append(str(error))
@@ -256,6 +292,8 @@ def _end(process: subprocess.Popen) -> None:
     if process.poll() is not None:
         return
     if os.name == "nt":
+        # The module venv starts a Python of its own, which would go on.
+        subprocess.run(["taskkill", "/F", "/T", "/PID", str(process.pid)], capture_output=True, check=False, **hidden())
         process.kill()
     else:
         os.killpg(process.pid, signal.SIGKILL)

@@ -7,6 +7,7 @@ leaves the folder alone when it updates the extension and removes it when it uni
 
 import enum
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +19,15 @@ EXTENSION = __package__.rpartition(".fdda_addon")[0]
 PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "scipy", "matplotlib")
 """What the trainer imports."""
 MARK = "fdda-complete"
+MAX_PATH = 259
+"""Letters of a path on Windows, unless the registry allows longer ones."""
+LONGEST_PATH = 126
+"""Letters of the longest path in the wheels for Windows: a license in the dist-info of torch 2.15.0.
+
+In the folder where they are installed: `find . -printf '%P\\n' | awk '{print length}' | sort -n | tail -1`.
+"""
+PIP_TARGET = "/pip-target-12345678/lib/python"
+"""Where pip first puts the packages in the folder for temporary files."""
 ROOT = Path(__file__).parents[3]
 """What holds the packages `fdda_addon` and `trainer`: the checkout, or the installed extension."""
 REQUIREMENTS = ROOT / "requirements"
@@ -52,8 +62,35 @@ def user_folder() -> Path:
 
 
 def own_folder() -> Path:
-    """The folder of the environment. A short name: on Windows the paths inside torch are nearly too long as it is."""
+    """The folder of the environment. Blender removes it with the extension, so it lies nowhere else.
+
+    On Windows it has 91 letters beside the name of the user's folder, which may have 33: see `LONGEST_PATH`.
+    """
     return user_folder() / "trainer"
+
+
+def missing_letters(folder: Path, temporary: Path) -> int:
+    """How many letters the paths of an environment would be too long for Windows, 0 for none.
+
+    Args:
+        folder: of the environment.
+        temporary: the folder for temporary files while it is made.
+    """
+    longest = max(len(str(folder)), len(str(temporary)) + len(PIP_TARGET)) + 1 + LONGEST_PATH
+    return max(0, longest - MAX_PATH)
+
+
+def has_path_limit() -> bool:
+    """Whether this system refuses paths of more than `MAX_PATH` letters."""
+    if os.name != "nt":
+        return False
+    import winreg
+
+    try:
+        with winreg.OpenKey(winreg.HKEY_LOCAL_MACHINE, r"SYSTEM\CurrentControlSet\Control\FileSystem") as key:
+            return winreg.QueryValueEx(key, "LongPathsEnabled")[0] != 1
+    except OSError:
+        return True
 
 
 def log_path() -> Path:
@@ -62,8 +99,16 @@ def log_path() -> Path:
 
 
 def python_in(folder: Path) -> Path:
-    """The interpreter of a virtual environment."""
-    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    """The interpreter of a virtual environment, or of one of conda's, which has it elsewhere on Windows."""
+    if os.name != "nt":
+        return folder / "bin/python"
+    of_conda, python = folder / "python.exe", folder / "Scripts/python.exe"
+    return of_conda if of_conda.is_file() and not python.is_file() else python
+
+
+def site_packages(folder: Path, version: tuple[int, int]) -> Path:
+    """The folder of a virtual environment that its Python of a version imports from."""
+    return folder / ("Lib" if os.name == "nt" else f"lib/python{version[0]}.{version[1]}") / "site-packages"
 
 
 def pins(version: tuple[int, int]) -> Path:
@@ -114,6 +159,12 @@ def remove(folder: Path) -> None:
 
     try:
         (folder / MARK).unlink(missing_ok=True)
+        # On Windows a virus scanner may hold what was just written.
+        for pause in (0.2, 1, 3) if os.name == "nt" else ():
+            shutil.rmtree(folder, ignore_errors=True)
+            if not folder.is_dir():
+                return
+            time.sleep(pause)
         if folder.is_dir():
             shutil.rmtree(folder)
     except OSError as error:

@@ -1,0 +1,23 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Recognizes that a package cannot be imported since Windows lacks Microsoft's Visual C++ runtime."""
+
+import platform
+import re
+
+_LOAD_ERROR = re.compile(r"DLL load failed|WinError 126\b|WinError 127\b", re.IGNORECASE)
+"""Python's own words and numbers; the rest of such a text is in the language of Windows."""
+
+
+def runtime_advice(error_text: str) -> str:
+    """Advise on a failed import, as the end of a sentence without its period; empty where no DLL is missing.
+
+    Args:
+        error_text: of the exception that the import raised.
+    """
+    return f"install Microsoft's Visual C++ runtime from {runtime_url()}" if _LOAD_ERROR.search(error_text) else ""
+
+
+def runtime_url() -> str:
+    """Return Microsoft's permanent address of the runtime for this processor."""
+    processor = "arm64" if platform.machine().lower() in ("arm64", "aarch64") else "x64"
+    return f"https://aka.ms/vs/17/release/vc_redist.{processor}.exe"

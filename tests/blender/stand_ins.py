@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Programs that do as a test says in place of a Python or of the trainer, on every system."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from fdda_addon.core.messages import Message, MessageType
+from fdda_addon.training.environment.choice import PYTHON_VARIABLE
+
+_HIJACK = """
+import sys
+if "trainer" in sys.orig_argv:
+    import os, signal, time
+    try:
+{code}
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+"""
+
+
+def stand_in_trainer(folder: Path, monkeypatch: pytest.MonkeyPatch, *lines: str, status: int = 0) -> None:
+    """Have this Python run lines in place of the trainer, and exit with a status."""
+    packages = folder / "packages"
+    packages.mkdir()
+    code = "\n".join(f"        {line}" for line in (f"status = {status}", *lines))
+    (packages / "sitecustomize.py").write_text(_HIJACK.format(code=code), encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(packages))
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    monkeypatch.setenv(PYTHON_VARIABLE, sys.executable)
+
+
+def say(kind: MessageType, **values) -> str:
+    """The line of code that says a message."""
+    return f"print({Message(kind, values).encode()!r}, flush=True)"
+
+
+def program(path: Path, *lines: str) -> str:
+    """A program in place of a Python, which runs lines; returns its path."""
+    script = path.with_name(f"{path.name}.py")
+    script.write_text("\n".join(["import json, os, subprocess, sys, time", *lines, ""]), encoding="utf-8")
+    if os.name == "nt":
+        path = path.with_name(f"{path.name}.cmd")
+        path.write_text(f'@"{sys.executable}" "{script}" %*\n', encoding="utf-8")
+    else:
+        path.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{script}" "$@"\n', encoding="utf-8")
+        path.chmod(0o755)
+    return str(path)
