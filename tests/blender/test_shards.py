@@ -167,7 +167,7 @@ def test_influences_of_something_else_are_refused(elbow, tmp_path, capfd):
     of_shard = ("record", elbow.rig, tmp_path / "s", "--shard", "1/2", "--influences")
     text = refusal(*of_shard, found, "--poses", 11)
     assert "not those of this recording: they were found with other settings (sources, poses)." in text
-    assert "with another seed" in refusal(*of_shard, found, "--poses", 10, "--seed", 1)
+    assert "with other settings (seed)" in refusal(*of_shard, found, "--poses", 10, "--seed", 1)
     assert "'none' is not a recording" in refusal(*of_shard, tmp_path / "none").replace(f"{tmp_path}{os.sep}", "")
     other = saved(waving, tmp_path / "other.blend")
     text = refusal("record", other, tmp_path / "s", "--shard", "1/2", "--influences", found, "--poses", 10)
