@@ -23,6 +23,7 @@ FOLDERS = (
 )
 INSTALLED = {"node_modules", "dist"}
 """Folders of others, inside of ours."""
+NEW_PROCESS = ("Popen", "run", "call", "check_call", "check_output")
 SPDX = "# SPDX-License-Identifier: GPL-3.0-or-later"
 
 # Names that say nothing about what is inside: such a file grows without end.
@@ -79,3 +80,17 @@ def test_files_are_named_for_what_they_hold():
 
 def test_no_file_names_a_package_registry():
     assert [str(path) for path, text in text_files() if REGISTRY_HOST.search(text)] == []
+
+
+def test_processes_of_blender_open_no_console_window():
+    """`hidden` keeps Windows from it. A verb has a console already, and what it starts prints there."""
+    calls, bare = 0, []
+    for file in sorted((ROOT / "fdda_addon").rglob("*.py")):
+        if "cli" in file.parts:
+            continue
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in {f"subprocess.{n}" for n in NEW_PROCESS}:
+                calls += 1
+                if not any(k.arg is None and ast.unparse(k.value).startswith("hidden(") for k in node.keywords):
+                    bare.append(f"{file.relative_to(ROOT).as_posix()}:{node.lineno}")
+    assert calls > 4 and bare == []
