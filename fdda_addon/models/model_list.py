@@ -86,21 +86,26 @@ def bind_entry(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> None:
         FDDAError: as `bind`, or it cannot play; what was bound is bound again.
     """
     mesh_object = scene_rig.mesh_object
-    binding = mesh_object.fdda
-    previous = bound_entry(mesh_object)
-    mode, use_in_render = binding.mode, binding.use_in_render
-    path = entry_path(mesh_object, entry)
-    bind(scene_rig, path, use_in_render, entry.packed)
-    entry.path = binding.model = path_for(mesh_object, path)
-    binding.model_index = list(binding.models).index(entry)
+    _bind(scene_rig, entry_path(mesh_object, entry), entry.packed)
+    entry.path = mesh_object.fdda.model
+    mesh_object.fdda.model_index = list(mesh_object.fdda.models).index(entry)
+
+
+def _bind(scene_rig: SceneRig, path: Path, packed_model: bpy.types.Text | None = None) -> None:
+    """As `bind_entry`; the list is left as it is."""
+    mesh_object, binding = scene_rig.mesh_object, scene_rig.mesh_object.fdda
+    use_in_render = binding.use_in_render
+    before = (binding.model, binding.packed, binding.mode) if binding.is_bound else None
+    bind(scene_rig, path, use_in_render, packed_model)
     # Evaluated here, so that what cannot play is told now and not at the next frame.
     bpy.context.view_layer.update()
     if problem := binding.status:
+        is_other = before is not None and before[:2] != (binding.model, binding.packed)
         unbind(mesh_object)
-        if previous is not None and previous != entry:
-            bind(scene_rig, entry_path(mesh_object, previous), use_in_render, previous.packed)
-            binding.model = previous.path
-            binding.mode = mode
+        if is_other:
+            model, packed_before, mode = before
+            bind(scene_rig, absolute_path(mesh_object, model), use_in_render, packed_before)
+            binding.model, binding.mode = model, mode
         raise ModelError(problem)
 
 
@@ -108,16 +113,18 @@ def relink(scene_rig: SceneRig, path: Path) -> None:
     """Bind the file that the bound model has moved to; its entry in the list follows.
 
     Raises:
-        FDDAError: as `bind_entry`.
+        FDDAError: as `bind_entry`; the list is as before.
     """
     mesh_object = scene_rig.mesh_object
-    read_model(path)
     entry = bound_entry(mesh_object)
-    if entry is None:
-        entry = remember(mesh_object, path)
-    entry.path, entry.packed, entry.packed_bytes = path_for(mesh_object, path), None, 0
+    index = list(mesh_object.fdda.models).index(entry) if entry else -1
+    _bind(scene_rig, path)
     model_files.choose(path)
-    bind_entry(scene_rig, entry)
+    if index < 0:
+        remember(mesh_object, path)
+        return
+    entry, mesh_object.fdda.model_index = mesh_object.fdda.models[index], index
+    entry.path, entry.packed, entry.packed_bytes = mesh_object.fdda.model, None, 0
     packed.remove_unused()
 
 

@@ -300,7 +300,6 @@ class FDDA_OT_relink(OnModel, ChoosesModel, bpy.types.Operator):
         scene_rig = self.bound_rig(context)
         if not self.filepath:
             raise ModelError("No file was chosen; give the model's file.")
-        model_list.adopt(scene_rig.mesh_object)
         model_list.relink(scene_rig, self.path())
         said = pack_by_default(scene_rig.mesh_object, chosen_entry(scene_rig.mesh_object))
         return f"'{scene_rig.mesh_object.name}' plays {self.path()}.{said}"

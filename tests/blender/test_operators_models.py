@@ -86,6 +86,25 @@ def test_packed_model_plays_without_its_file(packed_elbow, elbow, tmp_path):
     assert bytes(packed.read(mesh_object.fdda.packed)) == elbow.model.read_bytes()
 
 
+def test_a_refused_find_model_changes_nothing(packed_elbow, elbow, tmp_path):
+    """The model of another rig, and a file that is none."""
+    other = tmp_path / "other.onnx"
+    shutil.copy(elbow.model, other)
+    (tmp_path / "none.onnx").write_bytes(b"no model")
+    entry = packed_elbow.fdda.models[0]
+    before = entry.name, entry.path, entry.packed, entry.packed_bytes, packed_elbow.fdda.model_index
+    paint_weight()
+    for name, words in (("other.onnx", "the skin weights differ"), ("none.onnx", "is not a model")):
+        refused(lambda name=name: bpy.ops.fdda.relink(filepath=str(tmp_path / name)), words)
+        (entry,) = packed_elbow.fdda.models
+        assert before == (entry.name, entry.path, entry.packed, entry.packed_bytes, packed_elbow.fdda.model_index)
+        assert packed_elbow.fdda.packed == entry.packed and packed_elbow.fdda.is_bound
+    # Of a model that is in no list, none is made.
+    packed_elbow.fdda.models.clear()
+    refused(lambda: bpy.ops.fdda.relink(filepath=str(other)), "the skin weights differ")
+    assert not packed_elbow.fdda.models and packed_elbow.fdda.is_bound
+
+
 def test_undo_with_a_packed_model(packed_elbow, elbow):
     bpy.ops.ed.undo_push(message="packed")
     pose(angle=0.9)
