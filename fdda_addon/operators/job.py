@@ -40,6 +40,9 @@ class JobOperator:
     title = ""
     borrows_scene = True
     """The job changes the scene and gives it back: meanwhile the user may look, but not touch, and ESC cancels."""
+    changes_file = False
+    """The job has changed what the .blend file keeps. Its end is then a step of Blender's undo, and marks the file as
+    changed, so that Blender asks before it closes the file."""
     ends_itself = False
     """`steps` watches `state.cancel_requested` and ends soon: for a process that takes its time to stop."""
 
@@ -162,6 +165,8 @@ class JobOperator:
     def _end(self) -> set[str]:
         """Report how the job ended; returns the operator's result."""
         state = self._run.state
+        if self.changes_file:
+            bpy.ops.ed.undo_push(message=self.title)
         self.report({state.outcome_level}, state.outcome)
         return {"FINISHED"} if state.outcome_level == "INFO" else {"CANCELLED"}
 

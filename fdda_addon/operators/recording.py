@@ -76,6 +76,8 @@ class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         rigs = self.rigs(context)
+        # The others take over the settings of the one that is shown.
+        self.changes_file = len(rigs) > 1
         if self.folder:
             self._paths = [Path(bpy.path.abspath(self.folder))]
         else:

@@ -103,6 +103,7 @@ class TrainsModels(OnRig):
         """Put what was trained into the lists of the meshes, as far as these are there still."""
         from ..models.model_list import remember
 
+        self.changes_file = bool(self.trained)
         for uid, model in self.trained:
             mesh_object = next((o for o in bpy.data.objects if o.session_uid == uid), None)
             if mesh_object is not None:

@@ -222,24 +222,24 @@ def unregister() -> None:
 
 
 def recording_folder(mesh_object: bpy.types.Object) -> Path:
-    """Where the character is recorded: the folder that it names, else NAME_recording beside the .blend file.
+    """Where the character is recorded: the folder that it names, else FILE_NAME_recording beside the .blend file.
 
     Raises:
         OutputError: it is to lie beside a file that has not been saved.
     """
-    name = bpy.path.clean_name(mesh_object.name)
+    name = _file_name(mesh_object)
     return _path(mesh_object.fdda.settings.recording, f"{name}_recording", "folder for the recording")
 
 
 def model_file(mesh_object: bpy.types.Object) -> Path:
-    """Where the character's model is written: the file that it names, else NAME_model/NAME.onnx beside the .blend file.
+    """Where the character's model is written: the file that it names, else FILE_NAME_model/FILE_NAME.onnx.
 
-    A folder of its own: the trainer writes its report beside the model.
+    That is beside the .blend file. A folder of its own: the trainer writes its report beside the model.
 
     Raises:
         OutputError: it is to lie beside a file that has not been saved.
     """
-    name = bpy.path.clean_name(mesh_object.name)
+    name = _file_name(mesh_object)
     return _path(mesh_object.fdda.settings.model, f"{name}_model/{name}.onnx", "file for the model")
 
 
@@ -250,6 +250,12 @@ def trained_file(mesh_object: bpy.types.Object) -> Path | None:
     except OutputError:
         return None
     return path if path.is_file() else None
+
+
+def _file_name(mesh_object: bpy.types.Object) -> str:
+    """Names of the .blend file and of the mesh in one: files of a folder may have meshes of the same name."""
+    file, name = Path(bpy.data.filepath).stem, mesh_object.name
+    return bpy.path.clean_name(name if name == file else f"{file}_{name}")
 
 
 def _path(stated: str, beside: str, what: str) -> Path:

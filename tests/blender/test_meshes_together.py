@@ -34,7 +34,7 @@ def test_recorded_trained_bound_switched_and_evaluated_in_one_go(two, tmp_path):
     assert bpy.ops.fdda.record(all_meshes=True) == {"FINISHED"}
     assert two[1].fdda.settings.poses == 30, "the other takes over how the first is recorded"
     assert bpy.ops.fdda.train(all_meshes=True) == {"FINISHED"}
-    assert job.state_of("train").outcome.startswith("Trained 'elbow.onnx' and 'elbow_001.onnx' in")
+    assert job.state_of("train").outcome.startswith("Trained 'two_elbow.onnx' and 'two_elbow_001.onnx' in")
     assert bpy.ops.fdda.bind(all_meshes=True) == {"FINISHED"}
     for mode in ("RIG", "LINEAR", "FDDA"):
         bpy.ops.fdda.switch(mode=mode, all_meshes=True)
@@ -50,7 +50,15 @@ def test_recorded_trained_bound_switched_and_evaluated_in_one_go(two, tmp_path):
 
 def test_one_button_records_trains_and_binds(two):
     bpy.context.view_layer.objects.active = two[0]
+    bpy.ops.ed.undo_push(message="before")
     assert bpy.ops.fdda.make_model() == {"FINISHED"}
+    assert bpy.data.is_dirty
+    # It is a step of its own: Blender marks the file as changed, and asks before it closes it.
+    bpy.ops.ed.undo()
+    assert not bpy.data.objects[ELBOW].fdda.is_bound
+    bpy.ops.ed.redo()
+    two = bpy.data.objects[ELBOW], bpy.data.objects["elbow.001"]
+    bpy.context.view_layer.objects.active = two[0]
     assert two[0].fdda.mode == "FDDA" and two[0].fdda.packed is not None and not two[1].fdda.is_bound
     # Recorded already: it is trained again, and the new model plays.
     before = two[0].fdda.packed.session_uid
@@ -83,7 +91,7 @@ def test_a_model_that_an_undo_takes_off_the_list_is_known(two):
     two[0].fdda.models.clear()
     rig = SceneRig(two[0], bpy.data.objects[ELBOW_RIG])
     checks.check_now(rig)
-    assert trained(rig).path.name == "elbow.onnx" and not trained(rig).foreign
+    assert trained(rig).path.name == "two_elbow.onnx" and not trained(rig).foreign
     assert bpy.ops.fdda.bind() == {"FINISHED"} and two[0].fdda.is_bound
 
 

@@ -134,6 +134,11 @@ class TestFolder:
         assert (settings.poses, settings.seed, settings.tolerance_mm) == (5, 4, 0.25)
         assert recording_folder(mesh_object) == tmp_path / "takes" / "one"
         assert model_file(mesh_object) == tmp_path / "elbow_model" / "elbow.onnx"
+        # Another file of the folder has a mesh of this name too.
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "hero.blend"))
+        settings.recording = ""
+        assert recording_folder(mesh_object) == tmp_path / "hero_elbow_recording"
+        assert model_file(mesh_object) == tmp_path / "hero_elbow_model" / "hero_elbow.onnx"
         assert bpy.data.actions["elbow_wave"].fdda.record
 
 

@@ -333,7 +333,7 @@ def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
     bpy.data.actions[ACTION].fdda.record = True
     bpy.context.window_manager.fdda.all_meshes = False
     assert bpy.ops.fdda.record() == {"FINISHED"}
-    recording = read_recording(tmp_path / "elbow_recording")
+    recording = read_recording(tmp_path / "rig_elbow_recording")
     assert np.abs(complex_positions(recording) - complex_positions(own)).max() <= EXACT * own.rig.size
     assert recording.info.target.object_name == "flesh"
     settings.poses = 3

@@ -69,7 +69,7 @@ def make_several_models_together(folder: Path) -> Iterator[float]:
     yield from sidebar.push("fdda.record(")
     yield from job_done("record", 120)
     read = part("core.recording.index").read_index
-    done = [read(own / f"{name}_recording")["complete"] for name in ("arm", "sleeve")]
+    done = [read(own / f"{name}_recording")["complete"] for name in ("arm", "arm_sleeve")]
     check(done == [40, 40], f"{done} poses are recorded")
     yield from sidebar.open_section("training")
     yield from sidebar.push("fdda.train(")
