@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Chooses the bones that random poses move, and the controls that are sampled beside them."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import bpy
 
 from ..core.errors import RigError
+from ..properties.choices import recording_settings
 from .on_pose import OnPose
 
 if TYPE_CHECKING:  # Blender starts without numpy.
@@ -46,12 +48,17 @@ class FDDA_OT_add_control(OnPose, bpy.types.Operator):
     )
 
     def change(self, context: bpy.types.Context) -> str:
-        from ..scene.controls import stated_controls
+        from ..recording.plan import RecordingSettings, listed_controls
 
         rig = self.rig(context)
         settings = rig.mesh_object.fdda.settings
         if self.name:
-            stated_controls(rig, [self.name])
+            try:
+                wanted = recording_settings(rig)
+            except RigError:
+                # What random poses move has not been chosen yet.
+                wanted = RecordingSettings()
+            listed_controls(rig, replace(wanted, controls=(self.name,)))
         if self.name and self.name in settings.controls:
             raise RigError(f"The control '{self.name}' is in the list already.")
         settings.controls.add().name = self.name

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What of a rig random poses move: bones in their ranges of motion, and controls."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import bpy
 
@@ -11,91 +11,48 @@ from ..core.errors import RigError
 from ..core.model import ModelInfo
 from ..core.poses import CONTROL, KINDS, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.rig import Rig
-from ..scene.compatibility import is_selected
 from ..scene.controls import is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
-from .action_range import is_moved, keyed_ranges, measured_controls
-from .clip import find_action
+from .action_range import is_moved
+from .bone_numbers import control_name, ranges_by_control
+from .choice import OWN_BONES, Choice, Measured, choose_bones
 from .motion_range import DEFAULT, RotationRange, location_ranges, rotation_ranges, scale_ranges
 
 LIMITS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
-SELECTED, COLLECTION, ACTION, BONE = "selected", "collection:", "action:", "bone:"
-"""How a user chooses the control bones that are sampled."""
-
-Measured = dict[tuple[str, str, int], tuple[float, float]]
-"""Ranges by bone, kind and axis."""
+Ranges = dict[str, tuple[float, float]]
+"""Ranges by the names of controls."""
 
 
-@dataclass(frozen=True)
-class Choice:
-    """What a user chose to sample.
-
-    Attributes:
-        bones: names of the control bones; None for the bones of the rig as it stands (`own_channels`).
-        measured: ranges of what actions key. Bones that are chosen by action move in these, as far as the rig's limits
-            let them; other chosen bones do where the rig states no range.
-        by_action: names of the bones that are chosen by action alone.
-        controls: the controls, stated or keyed.
-    """
-
-    bones: frozenset[str] | None = None
-    measured: tuple[tuple[tuple[str, str, int], tuple[float, float]], ...] = ()
-    by_action: frozenset[str] = frozenset()
-    controls: tuple[Control, ...] = ()
-
-
-def choose(scene_rig: SceneRig, texts: Iterable[str], controls: tuple[Control, ...] = ()) -> Choice:
+def choose(scene_rig: SceneRig, texts: Iterable[str], find_controls: Callable[[Ranges], Iterable[Control]]) -> Choice:
     """Read what a user chose.
 
     Args:
         scene_rig: the rig.
         texts: `selected` for the selected bones, `collection:NAME` for those of a bone collection and of the ones below
             it, `action:NAME` for what an action keys, `bone:NAME`; none for the bones of the rig as it stands.
-        controls: that are sampled too.
+        find_controls: returns the controls that are sampled too, from the ranges of the numbers of bones that are
+            sampled (`ranges_by_control`): a control may be one of them.
 
     Raises:
         RigError: there is no such collection, action or bone, or it chooses nothing.
     """
     texts = list(texts)
-    if not texts:
-        return Choice(controls=controls)
-    chosen: set[str] = set()
-    actions = []
-    for text in texts:
-        if text.startswith(ACTION):
-            actions.append(find_action(text.removeprefix(ACTION)))
-        else:
-            chosen |= _bones_of(scene_rig, text)
-    measured = keyed_ranges(scene_rig.armature_object, actions)
-    own = {control.name: control for control in measured_controls(scene_rig, actions)}
-    own |= {control.name: control for control in controls}
-    keyed = {bone for bone, _, _ in measured}
-    if not chosen and not own and not any(map(is_moved, measured.values())):
+    choice = choose_bones(scene_rig, texts)
+    controls = {control.name: control for control in choice.controls}
+    controls |= {control.name: control for control in find_controls(sampled_numbers(scene_rig, choice))}
+    choice = replace(choice, controls=tuple(controls.values()))
+    moves = controls or choice.bones is None or choice.bones - choice.by_action
+    if not moves and not any(is_moved(bounds) for _, bounds in choice.measured):
         raise RigError(f"Nothing is chosen to sample by {', '.join(texts)}; choose bones that an animator poses.")
-    return Choice(frozenset(chosen | keyed), tuple(measured.items()), frozenset(keyed - chosen), tuple(own.values()))
+    return choice
 
 
-def _bones_of(scene_rig: SceneRig, text: str) -> set[str]:
-    armature_object = scene_rig.armature_object
-    bones, data = armature_object.pose.bones, armature_object.data
-    if text == SELECTED:
-        return {bone.name for bone in bones if is_selected(bone)}
-    if text.startswith(COLLECTION):
-        name = text.removeprefix(COLLECTION)
-        if name not in data.collections_all:
-            known = ", ".join(f"'{c.name}'" for c in data.collections_all) or "none"
-            raise RigError(f"'{armature_object.name}' has no bone collection '{name}'; its collections: {known}.")
-        return {bone.name for bone in data.collections_all[name].bones_recursive}
-    name = text.removeprefix(BONE)
-    if not text.startswith(BONE) or name not in bones:
-        raise RigError(
-            f"'{text}' chooses nothing of '{armature_object.name}'; give {SELECTED}, {COLLECTION}NAME, {ACTION}NAME or "
-            f"{BONE}NAME of what is there."
-        )
-    return {name}
+def sampled_numbers(scene_rig: SceneRig, choice: Choice) -> Ranges:
+    """Ranges of the numbers of bones that a choice samples, where the rig or an action states them."""
+    return ranges_by_control(scene_rig.armature_object, _bone_channels(scene_rig.armature_object, choice, set()))
 
 
-def sampled_channels(scene_rig: SceneRig, rig: Rig, choice: Choice = Choice()) -> tuple[Channel, ...]:
+def sampled_channels(scene_rig: SceneRig, rig: Rig, choice: Choice = OWN_BONES) -> tuple[Channel, ...]:
     """The channels of a random pose.
 
     Args:
@@ -106,22 +63,31 @@ def sampled_channels(scene_rig: SceneRig, rig: Rig, choice: Choice = Choice()) -
         RigError: nothing may be sampled.
     """
     armature_object = scene_rig.armature_object
-    if choice.bones is None:
-        found = own_channels(armature_object, set(rig.joint_names))
-    else:
-        found = chosen_channels(armature_object, choice)
-    found += tuple(
+    controls = {control.name: (control.low, control.high) for control in choice.controls}
+    found = []
+    for channel in _bone_channels(armature_object, choice, set(rig.joint_names)):
+        # A control that is a number of a bone is set with the bone, in the range of the control.
+        bounds = controls.pop(control_name(armature_object, channel), (channel.low, channel.high))
+        found.append(replace(channel, low=bounds[0], high=bounds[1]))
+    found += [
         Channel(control.name, CONTROL, 0, control.low, control.high)
         for control in choice.controls
-        if not is_driven(owner_of(scene_rig, control.owner), control.path)
-    )
+        if control.name in controls and not is_driven(owner_of(scene_rig, control.owner), control.path)
+    ]
     if not found:
         raise RigError(
             f"No bone of '{armature_object.name}' may be sampled: all {len(rig.joints)} are locked or moved by "
             "constraints; unlock an axis, give it a Limit Rotation, choose the bones that an animator poses "
             "(--sample), or record actions alone, with 0 random poses (--action NAME --poses 0)."
         )
-    return found
+    return tuple(found)
+
+
+def _bone_channels(armature_object: bpy.types.Object, choice: Choice, names: set[str]) -> tuple[Channel, ...]:
+    """The channels of the bones that a choice samples; `names` as for `own_channels`."""
+    if choice.bones is None:
+        return own_channels(armature_object, names)
+    return chosen_channels(armature_object, choice)
 
 
 def model_channels(scene_rig: SceneRig, rig: Rig, info: ModelInfo) -> tuple[Channel, ...]:

@@ -14,7 +14,9 @@ from ..core.rig import UNMOVED, Joint
 from ..scene.armature import PoseMatrices, rest_matrices
 from ..scene.scene_rig import SMALLEST_VOLUME, SceneRig, is_flat
 
-_OF_POSE = re.compile(r'pose\.bones\["(?:[^"\\]|\\.)*"\]\.(?:location|rotation_\w+|scale)')
+_OF_POSE = re.compile(r'pose\.bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]\.(?:location|rotation_\w+|scale)')
+_CHAIN_CONSTRAINTS = {"IK", "SPLINE_IK"}
+"""Constraints that move the bones above their own."""
 
 
 class HeldPose:
@@ -77,16 +79,38 @@ class HeldPose:
 
 
 @contextmanager
-def held_joints(scene_rig: SceneRig, joints: tuple[Joint, ...]) -> Iterator[HeldPose]:
+def held_joints(scene_rig: SceneRig, joints: tuple[Joint, ...], others_follow: bool = False) -> Iterator[HeldPose]:
     """Mute all that moves the bones of an armature but their own channels; given back afterwards.
 
     The pose is at rest when it begins (`armature.clear_pose`), and stays as it was set last.
+
+    Args:
+        scene_rig: the rig.
+        joints: as for `HeldPose`.
+        others_follow: leave what moves the bones that are no joints and carry none.
     """
     armature_object = scene_rig.armature_object
     animation = armature_object.animation_data
-    constraints = [c for bone in armature_object.pose.bones for c in bone.constraints if not c.mute]
-    drivers = [curve for curve in (animation.drivers if animation else ()) if _OF_POSE.fullmatch(curve.data_path)]
-    drivers = [curve for curve in drivers if not curve.mute]
+    names = {joint.name for joint in joints}
+    bones = [bone for bone in armature_object.pose.bones if bone.name in names]
+    carrying = {above.name for bone in bones for above in (bone, *bone.parent_recursive)}
+
+    def is_held(name: str) -> bool:
+        return not others_follow or name in carrying
+
+    constraints = [
+        constraint
+        for bone in armature_object.pose.bones
+        for constraint in bone.constraints
+        if not constraint.mute and (is_held(bone.name) or constraint.type in _CHAIN_CONSTRAINTS)
+    ]
+    drivers = [
+        curve
+        for curve in (animation.drivers if animation else ())
+        if (match := _OF_POSE.fullmatch(curve.data_path))
+        and is_held(bpy.utils.unescape_identifier(match["bone"]))
+        and not curve.mute
+    ]
     held = HeldPose(scene_rig, joints)
     for muted in (*constraints, *drivers):
         muted.mute = True

@@ -19,6 +19,7 @@ from ..core.poses import CONTROL, Channel
 from ..core.progress import Progress
 from ..core.rig import UNMOVED, Rig
 from ..core.skinning import LinearLayer
+from ..poses.bone_numbers import control_name
 from ..poses.sampling import is_moved_by_constraints
 from ..rig.reading import PoseEvaluator
 from ..scene.armature import Poser, clear_pose
@@ -41,6 +42,7 @@ class Search:
         draw: gives the values of the channels, (C,), for a number from 0 on.
         show: poses the rig as one of the recorded poses, for a number from 0 on, when there are no channels.
         stop: ends what `show` lets drive the rig.
+        has_target: the surface is that of another object, which other bones may deform than the joints.
         poses: how often each joint is moved alone.
         tolerance: a joint influences a partition when it moves a local residual by more than this part of the
             character's size.
@@ -52,6 +54,7 @@ class Search:
     stop: Callable[[], None]
     poses: int = INFLUENCE_POSES
     tolerance: float = INFLUENCE_TOLERANCE
+    has_target: bool = False
 
 
 class _Found:
@@ -163,6 +166,9 @@ def _move_channels(scene_rig: SceneRig, rig: Rig, search: Search, moves: _Moves)
         index = (controls if channel.kind == CONTROL else joints).get(channel.name)
         if index is not None:
             places.setdefault((CONTROL if channel.kind == CONTROL else "joint", index), []).append(place)
+        # A control may be the number that a channel of a bone sets.
+        if (control := controls.get(control_name(scene_rig.armature_object, channel))) is not None:
+            places[CONTROL, control] = [place]
     steps = dict(sorted(places.items(), key=lambda item: (item[0][0] == CONTROL, item[0][1])))
     rest = np.array([channel.rest for channel in channels])
     # One base pose serves all joints: the rest pose for half of the moves, a random pose each for the others.
@@ -196,7 +202,7 @@ def _take_joints(scene_rig: SceneRig, rig: Rig, search: Search, found: _Found, m
         # A number that a driver sets cannot be moved alone: it may influence all.
         found.note_everywhere(control)
     steps = [("joint", number) for number in varies] + [(CONTROL, number) for number in movable]
-    with held_joints(scene_rig, rig.joints) as held:
+    with held_joints(scene_rig, rig.joints, search.has_target) as held:
 
         def show(state: _State) -> None:
             held.set(state.joints)

@@ -2,14 +2,15 @@
 """Several meshes on one armature: whether, and how, they can be recorded together."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import bpy
 
 from ..core.errors import RigError
 from ..rig.dependencies import read_meshes
 from ..rig.modifier_stack import read_stack
-from ..scene.controls import stated_controls
 from ..scene.scene_rig import SceneRig
+from .plan import RecordingSettings, listed_controls
 
 
 def common_armature(rigs: Sequence[SceneRig]) -> bpy.types.Object:
@@ -29,18 +30,18 @@ def common_armature(rigs: Sequence[SceneRig]) -> bpy.types.Object:
     return armature_object
 
 
-def controls_of_each(rigs: Sequence[SceneRig], texts: Sequence[str]) -> list[tuple[str, ...]]:
-    """Which of the controls that a user lists, as `stated_controls` reads them, each mesh has.
+def controls_of_each(rigs: Sequence[SceneRig], settings: RecordingSettings) -> list[tuple[str, ...]]:
+    """Which of the controls that settings list each mesh has.
 
     Raises:
         RigError: none of them has one.
     """
     found: list[list[str]] = [[] for _ in rigs]
-    for text in texts:
+    for text in settings.controls:
         errors = []
         for scene_rig, own in zip(rigs, found, strict=True):
             try:
-                stated_controls(scene_rig, [text])
+                listed_controls(scene_rig, replace(settings, controls=(text,)))
                 own.append(text)
             except RigError as error:
                 errors.append(error)

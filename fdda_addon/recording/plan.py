@@ -1,19 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What a recording will hold, before a pose is evaluated: the settings, and what they come to for a rig."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
 
+from ..core.controls import Control
 from ..core.defaults import INFLUENCE_POSES, MARGIN, MIN_VERTICES, POSES, SPREAD
 from ..core.partition import INFLUENCE_TOLERANCE
 from ..core.poses import Channel, Margin, margin_of
 from ..core.recording.index import RANDOM, Sampling, Source
 from ..core.recording.target import POSE
 from ..core.rig import Rig
+from ..poses.choice import Choice, choose_bones
 from ..poses.clip import find_clips
-from ..poses.sampling import Choice, choose, locked_channels, sampled_channels
+from ..poses.sampling import Ranges, choose, locked_channels, sampled_channels, sampled_numbers
 from ..rig.dependencies import read_dependencies
 from ..rig.reading import read_rig
 from ..rig.target import find_target
@@ -101,10 +104,23 @@ def planned_choice(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Ch
         RigError: the rig lacks what the settings name.
     """
     dependencies = read_dependencies(scene_rig, planned_actions(settings))
-    controls = {control.name: control for control in dependencies.controls}
-    controls |= {control.name: control for control in stated_controls(scene_rig, settings.controls)}
-    choice = choose(scene_rig, settings.sample, tuple(controls.values()))
+
+    def find_controls(sampled: Ranges) -> Iterator[Control]:
+        yield from dependencies.controls
+        yield from stated_controls(scene_rig, settings.controls, sampled)
+
+    choice = choose(scene_rig, settings.sample, find_controls)
     return choice, None if choice.bones is None else dependencies.bones
+
+
+def listed_controls(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Control, ...]:
+    """The controls that these settings list.
+
+    Raises:
+        RigError: the rig lacks one, or nobody states its range.
+    """
+    sampled = sampled_numbers(scene_rig, choose_bones(scene_rig, settings.sample)) if settings.controls else {}
+    return stated_controls(scene_rig, settings.controls, sampled)
 
 
 def planned_actions(settings: RecordingSettings) -> tuple[bpy.types.Action, ...]:

@@ -11,9 +11,8 @@ from ..poses.sampling import sampled_channels
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..rig.reading import read_rig
 from ..rig.time_inputs import check_inputs
-from ..scene.controls import stated_controls
 from ..scene.scene_rig import SceneRig
-from .plan import RecordingSettings, depends_on_time, planned_actions, planned_choice
+from .plan import RecordingSettings, depends_on_time, listed_controls, planned_actions, planned_choice
 
 DEFAULTS = RecordingSettings()
 
@@ -74,7 +73,7 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, before: RigCheck | 
             rig = read_rig(scene_rig, *read_with)
         if rig.controls != choice.controls:
             rig = replace(rig, controls=choice.controls)
-        listed = stated_controls(scene_rig, settings.controls)
+        listed = listed_controls(scene_rig, settings)
         found = tuple(control for control in choice.controls if control not in listed)
         result = replace(result, rig=rig, found=found, besides=besides, with_unmoved=with_unmoved)
         result = replace(result, channels=sampled_channels(scene_rig, rig, choice))

@@ -107,7 +107,7 @@ def _plan(
     if settings.mirror and not clips:
         raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
     meshes = [scene_rig for scene_rig, _ in rigs]
-    controls = [settings.controls] if len(rigs) == 1 else controls_of_each(meshes, settings.controls)
+    controls = [settings.controls] if len(rigs) == 1 else controls_of_each(meshes, settings)
     if settings.target.name and len(rigs) > 1:
         raise RecordingError("A target is one of one mesh; record the meshes one by one, each with its target.")
     read = []
@@ -192,6 +192,7 @@ def _find_influences(
         player.stop,
         settings.influence_poses,
         settings.influence_tolerance,
+        mesh.planned.target is not None,
     )
     evaluator = TimedEvaluator(mesh.planned.evaluator(mesh.rig))
     known = mesh.planned.known

@@ -2,8 +2,9 @@
 """Controls in and out: which numbers there are, their ranges, their values."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from types import MappingProxyType
 
 import bpy
 import numpy as np
@@ -41,13 +42,20 @@ def owner_name(scene_rig: SceneRig, datablock: bpy.types.ID) -> str:
     return f"{OTHER_OBJECT}{datablock.name}" if isinstance(datablock, bpy.types.Object) else ""
 
 
-def make_control(scene_rig: SceneRig, owner: str, path: str, stated: tuple[float, float] | None = None) -> Control:
+def make_control(
+    scene_rig: SceneRig,
+    owner: str,
+    path: str,
+    stated: tuple[float, float] | None = None,
+    sampled: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+) -> Control:
     """A control of a rig, with the range that its property states.
 
     Args:
         scene_rig: the rig.
         owner, path: as of `Control`.
         stated: its range, in place of what the property states.
+        sampled: by the names of controls the ranges of numbers that random poses move anyway.
 
     Raises:
         RigError: there is no such number, or nobody states its range.
@@ -59,19 +67,22 @@ def make_control(scene_rig: SceneRig, owner: str, path: str, stated: tuple[float
             f"'{scene_rig.mesh_object.name}' has no control '{name}'; give the name of a shape key, or OWNER/PATH of a "
             f"number, with OWNER one of {', '.join(OWNERS)} and {OTHER_OBJECT}NAME."
         )
-    low, high = stated or _property_range(datablock, path)
+    low, high = stated or sampled.get(name) or _property_range(datablock, path)
     if not low < high or high - low > WIDEST_RANGE:
         raise RigError(f"The control '{name}' states no range; give one: '{name}=LOW:HIGH'.")
     return Control(owner, path, float(low), float(high))
 
 
-def stated_controls(scene_rig: SceneRig, texts: Iterable[str]) -> tuple[Control, ...]:
+def stated_controls(
+    scene_rig: SceneRig, texts: Iterable[str], sampled: Mapping[str, tuple[float, float]] = MappingProxyType({})
+) -> tuple[Control, ...]:
     """Controls as a user lists them.
 
     Args:
         scene_rig: the rig.
         texts: each OWNER/PATH, or the name of a shape key, and after it =LOW:HIGH where the property's range is not
             meant; `shape_keys` means every shape key that no driver moves.
+        sampled: as for `make_control`.
 
     Raises:
         RigError: as `make_control`.
@@ -86,7 +97,7 @@ def stated_controls(scene_rig: SceneRig, texts: Iterable[str]) -> tuple[Control,
             except ValueError as error:
                 raise RigError(f"'{text}' states no range; write it as NAME=LOW:HIGH, with two numbers.") from error
         for owner, path in _meant(scene_rig, name):
-            control = make_control(scene_rig, owner, path, stated)
+            control = make_control(scene_rig, owner, path, stated, sampled)
             found[control.name] = control
     return tuple(found.values())
 

@@ -10,8 +10,9 @@ from mathutils import Euler, Quaternion
 
 from fdda_addon.core.poses import ROTATION_VECTOR, Channel, sample_pose
 from fdda_addon.poses.action_range import measured_ranges
+from fdda_addon.poses.choice import choose_bones
 from fdda_addon.poses.measured_limits import WIDE_NOTE, limit_lines, state_measured_limits
-from fdda_addon.poses.sampling import choose, chosen_channels, states_channels
+from fdda_addon.poses.sampling import chosen_channels, states_channels
 from fdda_addon.scene.armature import Poser
 from fdda_addon.scene.compatibility import curves_of
 from fdda_addon.scene.scene_rig import SceneRig
@@ -28,7 +29,7 @@ def figure() -> SceneRig:
 
 def sampled(rig: SceneRig, *texts: str) -> tuple[Channel, ...]:
     texts = texts or tuple(f"action:{action.name}" for action in bpy.data.actions)
-    return chosen_channels(rig.armature_object, choose(rig, texts))
+    return chosen_channels(rig.armature_object, choose_bones(rig, texts))
 
 
 def ranges(channels: tuple[Channel, ...], bone: str) -> dict:
@@ -73,7 +74,7 @@ def test_what_is_muted_in_an_action_is_not_sampled(figure):
     curves['pose.bones["spine"].rotation_euler', 1].mute = True
     curves['pose.bones["arm.L"]["fist"]', 0].mute = True
     assert ("rotation", 1) not in ranges(sampled(figure), "spine")
-    assert choose(figure, [f"action:{WAVE}"]).controls == ()
+    assert choose_bones(figure, [f"action:{WAVE}"]).controls == ()
 
 
 def test_what_stands_still_beside_the_rest_pose_stays_there(figure):
