@@ -9,13 +9,22 @@ import numpy as np
 from mathutils import Matrix
 
 from ..core.errors import RigError
+from ..core.features import ROUNDING
 from ..core.model import ModelInfo
 from ..core.rig import UNMOVED, Fingerprint, Rig
 from ..poses.sampling import model_channels, sampled_channels
 from ..scene import armature as armature_io
 from ..scene import mesh as mesh_io
 from ..scene.controls import ControlReader
-from ..scene.scene_rig import MODIFIER_NAME, SceneRig, armature_modifier, armature_of, find_rig, is_flat
+from ..scene.scene_rig import (
+    MODIFIER_NAME,
+    SMALLEST_VOLUME,
+    SceneRig,
+    armature_modifier,
+    armature_of,
+    find_rig,
+    is_flat,
+)
 from ..scene.skin import read_skin
 from ..scene.unit import metres_per_unit
 from .joints import choose_joints
@@ -36,20 +45,27 @@ def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None, with_unm
         with_unmoved: also the joint that never moves, which says which way is down.
 
     Raises:
-        RigError: there is no vertex, or an object has a scale of zero.
+        RigError: there is no vertex, all lie at one point, an object or a bone has a scale of zero, or a rest position
+            or a transform is not finite.
     """
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
-    for scene_object in (mesh_object, armature_object):
+    # The armature first: the mesh may be its child.
+    for scene_object in (armature_object, mesh_object):
+        if not np.isfinite(scene_object.matrix_world).all():
+            raise RigError(
+                f"'{scene_object.name}' is at no finite place; clear the location, rotation and scale of it and of its "
+                "parents."
+            )
         if is_flat(scene_object):
             raise RigError(f"'{scene_object.name}' has a scale of zero; give it another.")
-    if not len(mesh_object.data.vertices):
-        raise RigError(f"The mesh of '{mesh_object.name}' has no vertices; choose another object.")
+    rest_positions = mesh_io.rest_positions(mesh_object.data)
+    _check_rest_positions(mesh_object, rest_positions)
     skin = read_skin(mesh_object, armature_object, armature_modifier(mesh_object))
     joints = choose_joints(scene_rig, (*skin.bones, UNMOVED) if with_unmoved else skin.bones, besides)
     names = tuple(joint.name for joint in joints)
     skin_joints, skin_weights = skin.arrays({name: number for number, name in enumerate(names)})
-    rest_positions = mesh_io.rest_positions(mesh_object.data)
     rest = joint_rest_matrices(scene_rig, names)
+    _check_rest_matrices(names, rest)
     faces = mesh_io.topology(mesh_object.data)
     fingerprint = Fingerprint(
         Fingerprint.digest(*faces),
@@ -66,6 +82,36 @@ def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None, with_unm
         *faces,
         metres_per_unit=metres_per_unit(mesh_object),
     )
+
+
+def _check_rest_positions(mesh_object: bpy.types.Object, rest_positions: np.ndarray) -> None:
+    """Raise a RigError where (V, 3) rest positions have no size."""
+    name, count = mesh_object.name, len(rest_positions)
+    if not count:
+        raise RigError(f"The mesh of '{name}' has no vertices; choose another object.")
+    finite = np.isfinite(rest_positions).all(axis=1)
+    if not finite.all():
+        raise RigError(
+            f"{count - finite.sum():,} of {count:,} vertices of '{name}' have coordinates that are not finite, the "
+            f"first is vertex {finite.argmin()}; delete them, or give them others in edit mode."
+        )
+    if count == 1:
+        raise RigError(f"The mesh of '{name}' has one vertex, and no surface to learn; choose another object.")
+    if np.ptp(rest_positions, axis=0).max() <= ROUNDING * np.abs(rest_positions).max():
+        raise RigError(
+            f"All {count:,} vertices of '{name}' lie at one point in the rest pose, so the mesh has no size; give the "
+            "mesh, or its Basis shape key, its shape."
+        )
+
+
+def _check_rest_matrices(names: tuple[str, ...], rest: np.ndarray) -> None:
+    """Raise a RigError where (J, 4, 4) rest matrices have no inverse."""
+    for name, matrix in zip(names, rest, strict=True):
+        if not np.isfinite(matrix).all() or np.abs(np.linalg.det(matrix[:3, :3])) < SMALLEST_VOLUME:
+            raise RigError(
+                f"The bone '{name}' has no length or no finite place in the rest pose; give its head and its tail "
+                "places in edit mode."
+            )
 
 
 def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
