@@ -7,6 +7,7 @@ Nothing is evaluated and the scene is not touched.
 import hashlib
 import re
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 
 import bpy
@@ -15,11 +16,11 @@ from mathutils import Euler, Quaternion, Vector
 
 from ..core.controls import ARMATURE, ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS, Control
 from ..core.errors import RigError
-from ..core.poses import LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE
+from ..core.poses import CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.rotations import euler_angles, rotation_vectors, total_width
 from ..scene.arrays import KEYFRAME, read
 from ..scene.compatibility import curves_of
-from ..scene.controls import make_control, owner_of
+from ..scene.controls import is_driven, is_number, make_control, owner_of
 from ..scene.scene_rig import SceneRig
 
 _OF_BONE = re.compile(r'pose\.bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]\.(?P<channel>\w+)')
@@ -169,6 +170,30 @@ def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) 
         scene_rig: the rig.
         actions: the actions.
     """
+    controls = []
+    for (owner, path), bounds in _keyed_controls(scene_rig, actions).items():
+        if is_moved(bounds):
+            with suppress(RigError):
+                controls.append(make_control(scene_rig, owner, path, bounds))
+    return tuple(controls)
+
+
+def held_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> tuple[Channel, ...]:
+    """The numbers as of `measured_controls` that actions key at one value, where the file has another value now."""
+    channels = []
+    for (owner, path), (low, high) in _keyed_controls(scene_rig, actions).items():
+        datablock = owner_of(scene_rig, owner)
+        if is_number(datablock, path) and not is_moved((low, high)):
+            channel = Channel(f"{owner}/{path}", CONTROL, 0, low, low)
+            if abs(float(datablock.path_resolve(path)) - low) > RANGE_TOLERANCE and not is_driven(datablock, path):
+                channels.append(channel)
+    return tuple(channels)
+
+
+def _keyed_controls(
+    scene_rig: SceneRig, actions: Iterable[bpy.types.Action]
+) -> dict[tuple[str, str], tuple[float, float]]:
+    """Lowest and highest value by owner and path."""
     found: dict[tuple[str, str], tuple[float, float]] = {}
     for action in actions:
         frames = action_frames(action)
@@ -179,14 +204,7 @@ def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) 
                     values = [curve.evaluate(frame) for frame in frames]
                     low, high = found.get((owner, curve.data_path), (np.inf, -np.inf))
                     found[owner, curve.data_path] = min(low, *values), max(high, *values)
-    controls = []
-    for (owner, path), (low, high) in found.items():
-        if is_moved((low, high)):
-            try:
-                controls.append(make_control(scene_rig, owner, path, (low, high)))
-            except RigError:
-                continue
-    return tuple(controls)
+    return found
 
 
 def _curves_by_bone(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, Curves]:

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 from ..core.controls import Control
 from ..core.errors import RigError
+from ..core.poses import Channel
 from ..scene.compatibility import is_selected
 from ..scene.scene_rig import SceneRig
-from .action_range import keyed_ranges, measured_controls
+from .action_range import held_controls, keyed_ranges, measured_controls
 from .clip import find_action
 
 SELECTED, COLLECTION, ACTION, BONE = "selected", "collection:", "action:", "bone:"
@@ -28,12 +29,14 @@ class Choice:
             let them; other chosen bones do where the rig states no range.
         by_action: names of the bones that are chosen by action alone.
         controls: the controls, stated or keyed.
+        held: numbers that actions key at one value, which the file has otherwise.
     """
 
     bones: frozenset[str] | None = None
     measured: tuple[tuple[tuple[str, str, int], tuple[float, float]], ...] = ()
     by_action: frozenset[str] = frozenset()
     controls: tuple[Control, ...] = ()
+    held: tuple[Channel, ...] = ()
 
 
 OWN_BONES = Choice()
@@ -58,8 +61,8 @@ def choose_bones(scene_rig: SceneRig, texts: Iterable[str]) -> Choice:
             chosen |= _bones_of(scene_rig, text)
     measured = keyed_ranges(scene_rig.armature_object, actions)
     keyed = {bone for bone, _, _ in measured}
-    controls = measured_controls(scene_rig, actions)
-    return Choice(frozenset(chosen | keyed), tuple(measured.items()), frozenset(keyed - chosen), controls)
+    controls, held = measured_controls(scene_rig, actions), held_controls(scene_rig, actions)
+    return Choice(frozenset(chosen | keyed), tuple(measured.items()), frozenset(keyed - chosen), controls, held)
 
 
 def _bones_of(scene_rig: SceneRig, text: str) -> set[str]:

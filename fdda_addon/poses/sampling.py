@@ -74,6 +74,8 @@ def sampled_channels(scene_rig: SceneRig, rig: Rig, choice: Choice = OWN_BONES) 
         for control in choice.controls
         if control.name in controls and not is_driven(owner_of(scene_rig, control.owner), control.path)
     ]
+    listed = {control.name for control in choice.controls}
+    found += [channel for channel in choice.held if channel.name not in listed]
     if not found:
         raise RigError(
             f"No bone of '{armature_object.name}' may be sampled: all {len(rig.joints)} are locked or moved by "

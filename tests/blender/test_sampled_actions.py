@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from mathutils import Euler, Quaternion
 
-from fdda_addon.core.poses import ROTATION_VECTOR, Channel, sample_pose
+from fdda_addon.core.poses import CONTROL, ROTATION_VECTOR, Channel, sample_pose
 from fdda_addon.poses.action_range import measured_ranges
 from fdda_addon.poses.choice import choose_bones
 from fdda_addon.poses.measured_limits import WIDE_NOTE, limit_lines, state_measured_limits
-from fdda_addon.poses.sampling import chosen_channels, states_channels
+from fdda_addon.poses.sampling import chosen_channels, sampled_channels, states_channels
+from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene.armature import Poser
 from fdda_addon.scene.compatibility import curves_of
 from fdda_addon.scene.scene_rig import SceneRig
@@ -88,6 +89,22 @@ def test_what_stands_still_beside_the_rest_pose_stays_there(figure):
         ("rotation", 1): pytest.approx((-0.2, 0.2)),
         ("location", 1): (0.5, 0.5),
     }
+
+
+def test_a_number_that_an_action_keys_at_one_value_has_it(figure):
+    """The switch from IK to FK, for example: poses are those of the action, whatever the file stands at."""
+    arm = figure.armature_object.pose.bones[ARM]
+    add_wave(figure)
+    for frame in (1, 9):
+        for name, value in (("switch", 1.0), ("same", 0.5)):
+            arm[name] = value
+            arm.keyframe_insert(f'["{name}"]', frame=frame)
+    figure.armature_object.animation_data.action = None
+    arm["switch"] = 0.0
+    channels = sampled_channels(figure, read_rig(figure), choose_bones(figure, [f"action:{WAVE}"]))
+    found = {c.name.partition("/")[2]: (c.low, c.high) for c in channels if c.kind == CONTROL}
+    assert found.keys() == {f'pose.bones["{ARM}"]["switch"]', f'pose.bones["{ARM}"]["fist"]'}
+    assert found[f'pose.bones["{ARM}"]["switch"]'] == (1, 1)
 
 
 def about(*degrees: float) -> Quaternion:
