@@ -65,6 +65,9 @@ class JobOperator:
         """The sentence that is reported when the user has cancelled the job."""
         return f"{self.title} cancelled."
 
+    def failed(self) -> None:
+        """Do what remains when the job has ended with an error."""
+
     @classmethod
     def is_idle(cls) -> bool:
         """Whether no job runs; sets the poll message otherwise. For `poll`."""
@@ -165,6 +168,8 @@ class JobOperator:
     def _end(self) -> set[str]:
         """Report how the job ended; returns the operator's result."""
         state = self._run.state
+        if state.outcome_level == "ERROR":
+            self.failed()
         if self.changes_file:
             bpy.ops.ed.undo_push(message=self.title)
         self.report({state.outcome_level}, state.outcome)

@@ -3,6 +3,7 @@
 
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import bpy
@@ -108,6 +109,11 @@ class TrainsModels(OnRig):
             mesh_object = next((o for o in bpy.data.objects if o.session_uid == uid), None)
             if mesh_object is not None:
                 remember(mesh_object, model)
+
+    def failed(self) -> None:
+        # What was trained before the mesh that failed is on the disk, and a packed model would stay the old one.
+        with suppress(FDDAError):
+            self.list_models()
 
     @property
     def trained(self) -> list[tuple[int, Path]]:

@@ -110,6 +110,7 @@ def _sampled_text(channels: "list[Channel]", is_wide: bool) -> str:
     """The ranges about the axes, and by which other channels the bone is moved."""
     from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR
 
+    channels = [channel for channel in channels if channel.low < channel.high]
     turns = {channel.axis: channel for channel in channels if channel.kind in {ROTATION, ROTATION_VECTOR}}
     moves = "".join("XYZ"[channel.axis] for channel in channels if channel.kind == LOCATION)
     texts = [

@@ -87,7 +87,11 @@ def test_a_model_that_an_undo_takes_off_the_list_is_known(two):
 
     bpy.context.view_layer.objects.active = two[0]
     bpy.ops.fdda.record()
-    bpy.ops.fdda.train()
+    bpy.context.view_layer.objects.active = bpy.data.objects[ELBOW_RIG]
+    with pytest.raises(RuntimeError, match="two_elbow_001_recording' is not a recording"):
+        bpy.ops.fdda.train(all_meshes=True)
+    assert [entry.name for entry in two[0].fdda.models] == ["two_elbow"], "it was trained before the other failed"
+    bpy.context.view_layer.objects.active = two[0]
     two[0].fdda.models.clear()
     rig = SceneRig(two[0], bpy.data.objects[ELBOW_RIG])
     checks.check_now(rig)

@@ -9,6 +9,7 @@ import pytest
 from mathutils import Euler, Quaternion
 
 from fdda_addon.core.poses import CONTROL, ROTATION_VECTOR, Channel, sample_pose
+from fdda_addon.panels.poses import _sampled_text
 from fdda_addon.poses.action_range import measured_ranges
 from fdda_addon.poses.choice import choose_bones
 from fdda_addon.poses.measured_limits import WIDE_NOTE, limit_lines, state_measured_limits
@@ -84,7 +85,9 @@ def test_what_stands_still_beside_the_rest_pose_stays_there(figure):
     for frame, turn in ((1, -0.2), (9, 0.2)):
         key(spine, frame, "rotation_euler", (0.75, turn, 0))
         key(spine, frame, "location", (0, 0.5, 0))
-    assert ranges(sampled(figure), "spine") == {
+    channels = sampled(figure)
+    assert _sampled_text(list(channels), True) == "fixed  -11…11°  fixed"
+    assert ranges(channels, "spine") == {
         ("rotation", 0): (0.75, 0.75),
         ("rotation", 1): pytest.approx((-0.2, 0.2)),
         ("location", 1): (0.5, 0.5),
