@@ -11,7 +11,7 @@ from ..core.errors import RigError
 from ..core.poses import LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE
 from ..scene.scene_rig import SceneRig
 from ..scene.unit import metres_per_unit
-from .action_range import Ranges, keyed_ranges, moved_ranges
+from .action_range import Ranges, is_moved, keyed_ranges, moved_ranges
 from .motion_range import (
     AXES,
     DEFAULT,
@@ -71,7 +71,7 @@ def state_measured_limits(
         margin: part of the width of each range that is added at each end.
 
     Returns:
-        What the actions move, in the order of the bones.
+        What the actions move, and which axes they rotate and hold, in the order of the bones.
 
     Raises:
         RigError: the actions move no bone of the rig, or it is linked and cannot be changed.
@@ -84,6 +84,7 @@ def state_measured_limits(
         )
     keyed = keyed_ranges(armature_object, actions)
     measured = moved_ranges(keyed)
+    still = {key: bounds for key, bounds in keyed.items() if key[1] == ROTATION and _stands_away(bounds)}
     if not measured:
         names = ", ".join(f"'{action.name}'" for action in actions) or "none"
         raise RigError(f"The actions ({names}) move no bone of '{armature_object.name}'; choose actions of this rig.")
@@ -92,7 +93,7 @@ def state_measured_limits(
     has_ik = any(constraint.type == "IK" for bone in armature_object.pose.bones for constraint in bone.constraints)
     found: list[MeasuredLimit] = []
     for bone in armature_object.pose.bones:
-        own = {key[1:]: bounds for key, bounds in measured.items() if key[0] == bone.name}
+        own = {key[1:]: bounds for key, bounds in (measured | still).items() if key[0] == bone.name}
         limits = [_limit(bone, kind, axis, bounds, margin) for (kind, axis), bounds in sorted(own.items())]
         for kind in (ROTATION, LOCATION, SCALE):
             stated = [limit for limit in limits if limit.kind == kind and not limit.why_not]
@@ -114,8 +115,15 @@ def _wide_bones(keyed: Ranges) -> set[str]:
     return {bone for bone, width in vectors if widths[bone, ROTATION] > MAX_WIDENING * width + RANGE_TOLERANCE}
 
 
+def _stands_away(bounds: tuple[float, float]) -> bool:
+    """Whether a rotation stands still elsewhere than in the rest pose."""
+    return not is_moved(bounds) and abs(bounds[0]) > RANGE_TOLERANCE
+
+
 def _limit(bone: bpy.types.PoseBone, kind: str, axis: int, bounds: tuple[float, float], margin: float) -> MeasuredLimit:
     """What is to be stated of an axis."""
+    if not is_moved(bounds):
+        return MeasuredLimit(bone.name, kind, axis, *bounds, "stands still away from rest, has no range")
     low, high = bounds
     added = (high - low) * margin
     # A scale of zero has no inverse.

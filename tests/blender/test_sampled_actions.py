@@ -85,6 +85,10 @@ def test_what_stands_still_beside_the_rest_pose_stays_there(figure):
     for frame, turn in ((1, -0.2), (9, 0.2)):
         key(spine, frame, "rotation_euler", (0.75, turn, 0))
         key(spine, frame, "location", (0, 0.5, 0))
+    limits = state_measured_limits(figure, bpy.data.actions, 0.0)
+    assert limit_lines(figure.armature_object, limits) == [
+        "spine: turns X 43.0 to 43.0° (stands still away from rest, has no range), turns Y -11.5 to 11.5°"
+    ]
     channels = sampled(figure)
     assert _sampled_text(list(channels), True) == "fixed  -11…11°  fixed"
     assert ranges(channels, "spine") == {
