@@ -50,15 +50,8 @@ def test_recorded_trained_bound_switched_and_evaluated_in_one_go(two, tmp_path):
 
 def test_one_button_records_trains_and_binds(two):
     bpy.context.view_layer.objects.active = two[0]
-    bpy.ops.ed.undo_push(message="before")
     assert bpy.ops.fdda.make_model() == {"FINISHED"}
-    assert bpy.data.is_dirty
-    # It is a step of its own: Blender marks the file as changed, and asks before it closes it.
-    bpy.ops.ed.undo()
-    assert not bpy.data.objects[ELBOW].fdda.is_bound
-    bpy.ops.ed.redo()
-    two = bpy.data.objects[ELBOW], bpy.data.objects["elbow.001"]
-    bpy.context.view_layer.objects.active = two[0]
+    assert bpy.data.is_dirty, "Blender asks before it closes the file"
     assert two[0].fdda.mode == "FDDA" and two[0].fdda.packed is not None and not two[1].fdda.is_bound
     # Recorded already: it is trained again, and the new model plays.
     before = two[0].fdda.packed.session_uid

@@ -25,6 +25,7 @@ class FDDA_OT_count(JobOperator, bpy.types.Operator):  # noqa: N801 - Blender wa
     upto: bpy.props.IntProperty(default=3)
     at: bpy.props.IntProperty(default=-1)
     what: bpy.props.StringProperty()
+    keep: bpy.props.BoolProperty(description="Keep the result in the file")
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -53,6 +54,8 @@ class FDDA_OT_count(JobOperator, bpy.types.Operator):  # noqa: N801 - Blender wa
 
     def finish(self, _context: bpy.types.Context, result: object) -> str:
         events.append(f"finished with {result}")
+        if self.keep:
+            bpy.context.scene["counted"], self.changes_file = result, True
         return f"Counted to {result}."
 
     def cancelled(self, _context: bpy.types.Context) -> str:
@@ -74,6 +77,19 @@ def test_a_job_runs_to_its_end_where_there_is_no_window():
     assert (state.done, state.total, state.stage, state.is_running) == (3, 3, "numbers", False)
     assert (state.outcome, state.outcome_level) == ("Counted to 3.", "INFO")
     assert job.current() is None
+
+
+def test_a_job_that_changes_the_file_is_a_step_of_undo_and_marks_it():
+    was_dirty = bpy.data.is_dirty
+    bpy.ops.fdda.count()
+    assert bpy.data.is_dirty is was_dirty
+    bpy.ops.ed.undo_push(message="before")
+    bpy.ops.fdda.count(keep=True)
+    assert bpy.data.is_dirty and bpy.context.scene["counted"] == 3
+    bpy.ops.ed.undo()
+    assert "counted" not in bpy.context.scene
+    bpy.ops.ed.redo()
+    assert bpy.context.scene["counted"] == 3
 
 
 def test_an_error_is_reported_and_the_operator_cancelled():
