@@ -55,6 +55,9 @@ PARTS = (
     Part("paths", 17, 17),
     Part("time", 300, 100),
     Part("armatures", 200, 100),
+    Part("mode", 1000, 1000),
+    Part("topology", 1000, 1000),
+    Part("controls", 300, 300),
 )
 
 
@@ -76,6 +79,10 @@ def work(part: str, folder: Path, seed: int, first: int, end: int) -> None:
         from benchmarks.soaking import inputs
 
         run = inputs.run_time if part == "time" else inputs.run_armatures
+    elif part in ("mode", "topology", "controls"):
+        from benchmarks.soaking import changes
+
+        run = getattr(changes, f"run_{part}")
     else:
         from benchmarks.soaking import playback
 

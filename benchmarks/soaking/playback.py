@@ -23,19 +23,19 @@ NEAR = 1e-6
 
 def run_frames(folder: Path, seed: int, first: int, end: int) -> None:
     """Frames and subframes at random."""
-    bound, random = _open(folder), np.random.default_rng((seed, first))
+    bound, random = open_bound(folder), np.random.default_rng((seed, first))
 
     def frame() -> float:
         subframe = float(random.random()) if random.random() < 0.3 else 0.0
         bpy.context.scene.frame_set(int(random.integers(1, 31)), subframe=subframe)
         return _off(bound, folder)
 
-    _repeat("frames", first, end, frame)
+    repeat("frames", first, end, frame)
 
 
 def run_undo(folder: Path, seed: int, first: int, end: int) -> None:
     """Poses, modes and copies, each with an undo step; undone and done again at random."""
-    _open(folder)
+    open_bound(folder)
     random = np.random.default_rng((seed, first))
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     bpy.ops.ed.undo_push(message="start")
@@ -59,7 +59,7 @@ def run_undo(folder: Path, seed: int, first: int, end: int) -> None:
         mesh_object = bpy.data.objects[ELBOW]
         return _off(mesh_object, folder) if mesh_object.fdda.mode == "FDDA" else 0.0
 
-    _repeat("undo steps", first, end, step)
+    repeat("undo steps", first, end, step)
 
 
 def run_loads(folder: Path, seed: int, first: int, end: int) -> None:
@@ -69,7 +69,7 @@ def run_loads(folder: Path, seed: int, first: int, end: int) -> None:
     def load() -> float:
         turn[0] += 1
         if turn[0] % 2:
-            return max(_off(_open(folder), folder), 0.0)
+            return max(_off(open_bound(folder), folder), 0.0)
         bpy.ops.wm.open_mainfile(filepath=str(folder / "elbow.blend"))
         rig = find_rig()
         bind(rig, folder / "elbow.onnx")
@@ -80,7 +80,7 @@ def run_loads(folder: Path, seed: int, first: int, end: int) -> None:
         bpy.context.view_layer.update()
         return max(off, _off(find_rig().mesh_object, folder))
 
-    _repeat("loads and binds", first, end, load)
+    repeat("loads and binds", first, end, load)
 
 
 def run_paths(folder: Path, seed: int, first: int, end: int) -> None:
@@ -91,12 +91,14 @@ def run_paths(folder: Path, seed: int, first: int, end: int) -> None:
         say(attempt("evaluation paths", name, lambda w=way: w(folder)))
 
 
-def _repeat(part: str, first: int, end: int, action: Callable[[], float]) -> None:
+def repeat(part: str, first: int, end: int, action: Callable[[], float]) -> None:
+    """Do something again and again, a case each; it returns how far it was off."""
     for number in range(first, end):
         say(attempt(part, f"{part} {number}", action))
 
 
-def _open(folder: Path) -> bpy.types.Object:
+def open_bound(folder: Path) -> bpy.types.Object:
+    """Open the bound elbow of a folder."""
     bpy.ops.wm.open_mainfile(filepath=str(folder / "bound.blend"))
     fdda_addon.register()
     return bpy.data.objects[ELBOW]
@@ -117,7 +119,7 @@ def _apart(shown: np.ndarray, expected: np.ndarray, limit: float = NEAR) -> floa
 
 
 def _frames(folder: Path) -> float:
-    bound, off = _open(folder), 0.0
+    bound, off = open_bound(folder), 0.0
     for number in range(1, 31):
         bpy.context.scene.frame_set(number, subframe=0.5 * (number % 2))
         off = max(off, _off(bound, folder))
@@ -125,7 +127,7 @@ def _frames(folder: Path) -> float:
 
 
 def _by_hand(folder: Path) -> float:
-    bound, off = _open(folder), 0.0
+    bound, off = open_bound(folder), 0.0
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     for angle in np.linspace(-1, 1, 21):
         pose(angle=float(angle))
@@ -134,7 +136,7 @@ def _by_hand(folder: Path) -> float:
 
 
 def _view_layers_and_scenes(folder: Path) -> float:
-    bound, off = _open(folder), 0.0
+    bound, off = open_bound(folder), 0.0
     layer, scene = bpy.context.scene.view_layers.new("second"), bpy.data.scenes.new("second")
     for name in (ELBOW, ELBOW_RIG):
         scene.collection.objects.link(bpy.data.objects[name])
@@ -149,7 +151,7 @@ def _view_layers_and_scenes(folder: Path) -> float:
 
 
 def _instances(folder: Path) -> float:
-    bound, off = _open(folder), 0.0
+    bound, off = open_bound(folder), 0.0
     collection = bpy.data.collections.new("character")
     collection.objects.link(bound)
     empty = bpy.data.objects.new("instance", None)
@@ -184,7 +186,7 @@ def _linked(folder: Path) -> float:
 
 def _still(engine: str, use_in_render: bool) -> Callable[[Path], float]:
     def way(folder: Path) -> float:
-        bound = _open(folder)
+        bound = open_bound(folder)
         set_camera()
         scene = bpy.context.scene
         scene.render.engine = engine
@@ -208,7 +210,7 @@ def _export(
     export: Callable[[Path, str], None], suffix: str, mode: str, use_in_render: bool
 ) -> Callable[[Path], float]:
     def way(folder: Path) -> float:
-        bound = keyed(_open(folder))
+        bound = keyed(open_bound(folder))
         bound.fdda.use_in_render = use_in_render
         expected = {}
         for number in FRAMES:

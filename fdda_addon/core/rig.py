@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .controls import Control
+from .deformation import check_deformation, deformation_differences
 
 UNMOVED = ""
 """Name of the joint that never moves; no bone has it. What follows no bone follows this one.
@@ -64,11 +65,17 @@ def read_joints(values: list) -> tuple[Joint, ...]:
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """Hashes that tell two rigs apart and say in what they differ. Equal for equal topology, rest and weights."""
+    """Tells two rigs apart and says in what they differ.
+
+    Attributes:
+        topology, rest_positions, skin_weights: hashes.
+        deformation: what deforms the mesh besides (`core.deformation`); empty where nobody knows.
+    """
 
     topology: str
     rest_positions: str
     skin_weights: str
+    deformation: dict = field(default_factory=dict)
 
     @staticmethod
     def from_json(value: dict) -> "Fingerprint":
@@ -76,7 +83,7 @@ class Fingerprint:
         parts = [value[name] for name in ("topology", "rest_positions", "skin_weights")]
         if not all(isinstance(part, str) and len(part) <= LONGEST_HASH for part in parts):
             raise ValueError("its fingerprint holds no hashes")
-        return Fingerprint(*parts)
+        return Fingerprint(*parts, check_deformation(value.get("deformation", {})))
 
     @staticmethod
     def digest(*arrays: np.ndarray) -> str:
@@ -87,6 +94,11 @@ class Fingerprint:
             digest.update(f"{array.dtype.str}{array.shape}".encode())
             digest.update(array.tobytes())
         return digest.hexdigest()[:16]
+
+    @staticmethod
+    def digest_text(text: str) -> str:
+        """Hash a text; 16 hexadecimal digits."""
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -179,6 +191,7 @@ def differences(
         ):
             if getattr(fingerprint, part) != getattr(rig.fingerprint, part):
                 found.append(f"{name} differ" + ("s" if part != "skin_weights" else ""))
+        found += deformation_differences(fingerprint.deformation, rig.fingerprint.deformation, rig.controls)
     return found
 
 

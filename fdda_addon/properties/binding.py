@@ -13,6 +13,7 @@ from bpy.props import (
 )
 
 from .character import FDDA_PG_character
+from .without_keys import without_keys
 
 OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}
 """A linked character keeps in the shot what is set there: Blender resets everything else of a library override."""
@@ -32,6 +33,7 @@ def _apply_mask(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None
     apply_mask(binding.id_data)
 
 
+@without_keys
 class FDDA_PG_modifier(bpy.types.PropertyGroup):
     """A modifier of the rig and how it was shown before a model took its place."""
 
@@ -40,6 +42,7 @@ class FDDA_PG_modifier(bpy.types.PropertyGroup):
     show_render: BoolProperty(override=OVERRIDABLE)
 
 
+@without_keys
 class FDDA_PG_model(bpy.types.PropertyGroup):
     """A model of a mesh: its file, or the text that holds it."""
 
@@ -60,6 +63,7 @@ class FDDA_PG_model(bpy.types.PropertyGroup):
     packed_bytes: IntProperty(name="Size", description="Size of the packed model in bytes", override=OVERRIDABLE)
 
 
+@without_keys
 class FDDA_PG_binding(bpy.types.PropertyGroup):
     """A model bound to a mesh object."""
 
@@ -87,6 +91,7 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
         ),
         default="RIG",
         update=_apply,
+        options={"ANIMATABLE"},
         override=OVERRIDABLE,
     )
     strength: FloatProperty(
@@ -97,6 +102,7 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
         default=1,
         subtype="FACTOR",
         update=_apply,
+        options={"ANIMATABLE"},
         override=OVERRIDABLE,
     )
     mask: StringProperty(

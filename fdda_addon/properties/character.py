@@ -22,8 +22,10 @@ from ..core.defaults import EPOCHS, MARGIN, MIN_VERTICES, POSES, SPREAD, TARGET_
 from ..core.errors import OutputError
 from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import resolved
+from .without_keys import without_keys
 
 
+@without_keys
 class FDDA_PG_bone(bpy.types.PropertyGroup):
     """A bone that random poses move."""
 
@@ -38,6 +40,7 @@ def _suggested_controls(control: "FDDA_PG_control", _context: bpy.types.Context,
     return suggested_controls(SceneRig(mesh_object, armature_object)) if armature_object else []
 
 
+@without_keys
 class FDDA_PG_control(bpy.types.PropertyGroup):
     """A number that is an input of the model, as `scene.controls.stated_controls` reads it."""
 
@@ -54,6 +57,7 @@ class FDDA_PG_control(bpy.types.PropertyGroup):
     high: FloatProperty(name="Maximum", description="Highest value of random poses", default=1.0)
 
 
+@without_keys
 class FDDA_PG_character(bpy.types.PropertyGroup):
     """How a character is sampled, recorded and trained; saved with its mesh object."""
 
@@ -182,12 +186,14 @@ def wanted_fit(settings: FDDA_PG_character) -> str:
     return "" if settings.fit_linear == "RIG" else settings.fit_linear.lower()
 
 
+@without_keys
 class FDDA_PG_action(bpy.types.PropertyGroup):
     """What an action is used for; saved with it."""
 
     record: BoolProperty(name="Record", description="Record the frames of this action after the random poses")
 
 
+@without_keys
 class FDDA_PG_session(bpy.types.PropertyGroup):
     """What the sidebar shows at the moment."""
 

@@ -39,6 +39,10 @@ BOUND = {
     "SURFACE_DEFORM": "is_bound",
 }  # fmt: skip
 """Modifiers that remember the rest pose, and the property that says whether they do."""
+INDIRECT = {
+    "DATA_TRANSFER", "TRIANGULATE", "VERTEX_WEIGHT_EDIT", "VERTEX_WEIGHT_MIX", "VERTEX_WEIGHT_PROXIMITY",
+}  # fmt: skip
+"""Modifiers that move no vertices, and change what those after them do: weights, edges."""
 NEED_ORIGINAL = {"MULTIRES", "SOFT_BODY"}
 """Blender lets no modifier that makes a mesh, as the one that plays a model does, stand before these, on or off."""
 
@@ -58,9 +62,9 @@ class ModifierStack:
 
     Attributes:
         replaced: those that move vertices, switched on or not, up to the last of them that is on, and what a model
-            cannot stand before.
+            cannot stand before. Of a bound object, up to the modifier that plays its model.
         misplaced: those that are on and change the topology before the last of `replaced`.
-        live: those that are on and change the topology after it.
+        live: those that are on after it: they change the topology or, behind the modifier of a bound model, deform.
         place: index after the last of `replaced`, the modifier that plays a model not counted.
     """
 
@@ -98,11 +102,15 @@ def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     # Where all are off, the last of all: what the user switches on later is replaced.
     shown = [i for i in deforming if modifiers[i].show_viewport] or deforming
     last = max(shown + original, default=-1)
+    bound = _playback_place(mesh_object)
+    if bound is not None and any(i < bound for i in deforming):
+        last = bound - 1
     generating = [i for i, kind in enumerate(kinds) if kind is _Kind.GENERATES and modifiers[i].show_viewport]
+    behind = sorted({*generating, *shown})
     return ModifierStack(
         replaced=tuple(m.name for i, m in enumerate(modifiers[: last + 1]) if i in deforming + original),
         misplaced=tuple(modifiers[i].name for i in generating if i <= last),
-        live=tuple(modifiers[i].name for i in generating if i > last),
+        live=tuple(modifiers[i].name for i in behind if i > last and modifiers[i].show_viewport),
         place=last + 1,
     )
 
@@ -116,11 +124,39 @@ def deforming_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifie
     Raises:
         RigError: as `read_stack`.
     """
-    modifiers = list(mesh_object.modifiers)
-    for place, modifier in enumerate(modifiers):
-        if is_playback(modifier):
-            return [m for m in modifiers[:place] if _kind(m) is not _Kind.NEUTRAL]
+    place = _playback_place(mesh_object)
+    if place is not None:
+        return [m for m in mesh_object.modifiers[:place] if _kind(m) is not _Kind.NEUTRAL]
     return [mesh_object.modifiers[name] for name in read_stack(mesh_object).replaced]
+
+
+def recorded_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier]:
+    """The modifiers whose work a model stands in for, in their order: those that are on, or will be with the rig.
+
+    Raises:
+        RigError: as `read_stack`.
+    """
+    place = _playback_place(mesh_object)
+    if place is None:
+        place = read_stack(mesh_object).place
+    candidates = [m for m in mesh_object.modifiers[:place] if _kind(m) is not _Kind.NEUTRAL or m.type in INDIRECT]
+    binding = getattr(mesh_object, "fdda", None)
+    if binding is None or not binding.is_playing:
+        return [m for m in candidates if m.show_viewport]
+    stored = {saved.uid: saved for saved in binding.modifiers}
+    found = []
+    for modifier in candidates:
+        shown = stored.get(modifier.persistent_uid, modifier)
+        # One that a render shows makes other vertices there, before the model could give them positions.
+        generates = _kind(modifier) is _Kind.GENERATES and binding.use_in_render and shown.show_render
+        if shown.show_viewport or generates:
+            found.append(modifier)
+    return found
+
+
+def _playback_place(mesh_object: bpy.types.Object) -> int | None:
+    """Where the modifier that plays a model stands, None when there is none."""
+    return next((place for place, modifier in enumerate(mesh_object.modifiers) if is_playback(modifier)), None)
 
 
 def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:

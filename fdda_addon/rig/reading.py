@@ -27,6 +27,7 @@ from ..scene.scene_rig import (
 )
 from ..scene.skin import read_skin
 from ..scene.unit import metres_per_unit
+from .deformation import read_deformation
 from .joints import choose_joints
 from .modifier_stack import check_evaluable, deforming_modifiers
 from .target import Target
@@ -71,6 +72,7 @@ def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None, with_unm
         Fingerprint.digest(*faces),
         Fingerprint.digest(rest_positions),
         Fingerprint.digest(skin_joints, skin_weights),
+        read_deformation(scene_rig),
     )
     return Rig(
         joints,

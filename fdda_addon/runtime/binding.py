@@ -38,8 +38,8 @@ def bind(
         raise RigError(f"'{mesh_object.name}' is in edit mode; leave it first.")
     model = model.absolute()
     network = model_files.load_network(model) if packed_model is None else packed.load(packed_model)
-    opened = open_model(scene_rig, network)
     with true_rig(mesh_object):
+        opened = open_model(scene_rig, network)
         stack = check_stack(mesh_object)
         check_inputs(scene_rig, opened.rig.controls, stack)
     if mesh_object.fdda.is_bound:
@@ -54,8 +54,8 @@ def bind(
     binding.packed = packed_model
     binding.use_in_render = use_in_render
     binding.is_bound = True
-    binding.mode = "FDDA"
     playback.forget()
+    binding.mode = "FDDA"
 
 
 def unbind(mesh_object: bpy.types.Object) -> None:
@@ -98,6 +98,8 @@ def apply(mesh_object: bpy.types.Object) -> None:
         switch.switch_modifiers(mesh_object)
         if mesh_object.fdda.is_playing != was_playing:
             playback.make_anew(mesh_object)
+            # At once: a handler that sets the mode may run after ours, and a render evaluates no third time.
+            playback.scan()
         mesh_object.update_tag()
 
 
@@ -108,16 +110,29 @@ def apply_mask(mesh_object: bpy.types.Object) -> None:
 
 
 @contextmanager
+def borrowed_mode(mesh_object: bpy.types.Object, mode: str) -> Iterator[None]:
+    """Show a bound object in a mode, whatever drives or keys its own; the binding is as before afterwards."""
+    binding = mesh_object.fdda
+    previous = binding.mode
+    try:
+        with switch.held_mode(mesh_object, mode):
+            if binding.is_bound:
+                binding.mode = mode
+                modifier = nodes.find_modifier(mesh_object)
+                if not binding.is_playing and modifier is not None:
+                    # Also where somebody shows it meanwhile.
+                    switch.disconnect(modifier)
+            yield
+    finally:
+        if binding.is_bound:
+            binding.mode = previous
+
+
+@contextmanager
 def true_rig(mesh_object: bpy.types.Object) -> Iterator[None]:
     """Borrow a bound object for its rig: the rig deforms it inside, the binding is as before afterwards."""
-    mode = mesh_object.fdda.mode
-    if mesh_object.fdda.is_bound:
-        mesh_object.fdda.mode = "RIG"
-    try:
+    with borrowed_mode(mesh_object, "RIG"):
         yield
-    finally:
-        if mesh_object.fdda.is_bound:
-            mesh_object.fdda.mode = mode
 
 
 @contextmanager

@@ -49,16 +49,22 @@ class Changed:
 def changed_meshes(depsgraph: bpy.types.Depsgraph) -> dict[int, bool]:
     """The `meshes` of `Changed` alone: in most frames there are none, and that is all that has to be known."""
     meshes: dict[int, bool] = {}
-    driven_keys = []
+    driven_keys, edited_keys = [], []
     for update in depsgraph.updates:
         found = update.id
         if isinstance(found, Mesh):
             if update.is_updated_geometry or update.is_updated_transform:
                 meshes[found.original.session_uid] = update.is_updated_transform
-        elif isinstance(found, Key) and update.is_updated_geometry and not update.is_updated_transform:
-            driven_keys.append(found)
+        elif isinstance(found, Key) and update.is_updated_geometry:
+            if update.is_updated_transform:
+                edited_keys.append(found)
+            else:
+                driven_keys.append(found)
     for key in driven_keys:
         uid = key.original.user.session_uid
         if meshes.get(uid) is False:
             del meshes[uid]
+    for key in edited_keys:
+        # Where only a driver or an action of theirs is another, the mesh does not say so.
+        meshes[key.original.user.session_uid] = True
     return meshes

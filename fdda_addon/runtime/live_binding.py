@@ -23,6 +23,10 @@ from . import cache as caches
 from . import rig_check
 from .model_files import network_of
 from .network import Execution
+from .switch import held_mode_of
+
+VIEWPORT_KEY = "fdda_viewport"
+"""Custom property of evaluated mesh objects of a viewport's graph; it goes with the evaluated copy."""
 
 
 class Job(NamedTuple):
@@ -45,9 +49,8 @@ class LiveBinding:
         job: what has to be executed for the pose that was read last.
         was_executed: it had a job, since whoever asked set it back.
         execution: where its positions lie.
-        graphs: addresses of the dependency graphs that know of it.
-        viewports: address of its evaluated mesh object in each graph of a viewport, by the address of the graph; 0
-            where it has no shape keys.
+        graphs: the dependency graphs that know of it: mode, session id of the scene, name of the view layer.
+        is_unmarked: it was evaluated with shape keys for a graph that may be that of a viewport, which nobody knows.
         lock: to be held from `read` to `write`.
     """
 
@@ -79,8 +82,8 @@ class LiveBinding:
         self.execution = self._own_execution = Execution(self.network, 1)
         self.job: Job | None = None
         self.was_executed = False
-        self.graphs: set[int] = set()
-        self.viewports: dict[int, int] = {}
+        self.graphs: set[tuple[str, int, str]] = set()
+        self.is_unmarked = False
         # A render may evaluate on another thread while the window does.
         self.lock = threading.Lock()
         self._shown: tuple | None = None
@@ -241,7 +244,7 @@ class LiveBinding:
             return False
         controls = self._controls.values(owners)
         # Where its mode says the rig, it is about to be switched, or has just been.
-        strength = 0.0 if binding.mode == "LINEAR" else binding.strength
+        strength = 0.0 if (held_mode_of(self.uid) or binding.mode) == "LINEAR" else binding.strength
         shown = pose.tobytes(), controls.tobytes(), strength
         if shown != self._shown and not (LiveBinding.is_constant and self._positions is not None):
             self._news = ""
@@ -276,8 +279,11 @@ class LiveBinding:
         """Give an evaluated cache object the positions, also those it had: it may show those of the rest pose again."""
         set_mesh_positions(cache.data, self._positions)
         # Baking asks here too where renders show the rig, and needs the shape keys.
-        if mesh_object.as_pointer() in self.viewports.values():
-            _mute_shape_keys(mesh_object)
+        if mesh_object.data.shape_keys is not None:
+            if VIEWPORT_KEY in mesh_object:
+                _mute_shape_keys(mesh_object)
+            else:
+                self.is_unmarked = True
 
     def _mended(self, pose: np.ndarray, armature: str) -> np.ndarray:
         """A pose in which every joint is a number: one that is none moves as the next above it does."""

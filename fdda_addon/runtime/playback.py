@@ -12,17 +12,16 @@ from contextlib import contextmanager
 import bpy
 
 from ..core.errors import FDDAError, ModelError
-from ..scene.compatibility import curves_of
 from . import cache as caches
 from . import nodes, rig_check, switch
 from .changed import Changed, changed_meshes
 from .crowd import Crowds, is_hub
 from .evaluation_threads import keep_thread
-from .live_binding import LiveBinding
+from .live_binding import VIEWPORT_KEY, LiveBinding
 from .model_files import network_of
 
-_bound: dict[int, bool] = {}
-"""Whether the mode of a bound object is animated or driven, by its session id."""
+_bound: dict[int, frozenset[str]] = {}
+"""What is animated or driven of what switches a bound object (`switch.animated_switches`), by its session id."""
 _live: dict[int, LiveBinding] = {}
 """Those that play, by the session id of their cache object."""
 _crowds = Crowds()
@@ -61,13 +60,26 @@ def follow(depsgraph: bpy.types.Depsgraph) -> None:
         mesh_object = live.find() if live.error or live.has_news else None
         if mesh_object is None:
             continue
-        if live.error:
-            fail(mesh_object, live.error)
-        else:
+        with _isolated(mesh_object):
+            if live.error:
+                raise live.error
             mesh_object.fdda.status = live.take_news()
     if any(_bound.values()) and not _is_following:
         for mesh_object in [o for o in bpy.data.objects if _bound.get(o.session_uid)]:
-            _follow_mode(mesh_object, depsgraph)
+            with _isolated(mesh_object):
+                _follow_mode(mesh_object, depsgraph)
+
+
+@contextmanager
+def _isolated(mesh_object: bpy.types.Object) -> Iterator[None]:
+    """Show the rig of a character for which the block fails; the other characters play on."""
+    try:
+        yield
+    except FDDAError as error:
+        fail(mesh_object, error)
+    except Exception as error:
+        # What a character can be is not known, and what leaves a handler stops all characters.
+        fail(mesh_object, ModelError(f"The model of '{mesh_object.name}' cannot be played ({error!r}); bind it again."))
 
 
 def _greet(depsgraph: bpy.types.Depsgraph) -> None:
@@ -75,7 +87,8 @@ def _greet(depsgraph: bpy.types.Depsgraph) -> None:
 
     What a graph did not need before, while its modifier was off, it leaves out of the first evaluation with it.
     """
-    key = depsgraph.as_pointer()
+    # Not by its address, which Blender gives to another graph when this one is gone.
+    key = depsgraph.mode, depsgraph.scene.session_uid, depsgraph.view_layer.name
     new = {uid for uid, live in _live.items() if key not in live.graphs}
     if new:
         for cache in [o for o in bpy.data.objects if o.session_uid in new]:
@@ -87,22 +100,26 @@ def _know_viewport(depsgraph: bpy.types.Depsgraph) -> None:
     """Tell the live bindings that have shape keys what evaluates for a viewport: a getter does not learn for whom."""
     if depsgraph.mode != "VIEWPORT":
         return
-    # Other relations may have made other copies.
-    key, all_anew = depsgraph.as_pointer(), depsgraph.id_type_updated("SCENE")
-    for live in [live for live in _live.values() if all_anew or key not in live.viewports]:
+    for live in [live for live in _live.values() if live.is_unmarked]:
         mesh_object = live.find()
-        has_keys = mesh_object is not None and mesh_object.data.shape_keys is not None
-        live.viewports[key] = mesh_object.evaluated_get(depsgraph).as_pointer() if has_keys else 0
+        if mesh_object is not None and (evaluated := mesh_object.evaluated_get(depsgraph)).is_evaluated:
+            evaluated[VIEWPORT_KEY], live.is_unmarked = True, False
 
 
 def _follow_mode(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
     """Switch the modifiers where a mode that is animated or driven has come to, or left, the rig."""
     global _is_following
     evaluated, binding = mesh_object.evaluated_get(depsgraph), mesh_object.fdda
+    switch.disconnect_visible(mesh_object, _bound[mesh_object.session_uid])
     if not evaluated.is_evaluated or (depsgraph.mode == "RENDER" and not binding.use_in_render):
         return
-    if (evaluated.fdda.mode != "RIG") != binding.is_playing:
-        switch.switch_modifiers(mesh_object, evaluated.fdda.mode != "RIG")
+    if switch.held_mode_of(mesh_object.session_uid):
+        return
+    wants_model = switch.evaluated_wants_model(evaluated, depsgraph, _bound[mesh_object.session_uid])
+    # What cannot play waits for the user: its status says what to do.
+    if wants_model != binding.is_playing and not (wants_model and binding.status):
+        switch.switch_modifiers(mesh_object, wants_model)
+        binding.status = ""
         make_anew(mesh_object)
         # That the cache object is needed now, Blender learns in one evaluation and evaluates it in the next, its own.
         _is_following = True
@@ -118,26 +135,34 @@ def note_changes(depsgraph: bpy.types.Depsgraph) -> None:
     """Look anew at the bound objects, and at the rigs, that an evaluation has changed."""
     changed = Changed.by(depsgraph)
     for mesh_object, is_mesh, is_whole in changed.mesh_objects:
-        if not mesh_object.fdda.is_bound:
-            continue
-        follow_mask(mesh_object)
-        if mesh_object.session_uid not in _bound:
-            look_again()
-            continue
-        _bound[mesh_object.session_uid] = _is_mode_animated(mesh_object)
-        uid, live = _of(mesh_object)
-        if live is None:
-            continue
-        if (is_mesh and not (live.fits(mesh_object) and _reads(mesh_object, uid))) or (
-            is_whole and not live.has_skin(mesh_object)
-        ):
-            _drop(uid)
-        elif mesh_object.mode not in rig_check.SETTLED_MODES:
-            _edited.add(mesh_object.session_uid)
+        if mesh_object.fdda.is_bound:
+            with _isolated(mesh_object):
+                _note_object(mesh_object, is_mesh, is_whole)
     _follow_weights(changed.meshes)
     # A render's own graph takes everything for new.
     if depsgraph.mode != "RENDER":
         _note_rigs(changed)
+
+
+def _note_object(mesh_object: bpy.types.Object, is_mesh: bool, is_whole: bool) -> None:
+    """Look anew at a bound object that an evaluation has changed (`Changed.mesh_objects`)."""
+    follow_mask(mesh_object)
+    if mesh_object.session_uid not in _bound:
+        look_again()
+        return
+    _bound[mesh_object.session_uid] = animated = switch.animated_switches(mesh_object)
+    if is_mesh:
+        switch.follow_visibility(mesh_object, animated)
+        switch.disconnect_visible(mesh_object, animated)
+    uid, live = _of(mesh_object)
+    if live is None:
+        return
+    if (is_mesh and not (live.fits(mesh_object) and _reads(mesh_object, uid))) or (
+        is_whole and not live.has_skin(mesh_object)
+    ):
+        _drop(uid)
+    elif mesh_object.mode not in rig_check.SETTLED_MODES:
+        _edited.add(mesh_object.session_uid)
 
 
 def note_data(depsgraph: bpy.types.Depsgraph) -> None:
@@ -159,19 +184,17 @@ def _note_rigs(changed: Changed) -> None:
         mesh_object = live.find()
         if mesh_object is None:
             continue
-        if is_other is not None and not live.has_bones(mesh_object, also_parents=is_other):
-            _drop(uid)
-        elif mesh_object.mode not in rig_check.SETTLED_MODES:
-            _edited.add(live.uid)
-        elif mesh_is_other or live.uid in _edited or (mesh_is_other is False and not live.has_rest(mesh_object)):
-            if live.uid in _edited:
-                _edited.discard(live.uid)
-                rig_check.doubt(live.form.mesh)
-            live.form = rig_check.Form.of(live.scene_rig(mesh_object))
-            try:
+        with _isolated(mesh_object):
+            if is_other is not None and not live.has_bones(mesh_object, also_parents=is_other):
+                _drop(uid)
+            elif mesh_object.mode not in rig_check.SETTLED_MODES:
+                _edited.add(live.uid)
+            elif mesh_is_other or live.uid in _edited or (mesh_is_other is False and not live.has_rest(mesh_object)):
+                if live.uid in _edited:
+                    _edited.discard(live.uid)
+                    rig_check.doubt(live.form.mesh)
+                live.form = rig_check.Form.of(live.scene_rig(mesh_object))
                 live.check_rig(mesh_object)
-            except FDDAError as error:
-                live.error = error
 
 
 def follow_mask(mesh_object: bpy.types.Object, *, weights_changed: bool = False) -> None:
@@ -187,15 +210,8 @@ def _follow_weights(meshes: Container[int]) -> None:
     for live in [live for live in _live.values() if live.has_mask and live.form.mesh in meshes]:
         mesh_object = live.find()
         if mesh_object is not None:
-            follow_mask(mesh_object, weights_changed=True)
-
-
-def _is_mode_animated(mesh_object: bpy.types.Object) -> bool:
-    animation = mesh_object.animation_data
-    if animation is None:
-        return False
-    curves = curves_of(animation.action, mesh_object) if animation.action else []
-    return bool(animation.nla_tracks) or any(c.data_path == "fdda.mode" for c in (*curves, *animation.drivers))
+            with _isolated(mesh_object):
+                follow_mask(mesh_object, weights_changed=True)
 
 
 def _reads(mesh_object: bpy.types.Object, uid: int) -> bool:
@@ -328,26 +344,37 @@ def scan() -> None:
     _crowds.forget()
     taken: set[int] = set()
     for mesh_object in [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]:
-        _bound[mesh_object.session_uid] = is_animated = _is_mode_animated(mesh_object)
-        switch.unpin_shape_keys(mesh_object)
-        if not is_animated and mesh_object.fdda.is_playing != (mesh_object.fdda.mode != "RIG"):
-            # Linked or appended from a file, which holds the true rig; or a library was reloaded.
-            switch.switch_modifiers(mesh_object)
-        if mesh_object.fdda.is_playing:
-            try:
-                cache = _own_cache(mesh_object, taken)
-                live = _live.get(cache.session_uid)
-                if live is None or live.uid != mesh_object.session_uid:
-                    _live[cache.session_uid] = LiveBinding(mesh_object, cache)
-                    if mesh_object.mode not in rig_check.SETTLED_MODES:
-                        _edited.add(mesh_object.session_uid)
-                else:
-                    # Blender hands a driver on to the override of what it reads.
-                    live.connect(mesh_object, cache)
-            except FDDAError as error:
-                fail(mesh_object, error)
+        with _isolated(mesh_object):
+            _find(mesh_object, taken)
     _remove_unused()
     _object_count = len(bpy.data.objects)
+
+
+def _find(mesh_object: bpy.types.Object, taken: set[int]) -> None:
+    """Make the live binding of a bound object that plays and has none.
+
+    Args:
+        mesh_object: the object.
+        taken: session ids of the cache objects that others use; its own is added.
+    """
+    _bound[mesh_object.session_uid] = animated = switch.animated_switches(mesh_object)
+    switch.unpin_shape_keys(mesh_object)
+    switch.follow_visibility(mesh_object, animated)
+    if not animated and mesh_object.fdda.is_playing != switch.wants_model(mesh_object):
+        # Linked or appended from a file, which holds the true rig; or a library was reloaded.
+        switch.switch_modifiers(mesh_object)
+    if not mesh_object.fdda.is_playing:
+        switch.disconnect_visible(mesh_object, animated)
+        return
+    cache = _own_cache(mesh_object, taken)
+    live = _live.get(cache.session_uid)
+    if live is None or live.uid != mesh_object.session_uid:
+        _live[cache.session_uid] = LiveBinding(mesh_object, cache)
+        if mesh_object.mode not in rig_check.SETTLED_MODES:
+            _edited.add(mesh_object.session_uid)
+    else:
+        # Blender hands a driver on to the override of what it reads.
+        live.connect(mesh_object, cache)
 
 
 def _own_cache(mesh_object: bpy.types.Object, taken: set[int]) -> bpy.types.Object:

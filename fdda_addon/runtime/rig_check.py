@@ -12,6 +12,7 @@ import numpy as np
 
 from ..core.errors import ModelError
 from ..core.rig import UNMOVED, Fingerprint, Rig, are_same_rest, differences
+from ..rig.deformation import read_b_bones, read_deformation
 from ..rig.reading import read_model_rig
 from ..scene.arrays import Element, read
 from ..scene.mesh import rest_positions
@@ -29,7 +30,9 @@ _BONES = (
     Element("head_radius", np.float32),
     Element("tail_radius", np.float32),
     Element("use_envelope_multiply", np.bool_),
+    Element("bbone_segments", np.int32),
 )
+_SEGMENTS = len(_BONES) - 1
 _SETTINGS = ("use_vertex_groups", "use_bone_envelopes", "vertex_group", "invert_vertex_group")
 """Of an Armature modifier: what skin weights follow from."""
 
@@ -47,6 +50,7 @@ class Form:
         parents: names of the bones' parents.
         skin: settings of the Armature modifier, and names of the vertex groups.
         rest: digest of the rest positions.
+        deformation: what deforms the mesh besides.
     """
 
     armature: int
@@ -55,6 +59,7 @@ class Form:
     parents: tuple
     skin: tuple
     rest: str
+    deformation: dict
 
     @staticmethod
     def of(scene_rig: SceneRig) -> "Form":
@@ -67,12 +72,16 @@ class Form:
             parents_of(armature),
             skin_of(mesh_object),
             rest_of(mesh_object.data),
+            read_deformation(scene_rig),
         )
 
 
 def bones_of(armature: bpy.types.Armature) -> tuple:
     """As in `Form`."""
-    return (*armature.bones.keys(), *(read(armature.bones, element).tobytes() for element in _BONES))
+    values = [read(armature.bones, element) for element in _BONES]
+    # All else of a B-Bone takes long to read, and most armatures have none.
+    b_bones = str(read_b_bones(armature)) if (values[_SEGMENTS] > 1).any() else ""
+    return (*armature.bones.keys(), *(value.tobytes() for value in values), b_bones)
 
 
 def parents_of(armature: bpy.types.Armature) -> tuple:

@@ -218,18 +218,17 @@ class ControlReader:
         Raises:
             RigError: the rig lacks one.
         """
-        self._controls = controls
-        for control in controls:
-            if not is_number(owner_of(scene_rig, control.owner), control.path):
-                raise RigError(
-                    f"'{scene_rig.mesh_object.name}' lacks the control '{control.name}'; name it as before, or record "
-                    "and train this rig."
-                )
+        self._controls, self._mesh_name = controls, scene_rig.mesh_object.name
+        self.values([owner_of(scene_rig, control.owner) for control in controls])
 
     def read(self, scene_rig: SceneRig, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
-        """(C,) float32 values as a dependency graph has evaluated them, each in the unit of its property.
+        """Read the controls as a dependency graph has evaluated them.
 
-        A control that is gone reads as 0.
+        Returns:
+            (C,) float32 values, each in the unit of its property.
+
+        Raises:
+            RigError: a control was removed or renamed.
         """
         owners = [owner_of(scene_rig, control.owner) for control in self._controls]
         return self.values([owner and owner.evaluated_get(depsgraph) for owner in owners])
@@ -238,7 +237,13 @@ class ControlReader:
         """As `read`, of the evaluated owner of each control."""
         values = np.zeros(len(self._controls), np.float32)
         for place, (owner, control) in enumerate(zip(owners, self._controls, strict=True)):
-            values[place] = (owner and _value(owner, control.path)) or 0.0
+            value = None if owner is None else _value(owner, control.path)
+            if value is None:
+                raise RigError(
+                    f"'{self._mesh_name}' lacks the control '{control.name}', or it is not a number; name it as "
+                    "before, or record and train this rig."
+                )
+            values[place] = value
         return values
 
 

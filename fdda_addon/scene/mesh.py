@@ -58,4 +58,7 @@ def mesh_positions(mesh: bpy.types.Mesh) -> np.ndarray:
 
 def set_mesh_positions(mesh: bpy.types.Mesh, positions: np.ndarray) -> None:
     """Move the vertices of a mesh: (V, 3) float32, its object's space, metres. Nothing is tagged."""
+    if not len(positions):
+        # A mesh without vertices has no positions.
+        return
     write(mesh.attributes["position"].data, VECTOR, positions)

@@ -20,7 +20,7 @@ from ..poses.sampling import model_channels, sampled_channels
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..rig.reading import read_rig
 from ..runtime import model_files, playback
-from ..runtime.binding import borrowed_binding
+from ..runtime.binding import borrowed_binding, borrowed_mode, true_rig
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser, clear_pose
 from ..scene.borrow import assign_action, borrowed_attributes, borrowed_pose
@@ -214,18 +214,17 @@ def _time(calls: list[Callable[[], object]]) -> list[float]:
 
 @contextmanager
 def _rig(mesh_object: bpy.types.Object) -> Iterator[None]:
-    mesh_object.fdda.mode = "RIG"
-    yield
+    with true_rig(mesh_object):
+        yield
 
 
 @contextmanager
 def armature_alone(mesh_object: bpy.types.Object) -> Iterator[None]:
     """Blender's own linear skinning: the Armature modifier alone, shape keys pinned."""
-    mesh_object.fdda.mode = "RIG"
     skinning = armature_modifier(mesh_object)
     if skinning is None:
         raise RigError(f"'{mesh_object.name}' has no Armature modifier: there is no linear skinning to time.")
-    with ExitStack() as stack:
+    with true_rig(mesh_object), ExitStack() as stack:
         for modifier in deforming_modifiers(mesh_object):
             if modifier != skinning:
                 stack.enter_context(borrowed_attributes(modifier, show_viewport=False))
@@ -237,14 +236,14 @@ def armature_alone(mesh_object: bpy.types.Object) -> Iterator[None]:
 
 @contextmanager
 def _fdda(mesh_object: bpy.types.Object) -> Iterator[None]:
-    mesh_object.fdda.mode = "FDDA"
-    yield
+    with borrowed_mode(mesh_object, "FDDA"):
+        yield
 
 
 @contextmanager
 def _floor(mesh_object: bpy.types.Object) -> Iterator[None]:
     """The playback with a model that costs nothing: it answers the same positions for every pose."""
-    mesh_object.fdda.mode = "FDDA"
-    bpy.context.view_layer.update()
-    with playback.constant_positions():
-        yield
+    with borrowed_mode(mesh_object, "FDDA"):
+        bpy.context.view_layer.update()
+        with playback.constant_positions():
+            yield

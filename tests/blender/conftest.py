@@ -11,6 +11,7 @@ import pytest
 
 import fdda_addon
 from fdda_addon.cli.main import main
+from fdda_addon.core.model import METADATA_KEY
 from fdda_addon.rig.reading import PoseReader
 from fdda_addon.runtime.network import Network
 from fdda_addon.scene.controls import ControlReader
@@ -59,6 +60,32 @@ def _addon() -> Iterator[None]:
     fdda_addon.register()
     yield
     fdda_addon.unregister()
+
+
+def without_deformation(model: Path) -> Path:
+    """Write a model beside another that says nothing about modifiers and shape keys: it plays on any."""
+    return with_deformation(model, {})
+
+
+def with_deformation(model: Path, deformation: dict) -> Path:
+    """Write a model beside another that was recorded with other modifiers, shape keys and drivers."""
+    import json
+
+    import onnx
+
+    loaded, path = onnx.load(model), model.with_name(f"other_{model.name}")
+    (prop,) = (prop for prop in loaded.metadata_props if prop.key == METADATA_KEY)
+    info = json.loads(prop.value)
+    info["fingerprint"]["deformation"] = deformation
+    prop.value = json.dumps(info)
+    onnx.save(loaded, path)
+    return path
+
+
+@pytest.fixture
+def loose_model(elbow: ElbowFiles) -> Path:
+    """The elbow's model for characters with other modifiers."""
+    return without_deformation(elbow.model)
 
 
 @pytest.fixture

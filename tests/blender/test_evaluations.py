@@ -9,7 +9,13 @@ import bpy
 import numpy as np
 import pytest
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, predicted
+from fdda_addon.runtime import playback
+from fdda_addon.runtime.binding import bind
+from fdda_addon.runtime.live_binding import VIEWPORT_KEY
+from fdda_addon.runtime.model_files import model_path
+from fdda_addon.scene.scene_rig import SceneRig, armature_of
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, predicted, without_deformation
 from .test_renders import rig_pixels, set_camera, still
 
 FRAMES = (4, 11, 20)
@@ -41,6 +47,7 @@ def test_subframes(bound, elbow, subframe):
 
 def keyed(bound: bpy.types.Object) -> bpy.types.Object:
     """The bound elbow with a shape key that the rig shows and the model has not learned."""
+    bind(SceneRig(bound, armature_of(bound)), without_deformation(model_path(bound)))
     bound.fdda.mode = "RIG"
     bound.shape_key_add(name="Basis")
     key = bound.shape_key_add(name="bulge")
@@ -248,3 +255,22 @@ def test_another_armature(bound, elbow):
     pose(other.name, angle=0.2)
     assert np.abs(assert_plays(bound, elbow.model) - first).max() > 1e-2
     assert np.abs(evaluated(bound) - predicted(bound, elbow.model)).max() < 1e-5
+
+
+def test_graphs_are_known_by_what_they_are_of(bound, tmp_path):
+    """Blender gives the address of a graph that is gone to another one."""
+    keyed(bound)
+    set_camera()
+    seen = []
+
+    def look(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+        seen.append((depsgraph.mode, VIEWPORT_KEY in bound.evaluated_get(depsgraph)))
+
+    with handler("frame_change_post", look):
+        for number in range(3):
+            still(tmp_path / "still.png")
+            bpy.context.scene.frame_set(number)
+    assert set(seen) == {("RENDER", False), ("VIEWPORT", True)}
+    (live,) = playback._live.values()
+    uid, name = bpy.context.scene.session_uid, bpy.context.view_layer.name
+    assert live.graphs == {("RENDER", uid, name), ("VIEWPORT", uid, name)}

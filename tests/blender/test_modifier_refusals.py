@@ -74,7 +74,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_no_model_can_stand_in_for_is_named(name, elbow, tmp_path):
+def test_what_no_model_can_stand_in_for_is_named(name, loose_model, tmp_path):
     add, sentence = REFUSED[name]
     rig = character(stacks.corrective_smooth)
     add(rig.mesh_object)
@@ -82,8 +82,8 @@ def test_what_no_model_can_stand_in_for_is_named(name, elbow, tmp_path):
     before = scene_state(rig)
     for refused in (
         lambda: drain(record(rig, tmp_path / "recording", FEW)),
-        lambda: drain(evaluate(rig, elbow.model, EvaluationSettings(poses=2))),
-        lambda: bind(rig, elbow.model),
+        lambda: drain(evaluate(rig, loose_model, EvaluationSettings(poses=2))),
+        lambda: bind(rig, loose_model),
     ):
         with pytest.raises(RigError) as error:
             refused()
@@ -94,16 +94,16 @@ def test_what_no_model_can_stand_in_for_is_named(name, elbow, tmp_path):
     # Switched off, nothing is wrong with it.
     rig.mesh_object.modifiers["It"].show_viewport = False
     assert check(rig).problems == ()
-    bind(rig, elbow.model)
-    assert_plays(rig.mesh_object, elbow.model)
+    bind(rig, loose_model)
+    assert_plays(rig.mesh_object, loose_model)
 
 
-def test_hidden_nodes_cannot_be_sorted(elbow):
+def test_hidden_nodes_cannot_be_sorted(loose_model):
     rig = character()
     nodes_at(1, "GeometryNodeTransform")(rig.mesh_object)
     rig.mesh_object.hide_viewport = True
     with pytest.raises(RigError, match="'elbow' is hidden, so Blender does not evaluate it"):
-        bind(rig, elbow.model)
+        bind(rig, loose_model)
 
 
 def test_a_live_modifier_that_a_driver_keeps_on(tmp_path):

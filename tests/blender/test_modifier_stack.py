@@ -34,7 +34,7 @@ def shown(rig: SceneRig) -> list[tuple]:
 
 
 @pytest.mark.parametrize("build", stacks.STACKS, ids=lambda build: build.__name__)
-def test_a_deforming_stack_is_recorded_and_played(build, elbow, tmp_path):
+def test_a_deforming_stack_is_recorded_and_played(build, loose_model, tmp_path):
     rig = character(build)
     assert check(rig).problems == ()
     before, modifiers = scene_state(rig), shown(rig)
@@ -43,7 +43,7 @@ def test_a_deforming_stack_is_recorded_and_played(build, elbow, tmp_path):
 
     pose(angle=1.0)
     true = evaluated(rig.mesh_object)
-    bind(rig, elbow.model)
+    bind(rig, loose_model)
     live = [m for m in rig.mesh_object.modifiers if m.name in read_live(rig)]
     assert len(evaluated(rig.mesh_object)) == len(true)
     for modifier in live:
@@ -52,7 +52,7 @@ def test_a_deforming_stack_is_recorded_and_played(build, elbow, tmp_path):
         rig.mesh_object.fdda.mode = mode
         assert len(evaluated(rig.mesh_object)) == len(rig.mesh_object.data.vertices)
     rig.mesh_object.fdda.mode = "FDDA"
-    assert_plays(rig.mesh_object, elbow.model)
+    assert_plays(rig.mesh_object, loose_model)
     for modifier in live:
         modifier.show_viewport = True
     unbind(rig.mesh_object)
@@ -68,14 +68,14 @@ def read_live(rig: SceneRig) -> tuple[str, ...]:
     return live
 
 
-def test_what_makes_vertices_after_the_rig_works_on_what_the_model_gives(elbow):
+def test_what_makes_vertices_after_the_rig_works_on_what_the_model_gives(loose_model):
     rig = character(stacks.subdivided)
     assert read_stack(rig.mesh_object) == ModifierStack(
         ("Armature", "Mush"), (), ("Subdivision", "Thickness", "Detail"), 2
     )
     pose(angle=1.0)
     true = evaluated(rig.mesh_object)
-    bind(rig, elbow.model)
+    bind(rig, loose_model)
     playing = evaluated(rig.mesh_object)
     assert len(playing) == len(true) > 8 * len(rig.mesh_object.data.vertices)
     # The mush of this character is not quite the one that the model has learnt.
@@ -120,7 +120,7 @@ def test_what_is_live_comes_back_when_a_recording_is_broken_off(tmp_path):
     assert_same_state(before, scene_state(rig))
 
 
-def test_modifiers_that_do_not_deform_stay_as_they_are_wherever_they_are(elbow, tmp_path):
+def test_modifiers_that_do_not_deform_stay_as_they_are_wherever_they_are(loose_model, tmp_path):
     rig = character(stacks.corrective_smooth)
     plain = residuals(rig, tmp_path)
     first = ("UV_WARP", "VERTEX_WEIGHT_EDIT", "DATA_TRANSFER")
@@ -131,34 +131,34 @@ def test_modifiers_that_do_not_deform_stay_as_they_are_wherever_they_are(elbow, 
     (tmp_path / "again").mkdir()
     assert read_stack(rig.mesh_object).replaced == ("Armature", "Mush")
     np.testing.assert_allclose(residuals(rig, tmp_path / "again"), plain, atol=1e-6)
-    bind(rig, elbow.model)
+    bind(rig, loose_model)
     assert {m.name for m in rig.mesh_object.modifiers if not m.show_viewport} == {"Armature", "Mush"}
-    assert_plays(rig.mesh_object, elbow.model)
+    assert_plays(rig.mesh_object, loose_model)
 
 
-def test_a_modifier_that_only_renders_show_is_off_while_a_model_renders(elbow):
+def test_a_modifier_that_only_renders_show_is_off_while_a_model_renders(loose_model):
     rig = character(stacks.corrective_smooth)
     rig.mesh_object.modifiers.new("Subdivision", "SUBSURF").show_viewport = False
     rig.mesh_object.modifiers.move(2, 1)
     before = shown(rig)
-    bind(rig, elbow.model, use_in_render=True)
+    bind(rig, loose_model, use_in_render=True)
     assert not rig.mesh_object.modifiers["Subdivision"].show_render
     rig.mesh_object.fdda.mode = "RIG"
     assert [state for state in shown(rig) if state[0] != "FDDA"] == before
 
 
-def test_a_modifier_that_is_off_after_what_is_live_stays_out_of_it(elbow):
+def test_a_modifier_that_is_off_after_what_is_live_stays_out_of_it(loose_model):
     rig = character(stacks.subdivided)
     rig.mesh_object.modifiers.new("Cast", "CAST").show_viewport = False
-    bind(rig, elbow.model)
+    bind(rig, loose_model)
     assert rig.mesh_object.modifiers.find("FDDA") == 2
 
 
-def test_the_modifier_that_plays_goes_before_one_that_is_pinned_to_the_end(elbow):
+def test_the_modifier_that_plays_goes_before_one_that_is_pinned_to_the_end(loose_model):
     rig = character(stacks.corrective_smooth)
     last = rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     last.use_pin_to_last = True
-    bind(rig, elbow.model)
+    bind(rig, loose_model)
     assert [m.name for m in rig.mesh_object.modifiers] == ["Armature", "Mush", "FDDA", "Subdivision"]
 
 
@@ -214,25 +214,25 @@ def test_an_attribute_that_is_the_position_moves_vertices():
     assert read_stack(rig.mesh_object).replaced == ("Armature", "It")
 
 
-def test_shading_nodes_after_a_subdivision_are_no_reason_to_refuse_it(elbow, tmp_path):
+def test_shading_nodes_after_a_subdivision_are_no_reason_to_refuse_it(loose_model, tmp_path):
     """As Blender adds them to every file that had auto smooth."""
     rig = character(stacks.corrective_smooth)
     rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     nodes_at(3, "GeometryNodeSetShadeSmooth")(rig.mesh_object)
     rig.mesh_object.modifiers["It"].use_pin_to_last = True
     assert len(residuals(rig, tmp_path)) == FEW.poses
-    bind(rig, elbow.model)
+    bind(rig, loose_model)
     assert [m.name for m in rig.mesh_object.modifiers if m.show_viewport] == ["FDDA", "Subdivision", "It"]
 
 
-def test_a_simulation_after_the_rig_works_on_what_the_model_gives(elbow):
+def test_a_simulation_after_the_rig_works_on_what_the_model_gives(loose_model):
     rig = character(stacks.corrective_smooth)
     at(2, "CLOTH", show_viewport=False)(rig.mesh_object)
-    bind(rig, elbow.model)
+    bind(rig, loose_model)
     rig.mesh_object.modifiers["It"].show_viewport = True
     for frame in range(1, 5):
         bpy.context.scene.frame_set(frame)
     falling = evaluated(rig.mesh_object)
     rig.mesh_object.modifiers["It"].show_viewport = False
-    moved = falling - assert_plays(rig.mesh_object, elbow.model)
+    moved = falling - assert_plays(rig.mesh_object, loose_model)
     assert len(falling) == len(rig.mesh_object.data.vertices) and -0.2 < moved[:, 2].mean() < -0.001

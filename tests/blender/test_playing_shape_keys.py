@@ -45,6 +45,7 @@ def test_shape_keys_that_come_while_a_model_plays(bound, elbow):
     pose(angle=0.3)
     assert_plays(bound, elbow.model)
     bound.shape_key_add(name="Basis")
+    # As it is added, it moves nothing.
     bound.shape_key_add(name="bulge").value = 1
     for angle in (0.5, 0.7, 0.9):
         pose(angle=angle)

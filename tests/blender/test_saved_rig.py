@@ -7,13 +7,16 @@ import pytest
 
 import fdda_addon
 from fdda_addon.runtime import model_files
+from fdda_addon.runtime.binding import bind
+from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
-from .conftest import ELBOW, assert_plays, evaluated, pose
+from .conftest import ELBOW, assert_plays, evaluated, pose, without_deformation
 
 
 @pytest.fixture
 def keyed(bound):
     """The bound elbow with a shape key, which a playing model pins away."""
+    bind(SceneRig(bound, armature_of(bound)), without_deformation(model_files.model_path(bound)))
     bound.fdda.mode = "RIG"
     bound.shape_key_add(name="Basis")
     key = bound.shape_key_add(name="bulge")

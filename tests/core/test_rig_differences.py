@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fdda_addon.core.controls import Control
 from fdda_addon.core.rig import REST_TOLERANCE, Fingerprint, Joint, Rig, differences
 
 from .limb import JOINTS, make_rig
@@ -86,3 +87,84 @@ def test_digest_tells_values_shapes_and_types_apart():
     assert len(digests) == 5
     assert all(len(digest) == 16 and int(digest, 16) >= 0 for digest in digests)
     assert Fingerprint.digest(array.reshape(3, 4).T.copy().T) == Fingerprint.digest(array.reshape(3, 4))
+
+
+MODIFIERS = [
+    {"name": "Armature", "type": "ARMATURE", "settings": {"object": "the rig's armature", "use_vertex_groups": True}},
+    {"name": "Mush", "type": "CORRECTIVE_SMOOTH", "settings": {"factor": 0.5, "iterations": 10, "scale": None}},
+]
+DEFORMATION = {
+    "modifiers": MODIFIERS,
+    "shape_keys": {"smile": {"value": 0.0, "mute": False, "shape": "a"}},
+    "b_bones": {"tail": {"segments": 4, "curve": [0.0, 0.5]}},
+    "drivers": "d",
+}
+
+
+def with_mush(**settings: object) -> dict:
+    return {
+        **DEFORMATION,
+        "modifiers": [MODIFIERS[0], MODIFIERS[1] | {"settings": MODIFIERS[1]["settings"] | settings}],
+    }
+
+
+def with_key(**settings: object) -> dict:
+    return {**DEFORMATION, "shape_keys": {"smile": DEFORMATION["shape_keys"]["smile"] | settings}}
+
+
+NEW = {"name": "New", "type": "CAST", "settings": {}}
+CHANGED = {
+    "the same": (DEFORMATION, []),
+    "one that says nothing": ({}, []),
+    "rounding": (with_mush(factor=0.500001), []),
+    "what was animated": (with_mush(scale=3.0), []),
+    "a control": (with_mush(iterations=None), []),
+    "a setting": (with_mush(factor=0.7), ["'factor' of the modifier 'Mush' was 0.5 and is 0.7"]),
+    "keys": (with_mush(factor=None), ["'factor' of the modifier 'Mush' is animated and is no control of the model"]),
+    "a name": ({**DEFORMATION, "modifiers": [MODIFIERS[0], MODIFIERS[1] | {"name": "Other"}]}, []),
+    "order": ({**DEFORMATION, "modifiers": MODIFIERS[::-1]}, ["the modifiers are in another order"]),
+    "new": (
+        {**DEFORMATION, "modifiers": [NEW, *MODIFIERS]}, ["it was recorded without the modifier 'New'"]
+    ),
+    "gone": (
+        {**DEFORMATION, "modifiers": MODIFIERS[:1]},
+        ["the modifier 'Mush' is gone, switched off or behind the modifier FDDA"],
+    ),
+    "a shape": (with_key(shape="b"), ["'shape' of the shape key 'smile' differs"]),
+    "a value": (with_key(value=1.0), ["'value' of the shape key 'smile' was 0.0 and is 1.0"]),
+    "no key": ({**DEFORMATION, "shape_keys": {}}, ["the shape key 'smile' is gone"]),
+    "B-Bones": (
+        {**DEFORMATION, "b_bones": {"tail": {"segments": 4, "curve": [0.0, 1.0]}, "arm": {"segments": 2}}},
+        ["'curve' of the bone 'tail' differs", "the bone 'arm' was no B-Bone when it was recorded"],
+    ),
+    "drivers": ({**DEFORMATION, "drivers": "e"}, ["the drivers that deform the mesh differ"]),
+    "much": (
+        {"modifiers": [], "drivers": ""},
+        ["the modifier 'Armature' is gone, switched off or behind the modifier FDDA",
+         "the modifier 'Mush' is gone, switched off or behind the modifier FDDA",
+         "the shape key 'smile' is gone", "2 more"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", CHANGED)
+def test_what_deforms_the_mesh_besides(rig, what):
+    now, sentences = CHANGED[what]
+    recorded = replace(rig, fingerprint=replace(rig.fingerprint, deformation=DEFORMATION))
+    controls = (Control("mesh_object", 'modifiers["Mush"].iterations', 0.0, 1.0),)
+    assert found(recorded, fingerprint=replace(rig.fingerprint, deformation=now), controls=controls) == sentences
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        [], "x", {"other": 1}, {"modifiers": [3]}, {"modifiers": [{"name": "a"}]}, {"shape_keys": {"a": 3}},
+        {"drivers": 3}, {"modifiers": [{"name": "a", "type": 4, "settings": {}}]},
+        {"b_bones": {str(number): {} for number in range(20_000)}},
+    ],
+)  # fmt: skip
+def test_a_damaged_deformation_is_refused(value):
+    parts = {"topology": "a", "rest_positions": "b", "skin_weights": "c"}
+    assert Fingerprint.from_json({**parts, "deformation": DEFORMATION}).deformation == DEFORMATION
+    with pytest.raises((KeyError, TypeError, ValueError)):
+        Fingerprint.from_json({**parts, "deformation": value})

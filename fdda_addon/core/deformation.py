@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What deforms a mesh beside its skin weights, as JSON: a recording and a model hold it, playback compares it.
+
+Keys, each left out where there is nothing to say: `modifiers`, a list of `{"name", "type", "settings"}` in their order;
+`shape_keys` and `b_bones`, objects of settings by name; `drivers`, a hash. A setting is a truth value, a number, a text
+or a list of them, and null where it is animated. An empty object says that nobody knows.
+"""
+
+import math
+from collections.abc import Iterable
+from difflib import SequenceMatcher
+
+from .controls import MESH_OBJECT, SHAPE_KEYS, Control
+
+MAX_ENTRIES = 10_000
+MAX_SHOWN = 3
+TOLERANCE = 1e-4
+"""Largest relative difference of a setting that counts as the same; a file of float32 has less."""
+_GROUPS = {"shape_keys": "shape key", "b_bones": "bone"}
+
+
+def check_deformation(value: object) -> dict:
+    """A deformation from a file; TypeError, KeyError or ValueError where it is damaged."""
+    if not isinstance(value, dict) or not value.keys() <= {"modifiers", "drivers", *_GROUPS}:
+        raise TypeError("its deformation is none")
+    named = [(m["name"], m["settings"]) for m in value.get("modifiers", [])]
+    named += [entry for group in _GROUPS for entry in value.get(group, {}).items()]
+    texts = [value.get("drivers", ""), *(m["type"] for m in value.get("modifiers", []))]
+    if len(named) > MAX_ENTRIES or sum(len(settings) for _, settings in named) > MAX_ENTRIES:
+        raise ValueError("its deformation has too many settings")
+    if not all(isinstance(text, str) for text in texts) or not all(
+        isinstance(name, str) and isinstance(settings, dict) for name, settings in named
+    ):
+        raise TypeError("its deformation is damaged")
+    return value
+
+
+def deformation_differences(recorded: dict, now: dict, controls: Iterable[Control] = ()) -> list[str]:
+    """Say in what the deformation of a rig differs from the recorded one.
+
+    Args:
+        recorded: that of a recording or model; where it is empty nobody knows, and nothing differs.
+        now: that of the rig at hand.
+        controls: the inputs of the model; their values may be others.
+
+    Returns:
+        One clause a difference.
+    """
+    if not recorded or not now:
+        return []
+    inputs = {(control.owner, control.path) for control in controls}
+    found = _modifier_differences(recorded.get("modifiers", []), now.get("modifiers", []), inputs)
+    for group, kind in _GROUPS.items():
+        found += _group_differences(kind, recorded.get(group, {}), now.get(group, {}), inputs)
+    if recorded.get("drivers", "") != now.get("drivers", ""):
+        found.append("the drivers that deform the mesh differ")
+    return found[:MAX_SHOWN] + ([f"{len(found) - MAX_SHOWN} more"] if len(found) > MAX_SHOWN else [])
+
+
+def _modifier_differences(recorded: list[dict], now: list[dict], inputs: set[tuple[str, str]]) -> list[str]:
+    types, types_now = ([modifier["type"] for modifier in modifiers] for modifiers in (recorded, now))
+    if types != types_now and sorted(types) == sorted(types_now):
+        return ["the modifiers are in another order"]
+    found = []
+    for operation, first, end, first_now, end_now in SequenceMatcher(None, types, types_now, False).get_opcodes():
+        if operation == "equal":
+            for modifier, own in zip(recorded[first:end], now[first_now:end_now], strict=True):
+                found += _setting_differences("modifier", own["name"], modifier["settings"], own["settings"], inputs)
+            continue
+        found += [f"it was recorded without the modifier '{m['name']}'" for m in now[first_now:end_now]]
+        found += [
+            f"the modifier '{m['name']}' is gone, switched off or behind the modifier FDDA" for m in recorded[first:end]
+        ]
+    return found
+
+
+def _group_differences(kind: str, recorded: dict, now: dict, inputs: set[tuple[str, str]]) -> list[str]:
+    found = [f"the {kind} '{name}' is gone" for name in recorded if name not in now and kind != "bone"]
+    found += [f"the bone '{name}' is no B-Bone any more" for name in recorded if name not in now and kind == "bone"]
+    for name, settings in now.items():
+        if name in recorded:
+            found += _setting_differences(kind, name, recorded[name], settings, inputs)
+        elif kind == "bone":
+            found.append(f"the bone '{name}' was no B-Bone when it was recorded")
+        elif settings.get("value", 0.0) != 0 and not settings.get("mute"):
+            found.append(f"it was recorded without the shape key '{name}'")
+    return found
+
+
+def _setting_differences(kind: str, name: str, recorded: dict, now: dict, inputs: set[tuple[str, str]]) -> list[str]:
+    found = []
+    for setting, value in recorded.items():
+        # Versions of Blender differ in what settings there are.
+        if value is None or setting not in now or _is_same(value, now[setting]):
+            continue
+        if _is_input(kind, name, setting, inputs):
+            continue
+        what = f"'{setting}' of the {kind} '{name}'"
+        if now[setting] is None:
+            found.append(f"{what} is animated and is no control of the model")
+        elif isinstance(value, bool | int | float | str) and setting != "shape":
+            found.append(f"{what} was {value} and is {now[setting]}")
+        else:
+            found.append(f"{what} differs")
+    return found
+
+
+def _is_input(kind: str, name: str, setting: str, inputs: set[tuple[str, str]]) -> bool:
+    escaped = name.replace("\\", "\\\\").replace('"', '\\"')
+    owner, path = {
+        "modifier": (MESH_OBJECT, f'modifiers["{escaped}"].{setting}'),
+        "shape key": (SHAPE_KEYS, f'key_blocks["{escaped}"].{setting}'),
+    }.get(kind, ("", ""))
+    return any(own == owner and (control == path or control.startswith(f"{path}[")) for own, control in inputs)
+
+
+def _is_same(value: object, now: object) -> bool:
+    if isinstance(value, list) and isinstance(now, list):
+        return len(value) == len(now) and all(map(_is_same, value, now))
+    if isinstance(value, int | float) and isinstance(now, int | float):
+        return math.isclose(value, now, rel_tol=TOLERANCE, abs_tol=TOLERANCE * TOLERANCE)
+    return value == now

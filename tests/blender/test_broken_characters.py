@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A character that cannot play any more: it shows its rig and says why, and the others play on."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from fdda_addon.core.model import CHECKSUM_KEY, CONTROLS_INPUT, METADATA_KEY
+from fdda_addon.runtime import playback
+from fdda_addon.runtime.binding import bind
+from fdda_addon.runtime.live_binding import LiveBinding
+from fdda_addon.scene.scene_rig import find_rig
+
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
+from .test_crowd import crowd_of
+
+
+def edit_mesh(mesh_object: bpy.types.Object, change: Callable[[], object]) -> None:
+    bpy.context.view_layer.objects.active = mesh_object
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="SELECT")
+    change()
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def delete_vertices(mesh_object: bpy.types.Object) -> None:
+    mesh_object.data = mesh_object.data.copy()
+    edit_mesh(mesh_object, lambda: bpy.ops.mesh.delete(type="VERT"))
+
+
+@pytest.mark.parametrize("count", [3, 5], ids=["each by itself", "a crowd"])
+def test_a_mesh_without_vertices(bound, elbow, count):
+    crowd = crowd_of(bound, count)
+    for frame in (1, 2, 3):
+        bpy.context.scene.frame_set(frame)
+    delete_vertices(crowd[1])
+    for frame in (4, 9):
+        bpy.context.scene.frame_set(frame)
+        for mesh_object in [o for o in crowd if o != crowd[1]]:
+            assert_plays(mesh_object, elbow.model)
+    pose(angle=0.4)
+    assert_plays(crowd[0], elbow.model)
+    assert crowd[1].fdda.mode == "RIG" and "has 0 vertices and its model was trained for" in crowd[1].fdda.status
+
+
+STEPS = {
+    "when it is found": (LiveBinding, "__init__"),
+    "when it has changed": (LiveBinding, "fits"),
+    "when its rig is checked": (LiveBinding, "check_rig"),
+    "when its mask is read": (LiveBinding, "follow_mask"),
+}
+
+
+@pytest.mark.parametrize("where", STEPS)
+def test_what_nobody_expected_harms_one_character(bound, elbow, monkeypatch, where):
+    crowd = crowd_of(bound, 3)
+    bpy.context.view_layer.update()
+    owner, name = STEPS[where]
+    real, broken = getattr(owner, name), crowd[1].session_uid
+
+    def fail(live: LiveBinding, *arguments: object, **named: object) -> object:
+        if broken in (getattr(live, "uid", 0), getattr(arguments[0], "session_uid", 0)):
+            raise KeyError("position")
+        return real(live, *arguments, **named)
+
+    monkeypatch.setattr(owner, name, fail)
+    if where == "when it is found":
+        playback.forget()
+    for mesh_object in crowd:
+        mesh_object.data.update()
+        mesh_object.update_tag()
+    bpy.context.view_layer.update()
+    bpy.context.scene.frame_set(8)
+    for mesh_object in (crowd[0], crowd[2]):
+        assert_plays(mesh_object, elbow.model)
+    assert crowd[1].fdda.mode == "RIG" and "cannot be played (KeyError('position'))" in crowd[1].fdda.status
+
+
+def with_control(model: Path, owner: str, path: str) -> Path:
+    """A model beside another that has a control, which moves nothing."""
+    loaded, changed = onnx.load(model), model.with_name("controlled.onnx")
+    loaded.graph.input.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", 1]))
+    for prop in list(loaded.metadata_props):
+        if prop.key == METADATA_KEY:
+            info = json.loads(prop.value)
+            info["controls"] = [{"owner": owner, "path": path, "low": 0.0, "high": 1.0}]
+            prop.value = json.dumps(info)
+        elif prop.key == CHECKSUM_KEY:
+            loaded.metadata_props.remove(prop)
+    onnx.save(loaded, changed)
+    return changed
+
+
+def armature_object() -> bpy.types.Object:
+    return bpy.data.objects[ELBOW_RIG]
+
+
+def keys() -> bpy.types.Key:
+    return bpy.data.objects[ELBOW].data.shape_keys
+
+
+def delete_property() -> None:
+    del armature_object()["dial"]
+    # As the interface does: until then Blender goes on with the value that it had.
+    armature_object().update_tag()
+
+
+def rename_property() -> None:
+    armature_object()["stretch"] = armature_object()["dial"]
+    delete_property()
+
+
+def rename_object() -> None:
+    bpy.data.objects["dials"].name = "others"
+    playback.forget()
+
+
+KEY = ("shape_keys", 'key_blocks["smile"].value')
+BONE = ("armature_object", 'pose.bones["dial"]["fist"]')
+OBJECT = ("object:dials", "location[2]")
+GONE = {
+    "a property is deleted": (("armature_object", '["dial"]'), delete_property),
+    "a property is renamed": (("armature_object", '["dial"]'), rename_property),
+    "a shape key is removed": (KEY, lambda: bpy.data.objects[ELBOW].shape_key_remove(keys().key_blocks["smile"])),
+    "all shape keys are": (KEY, lambda: bpy.data.objects[ELBOW].shape_key_clear()),
+    "a shape key is renamed": (KEY, lambda: setattr(keys().key_blocks["smile"], "name", "grin")),
+    "a bone is renamed": (BONE, lambda: setattr(armature_object().data.bones["dial"], "name", "knob")),
+    "an object is removed": (OBJECT, lambda: bpy.data.objects.remove(bpy.data.objects["dials"])),
+    "an object is renamed": (OBJECT, rename_object),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("when", ["pose", "frame"])
+@pytest.mark.parametrize("what", GONE)
+def test_a_control_that_is_gone(rig, elbow, what, when):
+    mesh_object = rig.mesh_object
+    armature_object()["dial"] = 0.5
+    mesh_object.shape_key_add(name="Basis")
+    mesh_object.shape_key_add(name="smile").value = 0.5
+    dials = bpy.data.objects.new("dials", None)
+    bpy.context.scene.collection.objects.link(dials)
+    bpy.context.view_layer.objects.active = armature_object()
+    bpy.ops.object.mode_set(mode="EDIT")
+    bone = armature_object().data.edit_bones.new("dial")
+    bone.head, bone.tail, bone.use_deform = (1, 0, 0), (1, 0, 0.2), False
+    bpy.ops.object.mode_set(mode="OBJECT")
+    armature_object().pose.bones["dial"]["fist"] = 0.5
+    (owner, path), change = GONE[what]
+    bind(find_rig(), with_control(elbow.model, owner, path))
+    pose(angle=1.0)
+    assert mesh_object.fdda.mode == "FDDA" and not mesh_object.fdda.status
+    change()
+    if when == "pose":
+        pose(angle=0.6)
+    else:
+        bpy.context.scene.frame_set(11)
+    assert mesh_object.fdda.mode == "RIG"
+    assert f"'elbow' lacks the control '{owner}/{path}'" in mesh_object.fdda.status
+    shown = evaluated(mesh_object)
+    mesh_object.modifiers.remove(mesh_object.modifiers["FDDA"])
+    assert np.array_equal(evaluated(mesh_object), shown)

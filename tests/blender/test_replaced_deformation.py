@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a model stands in for is changed while it plays: the rig is shown with why, or nothing is seen of the change."""
+
+from collections.abc import Callable
+
+import bpy
+import numpy as np
+import pytest
+
+from fdda_addon.rig.deformation import read_deformation
+from fdda_addon.runtime import nodes
+from fdda_addon.runtime.binding import bind
+from fdda_addon.scene.scene_rig import find_rig
+
+from .conftest import ELBOW_RIG, assert_plays, evaluated, pose, rig_positions, with_deformation
+from .test_changed_rigs import look
+
+
+def add(kind: str, place: int | None, **settings: object) -> Callable[[bpy.types.Object], None]:
+    """Add a modifier at a place, None for the end."""
+
+    def change(mesh_object: bpy.types.Object) -> None:
+        modifier = mesh_object.modifiers.new(kind.title(), kind)
+        for name, value in settings.items():
+            setattr(modifier, name, value)
+        if place is not None:
+            mesh_object.modifiers.move(len(mesh_object.modifiers) - 1, place)
+
+    return change
+
+
+def add_key(mesh_object: bpy.types.Object) -> bpy.types.ShapeKey:
+    mesh_object.shape_key_add(name="Basis")
+    key = mesh_object.shape_key_add(name="bulge")
+    for point in key.data:
+        point.co.z *= 1.2
+    key.value = 0.0
+    return key
+
+
+def key_factor(mesh_object: bpy.types.Object) -> None:
+    mesh_object.modifiers["CorrectiveSmooth"].keyframe_insert("factor", frame=1)
+
+
+def drive_factor(mesh_object: bpy.types.Object) -> None:
+    mesh_object.modifiers["CorrectiveSmooth"].driver_add("factor").driver.expression = "frame / 100"
+
+
+def set_of(modifier: str, **settings: object) -> Callable[[bpy.types.Object], None]:
+    def change(mesh_object: bpy.types.Object) -> None:
+        for name, value in settings.items():
+            setattr(mesh_object.modifiers[modifier], name, value)
+
+    return change
+
+
+def remove_smooth(mesh_object: bpy.types.Object) -> None:
+    mesh_object.modifiers.remove(mesh_object.modifiers["CorrectiveSmooth"])
+
+
+def bend_segments(_: bpy.types.Object) -> None:
+    bpy.data.objects[ELBOW_RIG].data.bones["lower"].bbone_segments = 4
+
+
+def add_weights(mesh_object: bpy.types.Object) -> None:
+    add("VERTEX_WEIGHT_EDIT", 0, vertex_group="lower", use_add=True, add_threshold=0.0)(mesh_object)
+
+
+GONE = "is gone, switched off or behind the modifier FDDA"
+CHANGES = {
+    "a subdivision first": (add("SUBSURF", 0, levels=1), "it was recorded without the modifier 'Subsurf'"),
+    "a mirror": (add("MIRROR", 1), "it was recorded without the modifier 'Mirror'"),
+    "a mask": (add("MASK", 0, vertex_group="lower"), "it was recorded without the modifier 'Mask'"),
+    "a decimation": (add("DECIMATE", 0, ratio=0.5), "it was recorded without the modifier 'Decimate'"),
+    "a smooth first": (add("SMOOTH", 0, iterations=5), "it was recorded without the modifier 'Smooth'"),
+    "other weights": (add_weights, "it was recorded without the modifier 'Vertex_Weight_Edit'"),
+    "preserved volume": (
+        set_of("Armature", use_deform_preserve_volume=True),
+        "'use_deform_preserve_volume' of the modifier 'Armature' was False and is True",
+    ),
+    "iterations": (
+        set_of("CorrectiveSmooth", iterations=3), "'iterations' of the modifier 'CorrectiveSmooth' was 8 and is 3"
+    ),
+    "a key": (key_factor, "'factor' of the modifier 'CorrectiveSmooth' is animated"),
+    "a driver": (drive_factor, "'factor' of the modifier 'CorrectiveSmooth' is animated"),
+    "a modifier is gone": (remove_smooth, f"the modifier 'CorrectiveSmooth' {GONE}"),
+    "the order": (lambda o: o.modifiers.move(0, 1), "the modifiers are in another order"),
+    "the model first": (lambda o: o.modifiers.move(2, 0), f"the modifier 'Armature' {GONE}"),
+    "segments": (bend_segments, "the bone 'lower' was no B-Bone when it was recorded"),
+    "a shape key": (lambda o: setattr(add_key(o), "value", 1.0), "it was recorded without the shape key 'bulge'"),
+}  # fmt: skip
+
+
+def assert_shows_rig(mesh_object: bpy.types.Object, clause: str) -> np.ndarray:
+    """The rig is shown, as it is where nothing is bound, and the status says why."""
+    assert clause in mesh_object.fdda.status and mesh_object.fdda.mode == "RIG"
+    shown = evaluated(mesh_object)
+    modifier = nodes.find_modifier(mesh_object)
+    if modifier is not None:
+        mesh_object.modifiers.remove(modifier)
+    assert np.array_equal(evaluated(mesh_object), shown)
+    return shown
+
+
+@pytest.mark.parametrize("when", ["update", "frame"])
+@pytest.mark.parametrize("what", CHANGES)
+def test_a_change_gives_the_rig_back(bound, what, when):
+    change, clause = CHANGES[what]
+    pose(angle=1.0)
+    change(bound)
+    look(when)
+    assert_shows_rig(bound, clause)
+
+
+def test_a_topology_that_only_renders_have(bound):
+    """A model that renders use too would be given to other vertices there."""
+    bound.fdda.use_in_render = True
+    add("SUBSURF", 0, show_viewport=False)(bound)
+    look("update")
+    assert_shows_rig(bound, "it was recorded without the modifier 'Subsurf'")
+
+
+ALLOWED = {
+    "a subdivision at the end": add("SUBSURF", None, levels=1),
+    "a smooth at the end": add("SMOOTH", None, iterations=5),
+    "one that is off": add("SMOOTH", 0, show_viewport=False),
+    "a replaced one is shown": set_of("CorrectiveSmooth", show_viewport=True),
+    "another name": set_of("CorrectiveSmooth", name="Mush"),
+    "a shape key that does nothing yet": add_key,
+    "shading": add("WEIGHTED_NORMAL", 0),
+}
+
+
+@pytest.mark.parametrize("what", ALLOWED)
+def test_what_changes_nothing_that_was_recorded_plays_on(bound, elbow, what):
+    pose(angle=1.0)
+    playing = evaluated(bound)
+    ALLOWED[what](bound)
+    pose(angle=1.0)
+    assert bound.fdda.mode == "FDDA" and not bound.fdda.status
+    for modifier in bound.modifiers:
+        if bound.modifiers.find(modifier.name) > bound.modifiers.find("FDDA"):
+            modifier.show_viewport = False
+    assert np.abs(assert_plays(bound, elbow.model) - playing).max() < 1e-6
+    # The rig is as near as before.
+    assert np.abs(rig_positions(bound) - playing).max() < 5e-3
+
+
+def test_undone_it_plays_again(bound, elbow):
+    pose(angle=1.0)
+    add("SMOOTH", 0)(bound)
+    look("update")
+    assert bound.fdda.mode == "RIG"
+    bound.modifiers.remove(bound.modifiers["Smooth"])
+    bound.fdda.mode = "FDDA"
+    pose(angle=0.8)
+    assert_plays(bound, elbow.model)
+
+
+def test_a_bound_rig_is_bound_again_with_what_stands_behind(bound, elbow):
+    """What deforms behind the model is not the model's, and stays behind it."""
+    add("SMOOTH", None, iterations=5)(bound)
+    bind(find_rig(), elbow.model)
+    bpy.context.view_layer.update()
+    assert [m.name for m in bound.modifiers] == ["Armature", "CorrectiveSmooth", "FDDA", "Smooth"]
+    assert not bound.fdda.status
+
+
+def drive_key(mesh_object: bpy.types.Object) -> bpy.types.Driver:
+    """Let the lower bone drive a shape key, as a biceps."""
+    driver = add_key(mesh_object).driver_add("value").driver
+    variable = driver.variables.new()
+    variable.type = "TRANSFORMS"
+    variable.targets[0].id, variable.targets[0].bone_target = bpy.data.objects[ELBOW_RIG], "lower"
+    variable.targets[0].transform_type = "ROT_X"
+    driver.type = "SUM"
+    return driver
+
+
+def other_armature(mesh_object: bpy.types.Object, _: bpy.types.Driver) -> None:
+    copy = bpy.data.objects[ELBOW_RIG].copy()
+    bpy.context.scene.collection.objects.link(copy)
+    mesh_object.modifiers["Armature"].object = copy
+
+
+def other_expression(_: bpy.types.Object, driver: bpy.types.Driver) -> None:
+    driver.type, driver.expression = "SCRIPTED", "0.5 * var"
+
+
+DRIVERS, KEY = "the drivers that deform the mesh differ", "shape key 'bulge'"
+DRIVEN = {
+    "another armature": (other_armature, DRIVERS),
+    "another expression": (other_expression, DRIVERS),
+    "no driver": (lambda o, _: remove_driver(o), DRIVERS),
+    "another shape": (lambda o, _: sculpt(o), f"'shape' of the {KEY} differs"),
+    "a muted key": (lambda o, _: setattr(o.data.shape_keys.key_blocks["bulge"], "mute", True), f"'mute' of the {KEY}"),
+    "no key": (lambda o, _: o.shape_key_remove(o.data.shape_keys.key_blocks["bulge"]), f"the {KEY} is gone"),
+}
+
+
+def remove_driver(mesh_object: bpy.types.Object) -> None:
+    mesh_object.data.shape_keys.key_blocks["bulge"].driver_remove("value")
+    # As the interface does: until then Blender evaluates the driver that was.
+    mesh_object.data.shape_keys.update_tag()
+
+
+def sculpt(mesh_object: bpy.types.Object) -> None:
+    mesh_object.data.shape_keys.key_blocks["bulge"].data[7].co.z += 0.05
+
+
+@pytest.mark.parametrize("what", DRIVEN)
+def test_a_shape_key_that_was_recorded(rig, elbow, what):
+    driver = drive_key(rig.mesh_object)
+    bpy.context.view_layer.update()
+    bind(rig, with_deformation(elbow.model, read_deformation(rig)))
+    for angle in (0.5, 1.0):
+        pose(angle=angle)
+    assert rig.mesh_object.fdda.mode == "FDDA" and not rig.mesh_object.fdda.status
+    change, clause = DRIVEN[what]
+    change(rig.mesh_object, driver)
+    look("update")
+    assert_shows_rig(rig.mesh_object, clause)
+
+
+def test_a_character_that_is_copied_with_all_that_drives_it_plays(rig, elbow):
+    """Names of objects are no part of what is compared."""
+    drive_key(rig.mesh_object)
+    bpy.context.view_layer.update()
+    bind(rig, with_deformation(elbow.model, read_deformation(rig)))
+    mesh_object, armature_object = rig.mesh_object.copy(), rig.armature_object.copy()
+    mesh_object.data = mesh_object.data.copy()
+    for copy in (mesh_object, armature_object):
+        bpy.context.scene.collection.objects.link(copy)
+    mesh_object.modifiers["Armature"].object = mesh_object.parent = armature_object
+    mesh_object.data.shape_keys.animation_data.drivers[0].driver.variables[0].targets[0].id = armature_object
+    pose(angle=0.7)
+    pose(armature_object.name, 0.4)
+    assert not mesh_object.fdda.status and mesh_object.fdda.mode == "FDDA"
