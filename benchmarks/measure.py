@@ -85,6 +85,8 @@ def crowd(bound: str) -> dict:
         mesh_copy, armature_copy = first.copy(), armature_object.copy()
         for copy in (mesh_copy, armature_copy):
             bpy.context.scene.collection.objects.link(copy)
+        mesh_copy.data = first.data.copy()
+        _redirect_drivers(mesh_copy.data.shape_keys, armature_object, armature_copy)
         mesh_copy.parent = armature_copy if first.parent else None
         armature_modifier(mesh_copy).object = armature_copy
         _shift_action(armature_copy, number * 7)
@@ -97,6 +99,16 @@ def crowd(bound: str) -> dict:
         "ms_a_character": many / CROWD,
         "ratio": many / CROWD / one,
     }
+
+
+def _redirect_drivers(
+    keys: bpy.types.Key | None, armature_object: bpy.types.Object, armature_copy: bpy.types.Object
+) -> None:
+    """Let the drivers of shape keys read the armature of their own character."""
+    for curve in keys.animation_data.drivers if keys is not None and keys.animation_data else ():
+        for target in (target for variable in curve.driver.variables for target in variable.targets):
+            if target.id == armature_object:
+                target.id = armature_copy
 
 
 def _without_play(mesh_object: bpy.types.Object) -> float:

@@ -84,12 +84,15 @@ def _shape_keys(mesh_object: bpy.types.Object) -> dict:
     keys = mesh_object.data.shape_keys
     if keys is None:
         return {}
-    animated, found = _animated_paths(keys), {}
+    animated, relatives, found = _animated_paths(keys), {}, {}
     for block in keys.key_blocks:
         if block == keys.reference_key:
             continue
-        shape = Fingerprint.digest(read(block.data, COORDINATE))
-        if shape == Fingerprint.digest(read(block.relative_key.data, COORDINATE)):
+        shape = read(block.data, COORDINATE)
+        relative = block.relative_key
+        if relative.name not in relatives:
+            relatives[relative.name] = read(relative.data, COORDINATE)
+        if (shape == relatives[relative.name]).all():
             # It moves nothing.
             continue
         settings = {name: _value(None, block, name) for name in _OF_SHAPE_KEY}
@@ -98,7 +101,7 @@ def _shape_keys(mesh_object: bpy.types.Object) -> dict:
                 settings[name] = None
         if mesh_object.show_only_shape_key:
             settings["value"] = float(block == mesh_object.active_shape_key)
-        found[block.name] = settings | {"shape": shape}
+        found[block.name] = settings | {"shape": Fingerprint.digest(shape)}
     return found
 
 
