@@ -12,6 +12,8 @@ from .conftest import run
 
 ROOT = Path(__file__).resolve().parents[2]
 SEED = 77
+NEAR_THE_RIG = {"mode": 40, "topology": 40, "controls": 20}
+"""Parts that compare with the rig, and how many cases; the others compare with the model."""
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +32,12 @@ def folder(elbow, tmp_path_factory) -> Path:
     ("part", "count"),
     [
         ("models", 60), ("kills", 3), ("disks", 4), ("outputs", 12), ("frames", 200), ("undo", 40), ("loads", 6),
-        ("time", 8), ("armatures", 6),
+        ("time", 8), ("armatures", 6), *NEAR_THE_RIG.items(),
     ],
 )  # fmt: skip
 def test_a_short_soak(folder, part, count):
     from benchmarks.soaking.cases import FELL_SHORT, heard
+    from benchmarks.soaking.changes import NEAR
 
     if part in ("kills", "disks") and not can_train():
         pytest.skip("the environment of this line has no torch")
@@ -44,7 +47,7 @@ def test_a_short_soak(folder, part, count):
     cases = [case for line in result.stdout.splitlines() if (case := heard(line))]
     assert [case for case in cases if case.outcome == FELL_SHORT] == []
     assert len(cases) == count and result.returncode == 0, result.stderr[-2000:]
-    assert max(case.off for case in cases) == 0
+    assert max(case.off for case in cases) <= (NEAR if part in NEAR_THE_RIG else 0)
 
 
 def can_train() -> bool:
