@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The extension in a Blender of its own: `python extension_life.py live|install|play|start [ZIP [BOUND]]`.
+"""The extension in a Blender of its own: `python extension_life.py live|install|play|start|list [ZIP [BOUND]]`.
 
 `live` installs the zip, enables, disables, installs again, uninstalls, and prints what Blender holds after each;
 `install` installs and enables it; `play` then opens a bound file and poses it; `start` says what it costs
-to enable it, once it is installed. The last line is JSON.
+to enable it, once it is installed; `list` names the files of the user. The last line is JSON.
 BLENDER_USER_RESOURCES names the folder for all that. Blender itself runs it too: `blender -b --python … -- live ZIP`.
 """
 
@@ -142,13 +142,15 @@ def live(package: str) -> dict[str, dict]:
     return story
 
 
-def main(action: str, *files: str) -> None:
+def main(action: str, *paths: str) -> None:
     if action == "live":
-        told = live(*files)
+        told = live(*paths)
     elif action == "install":
-        told = {"result": install(*files, True)}
+        told = {"result": install(*paths, True)}
+    elif action == "list":
+        told = {"files": files(Path(os.environ["BLENDER_USER_RESOURCES"]))}
     elif action == "play":
-        told = play(*files)
+        told = play(*paths)
     else:
         told = start()
     print(json.dumps(told))
