@@ -20,6 +20,8 @@ _UPDATES_AND_DRAWING = {f"{_ADDON}.properties.binding", f"{_ADDON}.evaluation.ov
 
 _called_by_blender: set[str] = set()
 """Modules whose functions Blender calls."""
+_pending = 0
+"""Signal of a request that had to wait."""
 
 
 @contextmanager
@@ -29,6 +31,8 @@ def interruptible() -> Iterator[None]:
         # Only the main thread may say what a signal does; it is not this job that Ctrl-C ends.
         yield
         return
+    global _pending
+    _pending = 0
     previous = handle_stop_signals(_on_request)
     try:
         yield
@@ -42,13 +46,28 @@ def note_callbacks(modules: Iterable[str]) -> None:
     _called_by_blender = {*modules} | _UPDATES_AND_DRAWING
 
 
+def raise_pending() -> None:
+    """Raise the KeyboardInterrupt of a request that had to wait, if there is one; for the end of imports."""
+    global _pending
+    if _pending:
+        number, _pending = _pending, 0
+        raise KeyboardInterrupt(number)
+
+
+def _repeat() -> None:
+    if _pending:
+        interrupt_main(_pending)
+
+
 def _on_request(number: int, frame: FrameType | None) -> None:
+    global _pending
+    _pending = number
     while frame is not None and frame.f_globals.get("__name__") != _MAIN:
         is_import = frame.f_code.co_filename.startswith("<frozen importlib")
         if is_import or frame.f_globals.get("__name__") in _called_by_blender:
-            timer = threading.Timer(RETRY_SECONDS, interrupt_main, (number,))
+            timer = threading.Timer(RETRY_SECONDS, _repeat)
             timer.daemon = True
             timer.start()
             return
         frame = frame.f_back
-    raise KeyboardInterrupt(number)
+    raise_pending()

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from .. import registration
-from .interruption import note_callbacks
+from .interruption import note_callbacks, raise_pending
 
 
 @contextmanager
@@ -15,6 +15,7 @@ def registered() -> Iterator[None]:
     registration.register()
     note_callbacks(handler.__module__ for _, handler in registration.handler_table())
     try:
+        raise_pending()
         yield
     finally:
         if not was_registered:
