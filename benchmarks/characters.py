@@ -22,7 +22,7 @@ import bpy  # noqa: E402
 import fdda_addon  # noqa: E402
 from blend_fixtures.characters.comparison import compare_row, record_row  # noqa: E402
 from blend_fixtures.characters.rows import ROWS, Row  # noqa: E402
-from blend_fixtures.characters.training import Trainings  # noqa: E402
+from blend_fixtures.characters.training import SMALL, Trainings  # noqa: E402
 
 PAGE = ROOT / "docs" / "characters.md"
 START, END = "<!-- make characters writes what follows -->", "<!-- until here -->"
@@ -36,7 +36,7 @@ def compare(rows: tuple[Row, ...], folder: Path) -> list[dict]:
             print(f"{row.name}: record", file=sys.stderr)
             (folder / row.name).mkdir()
             for recording, model in record_row(row, folder / row.name):
-                trainings.add(recording, model, row.epochs)
+                trainings.add(recording, model, "--epochs", row.epochs, *SMALL)
         print("train", file=sys.stderr)
     found = []
     for row in rows:

@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The elbow, recorded, trained and bound once for all tests; and what the tests measure with."""
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
+from filelock import FileLock
 
 import fdda_addon
+from blend_fixtures.characters.training import Trainings
 from fdda_addon.cli.main import main
 from fdda_addon.core.model import METADATA_KEY
 from fdda_addon.rig.reading import PoseReader
@@ -36,19 +40,41 @@ def run(*arguments: object) -> int:
     return main([str(argument) for argument in arguments], "fdda")
 
 
+@cache
+def _trainings() -> Trainings:
+    return Trainings()
+
+
+def train(recording: Path, model: Path, *options: object) -> None:
+    """Train a model as the verb does, in a process that all such trainings share: starting PyTorch takes seconds."""
+    trainings = _trainings()
+    trainings.add(recording, model, *options)
+    trainings.wait()
+
+
+def pytest_sessionfinish() -> None:
+    if _trainings.cache_info().currsize:
+        _trainings().close()
+
+
 @pytest.fixture(scope="session")
 def elbow(tmp_path_factory: pytest.TempPathFactory) -> ElbowFiles:
+    """The elbow's files, made by the first of the processes that run tests side by side; read only."""
     from blend_fixtures.elbow import build_elbow
     from fdda_addon.scene.blend_file import save_copy
 
-    folder = tmp_path_factory.mktemp("elbow")
+    temporary = tmp_path_factory.getbasetemp()
+    folder = (temporary.parent if "PYTEST_XDIST_WORKER" in os.environ else temporary) / "elbow"
     files = ElbowFiles(*(folder / name for name in ("elbow.blend", "recording", "elbow.onnx", "bound.blend")))
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    build_elbow()
-    save_copy(files.rig)
-    assert run("record", files.rig, files.recording, "--poses", 150) == 0
-    assert run("train", files.recording, files.model, "--epochs", 40) == 0
-    assert run("bind", files.rig, files.model, files.bound) == 0
+    with FileLock(folder.with_suffix(".lock")):
+        if not files.bound.exists():
+            folder.mkdir()
+            bpy.ops.wm.read_factory_settings(use_empty=True)
+            build_elbow()
+            save_copy(files.rig)
+            assert run("record", files.rig, files.recording, "--poses", 150) == 0
+            train(files.recording, files.model, "--epochs", 40)
+            assert run("bind", files.rig, files.model, files.bound) == 0
     return files
 
 

@@ -15,7 +15,7 @@ from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.scene.scene_rig import SceneRig
 
-from .conftest import run
+from .conftest import run, train
 from .figure import FRAMES, REACH, SMILE, WAVE, add_smile, add_wave, build_figure, edit_bones, key
 from .scene_state import assert_same_state, drain, scene_state
 
@@ -245,7 +245,7 @@ def trained(tmp_path_factory):
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "figure.blend"))
     options = ("--poses", 0, "--action", WAVE, "--mirror")
     assert run("record", folder / "figure.blend", folder / "recording", *options) == 0
-    assert run("train", folder / "recording", folder / "figure.onnx", "--epochs", 30) == 0
+    train(folder / "recording", folder / "figure.onnx", "--epochs", 30)
     return folder
 
 

@@ -15,7 +15,7 @@ from benchmarks.characters import END, START, table
 from blend_fixtures.characters import controls, skinning, stacks, targets, transforms
 from blend_fixtures.characters.comparison import compare_row, record_row
 from blend_fixtures.characters.rows import ROWS, Row
-from blend_fixtures.characters.training import Trainings
+from blend_fixtures.characters.training import SMALL, Trainings
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "characters.md"
@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for row in ROWS:
                 (path / row.name).mkdir()
                 for recording, model in record_row(row, path / row.name):
-                    trainings.add(recording, model, row.epochs)
+                    trainings.add(recording, model, "--epochs", row.epochs, *SMALL)
     finally:
         fdda_addon.unregister()
     return path

@@ -14,7 +14,7 @@ from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.runtime.network import Execution
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
 
-from .conftest import ELBOW, assert_plays, predicted, run
+from .conftest import ELBOW, assert_plays, predicted, run, train
 
 ROOT = Path(__file__).resolve().parents[2]
 CROWD = 20
@@ -151,7 +151,7 @@ def test_only_those_that_moved_are_evaluated(bound, calls):
 
 def test_different_models_side_by_side(bound, elbow, tmp_path, calls):
     other = tmp_path / "other.onnx"
-    assert run("train", elbow.recording, other, "--epochs", 3, "--hidden", 8, "--seed", 5) == 0
+    train(elbow.recording, other, "--epochs", 3, "--hidden", 8, "--seed", 5)
     bpy.ops.wm.open_mainfile(filepath=str(elbow.bound))
     crowd = crowd_of(bpy.data.objects[ELBOW], 4)
     for mesh_object in crowd[2:]:
@@ -191,7 +191,7 @@ def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
     try:
         assert run("build-arm", rig, "--density", 3) == 0
         assert run("record", rig, recording, "--poses", 40) == 0
-        assert run("train", recording, model, "--epochs", 2) == 0
+        train(recording, model, "--epochs", 2)
         assert run("bind", rig, model, bound) == 0
     finally:
         fdda_addon.unregister()

@@ -28,7 +28,7 @@ from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 
-from .conftest import ELBOW, assert_plays, evaluated, pose, run
+from .conftest import ELBOW, assert_plays, evaluated, pose, run, train
 from .refusals import Refusal, save_elbow
 from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
@@ -89,7 +89,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable]
             options = ("--object", ELBOW, "--poses", 120, "--fit-linear", kind)
             assert run("record", *files[:2], *options) == 0
             printed = capfd.readouterr().out
-            assert run("train", *files[1:], "--epochs", 25) == 0
+            train(*files[1:], "--epochs", 25)
             made[kind] = Fitted(*files, printed)
         return made[kind]
 

@@ -21,7 +21,7 @@ from fdda_addon.recording.run import record
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
-from .conftest import run
+from .conftest import run, train
 from .refusals import files, save_elbow
 from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
@@ -167,7 +167,7 @@ def test_a_model_knows_what_lies_beyond(tmp_path):
     for margin in ("1", "2"):
         recording, model, out = tmp_path / margin, tmp_path / f"{margin}.onnx", tmp_path / f"{margin}.json"
         assert run("record", rig, recording, "--poses", 200, "--margin", margin) == 0
-        assert run("train", recording, model, "--epochs", 60) == 0
+        train(recording, model, "--epochs", 60)
         assert run("evaluate", rig, model, "--json", out, "--poses", 40, "--beyond", 2) == 0
         errors[margin] = _errors(out)
     assert errors["2"][1] < errors["1"][1] / 2

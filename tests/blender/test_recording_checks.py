@@ -14,7 +14,7 @@ from fdda_addon.core.defaults import MIN_VERTICES
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.scene.blend_file import save_copy
 
-from .conftest import ELBOW, ELBOW_RIG, run
+from .conftest import ELBOW, ELBOW_RIG, run, train
 
 
 def record_elbow(folder: Path, turn: float, preserve_volume: bool, smooth: bool = True, poses: int = 200) -> Path:
@@ -134,7 +134,7 @@ class TestSmallPartitions:
 
     def test_the_model_and_its_evaluation_have_them(self, rig, tmp_path, capsys):
         assert run("record", rig, tmp_path / "r", "--poses", 60) == 0
-        assert run("train", tmp_path / "r", tmp_path / "m.onnx", "--epochs", 20) == 0
+        train(tmp_path / "r", tmp_path / "m.onnx", "--epochs", 20)
         assert run("evaluate", rig, tmp_path / "m.onnx", "--json", tmp_path / "e.json", "--poses", 20) == 0
         evaluation = json.loads((tmp_path / "e.json").read_text(encoding="utf-8"))
         sizes = {p["joint"]: p["vertices"] for p in evaluation["partitions"]}

@@ -21,7 +21,7 @@ from fdda_addon.scene.compatibility import animation_curves
 from fdda_addon.scene.scene_rig import find_rig
 
 from .. import systems
-from .conftest import evaluated, run
+from .conftest import evaluated, run, train
 from .refusals import Refusal
 from .scene_state import assert_same_state, drain, scene_state
 from .test_targets import built, complex_positions, of_flesh, recorded, refused
@@ -191,7 +191,7 @@ def test_a_settled_model_is_evaluated_against_settled_poses(tmp_path, capfd):
     assert capfd.readouterr().out.startswith("The same pose from two directions: ")
     assert recording.info.unsettled == ()
     model, errors = tmp_path / "elbow.onnx", tmp_path / "errors.json"
-    assert run("train", recording.path, model, "--epochs", 60) == 0
+    train(recording.path, model, "--epochs", 60)
     options = ["--object", "elbow", *SETTLED, "--poses", 6, "--json", errors]
     assert run("evaluate", rig, model, *options) == 0
     found = json.loads(errors.read_text())

@@ -15,7 +15,7 @@ from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.rig import UNMOVED
 from fdda_addon.scene.blend_file import save_copy
 
-from .conftest import run
+from .conftest import run, train
 from .refusals import Refusal
 
 EXACT = 1e-5
@@ -117,7 +117,7 @@ def test_a_model_of_a_cache_is_bound_evaluated_and_plays_without_it(tmp_path, ca
     rig = built(targets.target_alembic, tmp_path / "rig.blend")
     of_flesh(rig, tmp_path / "recording")
     model, bound = tmp_path / "elbow.onnx", tmp_path / "bound.blend"
-    assert run("train", tmp_path / "recording", model, "--epochs", 60) == 0
+    train(tmp_path / "recording", model, "--epochs", 60)
     errors = tmp_path / "errors.json"
     options = ["--object", "elbow", "--target", "flesh", "--poses", 0, "--action", ACTION, "--json", errors]
     assert run("evaluate", rig, model, *options) == 0
@@ -340,7 +340,7 @@ def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
     with pytest.raises(RuntimeError, match="The target 'flesh' shows frames"):
         bpy.ops.fdda.record(folder=str(tmp_path / "random"))
     model = tmp_path / "elbow.onnx"
-    assert run("train", recording.path, model, "--epochs", 30) == 0
+    train(recording.path, model, "--epochs", 30)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "rig.blend"))
     from fdda_addon.evaluation import last_evaluation
     from fdda_addon.runtime.binding import bind

@@ -14,8 +14,7 @@ from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import armature_modifier, find_rig
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, predicted, run
-from .training_in_one import train_all
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, predicted, run, train
 
 POSES = ((0.3, -0.2, 0.1), (1.2, 0.5, -0.4), (1.9, 0.1, 0.6))
 """Radians: the bend of the lower bone, two turns of the upper one."""
@@ -40,7 +39,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, P
             files[build.__name__] = (own / "rig.blend", own / "elbow.onnx")
     finally:
         fdda_addon.unregister()
-    train_all([(model.with_name("recording"), model) for _, model in files.values()], "--epochs", 40)
+    for _, model in files.values():
+        train(model.with_name("recording"), model, "--epochs", 40)
     return files
 
 

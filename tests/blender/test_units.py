@@ -28,8 +28,7 @@ from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import find_rig
 from fdda_addon.scene.unit import metres_per_unit
 
-from .conftest import ELBOW, run
-from .training_in_one import train_all
+from .conftest import ELBOW, run, train
 
 IN_METRES, IN_CENTIMETRES, FROM_FBX = "metres", "centimetres", "FBX"
 IN_MILLIMETRES, IN_KILOMETRES, FAR_AWAY = "millimetres", "kilometres", "100 metres from its origin"
@@ -74,7 +73,8 @@ def characters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Character]
             build()
             save_copy(rig)
             assert run("record", rig, recording, "--poses", 120) == 0
-        train_all([(recording, model) for _, recording, model, _ in files.values()], "--epochs", 40)
+        for _, recording, model, _ in files.values():
+            train(recording, model, "--epochs", 40)
         for rig, _, model, evaluation in files.values():
             assert run("evaluate", rig, model, "--json", evaluation, "--poses", 20) == 0
     finally:
