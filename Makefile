@@ -8,6 +8,9 @@ PYTHON_4.5 = 3.11
 PYTHON_5.2 = 3.13
 OTHER_LINE = $$(.venv/bin/python -c 'import sys; print("4.5" if sys.version_info >= (3, 13) else "5.2")')
 
+# A process for each core, of which each runs whole files: there is one Blender to a process.
+SIDE_BY_SIDE = -n auto --maxprocesses 4 --dist loadfile
+
 # Where torch is. Blender's Python, or a line's environment, starts this one for training.
 export FDDA_TRAINER_PYTHON ?= $(CURDIR)/.venv/bin/python
 
@@ -24,13 +27,13 @@ demo: .venv  ## the arm from rig to playback, into out/demo
 test: test-core test-trainer test-blender  ## all three tiers of tests, on one Blender LTS line
 
 test-core: .venv  ## the tests that need no Blender and take seconds
-	.venv/bin/python -m pytest tests/core tests/contract
+	.venv/bin/python -m pytest $(SIDE_BY_SIDE) tests/core tests/contract
 
 test-trainer: .venv  ## the tests of the training, export and report
-	.venv/bin/python -m pytest tests/trainer
+	.venv/bin/python -m pytest $(SIDE_BY_SIDE) tests/trainer
 
 test-blender: .venv  ## the tests that run in Blender
-	.venv/bin/python -m pytest tests/blender
+	.venv/bin/python -m pytest $(SIDE_BY_SIDE) tests/blender
 
 test-examples: .venv  ## the examples of docs/elsewhere.md, in Python and in Chromium (CHROMIUM=/path/to/chromium)
 	.venv/bin/python -m pytest tests/examples
@@ -56,8 +59,8 @@ test-all: test  ## as test, and the core and Blender tiers on the other LTS line
 	@$(MAKE) test-line LINE=$(OTHER_LINE)
 
 test-line: .venv-line .venv  ## the core and Blender tiers on LINE=4.5 or LINE=5.2
-	.venv-$(LINE)/bin/python -m pytest tests/core tests/contract
-	.venv-$(LINE)/bin/python -m pytest tests/blender
+	.venv-$(LINE)/bin/python -m pytest $(SIDE_BY_SIDE) tests/core tests/contract
+	.venv-$(LINE)/bin/python -m pytest $(SIDE_BY_SIDE) tests/blender
 
 .venv-line:
 	@setup/environment .venv-$(LINE) blender $(or $(PYTHON_$(LINE)),$(error LINE is 4.5 or 5.2))
