@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+import torch._dynamo  # noqa: F401 - an optimizer would at its first step: seconds in which nobody can stop it
 from torch.func import functional_call
 
 from fdda_addon.core.errors import TrainingError
