@@ -9,6 +9,10 @@ from pathlib import Path
 
 import pytest
 
+# Blender sets it when it is imported, and names its value in its output where it was set before: in the processes of
+# pytest-xdist, whose first process imports Blender.
+os.environ.pop("OCIO", None)
+
 TESTS = Path(__file__).resolve().parent
 TRAINER_PYTHON = "FDDA_TRAINER_PYTHON"
 NEEDS = {

@@ -34,13 +34,15 @@ sys.addaudithook(hook)
 """
 
 
+def _heed_signals() -> None:
+    """A script that runs the tests in the background has them ignore Ctrl-C, and one under nohup a closed terminal."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
 def start(*arguments: object, **environment: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "fdda_addon", *map(str, arguments)]
-    if os.name == "nt":
-        own = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
-    else:
-        # A script that runs the tests in the background has them ignore Ctrl-C.
-        own = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}
+    own = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP} if os.name == "nt" else {"preexec_fn": _heed_signals}
     return subprocess.Popen(
         command,
         cwd=ROOT,

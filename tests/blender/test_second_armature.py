@@ -62,7 +62,7 @@ def move(bone: bpy.types.PoseBone) -> None:
 
 
 @pytest.mark.parametrize("build", SENTENCES, ids=lambda build: build.__name__)
-def test_what_a_model_is_not_told_is_named(build, elbow, tmp_path):
+def test_what_a_model_is_not_told_is_named(build, loose_model, tmp_path):
     rig = character(build)
     before = scene_state(rig)
     assert SENTENCES[build] in check(rig).problems
@@ -71,9 +71,9 @@ def test_what_a_model_is_not_told_is_named(build, elbow, tmp_path):
     assert str(error.value) == SENTENCES[build]
     # This model is not told of Euler angles either.
     with pytest.raises(RigError, match=r" of a second armature, 'muscle_rig', .*without the model being told; "):
-        drain(evaluate(rig, elbow.model, EvaluationSettings(poses=2)))
+        drain(evaluate(rig, loose_model, EvaluationSettings(poses=2)))
     with pytest.raises(RigError, match=r" of a second armature, 'muscle_rig', .*without the model being told; "):
-        bind(rig, elbow.model)
+        bind(rig, loose_model)
     assert_same_state(before, scene_state(rig))
     still = evaluated(rig.mesh_object)
     move(bpy.data.objects["muscle_rig"].pose.bones["root" if build is second_armature.free_root else "muscle"])

@@ -100,14 +100,14 @@ def shown_in_frames(rig: SceneRig) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("build", CASES, ids=lambda build: build.__name__)
-def test_what_changes_with_time_is_named(build, elbow, tmp_path):
+def test_what_changes_with_time_is_named(build, loose_model, tmp_path):
     rig, sentence = character(build), SURFACE.format(*CASES[build])
     before = scene_state(rig)
     assert sentence in check(rig).problems
     for refused in (
         lambda: drain(record(rig, tmp_path / "recording", FEW)),
-        lambda: drain(evaluate(rig, elbow.model, EvaluationSettings(poses=2))),
-        lambda: bind(rig, elbow.model),
+        lambda: drain(evaluate(rig, loose_model, EvaluationSettings(poses=2))),
+        lambda: bind(rig, loose_model),
     ):
         with pytest.raises(RigError) as error:
             refused()
