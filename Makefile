@@ -10,6 +10,7 @@ OTHER_LINE = $$(.venv/bin/python -c 'import sys; print("4.5" if sys.version_info
 
 # A process for each core, of which each runs whole files: there is one Blender to a process.
 SIDE_BY_SIDE = -n auto --maxprocesses 4 --dist loadfile
+MARKS = -m "not one_line"
 
 # Where torch is. Blender's Python, or a line's environment, starts this one for training.
 export FDDA_TRAINER_PYTHON ?= $(CURDIR)/.venv/bin/python
@@ -56,11 +57,11 @@ test-windows: .venv  ## the tests in Python for Windows under Wine, as root on D
 	.venv/bin/python tests/windows/run.py $(LINE)
 
 test-all: test  ## as test, and the core and Blender tiers on the other LTS line
-	@$(MAKE) test-line LINE=$(OTHER_LINE)
+	@$(MAKE) test-line LINE=$(OTHER_LINE) MARKS=
 
-test-line: .venv-line .venv  ## the core and Blender tiers on LINE=4.5 or LINE=5.2
+test-line: .venv-line .venv  ## the core tier, and of the Blender tier what differs between versions, on LINE=4.5 or LINE=5.2
 	.venv-$(LINE)/bin/python -m pytest $(SIDE_BY_SIDE) tests/core tests/contract
-	.venv-$(LINE)/bin/python -m pytest $(SIDE_BY_SIDE) tests/blender
+	.venv-$(LINE)/bin/python -m pytest $(SIDE_BY_SIDE) $(MARKS) tests/blender
 
 .venv-line:
 	@setup/environment .venv-$(LINE) blender $(or $(PYTHON_$(LINE)),$(error LINE is 4.5 or 5.2))

@@ -12,6 +12,8 @@ from benchmarks import demo
 
 from .conftest import assert_plays, run
 
+pytestmark = pytest.mark.one_line
+
 MEAN_BAR, P999_BAR, MAX_BAR = 0.012, 0.03, 0.15
 """Held-out errors of the model as parts of the linear layer's."""
 BEYOND_BARS = {"1.5": 0.03, "2": 0.06, "3": 0.2}

@@ -15,6 +15,8 @@ from fdda_addon.jobs import background
 from fdda_addon.jobs.background import in_thread, look_after
 from fdda_addon.jobs.job import CHARACTER, ENVIRONMENT, JobState, Run, current, request_cancel, state_of
 
+pytestmark = pytest.mark.one_line
+
 
 class Work:
     """Steps that wait for `go`, one after the other, and end when `cancel` is called."""

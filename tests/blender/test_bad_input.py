@@ -15,6 +15,8 @@ import pytest
 from .. import systems
 from .refusals import Refusal, files, save_elbow, small_files
 
+pytestmark = pytest.mark.one_line
+
 
 @pytest.fixture
 def refusal(tmp_path, capfd) -> Refusal:

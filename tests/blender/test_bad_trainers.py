@@ -18,6 +18,8 @@ from .conftest import run
 from .refusals import Refusal
 from .stand_ins import say, stand_in_trainer
 
+pytestmark = pytest.mark.one_line
+
 
 @pytest.fixture
 def refusal(tmp_path, capfd) -> Refusal:

@@ -16,6 +16,8 @@ from fdda_addon.runtime import model_files, playback
 from .conftest import assert_plays, evaluated, pose, run
 from .refusals import files, save_elbow
 
+pytestmark = pytest.mark.one_line
+
 
 @pytest.mark.parametrize("arguments", [["--help"], *([verb, "--help"] for verb in VERBS)], ids=" ".join)
 def test_help(arguments, capfd):

@@ -18,6 +18,8 @@ from fdda_addon.training.process import trainer_python
 
 from .conftest import run
 
+pytestmark = pytest.mark.one_line
+
 ROOT = Path(__file__).resolve().parents[2]
 
 

@@ -12,6 +12,8 @@ import pytest
 
 from .refusals import save_elbow
 
+pytestmark = pytest.mark.one_line
+
 ROOT = Path(__file__).resolve().parents[2]
 ASCII = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
 

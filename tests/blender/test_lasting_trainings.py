@@ -14,6 +14,8 @@ from fdda_addon.core.messages import MessageType
 from fdda_addon.core.model import read_model_info
 from fdda_addon.training import lasting
 
+pytestmark = pytest.mark.one_line
+
 LEAVING = """
 import sys
 sys.path.insert(0, {root!r})

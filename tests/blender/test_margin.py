@@ -25,6 +25,8 @@ from .conftest import run, train
 from .refusals import files, save_elbow
 from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
+pytestmark = pytest.mark.one_line
+
 SETTINGS = RecordingSettings(poses=40, margin=2.0, influence_poses=2, actions=("elbow_wave",))
 INSIDE = 30
 """Of the 40 random poses, the first."""

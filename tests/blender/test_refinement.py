@@ -24,6 +24,8 @@ from .conftest import ELBOW_RIG, run, train
 from .refusals import files
 from .scene_state import scene_state
 
+pytestmark = pytest.mark.one_line
+
 
 @pytest.fixture
 def recording(elbow, tmp_path):

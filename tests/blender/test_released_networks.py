@@ -15,6 +15,8 @@ from fdda_addon.scene.blend_file import save_copy
 
 from .conftest import ELBOW, assert_plays
 
+pytestmark = pytest.mark.one_line
+
 
 def opened(path) -> weakref.ref:
     """Open a bound file; a reference to its network that does not keep it."""

@@ -27,6 +27,8 @@ from fdda_addon.scene.scene_rig import find_rigs
 from .conftest import assert_plays, pose, run
 from .refusals import Refusal, files
 
+pytestmark = pytest.mark.one_line
+
 BODY, SLEEVE = "elbow", "sleeve"
 POSES = 60
 

@@ -10,6 +10,8 @@ import pytest
 
 from .conftest import run
 
+pytestmark = pytest.mark.one_line
+
 ROOT = Path(__file__).resolve().parents[2]
 SEED = 77
 NEAR_THE_RIG = {"mode": 40, "topology": 40, "controls": 20}

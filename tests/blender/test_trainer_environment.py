@@ -24,6 +24,8 @@ from .conftest import run
 from .stand_ins import program
 from .tiny_wheels import pinned, write_wheel, write_wheels
 
+pytestmark = pytest.mark.one_line
+
 ROOT = Path(__file__).resolve().parents[2]
 
 

@@ -21,6 +21,8 @@ from .conftest import run
 from .stand_ins import program
 from .tiny_wheels import TORCH
 
+pytestmark = pytest.mark.one_line
+
 ROOT = Path(__file__).resolve().parents[2]
 ADVICE = "do this"
 
