@@ -2,7 +2,7 @@
 """All figures of speed with one command: `python benchmarks/bench.py OUT [--rig FILE.blend …]`.
 
 Builds the arm at its three densities, records, trains and binds each, and measures; the same for every rig given.
-Writes OUT/bench.json and prints the results as a table.
+Writes OUT/bench.json and prints the results as a table, then the times as parts of those of the last run in OUT.
 """
 
 import argparse
@@ -127,6 +127,26 @@ def table(results: list[dict]) -> str:
     return "\n".join(lines)
 
 
+COMPARED = (
+    ("rig", lambda r: _median(r, "rig")),
+    ("FDDA", lambda r: _median(r, "fdda")),
+    ("model alone", lambda r: _median(r, "inference")),
+    ("rig / FDDA", lambda r: r["frame"]["ratio"]),
+    ("crowd", lambda r: r["crowd"]["ms_a_character"]),
+)
+
+
+def against(last: list[dict], results: list[dict]) -> str:
+    """The times of each rig as parts of those of the last run, a line a rig; empty where none was measured before."""
+    before = {result["name"]: result for result in last}
+    return "\n".join(
+        f"{r['name']}, now / last run: "
+        + ", ".join(f"{label} {show(r) / show(before[r['name']]):.2f}" for label, show in COMPARED)
+        for r in results
+        if r["name"] in before
+    )
+
+
 def machine() -> dict:
     """What the figures were measured on."""
     model = next(
@@ -157,15 +177,19 @@ def main() -> None:
     rigs = {f"arm{density}": options.out / f"arm{density}.blend" for density in options.densities}
     for density, rig in zip(options.densities, rigs.values(), strict=True):
         run("-m", "fdda_addon", "build-arm", rig, "--density", density)
+    path = options.out / "bench.json"
+    last = json.loads(path.read_text(encoding="utf-8"))["rigs"] if path.exists() else []
     results = []
     for name, rig in (rigs | {rig.stem: rig for rig in options.rig}).items():
         results.append(bench(name, rig, options.out, options.poses))
         about = machine() | {"blender": results[0]["frame"]["blender"]}
         # After every rig: what one of them fails at costs only that one.
         content = json.dumps({"machine": about, "rigs": results}, indent=1)
-        (options.out / "bench.json").write_text(content, encoding="utf-8")
+        path.write_text(content, encoding="utf-8")
     print(f"{about['date']}, Blender {about['blender']}, {about['processor']}, {about['cores']} cores\n")
     print(table(results))
+    if compared := against(last, results):
+        print(f"\n{compared}")
 
 
 if __name__ == "__main__":

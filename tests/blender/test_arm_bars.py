@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the arm must show, from rig to playback: the demo's files, its errors, and the speed of a denser arm."""
+"""What the arm must show, from rig to playback: the demo's files and its errors."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import demo
 
-from .conftest import assert_plays, run
+from .conftest import assert_plays
 
 pytestmark = pytest.mark.one_line
 
@@ -19,9 +19,6 @@ MEAN_BAR, P999_BAR, MAX_BAR = 0.012, 0.03, 0.15
 BEYOND_BARS = {"1.5": 0.03, "2": 0.06, "3": 0.2}
 """Mean errors at so many times the range of motion."""
 NAMED_BARS = {"elbow 3x its range, off its axis": 0.45, "metacarpals 2.5x their range": 0.15}
-SPEED_BAR = 5.0
-"""With the default tolerance; docs/benchmarks.md has what a machine without other work measures, and the aim of 8."""
-SPEED_RUNS = 5
 
 
 @pytest.fixture(scope="module")
@@ -92,32 +89,3 @@ def test_bound_file_plays(made):
     for frame in (1, 76, 132, 240):
         bpy.context.scene.frame_set(frame)
         assert_plays(mesh_object, made / "arm.onnx")
-
-
-@pytest.fixture(scope="module")
-def denser(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the denser arm and a recording of it."""
-    folder = tmp_path_factory.mktemp("denser")
-    assert run("build-arm", folder / "arm.blend", "--density", 2) == 0
-    assert run("record", folder / "arm.blend", folder / "recording", "--poses", 400) == 0
-    return folder
-
-
-def speed(denser: Path) -> float:
-    """How many times as fast a frame of the denser arm is with a model.
-
-    Each way's least median of some benchmarks: what else the machine does can only add to them.
-    """
-    rig, model, times = (denser / name for name in ("arm.blend", "arm.onnx", "times.json"))
-    # The cost of a frame depends on the size of the model, not on how long it was trained.
-    assert run("train", denser / "recording", model, "--epochs", 3) == 0
-    measured = []
-    for _ in range(SPEED_RUNS):
-        assert run("benchmark", rig, model, "--json", times) == 0
-        measured.append(json.loads(times.read_text()))
-    of_rig, of_model = (min(one[way]["median"] for one in measured) for way in ("rig", "fdda"))
-    return of_rig / of_model
-
-
-def test_frame_of_the_denser_arm_takes_a_fifth(denser):
-    assert speed(denser) >= SPEED_BAR
