@@ -2,6 +2,7 @@
 """`pytest` alone runs every tier that this Python can run; of each other one it prints a line with what to type."""
 
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -43,8 +44,17 @@ class SkippedTier(pytest.Collector):
         pytest.skip(why_not(self.name), allow_module_level=True)
 
 
+def heed_stop_signals() -> None:
+    """Let children be stopped by signals that this process ignores, as below nohup: they inherit no handler."""
+    for name in ("SIGINT", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number and signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, lambda *_: None)
+
+
 def pytest_configure() -> None:
     """Name the Python that trains for the Blender tier, as make does."""
+    heed_stop_signals()
     of_the_checkout = TESTS.parent / ".venv/bin/python"
     if find_spec("torch"):
         os.environ.setdefault(TRAINER_PYTHON, sys.executable)

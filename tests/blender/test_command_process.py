@@ -34,15 +34,9 @@ sys.addaudithook(hook)
 """
 
 
-def _heed_signals() -> None:
-    """A script that runs the tests in the background has them ignore Ctrl-C, and one under nohup a closed terminal."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
-
-
 def start(*arguments: object, **environment: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "fdda_addon", *map(str, arguments)]
-    own = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP} if os.name == "nt" else {"preexec_fn": _heed_signals}
+    own = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP} if os.name == "nt" else {}
     return subprocess.Popen(
         command,
         cwd=ROOT,
