@@ -11,7 +11,7 @@ TURN = 2 * np.pi
 MAX_ITERATIONS = 10
 """The center of a range settles after a few choices of the nearest triples."""
 STARTS = 8
-"""Ranges wider than a half turn are looked for around so many of the rotations."""
+"""Number of rotations that are tried as the center of a range wider than a half turn."""
 LOCKED = 1e-12
 """Euler angles are in gimbal lock where the sine of the middle one is this near to 1."""
 MIN_ANGLE = 1e-9
