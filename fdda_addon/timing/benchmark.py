@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import bpy
@@ -131,7 +132,7 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
     opened = open_model(scene_rig, model or model_files.network_of(mesh_object))
     channels = model_channels(scene_rig, opened.rig, opened.network.info)
     with playing(scene_rig, channels) as played, borrowed_binding(scene_rig, model):
-        ways = {"rig": _rig, "linear": armature_alone, "fdda": _fdda, "floor": _floor}
+        ways = {"rig": true_rig, "linear": armature_alone, "fdda": partial(borrowed_mode, mode="FDDA"), "floor": _floor}
         times: dict[str, list[float]] = {way: [] for way in ways}
         each = max(1, -(-frames // ROUNDS))
         for number in range(ROUNDS):
@@ -213,12 +214,6 @@ def _time(calls: list[Callable[[], object]]) -> list[float]:
 
 
 @contextmanager
-def _rig(mesh_object: bpy.types.Object) -> Iterator[None]:
-    with true_rig(mesh_object):
-        yield
-
-
-@contextmanager
 def armature_alone(mesh_object: bpy.types.Object) -> Iterator[None]:
     """Blender's own linear skinning: the Armature modifier alone, shape keys pinned."""
     skinning = armature_modifier(mesh_object)
@@ -231,12 +226,6 @@ def armature_alone(mesh_object: bpy.types.Object) -> Iterator[None]:
         stack.enter_context(borrowed_attributes(skinning, use_deform_preserve_volume=False))
         if mesh_object.data.shape_keys:
             stack.enter_context(borrowed_attributes(mesh_object, show_only_shape_key=True, active_shape_key_index=0))
-        yield
-
-
-@contextmanager
-def _fdda(mesh_object: bpy.types.Object) -> Iterator[None]:
-    with borrowed_mode(mesh_object, "FDDA"):
         yield
 
 
