@@ -8,8 +8,8 @@ import bpy
 
 from ..core.rig import Fingerprint
 from ..scene.arrays import COORDINATE, read
-from ..scene.borrow import driving_actions
-from ..scene.compatibility import animation_curves, node_input
+from ..scene.borrow import animated_paths
+from ..scene.compatibility import node_input
 from ..scene.controls import owner_name
 from ..scene.scene_rig import SceneRig
 from .modifier_stack import BOUND, is_playback, recorded_modifiers
@@ -57,7 +57,7 @@ def _modifier(scene_rig: SceneRig, modifier: bpy.types.Modifier) -> dict:
         bound = BOUND.get(modifier.type)
         names = [p.identifier for p in properties if not p.is_readonly or p.identifier == bound]
         settings = {name: _value(scene_rig, modifier, name) for name in names if _is_setting(modifier, name)}
-    animated = _animated_paths(modifier.id_data)
+    animated = animated_paths(modifier.id_data)
     for name in settings:
         if f"{modifier.path_from_id()}.{name}" in animated:
             settings[name] = None
@@ -84,7 +84,7 @@ def _shape_keys(mesh_object: bpy.types.Object) -> dict:
     keys = mesh_object.data.shape_keys
     if keys is None:
         return {}
-    animated, relatives, found = _animated_paths(keys), {}, {}
+    animated, relatives, found = animated_paths(keys), {}, {}
     for block in keys.key_blocks:
         if block == keys.reference_key:
             continue
@@ -143,14 +143,6 @@ def _target(scene_rig: SceneRig, variable: bpy.types.DriverVariable, target: bpy
         yield target.data_path
     else:
         yield from (target.bone_target, target.transform_type, target.transform_space, target.rotation_mode)
-
-
-def _animated_paths(datablock: bpy.types.ID) -> set[str]:
-    animation = datablock.animation_data
-    if animation is None:
-        return set()
-    curves = [curve for action in driving_actions(animation) for curve in animation_curves(action)]
-    return {curve.data_path for curve in (*curves, *animation.drivers)}
 
 
 def _value(scene_rig: SceneRig | None, struct: bpy.types.bpy_struct, name: str) -> object:

@@ -7,8 +7,7 @@ from contextlib import contextmanager
 import bpy
 
 from ..rig.modifier_stack import deforming_modifiers
-from ..scene.borrow import driving_actions
-from ..scene.compatibility import animation_curves
+from ..scene.borrow import animated_paths
 from . import nodes
 
 _held: dict[int, list[str]] = {}
@@ -41,11 +40,7 @@ def wants_model(mesh_object: bpy.types.Object) -> bool:
 
 def animated_switches(mesh_object: bpy.types.Object) -> frozenset[str]:
     """What keyframes or drivers set of "mode", and of "show_viewport" and "show_render" of the FDDA modifier."""
-    animation = mesh_object.animation_data
-    if animation is None:
-        return frozenset()
-    curves = [curve for action in driving_actions(animation) for curve in animation_curves(action)]
-    paths = {curve.data_path for curve in (*curves, *animation.drivers)}
+    paths = animated_paths(mesh_object)
     if not paths:
         return frozenset()
     modifier = nodes.find_modifier(mesh_object)

@@ -65,6 +65,15 @@ def driving_actions(animation: bpy.types.AnimData) -> list[bpy.types.Action]:
     return [action for action in (animation.action, *(strip.action for strip in strips)) if action is not None]
 
 
+def animated_paths(datablock: bpy.types.ID) -> set[str]:
+    """RNA paths of all that the actions, the NLA and the drivers of a datablock set, also where they are muted."""
+    animation = datablock.animation_data
+    if animation is None:
+        return set()
+    curves = [curve for action in driving_actions(animation) for curve in animation_curves(action)]
+    return {curve.data_path for curve in (*curves, *animation.drivers)}
+
+
 def animated_values(owner: bpy.types.ID, actions: Iterable[bpy.types.Action]) -> dict[str, object]:
     """Values by RNA path of all that actions animate in a datablock."""
     values = {}

@@ -13,14 +13,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ...core.errors import TrainerEnvironmentError, os_reason
+from ...core.path_limits import MAX_WINDOWS_CHARACTERS
 
 EXTENSION = __package__.rpartition(".fdda_addon")[0]
 """The extension's module, "bl_ext.REPOSITORY.fdda"; empty where the add-on was imported and not installed."""
 PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "scipy", "matplotlib")
 """What the trainer imports."""
 MARK = "fdda-complete"
-MAX_PATH = 259
-"""Letters of a path on Windows, unless the registry allows longer ones."""
 LONGEST_PATH = 126
 """Letters of the longest path in the wheels for Windows: a license in the dist-info of torch 2.15.0.
 
@@ -77,11 +76,11 @@ def missing_letters(folder: Path, temporary: Path) -> int:
         temporary: the folder for temporary files while it is made.
     """
     longest = max(len(str(folder)), len(str(temporary)) + len(PIP_TARGET)) + 1 + LONGEST_PATH
-    return max(0, longest - MAX_PATH)
+    return max(0, longest - MAX_WINDOWS_CHARACTERS)
 
 
 def has_path_limit() -> bool:
-    """Whether this system refuses paths of more than `MAX_PATH` letters."""
+    """Whether this system refuses paths of more than `MAX_WINDOWS_CHARACTERS` letters."""
     if os.name != "nt":
         return False
     import winreg
