@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Ctrl-C, and other requests to stop, while a verb runs.
 
-Blender prints an exception that leaves a handler or a property's update function, and goes on; numpy turns one that
-strikes while it is imported into an ImportError. So a request that comes there is repeated until the verb is elsewhere.
+Blender prints an exception that leaves a handler, a property's update function or what it calls to register a class, and
+goes on; numpy turns one that strikes while it is imported into an ImportError. So a request that comes there is repeated until the verb is elsewhere.
 """
 
 import threading
@@ -16,9 +16,11 @@ from ..core.stop_signals import handle_stop_signals, restore_handlers
 RETRY_SECONDS = 0.01
 _ADDON = __name__.rsplit(".", 2)[0]
 _MAIN = f"{_ADDON}.cli.main"
-_UPDATES_AND_DRAWING = {f"{_ADDON}.properties.binding", f"{_ADDON}.evaluation.overlay"}
+_REGISTRATION_UPDATES_AND_DRAWING = {
+    f"{_ADDON}.{name}" for name in ("registration", "properties.binding", "evaluation.overlay")
+}
 
-_called_by_blender: set[str] = set()
+_called_by_blender: set[str] = set(_REGISTRATION_UPDATES_AND_DRAWING)
 """Modules whose functions Blender calls."""
 _pending = 0
 """Signal of a request that had to wait."""
@@ -43,7 +45,7 @@ def interruptible() -> Iterator[None]:
 def note_callbacks(modules: Iterable[str]) -> None:
     """Let no KeyboardInterrupt be raised in functions of these modules, which Blender calls."""
     global _called_by_blender
-    _called_by_blender = {*modules} | _UPDATES_AND_DRAWING
+    _called_by_blender = {*modules} | _REGISTRATION_UPDATES_AND_DRAWING
 
 
 def raise_pending() -> None:

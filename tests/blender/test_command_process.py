@@ -33,6 +33,16 @@ done = not "fdda_addon" in sys.orig_argv
 sys.addaudithook(hook)
 """
 
+REGISTRATION_HOOK = """
+import signal, sys, typing
+def hook(*arguments, **options):
+    signal.raise_signal(signal.SIGINT)
+    return get_type_hints(*arguments, **options)
+get_type_hints = typing.get_type_hints
+if "fdda_addon" in sys.orig_argv:
+    typing.get_type_hints = hook
+"""
+
 
 def start(*arguments: object, **environment: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "fdda_addon", *map(str, arguments)]
@@ -153,6 +163,14 @@ def test_ctrl_c_while_modules_are_imported(tmp_path, module, error):
     (tmp_path / "sitecustomize.py").write_text(HOOK.format(module=module))
     verb = ("record", tmp_path / "none.blend", tmp_path / "r")
     assert finish(*verb, PYTHONPATH=str(tmp_path)) == (130, "", error)
+
+
+def test_ctrl_c_while_classes_are_registered(elbow, tmp_path):
+    """Blender asks for the annotations of a class, and only prints what goes wrong there."""
+    (tmp_path / "sitecustomize.py").write_text(REGISTRATION_HOOK)
+    status, out, err = finish("record", elbow.rig, tmp_path / "r", "--poses", 10_000, PYTHONPATH=str(tmp_path))
+    assert (status, out, err) == (130, "", "Interrupted.\n")
+    assert files(tmp_path / "r") == {}
 
 
 def test_names_on_a_console_of_another_country(tmp_path):
