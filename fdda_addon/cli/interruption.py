@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Ctrl-C, and other requests to stop, while a verb runs.
 
-Blender prints an exception that leaves a handler, a property's update function or what it calls to register a class, and
-goes on; numpy turns one that strikes while it is imported into an ImportError. So a request that comes there is repeated until the verb is elsewhere.
+Blender prints an exception that leaves a handler, a property's update function or what it calls to register a class,
+and goes on; numpy turns one that strikes while it is imported into an ImportError. So a request that comes there is
+repeated until the verb is elsewhere.
 """
 
 import threading
