@@ -100,7 +100,7 @@ ROWS = (
     ("`train`, s / MB", lambda r: f"{r['seconds']['train']:.0f} / {r['peak_memory_mb']['train']:.0f}"),
     ("model, MB", lambda r: f"{r['model_mb']:.1f}"),
     ("held-out error, mean / max, mm", lambda r: _errors(r["errors_mm"]["fdda"])),
-    ("… of the linear layer", lambda r: _errors(r["errors_mm"]["linear"])),
+    ("… of linear skinning", lambda r: _errors(r["errors_mm"]["linear"])),
     ("… FDDA's part", lambda r: " / ".join(f"{100 * _part(r, figure):.1f} %" for figure in ("mean", "max"))),
 )
 

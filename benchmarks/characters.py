@@ -57,7 +57,7 @@ def write_table(folder: Path) -> None:
 
 def table(lines: dict[str, dict]) -> str:
     """The results of some lines as Markdown, by topic."""
-    header = "".join(f" {line}: linear layer / FDDA, mm | part |" for line in lines)
+    header = "".join(f" {line}: linear skinning / FDDA, mm | part |" for line in lines)
     parts = ["; ".join(f"{own['date']}, Blender {own['blender']}" for own in lines.values()) + "."]
     for topic, rows in groupby(ROWS, lambda row: row.topic):
         parts += ["", f"### {topic}", "", f"| |{header} played, m |", "|---" * (2 * len(lines) + 2) + "|"]

@@ -36,7 +36,7 @@ CROWD = 20
 
 
 def frames(rig: str, model: str, count: str = "100") -> dict:
-    """A whole frame of rig, linear layer, model and floor, as the verb `benchmark` times it."""
+    """A whole frame of rig, linear skinning, model and floor, as the verb `benchmark` times it."""
     bpy.ops.wm.open_mainfile(filepath=rig)
     *_, measured = benchmark(find_rig(), Path(model), int(count))
     return measured.to_json()

@@ -30,7 +30,7 @@ def verb(*arguments: object) -> None:
 
 
 def errors(rig: Path, model: Path) -> dict:
-    """Held-out errors of a model and of the linear layer, mm."""
+    """Held-out errors of a model and of linear skinning, mm."""
     path = model.with_suffix(".errors.json")
     verb("evaluate", rig, model, "--json", path, "--poses", HELD_OUT, "--seed", HELD_OUT_SEED)
     found = json.loads(path.read_text(encoding="utf-8"))

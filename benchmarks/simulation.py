@@ -2,8 +2,8 @@
 """What is learnt of a simulation: `python benchmarks/simulation.py OUT`, the figures of docs/simulations.md.
 
 Gives the arm flesh that sags and bulges, held to the skin of its bones: a soft body of Blender's own. Records settled
-poses, trains, and compares model and linear layer with settled poses that training never saw, beside how far two ways
-to the same pose lie apart and what a frame costs. Writes OUT/simulation.json, and the files of each step beside it.
+poses, trains, and compares model and linear skinning with settled poses that training never saw, beside how far two
+ways to the same pose lie apart and what a frame costs. Writes OUT/simulation.json, and the files of each step.
 """
 
 import argparse

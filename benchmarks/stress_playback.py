@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import fdda_addon  # noqa: E402
-from fdda_addon.core.skinning import LinearLayer  # noqa: E402
+from fdda_addon.core.skinning import LinearSkinning  # noqa: E402
 from fdda_addon.rig.reading import PoseReader, read_model_rig  # noqa: E402
 from fdda_addon.runtime.network import Network  # noqa: E402
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier  # noqa: E402
@@ -72,7 +72,7 @@ class Stress:
         self._network = Network(model)
         rig = read_model_rig(SceneRig(first, armature_modifier(first).object), self._network.info)
         rest = self._network.info.rest_matrices
-        self._linear = LinearLayer(replace(self._network.linear_rig(rig), rest_matrices=rest))
+        self._linear = LinearSkinning(replace(self._network.linear_rig(rig), rest_matrices=rest))
         self._second = bpy.context.scene.view_layers.new("second").name
         self._set_up_renders()
         for _ in range(characters - 1):

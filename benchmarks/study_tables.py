@@ -49,7 +49,7 @@ def _errors_and_times(result: dict) -> str:
         errors = every[0][name]["held_out_linear"]
         linear += [f"{errors['mean']:.4f}", f"{errors['max']:.2f}"]
     rows.append(["a network without error", "", "", *left, "", "", ""])
-    rows.append(["the linear layer", "", "", *linear, "", "", ""])
+    rows.append(["linear skinning", "", "", *linear, "", "", ""])
     return _markdown(rows)
 
 

@@ -172,7 +172,7 @@ def _basis_left(deformation: Deformation, number: int, recording: Recording) -> 
 
 
 def validation_score(training: dict) -> float:
-    """What a learning rate is chosen by: validation error as a part of the linear layer's, mean over the partitions."""
+    """What a learning rate is chosen by: validation error as a part of linear skinning's, mean over the partitions."""
     partitions = training["partitions"].values()
     return float(np.mean([p["validation"]["mean"] / p["validation_linear"]["mean"] for p in partitions]))
 

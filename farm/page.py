@@ -91,7 +91,10 @@ def _errors(report: dict) -> str:
             ("", ""),
             ("", ' class="text"'),
             ("vertices", ""),
-            *((text, "") for text in ("mean", "p99.9", "max", "linear layer: mean", "p99.9", "target p99.9", "rounds")),
+            *(
+                (text, "")
+                for text in ("mean", "p99.9", "max", "linear skinning: mean", "p99.9", "target p99.9", "rounds")
+            ),
             ("against the last run: mean", ""),
             ("p99.9", ""),
         )
@@ -180,6 +183,6 @@ def _pictures(pictures: dict[str, list[tuple[str, bytes]]]) -> str:
     if not figures:
         return ""
     return (
-        "<h2>Heat maps</h2><p>Rig, linear layer and model; the colour is the distance from the rig.</p>"
+        "<h2>Heat maps</h2><p>Rig, linear skinning and model; the colour is the distance from the rig.</p>"
         f'<div class="pictures">{"".join(figures)}</div>'
     )

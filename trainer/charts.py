@@ -46,7 +46,7 @@ def error_bars(
     p999: Sequence[float],
     largest: Sequence[float],
 ) -> str:
-    """Mean error of each partition, model against linear layer, and the model's p99.9 and largest; logarithmic, mm."""
+    """Mean error of each partition, of model and linear skinning, the model's p99.9 and largest; logarithmic, mm."""
     row, left, right, top = 20, 130, 16, 24
     width, height = 880, top + row * len(names) + 8
     positive = [value for value in (*fdda, *linear, *largest) if value > 0] or [1.0]
@@ -75,7 +75,7 @@ def error_bars(
 
 
 def histogram(edges: Sequence[float], fdda: Sequence[int], linear: Sequence[int]) -> str:
-    """How many vertices have which error: model and linear layer over one logarithmic axis, mm."""
+    """How many vertices have which error: model and linear skinning over one logarithmic axis, mm."""
     width, height, left, bottom, top = 880, 240, 46, 30, 10
     counts = np.array([fdda, linear], float)
     used = np.flatnonzero(counts.sum(axis=0))

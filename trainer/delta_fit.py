@@ -2,7 +2,7 @@
 """Chooses the vertices whose deltas networks see, and fits them to the recording.
 
 Nothing is asked of the modifiers: a rig may smooth by others, or by nodes. What skinning to the joints around leaves of
-the residuals is compared with the corners of the linear layer's surface, smoothed more and more; a rig that smooths
+the residuals is compared with the corners of linear skinning's surface, smoothed more and more; a rig that smooths
 answers to one of these, another to none.
 """
 
@@ -185,7 +185,7 @@ def _candidates(
 
 
 class _SmoothedSurface:
-    """The linear layer's surface at chosen vertices, smoothed as by a simple Corrective Smooth."""
+    """Linear skinning's surface at chosen vertices, smoothed as by a simple Corrective Smooth."""
 
     def __init__(self, rig: Rig, corners: _Corners):
         self._corners, count = corners, rig.vertex_count

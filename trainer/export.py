@@ -27,7 +27,7 @@ from fdda_addon.core.model import (
 from fdda_addon.core.onnx_file import read_onnx
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.skin_fit import skin_to_text
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.core.surface import Surface, SurfaceComparison, surface_errors, surface_json
 
 from .deformation import Deformation
@@ -48,7 +48,7 @@ class Measured:
     """Distances to the recorded positions, in metres, vertices in mesh order.
 
     Attributes:
-        fdda, linear: (n, V) float32, of the model and of the linear layer alone.
+        fdda, linear: (n, V) float32, of the model and of linear skinning alone.
     """
 
     fdda: np.ndarray
@@ -58,7 +58,7 @@ class Measured:
 def reference_positions(
     deformation: Deformation, pose_matrices: np.ndarray, controls: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What the model must play, computed by another way: core's features and linear layer, and the networks in PyTorch.
+    """What the model must play, computed by core's features and linear skinning, and the networks in PyTorch.
 
     Args:
         deformation: what was trained.
@@ -83,7 +83,7 @@ def reference_positions(
         residuals = prepared.basis.residuals(coefficients) * trust[:, number, None]
         local[:, partition.vertices] = residuals.reshape(len(features), -1, 3)
         offsets[:, partition.vertices] = prepared.fit.offsets(matrices) * trust[:, number, None, None]
-    return LinearLayer(rig, deformation.partitions).complex_positions(pose_matrices, local) + offsets, trust
+    return LinearSkinning(rig, deformation.partitions).complex_positions(pose_matrices, local) + offsets, trust
 
 
 def open_session(model: bytes) -> onnxruntime.InferenceSession:
@@ -114,14 +114,14 @@ def measure(
     """Errors of the exported model on poses of the recording, through the whole pipeline."""
     vertices = recording.rig.vertex_count
     fdda, linear = (np.empty((len(poses), vertices), np.float32) for _ in range(2))
-    layer = LinearLayer(recording.rig, recording.partitions)
+    skinning = LinearSkinning(recording.rig, recording.partitions)
     for block in _blocks(len(poses), vertices):
         inputs = _inputs(recording, poses[block])
         matrices = inputs[POSE_INPUT]
-        truth = layer.complex_positions(matrices, np.array(recording.residuals[poses[block]]))
+        truth = skinning.complex_positions(matrices, np.array(recording.residuals[poses[block]]))
         (positions,) = session.run([POSITIONS_OUTPUT], inputs)
         fdda[block] = distances(positions, truth, recording.rig.metres_per_unit)
-        linear[block] = distances(layer.positions(matrices), truth, recording.rig.metres_per_unit)
+        linear[block] = distances(skinning.positions(matrices), truth, recording.rig.metres_per_unit)
     return Measured(fdda, linear)
 
 
@@ -132,16 +132,16 @@ def measure_surface(
     rig, rows = recording.rig, []
     if not len(rig.face_starts):
         return surface_json(None, None)
-    layer = LinearLayer(rig, recording.partitions)
+    skinning = LinearSkinning(rig, recording.partitions)
     comparison = SurfaceComparison(
         Surface(rig.face_starts, rig.face_vertices), rig.rest_positions, deformation.partitions
     )
     for pose in poses[:: -(-len(poses) // MAX_SURFACES)]:
         inputs = _inputs(recording, np.array([pose]))
         matrices = inputs[POSE_INPUT]
-        truth = layer.complex_positions(matrices, np.array(recording.residuals[pose, None]))
+        truth = skinning.complex_positions(matrices, np.array(recording.residuals[pose, None]))
         (positions,) = session.run([POSITIONS_OUTPUT], inputs)
-        rows.append(comparison.compare(truth[0], (positions[0], layer.positions(matrices)[0])))
+        rows.append(comparison.compare(truth[0], (positions[0], skinning.positions(matrices)[0])))
     return surface_json(*(surface_errors(way) for way in zip(*rows, strict=True)))
 
 

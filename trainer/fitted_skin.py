@@ -13,14 +13,14 @@ from fdda_addon.core.metrics import distances
 from fdda_addon.core.recording.fit_folder import FitPoses, read_fit_poses, write_fitted
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skin_fit import INFLUENCES, Gain, SkinFit
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 
 from .announcements import Announcer
 from .process import Cancelled
 from .skin_solver import SkinSolver
 
 BLOCK_FLOATS = 1 << 22
-"""Linear layers are compared in blocks of so many coordinates."""
+"""Positions are compared in blocks of so many coordinates."""
 
 
 def fit_folder(
@@ -57,14 +57,14 @@ def fit_folder(
 
 
 def measure(poses: FitPoses, fitted: Rig) -> Gain:
-    """How far the linear layers of the rig's own and of the fitted weights are from the poses."""
+    """How far skinning with the rig's own and with the fitted weights is from the poses."""
     step, metres_per_unit = max(1, BLOCK_FLOATS // (3 * fitted.vertex_count)), fitted.metres_per_unit
     rms, largest = {}, {}
     for name, rig in (("rig", poses.rig), ("fitted", fitted)):
-        layer, squares, most = LinearLayer(rig), 0.0, 0.0
+        skinning, squares, most = LinearSkinning(rig), 0.0, 0.0
         for start in range(0, len(poses.positions), step):
             part = slice(start, start + step)
-            positions = layer.positions(poses.pose_matrices[part])
+            positions = skinning.positions(poses.pose_matrices[part])
             apart = distances(positions, poses.positions[part], metres_per_unit).astype(np.float64)
             squares, most = squares + float((apart**2).sum()), max(most, float(apart.max()))
         rms[name] = 1000 * (squares / (len(poses.positions) * fitted.vertex_count)) ** 0.5

@@ -44,7 +44,7 @@ class JointFit:
     factors: np.ndarray
 
     def offsets(self, matrices: np.ndarray) -> np.ndarray:
-        """Matrices as in `make_surroundings` to (N, Vp, 3) offsets from the linear layer, mesh-object space, mesh
+        """Matrices as in `make_surroundings` to (N, Vp, 3) offsets from linear skinning, mesh-object space, mesh
         units."""
         rows = matrices[:, self.joints, :3].transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1)
         return (rows.astype(np.float64) @ self.factors).transpose(0, 2, 1)

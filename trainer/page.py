@@ -87,11 +87,11 @@ def _head(report: dict) -> str:
     cards = [
         (
             _mm(held_out["mean"]),
-            f"held-out mean error, {_share(held_out['mean'], linear['mean'])} of the linear layer's",
+            f"held-out mean error, {_share(held_out['mean'], linear['mean'])} of linear skinning's",
         ),
         *([(_mm(report["repeats"]["apart_mm"]["mean"]), REPEATED)] if "repeats" in report else []),
-        (_mm(held_out["p999"]), f"99.9 % of vertices below; linear layer {_mm(linear['p999'])}"),
-        (_mm(held_out["max"]), f"largest error, {_share(held_out['max'], linear['max'])} of the linear layer's"),
+        (_mm(held_out["p999"]), f"99.9 % of vertices below; linear skinning {_mm(linear['p999'])}"),
+        (_mm(held_out["max"]), f"largest error, {_share(held_out['max'], linear['max'])} of linear skinning's"),
         (f"{training['seconds']:.0f} s", f"training on {escape(training['device'])}, {training['epochs']} epochs"),
         (f"{report['model_bytes'] / 1e6:.1f} MB", f"model of {len(report['partitions'])} partitions"),
     ]
@@ -134,7 +134,7 @@ def _evaluation(evaluation: dict | None) -> str:
         return ""
     rows = "".join(
         f"<tr><td>{name}</td>" + "".join(f"<td>{_mm(evaluation[key][k])}</td>" for k in STATISTICS) + "</tr>"
-        for key, name in (("fdda", "FDDA"), ("linear", "linear layer"))
+        for key, name in (("fdda", "FDDA"), ("linear", "linear skinning"))
     )
     heads = "".join(f"<th>{STATISTICS[k]}</th>" for k in STATISTICS)
     return (
@@ -158,10 +158,10 @@ def _errors(report: dict) -> str:
     counts = report["histogram"]
     return (
         "<h2>Held-out error</h2><p>Share of vertices by their distance to the true rig."
-        f"{_key('fdda', 'FDDA')}{_key('linear', 'linear layer alone')}</p>"
+        f"{_key('fdda', 'FDDA')}{_key('linear', 'linear skinning alone')}</p>"
         f"{histogram(counts['edges'], counts['fdda'], counts['linear'])}"
         "<h2>Held-out error by partition</h2><p>Bars are means, the ticks the 99.9th percentile and the largest error."
-        f"{_key('fdda', 'FDDA')}{_key('linear', 'linear layer alone')}</p>{bars}"
+        f"{_key('fdda', 'FDDA')}{_key('linear', 'linear skinning alone')}</p>{bars}"
     )
 
 
@@ -169,7 +169,7 @@ def _surface(report: dict) -> str:
     if not report.get("normals"):
         return ""
     rows = ""
-    for way, name in (("fdda", "FDDA"), ("linear", "linear layer")):
+    for way, name in (("fdda", "FDDA"), ("linear", "linear skinning")):
         normals, edges = report["normals"][way], report["edges"][way]
         cells = [f"{normals[key]:.2f}&deg;" for key in ("mean", "p99", "max")]
         cells += ["-" if edges[k] is None else f"{100 * edges[k]:.2f} %" for k in ("inside", "beside", "across")]

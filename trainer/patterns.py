@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Patterns of a large partition: what it plays beside the linear layer, in fewer numbers for each vertex.
+"""Patterns of a large partition: what it plays beside linear skinning, in fewer numbers for each vertex.
 
 A joint takes four numbers for each vertex, a shape three, and many of them say nearly the same: the elbow's shapes lie
 where the elbow's fit does. So the matrix of all joints and shapes is taken apart into a small one and few patterns, a

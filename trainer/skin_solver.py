@@ -196,7 +196,7 @@ class _Block:
     def _errors(self, tried: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """(B, C, C): with e_nj = S_nj x - y_n, sum_n e_nj . e_nk of the joints that are tried, square mesh units.
 
-        Where weights sum to 1, w' E w is the squared error of their linear layer.
+        Where weights sum to 1, w' E w is the squared error of skinning with them.
         """
         outer = (self.rest[chosen, :, None] * self.rest[chosen, None]).reshape(-1, 16)
         blocks = self._solver._blocks[tried[:, :, None], tried[:, None, :]]

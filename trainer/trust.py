@@ -22,8 +22,8 @@ MARGIN = 0.1
 FADE = 6.0
 """Fade width, as a part of the range. Wide: the residual at the border of the range stands in well for those outside.
 
-Measured on the arm, before there was a linear fit: at 3 times the range of motion the mean error is 51 % of the linear
-layer's, with a fade width of 0.15 it was 92 %."""
+Measured on the arm, before there was a linear fit: at 3 times the range of motion the mean error is 51 % of linear
+skinning's, with a fade width of 0.15 it was 92 %."""
 MIN_MARGIN = (0.01, 0.001)
 MIN_FADE = (4.0, 0.2)
 """Least margin and fade width: of rotation elements, no unit, and of translations, as a part of the character's size.

@@ -36,7 +36,7 @@ class Result:
 
     Attributes:
         mesh: name of the mesh object.
-        linear_mm, fdda_mm: mean error of the linear layer and of the model on held-out poses.
+        linear_mm, fdda_mm: mean error of linear skinning and of the model on held-out poses.
         moved_mm: how far the rig moves a vertex from its rest position in these poses, mean.
         difference: the largest between the evaluated mesh and the model's output, in any coordinate; metres.
     """

@@ -178,7 +178,7 @@ ROWS: tuple[Row, ...] = (
     _tube(
         MESHES,
         meshes.through_a_lattice,
-        "no weights, only a lattice that follows the bones; fitted linear layer",
+        "no weights, only a lattice that follows the bones; fitted linear skinning",
         recording=_recording(fit_linear="smooth"),
     ),
     Row(

@@ -48,7 +48,7 @@ class BakeSettings:
         frames: first and last frame; None for those of the action, or of the scene.
         shape_keys: write the positions as shape keys into the .blend file, not into a point cache beside it.
         overwrite: as in `core.output.check_outputs`.
-        strength: 0 for the linear layer alone, 1 for the model; None for the object's own, frame by frame.
+        strength: 0 for linear skinning alone, 1 for the model; None for the object's own, frame by frame.
     """
 
     action: str = ""

@@ -40,7 +40,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--beyond", type=float, action="append", default=[], metavar="X", help="compare at X times the range as well"
     )
     add_target(parser)
-    parser.add_argument("--heatmap", metavar="OUT.png", type=Path, help="draw rig, linear layer and model as heat maps")
+    parser.add_argument(
+        "--heatmap", metavar="OUT.png", type=Path, help="draw rig, linear skinning and model as heat maps"
+    )
     add_overwrite(parser)
 
 
@@ -99,7 +101,7 @@ def table(evaluation: Evaluation) -> str:
     for errors in (*random, *evaluation.beyond, *evaluation.named, *evaluation.actions):
         values = errors.to_json()
         lines.append(f"{errors.name}, {values['poses']} poses")
-        for key, label in (("linear", "  linear layer"), ("fdda", "  FDDA")):
+        for key, label in (("linear", "  linear skinning"), ("fdda", "  FDDA")):
             row = values[key]
             figures = "".join(f"{row[name]:>10.4f}" for name in ("mean", "rms", "p99", "p999", "max"))
             lines.append(f"{label:<24}{figures}")
@@ -107,7 +109,7 @@ def table(evaluation: Evaluation) -> str:
             f"{100 * values['fdda'][name] / max(values['linear'][name], 1e-12):>9.1f}%"
             for name in ("mean", "rms", "p99", "p999", "max")
         )
-        lines.append(f"{'  FDDA / linear layer':<24}{ratios}")
+        lines.append(f"{'  FDDA / linear skinning':<24}{ratios}")
         if values["normals"]:
             lines += _surface_lines(values["normals"], values["edges"])
     return "\n".join(lines)
@@ -116,7 +118,7 @@ def table(evaluation: Evaluation) -> str:
 def _surface_lines(normals: dict, edges: dict) -> list[str]:
     """What shading shows: a line on normals, one on edges."""
     angles, lengths = [], []
-    for way, label in (("fdda", "FDDA"), ("linear", "linear layer")):
+    for way, label in (("fdda", "FDDA"), ("linear", "linear skinning")):
         angle, edge = normals[way], edges[way]
         angles.append(f"{label} {angle['mean']:.3f}, p99 {angle['p99']:.2f}")
         parts = ["-" if edge[part] is None else f"{100 * edge[part]:.3f}" for part in ("inside", "beside", "across")]

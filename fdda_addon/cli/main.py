@@ -24,7 +24,7 @@ VERBS = {
     "train": ("train", "train a model on a recording"),
     "bind": ("bind", "let a model play in place of a rig"),
     "evaluate": ("evaluate", "compare a model with its rig on poses that training never saw"),
-    "benchmark": ("benchmark", "time a whole frame of rig, linear layer and model"),
+    "benchmark": ("benchmark", "time a whole frame of rig, linear skinning and model"),
     "farm": ("farm", "record, train and bind many characters on many machines"),
     "bake": ("bake", "write an action as the model shows it, to play without the add-on"),
 }

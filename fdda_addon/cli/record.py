@@ -82,7 +82,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--fit-linear",
         choices=("hard", "smooth"),
         default="",
-        help="fit the skin weights of the linear layer to the poses: one joint a vertex, or at most four",
+        help="fit the skin weights of linear skinning to the poses: one joint a vertex, or at most four",
     )
     parser.add_argument(
         "--least-vertices",

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where a model counts: a weight for each vertex, 1 for the model and 0 for the linear layer."""
+"""Where a model counts: a weight for each vertex, 1 for the model and 0 for linear skinning."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .rig import Rig
-from .skinning import LinearLayer
+from .skinning import LinearSkinning
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Mask:
         return Mask(weights, np.flatnonzero(weights < 1))
 
     def blended(self, linear: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Of one pose, (V, 3) float32 each: the model's positions where it counts, the linear layer's elsewhere."""
+        """Of one pose, (V, 3) float32 each: the model's positions where it counts, linear skinning's elsewhere."""
         blended, weights = positions.copy(), self.weights[self.partial][:, None]
         blended[self.partial] = linear[self.partial] + weights * (positions[self.partial] - linear[self.partial])
         return blended
@@ -40,17 +40,17 @@ class Mask:
 
 
 class Blend:
-    """Blends what a model gives with the linear layer: linear + strength * weight * (model - linear)."""
+    """Blends what a model gives with linear skinning: linear + strength * weight * (model - linear)."""
 
     def __init__(self, rig: Rig, mask: Mask | None = None):
         """Args:
-        rig: with the skin weights of the model's linear layer, and the rest pose of the model.
+        rig: with the skin weights of the model's linear skinning, and the rest pose of the model.
         mask: of its mesh; None where the model counts everywhere.
         """
         self.mask = mask
         self._rig = rig
-        self._whole: LinearLayer | None = None
-        self._partial: LinearLayer | None = None
+        self._whole: LinearSkinning | None = None
+        self._partial: LinearSkinning | None = None
 
     def with_mask(self, mask: Mask | None) -> "Blend":
         """The same with another mask."""
@@ -65,7 +65,7 @@ class Blend:
             positions: (N, V, 3) float32 of the model, mesh units; may be written into. Not looked at where the
                 strength is 0.
             pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
-            strengths: (N,) float32, 0 for the linear layer alone, 1 for the model where the mask lets it.
+            strengths: (N,) float32, 0 for linear skinning alone, 1 for the model where the mask lets it.
 
         Returns:
             (N, V, 3) float32, mesh-object space, mesh units; `positions` itself where it was written into.
@@ -85,16 +85,16 @@ class Blend:
             positions[:, partial] = linear + weights * (positions[:, partial] - linear)
         return positions
 
-    def _whole_layer(self) -> LinearLayer:
+    def _whole_layer(self) -> LinearSkinning:
         if self._whole is None:
-            self._whole = LinearLayer(self._rig)
+            self._whole = LinearSkinning(self._rig)
         return self._whole
 
-    def _partial_layer(self) -> LinearLayer:
+    def _partial_layer(self) -> LinearSkinning:
         """Of the vertices alone that the model does not have for itself: a mask costs as much as it covers."""
         if self._partial is None:
             rig, partial = self._rig, self.mask.partial
-            self._partial = LinearLayer(
+            self._partial = LinearSkinning(
                 replace(
                     rig,
                     rest_positions=rig.rest_positions[partial],

@@ -21,7 +21,7 @@ from .unit import read_unit, unit_json
 VERSION = 1
 METADATA_KEY = "fdda"
 SKIN_KEY = "fdda_skin"
-"""Metadata property of a model whose linear layer has fitted skin weights."""
+"""Metadata property of a model whose linear skinning has fitted skin weights."""
 POSE_INPUT = "pose_matrices"
 CONTROLS_INPUT = "controls"
 POSITIONS_OUTPUT = "positions"
@@ -93,7 +93,7 @@ class ModelInfo:
         return tuple(joint.name for joint in self.joints)
 
     def partitions_of(self, rig: Rig) -> tuple[Partition, ...]:
-        """The partitions of the model, with their vertices in a rig that has the weights of its linear layer."""
+        """The partitions of the model, with their vertices in a rig that has the weights of its linear skinning."""
         return make_partitions(
             rig,
             {p.joint: p.influencing for p in self.partitions},
@@ -275,7 +275,7 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
 
 
 def read_skin(data: bytes, info: ModelInfo, name: Path | str) -> tuple[np.ndarray, np.ndarray] | None:
-    """The fitted skin weights of a model's linear layer; None where it has those of the rig.
+    """The fitted skin weights of a model's linear skinning; None where it has those of the rig.
 
     Args:
         data: the bytes of a model that `check_model` has passed, and `info` what it gave.

@@ -19,7 +19,7 @@ MAX_INFLUENCES = 64
 
 @dataclass(frozen=True)
 class Gain:
-    """Distances of linear layers from the rig over poses and vertices, mm.
+    """Distances of linear skinning from the rig over poses and vertices, mm.
 
     Attributes:
         rms_mm, max_mm: by "rig" for its own weights and "fitted".
@@ -67,7 +67,7 @@ class SkinFit:
         """The gain, for people."""
         held_out, training = self.poses // 2, self.poses - self.poses // 2
         return (
-            f"Linear layer with fitted weights ({self.kind}), mm: {self.held_out.words('fitted')} on {held_out} "
+            f"Linear skinning with fitted weights ({self.kind}), mm: {self.held_out.words('fitted')} on {held_out} "
             f"held-out poses, {self.held_out.words('rig')} with the rig's own weights; "
             f"{self.training.words('fitted')} on the {training} poses of the fit, {self.training.words('rig')} with "
             "the rig's own."

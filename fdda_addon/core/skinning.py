@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Linear layer and local residuals.
+"""Linear skinning and local residuals.
 
 Matrices act on column vectors. A skin matrix is S_j = P_j B_j^-1, from the rest pose to the pose, both in
 mesh-object space (Bailey et al. 2018, section 3).
@@ -46,8 +46,8 @@ def have_inverse(matrices: np.ndarray) -> np.ndarray:
 class SkinBlock:
     """The linear skinning of one partition as one constant matrix.
 
-    With S the skin matrices of the joints that skin the partition side by side, `S @ weighted_rest` is the linear
-    layer of all its vertices: one product in place of a gather for each weight.
+    With S the skin matrices of the joints that skin the partition side by side, `S @ weighted_rest` is linear
+    skinning of all its vertices: one product in place of a gather for each weight.
 
     Attributes:
         joints: (Jp,) int32, the joints that skin the partition.
@@ -68,7 +68,7 @@ class SkinBlock:
         self.weighted_rest = (dense[:, None, :] * rest.T[None]).reshape(-1, len(partition.vertices))
 
 
-class LinearLayer:
+class LinearSkinning:
     """Linear blend skinning of a rig, and the local residuals beside it."""
 
     def __init__(self, rig: Rig, partitions: tuple[Partition, ...] | None = None):

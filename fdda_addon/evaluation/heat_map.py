@@ -174,7 +174,7 @@ def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:
     if last is None:
         return [], None
     errors = errors_of(mesh_object)
-    way = "linear layer" if view.way == "linear" else "FDDA"
+    way = "linear skinning" if view.way == "linear" else "FDDA"
     what = _what(last, view.statistic, context.scene.frame_current, view.pose)
     if errors is None:
         return [f"{mesh_object.name}, {way}: {what}"], None

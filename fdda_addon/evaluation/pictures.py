@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The pictures of an evaluation: partitions in colour; rig, linear layer and model side by side, plain or as heat."""
+"""The pictures of an evaluation: partitions in colour; rig, linear skinning and model side by side, or as heat."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core.metrics import distances, heat_colors
 from ..core.partition import merged_partitions, partition_colors
-from ..core.skinning import LinearLayer
+from ..core.skinning import LinearSkinning
 from ..rig.reading import read_rig
 from ..runtime.opened_model import open_model
 from ..scene.scene_rig import SceneRig
@@ -65,7 +65,7 @@ def draw_comparison(
     view: View = View(),  # noqa: B008 - frozen
     true: str = "true rig",
 ) -> None:
-    """Draw true rig, linear layer and model side by side, a row a pose.
+    """Draw true rig, linear skinning and model side by side, a row a pose.
 
     Args:
         scene_rig: the rig. model: bound or not.
@@ -79,16 +79,16 @@ def draw_comparison(
         OutputError: the file cannot be written.
     """
     opened = open_model(scene_rig, model)
-    network, layer = opened.network, LinearLayer(opened.linear_rig)
+    network, skinning = opened.network, LinearSkinning(opened.linear_rig)
     rows = []
     for pose in poses:
-        linear = layer.positions(pose.pose_matrices[None])[0]
+        linear = skinning.positions(pose.pose_matrices[None])[0]
         fdda = network.positions(pose.pose_matrices[None], pose.controls[None])[0].copy()
-        cells = [(pose.positions, f"{pose.name}: {true}"), (linear, "linear layer"), (fdda, "FDDA")]
+        cells = [(pose.positions, f"{pose.name}: {true}"), (linear, "linear skinning"), (fdda, "FDDA")]
         rows.append(
             [_cell(positions, pose.positions, label, heat, network.info.metres_per_unit) for positions, label in cells]
         )
-    title = title or (f"Distance from the {true}" if heat else f"{true[0].upper()}{true[1:]}, linear layer and FDDA")
+    title = title or (f"Distance from the {true}" if heat else f"{true[0].upper()}{true[1:]}, linear skinning and FDDA")
     draw(scene_rig.mesh_object.data, rows, path, title, view, heat_scale=heat, sculpted=not heat)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compares a model and the linear layer with the true rig, on poses that training never saw."""
+"""Compares a model and linear skinning with the true rig, on poses that training never saw."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -15,7 +15,7 @@ from ..core.metrics import ErrorStatistics, distances, error_statistics
 from ..core.partition import Partition
 from ..core.poses import Channel, beyond_range, sample_pose
 from ..core.progress import Progress
-from ..core.skinning import LinearLayer
+from ..core.skinning import LinearSkinning
 from ..core.surface import Surface, SurfaceComparison, SurfaceErrors, surface_errors, surface_json
 from ..poses.clip import find_clips
 from ..poses.sampling import model_channels
@@ -54,7 +54,7 @@ class EvaluationSettings:
         beyond: factors by which the range of motion is widened for further poses, a quarter as many for each.
         named: poses that are compared as well, each on its own.
         surface: compare normals and edges too, which takes longer than all else.
-        target: what the model and the linear layer are compared with; the rig itself where it names none.
+        target: what the model and linear skinning are compared with; the rig itself where it names none.
     """
 
     poses: int = EVALUATION_POSES
@@ -172,8 +172,8 @@ def evaluate(
         raise RigError("There is nothing to evaluate: 0 poses and no action; give --poses or --action.")
     random = settings.poses or len(settings.beyond) or len(settings.named)
     approach = make_approach(scene_rig, settings.target, clips, random)
-    network, layer = _prepare(scene_rig, model, is_own=not settings.target.name)
-    rig = layer.rig
+    network, skinning = _prepare(scene_rig, model, is_own=not settings.target.name)
+    rig = skinning.rig
     # A rig that is posed by actions alone may have nothing to sample.
     channels = model_channels(scene_rig, rig, network.info) if settings.poses or settings.beyond else ()
     extra = max(1, settings.poses // 4)
@@ -185,7 +185,7 @@ def evaluate(
         player = borrowed.enter_context(borrowed_rig(scene_rig, rig, channels, clips))
         evaluator = PoseEvaluator(scene_rig, rig, approach.target)
         mask = read_mask(scene_rig.mesh_object)
-        comparison = _Comparison(evaluator, network, layer, total, settings.surface, mask)
+        comparison = _Comparison(evaluator, network, skinning, total, settings.surface, mask)
         held_out = None
         if settings.poses:
             poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses, approach)
@@ -202,7 +202,7 @@ def evaluate(
         for clip in clips:
             frames = approach.frames(player, clip, range(len(clip.frames)))
             actions.append((yield from comparison.compare(clip.title, frames)))
-    yield Evaluation(layer.partitions, rig.joint_names, held_out or actions[0], actions, beyond, named, channels)
+    yield Evaluation(skinning.partitions, rig.joint_names, held_out or actions[0], actions, beyond, named, channels)
 
 
 def evaluate_action(
@@ -219,14 +219,14 @@ def evaluate_action(
         yield step
 
 
-def _prepare(scene_rig: SceneRig, model: Path | Network, is_own: bool) -> tuple[Network, LinearLayer]:
+def _prepare(scene_rig: SceneRig, model: Path | Network, is_own: bool) -> tuple[Network, LinearSkinning]:
     """Open a model, and check the rig as far as its own surface is compared."""
     stack = check_evaluable(scene_rig)
     opened = open_model(scene_rig, model)
     rig = opened.linear_rig
     if is_own:
         check_inputs(scene_rig, rig.controls, stack)
-    return opened.network, LinearLayer(rig, opened.network.info.partitions_of(rig))
+    return opened.network, LinearSkinning(rig, opened.network.info.partitions_of(rig))
 
 
 def pose_held_out(scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, index: int) -> None:
@@ -262,19 +262,19 @@ class _Comparison:
         self,
         evaluator: PoseEvaluator,
         network: Network,
-        layer: LinearLayer,
+        skinning: LinearSkinning,
         total: int,
         surface: bool,
         mask: Mask | None,
     ):
         self._mask = mask
-        self._evaluator, self._network, self._layer = evaluator, network, layer
+        self._evaluator, self._network, self._skinning = evaluator, network, skinning
         self._done, self._total = 0, total
-        rig, self._surface = layer.rig, None
+        rig, self._surface = skinning.rig, None
         self._metres_per_unit = rig.metres_per_unit
         if surface and len(rig.face_starts):
             faces = Surface(rig.face_starts, rig.face_vertices)
-            self._surface = SurfaceComparison(faces, rig.rest_positions, layer.partitions)
+            self._surface = SurfaceComparison(faces, rig.rest_positions, skinning.partitions)
 
     def compare(self, name: str, poses: Iterator[None]) -> Iterator[Progress]:
         """Yields progress, returns PoseErrors."""
@@ -291,7 +291,7 @@ class _Comparison:
             matrices.append(pose)
             positions.append(true)
             values.append(controls)
-            skinned = self._layer.positions(pose[None])[0]
+            skinned = self._skinning.positions(pose[None])[0]
             if self._mask is not None:
                 moved = self._mask.blended(skinned, moved)
             fdda.append(distances(moved, true, self._metres_per_unit))

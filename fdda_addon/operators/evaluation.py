@@ -96,7 +96,7 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
             true = f"'{target}'" if target else "the rig"
             sentences.append(
                 f"FDDA{of} is {fdda.mean:.2f} mm from {true} on average and {fdda.max:.1f} mm at most; "
-                f"the linear layer {linear.mean:.2f} and {linear.max:.1f} mm."
+                f"linear skinning {linear.mean:.2f} and {linear.max:.1f} mm."
             )
         context.window_manager.fdda_view.pose = -1
         if self._action:

@@ -19,7 +19,7 @@ from .on_rig import OnRig
 
 LARGE_BYTES = 32_000_000
 """From this size on a model is not packed without being asked: every save writes it again."""
-MODE_NAMES = {"RIG": "the rig", "LINEAR": "the linear layer", "FDDA": "the model"}
+MODE_NAMES = {"RIG": "the rig", "LINEAR": "linear skinning", "FDDA": "the model"}
 
 
 def _is_bound(mesh_object: bpy.types.Object) -> bool:

@@ -106,7 +106,7 @@ def _draw_figures(
         draw_sentence(body, context, f"{last.model} is not what is bound now; evaluate again.", "INFO")
     table = body.column(align=True)
     _row(table, "", [label for label, _ in FIGURES])
-    for label, way in (("FDDA", "fdda"), ("Linear layer", "linear")):
+    for label, way in (("FDDA", "fdda"), ("Linear skinning", "linear")):
         _row(table, label, [_millimetres(getattr(last.total[way], name)) for _, name in FIGURES])
     body.separator()
     row = body.row()

@@ -96,7 +96,7 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
     )
     strength: FloatProperty(
         name="Strength",
-        description="0 is the linear layer, 1 the model",
+        description="0 is linear skinning, 1 the model",
         min=0,
         max=1,
         default=1,

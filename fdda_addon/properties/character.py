@@ -101,7 +101,7 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
     control_index: IntProperty(name="Control", description="The control that the fields below are about")
     fit_linear: EnumProperty(
         name="Linear Layer",
-        description="Skin weights of the linear layer that a model learns to correct",
+        description="Skin weights of linear skinning that a model learns to correct",
         items=(
             ("RIG", "Rig's Weights", "The weights that the mesh has, as they are"),
             ("HARD", "Fitted, Rigid", "One joint a vertex, the one that explains the recorded poses best"),

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..core.recording.extension import RecordingExtension
 from ..core.recording.writer import RecordingWriter
-from ..core.skinning import LinearLayer
+from ..core.skinning import LinearSkinning
 from ..rig.reading import PoseEvaluator
 from ..rig.target_time import DIRECT, Approach
 
@@ -30,14 +30,14 @@ class Appender:
     def __init__(
         self,
         evaluator: PoseEvaluator,
-        layer: LinearLayer,
+        skinning: LinearSkinning,
         writer: RecordingWriter | RecordingExtension,
         approach: Approach = DIRECT,
     ) -> None:
         self._approach = approach
         self.done = writer.complete
-        self._evaluator, self._layer, self._writer = evaluator, layer, writer
-        self._size = max(1, min(BATCH_POSES, BATCH_BYTES // (layer.rig.vertex_count * 12)))
+        self._evaluator, self._skinning, self._writer = evaluator, skinning, writer
+        self._size = max(1, min(BATCH_POSES, BATCH_BYTES // (skinning.rig.vertex_count * 12)))
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._previous: Future | None = None
         self._batch: list[tuple] = []
@@ -63,7 +63,7 @@ class Appender:
     def _append(self, batch: list[tuple]) -> None:
         pose_matrices, positions, controls, are_at_rest = (np.stack(arrays) for arrays in zip(*batch, strict=True))
         unsettled = np.flatnonzero(~are_at_rest).tolist()
-        arrays = pose_matrices, self._layer.local_residuals(pose_matrices, positions), controls
+        arrays = pose_matrices, self._skinning.local_residuals(pose_matrices, positions), controls
         self._writer.append(*arrays, *([unsettled] if unsettled else []))
 
     def __enter__(self) -> Self:

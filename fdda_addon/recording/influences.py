@@ -18,7 +18,7 @@ from ..core.partition import INFLUENCE_TOLERANCE, Partition, make_partitions, re
 from ..core.poses import CONTROL, Channel
 from ..core.progress import Progress
 from ..core.rig import UNMOVED, Rig
-from ..core.skinning import LinearLayer
+from ..core.skinning import LinearSkinning
 from ..poses.bone_numbers import control_name
 from ..poses.sampling import is_moved_by_constraints
 from ..rig.reading import PoseEvaluator
@@ -92,7 +92,7 @@ class _Moves:
     """Moves from a base pose. Residuals of many are computed at once: each partition costs as much for one pose."""
 
     def __init__(self, rig: Rig, partitions: tuple[Partition, ...], evaluator: PoseEvaluator, found: _Found):
-        self._layer, self._evaluator, self._found = LinearLayer(rig, partitions), evaluator, found
+        self._layer, self._evaluator, self._found = LinearSkinning(rig, partitions), evaluator, found
         self._size = max(1, min(MAX_MOVES, BATCH_BYTES // (12 * rig.vertex_count)))
         self._base: np.ndarray | None = None
         self._moves: list[tuple[str, int]] = []

@@ -14,7 +14,7 @@ from ..core.skin_fit import SkinFit
 
 
 def recorded_weights(path: Path, rig: Rig, kind: str) -> tuple[Rig, SkinFit | None]:
-    """The rig with the weights of the linear layer that a recording has, complete or not.
+    """The rig with the weights of linear skinning that a recording has, complete or not.
 
     Args:
         path: folder of the recording.
@@ -44,7 +44,7 @@ def recorded_partitions(path: Path, rig: Rig, least_vertices: int) -> tuple[Part
 
     Args:
         path: folder of the recording.
-        rig: with the weights of the linear layer.
+        rig: with the weights of linear skinning.
         least_vertices: as in `RecordingSettings`.
 
     Raises:

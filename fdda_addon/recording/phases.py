@@ -81,11 +81,11 @@ class Planned:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A mesh that has the weights of its linear layer.
+    """A mesh that has the weights of its linear skinning.
 
     Attributes:
         planned: the mesh as it was planned.
-        rig: with the weights of the linear layer.
+        rig: with the weights of linear skinning.
         fit: of the weights; None where they are the rig's own.
     """
 
@@ -104,7 +104,7 @@ class Found:
     """A mesh whose influences are found: its poses can be recorded.
 
     Attributes:
-        fitted: the mesh with the weights of its linear layer.
+        fitted: the mesh with the weights of its linear skinning.
         partitions: with what influences them.
         evaluator: of the poses, which knows by now what one takes.
     """

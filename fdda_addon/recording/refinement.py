@@ -20,7 +20,7 @@ from ..core.recording.index import REFINED
 from ..core.recording.reader import Recording, read_recording
 from ..core.refinement import Probes, choose_poses, nearest_distances
 from ..core.rig import Rig, differences
-from ..core.skinning import LinearLayer
+from ..core.skinning import LinearSkinning
 from ..poses.sampling import model_channels, states_channels
 from ..rig.borrowed_rig import borrowed_rig
 from ..rig.modifier_stack import check_evaluable
@@ -108,8 +108,8 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         chosen = choose_poses(probes, channels, _owned(recording, channels), base, rng)
         with RecordingExtension(recording, model.name, added) as extension:
             posed = (poser.set(pose) for pose in chosen[added:])
-            layer = LinearLayer(recording.rig, recording.partitions)
-            with contextlib.closing(append_poses(posed, [Appender(evaluator, layer, extension)])) as steps:
+            skinning = LinearSkinning(recording.rig, recording.partitions)
+            with contextlib.closing(append_poses(posed, [Appender(evaluator, skinning, extension)])) as steps:
                 for done in steps:
                     yield Progress("poses", done - first, settings.poses)
 

@@ -12,7 +12,7 @@ from ..core.progress import Progress
 from ..core.recording.arrays import open_array
 from ..core.recording.target import Repeats
 from ..core.recording.writer import RecordingWriter
-from ..core.skinning import LinearLayer
+from ..core.skinning import LinearSkinning
 from ..poses.clip_player import ClipPlayer
 from .phases import Found
 from .pose_plan import PosePlan
@@ -39,16 +39,16 @@ def measure_repeats(
     if writer.repeats or not found:
         return
     numbers = sorted({found[int(number * GOLDEN_RATIO * len(found)) % len(found)] for number in range(count)})
-    rig, layer, settler = writer.rig, LinearLayer(writer.rig, writer.partitions), plan.approach.settler
+    rig, skinning, settler = writer.rig, LinearSkinning(writer.rig, writer.partitions), plan.approach.settler
     recorded = open_array(writer.path / "residuals.npy", (writer.complete, rig.vertex_count, 3), np.float32)
     apart, linear = [], []
     # So that what plays is stopped.
     with closing(plan.poses_again(player, numbers)) as again:
         for done, number in enumerate(again, 1):
             pose, positions, _ = mesh.evaluator.evaluate()
-            before = layer.complex_positions(pose[None], np.array(recorded[number])[None])[0]
+            before = skinning.complex_positions(pose[None], np.array(recorded[number])[None])[0]
             apart.append(distances(positions, before, rig.metres_per_unit))
-            linear.append(distances(before, layer.positions(pose[None])[0], rig.metres_per_unit))
+            linear.append(distances(before, skinning.positions(pose[None])[0], rig.metres_per_unit))
             yield Progress("repeats", done, len(numbers), detail=str(settler.last) if settler else "")
     statistics = {name: round(value, 6) for name, value in error_statistics(np.stack(apart)).to_json().items()}
     writer.note_repeats(Repeats(tuple(numbers), statistics, round(float(np.mean(linear)) * 1000, 6)))

@@ -19,7 +19,7 @@ from ..core.recording.place import check_recordable
 from ..core.recording.shard import Shard, shard_poses
 from ..core.recording.target import POSE
 from ..core.recording.writer import RecordingWriter
-from ..core.skinning import LinearLayer
+from ..core.skinning import LinearSkinning
 from ..poses.clip import Clip, find_clips
 from ..poses.clip_player import ClipPlayer
 from ..rig.borrowed_rig import borrowed_rigs
@@ -167,7 +167,7 @@ def _in_turn(
 def _fit(
     mesh: Planned, settings: RecordingSettings, plan: PosePlan, player: ClipPlayer | None
 ) -> Generator[Progress, None, Fitted]:
-    """Give a mesh the weights that its linear layer is to have."""
+    """Give a mesh the weights that its linear skinning is to have."""
     if mesh.known:
         return Fitted(mesh, *recorded_weights(mesh.known, mesh.rig, settings.fit_linear))
     if not settings.fit_linear:
@@ -225,8 +225,8 @@ def _record_poses(
                 *(mesh.fitted.rig, mesh.partitions, info),
                 *(settings.resume, settings.overwrite),
             )
-            layer = LinearLayer(mesh.fitted.rig, mesh.partitions)
-            appenders.append(Appender(mesh.evaluator, layer, stack.enter_context(writer), plan.approach))
+            skinning = LinearSkinning(mesh.fitted.rig, mesh.partitions)
+            appenders.append(Appender(mesh.evaluator, skinning, stack.enter_context(writer), plan.approach))
         first, settler = min(appender.done for appender in appenders), plan.approach.settler
         seconds = settler.last.seconds if settler and settler.last else None
         yield Progress("poses", first, len(wanted), estimate(meshes, len(wanted), len(wanted) - first, seconds))

@@ -10,7 +10,7 @@ from ..core.errors import RigError
 from ..core.partition import GOLDEN_RATIO
 from ..core.progress import Progress
 from ..core.recording.target import SIMULATION
-from ..core.skinning import LinearLayer
+from ..core.skinning import LinearSkinning
 from ..poses.clip_player import ClipPlayer
 from .phases import Fitted
 from .pose_plan import PosePlan
@@ -33,7 +33,7 @@ def check_moves(mesh: Fitted, plan: PosePlan, player: ClipPlayer) -> Iterator[Pr
     Raises:
         RigError: it does not move.
     """
-    evaluator, layer = mesh.planned.evaluator(mesh.rig), LinearLayer(mesh.rig)
+    evaluator, skinning = mesh.planned.evaluator(mesh.rig), LinearSkinning(mesh.rig)
     in_order = plan.approach.target.follows == SIMULATION
     spread = sorted({int(number * GOLDEN_RATIO * plan.total) % plan.total for number in range(MOST_POSES)})
     wanted = range(min(plan.total, 2 if plan.approach.settler else plan.total)) if in_order else spread
@@ -41,7 +41,7 @@ def check_moves(mesh: Fitted, plan: PosePlan, player: ClipPlayer) -> Iterator[Pr
     with closing(plan.poses(player, wanted)) as poses:
         for done, _ in enumerate(poses, 1):
             pose, positions, _ = evaluator.evaluate()
-            skinned = layer.positions(pose[None])[0]
+            skinned = skinning.positions(pose[None])[0]
             if first is None:
                 first = skinned, positions
             rig_moved = max(rig_moved, float(np.abs(skinned - first[0]).max()))

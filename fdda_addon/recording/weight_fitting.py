@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fits the skin weights of the linear layer to poses of a rig, in the trainer's Python."""
+"""Fits the skin weights of linear skinning to poses of a rig, in the trainer's Python."""
 
 import tempfile
 import time
@@ -100,7 +100,7 @@ def _fit_folder(folder: Path, kind: str, rig: Rig) -> Iterator[Progress]:
 
 
 def check_has_weights(scene_rig: SceneRig, rig: Rig) -> None:
-    """Fail where a linear layer with the rig's own weights would never move.
+    """Fail where linear skinning with the rig's own weights would never move.
 
     Raises:
         RigError: no vertex follows a bone.
@@ -109,6 +109,6 @@ def check_has_weights(scene_rig: SceneRig, rig: Rig) -> None:
     if names <= {UNMOVED}:
         raise RigError(
             f"The vertices of '{scene_rig.mesh_object.name}' have no weights on deforming bones of "
-            f"'{scene_rig.armature_object.name}', so there is no linear layer to learn from; have one fitted "
+            f"'{scene_rig.armature_object.name}', so there is no linear skinning to learn from; have one fitted "
             "(--fit-linear smooth, or Linear Layer in the sidebar), or paint weights."
         )

@@ -30,7 +30,7 @@ VIEWPORT_KEY = "fdda_viewport"
 
 
 class Job(NamedTuple):
-    """A pose to execute: pose matrices (J, 4, 4) and controls (C,), float32; strength, 0 for the linear layer alone."""
+    """A pose to execute: pose matrices (J, 4, 4) and controls (C,), float32; strength, 0 for linear skinning alone."""
 
     pose: np.ndarray
     controls: np.ndarray
@@ -300,7 +300,7 @@ class LiveBinding:
         return (skin @ info.rest_matrices).astype(np.float32)
 
     def _make_blend(self, scene_rig: SceneRig) -> Blend:
-        """What blends the model with the linear layer."""
+        """What blends the model with linear skinning."""
         rig = self.network.linear_rig(read_model_rig(scene_rig, self.network.info))
         # The rest pose of the model: the objects may have moved since, and pose matrices refer to it.
         return Blend(replace(rig, rest_matrices=self.network.info.rest_matrices), self._mask)

@@ -118,7 +118,7 @@ class Network:
         return trust
 
     def linear_rig(self, rig: Rig) -> Rig:
-        """A rig that the model fits, with the skin weights of the model's linear layer, which may be fitted ones."""
+        """A rig that the model fits, with the skin weights of the model's linear skinning, which may be fitted ones."""
         if self._skin is None:
             return rig
         joints, weights = self._skin

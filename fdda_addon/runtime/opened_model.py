@@ -25,7 +25,7 @@ class OpenedModel:
 
     @property
     def linear_rig(self) -> Rig:
-        """The rig with the skin weights of the model's linear layer."""
+        """The rig with the skin weights of the model's linear skinning."""
         return self.network.linear_rig(self.rig)
 
 

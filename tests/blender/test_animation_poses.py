@@ -9,7 +9,7 @@ import pytest
 
 from fdda_addon.core.errors import RecordingError, RigError
 from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.evaluation.run import EvaluationSettings, evaluate
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
@@ -39,8 +39,8 @@ def recorded(rig: SceneRig, path, **settings) -> Recording:
 def positions(recording: Recording) -> np.ndarray:
     """(N, V, 3) what Blender evaluated."""
     matrices = np.array(recording.pose_matrices)
-    layer = LinearLayer(recording.rig, recording.partitions)
-    return layer.complex_positions(matrices, np.array(recording.residuals))
+    skinning = LinearSkinning(recording.rig, recording.partitions)
+    return skinning.complex_positions(matrices, np.array(recording.residuals))
 
 
 def evaluated(rig: SceneRig) -> np.ndarray:

@@ -15,7 +15,7 @@ from .conftest import assert_plays
 pytestmark = pytest.mark.one_line
 
 MEAN_BAR, P999_BAR, MAX_BAR = 0.012, 0.03, 0.15
-"""Held-out errors of the model as parts of the linear layer's."""
+"""Held-out errors of the model as parts of linear skinning's."""
 BEYOND_BARS = {"1.5": 0.03, "2": 0.06, "3": 0.2}
 """Mean errors at so many times the range of motion."""
 NAMED_BARS = {"elbow 3x its range, off its axis": 0.45, "metacarpals 2.5x their range": 0.15}
@@ -59,7 +59,7 @@ def test_beyond_the_range(errors):
     bars = {**{f"{factor} times the range": bar for factor, bar in BEYOND_BARS.items()}, **NAMED_BARS}
     for poses in (*errors["beyond"], *errors["named"]):
         assert poses["fdda"]["mean"] < bars[poses["name"]] * poses["linear"]["mean"], poses["name"]
-        # Nothing explodes: no vertex is further from the rig than the linear layer leaves it, by more than a trifle.
+        # Nothing explodes: no vertex is further from the rig than linear skinning leaves it, by more than a trifle.
         assert poses["fdda"]["max"] < 1.05 * poses["linear"]["max"], poses["name"]
 
 

@@ -18,7 +18,7 @@ from .conftest import assert_plays, run, train
 
 ROOT = Path(__file__).resolve().parents[2]
 MOST = 0.1
-"""Part of the linear layer's error that may be left on an action that training has not seen."""
+"""Part of linear skinning's error that may be left on an action that training has not seen."""
 
 
 @dataclass(frozen=True)

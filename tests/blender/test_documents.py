@@ -60,11 +60,13 @@ def test_recording_code(folder):
     """Mean residual of the recording's first pose, as the core computes it."""
     from fdda_addon.core.metrics import distances
     from fdda_addon.core.recording.reader import read_recording
-    from fdda_addon.core.skinning import LinearLayer
+    from fdda_addon.core.skinning import LinearSkinning
 
     recording = read_recording(folder / "recording")
-    layer, pose = LinearLayer(recording.rig), recording.pose_matrices[:1]
-    expected = distances(layer.complex_positions(pose, recording.residuals[:1]), layer.positions(pose)).mean() * 1000
+    skinning, pose = LinearSkinning(recording.rig), recording.pose_matrices[:1]
+    expected = (
+        distances(skinning.complex_positions(pose, recording.residuals[:1]), skinning.positions(pose)).mean() * 1000
+    )
     shape, value = re.fullmatch(r"(\(300, 3\)) mean residual (\S+) mm\n", run_code("recording", folder)).groups()
     assert shape and float(value) == pytest.approx(expected, rel=1e-3)
 
@@ -76,7 +78,7 @@ def test_model_code(folder):
 def test_evaluation_code(folder):
     lines = run_code("evaluation", folder).splitlines()
     report = json.loads((folder / "evaluation.json").read_text())
-    assert lines[0].startswith(f"mean {report['fdda']['mean']:.3f} mm, linear layer ")
+    assert lines[0].startswith(f"mean {report['fdda']['mean']:.3f} mm, linear skinning ")
     assert lines[1].startswith("largest error: ")
 
 
@@ -87,7 +89,7 @@ def test_messages_code(folder, tmp_path):
 
 
 def test_development_code(elbow, tmp_path):
-    """What plays is what the model says, the model is near the rig, and the linear layer is farther."""
+    """What plays is what the model says, the model is near the rig, and linear skinning is farther."""
     text = run_code("development", tmp_path, arguments=(elbow.bound, "elbow", 12))
     playback, model, linear = (float(far) for far in re.findall(r"^\w.*: ([\d.]+) at vertex", text, re.MULTILINE))
     assert playback < 1e-5 and playback < model < 0.002 < linear

@@ -12,7 +12,7 @@ from fdda_addon.core.metrics import error_statistics
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.poses import beyond_range, sample_pose
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.evaluation.run import (
     HELD_OUT_INDEX,
     Evaluation,
@@ -59,7 +59,7 @@ def test_keys(report):
     assert report["named"] == []
 
 
-def test_the_model_is_nearer_than_the_linear_layer(report):
+def test_the_model_is_nearer_than_linear_skinning(report):
     assert 0 < report["fdda"]["mean"] < report["linear"]["mean"] / 3
     for values in (report["fdda"], report["linear"]):
         assert values["mean"] <= values["rms"] <= values["p999"] <= values["max"]
@@ -67,9 +67,9 @@ def test_the_model_is_nearer_than_the_linear_layer(report):
 
 
 def by_hand(rig, elbow, channels, seed: int, indices) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (N, V) of model and linear layer, computed without the evaluation: metres."""
+    """Errors (N, V) of model and linear skinning, computed without the evaluation: metres."""
     arrays = read_rig(rig)
-    layer, network = LinearLayer(arrays), Network(elbow.model)
+    skinning, network = LinearSkinning(arrays), Network(elbow.model)
     bones, errors = rig.armature_object.pose.bones, ([], [])
     poser = Poser(rig, channels)
     for index in indices:
@@ -77,7 +77,7 @@ def by_hand(rig, elbow, channels, seed: int, indices) -> tuple[np.ndarray, np.nd
         true = evaluated_positions(rig.mesh_object, bpy.context.evaluated_depsgraph_get())
         to_mesh = rig.mesh_object.matrix_world.inverted() @ rig.armature_object.matrix_world
         pose = np.float32([[np.array(to_mesh @ bones[name].matrix) for name in arrays.joint_names]])
-        for found, positions in zip(errors, (network.positions(pose), layer.positions(pose)), strict=True):
+        for found, positions in zip(errors, (network.positions(pose), skinning.positions(pose)), strict=True):
             found.append(np.linalg.norm(positions[0] - true, axis=1))
     return np.array(errors[0]), np.array(errors[1])
 
@@ -92,7 +92,7 @@ def test_figures_are_what_a_direct_computation_gives(report, rig, elbow):
         mm = errors * 1000
         assert report[name]["mean"] == pytest.approx(mm.mean(), abs=2e-4)
         assert report[name]["max"] == pytest.approx(mm.max(), abs=2e-4)
-    for partition, found in zip(LinearLayer(read_rig(rig)).partitions, report["partitions"], strict=True):
+    for partition, found in zip(LinearSkinning(read_rig(rig)).partitions, report["partitions"], strict=True):
         assert found["vertices"] == len(partition.vertices)
         assert found["fdda"]["mean"] == pytest.approx(1000 * fdda[:, partition.vertices].mean(), abs=2e-4)
     assert beyond_range(channels, 2)[0].high > channels[0].high
@@ -150,7 +150,7 @@ def test_the_table(elbow, tmp_path, capfd):
     captured = capfd.readouterr()
     report = json.loads((tmp_path / "e.json").read_text())
     for values in (report, report["actions"][0]):
-        for way, label in (("linear", "linear layer"), ("fdda", "FDDA")):
+        for way, label in (("linear", "linear skinning"), ("fdda", "FDDA")):
             row = "".join(f"{values[way][name]:>10.4f}" for name in STATISTICS)
             assert f"  {label:<22}{row}" in captured.out
     assert "evaluation: 33 of 33, " in captured.err
@@ -173,7 +173,7 @@ def test_heat_map(elbow, tmp_path):
     assert path.read_bytes().startswith(b"\x89PNG")
     picture = pixels(path)[..., :3]
     assert min(picture.shape[:2]) > 300
-    # Green where there is no error, and colours of the scale that are not: the linear layer is off by millimetres.
+    # Green where there is no error, and colours of the scale that are not: linear skinning is off by millimetres.
     green = (picture[..., 1] > 1.5 * picture[..., 0]) & (picture[..., 1] > 1.5 * picture[..., 2])
     blue = picture[..., 2] > 1.3 * picture[..., 1]
     assert green.mean() > 0.02 and blue.mean() > 0.02

@@ -16,7 +16,7 @@ from fdda_addon.scene.mesh import evaluated_positions
 from .conftest import assert_plays, run, train
 
 MOST = 0.5
-"""Part of the linear layer's mean error that a short training may leave; docs/characters.md has a long one's."""
+"""Part of linear skinning's mean error that a short training may leave; docs/characters.md has a long one's."""
 
 
 @pytest.fixture(scope="module")

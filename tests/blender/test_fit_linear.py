@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A linear layer with fitted weights: recorded, trained, bound and compared; resumed, and refused."""
+"""Linear skinning with fitted weights: recorded, trained, bound and compared; resumed, and refused."""
 
 import dataclasses
 import json
@@ -17,7 +17,7 @@ from fdda_addon.core.model import read_model_info
 from fdda_addon.core.recording.folder import FolderState, read_folder
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.evaluation import heat_map
 from fdda_addon.evaluation.run import EvaluationSettings, evaluate
 from fdda_addon.recording.plan import RecordingSettings
@@ -63,7 +63,7 @@ def cloth() -> SceneRig:
 
 @dataclasses.dataclass(frozen=True)
 class Fitted:
-    """The files of a character with a fitted linear layer, and what `record` printed."""
+    """The files of a character with fitted linear skinning, and what `record` printed."""
 
     rig: Path
     recording: Path
@@ -77,7 +77,7 @@ class Fitted:
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable], Fitted]:
-    """Makes a character once: records it with a fitted linear layer, and trains."""
+    """Makes a character once: records it with fitted linear skinning, and trains."""
     made: dict[str, Fitted] = {}
 
     def make(kind: str, build: Callable[[], object], capfd: pytest.CaptureFixture) -> Fitted:
@@ -119,7 +119,7 @@ def test_from_the_fit_to_playback(kind, build, fitted, capfd):
 
     rig = files.open()
     own = read_rig(rig)
-    # The fingerprint is that of the rig: it does not matter to it which linear layer a model has.
+    # The fingerprint is that of the rig: it does not matter to it which linear skinning a model has.
     assert recording.rig.fingerprint == own.fingerprint == info.fingerprint
     assert [own.joint_names[p.joint] for p in info.partitions] == ["upper", "lower"]
     assert (recording.rig.skin_weights > 0).sum(axis=1).max() == (1 if kind == "hard" else 2)
@@ -134,7 +134,7 @@ def test_from_the_fit_to_playback(kind, build, fitted, capfd):
 
 
 @pytest.mark.parametrize(("kind", "build"), CHARACTERS)
-def test_the_fitted_linear_layer_is_what_plays(kind, build, fitted, capfd):
+def test_the_fitted_linear_skinning_is_what_plays(kind, build, fitted, capfd):
     files = fitted(kind, build, capfd)
     rig = files.open()
     pose(angle=1.2)
@@ -147,7 +147,7 @@ def test_the_fitted_linear_layer_is_what_plays(kind, build, fitted, capfd):
     linear = evaluated(rig.mesh_object)
     recording = read_recording(files.recording)
     matrices = pose_matrices(rig, recording.rig)
-    np.testing.assert_allclose(linear, LinearLayer(recording.rig).positions(matrices[None])[0], atol=1e-5)
+    np.testing.assert_allclose(linear, LinearSkinning(recording.rig).positions(matrices[None])[0], atol=1e-5)
     errors = [np.linalg.norm(positions - true, axis=1).mean() for positions in (shown, linear)]
     assert errors[0] < errors[1] < 0.01
 
@@ -161,7 +161,7 @@ def test_a_mesh_without_weights_is_refused_unless_they_are_fitted(refusal, tmp_p
     cloth()
     save_copy(tmp_path / "cloth.blend")
     assert refusal("record", tmp_path / "cloth.blend", tmp_path / "recording", "--object", ELBOW) == (
-        "The vertices of 'elbow' have no weights on deforming bones of 'elbow_rig', so there is no linear layer to "
+        "The vertices of 'elbow' have no weights on deforming bones of 'elbow_rig', so there is no linear skinning to "
         "learn from; have one fitted (--fit-linear smooth, or Linear Layer in the sidebar), or paint weights."
     )
 
@@ -194,7 +194,7 @@ def test_a_fit_that_dies_is_reported(refusal, tmp_path, monkeypatch):
     )
 
 
-def test_refined_poses_take_the_linear_layer_of_the_recording(tmp_path, refusal):
+def test_refined_poses_take_linear_skinning_of_the_recording(tmp_path, refusal):
     assert run("record", save_elbow(tmp_path / "elbow.blend"), tmp_path / "recording", "--poses", 3) == 0
     status = run(
         "record", tmp_path / "elbow.blend", tmp_path / "recording", "--refine", "m.onnx", "--fit-linear", "hard"
@@ -256,6 +256,6 @@ def test_the_sidebar_fits_as_the_command_line_does(tmp_path):
     own = read_rig(rig)
     same = read_folder(tmp_path / "recording", own, index["sampling"], "hard")
     assert (same.state, same.sentence) == (FolderState.COMPLETE, "")
-    assert same.measured[0].startswith("Linear layer with fitted weights (hard), mm: ")
+    assert same.measured[0].startswith("Linear skinning with fitted weights (hard), mm: ")
     other = read_folder(tmp_path / "recording", own, index["sampling"], "")
-    assert other.sentence == "It was recorded with other settings than those above: linear layer."
+    assert other.sentence == "It was recorded with other settings than those above: linear skinning."

@@ -38,7 +38,7 @@ def ramp(mesh_object: bpy.types.Object) -> np.ndarray:
 
 
 def both(mesh_object: bpy.types.Object) -> tuple[np.ndarray, np.ndarray]:
-    """What the linear layer and the model alone show of the pose."""
+    """What linear skinning and the model alone show of the pose."""
     name, mode, mesh_object.fdda.mask = mesh_object.fdda.mask, mesh_object.fdda.mode, ""
     shown = []
     for mesh_object.fdda.mode in ("LINEAR", "FDDA"):
@@ -59,7 +59,7 @@ def masked(bound):
     return bound
 
 
-def test_the_weight_blends_the_model_with_the_linear_layer(masked):
+def test_the_weight_blends_the_model_with_linear_skinning(masked):
     weights = ramp(masked)[:, None]
     for angle in (1.4, 0.6, -0.2):
         pose(angle=angle)

@@ -74,7 +74,7 @@ def test_modes_give_the_rig_back(bound, elbow):
     assert np.array_equal(evaluated(bound), true)
 
 
-def test_linear_layer_is_the_armature_modifier(bound):
+def test_linear_skinning_is_the_armature_modifier(bound):
     pose(angle=1.4)
     bound.fdda.mode = "LINEAR"
     linear = evaluated(bound)

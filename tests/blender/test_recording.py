@@ -13,7 +13,7 @@ from fdda_addon.core.poses import sample_pose
 from fdda_addon.core.progress import Progress
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.recording.appender import BATCH_POSES
 from fdda_addon.recording.plan import RecordingSettings
@@ -43,8 +43,8 @@ def shown(rig: SceneRig) -> np.ndarray:
 
 def assert_reproduces(rig: SceneRig, recording: Recording, poses) -> None:
     """Recorded pose and residual of each index give what Blender shows when the rig is posed so again."""
-    layer = LinearLayer(recording.rig, recording.partitions)
-    positions = layer.complex_positions(recording.pose_matrices, recording.residuals)
+    skinning = LinearSkinning(recording.rig, recording.partitions)
+    positions = skinning.complex_positions(recording.pose_matrices, recording.residuals)
     for index, set_pose in poses:
         set_pose()
         assert np.abs(shown(rig) - positions[index]).max() < 1e-5
@@ -60,12 +60,12 @@ def test_residuals_reproduce_what_blender_shows(fresh, tmp_path):
     recording = recorded(fresh, tmp_path / "r", poses=12, seed=3)
     fresh.armature_object.animation_data_clear()
     assert_reproduces(fresh, recording, (random_pose(fresh, recording, index) for index in (0, 5, 11)))
-    assert np.abs(recording.residuals).max() > 2e-3, "the rig differs from its linear layer"
+    assert np.abs(recording.residuals).max() > 2e-3, "the rig differs from its linear skinning"
     assert len({pose.tobytes() for pose in recording.pose_matrices}) == 12
 
 
-def test_linear_layer_is_blender_s_armature_modifier(fresh):
-    layer = LinearLayer(rig := read_rig(fresh))
+def test_linear_skinning_is_blender_s_armature_modifier(fresh):
+    skinning = LinearSkinning(rig := read_rig(fresh))
     fresh.armature_object.animation_data_clear()
     fresh.mesh_object.modifiers["CorrectiveSmooth"].show_viewport = False
     fresh.armature_object.pose.bones["lower"].rotation_euler[0] = 1.5
@@ -74,7 +74,7 @@ def test_linear_layer_is_blender_s_armature_modifier(fresh):
     depsgraph = bpy.context.evaluated_depsgraph_get()
     reader = PoseReader(fresh, rig.joint_names, rig.rest_matrices)
     pose = reader.read(fresh.mesh_object.evaluated_get(depsgraph), fresh.armature_object.evaluated_get(depsgraph))
-    assert np.abs(layer.positions(pose[None])[0] - positions).max() < 1e-6
+    assert np.abs(skinning.positions(pose[None])[0] - positions).max() < 1e-6
     assert np.abs(positions - rig.rest_positions).max() > 0.1
 
 

@@ -14,7 +14,7 @@ from fdda_addon.core.metrics import distances
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.recording.index import REFINED
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.recording.refinement import RefinementSettings, refine
 from fdda_addon.rig.reading import PoseEvaluator, read_rig
 from fdda_addon.runtime.network import Network
@@ -35,9 +35,9 @@ def recording(elbow, tmp_path):
 
 def errors(recording, model, poses: slice) -> np.ndarray:
     """(n,) largest error of the model in each of these poses, against what was recorded."""
-    layer = LinearLayer(recording.rig, recording.partitions)
+    skinning = LinearSkinning(recording.rig, recording.partitions)
     matrices = np.array(recording.pose_matrices[poses])
-    true = layer.complex_positions(matrices, np.array(recording.residuals[poses]))
+    true = skinning.complex_positions(matrices, np.array(recording.residuals[poses]))
     return distances(Network(model).positions(matrices), true).max(axis=1)
 
 
@@ -67,8 +67,8 @@ def test_what_is_added_is_what_the_rig_does(elbow, recording):
     bpy.context.view_layer.update()
     pose, positions, _ = evaluator.evaluate()
     assert np.abs(pose - read.pose_matrices[-1]).max() < 1e-5
-    layer = LinearLayer(read.rig, read.partitions)
-    recorded = layer.complex_positions(read.pose_matrices[-1:], read.residuals[-1:])[0]
+    skinning = LinearSkinning(read.rig, read.partitions)
+    recorded = skinning.complex_positions(read.pose_matrices[-1:], read.residuals[-1:])[0]
     assert np.abs(recorded - positions).max() < 1e-5
 
 

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.core.surface import Surface
 from fdda_addon.evaluation.run import EvaluationSettings, evaluate
 from fdda_addon.rig.reading import read_rig
@@ -77,11 +77,11 @@ def report(elbow, tmp_path) -> dict:
 
 
 def test_figures_of_an_evaluation_are_what_blender_s_normals_and_edges_give(report, rig: SceneRig, elbow):
-    """The positions of the true rig and of the linear layer go into meshes of Blender's."""
+    """The positions of the true rig and of linear skinning go into meshes of Blender's."""
     evaluation = drain(evaluate(rig, elbow.model, EvaluationSettings(poses=24, seed=3)))
     arrays = read_rig(rig)
-    layer = LinearLayer(arrays)
-    partition_of = {int(vertex): p.joint for p in layer.partitions for vertex in p.vertices}
+    skinning = LinearSkinning(arrays)
+    partition_of = {int(vertex): p.joint for p in skinning.partitions for vertex in p.vertices}
     mesh = rig.mesh_object.data.copy()
     edges = np.array([edge.vertices[:] for edge in mesh.edges])
     crosses = np.array([partition_of[a] != partition_of[b] for a, b in edges])
@@ -95,7 +95,7 @@ def test_figures_of_an_evaluation_are_what_blender_s_normals_and_edges_give(repo
     rest = shown(arrays.rest_positions)[1]
     angles, lengths = [], []
     for pose, true in zip(evaluation.held_out.pose_matrices, evaluation.held_out.positions, strict=True):
-        (true_normals, true_lengths), (normals, moved_lengths) = shown(true), shown(layer.positions(pose[None])[0])
+        (true_normals, true_lengths), (normals, moved_lengths) = shown(true), shown(skinning.positions(pose[None])[0])
         angles.append(degrees(true_normals, normals))
         lengths.append(np.abs(moved_lengths - true_lengths) / rest)
     found, edge_errors = report["normals"]["linear"], report["edges"]["linear"]
@@ -109,7 +109,7 @@ def test_figures_of_an_evaluation_are_what_blender_s_normals_and_edges_give(repo
     assert edge_errors["ratio"] == pytest.approx(edge_errors["across"] / edge_errors["inside"])
 
 
-def test_the_model_shades_better_than_the_linear_layer_everywhere_it_was_compared(report):
+def test_the_model_shades_better_than_linear_skinning_everywhere_it_was_compared(report):
     for values in (report, *report["actions"], *report["beyond"]):
         normals, edges = values["normals"], values["edges"]
         assert list(normals) == list(edges) == ["fdda", "linear"]
@@ -123,7 +123,7 @@ def test_the_table_has_a_line_on_normals_and_one_on_edges(elbow, tmp_path, capfd
     assert run("evaluate", elbow.rig, elbow.model, "--json", tmp_path / "e.json", "--poses", 3) == 0
     out, report = capfd.readouterr().out, json.loads((tmp_path / "e.json").read_text())
     fdda, linear = report["normals"]["fdda"], report["normals"]["linear"]
-    assert f"FDDA {fdda['mean']:.3f}, p99 {fdda['p99']:.2f}; linear layer {linear['mean']:.3f}, p99 " in out
+    assert f"FDDA {fdda['mean']:.3f}, p99 {fdda['p99']:.2f}; linear skinning {linear['mean']:.3f}, p99 " in out
     edges = report["edges"]["fdda"]
     percent = " / ".join(f"{100 * edges[kind]:.3f}" for kind in ("inside", "beside", "across"))
     assert f"FDDA {percent} ({edges['ratio']:.2f} times)" in out

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The linear layer is what Blender's Armature modifier does, whatever the weights are like."""
+"""Linear skinning is what Blender's Armature modifier does, whatever the weights are like."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ import pytest
 
 from blend_fixtures.elbow import build_elbow
 from fdda_addon.core.rig import UNMOVED
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.rig.reading import PoseEvaluator, read_rig
 from fdda_addon.scene.scene_rig import find_rig
 
@@ -111,12 +111,12 @@ CASES = (
 
 
 @pytest.mark.parametrize("change", CASES)
-def test_the_linear_layer_is_blenders(smooth: bpy.types.Object, change: Callable):
+def test_linear_skinning_is_blenders(smooth: bpy.types.Object, change: Callable):
     change(smooth)
     scene_rig = find_rig()
     rig = read_rig(scene_rig)
     assert np.allclose(rig.skin_weights.sum(axis=1), 1, atol=1e-6) and (rig.skin_weights >= 0).all()
-    evaluator, layer = PoseEvaluator(scene_rig, rig), LinearLayer(rig)
+    evaluator, skinning = PoseEvaluator(scene_rig, rig), LinearSkinning(rig)
     moved = 0.0
     for angle in (0.0, 0.7, -1.2):
         pose(angle=angle)
@@ -124,7 +124,7 @@ def test_the_linear_layer_is_blenders(smooth: bpy.types.Object, change: Callable
         matrices, positions, _ = evaluator.evaluate()
         assert np.array_equal(positions, evaluated(smooth))
         moved = max(moved, np.abs(positions - rig.rest_positions).max())
-        assert np.abs(layer.positions(matrices[None])[0] - positions).max() < EXACT
+        assert np.abs(skinning.positions(matrices[None])[0] - positions).max() < EXACT
     assert moved > 0.01 or change is without_groups
 
 

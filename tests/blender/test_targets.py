@@ -45,10 +45,10 @@ def of_flesh(rig: Path, path: Path, *options: object) -> Recording:
 
 
 def complex_positions(recording: Recording) -> np.ndarray:
-    from fdda_addon.core.skinning import LinearLayer
+    from fdda_addon.core.skinning import LinearSkinning
 
-    layer = LinearLayer(recording.rig, recording.partitions)
-    return layer.complex_positions(np.array(recording.pose_matrices), np.array(recording.residuals))
+    skinning = LinearSkinning(recording.rig, recording.partitions)
+    return skinning.complex_positions(np.array(recording.pose_matrices), np.array(recording.residuals))
 
 
 @pytest.fixture(scope="module")
@@ -352,4 +352,4 @@ def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
     bpy.context.view_layer.objects.active = mesh_object
     assert bpy.ops.fdda.evaluate(source="ACTION", action=ACTION) == {"FINISHED"}
     linear = last_evaluation.of(mesh_object).total["linear"]
-    assert linear.mean > 0.5  # The rig itself is its linear layer.
+    assert linear.mean > 0.5  # The rig itself is its linear skinning.

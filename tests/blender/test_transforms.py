@@ -20,7 +20,7 @@ POSES = ((0.3, -0.2, 0.1), (1.2, 0.5, -0.4), (1.9, 0.1, 0.6))
 """Radians: the bend of the lower bone, two turns of the upper one."""
 
 BEST_PART = 0.3
-"""What the model's error may be of the linear layer's, after so short a training."""
+"""What the model's error may be of linear skinning's, after so short a training."""
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def assert_equal(mesh_object: bpy.types.Object, model: Path, size: float) -> Non
 
 
 def errors(mesh_object: bpy.types.Object) -> np.ndarray:
-    """Mean errors of the model and of the linear layer in this pose, units of the mesh."""
+    """Mean errors of the model and of linear skinning in this pose, units of the mesh."""
     true, playing, linear = (show(mesh_object, mode) for mode in ("RIG", "FDDA", "LINEAR"))
     return np.array([np.linalg.norm(positions - true, axis=1).mean() for positions in (playing, linear)])
 
@@ -102,7 +102,7 @@ def test_frames_of_an_action(character):
     assert_better_than_linear(found)
 
 
-def test_the_linear_layer_is_blenders_skinning(character):
+def test_linear_skinning_is_blenders_skinning(character):
     mesh_object, _, size = character
     for frame in (4, 15, 26):
         bpy.context.scene.frame_set(frame)

@@ -96,7 +96,7 @@ def assert_agree(own: dict, metres: dict) -> None:
             assert own[way][name] == pytest.approx(value, rel=AGREE, abs=STEP)
 
 
-def test_the_linear_layer_of_the_elbow_is_off_by_millimetres(characters):
+def test_linear_skinning_of_the_elbow_is_off_by_millimetres(characters):
     """The elbow is half a metre long."""
     assert 0.5 < characters[IN_METRES].evaluation["linear"]["mean"] < 10
 

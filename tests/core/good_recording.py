@@ -13,7 +13,7 @@ from fdda_addon.core.poses import Channel
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 
 JOINTS = (Joint("root", -1), Joint("upper", 0), Joint("lower", 1), Joint("hand", 2))
 BONE, RADIUS = 0.25, 0.05
@@ -91,8 +91,8 @@ def with_rig(recording: Recording, **changes: object) -> Recording:
 
 def recorded_positions(recording: Recording, positions: np.ndarray) -> Recording:
     """The recording as it is when the rig evaluates to these (N, V, 3) positions."""
-    layer = LinearLayer(recording.rig, recording.partitions)
-    return replace(recording, residuals=layer.local_residuals(recording.pose_matrices, positions))
+    skinning = LinearSkinning(recording.rig, recording.partitions)
+    return replace(recording, residuals=skinning.local_residuals(recording.pose_matrices, positions))
 
 
 def warned(recording: Recording) -> dict[str, str]:

@@ -32,9 +32,9 @@ WEIGHTS = np.array([[0.75, 0.25, 0, 0], [1, 0, 0, 0], [0.5, 0.5, 0, 0], [0.5, 0.
 
 def test_the_gain_in_a_sentence():
     assert FIT.sentence() == (
-        "Linear layer with fitted weights (smooth), mm: 1.50 rms and 21.2 max on 12 held-out poses, 4.25 rms and 40.0 "
-        "max with the rig's own weights; 1.25 rms and 20.0 max on the 13 poses of the fit, 4.00 rms and 39.0 max with "
-        "the rig's own."
+        "Linear skinning with fitted weights (smooth), mm: 1.50 rms and 21.2 max on 12 held-out poses, 4.25 rms and "
+        "40.0 max with the rig's own weights; 1.25 rms and 20.0 max on the 13 poses of the fit, 4.00 rms and 39.0 max "
+        "with the rig's own."
     )
 
 

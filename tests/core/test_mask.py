@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.mask import Blend, Mask
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 
 from .limb import VERTICES, make_rig, random_poses
 
@@ -26,7 +26,7 @@ def positions() -> np.ndarray:
 @pytest.mark.parametrize("strengths", [[1, 1, 1, 1, 1], [0, 0, 0, 0, 0], [0, 0.25, 0.5, 1, 1]])
 def test_a_blend_is_what_strength_times_weight_says(rig, positions, weights, strengths):
     poses, strengths = random_poses(5), np.float32(strengths)
-    linear = LinearLayer(rig).positions(poses)
+    linear = LinearSkinning(rig).positions(poses)
     each = np.ones(VERTICES) if weights is None else weights
     expected = linear + (strengths[:, None] * each)[..., None] * (positions - linear)
     blend = Blend(rig, None if weights is None else Mask.of(weights))

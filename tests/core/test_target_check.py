@@ -10,7 +10,7 @@ from fdda_addon.core.checks.target import check_target, unsettled_in_words
 from fdda_addon.core.recording.index import ACTION, Source
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.target import RecordedTarget, Repeats
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 
 from .good_recording import good_recording, recorded_positions
 
@@ -32,8 +32,8 @@ def swinging() -> Recording:
 
 
 def shown(recording: Recording) -> np.ndarray:
-    layer = LinearLayer(recording.rig, recording.partitions)
-    return layer.complex_positions(recording.pose_matrices, recording.residuals)
+    skinning = LinearSkinning(recording.rig, recording.partitions)
+    return skinning.complex_positions(recording.pose_matrices, recording.residuals)
 
 
 def only(recording: Recording, name: str) -> str:

@@ -82,7 +82,7 @@ def evaluate_against_the_flesh(folder: Path) -> Iterator[float]:
     yield from sidebar.push("fdda.evaluate")
     yield from until(lambda: evaluations.of(arm()) is not None, 120, "nothing is evaluated")
     total = evaluations.of(arm()).total
-    check(0 < total["fdda"].mean < total["linear"].mean, f"the model is no closer than the linear layer: {total}")
+    check(0 < total["fdda"].mean < total["linear"].mean, f"the model is no closer than linear skinning: {total}")
 
 
 def play_without_the_flesh(folder: Path) -> Iterator[float]:

@@ -192,7 +192,7 @@ def train(folder: Path) -> Iterator[float]:
     check(len(state.curves["training"]) == epochs, f"{len(state.curves['training'])} epochs have a loss")
     report = json.loads((folder / "work" / "arm_model" / "report.json").read_text(encoding="utf-8"))
     fdda, linear = (report[way]["held_out"]["mean"] for way in ("fdda", "linear"))
-    check(fdda < linear, f"the held-out error is {fdda} mm and that of the linear layer {linear}")
+    check(fdda < linear, f"the held-out error is {fdda} mm and that of linear skinning {linear}")
 
 
 def bind(_folder: Path) -> Iterator[float]:
@@ -220,7 +220,7 @@ def switch_the_deformation(folder: Path) -> Iterator[float]:
     check(np.allclose(shapes["RIG"], _rig_shape, atol=1e-6), "the true rig is not shown as it was before binding")
     check(np.allclose(shapes["FDDA"], _model_shape, atol=1e-6), "the model is not shown as before")
     linear, fdda = (distance_mm(shapes[mode], _rig_shape) for mode in ("LINEAR", "FDDA"))
-    check(fdda < linear, f"the model is {fdda:.3f} mm from the rig, the linear layer {linear:.3f}")
+    check(fdda < linear, f"the model is {fdda:.3f} mm from the rig, linear skinning {linear:.3f}")
 
 
 def measure_the_model(_folder: Path) -> Iterator[float]:
@@ -260,7 +260,7 @@ def evaluate(_folder: Path) -> Iterator[float]:
     last = evaluations.of(arm())
     check(last.poses == FRAMES, f"{last.poses} frames are compared")
     fdda, linear = last.total["fdda"].mean, last.total["linear"].mean
-    check(0 < fdda < linear, f"the model is {fdda} mm from the rig and the linear layer {linear}")
+    check(0 < fdda < linear, f"the model is {fdda} mm from the rig and linear skinning {linear}")
 
 
 def show_the_heat_map(folder: Path) -> Iterator[float]:

@@ -39,7 +39,7 @@ def open_the_bound_file(folder: Path) -> Iterator[float]:
 
 
 def choose_a_mask(folder: Path) -> Iterator[float]:
-    """Click the field Mask, type the name of a vertex group: below the elbow there is the linear layer."""
+    """Click the field Mask, type the name of a vertex group: below the elbow there is linear skinning."""
     binding = arm().fdda
     model = shape()
     binding.mode = "LINEAR"
@@ -54,7 +54,7 @@ def choose_a_mask(folder: Path) -> Iterator[float]:
     yield from press("Return")
     yield from until(lambda: binding.mask == GROUP, 5, f"the field has '{binding.mask}'")
     expected = np.where(weights[:, None], model, linear)
-    check(distance_mm(model, linear) > 0.5, "model and linear layer are the same here")
+    check(distance_mm(model, linear) > 0.5, "model and linear skinning are the same here")
     check(np.allclose(shape(), expected, atol=1e-6), "the mask is not what its weights say")
     yield from sidebar.push("fdda.invert_mask", across=0.99)
     yield from until(lambda: binding.invert_mask, 5, "the arrows do not invert the mask")

@@ -14,7 +14,7 @@ from fdda_addon.core.partition import Partition, make_partitions
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.report import weights_path
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from trainer import borders, training
 from trainer.__main__ import main
 from trainer.borders import better_borders, partition_of, recut
@@ -35,7 +35,7 @@ ODD = np.arange(RINGS // JOINTS, RINGS // JOINTS + 3)
 def write_odd(path: Path, per_metre: float = 1.0, away: float = 0.0) -> Recording:
     """A tube in which the surface around the first joint reaches further than its weights."""
     plain, rig, angles = tube(), tube(per_metre, away), chain_angles(POSES, JOINTS, seed=3, reach=1.5)
-    matrices, layer = pose_chain(plain, angles), LinearLayer(plain)
+    matrices, skinning = pose_chain(plain, angles), LinearSkinning(plain)
     ring = np.arange(plain.vertex_count) // AROUND
     follows = np.where(np.isin(ring, ODD), 0, plain.skin_joints[:, 0])
     waves = np.random.default_rng(2).normal(size=(JOINTS, WAVES, plain.vertex_count, 3))
@@ -46,10 +46,10 @@ def write_odd(path: Path, per_metre: float = 1.0, away: float = 0.0) -> Recordin
         own = follows == joint
         residuals[:, own] = 0.004 * np.einsum("nk,kva->nva", sines, waves[joint][:, own])
     cut = recut(make_partitions(plain), follows)
-    positions = LinearLayer(plain, cut).complex_positions(matrices, residuals)
+    positions = LinearSkinning(plain, cut).complex_positions(matrices, residuals)
     matrices = matrices.astype(np.float64)
     matrices[:, :, :3, 3] = per_metre * (matrices[:, :, :3, 3] + away)
-    residuals = per_metre * layer.local_residuals(pose_chain(plain, angles), positions)
+    residuals = per_metre * skinning.local_residuals(pose_chain(plain, angles), positions)
     with RecordingWriter(path, rig, make_partitions(rig, INFLUENCING), chain_info(POSES)) as writer:
         writer.append(matrices.astype(np.float32), residuals.astype(np.float32))
     return read_recording(path)
@@ -113,13 +113,13 @@ def test_a_partition_keeps_some_vertices(odd):
     few = odd_vertices()[:20]
     main_joints = np.where(np.isin(np.arange(RINGS * AROUND), few), 1, np.where(odd.rig.skin_joints[:, 0] == 2, 2, 0))
     rig = replace(odd.rig, skin_joints=main_joints[:, None].astype(np.int32))
-    layer = LinearLayer(odd.rig)
-    positions = layer.complex_positions(odd.pose_matrices, odd.residuals)
+    skinning = LinearSkinning(odd.rig)
+    positions = skinning.complex_positions(odd.pose_matrices, odd.residuals)
     small = replace(
         odd,
         rig=rig,
         partitions=make_partitions(rig, INFLUENCING),
-        residuals=LinearLayer(rig).local_residuals(odd.pose_matrices, positions),
+        residuals=LinearSkinning(rig).local_residuals(odd.pose_matrices, positions),
     )
     assert len(small.partitions[1].vertices) == len(few)
     assert np.array_equal(moved(small)[1].vertices, few)
@@ -133,8 +133,8 @@ def test_residuals_are_seen_from_the_partition_that_they_count_to(odd):
         local[:, partition.vertices] = residuals_of(odd, partition, poses)
         assert np.array_equal(residuals_of(odd, partition)[poses], local[:, partition.vertices])
     matrices = odd.pose_matrices[poses]
-    expected = LinearLayer(odd.rig, odd.partitions).complex_positions(matrices, odd.residuals[poses])
-    assert np.abs(LinearLayer(odd.rig, cut).complex_positions(matrices, local) - expected).max() < 2e-6
+    expected = LinearSkinning(odd.rig, odd.partitions).complex_positions(matrices, odd.residuals[poses])
+    assert np.abs(LinearSkinning(odd.rig, cut).complex_positions(matrices, local) - expected).max() < 2e-6
 
 
 def test_a_model_says_whose_vertices_it_took(odd, trained):

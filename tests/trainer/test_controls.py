@@ -18,7 +18,7 @@ from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
@@ -86,9 +86,9 @@ def network(model) -> Network:
 
 def test_the_error_is_small_with_the_controls_and_large_without(network, model):
     rig, (angles, values) = controlled_rig(), controlled_poses(50, 9)
-    poses, layer = pose_chain(rig, angles), LinearLayer(rig)
-    truth = layer.complex_positions(poses, controlled_residuals(rig, angles, values))
-    error, linear = distances(network.positions(poses, values), truth), distances(layer.positions(poses), truth)
+    poses, skinning = pose_chain(rig, angles), LinearSkinning(rig)
+    truth = skinning.complex_positions(poses, controlled_residuals(rig, angles, values))
+    error, linear = distances(network.positions(poses, values), truth), distances(skinning.positions(poses), truth)
     for partition in make_partitions(rig):
         assert error[:, partition.vertices].mean() < 0.1 * linear[:, partition.vertices].mean()
     middle = np.tile(values.mean(axis=0), (50, 1))
@@ -140,7 +140,7 @@ def test_trust_fades_beyond_the_range_of_a_control(network):
     assert (trust[:10, 1:] == 1).all() and (trust[-1, 1:] == 0).all()
     assert (np.diff(trust[:, 1:], axis=0) <= 0).all() and np.abs(np.diff(trust, axis=0)).max() < 0.05
     assert (trust[:, 0] == 1).all(), "the first partition does not follow this control"
-    # What is left far outside is the linear layer.
+    # What is left far outside is linear skinning.
     rest = network.info.rest_matrices[None]
     far = network.positions(rest, np.float32([[50, 0, 0.5]]))[0]
     rig = controlled_rig()

@@ -11,7 +11,7 @@ import pytest
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.report import weights_path
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
 from trainer.data import split_recording
@@ -50,7 +50,7 @@ def test_a_rig_that_smooths_has_deltas_in_every_partition(recording, deltas):
 
 def test_tangents_and_normals_are_those_of_the_smoothed_surface(recording, deltas):
     rig, matrices = recording.rig, np.array(recording.pose_matrices[:5])
-    for pose, skinned in enumerate(LinearLayer(rig).positions(matrices).astype(np.float64)):
+    for pose, skinned in enumerate(LinearSkinning(rig).positions(matrices).astype(np.float64)):
         faces = smoothed(rig, skinned)[rig.face_vertices.reshape(-1, 4)]
         before, after = ((np.roll(faces, shift, axis=1) - faces).reshape(-1, 3) for shift in (1, -1))
         vectors = np.stack([before + after, after - before, np.cross(before, after)])

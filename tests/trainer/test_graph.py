@@ -13,7 +13,7 @@ import trainer.training
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network
 from trainer import network_nodes, playback_nodes
 from trainer.__main__ import main
@@ -83,7 +83,7 @@ def test_a_character_that_is_scaled_as_a_whole_keeps_its_residuals(deformation):
     positions, trust = played(deformation, scaled)
     assert (trust[:, 2] == 1).all()
     np.testing.assert_allclose(positions[:, last], 2 * played(deformation, poses)[0][:, last], atol=4e-6)
-    assert np.abs(positions - LinearLayer(deformation.rig).positions(scaled))[:, last].max() > 1e-3
+    assert np.abs(positions - LinearSkinning(deformation.rig).positions(scaled))[:, last].max() > 1e-3
 
 
 def test_far_from_the_origin(deformation):
@@ -96,7 +96,7 @@ def test_far_from_the_origin(deformation):
 def test_a_sheared_bone_gives_numbers_and_takes_trust_at_most(deformation):
     poses = (pose_chain(deformation.rig, chain_angles(5, 3, 5)).astype(np.float64) @ SHEAR).astype(np.float32)
     positions, trust = played(deformation, poses)
-    linear = LinearLayer(deformation.rig).positions(poses)
+    linear = LinearSkinning(deformation.rig).positions(poses)
     assert np.isfinite(positions).all() and (trust >= 0).all() and (trust <= 1).all()
     assert np.abs(positions - linear).max() < 0.1
     agrees(replace(deformation, sheared=True), poses)

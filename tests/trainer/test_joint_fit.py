@@ -8,7 +8,7 @@ import pytest
 
 from fdda_addon.core.partition import Partition, make_partitions
 from fdda_addon.core.rig import Joint, Rig
-from fdda_addon.core.skinning import LinearLayer, skin_matrices
+from fdda_addon.core.skinning import LinearSkinning, skin_matrices
 from trainer.joint_fit import surroundings_of_rig
 
 from .chain import chain_angles, chain_rig, pose_chain, rotation
@@ -42,16 +42,16 @@ TRAINING = np.arange(300)
 
 @pytest.mark.parametrize("joint", range(JOINTS))
 def test_skinning_to_the_joints_around_is_found(smooth, poses, joint):
-    """The true rig is smoothly skinned, the linear layer hard: nothing is left for a network, on unseen poses too."""
+    """The true rig is smoothly skinned, linear skinning hard: nothing is left for a network, on unseen poses too."""
     rig = hard(smooth)
     partition = make_partitions(rig, INFLUENCING)[joint]
-    layer = LinearLayer(rig)
-    truth = LinearLayer(smooth).positions(poses)
-    residuals = layer.local_residuals(poses, truth)[:, partition.vertices]
+    skinning = LinearSkinning(rig)
+    truth = LinearSkinning(smooth).positions(poses)
+    residuals = skinning.local_residuals(poses, truth)[:, partition.vertices]
     skin = skin_matrices(poses, rig.rest_matrices)
     fit, left = surroundings_of_rig(rig, partition, skin).fit(residuals, TRAINING)
     assert np.abs(residuals).max() > 5e-3 and np.abs(left).max() < 1e-4
-    fitted = layer.positions(poses)[:, partition.vertices] + fit.offsets(skin)
+    fitted = skinning.positions(poses)[:, partition.vertices] + fit.offsets(skin)
     np.testing.assert_allclose(fitted, truth[:, partition.vertices], atol=1e-4)
 
 
@@ -60,7 +60,9 @@ def test_joints_that_say_nothing_are_left_out(smooth, poses):
     rig = hard(smooth)
     partition = make_partitions(rig, {0: (1, 2, 3)})[0]
     skin = skin_matrices(poses, rig.rest_matrices)
-    residuals = LinearLayer(rig).local_residuals(poses, LinearLayer(smooth).positions(poses))[:, partition.vertices]
+    residuals = LinearSkinning(rig).local_residuals(poses, LinearSkinning(smooth).positions(poses))[
+        :, partition.vertices
+    ]
     noise = np.random.default_rng(1).normal(0, 1e-3, residuals.shape).astype(np.float32)
     surroundings = surroundings_of_rig(rig, partition, skin)
     assert surroundings.joints.tolist() == [0, 1, 2, 3]

@@ -13,7 +13,7 @@ from fdda_addon.core.model import read_model_info
 from fdda_addon.core.partition import Partition, main_joints, make_partitions
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import UNMOVED, Joint, Rig
-from fdda_addon.core.skinning import LinearLayer, skin_matrices
+from fdda_addon.core.skinning import LinearSkinning, skin_matrices
 from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
 from trainer.inputs import inputs_of_rig, joints_between, middles
@@ -65,7 +65,7 @@ def model(tmp_path_factory) -> Path:
     folder, rig = tmp_path_factory.mktemp("odd"), odd_rig()
     partitions, poses = odd_partitions(rig), odd_poses(rig, POSES, 0)
     with RecordingWriter(folder / "recording", rig, partitions, chain_info(POSES)) as writer:
-        writer.append(poses, LinearLayer(rig, partitions).local_residuals(poses, smoothed(rig, poses)))
+        writer.append(poses, LinearSkinning(rig, partitions).local_residuals(poses, smoothed(rig, poses)))
     assert main([str(folder / "recording"), str(folder / "model.onnx"), *QUICK]) == 0
     return folder / "model.onnx"
 
@@ -74,7 +74,7 @@ def test_every_partition_approximates_unseen_poses(model):
     rig = odd_rig()
     poses, partitions = odd_poses(rig, 40, 9), odd_partitions(rig)
     positions, truth = Network(model).positions(poses), smoothed(rig, poses)
-    error, linear = distances(positions, truth), distances(LinearLayer(rig).positions(poses), truth)
+    error, linear = distances(positions, truth), distances(LinearSkinning(rig).positions(poses), truth)
     for partition in partitions:
         assert error[:, partition.vertices].mean() < 0.1 * linear[:, partition.vertices].mean()
     main_joint = main_joints(rig.skin_joints, rig.skin_weights)
@@ -98,7 +98,7 @@ def test_model_and_report_say_what_was_merged(model):
 def test_the_code_of_the_page_on_recordings_reads_it(model):
     rig = odd_rig()
     pose = odd_poses(rig, POSES, 0)[:1]
-    expected = distances(smoothed(rig, pose), LinearLayer(rig).positions(pose)).mean() * 1000
+    expected = distances(smoothed(rig, pose), LinearSkinning(rig).positions(pose)).mean() * 1000
     shape, residual = run_page("recording", model.parent).split(" mean residual ")
     assert shape == "(90, 3)" and float(residual.removesuffix(" mm\n")) == pytest.approx(expected, rel=1e-4)
 

@@ -10,7 +10,7 @@ import pytest
 from fdda_addon.core.partition import Partition, make_partitions
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import LinearLayer, skin_matrices
+from fdda_addon.core.skinning import LinearSkinning, skin_matrices
 from trainer.__main__ import main
 from trainer.basis import make_basis
 from trainer.deformation import Deformation
@@ -71,7 +71,7 @@ class Prepared:
         return find_patterns(*arguments)
 
     def offsets(self, of: "Prepared | Patterns") -> np.ndarray:
-        """(N, Vp, 3) offsets from the linear layer as the main joint sees them, mesh units."""
+        """(N, Vp, 3) offsets from linear skinning as the main joint sees them, mesh units."""
         turned = np.linalg.inv(self.skin[:, self.partition.joint, :3, :3].astype(np.float64))
         fitted = of.fit.offsets(self.skin) @ turned.transpose(0, 2, 1)
         return fitted + of.basis.residuals(of.coefficients).reshape(fitted.shape)
@@ -206,5 +206,5 @@ def test_the_graph_plays_them_far_away_and_beyond_the_range(trained):
     positions, trust = played(trained, folded)
     middle = trained.partitions[1].vertices
     assert trust[0, 1] == 0
-    linear = LinearLayer(trained.rig).positions(folded)
+    linear = LinearSkinning(trained.rig).positions(folded)
     np.testing.assert_allclose(positions[:, middle], linear[:, middle], atol=1e-6)

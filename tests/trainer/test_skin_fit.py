@@ -17,7 +17,7 @@ from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_
 from fdda_addon.core.recording.writer import array_header
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from fdda_addon.core.skin_fit import SkinFit
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from trainer.fitted_skin import fit_folder, measure
 from trainer.process import Cancelled
 from trainer.skin_fit import main
@@ -75,7 +75,7 @@ def posed(rig: Rig, seed: int = 1, noise: float = 0.0, poses: int = POSES) -> Fi
     """Poses of the rig; the weights that come with them are all on the first joint."""
     rng = np.random.default_rng(seed)
     matrices = random_poses(rng, rig.rest_matrices[:, :3, 3], poses)
-    positions = LinearLayer(rig).positions(matrices)
+    positions = LinearSkinning(rig).positions(matrices)
     positions += rng.normal(0, 1, positions.shape).astype(np.float32) * np.float32(noise)
     return FitPoses(with_one_joint(rig, np.zeros(rig.vertex_count)), matrices, positions)
 
@@ -200,7 +200,7 @@ def test_the_process_says_what_the_fit_brings(kind, tmp_path, capsys):
     for gain in (fit.held_out, fit.training):
         assert gain.rms_mm["fitted"] < 0.8 * gain.rms_mm["rig"]
     joints, weights = read_fitted(tmp_path, poses.rig)
-    found = LinearLayer(replace(poses.rig, skin_joints=joints, skin_weights=weights))
+    found = LinearSkinning(replace(poses.rig, skin_joints=joints, skin_weights=weights))
     # Every other pose is held out.
     for gain, part in ((fit.held_out, slice(1, None, 2)), (fit.training, slice(0, None, 2))):
         apart = np.linalg.norm(found.positions(poses.pose_matrices[part]) - poses.positions[part], axis=2)

@@ -13,7 +13,7 @@ from benchmarks.study_trainings import Material, Trainings, cut, read_material, 
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.metrics import error_statistics
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network
 from trainer.config import TrainingConfig
 from trainer.data import split_poses
@@ -97,7 +97,7 @@ def test_the_learning_rate_is_the_one_of_the_least_validation_error(studied, res
 
 def test_the_errors_are_those_of_the_model_on_the_held_out_poses(studied, result, held_out):
     small = cut(read_recording(held_out), NAMES)
-    truth = LinearLayer(small.rig).complex_positions(small.pose_matrices, small.residuals)
+    truth = LinearSkinning(small.rig).complex_positions(small.pose_matrices, small.residuals)
     training = result["configurations"][0]["trainings"][1]
     played = Network(studied / "trainings" / training["model"]).positions(small.pose_matrices)
     for partition, name in zip(small.partitions, NAMES, strict=True):

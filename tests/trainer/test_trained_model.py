@@ -13,7 +13,7 @@ from fdda_addon.core.metrics import distances
 from fdda_addon.core.model import check_rig, read_model_info
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 from trainer.__main__ import main
 from trainer.borders import partition_of
 from trainer.config import ACTIVATIONS, TrainingConfig
@@ -40,9 +40,9 @@ def test_approximates_unseen_poses(session, rig):
     angles = chain_angles(50, 3, seed=99)
     angles[:, 2, 1] = 0
     poses = pose_chain(rig, angles)
-    layer = LinearLayer(rig)
-    truth = layer.complex_positions(poses, chain_residuals(rig, angles))
-    error, linear = distances(play(session, poses)[0], truth), distances(layer.positions(poses), truth)
+    skinning = LinearSkinning(rig)
+    truth = skinning.complex_positions(poses, chain_residuals(rig, angles))
+    error, linear = distances(play(session, poses)[0], truth), distances(skinning.positions(poses), truth)
     assert linear.mean() > 2e-3
     assert error.mean() < 0.08 * linear.mean()
 
@@ -65,9 +65,9 @@ def test_moving_the_character_as_a_whole_moves_the_mesh(session, rig):
     poses = pose_chain(rig, chain_angles(4, 3, seed=6))
     shift = np.float32([0.5, -2, 1])
     moved = poses.copy()
-    # The root's own transform is outside the range, so the chain hangs on a root that only the linear layer knows.
+    # The root's own transform is outside the range, so the chain hangs on a root that only linear skinning knows.
     moved[:, :, :3, 3] += shift
-    linear = LinearLayer(rig)
+    linear = LinearSkinning(rig)
     np.testing.assert_allclose(linear.positions(moved), linear.positions(poses) + shift, atol=1e-5)
 
 
@@ -86,7 +86,7 @@ def test_trust_fades_outside(session, rig):
     assert np.abs(np.diff(trust, axis=0)).max() < 0.05, "the fade is a jump"
 
 
-def test_far_outside_the_linear_layer_is_left(session, rig, trained):
+def test_far_outside_linear_skinning_is_left(session, rig, trained):
     poses = pose_chain(rig, np.zeros((3, 3, 2)))
     poses[:, 1:, :3, :3] *= np.float32([1, 5, 50])[:, None, None, None]
     positions, trust = play(session, poses)
@@ -94,7 +94,7 @@ def test_far_outside_the_linear_layer_is_left(session, rig, trained):
     gone = np.flatnonzero(trust[2] == 0)
     assert len(gone), "a joint fifty times its size is still trusted"
     partitions = read_model_info(trained / "model.onnx").partitions_of(rig)
-    linear = LinearLayer(rig).positions(poses)
+    linear = LinearSkinning(rig).positions(poses)
     for number in gone:
         vertices = partitions[number].vertices
         np.testing.assert_allclose(positions[2, vertices], linear[2, vertices], atol=1e-4)
@@ -109,12 +109,12 @@ def test_a_locked_axis_that_turns_lowers_the_trust(session, rig):
 
 
 @pytest.mark.parametrize("reach", [1.5, 2.0, 3.0])
-def test_beyond_the_range_it_is_never_worse_than_the_linear_layer(session, rig, reach):
+def test_beyond_the_range_it_is_never_worse_than_linear_skinning(session, rig, reach):
     angles = chain_angles(100, 3, seed=8, reach=reach)
-    poses, layer = pose_chain(rig, angles), LinearLayer(rig)
-    truth = layer.complex_positions(poses, chain_residuals(rig, angles))
+    poses, skinning = pose_chain(rig, angles), LinearSkinning(rig)
+    truth = skinning.complex_positions(poses, chain_residuals(rig, angles))
     positions = play(session, poses)[0]
-    assert distances(positions, truth).mean() <= distances(layer.positions(poses), truth).mean()
+    assert distances(positions, truth).mean() <= distances(skinning.positions(poses), truth).mean()
 
 
 def test_a_joint_scaled_to_nothing_gives_numbers(session, rig):
@@ -185,7 +185,7 @@ def test_report_says_what_shading_shows(report, recording, session, trained):
     normals, edges = report["normals"], report["edges"]
     assert 0 < normals["fdda"]["mean"] < normals["linear"]["mean"] < normals["linear"]["p99"]
     assert edges["fdda"]["across"] < edges["linear"]["across"]
-    layer, split = LinearLayer(source.rig), split_recording(source, TrainingConfig())
+    skinning, split = LinearSkinning(source.rig), split_recording(source, TrainingConfig())
     triangles = source.rig.face_vertices.reshape(-1, 3)
     pairs = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     number = partition_of(read_model_info(trained / "model.onnx").partitions_of(source.rig))
@@ -194,7 +194,7 @@ def test_report_says_what_shading_shows(report, recording, session, trained):
     errors = []
     for pose in split.held_out:
         matrices = np.array(source.pose_matrices[pose : pose + 1])
-        truth = layer.complex_positions(matrices, np.array(source.residuals[pose : pose + 1]))[0]
+        truth = skinning.complex_positions(matrices, np.array(source.residuals[pose : pose + 1]))[0]
         played = play(session, matrices)[0][0]
         lengths = [np.linalg.norm(np.subtract(*positions[pairs.T]), axis=1) for positions in (played, truth)]
         errors.append(np.abs(lengths[0] - lengths[1]) / rest)

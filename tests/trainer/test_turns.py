@@ -15,7 +15,7 @@ from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skinning import LinearLayer, skin_matrices
+from fdda_addon.core.skinning import LinearSkinning, skin_matrices
 from trainer import playback_nodes
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
@@ -76,7 +76,7 @@ def write_volume(path: Path, per_metre: float = 1.0, away: float = 0.0, squash: 
         rest_positions=rest_positions.astype(np.float32),
         metres_per_unit=1 / per_metre,
     )
-    residuals = LinearLayer(rig).local_residuals(poses.astype(np.float32), positions)
+    residuals = LinearSkinning(rig).local_residuals(poses.astype(np.float32), positions)
     with RecordingWriter(path, rig, make_partitions(rig, INFLUENCING), chain_info(POSES)) as writer:
         writer.append(poses.astype(np.float32), residuals)
     return read_recording(path)

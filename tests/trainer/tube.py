@@ -7,7 +7,7 @@ from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
-from fdda_addon.core.skinning import LinearLayer
+from fdda_addon.core.skinning import LinearSkinning
 
 from .chain import chain_angles, chain_info, pose_chain, rotation
 
@@ -90,11 +90,11 @@ def write_tube(
 ) -> Recording:
     """A recording of the tube with delta mush, or with bulges that follow the joints in another way."""
     plain, rig, angles = tube(), tube(per_metre, away), chain_angles(poses, JOINTS, seed=1, reach=1.5)
-    matrices, layer = pose_chain(plain, angles), LinearLayer(plain)
+    matrices, skinning = pose_chain(plain, angles), LinearSkinning(plain)
     if sheared:
         matrices[:, -1, :3, 0] += 0.4 * np.sin(angles[:, -1, :1]) * matrices[:, -1, :3, 1]
     if smooths:
-        residuals = layer.local_residuals(matrices, delta_mush(plain, layer.positions(matrices)))
+        residuals = skinning.local_residuals(matrices, delta_mush(plain, skinning.positions(matrices)))
     else:
         waves = np.random.default_rng(2).normal(size=(2, plain.vertex_count, 3))
         residuals = 0.01 * np.einsum("nj,jva->nva", np.sin(7 * angles[:, 1]), waves)

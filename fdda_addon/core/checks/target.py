@@ -7,17 +7,17 @@ import numpy as np
 
 from ..recording.index import ACTION, STRIP, Source
 from ..recording.reader import Recording
-from ..skinning import LinearLayer
+from ..skinning import LinearSkinning
 from .warning import RecordingWarning, length, listed
 
 MAX_APART = 0.2
-"""Two ways to one pose may be apart by this part of what the linear layer is off by; a model would learn no more."""
+"""Two ways to one pose may be apart by this part of what linear skinning is off by; a model would learn no more."""
 JUMP, MIN_JUMP = 8.0, 0.01
-"""A frame jumps when the target moves beside its linear layer by so many times the median of such moves of the action,
+"""A frame jumps when the target moves against linear skinning by so many times the median of such moves of the action,
 and by more than this part of the character's size."""
 FROZEN, MOVES = 1e-6, 1e-3
 """Parts of the character's size: the target stands still where it moves by less than the first from a frame to the next
-while its linear layer moves by more than the second."""
+while its linear skinning moves by more than the second."""
 MAX_FRAMES = 2000
 """Frames beyond so many are not looked at."""
 MAX_POSES = 50
@@ -30,8 +30,8 @@ def check_target(recording: Recording) -> list[RecordingWarning]:
     """Warnings "hysteresis", "frame-jumps", "frozen-frames" and "target-place"; none where there is no target."""
     if recording.info.target is None:
         return []
-    layer = LinearLayer(recording.rig, recording.partitions)
-    return [*_check_repeats(recording), *_check_frames(recording, layer), *_check_place(recording, layer)]
+    skinning = LinearSkinning(recording.rig, recording.partitions)
+    return [*_check_repeats(recording), *_check_frames(recording, skinning), *_check_place(recording, skinning)]
 
 
 def _check_repeats(recording: Recording) -> list[RecordingWarning]:
@@ -40,20 +40,20 @@ def _check_repeats(recording: Recording) -> list[RecordingWarning]:
         return []
     text = (
         f"The target is {repeats.apart_mm['mean']:.2g} mm from itself when the same pose is reached from another "
-        f"direction, on average over {len(repeats.poses)} poses, and the linear layer is {repeats.linear_mm:.2g} mm "
+        f"direction, on average over {len(repeats.poses)} poses, and linear skinning is {repeats.linear_mm:.2g} mm "
         "off: no model can be closer; hold poses for more frames or play actions slower, damp the simulation, or leave "
         "folds to another mesh."
     )
     return [RecordingWarning("hysteresis", text)]
 
 
-def _check_frames(recording: Recording, layer: LinearLayer) -> list[RecordingWarning]:
+def _check_frames(recording: Recording, skinning: LinearSkinning) -> list[RecordingWarning]:
     """Frames of actions that jump, or in which the target stands still."""
     jumps, frozen = [], []
     first = 0
     for source in recording.info.sampling.sources:
         if source.kind in (ACTION, STRIP) and source.poses > 2:
-            moved, linear = _moves(recording, layer, first, min(source.poses, MAX_FRAMES))
+            moved, linear = _moves(recording, skinning, first, min(source.poses, MAX_FRAMES))
             size = recording.rig.size
             still = np.flatnonzero((moved[:, 0] < FROZEN * size) & (linear > MOVES * size)) + 1
             frozen += [_frame(source, number) for number in still.tolist()]
@@ -83,14 +83,14 @@ def _frame(source: Source, number: int) -> str:
     return f"{source.name} {source.frames[0] + number}"
 
 
-def _moves(recording: Recording, layer: LinearLayer, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _moves(recording: Recording, skinning: LinearSkinning, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     """How far vertices move from each frame to the next, the farthest of each frame.
 
     Returns:
-        (count - 1, 2) of the target, and of the target beside its linear layer; (count - 1,) of the linear layer.
+        (count - 1, 2) of the target, and of the target beside its linear skinning; (count - 1,) of linear skinning.
     """
     moved, linear, before = [], [], None
-    for positions, skinned in _shown(recording, layer, range(first, first + count)):
+    for positions, skinned in _shown(recording, skinning, range(first, first + count)):
         now = positions, skinned
         if before is not None:
             whole, rest = positions - before[0], skinned - before[1]
@@ -100,22 +100,22 @@ def _moves(recording: Recording, layer: LinearLayer, first: int, count: int) -> 
     return np.array(moved), np.array(linear)
 
 
-def _shown(recording: Recording, layer: LinearLayer, poses: range) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """(V, 3) positions of the target and of the linear layer in some poses."""
+def _shown(recording: Recording, skinning: LinearSkinning, poses: range) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(V, 3) positions of the target and of linear skinning in some poses."""
     for pose in poses:
         matrices = np.array(recording.pose_matrices[pose])[None]
         residuals = np.array(recording.residuals[pose])[None]
-        yield layer.complex_positions(matrices, residuals)[0], layer.positions(matrices)[0]
+        yield skinning.complex_positions(matrices, residuals)[0], skinning.positions(matrices)[0]
 
 
 def _farthest(offsets: np.ndarray) -> float:
     return float(np.sqrt(np.einsum("vc,vc->v", offsets, offsets).max()))
 
 
-def _check_place(recording: Recording, layer: LinearLayer) -> list[RecordingWarning]:
+def _check_place(recording: Recording, skinning: LinearSkinning) -> list[RecordingWarning]:
     poses = range(0, len(recording.pose_matrices), max(1, len(recording.pose_matrices) // MAX_POSES))
     scales, offsets = [], []
-    for positions, skinned in _shown(recording, layer, poses):
+    for positions, skinned in _shown(recording, skinning, poses):
         middles = positions.mean(axis=0), skinned.mean(axis=0)
         extents = [np.sqrt(((own - middle) ** 2).sum(axis=1).mean()) for own, middle in
                    zip((positions, skinned), middles, strict=True)]  # fmt: skip
@@ -125,7 +125,7 @@ def _check_place(recording: Recording, layer: LinearLayer) -> list[RecordingWarn
     if 1 / MAX_SCALE < scale < MAX_SCALE and off < MAX_OFF * recording.rig.size:
         return []
     text = (
-        f"The target '{recording.info.target.object_name}' is {scale:.3g} times as large as the linear layer, and its "
+        f"The target '{recording.info.target.object_name}' is {scale:.3g} times as large as linear skinning, and its "
         f"middle {length(recording.rig, off)} away: it is in other units or another place; scale and move it onto the "
         "mesh, and record again."
     )

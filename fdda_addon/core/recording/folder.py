@@ -14,7 +14,7 @@ from .lock import RecordingLock
 from .place import is_free, is_recording, remove_files
 from .writer import different_keys
 
-SETTINGS = {"limits": "range of motion", "sources": "number of poses or actions", "fit": "linear layer"}
+SETTINGS = {"limits": "range of motion", "sources": "number of poses or actions", "fit": "linear skinning"}
 """What people call the keys of a sampling."""
 
 

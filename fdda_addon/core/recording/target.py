@@ -61,7 +61,7 @@ class Repeats:
     Attributes:
         poses: their numbers.
         apart_mm: distance of the vertices between the two, mm: mean, rms, percentiles 99 and 99.9, and largest.
-        linear_mm: mean distance of the target from the linear layer in these poses, mm.
+        linear_mm: mean distance of the target from linear skinning in these poses, mm.
     """
 
     poses: tuple[int, ...]
@@ -89,6 +89,6 @@ class Repeats:
         count = "1 pose" if len(self.poses) == 1 else f"{len(self.poses)} poses"
         return (
             f"The same pose from two directions: {self.apart_mm['mean']:.3g} mm apart on average, "
-            f"{self.apart_mm['max']:.3g} mm at most ({count}); the linear layer is {self.linear_mm:.3g} mm off. No "
+            f"{self.apart_mm['max']:.3g} mm at most ({count}); linear skinning is {self.linear_mm:.3g} mm off. No "
             "model can be closer than that."
         )
