@@ -59,7 +59,7 @@ class Character:
         output: folder of the bound file, its models and their reports.
         objects: names of the mesh objects; empty for the only one of the file.
         depends: files that the rig's file links, so that a change of them is noticed.
-        poses, seed, spread, margin, actions, strips, mirror, sample, controls, fit_linear, least_vertices: as of
+        poses, seed, spread, margin, actions, strips, mirror, sample, controls, fit_linear, min_partition_vertices: as of
             `record`.
         shards: how many parts the poses are recorded in.
         train: settings of the training by name, as of `train`.
@@ -85,7 +85,7 @@ class Character:
     sample: tuple[str, ...] = ()
     controls: tuple[str, ...] = ()
     fit_linear: str = ""
-    least_vertices: int | None = None
+    min_partition_vertices: int | None = None
     shards: int = 4
     train: dict[str, Any] = field(default_factory=dict, hash=False)
     target_mm: float = 0.0

@@ -143,7 +143,9 @@ class _Tasks:
         own = self._character
         lists = {"--object": own.objects, "--action": own.actions, "--strip": own.strips, "--sample": own.sample}
         lists["--control"] = own.controls
-        least = () if own.least_vertices is None else ("--least-vertices", str(own.least_vertices))
+        min_vertices = (
+            () if own.min_partition_vertices is None else ("--min-partition-vertices", str(own.min_partition_vertices))
+        )
         return (
             *("record", str(own.rig), RECORDING, "--resume", "--poses", str(own.poses), "--seed", str(own.seed)),
             *("--spread", repr(float(own.spread)), *(("--mirror",) if own.mirror else ()), *least),

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from fdda_addon.core.defaults import MIN_VERTICES
+from fdda_addon.core.defaults import MIN_PARTITION_VERTICES
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.surface import Surface
@@ -140,7 +140,7 @@ class _Cut:
             least[vertices[cheaper]], owner[vertices[cheaper]] = cost[cheaper], number
         for number in self._able:
             before = self._first == number
-            if (before & (owner == number)).sum() < min(MIN_VERTICES, before.sum()):
+            if (before & (owner == number)).sum() < min(MIN_PARTITION_VERTICES, before.sum()):
                 owner[before] = number
         moved, self.owner = owner != self.owner, owner
         for number in np.unique(owner[moved]).tolist():

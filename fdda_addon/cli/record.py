@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..core.defaults import MARGIN, MIN_VERTICES, POSES, REFINEMENT_POSES, SPREAD
+from ..core.defaults import MARGIN, MIN_PARTITION_VERTICES, POSES, REFINEMENT_POSES, SPREAD
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -85,11 +85,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="fit the skin weights of linear skinning to the poses: one joint a vertex, or at most four",
     )
     parser.add_argument(
-        "--least-vertices",
+        "--min-partition-vertices",
         type=int,
-        default=MIN_VERTICES,
+        default=MIN_PARTITION_VERTICES,
         metavar="N",
-        help=f"merge partitions of fewer vertices into others, 0 for none (default {MIN_VERTICES})",
+        help=f"merge partitions of fewer vertices into others, 0 for none (default {MIN_PARTITION_VERTICES})",
     )
     parser.add_argument("--resume", action="store_true", help="continue what was interrupted; nothing is done twice")
     parser.add_argument(
@@ -139,8 +139,8 @@ def run(options: argparse.Namespace) -> None:
     from .progress import ProgressPrinter
     from .target import target_settings
 
-    if (options.poses or 0) < 0 or options.seed < 0 or options.least_vertices < 0:
-        raise WrongUsageError("--poses, --seed and --least-vertices must be 0 or more.")
+    if (options.poses or 0) < 0 or options.seed < 0 or options.min_partition_vertices < 0:
+        raise WrongUsageError("--poses, --seed and --min-partition-vertices must be 0 or more.")
     # Wider is uniform already, and most draws would fall outside and be drawn again.
     if not 0 < options.spread <= 10:
         raise WrongUsageError("--spread must be more than 0 and at most 10.")
@@ -189,7 +189,7 @@ def run(options: argparse.Namespace) -> None:
             index = read_index(recording)
             if options.fit_linear:
                 print(read_info(index).fit.sentence())
-            for line in (merges_in_words(index, options.least_vertices), unsettled_in_words(index)):
+            for line in (merges_in_words(index, options.min_partition_vertices), unsettled_in_words(index)):
                 if line:
                     print(line)
             if repeats := read_info(index).repeats:
@@ -232,7 +232,7 @@ def _steps(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> 
         sample=tuple(options.sample),
         controls=tuple(options.control),
         fit_linear=options.fit_linear,
-        least_vertices=options.least_vertices,
+        min_partition_vertices=options.min_partition_vertices,
         strips=tuple(options.strip),
         mirror=options.mirror,
         shard=options.shard,

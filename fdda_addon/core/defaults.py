@@ -11,7 +11,7 @@ MARGIN = 1.0
 """How many times as wide as the range of motion the poses of its margin are; 1 for none of them."""
 INFLUENCE_POSES = 10
 """How often each joint is moved alone to find the partitions that it influences."""
-MIN_VERTICES = 8
+MIN_PARTITION_VERTICES = 8
 """Partitions of fewer vertices are merged into others."""
 REFINEMENT_POSES = 250
 """Poses that are added where a model is worst."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .defaults import MIN_VERTICES
+from .defaults import MIN_PARTITION_VERTICES
 from .rig import Rig
 
 INFLUENCE_TOLERANCE = 1e-4
@@ -83,12 +83,12 @@ def make_partitions(
     )
 
 
-def merged_partitions(rig: Rig, least: int = MIN_VERTICES) -> tuple[Partition, ...]:
+def merged_partitions(rig: Rig, min_vertices: int = MIN_PARTITION_VERTICES) -> tuple[Partition, ...]:
     """Cut the mesh by main joint, and merge what has fewer than `least` vertices as `small_partition_merges` says."""
     return make_partitions(rig, merged=small_partition_merges(rig, least))
 
 
-def small_partition_merges(rig: Rig, least: int = MIN_VERTICES) -> dict[int, int]:
+def small_partition_merges(rig: Rig, min_vertices: int = MIN_PARTITION_VERTICES) -> dict[int, int]:
     """Choose where the vertices of small partitions go.
 
     The smallest goes first: to the partition whose joint has the most weight on its vertices, else to that of the

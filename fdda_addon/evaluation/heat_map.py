@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from ..core.defaults import MIN_VERTICES
+from ..core.defaults import MIN_PARTITION_VERTICES
 from ..core.errors import ModelError
 from ..core.metrics import heat_colors
 from ..core.partition import merged_partitions, partition_colors
@@ -45,14 +45,14 @@ def paint_errors(mesh_object: bpy.types.Object) -> None:
     _paint(mesh_object, Paint(ERRORS))
 
 
-def paint_partitions(scene_rig: SceneRig, least_vertices: int = MIN_VERTICES) -> None:
+def paint_partitions(scene_rig: SceneRig, min_partition_vertices: int = MIN_PARTITION_VERTICES) -> None:
     """Show the partitions of the bound model; where none is bound that can be read, those that a rig is recorded with.
 
     Raises:
         RigError: the rig cannot be read.
     """
     rig = read_rig(scene_rig)
-    partitions = merged_partitions(rig, least_vertices)
+    partitions = merged_partitions(rig, min_partition_vertices)
     if scene_rig.mesh_object.fdda.is_bound:
         with suppress(ModelError):
             opened = open_model(scene_rig, network_of(scene_rig.mesh_object))

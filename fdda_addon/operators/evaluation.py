@@ -171,7 +171,7 @@ class FDDA_OT_paint(OnEvaluation, bpy.types.Operator):
                 view.range_mm = heat_map.fitting_range_mm(scene_rig.mesh_object) or view.range_mm
         elif self.colors == "PARTITIONS":
             scene_rig = self.rig(context)
-            heat_map.paint_partitions(scene_rig, scene_rig.mesh_object.fdda.settings.least_vertices)
+            heat_map.paint_partitions(scene_rig, scene_rig.mesh_object.fdda.settings.min_partition_vertices)
         else:
             scene_rig = self.rig(context)
             heat_map.clear(scene_rig.mesh_object)

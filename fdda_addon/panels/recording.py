@@ -130,7 +130,7 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context, setti
         column.prop(settings, "pre_roll")
         column.prop(settings, "settle")
     column.prop(settings, "fit_linear")
-    column.prop(settings, "least_vertices")
+    column.prop(settings, "min_partition_vertices")
 
 
 def _draw_record(

@@ -18,7 +18,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..core.defaults import EPOCHS, MARGIN, MIN_VERTICES, POSES, SPREAD, TARGET_MM, TOLERANCE_MM
+from ..core.defaults import EPOCHS, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD, TARGET_MM, TOLERANCE_MM
 from ..core.errors import OutputError
 from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import resolved
@@ -138,11 +138,11 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         subtype="DIR_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
-    least_vertices: IntProperty(
+    min_partition_vertices: IntProperty(
         name="Least Vertices",
         description="Parts of the mesh with fewer vertices go with another part, which has the network; 0 for none. A "
         "tongue bone with 5 vertices, for example, goes with the jaw",
-        default=MIN_VERTICES,
+        default=MIN_PARTITION_VERTICES,
         min=0,
         soft_max=100,
     )

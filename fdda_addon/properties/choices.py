@@ -38,7 +38,7 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
         sample=_sample(settings, actions),
         controls=_controls(settings),
         fit_linear=wanted_fit(settings),
-        least_vertices=settings.least_vertices,
+        min_partition_vertices=settings.min_partition_vertices,
         mirror=settings.mirror and bool(actions),
         target=target_settings(settings),
     )
@@ -64,7 +64,7 @@ def take_over_sampling(settings: FDDA_PG_character, other: FDDA_PG_character) ->
         "bone_collection",
         "fit_linear",
         "mirror",
-        "least_vertices",
+        "min_partition_vertices",
     ):
         setattr(settings, name, getattr(other, name))
     for name, values in (("sampled_bones", ("name",)), ("controls", ("name", "has_range", "low", "high"))):

@@ -39,13 +39,13 @@ def recorded_weights(path: Path, rig: Rig, kind: str) -> tuple[Rig, SkinFit | No
     return replace(rig, skin_joints=joints, skin_weights=weights), fit
 
 
-def recorded_partitions(path: Path, rig: Rig, least_vertices: int) -> tuple[Partition, ...] | None:
+def recorded_partitions(path: Path, rig: Rig, min_partition_vertices: int) -> tuple[Partition, ...] | None:
     """The partitions of a rig with the influences that a recording of it has; None where it has none for this rig.
 
     Args:
         path: folder of the recording.
         rig: with the weights of linear skinning.
-        least_vertices: as in `RecordingSettings`.
+        min_partition_vertices: as in `RecordingSettings`.
 
     Raises:
         RecordingError: there is no recording, or it is damaged.
@@ -55,7 +55,7 @@ def recorded_partitions(path: Path, rig: Rig, least_vertices: int) -> tuple[Part
     controls = [control.to_json() for control in rig.controls]
     if joints != rig.joints or index["controls"] != controls or index["vertices"] != rig.vertex_count:
         return None
-    cut = merged_partitions(rig, least_vertices)
+    cut = merged_partitions(rig, min_partition_vertices)
     own = [(partition.joint, list(partition.merged)) for partition in cut]
     if own != [(value["joint"], value.get("merged", [])) for value in index["partitions"]]:
         return None

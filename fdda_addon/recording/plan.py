@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 
 from ..core.controls import Control
-from ..core.defaults import INFLUENCE_POSES, MARGIN, MIN_VERTICES, POSES, SPREAD
+from ..core.defaults import INFLUENCE_POSES, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD
 from ..core.partition import INFLUENCE_TOLERANCE
 from ..core.poses import Channel, Margin, margin_of
 from ..core.recording.index import RANDOM, Sampling, Source
@@ -44,7 +44,7 @@ class RecordingSettings:
         sample: which control bones the random poses move, as `sampling.choose` reads it; empty for those of the rig.
         fit_linear: kind of the skin weights that are fitted (`core.skin_fit.KINDS`); empty for those of the rig.
         controls: which numbers are inputs and are sampled beside those that are found, as `stated_controls` reads it.
-        least_vertices: partitions of fewer vertices are merged into others; 0 merges none.
+        min_partition_vertices: partitions of fewer vertices are merged into others; 0 merges none.
         shard: record this part of the poses, its number from 1 and how many parts there are; None for all.
         influences_only: find what a recording needs before its first pose, and record none.
         influences: folder with what `influences_only` found, of the same rig and settings; found anew when left out.
@@ -63,7 +63,7 @@ class RecordingSettings:
     sample: tuple[str, ...] = ()
     controls: tuple[str, ...] = ()
     fit_linear: str = ""
-    least_vertices: int = MIN_VERTICES
+    min_partition_vertices: int = MIN_PARTITION_VERTICES
     strips: tuple[str, ...] = ()
     mirror: bool = False
     shard: tuple[int, int] | None = None

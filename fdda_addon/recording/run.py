@@ -196,14 +196,14 @@ def _find_influences(
     )
     evaluator = TimedEvaluator(mesh.planned.evaluator(mesh.rig))
     known = mesh.planned.known
-    if known and (partitions := recorded_partitions(known, mesh.rig, settings.least_vertices)):
+    if known and (partitions := recorded_partitions(known, mesh.rig, settings.min_partition_vertices)):
         return Found(mesh, partitions, evaluator)
     if known and known != mesh.planned.path:
         raise RecordingError(
             f"The influences in '{known}' are of other partitions than those of '{mesh.name}'; find them with the same "
             "rig and options (record --influences-only)."
         )
-    cut = merged_partitions(mesh.rig, settings.least_vertices)
+    cut = merged_partitions(mesh.rig, settings.min_partition_vertices)
     target = mesh.planned.target
     if target and target.follows != POSE:
         # What depends on time does not answer when a joint is moved.

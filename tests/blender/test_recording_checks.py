@@ -10,7 +10,7 @@ import pytest
 
 from blend_fixtures.elbow import build_elbow
 from fdda_addon.core.checks.recording import check_recording
-from fdda_addon.core.defaults import MIN_VERTICES
+from fdda_addon.core.defaults import MIN_PARTITION_VERTICES
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.scene.blend_file import save_copy
 
@@ -109,26 +109,26 @@ class TestSmallPartitions:
             "tip": (12, ["nail"]),
         }
         assert run("check-recording", tmp_path / "merged", "--strict") == 0
-        assert run("record", rig, tmp_path / "all", "--poses", 30, "--least-vertices", 13) == 0
+        assert run("record", rig, tmp_path / "all", "--poses", 30, "--min-partition-vertices", 13) == 0
         line = "2 partitions of fewer than 13 vertices are merged: 'tip' into 'lower', 'nail' into 'lower'.\n"
         assert line in capsys.readouterr().out
         assert self.partitions(tmp_path / "all")["lower"] == (144, ["tip", "nail"])
 
     def test_none_are_when_nobody_wants_it(self, rig, tmp_path, capsys):
-        assert run("record", rig, tmp_path / "apart", "--poses", 30, "--least-vertices", 0) == 0
+        assert run("record", rig, tmp_path / "apart", "--poses", 30, "--min-partition-vertices", 0) == 0
         assert "merged" not in capsys.readouterr().out
         assert self.partitions(tmp_path / "apart")["nail"] == (3, [])
         assert run("check-recording", tmp_path / "apart") == 0
         assert capsys.readouterr().out.startswith(
             "Warning (small-partitions): The partition 'nail' has fewer than 8 vertices (the smallest 3), and"
         )
-        assert run("record", rig, tmp_path / "apart", "--poses", 30, "--least-vertices", -1) == 2
+        assert run("record", rig, tmp_path / "apart", "--poses", 30, "--min-partition-vertices", -1) == 2
 
     def test_a_recording_goes_on_with_the_same_partitions_only(self, rig, tmp_path, capsys):
         assert run("record", rig, tmp_path / "r", "--poses", 30) == 0
         index = json.loads((tmp_path / "r" / "recording.json").read_text(encoding="utf-8"))
         (tmp_path / "r" / "recording.json").write_text(json.dumps({**index, "complete": 10}), encoding="utf-8")
-        assert run("record", rig, tmp_path / "r", "--poses", 30, "--resume", "--least-vertices", 0) == 1
+        assert run("record", rig, tmp_path / "r", "--poses", 30, "--resume", "--min-partition-vertices", 0) == 1
         assert "partitions" in capsys.readouterr().err
         assert run("record", rig, tmp_path / "r", "--poses", 30, "--resume") == 0
 
@@ -151,8 +151,8 @@ class TestSmallPartitions:
     def test_the_sidebar_has_the_same_default_and_records_with_its_own(self, rig, tmp_path):
         bpy.ops.wm.open_mainfile(filepath=str(rig))
         elbow = bpy.data.objects[ELBOW]
-        assert elbow.fdda.settings.least_vertices == MIN_VERTICES
-        elbow.fdda.settings.least_vertices, elbow.fdda.settings.poses = 0, 30
+        assert elbow.fdda.settings.min_partition_vertices == MIN_PARTITION_VERTICES
+        elbow.fdda.settings.min_partition_vertices, elbow.fdda.settings.poses = 0, 30
         bpy.context.view_layer.objects.active = elbow
         assert bpy.ops.fdda.record(object=ELBOW, folder=str(tmp_path / "apart")) == {"FINISHED"}
         assert self.partitions(tmp_path / "apart")["nail"] == (3, [])

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from ..defaults import MIN_VERTICES
+from ..defaults import MIN_PARTITION_VERTICES
 from ..features import rounding, steady_features
 from ..recording.reader import Recording
 from ..rig import UNMOVED_LABEL, Rig
@@ -213,14 +213,14 @@ def _check_still(recording: Recording, scan: ResidualScan, moving: np.ndarray) -
 
 
 def _check_small(recording: Recording) -> list[RecordingWarning]:
-    small = [p for p in recording.partitions if len(p.vertices) < MIN_VERTICES]
+    small = [p for p in recording.partitions if len(p.vertices) < MIN_PARTITION_VERTICES]
     if not small or len(recording.partitions) == 1:
         return []
     names = [joint_name(recording.rig, p.joint) for p in small]
     fewest = min(len(p.vertices) for p in small)
     text = (
-        f"{counted(names, 'partition')} {'has' if len(small) == 1 else 'have'} fewer than {MIN_VERTICES} vertices "
-        f"(the smallest {fewest}), and a network each: record with --least-vertices {MIN_VERTICES} to merge them "
+        f"{counted(names, 'partition')} {'has' if len(small) == 1 else 'have'} fewer than {MIN_PARTITION_VERTICES} vertices "
+        f"(the smallest {fewest}), and a network each: record with --min-partition-vertices {MIN_PARTITION_VERTICES} to merge them "
         "into others."
     )
     return [RecordingWarning("small-partitions", text[0].upper() + text[1:])]
