@@ -71,7 +71,7 @@ def main() -> None:
     parser.add_argument("--kind", choices=("soft-body", "whole-arm", "cloth"), default="soft-body")
     parser.add_argument("--poses", type=int, default=300)
     parser.add_argument("--held-out", type=int, default=50)
-    parser.add_argument("--settle", type=int, default=60)
+    parser.add_argument("--max-settle-frames", type=int, default=60)
     options = parser.parse_args()
     out = options.out
     out.mkdir(parents=True, exist_ok=True)
@@ -80,7 +80,7 @@ def main() -> None:
     )
     fdda_addon.register()
     build(rig, options.kind)
-    of_target = ["--object", "arm", "--target", FLESH, "--settle", options.settle]
+    of_target = ["--object", "arm", "--target", FLESH, "--max-settle-frames", options.max_settle_frames]
     seconds = {"record": verb("record", rig, recording, *of_target, "--poses", options.poses, "--resume")}
     model.parent.mkdir(exist_ok=True)
     seconds["train"] = verb("train", recording, model)

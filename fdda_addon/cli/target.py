@@ -2,9 +2,10 @@
 """Options about a target: another object whose surface is learnt in place of the rig's own."""
 
 import argparse
+import math
 from typing import TYPE_CHECKING
 
-from ..core.defaults import REPEATS, STILL_MM
+from ..core.defaults import REPEATS, REST_THRESHOLD_MM
 from ..core.errors import WrongUsageError
 
 if TYPE_CHECKING:
@@ -41,18 +42,18 @@ def add_target(parser: argparse.ArgumentParser) -> None:
         help="let a simulated target go from the rest pose to the first frame of an action in the N frames before it",
     )
     parser.add_argument(
-        "--settle",
+        "--max-settle-frames",
         type=int,
         default=0,
         metavar="N",
         help="hold each random pose until a simulated target is at rest, for N frames at most",
     )
     parser.add_argument(
-        "--still-mm",
+        "--rest-threshold-mm",
         type=float,
-        default=STILL_MM,
+        default=REST_THRESHOLD_MM,
         metavar="X",
-        help=f"at rest is a target of which no vertex moves by more mm a frame (default {STILL_MM})",
+        help=f"at rest is a target of which no vertex moves by more mm a frame (default {REST_THRESHOLD_MM})",
     )
 
 
@@ -65,11 +66,15 @@ def target_settings(options: argparse.Namespace) -> "TargetSettings":
     from ..rig.target_time import TargetSettings
 
     repeats = getattr(options, "repeats", 0)
-    if min(options.pre_roll, options.settle, repeats) < 0 or not 0 < options.still_mm < float("inf"):
-        raise WrongUsageError("--pre-roll, --settle and --repeats must be 0 or more, and --still-mm more than 0.")
-    if (options.pre_roll or options.settle) and not options.target:
-        raise WrongUsageError("--pre-roll and --settle are about a target; give --target OBJECT.")
-    return TargetSettings(options.target, options.pre_roll, options.settle, options.still_mm, repeats)
+    if min(options.pre_roll, options.max_settle_frames, repeats) < 0 or not 0 < options.rest_threshold_mm < math.inf:
+        raise WrongUsageError(
+            "--pre-roll, --max-settle-frames and --repeats must be 0 or more, and --rest-threshold-mm more than 0."
+        )
+    if (options.pre_roll or options.max_settle_frames) and not options.target:
+        raise WrongUsageError("--pre-roll and --max-settle-frames are about a target; give --target OBJECT.")
+    return TargetSettings(
+        options.target, options.pre_roll, options.max_settle_frames, options.rest_threshold_mm, repeats
+    )
 
 
 def poses_of(scene_rig: "SceneRig", options: argparse.Namespace) -> int | None:
@@ -80,6 +85,11 @@ def poses_of(scene_rig: "SceneRig", options: argparse.Namespace) -> int | None:
     from ..core.recording.target import POSE
     from ..rig.target import find_target
 
-    if options.poses is not None or not options.target or options.settle or not (options.action or options.strip):
+    if (
+        options.poses is not None
+        or not options.target
+        or options.max_settle_frames
+        or not (options.action or options.strip)
+    ):
         return options.poses
     return None if find_target(scene_rig, options.target).follows == POSE else 0

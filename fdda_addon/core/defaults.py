@@ -15,7 +15,7 @@ MIN_PARTITION_VERTICES = 8
 """Partitions of fewer vertices are merged into others."""
 REFINEMENT_POSES = 250
 """Poses that are added where a model is worst."""
-STILL_MM = 0.1
+REST_THRESHOLD_MM = 0.1
 """A target that poses are held for is at rest when no vertex moves by more from a frame to the next."""
 REPEATS = 10
 """Poses that are approached from another direction as well."""

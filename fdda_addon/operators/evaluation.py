@@ -66,7 +66,7 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
             target = target_settings(mesh_object.fdda.settings)
             with true_rig(mesh_object):
                 if self._action:
-                    steps = evaluate_action(scene_rig, network, self._action, replace(target, settle=0))
+                    steps = evaluate_action(scene_rig, network, self._action, replace(target, max_settle_frames=0))
                 else:
                     wanted = EvaluationSettings(
                         self.poses, self.seed, surface=False, target=replace(target, pre_roll=0)

@@ -128,7 +128,7 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context, setti
     column.prop_search(settings, "target", context.scene, "objects", icon="OUTLINER_OB_MESH")
     if settings.target:
         column.prop(settings, "pre_roll")
-        column.prop(settings, "settle")
+        column.prop(settings, "max_settle_frames")
     column.prop(settings, "fit_linear")
     column.prop(settings, "min_partition_vertices")
 

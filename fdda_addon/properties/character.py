@@ -120,7 +120,7 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         min=0,
         soft_max=100,
     )
-    settle: IntProperty(
+    max_settle_frames: IntProperty(
         name="Settle",
         description="Frames for which a random pose is held at most until a simulated target is at rest; 0 to record "
         "none of them",

@@ -50,7 +50,7 @@ def target_settings(settings: FDDA_PG_character) -> "TargetSettings":
 
     if not settings.target:
         return TargetSettings()
-    return TargetSettings(settings.target, settings.pre_roll, settings.settle)
+    return TargetSettings(settings.target, settings.pre_roll, settings.max_settle_frames)
 
 
 def take_over_sampling(settings: FDDA_PG_character, other: FDDA_PG_character) -> None:

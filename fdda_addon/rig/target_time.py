@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from ..core.defaults import REPEATS, STILL_MM
+from ..core.defaults import REPEATS, REST_THRESHOLD_MM
 from ..core.errors import RigError
 from ..core.recording.target import FRAMES, POSE, SIMULATION, RecordedTarget
 from ..poses.clip import Clip
@@ -34,16 +34,16 @@ class TargetSettings:
     Attributes:
         name: of its object; empty for the rig itself.
         pre_roll: frames before the first of an action, in which the rig goes from the rest pose to it.
-        settle: frames for which a random pose is held at most until the target has come to rest; 0 for not at all.
-        still_mm: it is at rest when no vertex moves by more from a frame to the next, mm.
+        max_settle_frames: most frames for which a random pose is held until the target is at rest; 0 does not hold it.
+        rest_threshold_mm: it is at rest when no vertex moves by more from a frame to the next, mm.
         repeats: how many of the poses that are held, or of the frames of actions, a simulation is brought to a second
             time, from another direction.
     """
 
     name: str = ""
     pre_roll: int = 0
-    settle: int = 0
-    still_mm: float = STILL_MM
+    max_settle_frames: int = 0
+    rest_threshold_mm: float = REST_THRESHOLD_MM
     repeats: int = REPEATS
 
 
@@ -52,8 +52,8 @@ OWN_SURFACE = TargetSettings()
 
 
 @dataclass(frozen=True)
-class Settled:
-    """How a target came to rest in a pose.
+class RestState:
+    """Whether a target came to rest in a pose, and after how long.
 
     Attributes:
         frames: for which the pose was held.
@@ -77,19 +77,19 @@ class Settler:
 
     Attributes:
         frames: for which a pose is held at most.
-        still_mm: the target is at rest when no vertex moves by more from a frame to the next, mm.
+        rest_threshold_mm: the target is at rest when no vertex moves by more from a frame to the next, mm.
         last: how the last pose came to rest, None before the first.
     """
 
-    def __init__(self, target: Target, frames: int, still_mm: float = STILL_MM):
+    def __init__(self, target: Target, frames: int, rest_threshold_mm: float = REST_THRESHOLD_MM):
         """Args:
         target: a simulation.
-        frames, still_mm: as above.
+        frames, rest_threshold_mm: as above.
         """
-        self._target, self.frames, self.still_mm = target, frames, still_mm
+        self._target, self.frames, self.rest_threshold_mm = target, frames, rest_threshold_mm
         self._mm_per_unit = 1000 * metres_per_unit(target.scene_rig.mesh_object)
         self._first = target.first_frame
-        self.last: Settled | None = None
+        self.last: RestState | None = None
 
     @contextmanager
     def borrowed(self) -> Iterator[None]:
@@ -97,7 +97,7 @@ class Settler:
         with borrowed_range(self._target, self._first, self._first + 2 * APPROACH + self.frames):
             yield
 
-    def settle(self, pose: Callable[[float], None], over: Callable[[float], None] | None = None) -> Settled:
+    def settle(self, pose: Callable[[float], None], over: Callable[[float], None] | None = None) -> RestState:
         """Go from the rest pose to a pose, and hold it until the target rests or the frames are over.
 
         Args:
@@ -118,8 +118,8 @@ class Settler:
             now = self._positions()
             speed = float(np.sqrt(np.einsum("vc,vc->v", now - before, now - before).max())) * self._mm_per_unit
             before, held = now, held + 1
-            quiet = quiet + 1 if speed <= self.still_mm else 0
-        self.last = Settled(held, speed, quiet >= QUIET, time.perf_counter() - start)
+            quiet = quiet + 1 if speed <= self.rest_threshold_mm else 0
+        self.last = RestState(held, speed, quiet >= QUIET, time.perf_counter() - start)
         return self.last
 
     def _positions(self) -> np.ndarray:
@@ -253,7 +253,7 @@ class Approach:
         """What a recording says of the target."""
         if self.target is None:
             return None
-        held = (self.settler.frames, self.settler.still_mm) if self.settler else ()
+        held = (self.settler.frames, self.settler.rest_threshold_mm) if self.settler else ()
         return RecordedTarget(self.target.name, self.target.follows, self._pre_roll, *held)
 
     @contextmanager
@@ -305,7 +305,7 @@ def make_approach(scene_rig: SceneRig, settings: TargetSettings, clips: Sequence
         RigError: as `find_target` and `check_clips`, or the target cannot be brought to these poses.
     """
     if not settings.name:
-        if settings.pre_roll or settings.settle:
+        if settings.pre_roll or settings.max_settle_frames:
             raise RigError(
                 "There is no target whose time a pre-roll or settling would change; give one, or none of both."
             )
@@ -316,20 +316,22 @@ def make_approach(scene_rig: SceneRig, settings: TargetSettings, clips: Sequence
             f"The target '{target.name}' shows frames ({target.caches[0].words}), and not random poses; record 0 of "
             "them, and the action that it was made with."
         )
-    if random and target.follows == SIMULATION and not settings.settle:
+    if random and target.follows == SIMULATION and not settings.max_settle_frames:
         raise RigError(
             f"The target '{target.name}' is a simulation ({target.simulations[0].words}): what it shows in a random "
             "pose depends on the pose before; let it settle, or record 0 of them, and actions."
         )
-    if settings.settle and (target.follows != SIMULATION or any(not c.is_simulation for c in target.caches)):
+    if settings.max_settle_frames and (target.follows != SIMULATION or any(not c.is_simulation for c in target.caches)):
         raise RigError(f"The target '{target.name}' cannot settle: {_why_not(target)}; leave settling out.")
-    if settings.settle and clips:
+    if settings.max_settle_frames and clips:
         raise RigError(
             f"Settled poses are random ones, and '{clips[0].name}' is to be recorded too, frame by frame; leave it "
             "out, or make a recording of each."
         )
     check_clips(target, clips, settings.pre_roll)
-    settler = Settler(target, settings.settle, settings.still_mm) if settings.settle else None
+    settler = (
+        Settler(target, settings.max_settle_frames, settings.rest_threshold_mm) if settings.max_settle_frames else None
+    )
     return Approach(target, settings.pre_roll, settler)
 
 

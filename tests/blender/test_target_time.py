@@ -28,7 +28,7 @@ from .test_targets import built, complex_positions, of_flesh, recorded, refused
 
 SIMULATIONS = (targets.target_soft_body, targets.target_cloth, targets.target_geometry_nodes)
 ROOT = Path(__file__).resolve().parents[2]
-SETTLED = ("--target", "flesh", "--settle", 80)
+SETTLED = ("--target", "flesh", "--max-settle-frames", 80)
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ def test_random_poses_of_a_simulation_have_to_settle(refusal, tmp_path):
     assert refused(refusal, rig, "--poses", 5).startswith(
         "The target 'flesh' is a simulation (the modifier 'Cloth' of 'flesh'): what it shows in a random pose depends"
     )
-    assert refused(refusal, rig, "--poses", 5, "--settle", 9).startswith(
+    assert refused(refusal, rig, "--poses", 5, "--max-settle-frames", 9).startswith(
         f"Settled poses are random ones, and '{ACTION}' is to be recorded too, frame by frame;"
     )
 
@@ -136,7 +136,13 @@ def test_a_settled_pose_depends_on_the_pose_alone(build, tmp_path):
     recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 6)
     assert recording.info.unsettled == ()
     target = json.loads((tmp_path / "recording" / "recording.json").read_text())["target"]
-    assert target == {"object": "flesh", "follows": "simulation", "pre_roll": 0, "settle": 80, "still_mm": 0.1}
+    assert target == {
+        "object": "flesh",
+        "follows": "simulation",
+        "pre_roll": 0,
+        "max_settle_frames": 80,
+        "rest_threshold_mm": 0.1,
+    }
     # Other poses before it, or none.
     assert run("record", rig, tmp_path / "half", "--object", "elbow", *SETTLED, "--poses", 6, "--shard", "2/2") == 0
     half = open_recording(tmp_path / "half")
@@ -169,7 +175,7 @@ def complete_poses(recording: Path) -> int:
 
 def test_poses_that_do_not_settle_are_named(tmp_path, capfd):
     rig = built(targets.target_soft_body, tmp_path / "rig.blend")
-    hasty = "--target", "flesh", "--settle", 12, "--poses", 5
+    hasty = "--target", "flesh", "--max-settle-frames", 12, "--poses", 5
     recording = recorded(rig, tmp_path / "recording", *hasty)
     assert recording.info.unsettled == (0, 1, 2, 3, 4)
     assert "5 of 5 poses did not come to rest in 12 frames: 0, 1, 2 and 2 more" in capfd.readouterr().out
@@ -283,7 +289,7 @@ def test_other_simulations_are_not_disturbed(tmp_path):
     for frame in range(1, 13):
         bpy.context.scene.frame_set(frame)
     before = evaluated(bpy.data.objects["flag"])
-    settings = RecordingSettings(poses=4, target=TargetSettings("flesh", settle=40))
+    settings = RecordingSettings(poses=4, target=TargetSettings("flesh", max_settle_frames=40))
     drain(record(find_rig("elbow"), tmp_path / "recording", settings))
     assert bpy.context.scene.frame_current == 12
     assert np.array_equal(evaluated(bpy.data.objects["flag"]), before)

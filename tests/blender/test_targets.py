@@ -296,13 +296,13 @@ def test_mirrored_frames_of_a_cache(refusal, tmp_path):
 
 def test_settling_and_pre_roll_of_what_is_no_simulation(refusal, tmp_path):
     rig = built(targets.target_pc2, tmp_path / "rig.blend")
-    assert refused(refusal, rig, "--poses", 0, "--settle", 5) == (
+    assert refused(refusal, rig, "--poses", 0, "--max-settle-frames", 5) == (
         "The target 'flesh' cannot settle: the modifier 'Cache' of 'flesh' has the frames that it has; leave settling "
         "out."
     )
     assert refused(refusal, rig, "--pre-roll", 5).startswith("The target 'flesh' is no simulation, so there is nothing")
     rig = built(targets.target_copy, tmp_path / "copy.blend")
-    assert "cannot settle: it follows the pose at once;" in refused(refusal, rig, "--settle", 5)
+    assert "cannot settle: it follows the pose at once;" in refused(refusal, rig, "--max-settle-frames", 5)
 
 
 def test_one_target_is_of_one_mesh(refusal, tmp_path):
@@ -329,7 +329,7 @@ def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
     mesh_object = bpy.data.objects["elbow"]
     bpy.context.view_layer.objects.active = mesh_object
     settings = mesh_object.fdda.settings
-    settings.target, settings.poses, settings.settle = "flesh", 0, 0
+    settings.target, settings.poses, settings.max_settle_frames = "flesh", 0, 0
     bpy.data.actions[ACTION].fdda.record = True
     bpy.context.window_manager.fdda.all_meshes = False
     assert bpy.ops.fdda.record() == {"FINISHED"}

@@ -85,7 +85,7 @@ def test_the_same_pose_from_two_directions(swinging):
 
 def test_poses_that_did_not_settle_in_words():
     assert unsettled_in_words({"complete": 9}) == ""
-    index = {"complete": 9, "unsettled": [1, 4], "target": {"settle": 30}}
+    index = {"complete": 9, "unsettled": [1, 4], "target": {"max_settle_frames": 30}}
     assert unsettled_in_words(index).startswith("2 of 9 poses did not come to rest in 30 frames: 1 and 4. A training")
 
 
@@ -102,6 +102,12 @@ def test_index_of_a_target():
     settled = RecordedTarget("flesh", "simulation", 3, 60, 0.1)
     assert RecordedTarget.from_json(settled.to_json()) == settled
     assert RecordedTarget.from_json(TARGET.to_json()) == TARGET
-    for change in ({"follows": "wind"}, {"pre_roll": -1}, {"settle": 1.5}, {"still_mm": float("nan")}, {"object": 3}):
+    for change in (
+        {"follows": "wind"},
+        {"pre_roll": -1},
+        {"max_settle_frames": 1.5},
+        {"rest_threshold_mm": float("nan")},
+        {"object": 3},
+    ):
         with pytest.raises((ValueError, TypeError)):
             RecordedTarget.from_json(settled.to_json() | change)

@@ -39,11 +39,13 @@ def choose_the_target(folder: Path) -> Iterator[float]:
     yield from sidebar.type_into("settings.target", FLESH)
     yield from press("Return")
     yield from until(lambda: settings.target == FLESH, 5, f"the field has '{settings.target}'")
-    x, y = yield from sidebar.find("settings.settle", across=0.7)
+    x, y = yield from sidebar.find("settings.max_settle_frames", across=0.7)
     yield from click(x, y, times=2)
     yield 0.3
     yield from press("ctrl+a", *str(SETTLE), "Return")
-    yield from until(lambda: settings.settle == SETTLE, 5, f"the field has {settings.settle} frames")
+    yield from until(
+        lambda: settings.max_settle_frames == SETTLE, 5, f"the field has {settings.max_settle_frames} frames"
+    )
     yield from redraw()
     yield from picture(folder / "target.png")
 

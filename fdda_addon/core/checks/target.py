@@ -142,6 +142,6 @@ def unsettled_in_words(index: dict) -> str:
     if not unsettled:
         return ""
     return (
-        f"{len(unsettled)} of {index['complete']} poses did not come to rest in {index['target']['settle']} frames: "
-        f"{listed(unsettled)}. A training leaves them out; more frames (--settle) let them rest."
+        f"{len(unsettled)} of {index['complete']} poses did not come to rest in {index['target']['max_settle_frames']} frames: "
+        f"{listed(unsettled)}. A training leaves them out; more frames (--max-settle-frames) let them rest."
     )

@@ -20,18 +20,22 @@ class RecordedTarget:
         object_name: of the target.
         follows: `POSE`, `FRAMES` or `SIMULATION`.
         pre_roll: frames in which the rig went from the rest pose to the first frame of an action.
-        settle: frames that a random pose was held for at most, 0 where poses were not held.
-        still_mm: the target is at rest when no vertex moves by more from a frame to the next, mm.
+        max_settle_frames: frames that a random pose was held for at most, 0 where poses were not held.
+        rest_threshold_mm: the target is at rest when no vertex moves by more from a frame to the next, mm.
     """
 
     object_name: str
     follows: str
     pre_roll: int = 0
-    settle: int = 0
-    still_mm: float = 0.0
+    max_settle_frames: int = 0
+    rest_threshold_mm: float = 0.0
 
     def to_json(self) -> dict:
-        settled = {"settle": self.settle, "still_mm": self.still_mm} if self.settle else {}
+        settled = (
+            {"max_settle_frames": self.max_settle_frames, "rest_threshold_mm": self.rest_threshold_mm}
+            if self.max_settle_frames
+            else {}
+        )
         return {"object": self.object_name, "follows": self.follows, "pre_roll": self.pre_roll, **settled}
 
     @staticmethod
@@ -41,16 +45,16 @@ class RecordedTarget:
             read_name(value["object"]),
             value["follows"],
             value["pre_roll"],
-            value.get("settle", 0),
-            value.get("still_mm", 0.0),
+            value.get("max_settle_frames", 0),
+            value.get("rest_threshold_mm", 0.0),
         )
         if target.follows not in FOLLOWS:
             raise ValueError(f"its target follows {target.follows!r}")
-        for number in (target.pre_roll, target.settle):
+        for number in (target.pre_roll, target.max_settle_frames):
             if type(number) is not int or number < 0:
                 raise ValueError(f"its target has {number!r} frames")
-        if type(target.still_mm) not in (int, float) or not 0 <= target.still_mm < math.inf:
-            raise ValueError(f"its target rests below {target.still_mm!r} mm")
+        if type(target.rest_threshold_mm) not in (int, float) or not 0 <= target.rest_threshold_mm < math.inf:
+            raise ValueError(f"its target rests below {target.rest_threshold_mm!r} mm")
         return target
 
 
