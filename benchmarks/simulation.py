@@ -99,7 +99,7 @@ def main() -> None:
         "linear_mm": found["linear"],
         "fdda_mm": found["fdda"],
         "part": found["fdda"]["mean"] / found["linear"]["mean"],
-        "repeats": index.get("repeats"),
+        "repeatability": index.get("repeatability"),
         "simulation_ms": frame_ms(rig, FLESH, "arm"),
         "model_ms": frame_ms(bound, "arm", FLESH),
         "seconds": seconds,

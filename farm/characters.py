@@ -59,8 +59,8 @@ class Character:
         output: folder of the bound file, its models and their reports.
         objects: names of the mesh objects; empty for the only one of the file.
         depends: files that the rig's file links, so that a change of them is noticed.
-        poses, seed, spread, margin, actions, strips, mirror, sample, controls, fit_linear, min_partition_vertices: as of
-            `record`.
+        poses, seed, spread, margin, actions, strips, mirror, sample, controls, fit_linear, min_partition_vertices: as
+            of `record`.
         shards: how many parts the poses are recorded in.
         train: settings of the training by name, as of `train`.
         target_mm: what 99.9 % of the vertices of held-out poses are to be within; 0 for no target.

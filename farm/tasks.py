@@ -148,7 +148,7 @@ class _Tasks:
         )
         return (
             *("record", str(own.rig), RECORDING, "--resume", "--poses", str(own.poses), "--seed", str(own.seed)),
-            *("--spread", repr(float(own.spread)), *(("--mirror",) if own.mirror else ()), *least),
+            *("--spread", repr(float(own.spread)), *(("--mirror",) if own.mirror else ()), *min_vertices),
             *(("--margin", repr(float(own.margin))) if own.margin != 1 else ()),
             *(("--fit-linear", own.fit_linear) if own.fit_linear else ()),
             *(f"{option}={value}" for option, values in lists.items() for value in values),

@@ -89,7 +89,7 @@ def _head(report: dict) -> str:
             _mm(held_out["mean"]),
             f"held-out mean error, {_share(held_out['mean'], linear['mean'])} of linear skinning's",
         ),
-        *([(_mm(report["repeats"]["apart_mm"]["mean"]), REPEATED)] if "repeats" in report else []),
+        *([(_mm(report["repeatability"]["distance_mm"]["mean"]), REPEATED)] if "repeatability" in report else []),
         (_mm(held_out["p999"]), f"99.9 % of vertices below; linear skinning {_mm(linear['p999'])}"),
         (_mm(held_out["max"]), f"largest error, {_share(held_out['max'], linear['max'])} of linear skinning's"),
         (f"{training['seconds']:.0f} s", f"training on {escape(training['device'])}, {training['epochs']} epochs"),

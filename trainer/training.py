@@ -146,8 +146,8 @@ def train_model(
     )
     # Not in the model: the same recording and settings give the same bytes.
     content["training"] = {**content["training"], "seconds": round(time.perf_counter() - started, 2)}
-    if recording.info.repeats:
-        content["repeats"] = recording.info.repeats.to_json()
+    if recording.info.repeatability:
+        content["repeatability"] = recording.info.repeatability.to_json()
     content["warnings"] = [warning.to_json() for warning in warnings]
     poses, p999 = len(recording.pose_matrices), exported.info.held_out_mm["p999"]
     history = [*(last.history if last else ()), {"poses": poses, "p999": p999}]

@@ -70,7 +70,7 @@ def _frames(build: Callable[[], object], text: str) -> Row:
 
 def _settled(build: Callable[[], object], text: str) -> Row:
     """A simulation that is learnt and compared in poses that settle."""
-    target = TargetSettings(targets.TARGET, max_settle_frames=80, repeats=0)
+    target = TargetSettings(targets.TARGET, max_settle_frames=80, repeatability_poses=0)
     return _tube(TARGETS, build, f"{text}; poses settle", recording=_recording(poses=60, target=target))
 
 

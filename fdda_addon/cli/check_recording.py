@@ -30,8 +30,8 @@ def run(options: argparse.Namespace) -> None:
     if options.json:
         check_outputs({options.json: WARNINGS}, overwrite=options.overwrite)
     recording = read_recording(options.recording)
-    if recording.info.repeats:
-        print(recording.info.repeats.sentence())
+    if recording.info.repeatability:
+        print(recording.info.repeatability.sentence())
     warnings = check_recording(recording)
     for warning in warnings:
         print(warning)

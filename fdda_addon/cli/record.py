@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     from .files import add_rig
-    from .target import add_repeats, add_target
+    from .target import add_repeatability, add_target
 
     add_rig(parser)
     parser.add_argument(
@@ -108,7 +108,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--influences", metavar="FOLDER", type=Path, help="take them from what --influences-only made of the same rig"
     )
     add_target(parser)
-    add_repeats(parser)
+    add_repeatability(parser)
     parser.add_argument(
         "--refine", metavar="MODEL.onnx", type=Path, help="add poses to the recording where this model is worst"
     )
@@ -192,8 +192,8 @@ def run(options: argparse.Namespace) -> None:
             for line in (merges_in_words(index, options.min_partition_vertices), unsettled_in_words(index)):
                 if line:
                     print(line)
-            if repeats := read_info(index).repeats:
-                print(repeats.sentence())
+            if repeatability := read_info(index).repeatability:
+                print(repeatability.sentence())
         done = "influences" if options.influences_only else f"{step.total} poses{' added' if options.refine else ''}"
         print(f"{recording}: {done} in {seconds:.1f} s")
 

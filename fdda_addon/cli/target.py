@@ -5,7 +5,7 @@ import argparse
 import math
 from typing import TYPE_CHECKING
 
-from ..core.defaults import REPEATS, REST_THRESHOLD_MM
+from ..core.defaults import REPEATABILITY_POSES, REST_THRESHOLD_MM
 from ..core.errors import WrongUsageError
 
 if TYPE_CHECKING:
@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from ..scene.scene_rig import SceneRig
 
 
-def add_repeats(parser: argparse.ArgumentParser) -> None:
-    """Declare `--repeats`."""
+def add_repeatability(parser: argparse.ArgumentParser) -> None:
+    """Declare `--repeatability-poses`."""
     parser.add_argument(
-        "--repeats",
+        "--repeatability-poses",
         type=int,
-        default=REPEATS,
+        default=REPEATABILITY_POSES,
         metavar="N",
         help="approach N of the poses that settle, or of the frames of actions, from another direction as well, to say "
-        f"how close a model of a simulation can come (default {REPEATS})",
+        f"how close a model of a simulation can come (default {REPEATABILITY_POSES})",
     )
 
 
@@ -65,15 +65,19 @@ def target_settings(options: argparse.Namespace) -> "TargetSettings":
     """
     from ..rig.target_time import TargetSettings
 
-    repeats = getattr(options, "repeats", 0)
-    if min(options.pre_roll, options.max_settle_frames, repeats) < 0 or not 0 < options.rest_threshold_mm < math.inf:
+    repeatability_poses = getattr(options, "repeatability_poses", 0)
+    if (
+        min(options.pre_roll, options.max_settle_frames, repeatability_poses) < 0
+        or not 0 < options.rest_threshold_mm < math.inf
+    ):
         raise WrongUsageError(
-            "--pre-roll, --max-settle-frames and --repeats must be 0 or more, and --rest-threshold-mm more than 0."
+            "--pre-roll, --max-settle-frames and --repeatability-poses must be 0 or more, and --rest-threshold-mm "
+            "more than 0."
         )
     if (options.pre_roll or options.max_settle_frames) and not options.target:
         raise WrongUsageError("--pre-roll and --max-settle-frames are about a target; give --target OBJECT.")
     return TargetSettings(
-        options.target, options.pre_roll, options.max_settle_frames, options.rest_threshold_mm, repeats
+        options.target, options.pre_roll, options.max_settle_frames, options.rest_threshold_mm, repeatability_poses
     )
 
 

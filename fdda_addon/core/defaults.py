@@ -17,7 +17,7 @@ REFINEMENT_POSES = 250
 """Poses that are added where a model is worst."""
 REST_THRESHOLD_MM = 0.1
 """A target that poses are held for is at rest when no vertex moves by more from a frame to the next."""
-REPEATS = 10
+REPEATABILITY_POSES = 10
 """Poses that are approached from another direction as well."""
 
 TOLERANCE_MM = 0.04

@@ -84,8 +84,8 @@ def make_partitions(
 
 
 def merged_partitions(rig: Rig, min_vertices: int = MIN_PARTITION_VERTICES) -> tuple[Partition, ...]:
-    """Cut the mesh by main joint, and merge what has fewer than `least` vertices as `small_partition_merges` says."""
-    return make_partitions(rig, merged=small_partition_merges(rig, least))
+    """Cut the mesh by main joint, and merge partitions of fewer vertices as in `small_partition_merges`."""
+    return make_partitions(rig, merged=small_partition_merges(rig, min_vertices))
 
 
 def small_partition_merges(rig: Rig, min_vertices: int = MIN_PARTITION_VERTICES) -> dict[int, int]:
@@ -96,7 +96,7 @@ def small_partition_merges(rig: Rig, min_vertices: int = MIN_PARTITION_VERTICES)
 
     Args:
         rig: the rig.
-        least: partitions of fewer vertices are small; 0 merges none.
+        min_vertices: partitions of fewer vertices are small; 0 merges none.
 
     Returns:
         For each main joint whose vertices go elsewhere the joint whose partition takes them, for `make_partitions`.
@@ -111,7 +111,7 @@ def small_partition_merges(rig: Rig, min_vertices: int = MIN_PARTITION_VERTICES)
     counts = dict(zip(*(values.tolist() for values in np.unique(main, return_counts=True)), strict=True))
     merged: dict[int, int] = {}
     stays: set[int] = set()
-    while small := [joint for joint in counts if counts[joint] < least and joint not in stays]:
+    while small := [joint for joint in counts if counts[joint] < min_vertices and joint not in stays]:
         joint = min(small, key=lambda j: (counts[j], j))
         other = _merge_target(rig, joint, weights)
         if other is None:

@@ -85,7 +85,7 @@ _REPORT = {
     "histogram": {"edges": [float], "fdda": [int], "linear": [int]},
     "partitions": [_PARTITION],
     "warnings?": [{"name": str, "text": str}],
-    "repeats?": {"poses": [int], "apart_mm": _ERRORS, "linear_mm": float},
+    "repeatability?": {"poses": [int], "distance_mm": _ERRORS, "linear_mm": float},
     "target?": {"target": float, "p999": float, "verdict": Verdict},
 }
 """Keys and the kinds of their values; `?` ends one that may be missing, and further keys may come."""

@@ -34,7 +34,7 @@ from .mesh_group import common_armature, controls_of_each, in_passes
 from .phases import Fitted, Found, Planned, TimedEvaluator, estimate
 from .plan import RecordingSettings, planned_actions, planned_rig, planned_sampling
 from .pose_plan import PosePlan
-from .repeats import measure_repeats
+from .repeatability import measure_repeatability
 from .target_check import check_moves
 from .time_check import check_follows_pose
 from .weight_fitting import check_has_weights, fit_weights, poses_to_fit
@@ -235,8 +235,8 @@ def _record_poses(
         with closing(left), closing(append_poses(left, appenders)) as steps:
             for done in steps:
                 yield Progress("poses", done, len(wanted), detail=str(settler.last) if settler else "")
-        if plan.repeatable and settings.target.repeats and len(wanted) == plan.total:
-            yield from measure_repeats(meshes[0], plan, player, writer, settings.target.repeats)
+        if plan.repeatable and settings.target.repeatability_poses and len(wanted) == plan.total:
+            yield from measure_repeatability(meshes[0], plan, player, writer, settings.target.repeatability_poses)
             yield Progress("poses", len(wanted), len(wanted))
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from ..core.defaults import REPEATS, REST_THRESHOLD_MM
+from ..core.defaults import REPEATABILITY_POSES, REST_THRESHOLD_MM
 from ..core.errors import RigError
 from ..core.recording.target import FRAMES, POSE, SIMULATION, RecordedTarget
 from ..poses.clip import Clip
@@ -36,15 +36,15 @@ class TargetSettings:
         pre_roll: frames before the first of an action, in which the rig goes from the rest pose to it.
         max_settle_frames: most frames for which a random pose is held until the target is at rest; 0 does not hold it.
         rest_threshold_mm: it is at rest when no vertex moves by more from a frame to the next, mm.
-        repeats: how many of the poses that are held, or of the frames of actions, a simulation is brought to a second
-            time, from another direction.
+        repeatability_poses: how many poses that are held, or frames of actions, are reached a second time, from another
+            direction.
     """
 
     name: str = ""
     pre_roll: int = 0
     max_settle_frames: int = 0
     rest_threshold_mm: float = REST_THRESHOLD_MM
-    repeats: int = REPEATS
+    repeatability_poses: int = REPEATABILITY_POSES
 
 
 OWN_SURFACE = TargetSettings()

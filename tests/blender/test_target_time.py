@@ -189,9 +189,9 @@ def test_poses_that_do_not_settle_are_named(tmp_path, capfd):
 
 def test_a_settled_model_is_evaluated_against_settled_poses(tmp_path, capfd):
     rig = built(targets.target_soft_body, tmp_path / "rig.blend")
-    recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 40, "--repeats", 3)
-    repeats = recording.info.repeats
-    assert len(repeats.poses) == 3 and 0 <= repeats.apart_mm["mean"] < 0.2 * repeats.linear_mm
+    recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 40, "--repeatability-poses", 3)
+    repeatability = recording.info.repeatability
+    assert len(repeatability.poses) == 3 and 0 <= repeatability.distance_mm["mean"] < 0.2 * repeatability.linear_mm
     capfd.readouterr()
     assert run("check-recording", recording.path) == 0
     assert capfd.readouterr().out.startswith("The same pose from two directions: ")
@@ -203,14 +203,14 @@ def test_a_settled_model_is_evaluated_against_settled_poses(tmp_path, capfd):
     found = json.loads(errors.read_text())
     assert found["fdda"]["mean"] < found["linear"]["mean"]
     report = json.loads((tmp_path / "report.json").read_text())
-    assert report["repeats"] == repeats.to_json()
+    assert report["repeatability"] == repeatability.to_json()
     assert "two ways to the same pose" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_cloth_that_folds_one_way_or_the_other_is_named(tmp_path, capfd):
     rig = built(targets.target_cloth, tmp_path / "rig.blend")
-    recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 16, "--repeats", 5)
-    assert recording.info.repeats.apart_mm["mean"] > 0.2 * recording.info.repeats.linear_mm
+    recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 16, "--repeatability-poses", 5)
+    assert recording.info.repeatability.distance_mm["mean"] > 0.2 * recording.info.repeatability.linear_mm
     assert run("check-recording", recording.path) == 0
     out = capfd.readouterr().out
     assert "hysteresis" in out and "mm from itself when the same pose is reached from another direction" in out
@@ -219,13 +219,13 @@ def test_cloth_that_folds_one_way_or_the_other_is_named(tmp_path, capfd):
 def test_repeats_are_measured_once_and_again_where_they_are_missing(tmp_path):
     rig = built(targets.target_geometry_nodes, tmp_path / "rig.blend")
     options = ["--object", "elbow", *SETTLED, "--poses", 6]
-    assert run("record", rig, tmp_path / "recording", *options, "--repeats", 0) == 0
-    assert read_recording(tmp_path / "recording").info.repeats is None
+    assert run("record", rig, tmp_path / "recording", *options, "--repeatability-poses", 0) == 0
+    assert read_recording(tmp_path / "recording").info.repeatability is None
     for _ in range(2):
-        assert run("record", rig, tmp_path / "recording", *options, "--repeats", 2, "--resume") == 0
-        repeats = read_recording(tmp_path / "recording").info.repeats
+        assert run("record", rig, tmp_path / "recording", *options, "--repeatability-poses", 2, "--resume") == 0
+        repeatability = read_recording(tmp_path / "recording").info.repeatability
         # It lags, and has no memory of the way once it rests.
-        assert len(repeats.poses) == 2 and repeats.apart_mm["max"] < 0.5
+        assert len(repeatability.poses) == 2 and repeatability.distance_mm["max"] < 0.5
 
 
 @pytest.mark.parametrize("options", [(), ("--pre-roll", 4)])
@@ -255,22 +255,24 @@ def test_frames_of_an_action_are_repeated_on_the_way_back(options, tmp_path):
                 curve.keyframe_points.insert(first + number, value).interpolation = "LINEAR"
 
     rig = built(lags, tmp_path / "rig.blend")
-    recording = of_flesh(rig, tmp_path / "recording", *options, "--repeats", 5)
-    repeats = recording.info.repeats
-    turn = max(repeats.poses) + APPROACH
-    both = of_flesh(built(there_and_back, tmp_path / "both.blend"), tmp_path / "both", *options, "--repeats", 0)
-    shown, numbers = complex_positions(both), np.array(repeats.poses)
+    recording = of_flesh(rig, tmp_path / "recording", *options, "--repeatability-poses", 5)
+    repeatability = recording.info.repeatability
+    turn = max(repeatability.poses) + APPROACH
+    both = of_flesh(
+        built(there_and_back, tmp_path / "both.blend"), tmp_path / "both", *options, "--repeatability-poses", 0
+    )
+    shown, numbers = complex_positions(both), np.array(repeatability.poses)
     apart = np.linalg.norm(shown[numbers] - shown[2 * turn - numbers], axis=2) * 1000
     assert len(numbers) == 5 and apart.mean() > 1
-    assert repeats.apart_mm["mean"] == pytest.approx(apart.mean(), rel=1e-3)
-    assert repeats.apart_mm["max"] == pytest.approx(apart.max(), rel=1e-3)
-    assert both.info.repeats is None
+    assert repeatability.distance_mm["mean"] == pytest.approx(apart.mean(), rel=1e-3)
+    assert repeatability.distance_mm["max"] == pytest.approx(apart.max(), rel=1e-3)
+    assert both.info.repeatability is None
     assert np.array_equal(complex_positions(both)[: turn + 1], complex_positions(recording)[: turn + 1])
 
 
 def test_what_follows_the_pose_is_not_repeated(tmp_path):
     rig = built(targets.target_copy, tmp_path / "rig.blend")
-    assert of_flesh(rig, tmp_path / "recording").info.repeats is None
+    assert of_flesh(rig, tmp_path / "recording").info.repeatability is None
 
 
 def test_other_simulations_are_not_disturbed(tmp_path):

@@ -11,7 +11,7 @@ from fdda_addon.core.errors import OutputError, RecordingError
 from fdda_addon.core.recording.arrays import ARRAYS
 from fdda_addon.core.recording.folder import FolderContent, FolderState, read_folder, remove_recording
 from fdda_addon.core.recording.lock import LOCK, RecordingLock
-from fdda_addon.core.recording.target import STATISTICS, Repeats
+from fdda_addon.core.recording.target import STATISTICS, Repeatability
 from fdda_addon.core.recording.writer import RecordingWriter
 
 from .good_recording import good_recording
@@ -51,11 +51,11 @@ def test_a_recording_that_is_complete(tmp_path):
 
 def test_what_was_measured_with_a_recording_is_said(tmp_path):
     record_limb(tmp_path / "r", POSES)
-    repeats = Repeats((1, 2), dict.fromkeys(STATISTICS, 0.25), 5.0)
+    repeatability = Repeatability((1, 2), dict.fromkeys(STATISTICS, 0.25), 5.0)
     index = json.loads((tmp_path / "r" / "recording.json").read_text())
-    (tmp_path / "r" / "recording.json").write_text(json.dumps({**index, "repeats": repeats.to_json()}))
-    assert look(tmp_path / "r").measured == (repeats.sentence(),)
-    assert "0.25 mm apart on average" in repeats.sentence()
+    (tmp_path / "r" / "recording.json").write_text(json.dumps({**index, "repeatability": repeatability.to_json()}))
+    assert look(tmp_path / "r").measured == (repeatability.sentence(),)
+    assert "0.25 mm apart on average" in repeatability.sentence()
 
 
 def test_a_recording_that_was_broken_off(tmp_path):

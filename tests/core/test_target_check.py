@@ -9,7 +9,7 @@ import pytest
 from fdda_addon.core.checks.target import check_target, unsettled_in_words
 from fdda_addon.core.recording.index import ACTION, Source
 from fdda_addon.core.recording.reader import Recording
-from fdda_addon.core.recording.target import RecordedTarget, Repeats
+from fdda_addon.core.recording.target import RecordedTarget, Repeatability
 from fdda_addon.core.skinning import LinearSkinning
 
 from .good_recording import good_recording, recorded_positions
@@ -73,13 +73,15 @@ def test_a_target_in_other_units_or_another_place(factor, move, swinging):
 
 
 def test_the_same_pose_from_two_directions(swinging):
-    def with_repeats(mean: float) -> Recording:
+    def with_repeatability(mean: float) -> Recording:
         statistics = {"mean": mean, "rms": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
-        return replace(swinging, info=replace(swinging.info, repeats=Repeats((1, 2), statistics, 5.0)))
+        return replace(swinging, info=replace(swinging.info, repeatability=Repeatability((1, 2), statistics, 5.0)))
 
-    assert check_target(with_repeats(0.9)) == []
-    assert only(with_repeats(1.1), "hysteresis").startswith("The target is 1.1 mm from itself when the same pose is")
-    sentence = with_repeats(1.1).info.repeats.sentence()
+    assert check_target(with_repeatability(0.9)) == []
+    assert only(with_repeatability(1.1), "hysteresis").startswith(
+        "The target is 1.1 mm from itself when the same pose is"
+    )
+    sentence = with_repeatability(1.1).info.repeatability.sentence()
     assert sentence.startswith("The same pose from two directions: 1.1 mm apart on average, 4 mm at most (2 poses);")
 
 
@@ -89,13 +91,13 @@ def test_poses_that_did_not_settle_in_words():
     assert unsettled_in_words(index).startswith("2 of 9 poses did not come to rest in 30 frames: 1 and 4. A training")
 
 
-def test_index_of_repeats():
+def test_index_of_repeatability():
     statistics = {"mean": 0.5, "rms": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
-    repeats = Repeats((1, 2), statistics, 5.0)
-    assert Repeats.from_json(repeats.to_json(), 3) == repeats
-    for change in ({"poses": []}, {"poses": [3]}, {"apart_mm": statistics | {"max": -1}}, {"linear_mm": "5"}):
+    repeatability = Repeatability((1, 2), statistics, 5.0)
+    assert Repeatability.from_json(repeatability.to_json(), 3) == repeatability
+    for change in ({"poses": []}, {"poses": [3]}, {"distance_mm": statistics | {"max": -1}}, {"linear_mm": "5"}):
         with pytest.raises((ValueError, TypeError)):
-            Repeats.from_json(repeats.to_json() | change, 3)
+            Repeatability.from_json(repeatability.to_json() | change, 3)
 
 
 def test_index_of_a_target():

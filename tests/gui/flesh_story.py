@@ -58,7 +58,7 @@ def record_settled_poses(folder: Path) -> Iterator[float]:
     yield from picture(folder / "settling.png")
     yield from job_done("record", 400)
     index = part("core.recording.index").read_index(folder / "flesh" / "arm_recording")
-    check(index["complete"] == POSES and index["repeats"]["poses"], f"recorded is {index['complete']}")
+    check(index["complete"] == POSES and index["repeatability"]["poses"], f"recorded is {index['complete']}")
     yield from redraw()
     yield from picture(folder / "flesh_recorded.png")
     check(len(index.get("unsettled", ())) < POSES // 2, f"{index.get('unsettled')} have not come to rest")

@@ -219,8 +219,8 @@ def _check_small(recording: Recording) -> list[RecordingWarning]:
     names = [joint_name(recording.rig, p.joint) for p in small]
     fewest = min(len(p.vertices) for p in small)
     text = (
-        f"{counted(names, 'partition')} {'has' if len(small) == 1 else 'have'} fewer than {MIN_PARTITION_VERTICES} vertices "
-        f"(the smallest {fewest}), and a network each: record with --min-partition-vertices {MIN_PARTITION_VERTICES} to merge them "
-        "into others."
+        f"{counted(names, 'partition')} {'has' if len(small) == 1 else 'have'} fewer than {MIN_PARTITION_VERTICES} "
+        f"vertices (the smallest {fewest}), and a network each: record with --min-partition-vertices "
+        f"{MIN_PARTITION_VERTICES} to merge them into others."
     )
     return [RecordingWarning("small-partitions", text[0].upper() + text[1:])]

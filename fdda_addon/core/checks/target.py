@@ -31,16 +31,16 @@ def check_target(recording: Recording) -> list[RecordingWarning]:
     if recording.info.target is None:
         return []
     skinning = LinearSkinning(recording.rig, recording.partitions)
-    return [*_check_repeats(recording), *_check_frames(recording, skinning), *_check_place(recording, skinning)]
+    return [*_check_repeatability(recording), *_check_frames(recording, skinning), *_check_place(recording, skinning)]
 
 
-def _check_repeats(recording: Recording) -> list[RecordingWarning]:
-    repeats = recording.info.repeats
-    if repeats is None or repeats.apart_mm["mean"] <= MAX_APART * repeats.linear_mm:
+def _check_repeatability(recording: Recording) -> list[RecordingWarning]:
+    repeatability = recording.info.repeatability
+    if repeatability is None or repeatability.distance_mm["mean"] <= MAX_APART * repeatability.linear_mm:
         return []
     text = (
-        f"The target is {repeats.apart_mm['mean']:.2g} mm from itself when the same pose is reached from another "
-        f"direction, on average over {len(repeats.poses)} poses, and linear skinning is {repeats.linear_mm:.2g} mm "
+        f"The target is {repeatability.distance_mm['mean']:.2g} mm from itself when the same pose is reached from "
+        f"another direction, on average over {len(repeatability.poses)} poses, and linear skinning is {repeatability.linear_mm:.2g} mm "
         "off: no model can be closer; hold poses for more frames or play actions slower, damp the simulation, or leave "
         "folds to another mesh."
     )
@@ -141,7 +141,8 @@ def unsettled_in_words(index: dict) -> str:
     unsettled = index.get("unsettled", [])
     if not unsettled:
         return ""
+    frames = index["target"]["max_settle_frames"]
     return (
-        f"{len(unsettled)} of {index['complete']} poses did not come to rest in {index['target']['max_settle_frames']} frames: "
+        f"{len(unsettled)} of {index['complete']} poses did not come to rest in {frames} frames: "
         f"{listed(unsettled)}. A training leaves them out; more frames (--max-settle-frames) let them rest."
     )

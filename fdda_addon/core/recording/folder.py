@@ -92,7 +92,7 @@ def _content(path: Path, rig: Rig | None, sampling: dict | None, fit_linear: str
     names = ", ".join(sorted({SETTINGS.get(key.partition(".")[0], key) for key in found}))
     if counts[0] == counts[1]:
         sentence = f"It was recorded with other settings than those above: {names}." if found else ""
-        measured = tuple(part.sentence() for part in (fit, info.repeats) if part)
+        measured = tuple(part.sentence() for part in (fit, info.repeatability) if part)
         return FolderContent(FolderState.COMPLETE, *counts, sentence, measured)
     if found:
         return FolderContent(

@@ -15,7 +15,7 @@ from ..skin_fit import SkinFit
 from ..surface import MIN_CORNERS
 from ..unit import read_unit
 from .shard import Shard
-from .target import RecordedTarget, Repeats
+from .target import RecordedTarget, Repeatability
 
 FORMAT = "fdda-recording"
 VERSION = 1
@@ -75,8 +75,8 @@ class RecordingInfo:
 
     `fit` is there where the skin weights are not the rig's own, `shard` where the poses are a part of those of a plan:
     `sampling` is that of the whole plan then. `target` is there where the surface is another object's; `unsettled` are
-    numbers of poses, ascending, in which it did not come to rest, and `repeats` is there where poses were approached
-    from two directions.
+    numbers of poses, ascending, in which it did not come to rest, and `repeatability` is there where poses were
+    approached from two directions.
     """
 
     poses: int
@@ -89,7 +89,7 @@ class RecordingInfo:
     shard: Shard | None = None
     target: RecordedTarget | None = None
     unsettled: tuple[int, ...] = ()
-    repeats: Repeats | None = None
+    repeatability: Repeatability | None = None
 
 
 def read_index(path: Path) -> dict:
@@ -161,8 +161,8 @@ def _check_index(index: dict) -> None:
         Shard.from_json(index["shard"], index["poses"])
     if "target" in index:
         RecordedTarget.from_json(index["target"])
-    if "repeats" in index:
-        Repeats.from_json(index["repeats"], index["complete"])
+    if "repeatability" in index:
+        Repeatability.from_json(index["repeatability"], index["complete"])
     _check_numbers(index.get("unsettled", []), "unsettled pose", index["complete"], "it")
     _sampling(index["sampling"])
 
@@ -219,5 +219,5 @@ def read_info(index: dict) -> RecordingInfo:
         Shard.from_json(index["shard"], index["poses"]) if "shard" in index else None,
         RecordedTarget.from_json(index["target"]) if "target" in index else None,
         tuple(index.get("unsettled", ())),
-        Repeats.from_json(index["repeats"], index["complete"]) if "repeats" in index else None,
+        Repeatability.from_json(index["repeatability"], index["complete"]) if "repeatability" in index else None,
     )

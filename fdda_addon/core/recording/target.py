@@ -59,31 +59,31 @@ class RecordedTarget:
 
 
 @dataclass(frozen=True)
-class Repeats:
+class Repeatability:
     """Poses that were approached from two directions: no model can be closer to a target than these are apart.
 
     Attributes:
         poses: their numbers.
-        apart_mm: distance of the vertices between the two, mm: mean, rms, percentiles 99 and 99.9, and largest.
+        distance_mm: distance of the vertices between the two, mm: mean, rms, percentiles 99 and 99.9, and largest.
         linear_mm: mean distance of the target from linear skinning in these poses, mm.
     """
 
     poses: tuple[int, ...]
-    apart_mm: dict[str, float]
+    distance_mm: dict[str, float]
     linear_mm: float
 
     def to_json(self) -> dict:
-        return {"poses": list(self.poses), "apart_mm": self.apart_mm, "linear_mm": self.linear_mm}
+        return {"poses": list(self.poses), "distance_mm": self.distance_mm, "linear_mm": self.linear_mm}
 
     @staticmethod
-    def from_json(value: dict, poses: int) -> "Repeats":
+    def from_json(value: dict, poses: int) -> "Repeatability":
         """ValueError, TypeError or KeyError where it is damaged; `poses` is how many there are."""
-        found = Repeats(
-            tuple(value["poses"]), {name: value["apart_mm"][name] for name in STATISTICS}, value["linear_mm"]
+        found = Repeatability(
+            tuple(value["poses"]), {name: value["distance_mm"][name] for name in STATISTICS}, value["linear_mm"]
         )
         if not found.poses or not all(type(pose) is int and 0 <= pose < poses for pose in found.poses):
             raise ValueError("its repeated poses are none of its poses")
-        for number in (*found.apart_mm.values(), found.linear_mm):
+        for number in (*found.distance_mm.values(), found.linear_mm):
             if type(number) not in (int, float) or not 0 <= number < math.inf:
                 raise ValueError(f"repeated poses are {number!r} mm apart")
         return found
@@ -92,7 +92,7 @@ class Repeats:
         """What it comes to, for people."""
         count = "1 pose" if len(self.poses) == 1 else f"{len(self.poses)} poses"
         return (
-            f"The same pose from two directions: {self.apart_mm['mean']:.3g} mm apart on average, "
-            f"{self.apart_mm['max']:.3g} mm at most ({count}); linear skinning is {self.linear_mm:.3g} mm off. No "
+            f"The same pose from two directions: {self.distance_mm['mean']:.3g} mm apart on average, "
+            f"{self.distance_mm['max']:.3g} mm at most ({count}); linear skinning is {self.linear_mm:.3g} mm off. No "
             "model can be closer than that."
         )

@@ -24,9 +24,9 @@ from .index import FORMAT, INDEX, VERSION, RecordingInfo, read_index
 from .lock import RecordingLock
 from .place import check_place, remove_files, remove_left_over
 from .reader import check_poses, partitions_json
-from .target import Repeats
+from .target import Repeatability
 
-GROWS = ("complete", "unsettled", "repeats")
+GROWS = ("complete", "unsettled", "repeatability")
 """Keys of the index that change while poses are added."""
 
 
@@ -64,7 +64,7 @@ class RecordingWriter:
         self.path, self.rig, self.partitions, self.info = path, rig, partitions, info
         self.complete = 0
         self.unsettled: list[int] = []
-        self.repeats: Repeats | None = None
+        self.repeatability: Repeatability | None = None
         self._faces, self._corners = len(rig.face_starts), len(rig.face_vertices)
         self._files: dict[str, io.BufferedRandom] = {}
         self._is_new = False
@@ -108,8 +108,8 @@ class RecordingWriter:
                 "record with the same rig and options, or into another folder."
             )
         self.unsettled = list(previous.get("unsettled", ()))
-        if "repeats" in previous:
-            self.repeats = Repeats.from_json(previous["repeats"], previous["complete"])
+        if "repeatability" in previous:
+            self.repeatability = Repeatability.from_json(previous["repeatability"], previous["complete"])
         return previous["complete"]
 
     def _open_arrays(self) -> None:
@@ -190,7 +190,7 @@ class RecordingWriter:
             **({"fit": info.fit.to_json()} if info.fit else {}),
             **({"target": info.target.to_json()} if info.target else {}),
             **({"unsettled": list(self.unsettled)} if self.unsettled else {}),
-            **({"repeats": self.repeats.to_json()} if self.repeats else {}),
+            **({"repeatability": self.repeatability.to_json()} if self.repeatability else {}),
             # Through JSON and back, so that it compares equal with what was read.
             "sampling": json.loads(json.dumps(info.sampling.to_json())),
         }
@@ -233,13 +233,13 @@ class RecordingWriter:
             self.complete, self.unsettled = before
             raise self._failed(error) from error
 
-    def note_repeats(self, repeats: Repeats) -> None:
+    def set_repeatability(self, repeatability: Repeatability) -> None:
         """Write what poses that were approached twice came to.
 
         Raises:
             OutputError: the disk is full or went away.
         """
-        self.repeats = repeats
+        self.repeatability = repeatability
         try:
             self._write_index()
         except OSError as error:

@@ -10,7 +10,7 @@ from ..core.metrics import distances, error_statistics
 from ..core.partition import GOLDEN_RATIO
 from ..core.progress import Progress
 from ..core.recording.arrays import open_array
-from ..core.recording.target import Repeats
+from ..core.recording.target import Repeatability
 from ..core.recording.writer import RecordingWriter
 from ..core.skinning import LinearSkinning
 from ..poses.clip_player import ClipPlayer
@@ -18,7 +18,7 @@ from .phases import Found
 from .pose_plan import PosePlan
 
 
-def measure_repeats(
+def measure_repeatability(
     mesh: Found, plan: PosePlan, player: ClipPlayer | None, writer: RecordingWriter, count: int
 ) -> Iterator[Progress]:
     """Reach some poses of a recording over another way, and note how far the target is from what was recorded.
@@ -33,10 +33,10 @@ def measure_repeats(
         count: how many poses are repeated at most.
 
     Yields:
-        Progress of the stage "repeats".
+        Progress of the stage "repeatability".
     """
     found = [number for number in plan.repeatable if number not in writer.unsettled]
-    if writer.repeats or not found:
+    if writer.repeatability or not found:
         return
     numbers = sorted({found[int(number * GOLDEN_RATIO * len(found)) % len(found)] for number in range(count)})
     rig, skinning, settler = writer.rig, LinearSkinning(writer.rig, writer.partitions), plan.approach.settler
@@ -49,6 +49,6 @@ def measure_repeats(
             before = skinning.complex_positions(pose[None], np.array(recorded[number])[None])[0]
             apart.append(distances(positions, before, rig.metres_per_unit))
             linear.append(distances(before, skinning.positions(pose[None])[0], rig.metres_per_unit))
-            yield Progress("repeats", done, len(numbers), detail=str(settler.last) if settler else "")
+            yield Progress("repeatability", done, len(numbers), detail=str(settler.last) if settler else "")
     statistics = {name: round(value, 6) for name, value in error_statistics(np.stack(apart)).to_json().items()}
-    writer.note_repeats(Repeats(tuple(numbers), statistics, round(float(np.mean(linear)) * 1000, 6)))
+    writer.set_repeatability(Repeatability(tuple(numbers), statistics, round(float(np.mean(linear)) * 1000, 6)))
