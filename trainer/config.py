@@ -33,7 +33,7 @@ class TrainingConfig:
         held_out_fraction: part of the poses that is kept from training and choice to measure the error on.
         target_mm: what 99.9 % of the held-out vertices are to be within, 0 for no target.
         patience: stop when no partition has improved for so many epochs; 0 trains to the end.
-        unsettled: use poses in which the target did not come to rest as well.
+        include_unsettled: use poses in which the target did not come to rest as well.
     """
 
     seed: int = 0
@@ -52,7 +52,7 @@ class TrainingConfig:
     held_out_fraction: float = 0.1
     target_mm: float = TARGET_MM
     patience: int = 0
-    unsettled: bool = False
+    include_unsettled: bool = False
 
     def __post_init__(self):
         checks = {
@@ -72,7 +72,7 @@ class TrainingConfig:
             "held_out_fraction": 0 < self.held_out_fraction <= 0.4,
             "target_mm": self.target_mm >= 0,
             "patience": self.patience >= 0,
-            "unsettled": isinstance(self.unsettled, bool),
+            "include_unsettled": isinstance(self.include_unsettled, bool),
         }
         for name, good in checks.items():
             value = getattr(self, name)
@@ -118,7 +118,7 @@ HELP = {
     "held_out_fraction": "part of the poses that is kept from all of it to measure the error on",
     "target_mm": "what 99.9 %% of the held-out vertices are to be within, in mm; 0 for no target",
     "patience": "stop after so many epochs without improvement, 0 for never",
-    "unsettled": "use the poses in which the target did not come to rest as well",
+    "include_unsettled": "use the poses in which the target did not come to rest as well",
 }
 
 

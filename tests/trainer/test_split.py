@@ -112,7 +112,7 @@ def test_poses_that_did_not_come_to_rest_are_in_no_part_unless_they_are_asked_fo
     found = split_recording(replace(source, info=info), CONFIG)
     poses = np.sort(np.concatenate([getattr(found, part) for part in PARTS]))
     assert np.array_equal(poses, [pose for pose in range(30) if pose % 3])
-    all_of_them = split_recording(replace(source, info=info), replace(CONFIG, unsettled=True))
+    all_of_them = split_recording(replace(source, info=info), replace(CONFIG, include_unsettled=True))
     assert sum(len(getattr(all_of_them, part)) for part in PARTS) == 30
     with pytest.raises(TrainingError, match="Only 4 of the 30 poses of the recording came to rest and training takes"):
         split_recording(replace(source, info=replace(info, unsettled=tuple(range(26)))), CONFIG)
