@@ -103,7 +103,7 @@ def main(folder: Path) -> int:
 def _evaluate(rig: Path, model: Path, out: Path, pictures: Path) -> Evaluation:
     open_file(rig)
     scene_rig = find_rig()
-    settings = EvaluationSettings(HELD_OUT_POSES, actions=(ACTION,), beyond=(1.5, 2.0, 3.0), named=BEYOND)
+    settings = EvaluationSettings(HELD_OUT_POSES, actions=(ACTION,), range_scales=(1.5, 2.0, 3.0), named=BEYOND)
     evaluation = run_evaluation(scene_rig, model, settings)
     write_json(out, evaluation.to_json())
 

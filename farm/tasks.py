@@ -117,7 +117,7 @@ class _Tasks:
 
     def all(self) -> Iterable[Task]:
         character = self._character
-        influences = self._task(INFLUENCES, self._record("--influences-only"), (RECORDING,))
+        influences = self._task(INFLUENCES, self._record("--detect-influences"), (RECORDING,))
         found = ("--influences", str(influences.folder / RECORDING))
         shards = [
             self._task(

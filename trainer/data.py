@@ -177,7 +177,8 @@ def split_recording(recording: Recording, config: TrainingConfig) -> Split:
     if not usable.all() and at_rest < MIN_POSES:
         raise TrainingError(
             f"Only {at_rest} of the {len(usable)} poses of the recording came to rest and training takes at least "
-            f"{MIN_POSES}; hold them for more frames (record --max-settle-frames), or take all with --include-unsettled."
+            f"{MIN_POSES}; hold them for more frames (record --max-settle-frames), or take all with "
+            "--include-unsettled."
         )
     _check_count(int((~besides).sum()))
     random, around = random & usable, around[usable[around]]

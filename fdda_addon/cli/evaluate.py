@@ -37,7 +37,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--strip", action="append", default=[], metavar="NAME", help="compare the frames of a strip of the NLA as well"
     )
     parser.add_argument(
-        "--beyond", type=float, action="append", default=[], metavar="X", help="compare at X times the range as well"
+        "--range-scale",
+        type=float,
+        action="append",
+        default=[],
+        metavar="X",
+        help="compare at X times the range as well",
     )
     add_target(parser)
     parser.add_argument(
@@ -47,10 +52,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    if options.poses < 0 or options.seed < 0 or min(options.beyond, default=1) <= 0:
-        raise WrongUsageError("--poses and --seed must be 0 or more, and --beyond more than 0.")
-    if not options.poses and (options.beyond or not (options.action or options.strip)):
-        raise WrongUsageError("With --poses 0 only actions and strips are compared; give --action and no --beyond.")
+    if options.poses < 0 or options.seed < 0 or min(options.range_scale, default=1) <= 0:
+        raise WrongUsageError("--poses and --seed must be 0 or more, and --range-scale more than 0.")
+    if not options.poses and (options.range_scale or not (options.action or options.strip)):
+        raise WrongUsageError(
+            "With --poses 0 only actions and strips are compared; give --action and no --range-scale."
+        )
     target = target_settings(options)
     outputs = [(options.json, EVALUATION), *([(options.heatmap, PICTURE)] if options.heatmap else [])]
     check_outputs(outputs, (options.rig, options.model), options.overwrite)
@@ -63,7 +70,7 @@ def run(options: argparse.Namespace) -> None:
         options.poses,
         options.seed,
         tuple(options.action),
-        tuple(options.beyond),
+        tuple(options.range_scale),
         strips=tuple(options.strip),
         target=target,
     )
@@ -98,7 +105,7 @@ def table(evaluation: Evaluation) -> str:
     head = f"{'error in mm':<24}{'mean':>10}{'rms':>10}{'p99':>10}{'p99.9':>10}{'max':>10}"
     lines = [head, "-" * len(head)]
     random = [] if any(errors is evaluation.held_out for errors in evaluation.actions) else [evaluation.held_out]
-    for errors in (*random, *evaluation.beyond, *evaluation.named, *evaluation.actions):
+    for errors in (*random, *evaluation.scaled_ranges, *evaluation.named, *evaluation.actions):
         values = errors.to_json()
         lines.append(f"{errors.name}, {values['poses']} poses")
         for key, label in (("linear", "  linear skinning"), ("fdda", "  FDDA")):

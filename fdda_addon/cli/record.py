@@ -102,10 +102,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="record part K of N of the poses; all parts, joined by merge-recordings, are the recording of one run",
     )
     parser.add_argument(
-        "--influences-only", action="store_true", help="find which joints move what, once for all shards; no poses"
+        "--detect-influences", action="store_true", help="find which joints move what, once for all shards; no poses"
     )
     parser.add_argument(
-        "--influences", metavar="FOLDER", type=Path, help="take them from what --influences-only made of the same rig"
+        "--influences", metavar="FOLDER", type=Path, help="take them from what --detect-influences made of the same rig"
     )
     add_target(parser)
     add_repeatability(parser)
@@ -155,7 +155,7 @@ def run(options: argparse.Namespace) -> None:
         options.control,
         options.fit_linear,
         options.shard,
-        options.influences_only,
+        options.detect_influences,
         options.influences,
         options.target,
     )
@@ -164,8 +164,10 @@ def run(options: argparse.Namespace) -> None:
             "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --sample, "
             "--control, --fit-linear, --shard, --influences and --target out."
         )
-    if options.influences_only and (options.shard or options.influences):
-        raise WrongUsageError("--influences-only finds influences for all shards; leave --shard and --influences out.")
+    if options.detect_influences and (options.shard or options.influences):
+        raise WrongUsageError(
+            "--detect-influences finds influences for all shards; leave --shard and --influences out."
+        )
     if options.refine and (options.all or len(options.object) > 1):
         raise WrongUsageError("--refine takes one mesh; give --object NAME once, and the recording and model of it.")
     if options.all and options.object:
@@ -194,7 +196,7 @@ def run(options: argparse.Namespace) -> None:
                     print(line)
             if repeatability := read_info(index).repeatability:
                 print(repeatability.sentence())
-        done = "influences" if options.influences_only else f"{step.total} poses{' added' if options.refine else ''}"
+        done = "influences" if options.detect_influences else f"{step.total} poses{' added' if options.refine else ''}"
         print(f"{recording}: {done} in {seconds:.1f} s")
 
 
@@ -236,7 +238,7 @@ def _steps(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> 
         strips=tuple(options.strip),
         mirror=options.mirror,
         shard=options.shard,
-        influences_only=options.influences_only,
+        detect_influences=options.detect_influences,
         influences=options.influences,
         target=target_settings(options),
         **given,

@@ -51,7 +51,7 @@ class EvaluationSettings:
         poses: number of random held-out poses; with 0 of them the first action or strip stands in their place.
         seed: of the random poses.
         actions, strips: names of actions, and of strips of the NLA, whose frames are compared as well.
-        beyond: factors by which the range of motion is widened for further poses, a quarter as many for each.
+        range_scales: factors by which the range of motion is widened for further poses, a quarter as many for each.
         named: poses that are compared as well, each on its own.
         surface: compare normals and edges too, which takes longer than all else.
         target: what the model and linear skinning are compared with; the rig itself where it names none.
@@ -60,7 +60,7 @@ class EvaluationSettings:
     poses: int = EVALUATION_POSES
     seed: int = EVALUATION_SEED
     actions: tuple[str, ...] = ()
-    beyond: tuple[float, ...] = ()
+    range_scales: tuple[float, ...] = ()
     named: tuple[NamedPose, ...] = ()
     surface: bool = True
     strips: tuple[str, ...] = ()
@@ -107,8 +107,8 @@ class Evaluation:
     Attributes:
         partitions: of the rig. joints: names by joint index.
         held_out: errors of the random poses, or of the first action or strip where there are none.
-        actions, beyond, named: errors of the actions and strips, of the poses beyond the range of motion by factor,
-            and of the poses given by hand.
+        actions, scaled_ranges, named: errors of the actions and strips, of the random poses by scale of the range of
+            motion, and of the poses given by hand.
         channels: that the random poses were drawn from.
     """
 
@@ -116,7 +116,7 @@ class Evaluation:
     joints: tuple[str, ...]
     held_out: PoseErrors
     actions: list[PoseErrors] = field(default_factory=list)
-    beyond: list[PoseErrors] = field(default_factory=list)
+    scaled_ranges: list[PoseErrors] = field(default_factory=list)
     named: list[PoseErrors] = field(default_factory=list)
     channels: tuple[Channel, ...] = ()
 
@@ -146,7 +146,7 @@ class Evaluation:
                 for partition in self.partitions
             ],
             "actions": [errors.to_json() for errors in self.actions],
-            "beyond": [errors.to_json() for errors in self.beyond],
+            "scaled_ranges": [errors.to_json() for errors in self.scaled_ranges],
             "named": [errors.to_json() for errors in self.named],
             **surface_json(self.held_out.fdda_surface, self.held_out.linear_surface),
         }
@@ -170,14 +170,14 @@ def evaluate(
     clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips)
     if not settings.poses and not clips:
         raise RigError("There is nothing to evaluate: 0 poses and no action; give --poses or --action.")
-    random = settings.poses or len(settings.beyond) or len(settings.named)
+    random = settings.poses or len(settings.range_scales) or len(settings.named)
     approach = make_approach(scene_rig, settings.target, clips, random)
     network, skinning = _prepare(scene_rig, model, is_own=not settings.target.name)
     rig = skinning.rig
     # A rig that is posed by actions alone may have nothing to sample.
-    channels = model_channels(scene_rig, rig, network.info) if settings.poses or settings.beyond else ()
+    channels = model_channels(scene_rig, rig, network.info) if settings.poses or settings.range_scales else ()
     extra = max(1, settings.poses // 4)
-    total = settings.poses + extra * len(settings.beyond) + len(settings.named)
+    total = settings.poses + extra * len(settings.range_scales) + len(settings.named)
     total += sum(len(clip.frames) for clip in clips)
     with ExitStack() as borrowed:
         if approach.target:
@@ -190,11 +190,11 @@ def evaluate(
         if settings.poses:
             poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses, approach)
             held_out = yield from comparison.compare("held-out poses", poses)
-        beyond = []
-        for number, factor in enumerate(settings.beyond, 1):
+        scaled_ranges = []
+        for number, factor in enumerate(settings.range_scales, 1):
             first = HELD_OUT_INDEX * (1 + number)
             poses = _random_poses(scene_rig, beyond_range(channels, factor), settings.seed, first, extra, approach)
-            beyond.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
+            scaled_ranges.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
         named = []
         for pose in settings.named:
             named.append((yield from comparison.compare(pose.name, _named_pose(scene_rig, pose, approach))))
@@ -202,7 +202,9 @@ def evaluate(
         for clip in clips:
             frames = approach.frames(player, clip, range(len(clip.frames)))
             actions.append((yield from comparison.compare(clip.title, frames)))
-    yield Evaluation(skinning.partitions, rig.joint_names, held_out or actions[0], actions, beyond, named, channels)
+    yield Evaluation(
+        skinning.partitions, rig.joint_names, held_out or actions[0], actions, scaled_ranges, named, channels
+    )
 
 
 def evaluate_action(

@@ -89,5 +89,5 @@ def check_found_for(path: Path, rig: Rig, info: RecordingInfo) -> None:
     if different:
         raise RecordingError(
             f"The influences in '{path}' are not those of this recording: {'; '.join(different)}. Find them with the "
-            "same rig and options (record --influences-only)."
+            "same rig and options (record --detect-influences)."
         )

@@ -46,8 +46,8 @@ class RecordingSettings:
         controls: which numbers are inputs and are sampled beside those that are found, as `stated_controls` reads it.
         min_partition_vertices: partitions of fewer vertices are merged into others; 0 merges none.
         shard: record this part of the poses, its number from 1 and how many parts there are; None for all.
-        influences_only: find what a recording needs before its first pose, and record none.
-        influences: folder with what `influences_only` found, of the same rig and settings; found anew when left out.
+        detect_influences: find what a recording needs before its first pose, and record none.
+        influences: folder with what `detect_influences` found, of the same rig and settings; found anew when left out.
             Where several meshes are recorded, it has a folder of the same name for each.
         target: whose surface is recorded.
     """
@@ -67,7 +67,7 @@ class RecordingSettings:
     strips: tuple[str, ...] = ()
     mirror: bool = False
     shard: tuple[int, int] | None = None
-    influences_only: bool = False
+    detect_influences: bool = False
     influences: Path | None = None
     target: TargetSettings = OWN_SURFACE
     overwrite: bool = False

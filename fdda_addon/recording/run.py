@@ -143,7 +143,7 @@ def _known(path: Path, settings: RecordingSettings, is_one_of_several: bool) -> 
 
 def _wanted(settings: RecordingSettings, total: int) -> range:
     """Numbers of the poses to record."""
-    if settings.influences_only:
+    if settings.detect_influences:
         return range(0)
     return shard_poses(*settings.shard, total) if settings.shard else range(total)
 
@@ -201,7 +201,7 @@ def _find_influences(
     if known and known != mesh.planned.path:
         raise RecordingError(
             f"The influences in '{known}' are of other partitions than those of '{mesh.name}'; find them with the same "
-            "rig and options (record --influences-only)."
+            "rig and options (record --detect-influences)."
         )
     cut = merged_partitions(mesh.rig, settings.min_partition_vertices)
     target = mesh.planned.target
@@ -245,7 +245,7 @@ def _info(mesh: Found, settings: RecordingSettings, plan: PosePlan, wanted: rang
     planned = mesh.fitted.planned
     sampling = planned_sampling(planned.scene_rig, settings, planned.limits)
     file, version = Path(bpy.data.filepath).name, bpy.app.version_string
-    is_part = settings.shard is not None or settings.influences_only
+    is_part = settings.shard is not None or settings.detect_influences
     shard = Shard(wanted.start, plan.total) if is_part else None
     info = RecordingInfo(len(wanted), 0, file, planned.name, version, sampling, mesh.fitted.fit, shard)
     if planned.known and planned.known != planned.path:

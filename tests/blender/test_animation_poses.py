@@ -257,7 +257,7 @@ def test_the_first_action_stands_in_place_of_held_out_poses(trained, tmp_path, c
     assert report["fdda"] == report["actions"][0]["fdda"] and report["fdda"]["mean"] < report["linear"]["mean"] / 2
     assert report["actions"][1]["poses"] == FRAMES and report["actions"][1]["linear"] != report["linear"]
     assert table.count(f"{WAVE}, {FRAMES} poses") == 1 and "swing" in table
-    for wrong in ((), ("--action", WAVE, "--beyond", 2)):
+    for wrong in ((), ("--action", WAVE, "--range-scale", 2)):
         assert run("evaluate", *files, "--poses", 0, *wrong) == 2
         assert "With --poses 0 only actions and strips are compared; give --action" in capsys.readouterr().err
 

@@ -31,7 +31,7 @@ def before(disarranged) -> dict:
 
 
 RECORDING = RecordingSettings(poses=8, actions=("elbow_wave",))
-EVALUATION = EvaluationSettings(poses=8, actions=("elbow_wave",), beyond=(2.0,))
+EVALUATION = EvaluationSettings(poses=8, actions=("elbow_wave",), range_scales=(2.0,))
 
 
 def test_a_disarranged_scene_is_not_at_rest(disarranged, before):

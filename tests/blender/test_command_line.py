@@ -52,7 +52,7 @@ def test_help(arguments, capfd):
         ["bind", "a.blend", "m.onnx"],
         ["evaluate", "a.blend", "m.onnx"],
         ["evaluate", "a.blend", "m.onnx", "--json", "e.json", "--poses", "0"],
-        ["evaluate", "a.blend", "m.onnx", "--json", "e.json", "--beyond", "0"],
+        ["evaluate", "a.blend", "m.onnx", "--json", "e.json", "--range-scale", "0"],
         ["benchmark", "a.blend", "m.onnx", "--json", "b.json", "--frames", "0"],
         ["train"],
         ["train", "recording", "m.onnx", "--activation", "step"],

@@ -37,7 +37,7 @@ STATISTICS = ["mean", "rms", "p99", "p999", "max"]
 def report(elbow, tmp_path_factory) -> dict:
     """What `evaluate --json` writes, with everything it can compare."""
     path = tmp_path_factory.mktemp("evaluation") / "e.json"
-    options = ["--poses", 12, "--seed", 3, "--action", "elbow_wave", "--beyond", 1.5, "--beyond", 2]
+    options = ["--poses", 12, "--seed", 3, "--action", "elbow_wave", "--range-scale", 1.5, "--range-scale", 2]
     assert run("evaluate", elbow.rig, elbow.model, "--json", path, *options) == 0
     return json.loads(path.read_text())
 
@@ -45,7 +45,7 @@ def report(elbow, tmp_path_factory) -> dict:
 def test_keys(report):
     assert list(report) == [
         *("unit", "poses", "vertices", "fdda", "linear", "partitions"),
-        *("actions", "beyond", "named", "normals", "edges"),
+        *("actions", "scaled_ranges", "named", "normals", "edges"),
     ]
     assert (report["unit"], report["poses"], report["vertices"]) == ("mm", 12, 300)
     assert list(report["fdda"]) == list(report["linear"]) == STATISTICS
@@ -55,7 +55,10 @@ def test_keys(report):
     assert [p["joint"] for p in report["partitions"]] == ["upper", "lower"]
     assert sum(p["vertices"] for p in report["partitions"]) == 300
     assert [(e["name"], e["poses"]) for e in report["actions"]] == [("elbow_wave", 30)]
-    assert [(e["name"], e["poses"]) for e in report["beyond"]] == [("1.5 times the range", 3), ("2 times the range", 3)]
+    assert [(e["name"], e["poses"]) for e in report["scaled_ranges"]] == [
+        ("1.5 times the range", 3),
+        ("2 times the range", 3),
+    ]
     assert report["named"] == []
 
 

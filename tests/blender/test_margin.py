@@ -170,7 +170,7 @@ def test_a_model_knows_what_lies_beyond(tmp_path):
         recording, model, out = tmp_path / margin, tmp_path / f"{margin}.onnx", tmp_path / f"{margin}.json"
         assert run("record", rig, recording, "--poses", 200, "--margin", margin) == 0
         train(recording, model, "--epochs", 60)
-        assert run("evaluate", rig, model, "--json", out, "--poses", 40, "--beyond", 2) == 0
+        assert run("evaluate", rig, model, "--json", out, "--poses", 40, "--range-scale", 2) == 0
         errors[margin] = _errors(out)
     assert errors["2"][1] < errors["1"][1] / 2
     assert errors["2"][0] < 1.5 * errors["1"][0]
@@ -179,4 +179,4 @@ def test_a_model_knows_what_lies_beyond(tmp_path):
 def _errors(path: Path) -> tuple[float, float]:
     """Mean error inside the range of motion, and at twice the range, mm."""
     found = json.loads(path.read_text())
-    return found["fdda"]["mean"], found["beyond"][0]["fdda"]["mean"]
+    return found["fdda"]["mean"], found["scaled_ranges"][0]["fdda"]["mean"]

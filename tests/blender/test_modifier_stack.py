@@ -86,7 +86,7 @@ def test_what_makes_vertices_after_the_rig_works_on_what_the_model_gives(loose_m
 
 
 def test_an_evaluation_borrows_what_is_live(rig, elbow):
-    settings = EvaluationSettings(poses=3, beyond=())
+    settings = EvaluationSettings(poses=3, range_scales=())
     errors = drain(evaluate(rig, elbow.model, settings)).fdda
     rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     before = scene_state(rig)

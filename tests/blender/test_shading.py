@@ -71,7 +71,7 @@ def test_faces_of_a_rig_are_those_of_its_mesh(rig):
 @pytest.fixture
 def report(elbow, tmp_path) -> dict:
     path = tmp_path / "e.json"
-    options = ["--poses", 24, "--seed", 3, "--action", "elbow_wave", "--beyond", 2]
+    options = ["--poses", 24, "--seed", 3, "--action", "elbow_wave", "--range-scale", 2]
     assert run("evaluate", elbow.rig, elbow.model, "--json", path, *options) == 0
     return json.loads(path.read_text())
 
@@ -110,7 +110,7 @@ def test_figures_of_an_evaluation_are_what_blender_s_normals_and_edges_give(repo
 
 
 def test_the_model_shades_better_than_linear_skinning_everywhere_it_was_compared(report):
-    for values in (report, *report["actions"], *report["beyond"]):
+    for values in (report, *report["actions"], *report["scaled_ranges"]):
         normals, edges = values["normals"], values["edges"]
         assert list(normals) == list(edges) == ["fdda", "linear"]
         for way in ("fdda", "linear"):

@@ -69,7 +69,7 @@ def test_shards_are_the_recording_of_one_run(tmp_path, case, count):
     rig = saved(build, tmp_path / "rig.blend")
     drain(record(opened(rig), tmp_path / "whole", settings))
     found = tmp_path / "found"
-    drain(record(opened(rig), found, replace(settings, influences_only=True)))
+    drain(record(opened(rig), found, replace(settings, detect_influences=True)))
     shards = [tmp_path / f"shard{number}" for number in range(1, count + 1)]
     # The last first: what a machine recorded before does not matter.
     for number in range(count, 0, -1):
@@ -109,7 +109,7 @@ def test_shards_of_several_meshes(tmp_path, alone):
 
     settings = RecordingSettings(poses=10, actions=("elbow_wave",), influence_poses=2)
     whole = recorded("whole", settings)
-    found = recorded("found", replace(settings, influences_only=True))
+    found = recorded("found", replace(settings, detect_influences=True))
     own = replace(settings, influences=found)
     shards = [recorded(str(number), replace(own, shard=(number, 4))) for number in range(1, 5)]
     drain(merge_recordings(shards, tmp_path / "merged"))
@@ -142,7 +142,7 @@ def test_the_verbs(elbow, tmp_path, capfd):
     options = ("--poses", 10, "--action", "elbow_wave")
     assert run("record", elbow.rig, tmp_path / "whole", *options) == 0
     for _ in range(2):
-        assert run("record", elbow.rig, tmp_path / "found", *options, "--influences-only", "--resume") == 0
+        assert run("record", elbow.rig, tmp_path / "found", *options, "--detect-influences", "--resume") == 0
     for number in (1, 2):
         own = ("--shard", f"{number}/2", "--influences", tmp_path / "found", "--resume")
         assert run("record", elbow.rig, tmp_path / f"s{number}", *options, *own) == 0
@@ -158,14 +158,14 @@ def test_options_of_shards_that_make_no_sense(elbow, tmp_path, capfd):
     for shard in ("0/2", "3/2", "1", "a/b", "1/2/3", "-1/2", "1/100001"):
         assert run("record", elbow.rig, tmp_path / "r", f"--shard={shard}") == 2
         assert "a shard is K/N, part K of N" in capfd.readouterr().err
-    assert run("record", elbow.rig, tmp_path / "r", "--influences-only", "--shard", "1/2") == 2
+    assert run("record", elbow.rig, tmp_path / "r", "--detect-influences", "--shard", "1/2") == 2
     assert "leave --shard and --influences out" in capfd.readouterr().err
 
 
 def test_influences_of_something_else_are_refused(elbow, tmp_path, capfd):
     refusal = Refusal(tmp_path, capfd)
     found = tmp_path / "found"
-    assert run("record", elbow.rig, found, "--poses", 10, "--influences-only") == 0
+    assert run("record", elbow.rig, found, "--poses", 10, "--detect-influences") == 0
     of_shard = ("record", elbow.rig, tmp_path / "s", "--shard", "1/2", "--influences")
     text = refusal(*of_shard, found, "--poses", 11)
     assert "not those of this recording: they were found with other settings (sources, poses)." in text

@@ -40,9 +40,9 @@ def _check_repeatability(recording: Recording) -> list[RecordingWarning]:
         return []
     text = (
         f"The target is {repeatability.distance_mm['mean']:.2g} mm from itself when the same pose is reached from "
-        f"another direction, on average over {len(repeatability.poses)} poses, and linear skinning is {repeatability.linear_mm:.2g} mm "
-        "off: no model can be closer; hold poses for more frames or play actions slower, damp the simulation, or leave "
-        "folds to another mesh."
+        f"another direction, on average over {len(repeatability.poses)} poses, and linear skinning is "
+        f"{repeatability.linear_mm:.2g} mm off: no model can be closer; hold poses for more frames or play actions "
+        "slower, damp the simulation, or leave folds to another mesh."
     )
     return [RecordingWarning("hysteresis", text)]
 
