@@ -33,7 +33,7 @@ OBJECT = "object"
 MAX_BYTES = 768 << 20
 MAX_METADATA = 16 << 20  # letters
 CHECKSUM_KEY = "fdda_checksum"
-"""Metadata property with the SHA-256 of the graph; models of earlier versions have none."""
+"""Metadata property with the SHA-256 of the graph."""
 
 
 @dataclass(frozen=True)
@@ -269,7 +269,7 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
         check_graph(contents, info.explained(), len(data), outputs)
     except ValueError as error:
         raise ModelError(f"The model '{name}' is refused: {error}; give one that train made.") from error
-    if contents.metadata.get(CHECKSUM_KEY, contents.checksum) != contents.checksum:
+    if contents.metadata.get(CHECKSUM_KEY) != contents.checksum:
         raise ModelError(f"The model '{name}' is damaged: its checksum is not that of its weights; copy it again.")
     return info
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What it takes to run a graph, found without running it: the shapes of all its values, node by node.
 
-`RULES` is the list of the operators that a model may have: those that `train` writes, now and in earlier versions. An
-exporter that needs another adds it here, with the rule of its shape (https://onnx.ai/onnx/operators/).
+`RULES` is the list of the operators that a model may have: those that `train` writes. An exporter that needs
+another adds it here, with the rule of its shape (https://onnx.ai/onnx/operators/).
 """
 
 import math

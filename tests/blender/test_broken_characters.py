@@ -12,6 +12,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from fdda_addon.core.model import CHECKSUM_KEY, CONTROLS_INPUT, METADATA_KEY
+from fdda_addon.core.onnx_file import read_onnx
 from fdda_addon.runtime import playback
 from fdda_addon.runtime.binding import bind
 from fdda_addon.runtime.live_binding import LiveBinding
@@ -86,13 +87,13 @@ def with_control(model: Path, owner: str, path: str) -> Path:
     """A model beside another that has a control, which moves nothing."""
     loaded, changed = onnx.load(model), model.with_name("controlled.onnx")
     loaded.graph.input.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", 1]))
-    for prop in list(loaded.metadata_props):
+    for prop in loaded.metadata_props:
         if prop.key == METADATA_KEY:
             info = json.loads(prop.value)
             info["controls"] = [{"owner": owner, "path": path, "low": 0.0, "high": 1.0}]
             prop.value = json.dumps(info)
         elif prop.key == CHECKSUM_KEY:
-            loaded.metadata_props.remove(prop)
+            prop.value = read_onnx(loaded.SerializeToString()).checksum
     onnx.save(loaded, changed)
     return changed
 

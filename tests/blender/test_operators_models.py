@@ -260,6 +260,7 @@ def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_pa
     import onnx
 
     from fdda_addon.core.model import CHECKSUM_KEY
+    from fdda_addon.core.onnx_file import read_onnx
     from fdda_addon.evaluation import last_evaluation
     from fdda_addon.models import model_list
 
@@ -274,7 +275,7 @@ def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_pa
     node.output[0] = "before"
     model.graph.node.append(onnx.helper.make_node("Add", ["before", "before"], ["positions"]))
     (checksum,) = (prop for prop in model.metadata_props if prop.key == CHECKSUM_KEY)
-    model.metadata_props.remove(checksum)
+    checksum.value = read_onnx(model.SerializeToString()).checksum
     onnx.save(model, path)
     model_list.remember(bound, path)
     bpy.context.view_layer.update()

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """ONNX models of three joints and four vertices, as good or as bad as a test wants them."""
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from fdda_addon.core.model import METADATA_KEY, ModelInfo, ModelPartition
+from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY, ModelInfo, ModelPartition
+from fdda_addon.core.onnx_file import read_onnx
 from fdda_addon.core.rig import Fingerprint, Joint
 
 J, V = 3, 4
@@ -69,6 +71,9 @@ def tiny_model(metadata: str | None = "", nodes=(), initializers=(), inputs=(), 
         sparse_initializer=list(sparse),
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    # Some are refused before their checksum is compared.
+    with suppress(ValueError):
+        model.metadata_props.add(key=CHECKSUM_KEY, value=read_onnx(model.SerializeToString()).checksum)
     if metadata is not None:
         model.metadata_props.add(key=METADATA_KEY, value=metadata or tiny_info().to_json())
     return model

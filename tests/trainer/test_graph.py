@@ -3,7 +3,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -14,7 +13,6 @@ from fdda_addon.core.model import read_model_info
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.skinning import LinearSkinning
-from fdda_addon.runtime.network import Network
 from trainer import network_nodes, playback_nodes
 from trainer.__main__ import main
 from trainer.deformation import Deformation, is_sheared
@@ -24,7 +22,6 @@ from trainer.graph import build_graph
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain, rotation
 from .conftest import QUICK
 
-OLD_MODELS = Path(__file__).with_name("old_models")
 SHEAR = np.eye(4)
 SHEAR[0, 1] = 0.3
 
@@ -223,12 +220,3 @@ def test_constants_are_the_matrices_and_little_else(trained, deformation, report
     assert apart < 1.5 * 4 * (networks + matrices) + 16_000
     # Zeros beside the second matrix and beside the third.
     assert apart < together < apart + 2 * 4 * 6_000
-
-
-def test_a_model_of_the_first_version_still_plays():
-    network = Network(OLD_MODELS / "version_1.onnx")
-    assert network.info.constant_bytes == 0 and network.info.vertex_count == 90
-    poses = pose_chain(chain_rig(), chain_angles(2, 3, 7))
-    expected = np.load(OLD_MODELS / "positions.npy")
-    np.testing.assert_allclose(network.positions(poses), expected, atol=2e-6)
-    assert network.trust(poses).shape == (2, 3)

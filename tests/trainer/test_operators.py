@@ -8,7 +8,7 @@ import onnx
 import pytest
 
 from fdda_addon.core.errors import ModelError
-from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY, ModelInfo, check_model
+from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY, check_model
 from fdda_addon.core.model_graph import ROOM, SMALL
 from fdda_addon.core.onnx_file import read_onnx
 from fdda_addon.core.onnx_work import OPERATORS, measure_work
@@ -56,16 +56,6 @@ def test_weights_that_were_changed_are_noticed(trained):
     data[bytes(data).index(bytes(largest)) + len(largest) // 2] ^= 1
     with pytest.raises(ModelError, match="is damaged: its checksum is not that of its weights"):
         check_model(bytes(data), "m.onnx")
-
-
-def test_a_model_without_a_checksum_is_taken(trained):
-    """As those of earlier versions are."""
-    model = onnx.load_from_string((trained / "model.onnx").read_bytes())
-    (kept,) = (prop for prop in model.metadata_props if prop.key == METADATA_KEY)
-    assert {prop.key for prop in model.metadata_props} == {METADATA_KEY, CHECKSUM_KEY}
-    del model.metadata_props[:]
-    model.metadata_props.append(kept)
-    assert isinstance(check_model(model.SerializeToString(), "m.onnx"), ModelInfo)
 
 
 def test_a_larger_character_is_explained_by_its_numbers(trained):
