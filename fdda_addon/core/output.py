@@ -21,8 +21,8 @@ from .path_limits import check_path, is_windows, same_place
 TEMPORARY = ".fdda-"
 KEPT = "new-"
 """Begins the name of a file that could not take the place of another."""
-_LEFT_OVER = r"\.fdda-[0-9a-f]{12}(\..*)?|\.\d+-recording\.json"
-"""Names that `replacing` gives, and those that earlier versions gave to the index of a recording."""
+_LEFT_OVER = r"\.fdda-[0-9a-f]{12}(\..*)?"
+"""Names that `replacing` gives."""
 
 
 def check_outputs(

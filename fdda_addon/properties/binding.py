@@ -134,8 +134,6 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
         description="The modifiers of the rig are switched off and `modifiers` says how they were", override=OVERRIDABLE
     )
     modifiers: CollectionProperty(type=FDDA_PG_modifier, override=INSERTABLE)
-    show_only_shape_key: BoolProperty(override=OVERRIDABLE)
-    active_shape_key_index: IntProperty(override=OVERRIDABLE)
 
     models: CollectionProperty(type=FDDA_PG_model, override=INSERTABLE)
     model_index: IntProperty(

@@ -16,7 +16,7 @@ from ..core.errors import RigError
 from ..scene.node_groups import Effect, effect, time_node
 from ..scene.scene_rig import MODIFIER_NAME, SceneRig, armature_modifier
 
-PLAYBACK_KEY = "fdda_version"
+PLAYBACK_KEY = "fdda_playback"
 """Custom property of the node group that plays a model."""
 
 DEFORMING = {

@@ -12,7 +12,6 @@ from ..scene.compatibility import node_input, set_node_input
 from ..scene.scene_rig import MODIFIER_NAME
 
 GROUP_NAME = "FDDA Playback"
-GROUP_VERSION = 2
 
 
 def add_modifier(mesh_object: bpy.types.Object, place: int) -> bpy.types.NodesModifier:
@@ -78,25 +77,16 @@ def _cache_socket(group: bpy.types.NodeTree) -> str:
     raise KeyError(f"the node group '{group.name}' has no input for the positions")
 
 
-def update_group(modifier: bpy.types.NodesModifier) -> None:
-    """Give a modifier of this file the node group of this version; an older one goes with its last user."""
-    group = modifier.node_group
-    if group.library is None and group[PLAYBACK_KEY] != GROUP_VERSION:
-        modifier.node_group = _node_group()
-        if group.users == 0:
-            bpy.data.node_groups.remove(group)
-
-
 def _node_group() -> bpy.types.NodeTree:
     """Object Info → Sample Index → Set Position; one group serves all bindings of a file.
 
     Where the cache object is missing or has another number of vertices, the mesh stays as it is.
     """
     for group in bpy.data.node_groups:
-        if group.get(PLAYBACK_KEY) == GROUP_VERSION and group.library is None:
+        if PLAYBACK_KEY in group and group.library is None:
             return group
     group = bpy.data.node_groups.new(GROUP_NAME, "GeometryNodeTree")
-    group[PLAYBACK_KEY] = GROUP_VERSION
+    group[PLAYBACK_KEY] = True
     group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
     group.interface.new_socket("Positions", in_out="INPUT", socket_type="NodeSocketObject")
     group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")

@@ -358,7 +358,6 @@ def _find(mesh_object: bpy.types.Object, taken: set[int]) -> None:
         taken: session ids of the cache objects that others use; its own is added.
     """
     _bound[mesh_object.session_uid] = animated = switch.animated_switches(mesh_object)
-    switch.unpin_shape_keys(mesh_object)
     switch.follow_visibility(mesh_object, animated)
     if not animated and mesh_object.fdda.is_playing != switch.wants_model(mesh_object):
         # Linked or appended from a file, which holds the true rig; or a library was reloaded.
@@ -382,16 +381,12 @@ def _own_cache(mesh_object: bpy.types.Object, taken: set[int]) -> bpy.types.Obje
     modifier = nodes.find_modifier(mesh_object)
     if modifier is None:
         raise ModelError(f"The FDDA modifier of '{mesh_object.name}' was removed; bind the model again.")
-    nodes.update_group(modifier)
     cache = nodes.cache_of(modifier)
     is_own = cache is not None and caches.is_cache(cache) and cache.session_uid not in taken
     if not is_own or len(cache.data.vertices) != len(mesh_object.data.vertices):
-        # A duplicate still points to the positions of its original, an override to those of the linked object. Those
-        # in a file of an older version were saved.
-        former, cache = cache, caches.new_cache(mesh_object)
+        # A duplicate still points to the positions of its original, an override to those of the linked object.
+        cache = caches.new_cache(mesh_object)
         nodes.set_cache(modifier, cache)
-        if former is not None and not former.is_runtime_data and former not in nodes.used_caches():
-            caches.remove(former)
     taken.add(cache.session_uid)
     return cache
 

@@ -146,17 +146,6 @@ def give_back(mesh_object: bpy.types.Object) -> None:
         modifier.show_viewport = modifier.show_render = False
 
 
-def unpin_shape_keys(mesh_object: bpy.types.Object) -> None:
-    """Show the shape keys that an older version of the add-on hid while it played, in a file that was saved so."""
-    binding = mesh_object.fdda
-    if binding.is_property_set("active_shape_key_index"):
-        if binding.is_playing and mesh_object.data.shape_keys is not None:
-            mesh_object.show_only_shape_key = binding.show_only_shape_key
-            mesh_object.active_shape_key_index = binding.active_shape_key_index
-        for name in ("active_shape_key_index", "show_only_shape_key"):
-            binding.property_unset(name)
-
-
 def _store(mesh_object: bpy.types.Object) -> None:
     binding = mesh_object.fdda
     binding.modifiers.clear()
