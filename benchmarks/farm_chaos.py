@@ -54,7 +54,7 @@ output = "{output}/elbow"
 poses = 6000
 shards = 4
 actions = ["elbow_wave"]
-target_mm = 0.001
+goal_mm = 0.001
 rounds = 1
 refine_poses = 300
 [characters.arm]

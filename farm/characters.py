@@ -63,8 +63,8 @@ class Character:
             of `record`.
         shards: how many parts the poses are recorded in.
         train: settings of the training by name, as of `train`.
-        target_mm: what 99.9 % of the vertices of held-out poses are to be within; 0 for no target.
-        rounds: how often at most poses are added where the model is worst, while the target is missed.
+        goal_mm: what 99.9 % of the vertices of held-out poses are to be within; 0 for no goal.
+        rounds: how often at most poses are added where the model is worst, while the goal is missed.
         refine_poses: how many each time.
         evaluate_poses: held-out poses that the error is measured on.
         use_in_render: final renders use the model too.
@@ -88,7 +88,7 @@ class Character:
     min_partition_vertices: int | None = None
     shards: int = 4
     train: dict[str, Any] = field(default_factory=dict, hash=False)
-    target_mm: float = 0.0
+    goal_mm: float = 0.0
     rounds: int = 3
     refine_poses: int = 250
     evaluate_poses: int = 200
@@ -175,9 +175,9 @@ def _check_character(character: Character, place: str) -> None:
     if character.fit_linear not in ("", "hard", "smooth"):
         raise PlanError(f"{place}: fit_linear is hard or smooth, and not {character.fit_linear!r}.")
     for key, value in character.train.items():
-        if not SETTING.fullmatch(key) or key in ("messages", "warm_start", "target_mm"):
+        if not SETTING.fullmatch(key) or key in ("messages", "warm_start", "goal_mm"):
             raise PlanError(
-                f"{place}: train cannot have {key!r}; it takes settings of train, and target_mm stands beside it."
+                f"{place}: train cannot have {key!r}; it takes settings of train, and goal_mm stands beside it."
             )
         values = value if isinstance(value, list) else [value]
         if not values or not all(isinstance(one, int | float | str) for one in values):

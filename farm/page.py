@@ -58,7 +58,7 @@ def _head(report: dict) -> str:
     cards = [
         (f"{states.count('done')} of {len(states)}", "characters are done", ""),
         (str(states.count("failed")), "failed", "bad" if "failed" in states else ""),
-        (str(sum(_misses(own) for own in characters)), "done, and miss their target", ""),
+        (str(sum(_misses(own) for own in characters)), "done, and miss their goal", ""),
         (str(sum(own["ran_now"] for own in characters)), "tasks ran now, the others were up to date", ""),
         (duration_in_words(seconds).removeprefix("about "), "of processes, one after the other", ""),
         (f"{max((own['peak_mb'] for own in characters), default=0):,.0f} MB", "most memory of a process", ""),
@@ -71,7 +71,7 @@ def _head(report: dict) -> str:
 
 
 def _misses(own: dict) -> bool:
-    return any(own["target_mm"] and model["fdda"].get("p999", 0) > own["target_mm"] for model in own["models"])
+    return any(own["goal_mm"] and model["fdda"].get("p999", 0) > own["goal_mm"] for model in own["models"])
 
 
 def _failures(report: dict) -> str:
@@ -93,7 +93,7 @@ def _errors(report: dict) -> str:
             ("vertices", ""),
             *(
                 (text, "")
-                for text in ("mean", "p99.9", "max", "linear skinning: mean", "p99.9", "target p99.9", "rounds")
+                for text in ("mean", "p99.9", "max", "linear skinning: mean", "p99.9", "goal p99.9", "rounds")
             ),
             ("against the last run: mean", ""),
             ("p99.9", ""),
@@ -115,15 +115,15 @@ def _error_rows(name: str, own: dict) -> str:
     rows = []
     for model in own["models"]:
         shown = name if len(own["models"]) == 1 else f"{name}: {model['name']}"
-        fdda, linear, target = model["fdda"], model["linear"], own["target_mm"]
-        is_met = bool(target) and fdda.get("p999", 0) <= target
-        verdict = f'<td class="{"good" if is_met else "bad"}">{target:g} {"met" if is_met else "missed"}</td>'
+        fdda, linear, goal = model["fdda"], model["linear"], own["goal_mm"]
+        is_met = bool(goal) and fdda.get("p999", 0) <= goal
+        verdict = f'<td class="{"good" if is_met else "bad"}">{goal:g} {"met" if is_met else "missed"}</td>'
         last = before.get(model["name"], {}).get("fdda", {})
         cells = [
             f"<td>{model['vertices']:,}</td>",
             *(_mm(fdda.get(key)) for key in ("mean", "p999", "max")),
             *(_mm(linear.get(key)) for key in ("mean", "p999")),
-            verdict if target else NOTHING,
+            verdict if goal else NOTHING,
             f"<td>{model['round']} of {model['rounds'] - 1}</td>" if model["rounds"] > 1 else NOTHING,
             *(_change(fdda.get(key), last.get(key)) for key in ("mean", "p999")),
         ]

@@ -25,7 +25,7 @@ FAILURE = {"task": str, "state": str, "sentence": str}
 SUMMARY = {"state": str, "models": [MODEL], "seconds": {str: float}, "failures": [FAILURE]}
 CHARACTER = {
     **SUMMARY,
-    **{"rig": str, "output": str, "target_mm": float, "peak_mb": float, "hosts": [str], "tasks": int, "ran_now": int},
+    **{"rig": str, "output": str, "goal_mm": float, "peak_mb": float, "hosts": [str], "tasks": int, "ran_now": int},
     **{"key": str, "before": (SUMMARY, None)},
 }
 """What a report says of a character: lists of, dictionaries of, or one of several."""
@@ -83,7 +83,7 @@ def _character(character: Character, tasks: dict[str, Task], outcomes: dict[str,
         "rig": character.rig.name,
         "output": str(character.output),
         "failures": failures,
-        "target_mm": character.target_mm,
+        "goal_mm": character.goal_mm,
         "models": _models(tasks, bind, stamps[bind.name]) if is_bound else [],
         "seconds": {kind: round(sum(s.seconds for n, s in ran.items() if tasks[n].kind == kind), 1) for kind in KINDS},
         "peak_mb": max((stamp.peak_mb for stamp in ran.values()), default=0.0),
@@ -122,7 +122,7 @@ def _models(tasks: dict[str, Task], bind: Task, stamp: Stamp) -> list[dict]:
                 "vertices": _taken(errors.get("vertices"), int, 0),
                 "fdda": _errors(errors.get("fdda")),
                 "linear": _errors(errors.get("linear")),
-                "verdict": _taken(_taken(report.get("target"), dict, {}).get("verdict"), str, ""),
+                "verdict": _taken(_taken(report.get("goal"), dict, {}).get("verdict"), str, ""),
                 "warnings": [own["text"] for own in _taken(report.get("warnings"), [{"text": str}], [])],
             }
         )

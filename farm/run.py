@@ -112,8 +112,8 @@ def _skipped(tasks: dict[str, Task], task: Task) -> str:
     check_outputs(train, lambda name: name in REPORT)
     check_outputs(tasks[task.round.evaluate])
     reached = reached_mm(tasks[task.round.evaluate])
-    if reached <= task.round.target_mm:
-        return f"99.9 % of the vertices are within {reached:.3g} mm, and the target is {task.round.target_mm:g} mm."
+    if reached <= task.round.goal_mm:
+        return f"99.9 % of the vertices are within {reached:.3g} mm, and the goal is {task.round.goal_mm:g} mm."
     if _verdict(train) == EXHAUSTED:
         return f"More poses no longer help: 99.9 % of the vertices are within {reached:.3g} mm."
     return ""
@@ -132,9 +132,9 @@ def reached_mm(evaluate: Task) -> float:
 
 
 def _verdict(train: Task) -> object:
-    """Whether more poses would help, by the report of a training; None where it had no target."""
+    """Whether more poses would help, by the report of a training; None where it had no accuracy goal."""
     try:
-        return read_json(train.folder / REPORT[0]).get("target", {}).get("verdict")
+        return read_json(train.folder / REPORT[0]).get("goal", {}).get("verdict")
     except (OSError, AttributeError, ValueError) as error:
         raise _damaged(train, REPORT[0], error) from error
 

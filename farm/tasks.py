@@ -3,7 +3,7 @@
 
     influences → record 1 … N → merge → train 0 → evaluate 0 → refine 1 → train 1 → evaluate 1 → … → bind
 
-for each character; from train 0 on for each of its meshes. A round that is not needed, because the target is met, ends
+for each character; from train 0 on for each of its meshes. A round that is not needed, because the goal is met, ends
 at once. The graph is the same for every engine: a task is run by its name, wherever the plan and its files are.
 """
 
@@ -24,17 +24,17 @@ PICTURE_POSES = 20
 
 @dataclass(frozen=True)
 class Round:
-    """Whether a round is needed: it is not where the round before ended, or met the target.
+    """Whether a round is needed: it is not where the round before ended, or met the goal.
 
     Attributes:
         evaluate: name of the task that measured the model of the round before.
         train: name of the task that trained it, whose report says whether more poses help.
-        target_mm: what the error has to be within.
+        goal_mm: what the error has to be within.
     """
 
     evaluate: str
     train: str
-    target_mm: float
+    goal_mm: float
 
 
 @dataclass(frozen=True)
@@ -187,9 +187,9 @@ class _Tasks:
         if self._several:
             recording /= folder_of_mesh(mesh)
         source, refined, last = merge, (), None
-        for number in range(1 + (own.rounds if own.target_mm else 0)):
+        for number in range(1 + (own.rounds if own.goal_mm else 0)):
             if number:
-                condition = Round(before[1].name, before[0].name, own.target_mm)
+                condition = Round(before[1].name, before[0].name, own.goal_mm)
                 last = before[0].folder / model
                 verb = ("record", str(own.rig), RECORDING, "--resume", "--refine", str(last), *of_mesh)
                 options = ("--poses", str(own.refine_poses), "--seed", str(number))
@@ -266,7 +266,7 @@ class _Tasks:
 
 def _options(character: Character) -> tuple[str, ...]:
     """Options of `train`."""
-    options = ["--target-mm", repr(float(character.target_mm))] if character.target_mm else []
+    options = ["--goal-mm", repr(float(character.goal_mm))] if character.goal_mm else []
     for key, value in character.train.items():
         values = value if isinstance(value, list) else [value]
         options += [f"--{key.replace('_', '-')}", *([] if value is True else map(str, values))]

@@ -5,7 +5,7 @@ import argparse
 import math
 from dataclasses import asdict, dataclass, fields
 
-from fdda_addon.core.defaults import EPOCHS, TARGET_MM, TOLERANCE_MM
+from fdda_addon.core.defaults import EPOCHS, GOAL_MM, TOLERANCE_MM
 from fdda_addon.core.errors import TrainingError
 
 ACTIVATIONS = ("silu", "gelu", "tanh", "relu")
@@ -31,7 +31,7 @@ class TrainingConfig:
             themselves.
         validation_fraction: part of the poses that is kept from the training to choose the best weights.
         held_out_fraction: part of the poses that is kept from training and choice to measure the error on.
-        target_mm: what 99.9 % of the held-out vertices are to be within, 0 for no target.
+        goal_mm: what 99.9 % of the held-out vertices are to be within, 0 for no goal.
         patience: stop when no partition has improved for so many epochs; 0 trains to the end.
         include_unsettled: use poses in which the target did not come to rest as well.
     """
@@ -50,7 +50,7 @@ class TrainingConfig:
     averaging: float = 0.99
     validation_fraction: float = 0.05
     held_out_fraction: float = 0.1
-    target_mm: float = TARGET_MM
+    goal_mm: float = GOAL_MM
     patience: int = 0
     include_unsettled: bool = False
 
@@ -70,7 +70,7 @@ class TrainingConfig:
             "averaging": 0 <= self.averaging < 1,
             "validation_fraction": 0 < self.validation_fraction <= 0.4,
             "held_out_fraction": 0 < self.held_out_fraction <= 0.4,
-            "target_mm": self.target_mm >= 0,
+            "goal_mm": self.goal_mm >= 0,
             "patience": self.patience >= 0,
             "include_unsettled": isinstance(self.include_unsettled, bool),
         }
@@ -116,7 +116,7 @@ HELP = {
     "averaging": "how slowly the average of the weights moves, 0 for no average",
     "validation_fraction": "part of the poses that is kept from the training to choose the best weights",
     "held_out_fraction": "part of the poses that is kept from all of it to measure the error on",
-    "target_mm": "what 99.9 %% of the held-out vertices are to be within, in mm; 0 for no target",
+    "goal_mm": "what 99.9 %% of the held-out vertices are to be within, in mm; 0 for no goal",
     "patience": "stop after so many epochs without improvement, 0 for never",
     "include_unsettled": "use the poses in which the target did not come to rest as well",
 }

@@ -29,13 +29,13 @@ from .data import PreparedPartition, Split, held_back_digest, partitions_of, pre
 from .deformation import Deformation, is_sheared
 from .delta_fit import find_deltas
 from .export import build_model, measure, measure_surface, write_model
+from .goal import GoalResult, evaluate_goal
 from .inputs import Inputs, inputs_with_deltas
 from .loop import Trained, choose_device, train
 from .outputs import check_training_outputs, training_outputs
 from .page import render_html
 from .process import Cancelled
 from .sagging import without_needless_down
-from .target import Outcome, judge
 from .trust import make_trust_range
 from .turns import turns_help
 from .weights import LastWeights, initial_networks, read_weights, write_weights
@@ -151,11 +151,11 @@ def train_model(
     content["warnings"] = [warning.to_json() for warning in warnings]
     poses, p999 = len(recording.pose_matrices), exported.info.held_out_mm["p999"]
     history = [*(last.history if last else ()), {"poses": poses, "p999": p999}]
-    outcome = None
-    if config.target_mm:
+    goal_result = None
+    if config.goal_mm:
         training_p999 = content["fdda"]["training"]["p999"]
-        outcome = judge(config.target_mm, history, training_p999, recording_path, model_path)
-        content["target"] = outcome.to_json()
+        goal_result = evaluate_goal(config.goal_mm, history, training_p999, recording_path, model_path)
+        content["goal"] = goal_result.to_json()
     page = render_html(content)
     _check_stop(should_stop)
     # From here on nothing stops: the model and what lies beside it belong together.
@@ -164,7 +164,7 @@ def train_model(
         write_weights(weights, deformation, held_back, config.hidden, history)
         report_file.write_text(report_text(content), encoding="utf-8")
         page_file.write_text(page, encoding="utf-8", errors="backslashreplace")
-    _announce_end(announcer, model_path, content, outcome, time.perf_counter() - started)
+    _announce_end(announcer, model_path, content, goal_result, time.perf_counter() - started)
 
 
 def _check(recording: Recording, announcer: Announcer, strict: bool) -> list[RecordingWarning]:
@@ -182,7 +182,7 @@ def _check(recording: Recording, announcer: Announcer, strict: bool) -> list[Rec
 
 
 def _announce_end(
-    announcer: Announcer, model_path: Path, content: dict, outcome: Outcome | None, seconds: float
+    announcer: Announcer, model_path: Path, content: dict, goal_result: GoalResult | None, seconds: float
 ) -> None:
     for partition in content["partitions"]:
         announcer.say(
@@ -191,8 +191,8 @@ def _announce_end(
             basis=partition["basis"],
             held_out_mm=partition["held_out"]["mean"],
         )
-    if outcome:
-        announcer.say(MessageType.LOG, text=outcome.text)
+    if goal_result:
+        announcer.say(MessageType.LOG, text=goal_result.text)
     held_out = content["fdda"]["held_out"]
     announcer.say(
         MessageType.FINISHED,
@@ -200,7 +200,7 @@ def _announce_end(
         seconds=round(seconds, 2),
         held_out_mm=held_out["mean"],
         held_out_p999_mm=held_out["p999"],
-        **({"verdict": outcome.verdict.value} if outcome else {}),
+        **({"verdict": goal_result.verdict.value} if goal_result else {}),
     )
 
 

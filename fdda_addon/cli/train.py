@@ -2,7 +2,7 @@
 """`train RECORDING MODEL.onnx …`: the trainer with its own options, started in the Python that has torch.
 
 RECORDING may be a folder of recordings, and MODEL.onnx is then the folder of their models. With `--refine RIG.blend` it
-goes on by itself: while the target is missed and more poses help, it adds poses to the recording where the model is
+goes on by itself: while the goal is missed and more poses help, it adds poses to the recording where the model is
 worst, and trains on.
 """
 
@@ -23,7 +23,7 @@ from .progress import ProgressPrinter
 if TYPE_CHECKING:
     from ..scene.scene_rig import SceneRig
 
-WARM_START, TARGET = "--warm-start", "--target-mm"
+WARM_START, GOAL = "--warm-start", "--goal-mm"
 MAX_ROUNDS = 20
 
 
@@ -41,12 +41,12 @@ def run(arguments: list[str]) -> int:
         if options.object or options.poses is not None:
             raise WrongUsageError("--object and --poses say how to refine; give --refine RIG.blend with them.")
         return _train(own)[0]
-    return _train_to_target(own, options)
+    return _train_to_goal(own, options)
 
 
 def _refinement_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("train", usage=argparse.SUPPRESS, add_help=False, allow_abbrev=False)
-    group = parser.add_argument_group("until the target is met, with --target-mm")
+    group = parser.add_argument_group("until the accuracy goal is met, with --goal-mm")
     group.add_argument(
         "--refine", metavar="RIG.blend", type=Path, help="add poses of this rig where the model is worst, and train on"
     )
@@ -87,12 +87,12 @@ def _line(values: dict) -> str:
     return f"{values['model']}: trained in {values['seconds']:.1f} s, held-out error {values['held_out_mm']:.4f} mm"
 
 
-def _train_to_target(arguments: list[str], options: argparse.Namespace) -> int:
+def _train_to_goal(arguments: list[str], options: argparse.Namespace) -> int:
     """Train, and refine the recording, in turn."""
     if len(arguments) < 2 or any(argument.startswith("-") for argument in arguments[:2]):
         raise WrongUsageError("With --refine, give RECORDING and MODEL.onnx before the training settings.")
-    if not any(argument.partition("=")[0] == TARGET for argument in arguments):
-        raise WrongUsageError(f"--refine trains until a target is met; say which with {TARGET}.")
+    if not any(argument.partition("=")[0] == GOAL for argument in arguments):
+        raise WrongUsageError(f"--refine trains until an accuracy goal is met; say which with {GOAL}.")
     recording, model = map(Path, arguments[:2])
     if recordings_in(recording):
         raise WrongUsageError(
@@ -112,7 +112,7 @@ def _train_to_target(arguments: list[str], options: argparse.Namespace) -> int:
             status, values = _train([*arguments, *warm])
             if status or values.get("verdict") != Verdict.MISSED.value:
                 return status
-    print(f"The target is not met after {MAX_ROUNDS} rounds; run the command again with {WARM_START} to go on.")
+    print(f"The goal is not met after {MAX_ROUNDS} rounds; run the command again with {WARM_START} to go on.")
     return 0
 
 

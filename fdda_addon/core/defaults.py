@@ -23,8 +23,8 @@ REPEATABILITY_POSES = 10
 TOLERANCE_MM = 0.04
 """What the basis shapes may leave, over the whole mesh."""
 EPOCHS = 200
-TARGET_MM = 0.0
-"""What 99.9 % of the held-out vertices are to be within; 0 for no target."""
+GOAL_MM = 0.0
+"""What 99.9 % of the held-out vertices are to be within; 0 for no goal."""
 
 EVALUATION_POSES, SIDEBAR_EVALUATION_POSES = 200, 100
 """Random poses that a model is compared on; fewer where a user waits for them."""

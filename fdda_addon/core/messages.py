@@ -35,7 +35,7 @@ class MessageType(enum.Enum):
     """As `FINISHED`, of one of several models that are trained in turn: each has its own `STARTED` before it."""
     FINISHED = "finished"
     """model: str (path), seconds: float, held_out_mm and held_out_p999_mm: float (mean and percentile 99.9);
-    verdict: str, "met", "missed" or "exhausted", where there is a target. Of several models: model is their folder, the
+    verdict: str, "met", "missed" or "exhausted", where there is a goal. Of several models: model is their folder, the
     errors are the largest of them, models: int. Of a fit of skin weights: seconds: float,
     fit: dict (`SkinFit.to_json`)."""
     CANCELLED = "cancelled"

@@ -22,7 +22,7 @@ MOST = 1e300
 
 
 class Verdict(enum.Enum):
-    """What a training says of its target."""
+    """How a training meets its accuracy goal."""
 
     MET = "met"
     MISSED = "missed"
@@ -86,7 +86,7 @@ _REPORT = {
     "partitions": [_PARTITION],
     "warnings?": [{"name": str, "text": str}],
     "repeatability?": {"poses": [int], "distance_mm": _ERRORS, "linear_mm": float},
-    "target?": {"target": float, "p999": float, "verdict": Verdict},
+    "goal?": {"goal": float, "p999": float, "verdict": Verdict},
 }
 """Keys and the kinds of their values; `?` ends one that may be missing, and further keys may come."""
 

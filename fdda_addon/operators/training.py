@@ -70,8 +70,8 @@ class TrainsModels(OnRig):
         settings = mesh_object.fdda.settings
         arguments = [str(recording), str(model), "--seed", str(settings.training_seed)]
         arguments += ["--tolerance-mm", f"{settings.tolerance_mm:.6g}", "--epochs", str(settings.epochs)]
-        if settings.target_mm:
-            arguments += ["--target-mm", f"{settings.target_mm:.6g}"]
+        if settings.goal_mm:
+            arguments += ["--goal-mm", f"{settings.goal_mm:.6g}"]
         if warm_start:
             arguments += ["--warm-start"]
         return Training(arguments) if bpy.app.background else LastingTraining(arguments, model)

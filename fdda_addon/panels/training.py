@@ -100,7 +100,7 @@ def _draw_settings(
     column = layout.column()
     column.use_property_split = True
     column.use_property_decorate = False
-    for name in ("target_mm", "tolerance_mm", "epochs", "training_seed"):
+    for name in ("goal_mm", "tolerance_mm", "epochs", "training_seed"):
         column.prop(settings, name)
     draw_path(layout, settings, "model")
     content = shown_content(rig)
@@ -140,8 +140,8 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     report = _report(report_path(model))
     if report is None or report["model"] != model.name:
         return
-    if target := report.get("target"):
-        draw_sentence(layout, context, *_target(target))
+    if goal := report.get("goal"):
+        draw_sentence(layout, context, *_goal(goal))
     for warning in report.get("warnings", ()):
         draw_sentence(layout, context, f"Warning: {warning['name']}; the report says what to do.", "INFO")
     everything = report["fdda"]["held_out"]
@@ -177,14 +177,14 @@ def _columns(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
     return columns
 
 
-def _target(target: dict) -> tuple[str, str]:
-    """A sentence and an icon for what the report says of the target."""
-    reached = f"99.9 % within {target['p999']:.2f} mm, target {target['target']:g} mm"
+def _goal(goal: dict) -> tuple[str, str]:
+    """A sentence and an icon for what the report says of the accuracy goal."""
+    reached = f"99.9 % within {goal['p999']:.2f} mm, goal {goal['goal']:g} mm"
     return {
         Verdict.MET: (f"{reached}: met.", "CHECKMARK"),
         Verdict.MISSED: (f"{reached}: missed. Add poses where the model is worst, and train on.", "INFO"),
         Verdict.EXHAUSTED: (f"{reached}: missed, and more poses no longer help.", "INFO"),
-    }[Verdict(target["verdict"])]
+    }[Verdict(goal["verdict"])]
 
 
 def _report(path: Path) -> dict | None:

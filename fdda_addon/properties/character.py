@@ -18,7 +18,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..core.defaults import EPOCHS, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD, TARGET_MM, TOLERANCE_MM
+from ..core.defaults import EPOCHS, GOAL_MM, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD, TOLERANCE_MM
 from ..core.errors import OutputError
 from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import resolved
@@ -162,10 +162,10 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
         precision=3,
         step=1,
     )
-    target_mm: FloatProperty(
+    goal_mm: FloatProperty(
         name="Target (mm)",
-        description="What 99.9 % of the held-out vertices are to be within; 0 for no target",
-        default=TARGET_MM,
+        description="What 99.9 % of the held-out vertices are to be within; 0 for no goal",
+        default=GOAL_MM,
         min=0.0,
         soft_max=10.0,
         precision=2,

@@ -318,7 +318,7 @@ class TestTraining:
 
     def test_more_poses_where_the_model_is_worst_and_training_on(self, saved, elbow, tmp_path):
         settings = saved.mesh_object.fdda.settings
-        settings.poses, settings.epochs, settings.target_mm = 40, 4, 0.001
+        settings.poses, settings.epochs, settings.goal_mm = 40, 4, 0.001
         assert bpy.ops.fdda.record() == {"FINISHED"}
         with pytest.raises(RuntimeError, match="There are no last weights"):
             bpy.ops.fdda.train(warm_start=True)
@@ -336,8 +336,8 @@ class TestTraining:
         model = model_file(saved.mesh_object)
         assert read_model_info(model).training["warm_start"]
         report = json.loads((model.parent / "report.json").read_text())
-        assert report["poses"] == 52 and report["target"]["verdict"] == "missed"
-        assert any("The target is missed" in line for line in job.state_of("train").log)
+        assert report["poses"] == 52 and report["goal"]["verdict"] == "missed"
+        assert any("The goal is missed" in line for line in job.state_of("train").log)
 
     def test_there_must_be_a_model_to_refine(self, saved):
         saved.mesh_object.fdda.settings.poses = 12

@@ -49,7 +49,7 @@ VERBS = {
     "train over its recording": ("train recording recording/residuals.npy", "recording/residuals.npy", "a model"),
     "train over an index": (f"train recording {RECORDING}", RECORDING, "a model"),
     "refining over the rig": (
-        "train recording rig.blend --target-mm 1 --refine rig.blend --epochs 1",
+        "train recording rig.blend --goal-mm 1 --refine rig.blend --epochs 1",
         "rig.blend",
         "a model",
     ),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`record --refine` and `train --target-mm --refine`: more poses where the model is worst, until it is good enough."""
+"""`record --refine` and `train --goal-mm --refine`: more poses where the model is worst, until it is good enough."""
 
 import shutil
 
@@ -152,20 +152,20 @@ def test_training_until_a_target_is_met(elbow, recording, tmp_path, capfd):
     quick = ("--epochs", 8, "--hidden", 16, 16)
     train(recording, model, *quick)
     reached = read_model_info(model).held_out_mm["p999"]
-    assert run("train", recording, model, *quick, "--target-mm", reached / 2, "--refine", elbow.rig, "--poses", 40) == 0
+    assert run("train", recording, model, *quick, "--goal-mm", reached / 2, "--refine", elbow.rig, "--poses", 40) == 0
     out = capfd.readouterr()
     read, info = read_recording(recording), read_model_info(model)
     added = [s.poses for s in read.info.sampling.sources if s.kind == REFINED]
     assert added and set(added) == {40}
     assert f"{recording}: 40 poses added where the model is worst" in out.out
-    assert ("The target is met" in out.err) == (info.held_out_mm["p999"] <= reached / 2)
+    assert ("The goal is met" in out.err) == (info.held_out_mm["p999"] <= reached / 2)
     assert info.training["warm_start"] and info.training["training_poses"] == len(read.pose_matrices) - 15 - 8
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--refine", "RIG"], "say which with --target-mm"),
+        (["--refine", "RIG"], "say which with --goal-mm"),
         (["--object", "elbow"], "give --refine RIG.blend with them"),
     ],
 )
@@ -173,13 +173,13 @@ def test_options_of_the_target_that_make_no_sense(elbow, recording, tmp_path, ca
     options = [elbow.rig if option == "RIG" else option for option in options]
     assert run("train", recording, tmp_path / "m.onnx", *options) == 2
     assert words in capfd.readouterr().err
-    assert run("train", "--target-mm", 1, recording, tmp_path / "m.onnx", "--refine", elbow.rig) == 2
+    assert run("train", "--goal-mm", 1, recording, tmp_path / "m.onnx", "--refine", elbow.rig) == 2
     assert "give RECORDING and MODEL.onnx before the training settings" in capfd.readouterr().err
-    assert run("train", recording, tmp_path / "m.onnx", "--target-mm", 1, "--refine", tmp_path / "no.blend") == 1
+    assert run("train", recording, tmp_path / "m.onnx", "--goal-mm", 1, "--refine", tmp_path / "no.blend") == 1
     assert "There is no file" in capfd.readouterr().err
 
 
 def test_the_help_of_train_says_how_to_refine(capfd):
     assert run("train", "--help") == 0
     out = capfd.readouterr().out
-    assert "--target-mm" in out and "--refine RIG.blend" in out and "poses to add each time" in out
+    assert "--goal-mm" in out and "--refine RIG.blend" in out and "poses to add each time" in out

@@ -284,7 +284,7 @@ def test_an_incomplete_recording_of_several_is_refused_before_the_first_training
 @pytest.mark.parametrize(
     ("verb", "options", "text"),
     [
-        ("train", ("--target-mm", 1, "--refine", "rig"), "--refine takes one mesh"),
+        ("train", ("--goal-mm", 1, "--refine", "rig"), "--refine takes one mesh"),
         ("record", ("--all", "--refine", "m.onnx"), "--refine takes one mesh"),
         ("record", ("--all", "--object", BODY), "give one of them"),
         ("evaluate", ("--json", "e.json", "--heatmap", "h.png"), "--heatmap draws one mesh"),

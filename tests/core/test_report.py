@@ -43,7 +43,7 @@ REPORT = {
         }
     ],
     "warnings": [{"name": "flips", "text": "It jumps."}],
-    "target": {"target": 0.5, "p999": 1.0, "verdict": "missed"},
+    "goal": {"goal": 0.5, "p999": 1.0, "verdict": "missed"},
 }
 
 
@@ -72,7 +72,7 @@ def test_what_is_written_is_read(tmp_path):
     assert read_report(tmp_path / "report.json") == {"format": "fdda-report", "version": 1, **REPORT}
 
 
-@pytest.mark.parametrize("key", ["warnings", "target", "normals", "edges"])
+@pytest.mark.parametrize("key", ["warnings", "goal", "normals", "edges"])
 def test_what_may_be_missing(tmp_path, key):
     write_report(tmp_path / "report.json", damaged((key,), ...))
     assert key not in read_report(tmp_path / "report.json")
@@ -92,7 +92,7 @@ DAMAGE = [
     (("partitions", 0, "merged"), [3], "partitions[0].merged[0] is no text"),
     (("edges", "fdda", "inside"), "0", "edges.fdda.inside is no number"),
     (("warnings", 0), {"text": "…"}, "warnings[0] has no name"),
-    (("target", "verdict"), "lunch", "target.verdict is no verdict"),
+    (("goal", "verdict"), "lunch", "goal.verdict is no verdict"),
 ]
 
 

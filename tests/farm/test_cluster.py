@@ -17,7 +17,7 @@ from .conftest import ONE, ROOT
 
 TWO = (
     ONE
-    + 'actions = ["elbow_wave"]\ntarget_mm = 1000.0\nrounds = 1\n'
+    + 'actions = ["elbow_wave"]\ngoal_mm = 1000.0\nrounds = 1\n'
     + '[characters.broken]\nrig = "broken.blend"\noutput = "out/broken"\n'
     + '[characters.gone]\nrig = "gone.blend"\noutput = "out/gone"\n'
 )

@@ -68,7 +68,7 @@ def test_fingerprints_of_wrong_values(written, capsys):
 @pytest.fixture
 def bound(written):
     """A farm whose tasks are all done, by their fingerprints, and its task `bind`."""
-    plan = written(ONE + "target_mm = 1.0\nrounds = 1\n")
+    plan = written(ONE + "goal_mm = 1.0\nrounds = 1\n")
     tasks = make_tasks(plan)
     keys = Keys(plan.farm, tasks)
     for name, task in tasks.items():
@@ -128,7 +128,7 @@ def test_evaluations_and_reports_of_wrong_values(bound):
     folder = tasks["elbow/bind"].folder
     for value in VALUES:
         (folder / "evaluation.json").write_text(json.dumps({"vertices": value, "fdda": value, "linear": value}))
-        (folder / "report.json").write_text(json.dumps({"target": value, "warnings": value}))
+        (folder / "report.json").write_text(json.dumps({"goal": value, "warnings": value}))
         assert main([str(plan.path), "--report-only"]) == 0, value
         evaluate = tasks["elbow/evaluate-0"]
         for wrong in ({"fdda": value}, {"fdda": {"p999": value}} if value != -1 else {}, value):

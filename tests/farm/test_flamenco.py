@@ -59,7 +59,7 @@ def job_of(plan) -> dict:
 
 
 def test_the_tasks_are_the_graph(written):
-    plan = written(ONE + "target_mm = 1\nrounds = 2\n")
+    plan = written(ONE + "goal_mm = 1\nrounds = 2\n")
     tasks = make_tasks(plan)
     made = {task["name"]: task for task in compiled(job_of(plan))["tasks"]}
     assert list(made) == [*tasks, "report"]

@@ -13,7 +13,7 @@ from farm.tasks import make_tasks
 
 from .conftest import ONE
 
-MANY = "".join(f'[characters.c{n}]\nrig = "elbow.blend"\noutput = "out/{n}"\ntarget_mm = 1\n' for n in range(50))
+MANY = "".join(f'[characters.c{n}]\nrig = "elbow.blend"\noutput = "out/{n}"\ngoal_mm = 1\n' for n in range(50))
 
 
 def openjd(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -28,7 +28,7 @@ def template_of(plan) -> Path:
 
 
 def test_templates_are_valid(written):
-    for text in (ONE, ONE + "shards = 1\n", ONE + 'objects = ["a", "b c"]\ntarget_mm = 1\n', MANY):
+    for text in (ONE, ONE + "shards = 1\n", ONE + 'objects = ["a", "b c"]\ngoal_mm = 1\n', MANY):
         checked = openjd("check", template_of(written(text)))
         assert "passes validation checks" in checked.stdout, checked.stdout + checked.stderr
 

@@ -25,12 +25,12 @@ def bound(plan, mean: float, key: str = "first") -> None:
     folder = make_tasks(plan)["elbow/bind"].folder
     (folder / "evaluation.json").write_text(json.dumps({"vertices": 300, "fdda": errors, "linear": errors}))
     warnings = [{"name": "flips", "text": "Bones <flip> & turn."}]
-    (folder / "report.json").write_text(json.dumps({"warnings": warnings, "target": {"verdict": "missed"}}))
+    (folder / "report.json").write_text(json.dumps({"warnings": warnings, "goal": {"verdict": "missed"}}))
     (folder / "heat_map.png").write_bytes(PNG)
 
 
 def test_what_changed_against_the_last_run(written):
-    plan = written(ONE + "target_mm = 0.5\nrounds = 0\n")
+    plan = written(ONE + "goal_mm = 0.5\nrounds = 0\n")
     page, tasks = plan.path.with_name("report.html"), make_tasks(plan)
     read = lambda: json.loads(page.with_suffix(".json").read_text())["characters"]["elbow"]  # noqa: E731
     bound(plan, 0.1)
@@ -59,7 +59,7 @@ def test_what_failed_is_said_and_escaped(written):
 
 def test_the_page_is_whole(written):
     """Every tag that is opened is closed, and nothing is fetched."""
-    plan = written(ONE + "target_mm = 0.5\nrounds = 0\n")
+    plan = written(ONE + "goal_mm = 0.5\nrounds = 0\n")
     page, tasks = plan.path.with_name("report.html"), make_tasks(plan)
     bound(plan, 0.1)
     write_report(plan, tasks, {}, page)

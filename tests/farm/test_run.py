@@ -24,7 +24,7 @@ from fdda_addon.core.recording.reader import read_recording
 
 from .conftest import ELBOW, ONE, ROOT, SMALL, contents, do_all, states
 
-ROUNDS = ONE + "target_mm = 0.001\nrounds = 1\n"
+ROUNDS = ONE + "goal_mm = 0.001\nrounds = 1\n"
 
 
 @pytest.fixture(scope="module")
@@ -98,9 +98,9 @@ def test_what_was_changed_is_not_used(elbow_farm):
     assert model.read_bytes() == kept, "the same recording and settings give the same bytes"
 
 
-def test_a_target_that_is_met_ends_the_rounds(elbow_farm):
+def test_a_goal_that_is_met_ends_the_rounds(elbow_farm):
     plan, _ = elbow_farm
-    plan.path.write_text(plan.path.read_text().replace("target_mm = 0.001", "target_mm = 1000.0"))
+    plan.path.write_text(plan.path.read_text().replace("goal_mm = 0.001", "goal_mm = 1000.0"))
 
     found = states(do_all(read_plan(plan.path)))
     assert {name: state for name, state in found.items() if "-1" in name and "record" not in name} == {

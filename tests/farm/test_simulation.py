@@ -46,7 +46,7 @@ def test_what_has_the_longest_way_goes_first():
 
 
 def test_no_number_of_workers_beats_the_longest_path_nor_the_sum(written):
-    tasks = make_tasks(written(ONE + "shards = 7\ntarget_mm = 1\nrounds = 3\n"))
+    tasks = make_tasks(written(ONE + "shards = 7\ngoal_mm = 1\nrounds = 3\n"))
     seconds, measured = task_seconds(tasks)
     assert measured == 0 and min(seconds.values()) >= START_SECONDS
     total, (longest, _) = sum(seconds.values()), longest_path(tasks, seconds)

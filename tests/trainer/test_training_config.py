@@ -27,7 +27,7 @@ def test_an_unknown_setting_is_an_error():
         ("dropout", 1.0),
         ("validation_fraction", 0.9),
         ("held_out_fraction", 0.0),
-        ("target_mm", -1.0),
+        ("goal_mm", -1.0),
         ("seed", -1),
     ],
 )
@@ -42,7 +42,7 @@ def test_every_setting_is_an_option():
     given = (
         "--seed 3 --tolerance-mm 0.2 --hidden 8 9 10 --activation gelu --epochs 7 --batch-size 5 --learning-rate 0.1 "
         "--weight-decay 0.3 --dropout 0.25 --l1 1e-4 --l2 1e-3 --averaging 0.5 --validation-fraction 0.3 "
-        "--held-out-fraction 0.2 --target-mm 0.5 --patience 4 --include-unsettled"
+        "--held-out-fraction 0.2 --goal-mm 0.5 --patience 4 --include-unsettled"
     )
     assert config_from_arguments(parser.parse_args(given.split())) == TrainingConfig(
         3, 0.2, (8, 9, 10), "gelu", 7, 5, 0.1, 0.3, 0.25, 1e-4, 1e-3, 0.5, 0.3, 0.2, 0.5, 4, True

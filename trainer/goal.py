@@ -16,48 +16,50 @@ cannot follow even those that they have seen."""
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """How a training stands to its target.
+class GoalResult:
+    """How a training meets the accuracy goal.
 
     Attributes:
-        target_mm: what 99.9 % of the held-out vertices are to be within.
+        goal_mm: what 99.9 % of the held-out vertices are to be within.
         p999_mm: what they are within.
         verdict: what follows.
         text: the same as sentences for the user.
     """
 
-    target_mm: float
+    goal_mm: float
     p999_mm: float
     verdict: Verdict
     text: str
 
     def to_json(self) -> dict:
-        return {"target": self.target_mm, "p999": self.p999_mm, "verdict": self.verdict.value}
+        return {"goal": self.goal_mm, "p999": self.p999_mm, "verdict": self.verdict.value}
 
 
-def judge(target_mm: float, history: list[dict], training_p999_mm: float, recording: Path, model: Path) -> Outcome:
-    """Compare the held-out error with the target.
+def evaluate_goal(
+    goal_mm: float, history: list[dict], training_p999_mm: float, recording: Path, model: Path
+) -> GoalResult:
+    """Compare the held-out error with the accuracy goal.
 
     Args:
-        target_mm: asked for.
+        goal_mm: asked for.
         history: held-out errors of the trainings so far, the last of which has just ended: `{"poses", "p999"}`, mm.
         training_p999_mm: error of the last on its own training poses, mm.
         recording, model: for the sentence.
     """
     p999 = history[-1]["p999"]
-    reached = f"99.9 % of the held-out vertices are within {p999:.3g} mm and the target is {target_mm:g} mm"
-    if p999 <= target_mm:
-        return Outcome(target_mm, p999, Verdict.MET, f"The target is met: {reached}.")
+    reached = f"99.9 % of the held-out vertices are within {p999:.3g} mm and the goal is {goal_mm:g} mm"
+    if p999 <= goal_mm:
+        return GoalResult(goal_mm, p999, Verdict.MET, f"The goal is met: {reached}.")
     if not _exhausted([entry["p999"] for entry in history]):
         text = (
-            f"The target is missed: {reached}. Add poses where the model is worst (record RIG.blend {recording} "
+            f"The goal is missed: {reached}. Add poses where the model is worst (record RIG.blend {recording} "
             f"--refine {model}) and train on with --warm-start, or let train do both with --refine RIG.blend."
         )
-        return Outcome(target_mm, p999, Verdict.MISSED, text)
+        return GoalResult(goal_mm, p999, Verdict.MISSED, text)
     before = history[-1 - PATIENCE]
     more = history[-1]["poses"] - before["poses"]
     text = (
-        f"The target is missed and more poses no longer help: {reached}; {more} more poses brought it there from "
+        f"The goal is missed and more poses no longer help: {reached}; {more} more poses brought it there from "
         f"{before['p999']:.3g} mm. "
     )
     if training_p999_mm > SMALL_GAP * p999:
@@ -67,7 +69,7 @@ def judge(target_mm: float, history: list[dict], training_p999_mm: float, record
         )
     else:
         text += "Narrow the range of motion to what is animated, or accept this error."
-    return Outcome(target_mm, p999, Verdict.EXHAUSTED, text)
+    return GoalResult(goal_mm, p999, Verdict.EXHAUSTED, text)
 
 
 def _exhausted(errors: list[float]) -> bool:

@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 
 from fdda_addon.core.report import Verdict
-from trainer.target import judge
+from trainer.goal import evaluate_goal
 
 
-def outcome(*errors: float, target: float = 0.5, training: float = 0.1):
+def goal_result(*errors: float, goal: float = 0.5, training: float = 0.1):
     history = [{"poses": 500 + 250 * number, "p999": error} for number, error in enumerate(errors)]
-    return judge(target, history, training, Path("recording"), Path("arm.onnx"))
+    return evaluate_goal(goal, history, training, Path("recording"), Path("arm.onnx"))
 
 
 @pytest.mark.parametrize(
@@ -27,16 +27,18 @@ def outcome(*errors: float, target: float = 0.5, training: float = 0.1):
     ],
 )
 def test_verdict(errors, verdict):
-    assert outcome(*errors).verdict is verdict
+    assert goal_result(*errors).verdict is verdict
 
 
 def test_a_miss_says_how_to_go_on():
-    text = outcome(0.8).text
-    assert "within 0.8 mm and the target is 0.5 mm" in text
+    text = goal_result(0.8).text
+    assert "within 0.8 mm and the goal is 0.5 mm" in text
     assert "record RIG.blend recording --refine arm.onnx" in text and "--warm-start" in text
 
 
 def test_the_end_says_what_limits():
-    assert "500 more poses brought it there from 0.9 mm" in outcome(0.9, 0.89, 0.88).text
-    assert "Narrow the range of motion" in outcome(0.9, 0.89, 0.88).text
-    assert "training poses are at 0.85 mm, so the networks are too small" in outcome(0.9, 0.9, 0.9, training=0.85).text
+    assert "500 more poses brought it there from 0.9 mm" in goal_result(0.9, 0.89, 0.88).text
+    assert "Narrow the range of motion" in goal_result(0.9, 0.89, 0.88).text
+    assert (
+        "training poses are at 0.85 mm, so the networks are too small" in goal_result(0.9, 0.9, 0.9, training=0.85).text
+    )
