@@ -40,7 +40,7 @@ SETTINGS = {
     "weight_decay": 1.0,
     "validation_fraction": 0.05,
 }
-"""What differs from the defaults: networks as large as the largest published, and less trust in few, noisy poses."""
+"""Differences from the defaults: the largest published networks, and more regularization for few, noisy poses."""
 RELU = {
     "wrist": (0.0801, 0.4991),
     "index_1": (0.0594, 0.6329),

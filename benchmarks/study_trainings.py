@@ -16,6 +16,7 @@ from fdda_addon.core.output import replacing, write_json
 from fdda_addon.core.recording.reader import Recording, partitions_json, read_partitions, read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
+from trainer.confidence import measure_training_range
 from trainer.config import TrainingConfig
 from trainer.data import partitions_of, prepare, split_poses
 from trainer.deformation import Deformation, is_sheared
@@ -23,7 +24,6 @@ from trainer.delta_fit import find_deltas
 from trainer.export import Measured, build_model, measure, write_model
 from trainer.inputs import Inputs, inputs_of_rig, middles
 from trainer.loop import Curves, train
-from trainer.trust import make_trust_range
 
 
 @dataclass(frozen=True)
@@ -105,14 +105,14 @@ def train_once(material: Material, config: TrainingConfig, model_path: Path) -> 
     seconds = {"processor": time.process_time() - processor, "wall": time.perf_counter() - wall}
     poses, controls = (np.array(a[split.training]) for a in (recording.pose_matrices, recording.controls))
     seen = inputs.features(poses, recording.rig.rest_matrices, controls)
-    trust = make_trust_range(seen, recording.rig, recording.partitions)
+    training_range = measure_training_range(seen, recording.rig, recording.partitions)
     deformation = Deformation(
         recording.rig,
         recording.partitions,
         inputs,
         tuple(prepared),
         trained.networks,
-        trust,
+        training_range,
         config.activation,
         is_sheared(recording.pose_matrices),
     )

@@ -8,14 +8,14 @@ import numpy as np
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
 
+from .confidence import TrainingRange
 from .data import PreparedPartition
 from .inputs import Inputs
 from .model import Network
-from .trust import TrustRange
 
 ORTHOGONAL = 1e-5
 """Cosine of two columns of a pose matrix from which on it is sheared; float32 alone makes a tenth of it. Nearly locked
-joints notice 3e-5: to take their bones for orthogonal takes trust off them."""
+joints notice 3e-5: treating their bones as orthogonal lowers their confidence."""
 BLOCK_POSES = 256
 
 
@@ -27,7 +27,7 @@ class Deformation:
         rig: with J joints and V vertices.
         partitions: P of them, with the prepared data and the network of each.
         inputs: what the networks see.
-        trust: range of the training poses.
+        training_range: features of the training poses.
         activation: of the networks.
         sheared: whether the columns of some recorded pose matrix are not orthogonal to each other.
     """
@@ -37,13 +37,13 @@ class Deformation:
     inputs: Inputs
     prepared: tuple[PreparedPartition, ...]
     networks: tuple[Network, ...]
-    trust: TrustRange
+    training_range: TrainingRange
     activation: str
     sheared: bool
 
     def standardisation(self) -> tuple[np.ndarray, np.ndarray]:
         """(F,) float64 mean and scale of each feature; 0 and 1 where no network looks at it."""
-        size = len(self.trust.low)
+        size = len(self.training_range.low)
         mean, scale = np.zeros(size), np.ones(size)
         for number, prepared in enumerate(self.prepared):
             columns = self.seen_columns(number)

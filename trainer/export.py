@@ -66,13 +66,13 @@ def reference_positions(
         controls: (N, C).
 
     Returns:
-        (N, V, 3) float32 positions, mesh-object space, mesh units, and (N, P) float32 trust.
+        (N, V, 3) float32 positions, mesh-object space, mesh units, and (N, P) float32 confidence.
     """
-    rig, trust_range = deformation.rig, deformation.trust
+    rig, training_range = deformation.rig, deformation.training_range
     features = deformation.inputs.features(pose_matrices, rig.rest_matrices, controls)
-    trust = trust_range.trust(features)
+    confidence = training_range.confidence(features)
     mean, scale = deformation.standardisation()
-    clamped = np.clip(features, trust_range.low, trust_range.high)
+    clamped = np.clip(features, training_range.low, training_range.high)
     inputs = ((clamped - mean) / scale).astype(np.float32)
     matrices = fit_matrices(pose_matrices, rig, len(deformation.turns()) > 0)
     local, offsets = (np.zeros((len(features), rig.vertex_count, 3), np.float32) for _ in range(2))
@@ -80,10 +80,10 @@ def reference_positions(
         zip(deformation.partitions, deformation.prepared, deformation.networks, strict=True)
     ):
         coefficients = network.coefficients(inputs[:, deformation.seen_columns(number)], deformation.activation)
-        residuals = prepared.basis.residuals(coefficients) * trust[:, number, None]
+        residuals = prepared.basis.residuals(coefficients) * confidence[:, number, None]
         local[:, partition.vertices] = residuals.reshape(len(features), -1, 3)
-        offsets[:, partition.vertices] = prepared.fit.offsets(matrices) * trust[:, number, None, None]
-    return LinearSkinning(rig, deformation.partitions).complex_positions(pose_matrices, local) + offsets, trust
+        offsets[:, partition.vertices] = prepared.fit.offsets(matrices) * confidence[:, number, None, None]
+    return LinearSkinning(rig, deformation.partitions).complex_positions(pose_matrices, local) + offsets, confidence
 
 
 def open_session(model: bytes) -> onnxruntime.InferenceSession:
@@ -159,14 +159,16 @@ def check_parity(
     largest, metres_per_unit = 0.0, recording.rig.metres_per_unit
     for block in _blocks(len(poses), recording.rig.vertex_count):
         inputs = _inputs(recording, poses[block])
-        positions, trust = session.run(None, inputs)
+        positions, confidence = session.run(None, inputs)
         controls = np.array(recording.controls[poses[block]])
-        expected, expected_trust = reference_positions(deformation, inputs[POSE_INPUT], controls)
+        expected, expected_confidence = reference_positions(deformation, inputs[POSE_INPUT], controls)
         difference = max(float(distances(positions, expected, metres_per_unit).max()), 0.0)
-        if not np.isfinite(positions).all() or not np.isfinite(trust).all():
+        if not np.isfinite(positions).all() or not np.isfinite(confidence).all():
             raise TrainingError("The exported model gives values that are not numbers; train with other settings.")
-        if np.abs(trust - expected_trust).max(initial=0) > 1e-3:
-            raise TrainingError("The trust of the exported model differs from PyTorch; this is a defect, report it.")
+        if np.abs(confidence - expected_confidence).max(initial=0) > 1e-3:
+            raise TrainingError(
+                "The confidence of the exported model differs from PyTorch; this is a defect, report it."
+            )
         largest = max(largest, difference)
     reach = float(np.abs(recording.rig.rest_positions).max() + np.abs(recording.pose_matrices[..., :3, 3]).max())
     allowed = MAX_DIFFERENCE * max(1.0, recording.rig.size * metres_per_unit) + 2 * ROUNDING * reach * metres_per_unit
@@ -186,7 +188,7 @@ def model_info(recording: Recording, deformation: Deformation, held_out: np.ndar
         held_out: distances of the validation poses, metres.
         training: settings, versions and times.
     """
-    rig, low, high = recording.rig, deformation.trust.low, deformation.trust.high
+    rig, low, high = recording.rig, deformation.training_range.low, deformation.training_range.high
     partitions = zip(deformation.partitions, recording.partitions, deformation.shape_counts(), strict=True)
     return ModelInfo(
         rig.joints,
@@ -201,7 +203,7 @@ def model_info(recording: Recording, deformation: Deformation, held_out: np.ndar
             for p, recorded, shapes in partitions
         ),
         *(bound[: deformation.inputs.joint_columns].reshape(-1, FEATURES_PER_JOINT) for bound in (low, high)),
-        deformation.trust.controls,
+        deformation.training_range.controls,
         error_statistics(held_out).to_json(),
         0.0,
         {**training, OBJECT: recording.info.object_name, LIMITS: recording.info.sampling.to_json()["limits"]},

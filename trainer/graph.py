@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The model's ONNX graph: from pose matrices and controls to positions and trust, in standard operators.
+"""The model's ONNX graph: from pose matrices and controls to positions and confidence, in standard operators.
 
 At one pose a frame the graph costs most of a microsecond a node, whatever the node does, and the time to read its
 constants once: hence few nodes, products with matrices of ones and zeros in place of gathers, and little padding.
@@ -10,7 +10,7 @@ F features, D deltas, P partitions, K basis shapes, V vertices.
 import onnx
 from onnx import TensorProto, helper
 
-from fdda_addon.core.model import CONTROLS_INPUT, POSE_INPUT, POSITIONS_OUTPUT, TRUST_OUTPUT
+from fdda_addon.core.model import CONFIDENCE_OUTPUT, CONTROLS_INPUT, POSE_INPUT, POSITIONS_OUTPUT
 
 from .deformation import Deformation
 from .network_nodes import add_networks
@@ -35,7 +35,7 @@ def build_graph(deformation: Deformation) -> onnx.ModelProto:
         inputs.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", count]))
     outputs = [
         helper.make_tensor_value_info(POSITIONS_OUTPUT, TensorProto.FLOAT, ["N", deformation.rig.vertex_count, 3]),
-        helper.make_tensor_value_info(TRUST_OUTPUT, TensorProto.FLOAT, ["N", len(deformation.partitions)]),
+        helper.make_tensor_value_info(CONFIDENCE_OUTPUT, TensorProto.FLOAT, ["N", len(deformation.partitions)]),
     ]
     proto = helper.make_graph(graph.nodes, "deformation", inputs, outputs, graph.constants)
     model = helper.make_model(proto, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="fdda")

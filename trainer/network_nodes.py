@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdda_addon.core.model import TRUST_OUTPUT
+from fdda_addon.core.model import CONFIDENCE_OUTPUT
 
 from .deformation import Deformation
 from .nodes import Graph
@@ -24,7 +24,7 @@ PIECE_FLOATS, CUT_FLOATS = 800, 15_000
 
 @dataclass(frozen=True)
 class Coefficients:
-    """What the networks say, times the trust.
+    """What the networks say, times the confidence.
 
     Attributes:
         name: (N, ·) coefficients without the last bias, mesh units.
@@ -115,9 +115,9 @@ def _add_last_layer(graph: Graph, values: str, layers: dict[int, np.ndarray]) ->
         values = graph.add("Gather", [values, graph.integers("piece_owners", owners)], "hidden_of_pieces", axis=0)
     values = graph.add("MatMul", [values, graph.floats("last_weights", weights)], "coefficients_by_piece")
     values = graph.add("Transpose", [values], "coefficients", perm=[1, 0, 2])
-    trust = graph.integers("trust_of_pieces", np.array([[partitions[n]] for n in owners]))
-    trust = graph.add("Gather", [TRUST_OUTPUT, trust], "trust_by_piece", axis=1)
-    values = graph.add("Mul", [values, trust], "trusted_coefficients")
+    confidence = graph.integers("confidence_of_pieces", np.array([[partitions[n]] for n in owners]))
+    confidence = graph.add("Gather", [CONFIDENCE_OUTPUT, confidence], "confidence_by_piece", axis=1)
+    values = graph.add("Mul", [values, confidence], "scaled_coefficients")
     name = graph.reshape(values, [0, len(pieces) * size], "coefficient_row")
     return Coefficients(name, {partition: size * owners.index(n) for n, partition in enumerate(layers)})
 

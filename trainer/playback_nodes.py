@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdda_addon.core.model import POSITIONS_OUTPUT, TRUST_OUTPUT
+from fdda_addon.core.model import CONFIDENCE_OUTPUT, POSITIONS_OUTPUT
 from fdda_addon.core.skinning import SkinBlock
 
 from .deformation import Deformation
@@ -68,8 +68,8 @@ def add_playback(
 
     Args:
         features: has the poses.
-        coefficients: of the networks, if there are any, times the trust.
-        outside: (N, 3 own), as `add_range` gives it: it has a 1 for what needs no trust.
+        coefficients: of the networks, if there are any, times the confidence.
+        outside: (N, 3 own), as `add_range` gives it: it has a 1 for what has no confidence factor.
     """
     partitions = deformation.partitions
     skins = [SkinBlock(deformation.rig, partition) for partition in partitions]
@@ -137,29 +137,29 @@ def _add_pieces(
     Returns:
         (N, ·, 9), and which of these follow one another.
     """
-    # The ones are the last vector outside, right before the trust, and that before the coefficients.
-    one, trust = VECTOR * features.one, VECTOR * (features.one + 1)
+    # The ones are the last vector outside, right before the confidence, and that before the coefficients.
+    one, confidence = VECTOR * features.one, VECTOR * (features.one + 1)
     poses: list[tuple[int, int]] = []
     starts = {}
     for n, own in rows.items():
         starts[n] = len(poses)
         poses += [(joint, one) for joint in own.joints[: own.skinning]]
-        poses += [(joint, trust + n) for joint in own.joints[own.skinning :]]
+        poses += [(joint, confidence + n) for joint in own.joints[own.skinning :]]
         poses += own.spare * [(0, one)]
     places = []
     for n, own in rows.items():
         turning = len(poses)
         if own.shapes:
-            first = trust + len(rows) + coefficients.first[n]
+            first = confidence + len(rows) + coefficients.first[n]
             poses += [(deformation.partitions[n].joint, first + shape) for shape in range(own.shapes)]
-        poses += [(joint, trust + n) for joint in own.turns]
+        poses += [(joint, confidence + n) for joint in own.turns]
         end = starts[n] + len(own.joints)
         places += [*range(turning, len(poses)), *range(starts[n], end)]
         places += [~(piece // 3) for piece in range(starts[n] + own.early, end, 3)]
     poses += -len(poses) % 3 * [(0, one)]
     places = [len(poses) + ~place if place < 0 else place for place in places]
     joints, factors = zip(*poses, strict=True)
-    scalars = [outside, TRUST_OUTPUT, *([coefficients.name] if coefficients else [])]
+    scalars = [outside, CONFIDENCE_OUTPUT, *([coefficients.name] if coefficients else [])]
     scale = graph.integers("row_factors", np.array(factors)[:, None])
     scale = graph.add("Gather", [graph.join(scalars, "scalars", axis=1), scale], "factors", axis=1)
     # Spread over the twelve numbers by a product: to multiply each pose by one number takes three times as long.

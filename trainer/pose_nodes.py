@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The part of the graph that looks at the pose: features, their range, and trust.
+"""The part of the graph that looks at the pose: features, their range, and confidence.
 
 Every three features are one vector as a frame sees it, R^-1 (d - t): the columns of a joint's matrix as the joint sees
 them that its parent carries along, and the points of other joints as a main joint sees them. So all are one gather of
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdda_addon.core.features import FEATURES_PER_JOINT
-from fdda_addon.core.model import CONTROLS_INPUT, POSE_INPUT, TRUST_OUTPUT
+from fdda_addon.core.model import CONFIDENCE_OUTPUT, CONTROLS_INPUT, POSE_INPUT
 
 from .deformation import Deformation
 from .delta_nodes import add_deltas
@@ -78,7 +78,7 @@ class _Frames:
 
 
 def add_features(graph: Graph, deformation: Deformation) -> Features:
-    """Add the features that networks or trust look at."""
+    """Add the features that networks or confidence look at."""
     inputs, joints = deformation.inputs, _joints_needed(deformation)
     points = np.unique(inputs.pair_points)
     frames = _Frames(joints, points, len(joints) + len(points))
@@ -115,9 +115,9 @@ def add_features(graph: Graph, deformation: Deformation) -> Features:
 
 
 def _joints_needed(deformation: Deformation) -> np.ndarray:
-    """(Ju,) joints that some network sees, that count for some partition's trust, or whose turns are needed."""
+    """(Ju,) joints that some network sees, that count for some partition's confidence, or whose turns are needed."""
     inputs = deformation.inputs
-    needed = deformation.trust.counts[:, : inputs.joint_columns].any(axis=0)
+    needed = deformation.training_range.counts[:, : inputs.joint_columns].any(axis=0)
     for number in range(len(deformation.partitions)):
         columns = deformation.seen_columns(number)
         needed[columns[columns < inputs.joint_columns]] = True
@@ -221,24 +221,24 @@ def _inverses(graph: Graph, flat: str) -> str:
 
 
 def add_range(graph: Graph, features: Features, deformation: Deformation) -> tuple[str, str]:
-    """Clamp the features to the training range, and add the output `trust`.
+    """Clamp the features to the training range, and add the output `confidence`.
 
     Returns:
         (N, B, 3) features, clamped, and (N, 3 own) squares of how far the own ones are outside; those of `Features.one`
         are ones.
     """
-    trust, size = deformation.trust, VECTOR * features.own
-    raised = graph.add("Max", [features.name, graph.floats("range_low", features.bound(trust.low))], "raised")
-    clamped = graph.add("Min", [raised, graph.floats("range_high", features.bound(trust.high))], "clamped")
+    training_range, size = deformation.training_range, VECTOR * features.own
+    raised = graph.add("Max", [features.name, graph.floats("range_low", features.bound(training_range.low))], "raised")
+    clamped = graph.add("Min", [raised, graph.floats("range_high", features.bound(training_range.high))], "clamped")
     outside = graph.add("Sub", [features.name, clamped], "outside")
     if features.size > size:
         outside = graph.slice(outside, 0, features.own, 1, "own_outside")
     outside = graph.reshape(outside, [0, size], "outside_row")
     squared = graph.add("Mul", [outside, outside], "outside_squared")
-    counts = np.zeros((size, len(trust.counts)))
-    own = features.place[: len(trust.width)]
-    counts[own[own >= 0]] = (trust.counts / trust.width.astype(np.float64) ** 2).T[own >= 0]
-    left = [squared, graph.floats("counts", counts), graph.floats("all_trust", np.ones(1))]
-    root = graph.add("Relu", [graph.add("Gemm", left, "trust_left", alpha=-1.0)], "trust_root")
-    graph.add("Mul", [root, root], TRUST_OUTPUT)
+    counts = np.zeros((size, len(training_range.counts)))
+    own = features.place[: len(training_range.width)]
+    counts[own[own >= 0]] = (training_range.counts / training_range.width.astype(np.float64) ** 2).T[own >= 0]
+    left = [squared, graph.floats("counts", counts), graph.floats("full_confidence", np.ones(1))]
+    root = graph.add("Relu", [graph.add("Gemm", left, "confidence_left", alpha=-1.0)], "confidence_root")
+    graph.add("Mul", [root, root], CONFIDENCE_OUTPUT)
     return clamped, squared

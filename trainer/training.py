@@ -24,6 +24,7 @@ from fdda_addon.core.rig import UNMOVED_LABEL
 from . import report
 from .announcements import Announcer
 from .borders import better_borders, partition_of
+from .confidence import measure_training_range
 from .config import TrainingConfig
 from .data import PreparedPartition, Split, held_back_digest, partitions_of, prepare_together, split_recording
 from .deformation import Deformation, is_sheared
@@ -36,7 +37,6 @@ from .outputs import check_training_outputs, training_outputs
 from .page import render_html
 from .process import Cancelled
 from .sagging import without_needless_down
-from .trust import make_trust_range
 from .turns import turns_help
 from .weights import LastWeights, initial_networks, read_weights, write_weights
 from .worst import find_worst
@@ -282,7 +282,7 @@ def _deformation(
         inputs,
         tuple(prepared),
         trained.networks,
-        make_trust_range(features, rig, partitions),
+        measure_training_range(features, rig, partitions),
         config.activation,
         is_sheared(recording.pose_matrices),
     )

@@ -112,12 +112,12 @@ def main() -> None:
     inputs = {"pose_matrices": pose_matrices(info, arguments.turn)[None]}  # N = 1 pose
     if controls:
         inputs["controls"] = control_values(controls, arguments.control)[None]
-    positions, trust = session.run(["positions", "trust"], inputs)
+    positions, confidence = session.run(["positions", "confidence"], inputs)
     if arguments.out.suffix == ".npy":
         np.save(arguments.out, positions[0])
     else:
         write_obj(arguments.out, positions[0], read_faces(arguments.recording, info) if arguments.recording else [])
-    print(f"{arguments.out}: {len(positions[0])} vertices, trust {trust.min():.2f}")
+    print(f"{arguments.out}: {len(positions[0])} vertices, confidence {confidence.min():.2f}")
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ SKIN_KEY = "fdda_skin"
 POSE_INPUT = "pose_matrices"
 CONTROLS_INPUT = "controls"
 POSITIONS_OUTPUT = "positions"
-TRUST_OUTPUT = "trust"
+CONFIDENCE_OUTPUT = "confidence"
 LIMITS = "limits"
 """Key of `ModelInfo.training`."""
 OBJECT = "object"
@@ -63,7 +63,7 @@ class ModelInfo:
         rest_matrices: (J, 4, 4) float32, mesh-object space, mesh units.
         vertex_count: of the mesh.
         fingerprint: of the rig that was recorded.
-        partitions: in ascending order of their main joints, the order of the output `trust`.
+        partitions: in ascending order of their main joints, the order of the output `confidence`.
         feature_low, feature_high: (J, 12) float32, range of the joint features (core.features) in training.
         controls: the inputs beside the joints, with the ranges that they had in training.
         held_out_mm: error over the poses that were held out of the training, in mm, by the names of
@@ -261,7 +261,7 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
         raise ModelError(f"The model '{name}' cannot be used: {error}; train it again.") from error
     controls = {CONTROLS_INPUT: (len(info.controls),)} if info.controls else {}
     inputs = {POSE_INPUT: (len(info.joints), 4, 4), **controls}
-    outputs = {POSITIONS_OUTPUT: (info.vertex_count, 3), TRUST_OUTPUT: (len(info.partitions),)}
+    outputs = {POSITIONS_OUTPUT: (info.vertex_count, 3), CONFIDENCE_OUTPUT: (len(info.partitions),)}
     if extra := sorted(set(contents.inputs) - set(inputs)):
         raise ModelError(f"'{name}' asks for inputs that no rig gives ({', '.join(extra)}); train it again.")
     try:

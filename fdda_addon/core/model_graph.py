@@ -108,7 +108,7 @@ def check_graph(contents: OnnxContents, explained: Explained, size: int, outputs
         raise ValueError(f"it has {contents.oddities[0]}, which train does not write")
     if explained.values > 2 * size + 16 * SMALL:
         raise ValueError(f"its metadata tells of a character that {size} bytes cannot hold")
-    partitions = outputs.get("trust", (1,))[0]
+    partitions = outputs.get("confidence", (1,))[0]
     if len(contents.nodes) > min(MAX_NODES, NODES + NODES_PER_PARTITION * partitions):
         raise ValueError(f"it has {len(contents.nodes)} nodes, more than its {partitions} partitions explain")
     held = sum(len(constant.data) for constant in contents.constants.values())

@@ -17,7 +17,7 @@ from .section import Section, draw_button, draw_job, draw_sentence, panel_rig, t
 from .trained import trained
 from .watch import Watch
 
-FULL_TRUST = 0.995
+FULL_CONFIDENCE = 0.995
 MAX_SHOWN = 6
 MODES = (("RIG", "Rig"), ("LINEAR", "Linear Layer"), ("FDDA", "FDDA"))
 
@@ -38,13 +38,13 @@ def mask_sentence(mesh_object: bpy.types.Object) -> str:
     return f"'{mesh_object.name}' has no vertex group '{name}', so the model counts everywhere; choose another mask."
 
 
-def _trust(mesh_object: bpy.types.Object) -> object:
-    from ..runtime.trust import partition_trust
+def _confidence(mesh_object: bpy.types.Object) -> object:
+    from ..runtime.confidence import partition_confidence
 
-    return partition_trust(mesh_object) or "This model does not say how far it is believed."
+    return partition_confidence(mesh_object) or "This model has no confidence output."
 
 
-_trusts = Watch(_trust, 0.2)
+_confidences = Watch(_confidence, 0.2)
 
 
 class FDDA_PT_playback(Section, bpy.types.Panel):
@@ -70,7 +70,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         self._draw_bound(context, mesh_object)
         if not mesh_object.fdda.status:
             self._draw_times(context, mesh_object)
-            self._draw_trust(context, mesh_object)
+            self._draw_confidence(context, mesh_object)
             self._draw_bake(context)
         draw_button(layout, context, "fdda.unbind", "Unbind", "UNLINKED")
 
@@ -155,21 +155,23 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             draw_sentence(body, context, times.sentence, "INFO" if times.fdda < times.rig else "ERROR")
         body.operator("fdda.measure_model", text="Measure Again" if times else "Measure", icon="TIME")
 
-    def _draw_trust(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
+    def _draw_confidence(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
         # Closed, nobody looks and the model is not asked.
-        header, body = self.layout.panel("fdda_trust", default_closed=True)
+        header, body = self.layout.panel("fdda_confidence", default_closed=True)
         header.label(text="Trust in This Pose")
         if body is None:
             return
-        trust = _trusts.look(mesh_object)
-        if trust is None or isinstance(trust, str):
-            draw_sentence(body, context, trust or "…")
+        confidence = _confidences.look(mesh_object)
+        if confidence is None or isinstance(confidence, str):
+            draw_sentence(body, context, confidence or "…")
             return
-        doubtful = [(name, value) for name, value in trust if value < FULL_TRUST]
+        doubtful = [(name, value) for name, value in confidence if value < FULL_CONFIDENCE]
         if not doubtful:
             draw_sentence(body, context, "This pose lies inside what the model was trained on.", "CHECKMARK")
             return
-        draw_sentence(body, context, f"{len(doubtful)} of {len(trust)} partitions leave what the model was trained on:")
+        draw_sentence(
+            body, context, f"{len(doubtful)} of {len(confidence)} partitions leave what the model was trained on:"
+        )
         column = body.column(align=True)
         for name, value in doubtful[:MAX_SHOWN]:
             row = column.split(factor=0.5, align=True)
@@ -188,4 +190,4 @@ CLASSES = (FDDA_PT_playback,)
 
 def unregister() -> None:
     """Work nothing out any more."""
-    _trusts.stop()
+    _confidences.stop()

@@ -9,7 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import ModelError
-from ..core.model import CONTROLS_INPUT, POSE_INPUT, POSITIONS_OUTPUT, TRUST_OUTPUT, check_model, read_model, read_skin
+from ..core.model import (
+    CONFIDENCE_OUTPUT,
+    CONTROLS_INPUT,
+    POSE_INPUT,
+    POSITIONS_OUTPUT,
+    check_model,
+    read_model,
+    read_skin,
+)
 from ..core.native_library import runtime_advice
 from ..core.rig import Rig
 
@@ -92,8 +100,8 @@ class Network:
             execution.controls[:] = self._controls(controls, count)
         return execution.run()
 
-    def trust(self, pose_matrices: np.ndarray, controls: np.ndarray | None = None) -> np.ndarray | None:
-        """How far the networks are believed; costs as much as the positions, so not for every frame.
+    def confidence(self, pose_matrices: np.ndarray, controls: np.ndarray | None = None) -> np.ndarray | None:
+        """Evaluate the confidence of the networks; it takes as long as the positions, so not for every frame.
 
         Args:
             pose_matrices, controls: as for `positions`.
@@ -104,18 +112,18 @@ class Network:
         Raises:
             ModelError: the model fails, answers in another shape, or values of its controls are missing.
         """
-        if TRUST_OUTPUT not in {output.name for output in self._session.get_outputs()}:
+        if CONFIDENCE_OUTPUT not in {output.name for output in self._session.get_outputs()}:
             return None
         inputs = {POSE_INPUT: pose_matrices}
         if self.info.controls:
             inputs[CONTROLS_INPUT] = np.asarray(self._controls(controls, len(pose_matrices)), np.float32)
         try:
-            (trust,) = self._session.run([TRUST_OUTPUT], inputs)
+            (confidence,) = self._session.run([CONFIDENCE_OUTPUT], inputs)
         except Exception as error:  # As above.
             raise ModelError(f"The model '{self.path}' failed ({_first_line(error)}); train it again.") from error
-        if trust.shape != (len(pose_matrices), len(self.info.partitions)):
-            raise ModelError(f"The model '{self.path}' gives trust of another shape than it says; train it again.")
-        return trust
+        if confidence.shape != (len(pose_matrices), len(self.info.partitions)):
+            raise ModelError(f"The model '{self.path}' gives confidence of another shape than it says; train it again.")
+        return confidence
 
     def linear_rig(self, rig: Rig) -> Rig:
         """A rig that the model fits, with the skin weights of the model's linear skinning, which may be fitted ones."""

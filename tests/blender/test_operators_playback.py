@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.runtime import model_files, nodes, trust
+from fdda_addon.runtime import confidence, model_files, nodes
 from fdda_addon.runtime.network import Network
 from fdda_addon.timing import frame_times
 
@@ -153,27 +153,27 @@ def test_a_model_that_was_moved_is_found_again(elbow, tmp_path):
 
 def test_trust_is_what_the_model_says_and_asked_once_a_pose(bound, elbow, monkeypatch):
     pose(angle=0.3)
-    inside = trust.partition_trust(bound)
+    inside = confidence.partition_confidence(bound)
     assert sorted(name for name, _ in inside) == ["lower", "upper"]
     assert all(value == pytest.approx(1) for _, value in inside)
     bone = bpy.data.objects[ELBOW_RIG].pose.bones["lower"]
     bone.constraints.remove(bone.constraints[0])
     pose(angle=-2.0)
-    outside = trust.partition_trust(bound)
+    outside = confidence.partition_confidence(bound)
     assert outside[0][1] < 0.99 and outside[0][1] <= outside[-1][1]
     network = Network(elbow.model)
     calls = []
     monkeypatch.setattr(
-        Network, "trust", lambda self, *inputs: calls.append(1) or np.ones((1, len(network.info.partitions)))
+        Network, "confidence", lambda self, *inputs: calls.append(1) or np.ones((1, len(network.info.partitions)))
     )
-    assert trust.partition_trust(bound) == outside and not calls
+    assert confidence.partition_confidence(bound) == outside and not calls
     pose(angle=2.0)
-    trust.partition_trust(bound)
-    assert trust.partition_trust(bound) and len(calls) == 1
+    confidence.partition_confidence(bound)
+    assert confidence.partition_confidence(bound) and len(calls) == 1
 
 
-def test_trust_of_what_cannot_be_read_is_nothing(bound):
+def test_confidence_of_what_cannot_be_read_is_nothing(bound):
     bpy.data.objects[ELBOW_RIG].data.bones["lower"].name = "forearm"
-    assert trust.partition_trust(bound) is None
+    assert confidence.partition_confidence(bound) is None
     bpy.data.objects.remove(bpy.data.objects[ELBOW_RIG])
-    assert trust.partition_trust(bound) is None
+    assert confidence.partition_confidence(bound) is None

@@ -60,8 +60,8 @@ def test_it_writes_faces(chain: Character, tmp_path: Path):
 
 def test_it_says_how_far_the_model_is_to_be_believed(chain: Character, tmp_path: Path):
     inside, outside = (play(tmp_path, chain.model, "a.obj", "--turn", "bone_1", angle, 0, 0) for angle in (20, 170))
-    assert inside.stdout == "a.obj: 90 vertices, trust 1.00\n"
-    assert float(outside.stdout.removeprefix("a.obj: 90 vertices, trust ")) < 0.9
+    assert inside.stdout == "a.obj: 90 vertices, confidence 1.00\n"
+    assert float(outside.stdout.removeprefix("a.obj: 90 vertices, confidence ")) < 0.9
 
 
 @pytest.mark.parametrize("given", [False, True])

@@ -145,7 +145,7 @@ def mesh_part(view: np.ndarray) -> np.ndarray:
 def test_it_shows_what_python_computes(at_rest: Shown, posed: Shown, chain: Character):
     for shown, turns in (at_rest, {}), (posed, TURNS):
         assert (shown.state, shown.errors) == ("ready", [])
-        assert re.fullmatch(r"Trust \d+ %, \d+\.\d ms", shown.status)
+        assert re.fullmatch(r"Confidence \d+ %, \d+\.\d ms", shown.status)
         assert shown.joints == ["bone_0", "bone_1", "bone_2", "bone_3"]
         assert np.abs(shown.positions - expected_positions(chain.model, turns)).max() < 1e-5
     assert np.abs(posed.positions - at_rest.positions).max() > 0.1

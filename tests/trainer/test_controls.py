@@ -21,10 +21,10 @@ from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
+from trainer.confidence import measure_training_range
 from trainer.config import TrainingConfig
 from trainer.data import split_recording
 from trainer.inputs import inputs_of_rig, middles
-from trainer.trust import make_trust_range
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import QUICK, run_page
@@ -128,18 +128,18 @@ def test_the_report_names_controls(model):
     assert "<th>controls</th>" in page and '<td title="armature_object/[&quot;puff&quot;]">1</td>' in page
 
 
-def trust_of(network: Network, control: int, values: np.ndarray) -> np.ndarray:
-    """(N, 3) trust in the rest pose as one control moves; the others stay at their middles."""
+def confidence_of(network: Network, control: int, values: np.ndarray) -> np.ndarray:
+    """(N, 3) confidence in the rest pose as one control moves; the others stay at their middles."""
     controls = np.tile(np.float32([0.5, 0, 0.5]), (len(values), 1))
     controls[:, control] = values
-    return network.trust(np.tile(network.info.rest_matrices, (len(values), 1, 1, 1)), controls)
+    return network.confidence(np.tile(network.info.rest_matrices, (len(values), 1, 1, 1)), controls)
 
 
 def test_trust_fades_beyond_the_range_of_a_control(network):
-    trust = trust_of(network, 0, np.linspace(0, 8, 80))
-    assert (trust[:10, 1:] == 1).all() and (trust[-1, 1:] == 0).all()
-    assert (np.diff(trust[:, 1:], axis=0) <= 0).all() and np.abs(np.diff(trust, axis=0)).max() < 0.05
-    assert (trust[:, 0] == 1).all(), "the first partition does not follow this control"
+    confidence = confidence_of(network, 0, np.linspace(0, 8, 80))
+    assert (confidence[:10, 1:] == 1).all() and (confidence[-1, 1:] == 0).all()
+    assert (np.diff(confidence[:, 1:], axis=0) <= 0).all() and np.abs(np.diff(confidence, axis=0)).max() < 0.05
+    assert (confidence[:, 0] == 1).all(), "the first partition does not follow this control"
     # What is left far outside is linear skinning.
     rest = network.info.rest_matrices[None]
     far = network.positions(rest, np.float32([[50, 0, 0.5]]))[0]
@@ -149,9 +149,9 @@ def test_trust_fades_beyond_the_range_of_a_control(network):
 
 
 def test_a_control_that_never_moved_takes_trust_only_when_it_moves(network):
-    trust = trust_of(network, 2, np.float32([0.5, 0.7, 1.5, 5]))
-    assert (trust[0] == 1).all()
-    assert (np.diff(trust, axis=0) < 0).all() and (trust[-1] == 0).all(), "nobody knows what it moves"
+    confidence = confidence_of(network, 2, np.float32([0.5, 0.7, 1.5, 5]))
+    assert (confidence[0] == 1).all()
+    assert (np.diff(confidence, axis=0) < 0).all() and (confidence[-1] == 0).all(), "nobody knows what it moves"
 
 
 def test_a_control_that_was_watched_and_stood_still_counts_where_it_influences():
@@ -159,15 +159,17 @@ def test_a_control_that_was_watched_and_stood_still_counts_where_it_influences()
     partitions = make_partitions(rig, INFLUENCING, {1: (0,)})
     inputs = inputs_of_rig(rig, middles(rig, partitions), partitions)
     poses, still = pose_chain(rig, chain_angles(20, 3, 0)), np.full((20, 1), 0.25)
-    own = make_trust_range(inputs.features(poses, rig.rest_matrices, still), rig, partitions)
+    own = measure_training_range(inputs.features(poses, rig.rest_matrices, still), rig, partitions)
     assert own.controls == (replace(BULGE, low=0.25, high=0.25),)
-    trust = own.trust(inputs.features(poses[:3], rig.rest_matrices, np.array([[0.25], [1], [6]])))
-    assert (trust[:, [0, 2]] == 1).all() and trust[0, 1] == 1 > trust[1, 1] > 0.8 and trust[2, 1] == 0
+    confidence = own.confidence(inputs.features(poses[:3], rig.rest_matrices, np.array([[0.25], [1], [6]])))
+    assert (
+        (confidence[:, [0, 2]] == 1).all() and confidence[0, 1] == 1 > confidence[1, 1] > 0.8 and confidence[2, 1] == 0
+    )
 
 
 def test_values_of_controls_must_be_given(network):
     rest = np.repeat(network.info.rest_matrices[None], 2, axis=0)
-    for call in (network.positions, network.trust):
+    for call in (network.positions, network.confidence):
         with pytest.raises(
             ModelError, match=r"has 3 controls and takes their values as an array \(2, 3\);.* given none"
         ):

@@ -43,16 +43,16 @@ def deformation(recording, tmp_path_factory) -> Deformation:
 
 def played(deformation: Deformation, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     session = open_session(build_graph(deformation).SerializeToString())
-    return tuple(session.run(["positions", "trust"], {"pose_matrices": poses}))
+    return tuple(session.run(["positions", "confidence"], {"pose_matrices": poses}))
 
 
 def agrees(deformation: Deformation, poses: np.ndarray, tolerance: float = 2e-6) -> np.ndarray:
-    """Compare with PyTorch; returns the trust."""
-    positions, trust = played(deformation, poses)
-    expected, expected_trust = reference_positions(deformation, poses, np.zeros((len(poses), 0), np.float32))
+    """Compare with PyTorch; returns the confidence."""
+    positions, confidence = played(deformation, poses)
+    expected, expected_confidence = reference_positions(deformation, poses, np.zeros((len(poses), 0), np.float32))
     np.testing.assert_allclose(positions, expected, atol=tolerance)
-    np.testing.assert_allclose(trust, expected_trust, atol=1e-5)
-    return trust
+    np.testing.assert_allclose(confidence, expected_confidence, atol=1e-5)
+    return confidence
 
 
 @pytest.mark.parametrize("sheared", [False, True])
@@ -77,8 +77,8 @@ def test_a_character_that_is_scaled_as_a_whole_keeps_its_residuals(deformation):
     scaled = np.diag([2, 2, 2, 1]).astype(np.float32) @ poses
     # The last partition does not look at the root, which was locked.
     last = deformation.partitions[2].vertices
-    positions, trust = played(deformation, scaled)
-    assert (trust[:, 2] == 1).all()
+    positions, confidence = played(deformation, scaled)
+    assert (confidence[:, 2] == 1).all()
     np.testing.assert_allclose(positions[:, last], 2 * played(deformation, poses)[0][:, last], atol=4e-6)
     assert np.abs(positions - LinearSkinning(deformation.rig).positions(scaled))[:, last].max() > 1e-3
 
@@ -92,9 +92,9 @@ def test_far_from_the_origin(deformation):
 
 def test_a_sheared_bone_gives_numbers_and_takes_trust_at_most(deformation):
     poses = (pose_chain(deformation.rig, chain_angles(5, 3, 5)).astype(np.float64) @ SHEAR).astype(np.float32)
-    positions, trust = played(deformation, poses)
+    positions, confidence = played(deformation, poses)
     linear = LinearSkinning(deformation.rig).positions(poses)
-    assert np.isfinite(positions).all() and (trust >= 0).all() and (trust <= 1).all()
+    assert np.isfinite(positions).all() and (confidence >= 0).all() and (confidence <= 1).all()
     assert np.abs(positions - linear).max() < 0.1
     agrees(replace(deformation, sheared=True), poses)
 

@@ -97,7 +97,7 @@ def test_models_are_as_good(trained, name):
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_the_same_counts_as_locked(trained, name):
-    """What the trust is taken for: ranges in true metres agree."""
+    """What the confidence is taken for: ranges in true metres agree."""
     (_, _, own), (_, _, metres) = trained[name], trained[METRES]
     per_metre, _ = WAYS[name]
     for mine, theirs in ((own.feature_low, metres.feature_low), (own.feature_high, metres.feature_high)):

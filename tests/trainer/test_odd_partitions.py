@@ -104,7 +104,7 @@ def test_the_code_of_the_page_on_recordings_reads_it(model):
 
 
 def test_trust_is_one_where_nothing_moves_that_did_not(model):
-    assert (Network(model).trust(odd_poses(odd_rig(), 10, 0)) == 1).all()
+    assert (Network(model).confidence(odd_poses(odd_rig(), 10, 0)) == 1).all()
 
 
 def test_what_follows_no_bone_sees_the_joints_that_influence_it():

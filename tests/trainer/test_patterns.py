@@ -200,11 +200,11 @@ def test_the_graph_plays_them_far_away_and_beyond_the_range(trained):
     poses = pose_chain(trained.rig, chain_angles(20, JOINTS, 5, reach=1.2))
     there = np.eye(4)
     there[:3, 3] = 60, -70, 40
-    trust = agrees(trained, (there @ poses).astype(np.float32), tolerance=1e-4)
-    assert (trust < 1).any()
+    confidence = agrees(trained, (there @ poses).astype(np.float32), tolerance=1e-4)
+    assert (confidence < 1).any()
     folded = pose_chain(trained.rig, np.full((1, JOINTS, 2), 3.0))
-    positions, trust = played(trained, folded)
+    positions, confidence = played(trained, folded)
     middle = trained.partitions[1].vertices
-    assert trust[0, 1] == 0
+    assert confidence[0, 1] == 0
     linear = LinearSkinning(trained.rig).positions(folded)
     np.testing.assert_allclose(positions[:, middle], linear[:, middle], atol=1e-6)

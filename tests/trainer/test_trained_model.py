@@ -33,7 +33,7 @@ def session(trained) -> onnxruntime.InferenceSession:
 
 
 def play(session, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return tuple(session.run(["positions", "trust"], {"pose_matrices": poses}))
+    return tuple(session.run(["positions", "confidence"], {"pose_matrices": poses}))
 
 
 def test_approximates_unseen_poses(session, rig):
@@ -49,9 +49,9 @@ def test_approximates_unseen_poses(session, rig):
 
 def test_number_of_poses_is_free_and_poses_do_not_mix(session, rig):
     poses = pose_chain(rig, chain_angles(7, 3, seed=5))
-    together, trust = play(session, poses)
+    together, confidence = play(session, poses)
     assert together.shape == (7, rig.vertex_count, 3) and together.dtype == np.float32
-    assert trust.shape == (7, len(read_model_info_partitions(session)))
+    assert confidence.shape == (7, len(read_model_info_partitions(session)))
     for number in (0, 6):
         alone = play(session, poses[number : number + 1])[0]
         np.testing.assert_allclose(alone[0], together[number], atol=2e-6)
@@ -72,27 +72,27 @@ def test_moving_the_character_as_a_whole_moves_the_mesh(session, rig):
 
 
 def test_trust_is_one_inside_the_range_and_the_recorded_poses_are(session, recording):
-    trust = play(session, np.array(read_recording(recording).pose_matrices))[1]
-    assert (trust == 1).all()
+    confidence = play(session, np.array(read_recording(recording).pose_matrices))[1]
+    assert (confidence == 1).all()
 
 
 def test_trust_fades_outside(session, rig):
     angles = np.zeros((40, 3, 2))
     angles[:, 1, 0] = np.linspace(LIMIT, LIMIT * 3, 40)
-    trust = play(session, pose_chain(rig, angles))[1]
-    assert trust[0].min() == 1
-    assert (np.diff(trust, axis=0) <= 1e-6).all(), "trust grows again on the way out"
-    assert 0 < trust[-1, :2].max() < 0.99
-    assert np.abs(np.diff(trust, axis=0)).max() < 0.05, "the fade is a jump"
+    confidence = play(session, pose_chain(rig, angles))[1]
+    assert confidence[0].min() == 1
+    assert (np.diff(confidence, axis=0) <= 1e-6).all(), "confidence grows again on the way out"
+    assert 0 < confidence[-1, :2].max() < 0.99
+    assert np.abs(np.diff(confidence, axis=0)).max() < 0.05, "the fade is a jump"
 
 
 def test_far_outside_linear_skinning_is_left(session, rig, trained):
     poses = pose_chain(rig, np.zeros((3, 3, 2)))
     poses[:, 1:, :3, :3] *= np.float32([1, 5, 50])[:, None, None, None]
-    positions, trust = play(session, poses)
-    assert (trust[0] == 1).all() and (np.diff(trust[:, :2], axis=0) <= 0).all()
-    gone = np.flatnonzero(trust[2] == 0)
-    assert len(gone), "a joint fifty times its size is still trusted"
+    positions, confidence = play(session, poses)
+    assert (confidence[0] == 1).all() and (np.diff(confidence[:, :2], axis=0) <= 0).all()
+    gone = np.flatnonzero(confidence[2] == 0)
+    assert len(gone), "a joint fifty times its size still has full confidence"
     partitions = read_model_info(trained / "model.onnx").partitions_of(rig)
     linear = LinearSkinning(rig).positions(poses)
     for number in gone:
@@ -100,12 +100,12 @@ def test_far_outside_linear_skinning_is_left(session, rig, trained):
         np.testing.assert_allclose(positions[2, vertices], linear[2, vertices], atol=1e-4)
 
 
-def test_a_locked_axis_that_turns_lowers_the_trust(session, rig):
+def test_a_locked_axis_that_turns_lowers_the_confidence(session, rig):
     angles = np.zeros((3, 3, 2))
     angles[1:, 2, 1] = 0.5, 1.5
-    trust = play(session, pose_chain(rig, angles))[1]
-    assert (trust[0] == 1).all()
-    assert 1 > trust[1, 2] > trust[2, 2], "the last joint never turned about z in the recording"
+    confidence = play(session, pose_chain(rig, angles))[1]
+    assert (confidence[0] == 1).all()
+    assert 1 > confidence[1, 2] > confidence[2, 2], "the last joint never turned about z in the recording"
 
 
 @pytest.mark.parametrize("reach", [1.5, 2.0, 3.0])
@@ -120,9 +120,9 @@ def test_beyond_the_range_it_is_never_worse_than_linear_skinning(session, rig, r
 def test_a_joint_scaled_to_nothing_gives_numbers(session, rig):
     poses = pose_chain(rig, chain_angles(2, 3, seed=1))
     poses[1, 1, :3, :3] = 0
-    positions, trust = play(session, poses)
-    assert np.isfinite(positions).all() and np.isfinite(trust).all()
-    assert trust[1].min() < 1
+    positions, confidence = play(session, poses)
+    assert np.isfinite(positions).all() and np.isfinite(confidence).all()
+    assert confidence[1].min() < 1
 
 
 def test_metadata_describes_rig_and_training(trained, recording, report):
@@ -175,9 +175,9 @@ def test_a_rig_of_one_joint_has_nothing_to_learn_and_plays(tmp_path):
     model = tmp_path / "m.onnx"
     assert main([str(tmp_path / "one"), str(model), "--epochs", "1"]) == 0
     session = onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
-    positions, trust = play(session, rig.rest_matrices[None])
+    positions, confidence = play(session, rig.rest_matrices[None])
     np.testing.assert_allclose(positions[0], rig.rest_positions, atol=1e-5)
-    assert trust.tolist() == [[1.0]]
+    assert confidence.tolist() == [[1.0]]
 
 
 def test_report_says_what_shading_shows(report, recording, session, trained):

@@ -44,11 +44,11 @@ async function start() {
       while (newer) {
         newer = false;
         const begin = performance.now();
-        const { positions, trust } = await model.run(pose);
+        const { positions, confidence } = await model.run(pose);
         const time = performance.now() - begin;
         stage.show(positions, pose.matrices()[joint]);
         globalThis.positions = positions; // for the console, and for whoever compares them
-        if (!newer) tell("ready", `Trust ${Math.round(trust * 100)} %, ${time.toFixed(1)} ms`);
+        if (!newer) tell("ready", `Confidence ${Math.round(confidence * 100)} %, ${time.toFixed(1)} ms`);
       }
     } finally {
       running = false;

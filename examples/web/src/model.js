@@ -22,7 +22,7 @@ export class Model {
    * Deform the mesh.
    *
    * @param {Pose} pose
-   * @returns `positions`, Float32Array of V times x, y, z in mesh-object space, metres, and `trust`, the lowest of the
+   * @returns `positions`, Float32Array of V times x, y, z in mesh-object space, metres, and `confidence`, the lowest of the
    *     partitions, 0 to 1
    */
   async run(pose) {
@@ -33,7 +33,7 @@ export class Model {
     if (pose.controls.length) {
       inputs.controls = new ort.Tensor("float32", Float32Array.from(pose.values), [1, pose.values.length]);
     }
-    const { positions, trust } = await this.session.run(inputs);
-    return { positions: positions.data, trust: Math.min(...trust.data) };
+    const { positions, confidence } = await this.session.run(inputs);
+    return { positions: positions.data, confidence: Math.min(...confidence.data) };
   }
 }

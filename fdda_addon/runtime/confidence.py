@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How far a bound model is believed in the current pose, by partition."""
+"""The confidence of a bound model in the current pose, by partition."""
 
 import bpy
 
@@ -13,13 +13,13 @@ from . import model_files
 _last: dict[int, tuple[object, bytes, list[tuple[str, float]] | None]] = {}
 
 
-def partition_trust(mesh_object: bpy.types.Object) -> list[tuple[str, float]] | None:
-    """Name of the main joint and trust, 0 to 1, of each partition in the pose that Blender has evaluated.
+def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float]] | None:
+    """Name of the main joint and confidence, 0 to 1, of each partition in the pose that Blender has evaluated.
 
     The model is executed once for a pose, however often this is asked.
 
     Returns:
-        The least trusted first; None when the model does not say, or the pose cannot be read.
+        The least confident first; None when the model does not say, or the pose cannot be read.
     """
     armature_object = armature_of(mesh_object)
     if armature_object is None or not mesh_object.fdda.is_bound:
@@ -39,10 +39,10 @@ def partition_trust(mesh_object: bpy.types.Object) -> list[tuple[str, float]] | 
         shown = pose.tobytes() + controls.tobytes()
         kept = _last.get(mesh_object.session_uid)
         if kept is None or kept[0] is not network or kept[1] != shown:
-            trust = network.trust(pose[None], controls[None])
+            confidence = network.confidence(pose[None], controls[None])
             values = None
-            if trust is not None:
-                partitions = zip(network.info.partitions, trust[0].tolist(), strict=True)
+            if confidence is not None:
+                partitions = zip(network.info.partitions, confidence[0].tolist(), strict=True)
                 values = sorted(((names[p.joint], value) for p, value in partitions), key=lambda pair: pair[1])
             _last.clear()
             kept = _last[mesh_object.session_uid] = (network, shown, values)

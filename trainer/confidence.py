@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Trust: how far a pose lies inside what the training has seen.
+"""Confidence: how far a pose lies inside what the training has seen.
 
 The range of a joint is a box around its features in the training poses, with a margin; that of a control, around its
 values. The excess of a pose is its distance from the box in units of a fade width that grows with the range. With e the
-excess over all joints and controls that count for a partition, its trust is max(0, 1 - e^2)^2: exactly 1 inside, 0 from
-one fade width on, smooth at both ends.
+excess over all joints and controls that count for a partition, its confidence is max(0, 1 - e^2)^2: exactly 1 inside,
+0 from one fade width on, smooth at both ends.
 """
 
 from dataclasses import dataclass, replace
@@ -28,14 +28,14 @@ MIN_MARGIN = (0.01, 0.001)
 MIN_FADE = (4.0, 0.2)
 """Least margin and fade width: of rotation elements, no unit, and of translations, as a part of the character's size.
 
-A locked axis has no range of its own; these are what it may turn before it counts, and what takes all trust away. Those
+A locked axis has no range of its own; these are what it may turn before it counts, and where the confidence is 0. Those
 of a control are the first of each, as a part of the range that it was recorded for."""
 LOCKED = 1e-4
 """A joint whose features spread less than this was locked in the recording (no unit, or mesh units)."""
 
 
 @dataclass(frozen=True)
-class TrustRange:
+class TrainingRange:
     """What the training has seen of each joint and control.
 
     Attributes:
@@ -52,15 +52,15 @@ class TrustRange:
     counts: np.ndarray
     controls: tuple[Control, ...] = ()
 
-    def trust(self, features: np.ndarray) -> np.ndarray:
-        """(N, F) features to (N, P) float32 trust."""
+    def confidence(self, features: np.ndarray) -> np.ndarray:
+        """Compute the confidence of each partition, (N, P) float32, from (N, F) features."""
         size = len(self.width)
         own = features[:, :size]
         excess = ((own - np.clip(own, self.low[:size], self.high[:size])) / self.width).astype(np.float64)
         return (np.maximum(0, 1 - excess**2 @ self.counts.T) ** 2).astype(np.float32)
 
 
-def make_trust_range(features: np.ndarray, rig: Rig, partitions: tuple[Partition, ...]) -> TrustRange:
+def measure_training_range(features: np.ndarray, rig: Rig, partitions: tuple[Partition, ...]) -> TrainingRange:
     """Measure the range of the training poses.
 
     Args:
@@ -80,7 +80,7 @@ def make_trust_range(features: np.ndarray, rig: Rig, partitions: tuple[Partition
     margin = np.maximum(MARGIN * spread, least_margin)
     width = np.maximum(FADE * spread, least_fade)[:own]
     ranges = zip(rig.controls, low[joints:own].tolist(), high[joints:own].tolist(), strict=True)
-    return TrustRange(
+    return TrainingRange(
         *(array.astype(np.float32) for array in (low - margin, high + margin, width)),
         np.concatenate([_joints_that_count(spread, rig, partitions), _controls_that_count(rig, partitions)], axis=1),
         tuple(replace(control, low=least, high=most) for control, least, most in ranges),
