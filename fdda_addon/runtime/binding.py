@@ -12,8 +12,7 @@ from ..rig.modifier_stack import check_stack
 from ..rig.time_inputs import check_inputs
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import path_for
-from . import cache as caches
-from . import model_files, nodes, packed, playback, switch
+from . import model_files, nodes, packed, playback, position_buffer, switch
 from .opened_model import open_model
 
 
@@ -71,12 +70,12 @@ def unbind(mesh_object: bpy.types.Object) -> None:
     binding.mode = "RIG"
     modifier = nodes.find_modifier(mesh_object)
     if modifier is not None:
-        cache = nodes.cache_of(modifier)
-        nodes.set_cache(modifier, None)
+        buffer = nodes.buffer_of(modifier)
+        nodes.set_buffer(modifier, None)
         if not nodes.is_inherited(modifier):
             mesh_object.modifiers.remove(modifier)
-        if cache is not None and cache not in nodes.used_caches():
-            caches.remove(cache)
+        if buffer is not None and buffer not in nodes.used_buffers():
+            position_buffer.remove_buffer(buffer)
     for name in ("is_bound", "model", "packed", "use_in_render", "status"):
         binding.property_unset(name)
     playback.forget()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Characters with one model that move in the same frames: their poses are executed in one call.
 
-While they do, the drivers of their cache objects wait for one hub, an object whose driver reads all that they read; its
-getter plays them all. A hub makes Blender evaluate all of them when one is posed, so it is there only while frames
+While they do, the drivers of their position buffers wait for one hub, an object whose driver reads all that they read;
+its getter plays them all. A hub makes Blender evaluate all of them when one is posed, so it is there only while frames
 change: it comes with the second frame in which the same ones moved, and goes with the first pose that few of them took.
 """
 
@@ -13,7 +13,7 @@ from itertools import islice
 import bpy
 
 from ..core.errors import FDDAError
-from . import cache as caches
+from . import driver
 from .live_binding import LiveBinding
 from .network import Execution, Network
 
@@ -34,7 +34,7 @@ class Crowd:
 
     Attributes:
         network: their model.
-        members: by the session ids of their cache objects.
+        members: by the session ids of their position buffers.
     """
 
     def __init__(self, network: Network, members: Mapping[int, LiveBinding]):
@@ -48,11 +48,11 @@ class Crowd:
         # Nothing uses it, and it must stay when the user purges what nothing uses.
         hub.is_runtime_data, hub.use_fake_user, hub[HUB_KEY] = True, True, True
         found = [(live, live.find(), known[uid]) for uid, live in self.members.items()]
-        sources = [source for live, mesh_object, cache in found for source in live.sources(mesh_object, cache)]
+        sources = [source for live, mesh_object, buffer in found for source in live.sources(mesh_object, buffer)]
         inputs = [variable for live, mesh_object, _ in found for variable in live.inputs(mesh_object)]
-        caches.connect(hub, [caches.getter(hub), *sources, *inputs])
+        driver.set_driver_inputs(hub, [driver.playback_input(hub), *sources, *inputs])
         for uid in self.members:
-            caches.connect(known[uid], [("SINGLE_PROP", hub, "location[0]")])
+            driver.set_driver_inputs(known[uid], [("SINGLE_PROP", hub, "location[0]")])
         return hub
 
     def scatter(self) -> None:
@@ -67,21 +67,21 @@ class Crowd:
                     live.error = error
 
     def play(self, hub: bpy.types.Object) -> None:
-        """Give all evaluated cache objects their positions; errors are noted with the members."""
+        """Give all evaluated position buffers their positions; errors are noted with the members."""
         with ExitStack() as stack:
             shown = []
-            sources = iter(caches.sources(hub, sum(live.source_count for live in self.members.values())))
+            sources = iter(driver.evaluated_inputs(hub, sum(live.source_count for live in self.members.values())))
             for live in self.members.values():
                 stack.enter_context(live.lock)
-                cache, mesh_object, armature_object, *owners = islice(sources, live.source_count)
+                buffer, mesh_object, armature_object, *owners = islice(sources, live.source_count)
                 with live.noting_errors():
-                    if cache is not None and live.read(mesh_object, armature_object, owners):
-                        shown.append((live, cache, mesh_object))
+                    if buffer is not None and live.read(mesh_object, armature_object, owners):
+                        shown.append((live, buffer, mesh_object))
             moved = [live for live, _, _ in shown if live.job is not None]
             self._execute(moved)
-            for live, cache, mesh_object in shown:
+            for live, buffer, mesh_object in shown:
                 with live.noting_errors():
-                    live.write(cache, mesh_object)
+                    live.write(buffer, mesh_object)
 
     def _execute(self, moved: list[LiveBinding]) -> None:
         together = [live for live in moved if live.job.strength > 0]
@@ -135,7 +135,7 @@ class Crowds:
         """After an evaluation: let those play together that moved in this frame and the one before, and no others.
 
         Args:
-            lives: all live bindings, by the session ids of their cache objects.
+            lives: all live bindings, by the session ids of their position buffers.
             frame_changed: whether another frame was evaluated.
 
         Returns:

@@ -32,10 +32,10 @@ def _playback() -> ModuleType | None:
     return playback
 
 
-def _play(cache: bpy.types.Object) -> float:
-    """The getter that the driver of a cache object reads: what it is for is that it is called."""
-    if cache.is_evaluated and _PLAYBACK in sys.modules:
-        sys.modules[_PLAYBACK].play(cache)
+def _play(buffer: bpy.types.Object) -> float:
+    """The getter that the driver of a position buffer reads: what it is for is that it is called."""
+    if buffer.is_evaluated and _PLAYBACK in sys.modules:
+        sys.modules[_PLAYBACK].play(buffer)
     return 0.0
 
 
@@ -75,12 +75,12 @@ def _on_loaded(*_: object) -> None:
 @persistent
 def _on_undo_begins(*_: object) -> None:
     if playback := _playback():
-        playback.remove_caches()
+        playback.remove_buffers()
 
 
 @persistent
 def _on_undone(*_: object) -> None:
-    # The step that was read may have brought cache objects back, of which evaluated copies are left from before.
+    # The step that was read may have brought position buffers back, of which evaluated copies are left from before.
     _on_undo_begins()
     _play_anew()
 
@@ -138,11 +138,11 @@ def _resume_open_file() -> None:
 
 
 def unregister() -> None:
-    """Remove getter and cache objects; rigs are given back."""
+    """Remove getter and position buffers; rigs are given back."""
     if bpy.app.timers.is_registered(_resume_open_file):
         bpy.app.timers.unregister(_resume_open_file)
     if _PLAYBACK in sys.modules:
         # Nothing would move their meshes any more.
         sys.modules[_PLAYBACK].give_back_rigs()
-        sys.modules[_PLAYBACK].remove_caches()
+        sys.modules[_PLAYBACK].remove_buffers()
     del bpy.types.Object.fdda_playback

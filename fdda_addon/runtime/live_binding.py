@@ -19,8 +19,7 @@ from ..scene.controls import ControlReader
 from ..scene.mask import mask_key, read_mask
 from ..scene.mesh import set_mesh_positions
 from ..scene.scene_rig import SceneRig, armature_of
-from . import cache as caches
-from . import rig_check
+from . import driver, rig_check
 from .model_files import network_of
 from .network import Execution
 from .switch import held_mode_of
@@ -57,10 +56,10 @@ class LiveBinding:
     is_constant = False
     """No model is executed: what was shown last stays (`playback.constant_positions`)."""
 
-    def __init__(self, mesh_object: bpy.types.Object, cache: bpy.types.Object):
+    def __init__(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object):
         """Args:
             mesh_object: bound.
-            cache: its cache object.
+            buffer: its position buffer.
 
         Raises:
             FDDAError: the model cannot be loaded, or does not fit the object any more.
@@ -92,24 +91,26 @@ class LiveBinding:
         self.execution.poses[0] = info.rest_matrices
         # The first pose is played when the handlers have been called already.
         self._look_for_numbers(self.execution.run())
-        self.connect(mesh_object, cache)
+        self.connect(mesh_object, buffer)
 
-    def connect(self, mesh_object: bpy.types.Object, cache: bpy.types.Object) -> None:
-        """Have the cache object evaluated whenever what the model reads has been."""
-        caches.connect(cache, [caches.getter(cache), *self.sources(mesh_object, cache), *self.inputs(mesh_object)])
+    def connect(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object) -> None:
+        """Have the position buffer evaluated whenever what the model reads has been."""
+        driver.set_driver_inputs(
+            buffer, [driver.playback_input(buffer), *self.sources(mesh_object, buffer), *self.inputs(mesh_object)]
+        )
 
     @property
     def source_count(self) -> int:
         """How many `sources` there are."""
         return 3 + len(self.network.info.controls)
 
-    def sources(self, mesh_object: bpy.types.Object, cache: bpy.types.Object) -> list[caches.Variable]:
+    def sources(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object) -> list[driver.DriverInput]:
         """What is read in `play`."""
-        return caches.sources_of(cache, self.scene_rig(mesh_object), self.network.info.controls)
+        return driver.pose_inputs(buffer, self.scene_rig(mesh_object), self.network.info.controls)
 
-    def inputs(self, mesh_object: bpy.types.Object) -> list[caches.Variable]:
+    def inputs(self, mesh_object: bpy.types.Object) -> list[driver.DriverInput]:
         """What the positions follow from besides."""
-        return caches.further_inputs(self.scene_rig(mesh_object), self.network.info.joint_names)
+        return driver.dependency_inputs(self.scene_rig(mesh_object), self.network.info.joint_names)
 
     def find(self) -> bpy.types.Object | None:
         """The object, under whatever name it has now; None when it is gone or no longer bound."""
@@ -199,14 +200,14 @@ class LiveBinding:
         self._sentence = self._news
         return self._news
 
-    def play(self, cache: bpy.types.Object) -> None:
-        """Give an evaluated cache object the positions of the evaluated pose; what goes wrong is noted in `error`."""
+    def play(self, buffer: bpy.types.Object) -> None:
+        """Write the positions of the evaluated pose to an evaluated position buffer; note errors in `error`."""
         with self.lock, self.noting_errors():
-            _, mesh_object, armature_object, *owners = caches.sources(cache, self.source_count)
+            _, mesh_object, armature_object, *owners = driver.evaluated_inputs(buffer, self.source_count)
             if self.read(mesh_object, armature_object, owners):
                 if self.job is not None:
                     self.execute()
-                self.write(cache, mesh_object)
+                self.write(buffer, mesh_object)
 
     @contextmanager
     def noting_errors(self) -> Iterator[None]:
@@ -275,9 +276,9 @@ class LiveBinding:
             playing, strengths = execution.positions[place : place + 1], np.array([self.job.strength], np.float32)
             self._positions = self._blend.apply(playing, self.job.pose[None], strengths)[0]
 
-    def write(self, cache: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
-        """Give an evaluated cache object the positions, also those it had: it may show those of the rest pose again."""
-        set_mesh_positions(cache.data, self._positions)
+    def write(self, buffer: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
+        """Write the positions to an evaluated position buffer, also unchanged ones: evaluation may have reset them."""
+        set_mesh_positions(buffer.data, self._positions)
         # Baking asks here too where renders show the rig, and needs the shape keys.
         if mesh_object.data.shape_keys is not None:
             if VIEWPORT_KEY in mesh_object:

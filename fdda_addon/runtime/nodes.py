@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Geometry Nodes modifier that gives a mesh the positions of a cache object.
+"""The Geometry Nodes modifier that gives a mesh the positions of a position buffer.
 
 The positions lie in a mesh of their own, which is in no scene: the user's mesh is never touched, and objects that
 share one mesh datablock can still have different positions.
@@ -15,7 +15,7 @@ GROUP_NAME = "FDDA Playback"
 
 
 def add_modifier(mesh_object: bpy.types.Object, place: int) -> bpy.types.NodesModifier:
-    """Add the modifier at a place of the stack; it is given a cache object when it plays.
+    """Add the modifier at a place of the stack; it is given a position buffer when it plays.
 
     A library override may have one of its library, which cannot be removed; that one serves again. So does one that is
     left from a binding that is gone: an override forgets its binding when it is saved where the add-on is missing.
@@ -52,25 +52,25 @@ def is_inherited(modifier: bpy.types.NodesModifier) -> bool:
     return modifier.id_data.override_library is not None and modifier.is_override_data
 
 
-def cache_of(modifier: bpy.types.NodesModifier) -> bpy.types.Object | None:
-    """The cache object of a modifier."""
-    return node_input(modifier, _cache_socket(modifier.node_group))
+def buffer_of(modifier: bpy.types.NodesModifier) -> bpy.types.Object | None:
+    """The position buffer of a modifier."""
+    return node_input(modifier, _buffer_socket(modifier.node_group))
 
 
-def set_cache(modifier: bpy.types.NodesModifier, cache: bpy.types.Object | None) -> None:
-    """Give a modifier another cache object, or none."""
-    set_node_input(modifier, _cache_socket(modifier.node_group), cache)
+def set_buffer(modifier: bpy.types.NodesModifier, buffer: bpy.types.Object | None) -> None:
+    """Give a modifier another position buffer, or none."""
+    set_node_input(modifier, _buffer_socket(modifier.node_group), buffer)
     # Setting the input alone does not tell the dependency graph of the new relation.
     modifier.node_group = modifier.node_group
 
 
-def used_caches() -> set[bpy.types.Object]:
-    """The cache objects that modifiers read."""
+def used_buffers() -> set[bpy.types.Object]:
+    """The position buffers that modifiers read."""
     modifiers = (m for o in bpy.data.objects if o.type == "MESH" for m in o.modifiers if plays(m))
-    return {cache for modifier in modifiers if (cache := cache_of(modifier)) is not None}
+    return {buffer for modifier in modifiers if (buffer := buffer_of(modifier)) is not None}
 
 
-def _cache_socket(group: bpy.types.NodeTree) -> str:
+def _buffer_socket(group: bpy.types.NodeTree) -> str:
     for item in group.interface.items_tree:
         if item.item_type == "SOCKET" and item.in_out == "INPUT" and item.socket_type == "NodeSocketObject":
             return item.identifier
@@ -80,7 +80,7 @@ def _cache_socket(group: bpy.types.NodeTree) -> str:
 def _node_group() -> bpy.types.NodeTree:
     """Object Info → Sample Index → Set Position; one group serves all bindings of a file.
 
-    Where the cache object is missing or has another number of vertices, the mesh stays as it is.
+    Where the position buffer is missing or has another number of vertices, the mesh stays as it is.
     """
     for group in bpy.data.node_groups:
         if PLAYBACK_KEY in group and group.library is None:
@@ -103,7 +103,7 @@ def _node_group() -> bpy.types.NodeTree:
     position = node("GeometryNodeInputPosition", 1, 2)
     index = node("GeometryNodeInputIndex", 1, 3)
     sample = node("GeometryNodeSampleIndex", 2, 1, data_type="FLOAT_VECTOR", domain="POINT")
-    own, cached = (node("GeometryNodeAttributeDomainSize", 2, row) for row in (2, 3))
+    mesh_size, buffer_size = (node("GeometryNodeAttributeDomainSize", 2, row) for row in (2, 3))
     set_position = node("GeometryNodeSetPosition", 3, 0)
     equal = node("FunctionNodeCompare", 3, 2, data_type="INT", operation="EQUAL")
     first, second = (socket for socket in equal.inputs if socket.type == "INT")
@@ -116,10 +116,10 @@ def _node_group() -> bpy.types.NodeTree:
         (position.outputs["Position"], sample.inputs["Value"]),
         (index.outputs["Index"], sample.inputs["Index"]),
         (sample.outputs["Value"], set_position.inputs["Position"]),
-        (inputs.outputs["Geometry"], own.inputs["Geometry"]),
-        (info.outputs["Geometry"], cached.inputs["Geometry"]),
-        (own.outputs["Point Count"], first),
-        (cached.outputs["Point Count"], second),
+        (inputs.outputs["Geometry"], mesh_size.inputs["Geometry"]),
+        (info.outputs["Geometry"], buffer_size.inputs["Geometry"]),
+        (mesh_size.outputs["Point Count"], first),
+        (buffer_size.outputs["Point Count"], second),
         (equal.outputs["Result"], switch.inputs["Switch"]),
         (inputs.outputs["Geometry"], switch.inputs["False"]),
         (set_position.outputs["Geometry"], switch.inputs["True"]),

@@ -12,8 +12,7 @@ from contextlib import contextmanager
 import bpy
 
 from ..core.errors import FDDAError, ModelError
-from . import cache as caches
-from . import nodes, rig_check, switch
+from . import nodes, position_buffer, rig_check, switch
 from .changed import Changed, changed_meshes
 from .crowd import Crowds, is_hub
 from .evaluation_threads import keep_thread
@@ -23,7 +22,7 @@ from .model_files import network_of
 _bound: dict[int, frozenset[str]] = {}
 """What is animated or driven of what switches a bound object (`switch.animated_switches`), by its session id."""
 _live: dict[int, LiveBinding] = {}
-"""Those that play, by the session id of their cache object."""
+"""Those that play, by the session id of their position buffer."""
 _crowds = Crowds()
 _edited: set[int] = set()
 """Session ids of the bound objects whose meshes are being changed, in edit mode or another."""
@@ -33,7 +32,7 @@ _is_given_back = False
 
 
 def play(driven: bpy.types.Object) -> None:
-    """Give an evaluated cache object, or all of a hub, the positions of the pose. Nothing is raised."""
+    """Give an evaluated position buffer, or all of a hub, the positions of the pose. Nothing is raised."""
     keep_thread()
     uid = driven.original.session_uid
     player = _live.get(uid) or _crowds.by_hub.get(uid)
@@ -83,7 +82,7 @@ def _isolated(mesh_object: bpy.types.Object) -> Iterator[None]:
 
 
 def _greet(depsgraph: bpy.types.Depsgraph) -> None:
-    """Have the cache objects of new live bindings evaluated once more in a dependency graph.
+    """Have the position buffers of new live bindings evaluated once more in a dependency graph.
 
     What a graph did not need before, while its modifier was off, it leaves out of the first evaluation with it.
     """
@@ -91,9 +90,9 @@ def _greet(depsgraph: bpy.types.Depsgraph) -> None:
     key = depsgraph.mode, depsgraph.scene.session_uid, depsgraph.view_layer.name
     new = {uid for uid, live in _live.items() if key not in live.graphs}
     if new:
-        for cache in [o for o in bpy.data.objects if o.session_uid in new]:
-            _live[cache.session_uid].graphs.add(key)
-            cache.data.update_tag()
+        for buffer in [o for o in bpy.data.objects if o.session_uid in new]:
+            _live[buffer.session_uid].graphs.add(key)
+            buffer.data.update_tag()
 
 
 def _know_viewport(depsgraph: bpy.types.Depsgraph) -> None:
@@ -121,7 +120,7 @@ def _follow_mode(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) 
         switch.switch_modifiers(mesh_object, wants_model)
         binding.status = ""
         make_anew(mesh_object)
-        # That the cache object is needed now, Blender learns in one evaluation and evaluates it in the next, its own.
+        # In one evaluation Blender learns that the position buffer is needed; it evaluates the buffer in the next one.
         _is_following = True
         try:
             depsgraph.update()
@@ -201,8 +200,8 @@ def follow_mask(mesh_object: bpy.types.Object, *, weights_changed: bool = False)
     """Play the pose again with the mask that a bound object has now, if it is another."""
     uid, live = _of(mesh_object)
     if live is not None and live.follow_mask(mesh_object, weights_changed):
-        for cache in [o for o in bpy.data.objects if o.session_uid == uid]:
-            cache.data.update_tag()
+        for buffer in [o for o in bpy.data.objects if o.session_uid == uid]:
+            buffer.data.update_tag()
 
 
 def _follow_weights(meshes: Container[int]) -> None:
@@ -215,10 +214,10 @@ def _follow_weights(meshes: Container[int]) -> None:
 
 
 def _reads(mesh_object: bpy.types.Object, uid: int) -> bool:
-    """Whether the modifier of a mesh object reads a cache object."""
+    """Whether the modifier of a mesh object reads a position buffer."""
     modifier = nodes.find_modifier(mesh_object)
-    cache = modifier and nodes.cache_of(modifier)
-    return cache is not None and cache.session_uid == uid
+    buffer = modifier and nodes.buffer_of(modifier)
+    return buffer is not None and buffer.session_uid == uid
 
 
 def is_outdated(mesh_object: bpy.types.Object) -> bool:
@@ -289,7 +288,7 @@ def rigs_given_back() -> Iterator[None]:
     """Borrow the open file as it is without models, to write parts of it: nothing of ours comes along."""
     global _is_given_back
     give_back_rigs()
-    remove_caches()
+    remove_buffers()
     # Operators evaluate before they begin.
     _is_given_back = True
     try:
@@ -299,8 +298,8 @@ def rigs_given_back() -> Iterator[None]:
         resume()
 
 
-def remove_caches() -> None:
-    """Remove all cache objects, and forget what plays; `resume` makes them anew.
+def remove_buffers() -> None:
+    """Remove all position buffers, and forget what plays; `resume` makes them anew.
 
     Blender's undo keeps datablocks that are the same in two steps as they are in memory: one that points to an object
     which was made without a step of its own would then point to memory that is free.
@@ -309,7 +308,7 @@ def remove_caches() -> None:
     for mesh_object in [o for o in bpy.data.objects if o.type == "MESH"]:
         modifier = nodes.find_modifier(mesh_object)
         if modifier is not None:
-            nodes.set_cache(modifier, None)
+            nodes.set_buffer(modifier, None)
     _remove_unused()
 
 
@@ -337,7 +336,7 @@ def fail(mesh_object: bpy.types.Object, error: FDDAError) -> None:
 
 
 def scan() -> None:
-    """Find the bound objects when objects have come or gone; each that plays has its own cache object."""
+    """Find the bound objects when objects have come or gone; each that plays has its own position buffer."""
     global _object_count
     if _is_given_back or _object_count == len(bpy.data.objects):
         return
@@ -355,7 +354,7 @@ def _find(mesh_object: bpy.types.Object, taken: set[int]) -> None:
 
     Args:
         mesh_object: the object.
-        taken: session ids of the cache objects that others use; its own is added.
+        taken: session ids of the position buffers that others use; its own is added.
     """
     _bound[mesh_object.session_uid] = animated = switch.animated_switches(mesh_object)
     switch.follow_visibility(mesh_object, animated)
@@ -365,37 +364,37 @@ def _find(mesh_object: bpy.types.Object, taken: set[int]) -> None:
     if not mesh_object.fdda.is_playing:
         switch.disconnect_visible(mesh_object, animated)
         return
-    cache = _own_cache(mesh_object, taken)
-    live = _live.get(cache.session_uid)
+    buffer = _ensure_buffer(mesh_object, taken)
+    live = _live.get(buffer.session_uid)
     if live is None or live.uid != mesh_object.session_uid:
-        _live[cache.session_uid] = LiveBinding(mesh_object, cache)
+        _live[buffer.session_uid] = LiveBinding(mesh_object, buffer)
         if mesh_object.mode not in rig_check.SETTLED_MODES:
             _edited.add(mesh_object.session_uid)
     else:
         # Blender hands a driver on to the override of what it reads.
-        live.connect(mesh_object, cache)
+        live.connect(mesh_object, buffer)
 
 
-def _own_cache(mesh_object: bpy.types.Object, taken: set[int]) -> bpy.types.Object:
-    """The cache object of a mesh object: a new one where it has none, or one that is in another's use."""
+def _ensure_buffer(mesh_object: bpy.types.Object, taken: set[int]) -> bpy.types.Object:
+    """The position buffer of a mesh object: a new one where it has none, or one that is in another's use."""
     modifier = nodes.find_modifier(mesh_object)
     if modifier is None:
         raise ModelError(f"The FDDA modifier of '{mesh_object.name}' was removed; bind the model again.")
-    cache = nodes.cache_of(modifier)
-    is_own = cache is not None and caches.is_cache(cache) and cache.session_uid not in taken
-    if not is_own or len(cache.data.vertices) != len(mesh_object.data.vertices):
+    buffer = nodes.buffer_of(modifier)
+    is_own = buffer is not None and position_buffer.is_buffer(buffer) and buffer.session_uid not in taken
+    if not is_own or len(buffer.data.vertices) != len(mesh_object.data.vertices):
         # A duplicate still points to the positions of its original, an override to those of the linked object.
-        cache = caches.new_cache(mesh_object)
-        nodes.set_cache(modifier, cache)
-    taken.add(cache.session_uid)
-    return cache
+        buffer = position_buffer.create_buffer(mesh_object)
+        nodes.set_buffer(modifier, buffer)
+    taken.add(buffer.session_uid)
+    return buffer
 
 
 def _remove_unused() -> None:
-    """Remove the cache objects of what was deleted."""
-    used = nodes.used_caches()
-    for cache in [o for o in bpy.data.objects if caches.is_cache(o) and o not in used]:
-        _live.pop(cache.session_uid, None)
-        caches.remove(cache)
+    """Remove the position buffers of what was deleted."""
+    used = nodes.used_buffers()
+    for buffer in [o for o in bpy.data.objects if position_buffer.is_buffer(o) and o not in used]:
+        _live.pop(buffer.session_uid, None)
+        position_buffer.remove_buffer(buffer)
     for hub in [o for o in bpy.data.objects if is_hub(o) and o.session_uid not in _crowds.by_hub]:
         bpy.data.objects.remove(hub)

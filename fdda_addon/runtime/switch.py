@@ -105,8 +105,8 @@ def disconnect_visible(mesh_object: bpy.types.Object, animated: frozenset[str]) 
 
 def disconnect(modifier: bpy.types.NodesModifier) -> None:
     """Give an FDDA modifier no positions; whoever plays a model gives it some again."""
-    if nodes.cache_of(modifier) is not None:
-        nodes.set_cache(modifier, None)
+    if nodes.buffer_of(modifier) is not None:
+        nodes.set_buffer(modifier, None)
 
 
 def switch_modifiers(mesh_object: bpy.types.Object, playing: bool | None = None) -> None:

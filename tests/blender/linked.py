@@ -111,8 +111,8 @@ def own_characters() -> list[bpy.types.Object]:
     return [o for o in bpy.data.objects if o.type == "MESH" and o.override_library]
 
 
-def cache_name(mesh_object: bpy.types.Object) -> str:
-    return nodes.cache_of(nodes.find_modifier(mesh_object)).name
+def buffer_name(mesh_object: bpy.types.Object) -> str:
+    return nodes.buffer_of(nodes.find_modifier(mesh_object)).name
 
 
 def assert_play(library: Library, angles: tuple[float, ...] = ANGLES) -> list[np.ndarray]:

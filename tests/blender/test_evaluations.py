@@ -225,7 +225,7 @@ def test_a_character_that_stands_still_is_not_evaluated(bound, monkeypatch):
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     bpy.context.view_layer.update()
     calls, real = [], LiveBinding.play
-    monkeypatch.setattr(LiveBinding, "play", lambda self, cache: calls.append(cache) or real(self, cache))
+    monkeypatch.setattr(LiveBinding, "play", lambda self, buffer: calls.append(buffer) or real(self, buffer))
     bpy.context.scene.frame_set(7)
     assert calls == []
     pose(angle=0.7)

@@ -15,7 +15,7 @@ from .linked import (
     armature_of,
     assert_play,
     bend,
-    cache_name,
+    buffer_name,
     elsewhere,
     link,
     override,
@@ -127,7 +127,7 @@ def test_an_override_of_what_plays_already(library, tmp_path):
     armature_of(mesh_object).animation_data.action = None
     bend(mesh_object, 0.8)
     assert_play(library, (0.8,))
-    assert nodes.cache_of(nodes.find_modifier(mesh_object)).is_runtime_data
+    assert nodes.buffer_of(nodes.find_modifier(mesh_object)).is_runtime_data
     save_and_open(tmp_path)
     assert_play(library, (0.8,))
 
@@ -167,7 +167,7 @@ def test_a_duplicated_override_has_its_own_positions(pair, library, tmp_path):
     assert copy not in pair and copy.override_library and armature_of(copy) != armature_of(pair[1])
     bend(copy, 0.7)
     assert_play(library, (*ANGLES, 0.7))
-    assert len({cache_name(o) for o in own_characters()}) == 3
+    assert len({buffer_name(o) for o in own_characters()}) == 3
     save_and_open(tmp_path)
     assert_play(library, (*ANGLES, 0.7))
 
@@ -182,4 +182,4 @@ def test_a_crowd_of_overrides_is_one_call(library, monkeypatch):
     assert calls[-1] == CROWD
     for mesh_object in crowd:
         assert_plays(mesh_object, library.model)
-    assert len({cache_name(mesh_object) for mesh_object in crowd}) == CROWD
+    assert len({buffer_name(mesh_object) for mesh_object in crowd}) == CROWD

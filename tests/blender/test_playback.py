@@ -33,8 +33,8 @@ def test_posing(bound, elbow):
 
 def test_each_bone_of_a_chain(bound, elbow):
     """The driver names the last bone alone: Blender evaluates it after those above, with a solver too."""
-    cache = nodes.cache_of(nodes.find_modifier(bound))
-    variables = cache.animation_data.drivers[0].driver.variables
+    buffer = nodes.buffer_of(nodes.find_modifier(bound))
+    variables = buffer.animation_data.drivers[0].driver.variables
     assert {v.targets[0].bone_target for v in variables if v.type == "TRANSFORMS"} == {"", "lower"}
     shown = [assert_plays(bound, elbow.model)]
     for angle, bone in ((0.7, "upper"), (0.5, "lower"), (-0.3, "upper")):

@@ -285,10 +285,10 @@ def test_one_character_that_fails_in_any_way_leaves_the_others(bound, elbow, mon
     bpy.context.view_layer.update()
     real = LiveBinding.write
 
-    def write(self, cache, mesh_object):
+    def write(self, buffer, mesh_object):
         if mesh_object.name == crowd[1].name:
             raise SystemExit("out")
-        real(self, cache, mesh_object)
+        real(self, buffer, mesh_object)
 
     monkeypatch.setattr(LiveBinding, "write", write)
     for mesh_object in crowd:

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The position buffer of a bound mesh object: an object whose evaluated mesh holds the vertex positions of the model.
+
+Object and mesh are runtime data, local, and in no scene. Blender never saves them; `playback` creates missing ones.
+"""
+
+import bpy
+
+from ..scene.mesh import mesh_positions, set_mesh_positions
+from ..scene.scene_rig import MODIFIER_NAME
+
+BUFFER_KEY = "fdda_position_buffer"
+"""Custom property that marks position buffers."""
+
+
+def create_buffer(mesh_object: bpy.types.Object) -> bpy.types.Object:
+    """Create a position buffer with the vertices of a mesh object, at their rest positions."""
+    name = f"{mesh_object.name} {MODIFIER_NAME} positions"
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(len(mesh_object.data.vertices))
+    set_mesh_positions(mesh, mesh_positions(mesh_object.data))
+    buffer = bpy.data.objects.new(name, mesh)
+    mesh.is_runtime_data = buffer.is_runtime_data = True
+    buffer[BUFFER_KEY] = True
+    return buffer
+
+
+def is_buffer(scene_object: bpy.types.Object) -> bool:
+    """Tell whether an object is a position buffer of this session."""
+    return scene_object.is_runtime_data and BUFFER_KEY in scene_object
+
+
+def remove_buffer(buffer: bpy.types.Object | None) -> None:
+    """Delete a position buffer and its mesh."""
+    if buffer is not None and buffer.library is None:
+        mesh = buffer.data
+        bpy.data.objects.remove(buffer)
+        if mesh.users == 0:
+            bpy.data.meshes.remove(mesh)
