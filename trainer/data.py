@@ -171,7 +171,7 @@ def split_recording(recording: Recording, config: TrainingConfig) -> Split:
         around = np.flatnonzero(random)[random.sum() - margin.poses :]
         besides[around], random[around] = True, False
     usable = np.ones(len(besides), bool)
-    if not config.unsettled:
+    if not config.include_unsettled:
         usable[list(recording.info.unsettled)] = False
     at_rest = int((usable & ~besides).sum())
     if not usable.all() and at_rest < MIN_POSES:
