@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from farm.characters import Plan, read_plan  # noqa: E402
-from farm.stamps import check_outputs, read_stamp  # noqa: E402
+from farm.fingerprints import check_outputs, read_manifest  # noqa: E402
 from farm.tasks import MERGE, RECORD, REFINE, TRAIN, make_tasks  # noqa: E402
 
 INSIDE = "FDDA_CHAOS_INSIDE"
@@ -231,13 +231,13 @@ def differences(calm: Plan, storm: Plan) -> list[str]:
     wrong = []
     first, second = make_tasks(calm), make_tasks(storm)
     for name, task in second.items():
-        stamps = read_stamp(first[name]), check_outputs(task)
-        if bool(stamps[0].skipped) != bool(stamps[1].skipped):
+        manifests = read_manifest(first[name]), check_outputs(task)
+        if bool(manifests[0].skipped) != bool(manifests[1].skipped):
             wrong.append(f"{name} was not needed in one of them")
-        if task.kind in (RECORD, MERGE, REFINE) and stamps[0].outputs != stamps[1].outputs:
+        if task.kind in (RECORD, MERGE, REFINE) and manifests[0].outputs != manifests[1].outputs:
             wrong.append(f"the recordings of {name} differ")
         if task.kind == TRAIN:
-            models = [{n: own for n, own in stamp.outputs.items() if n.endswith(".onnx")} for stamp in stamps]
+            models = [{n: own for n, own in manifest.outputs.items() if n.endswith(".onnx")} for manifest in manifests]
             if models[0] != models[1] or len(models[0]) != 1:
                 wrong.append(f"the models of {name} differ")
         if task.kind in (RECORD, REFINE):

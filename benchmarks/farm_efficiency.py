@@ -23,8 +23,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from farm.characters import read_plan  # noqa: E402
+from farm.fingerprints import read_manifest  # noqa: E402
 from farm.run import GOOD, run_task  # noqa: E402
-from farm.stamps import read_stamp  # noqa: E402
 from farm.tasks import make_tasks  # noqa: E402
 
 HUMANS = ("BASIC_HUMAN", "HUMAN")
@@ -113,12 +113,12 @@ def measure(out: Path, name: str, workers: int, options: argparse.Namespace) -> 
             outcome = run_task(plan.farm, tasks, task)
             assert outcome.state in GOOD, outcome
     seconds, after = time.monotonic() - started, resource.getrusage(resource.RUSAGE_CHILDREN)
-    stamps = [read_stamp(task) for task in tasks.values()]
+    manifests = [read_manifest(task) for task in tasks.values()]
     return {
         "seconds": round(seconds, 1),
-        "seconds of verbs": round(sum(stamp.seconds for stamp in stamps), 1),
+        "seconds of verbs": round(sum(manifest.seconds for manifest in manifests), 1),
         "processor seconds": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
-        "peak MB of a process": max(stamp.peak_mb for stamp in stamps),
+        "peak MB of a process": max(manifest.peak_mb for manifest in manifests),
         "tasks": len(tasks),
     }
 

@@ -80,9 +80,9 @@ def way() -> Iterator[float]:
     done("recorded")
     yield from sidebar.open_section("training")
     session = part("training.environment.session")
-    if session.answer is None:
+    if session.check_result is None:
         yield from sidebar.push("fdda.check_trainer", across=0.2)
-        yield from until(lambda: session.answer is not None, 60, "the check does not end")
+        yield from until(lambda: session.check_result is not None, 60, "the check does not end")
     yield 0.3
     yield from sidebar.push("fdda.train(")
     yield from job_done("train", LIMIT)

@@ -158,11 +158,11 @@ def _all(options: argparse.Namespace, plan: "Plan", tasks: dict[str, "Task"], pa
     from fdda_addon.core.temporary import check_temporary_folder
 
     from .cluster import connected, local_workers, run_on
+    from .fingerprints import InputFingerprints, outdated_tasks
     from .report import write_report
     from .run import AGAIN, FAILED, GOOD, Outcome
-    from .stamps import Keys, to_do
 
-    names, unreadable = to_do(tasks, Keys(plan.farm, tasks))
+    names, unreadable = outdated_tasks(tasks, InputFingerprints(plan.farm, tasks))
     outcomes = {name: Outcome(name, FAILED, sentence) for name, sentence in unreadable.items()}
     if options.list:
         for name in tasks:

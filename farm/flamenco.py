@@ -8,7 +8,7 @@ from pathlib import Path
 from fdda_addon.core.output import write_json
 
 from .characters import Plan
-from .stamps import ROOT
+from .fingerprints import ROOT
 from .tasks import Task
 
 JOB_TYPE = "fdda-characters"

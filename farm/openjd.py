@@ -7,7 +7,7 @@ from pathlib import Path
 from fdda_addon.core.output import write_json
 
 from .characters import Plan
-from .stamps import ROOT
+from .fingerprints import ROOT
 from .tasks import BIND, RECORD, TRAIN, Task
 
 SPECIFICATION = "jobtemplate-2023-09"

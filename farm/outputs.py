@@ -10,14 +10,14 @@ from fdda_addon.core.file_kind import BLEND, EVALUATION, MODEL, PAGE, PICTURE, R
 from fdda_addon.core.output import check_folder_writable, check_outputs
 
 from .characters import Plan, PlanError
-from .stamps import digest_file, read_stamp
+from .fingerprints import digest_file, read_manifest
 from .tasks import Task
 
 FARM_REPORT = FileKind("the report of a farm", rb'\s*\{\s*"format":\s*"fdda-farm-report"')
 FARM_PAGE = FileKind("the page of the report of a farm", rb"<!doctype html>.*: characters</title>")
 TEMPLATE = FileKind("an OpenJD job template", rb'\s*\{\s*"specificationVersion":\s*"jobtemplate-')
 JOB = FileKind("a job for Flamenco", rb'\s*\{\s*"name":\s*"(?:[^"\\]|\\.)*",\s*"type":\s*"fdda-characters"')
-STAMP = FileKind("the fingerprint of a task", rb'\s*\{\s*"format":\s*"fdda-farm-task"')
+MANIFEST = FileKind("the fingerprint of a task", rb'\s*\{\s*"format":\s*"fdda-farm-task"')
 LOG = FileKind("the log of a task", rb"\$ ")
 KINDS_OF_PUBLISHED = {
     **{".blend": BLEND, ".onnx": MODEL, ".png": PICTURE, "report.json": REPORT},
@@ -49,7 +49,9 @@ def check_farm_outputs(
     tasks, own = list(tasks), list(own)
     read = [plan.path, *(path for each in plan.characters for path in (each.rig, *each.depends))]
     published = [(place, kind_of(name)) for task in tasks for name, place in task.publishes]
-    kept = {os.path.realpath(path): path for task in tasks for path in (task.folder, task.stamp, task.log, task.lock)}
+    kept = {
+        os.path.realpath(path): path for task in tasks for path in (task.folder, task.manifest, task.log, task.lock)
+    }
     for path in (*read, *(path for path, _ in (*own, *published))):
         real = Path(os.path.realpath(path))
         if taken := next((kept[str(one)] for one in (real, *real.parents) if str(one) in kept), None):
@@ -73,11 +75,11 @@ def check_published(task: Task, overwrite: bool = False) -> None:
         OutputError: a file is there that is of another kind, is read, or is a bound file that somebody has changed.
     """
     _check_files([(place, kind_of(name)) for name, place in task.publishes], task.files, overwrite)
-    stamp = None if overwrite else read_stamp(task)
+    manifest = None if overwrite else read_manifest(task)
     # Of the other files nobody makes anything: they are made again.
     bound = [(name, place) for name, place in task.publishes if kind_of(name) is BLEND and os.path.exists(place)]
-    for name, place in bound if stamp else ():
-        if os.path.getsize(place) and digest_file(place) != stamp.outputs.get(name):
+    for name, place in bound if manifest else ():
+        if os.path.getsize(place) and digest_file(place) != manifest.outputs.get(name):
             raise OutputError(
                 f"Cannot write '{place}': somebody has changed it since the farm made it; move it, or --overwrite."
             )
@@ -91,7 +93,7 @@ def check_unclaimed(task: Task) -> None:
     """
     if os.path.lexists(task.folder):
         raise OutputError(f"'{task.folder}' is there, and not from the farm; move it, or give [farm] another work.")
-    check_outputs([(task.stamp, STAMP), (task.log, LOG)])
+    check_outputs([(task.manifest, MANIFEST), (task.log, LOG)])
 
 
 def _check_files(outputs: list[tuple[Path, FileKind]], read: Iterable[Path], overwrite: bool) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from fdda_addon.core.errors import TRY_AGAIN, FDDAError
 
 from .characters import Farm
-from .stamps import ROOT
+from .fingerprints import ROOT
 
 WAIT_SECONDS = 0.05
 ENDED_BY_SIGNAL = 128
@@ -41,7 +41,7 @@ class TryAgainError(FDDAError):
 
 
 @dataclass(frozen=True)
-class Ended:
+class ProcessResult:
     """What a verb took: wall-clock time, and the most memory of a process of it."""
 
     seconds: float
@@ -90,7 +90,7 @@ def _paths() -> list[str]:
 
 def run_verb(
     farm: Farm, verb: tuple[str, ...], folder: Path, log: Path, lock: int, is_wanted: Callable[[], bool] = lambda: True
-) -> Ended:
+) -> ProcessResult:
     """Run a verb until it ends.
 
     Args:
@@ -137,7 +137,7 @@ def run_verb(
     if code:
         sentence = _sentence(log, begin) or f"{verb[0]} ended with status {code}; see '{log}'."
         raise (TryAgainError if code == TRY_AGAIN else VerbError)(sentence)
-    return Ended(time.monotonic() - started, usage.ru_maxrss / POSIX_MB)
+    return ProcessResult(time.monotonic() - started, usage.ru_maxrss / POSIX_MB)
 
 
 def _wait(process: int, is_wanted: Callable[[], bool]) -> tuple[int, resource.struct_rusage]:

@@ -8,9 +8,9 @@ from typing import Any
 from fdda_addon.core.output import write_json, write_text
 
 from .characters import Character, Plan
+from .fingerprints import LARGEST, TaskManifest, read_json, read_manifest
 from .page import render_page
 from .run import BLOCKED, GOOD, Outcome
-from .stamps import LARGEST, Stamp, read_json, read_stamp
 from .tasks import BIND, EVALUATE, EVALUATION, KINDS, PICTURE, REFINE, REPORT, Task
 
 FORMAT, VERSION = "fdda-farm-report", 1
@@ -69,28 +69,28 @@ def write_report(plan: Plan, tasks: dict[str, Task], outcomes: dict[str, Outcome
 
 
 def _character(character: Character, tasks: dict[str, Task], outcomes: dict[str, Outcome]) -> dict:
-    stamps = {name: read_stamp(task) for name, task in tasks.items()}
+    manifests = {name: read_manifest(task) for name, task in tasks.items()}
     failures = [
         {"task": name, "state": outcomes[name].state, "sentence": outcomes[name].sentence}
         for name in tasks
         if name in outcomes and outcomes[name].state not in (*GOOD, BLOCKED)
     ]
     bind = next(task for task in tasks.values() if task.kind == BIND)
-    is_bound = stamps[bind.name] is not None and not failures and bind.name not in _not_good(outcomes)
-    ran = {name: stamp for name, stamp in stamps.items() if stamp is not None and not stamp.skipped}
+    is_bound = manifests[bind.name] is not None and not failures and bind.name not in _not_good(outcomes)
+    ran = {name: manifest for name, manifest in manifests.items() if manifest is not None and not manifest.skipped}
     return {
         "state": BOUND if is_bound else BROKEN if failures else UNFINISHED,
         "rig": character.rig.name,
         "output": str(character.output),
         "failures": failures,
         "goal_mm": character.goal_mm,
-        "models": _models(tasks, bind, stamps[bind.name]) if is_bound else [],
+        "models": _models(tasks, bind, manifests[bind.name]) if is_bound else [],
         "seconds": {kind: round(sum(s.seconds for n, s in ran.items() if tasks[n].kind == kind), 1) for kind in KINDS},
-        "peak_mb": max((stamp.peak_mb for stamp in ran.values()), default=0.0),
-        "hosts": sorted({stamp.host for stamp in ran.values() if stamp.host}),
+        "peak_mb": max((manifest.peak_mb for manifest in ran.values()), default=0.0),
+        "hosts": sorted({manifest.host for manifest in ran.values() if manifest.host}),
         "tasks": len(tasks),
         "ran_now": sum(outcomes[name].state == "done" for name in tasks if name in outcomes),
-        "key": stamps[bind.name].key if is_bound else "",
+        "key": manifests[bind.name].key if is_bound else "",
     }
 
 
@@ -98,11 +98,11 @@ def _not_good(outcomes: dict[str, Outcome]) -> set[str]:
     return {name for name, outcome in outcomes.items() if outcome.state not in GOOD}
 
 
-def _models(tasks: dict[str, Task], bind: Task, stamp: Stamp) -> list[dict]:
+def _models(tasks: dict[str, Task], bind: Task, manifest: TaskManifest) -> list[dict]:
     """Of each model that is bound: its errors, and the round that it is of."""
     found = []
     for place, rounds in bind.choices:
-        bound = stamp.notes.get("bound")
+        bound = manifest.notes.get("bound")
         train = bound.get(place) if isinstance(bound, dict) else None
         if train not in [name for name, _ in rounds]:
             train = rounds[0][0]
@@ -130,8 +130,8 @@ def _models(tasks: dict[str, Task], bind: Task, stamp: Stamp) -> list[dict]:
 
 
 def _was_skipped(task: Task) -> bool:
-    stamp = read_stamp(task)
-    return stamp is None or bool(stamp.skipped)
+    manifest = read_manifest(task)
+    return manifest is None or bool(manifest.skipped)
 
 
 def _pictures(tasks: dict[str, Task], character: Character) -> list[tuple[str, bytes]]:

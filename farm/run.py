@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Does one task, wherever it is: checks what it uses, runs its verbs, and says by a stamp that it is done.
+"""Does one task, wherever it is: checks what it uses, runs its verbs, and says by a manifest that it is done.
 
 It may be killed at any moment, and be started again on any machine: what is there is gone on with, what is done is not
 done again, and no two processes do the same task at a time.
@@ -18,20 +18,20 @@ from fdda_addon.core.errors import FDDAError, exit_status
 from fdda_addon.core.output import is_left_over, replacing, write_text
 
 from .characters import Farm
-from .outputs import check_published, check_unclaimed
-from .process import Ended, TryAgainError, held, run_verb
-from .stamps import (
-    Keys,
-    Stamp,
-    StampError,
+from .fingerprints import (
+    InputFingerprints,
+    ManifestError,
+    TaskManifest,
     check_outputs,
     digest_outputs,
-    float_of,
+    finite_float,
     is_up_to_date,
     read_json,
-    read_stamp,
-    write_stamp,
+    read_manifest,
+    write_manifest,
 )
+from .outputs import check_published, check_unclaimed
+from .process import ProcessResult, TryAgainError, held, run_verb
 from .tasks import BIND, EVALUATION, REPORT, Task
 
 DONE, UP_TO_DATE, NOT_NEEDED, FAILED, AGAIN, BLOCKED = (
@@ -80,18 +80,18 @@ def run_task(
     """
     task, host = tasks[name], socket.gethostname()
     try:
-        key = Keys(farm, tasks).of(name)
+        key = InputFingerprints(farm, tasks).of_task(name)
         with held(task.lock) as lock:
             if is_up_to_date(task, key):
-                skipped = read_stamp(task).skipped
+                skipped = read_manifest(task).skipped
                 return Outcome(name, NOT_NEEDED if skipped else UP_TO_DATE, skipped, host=host)
             if skipped := _skipped(tasks, task):
-                write_stamp(task, Stamp(key, {}, skipped, host=host))
+                write_manifest(task, TaskManifest(key, {}, skipped, host=host))
                 return Outcome(name, NOT_NEEDED, skipped, host=host)
             check_published(task, overwrite)
-            stamp = _do(tasks, task, key, lambda verb: run_verb(farm, verb, task.folder, task.log, lock, is_wanted))
-            write_stamp(task, stamp)
-        return Outcome(name, DONE, "", stamp.seconds, stamp.peak_mb, host)
+            manifest = _do(tasks, task, key, lambda verb: run_verb(farm, verb, task.folder, task.log, lock, is_wanted))
+            write_manifest(task, manifest)
+        return Outcome(name, DONE, "", manifest.seconds, manifest.peak_mb, host)
     except FDDAError as error:
         state = AGAIN if exit_status(error) == TryAgainError.exit_status else FAILED
         return Outcome(name, state, str(error), host=host)
@@ -105,7 +105,7 @@ def _skipped(tasks: dict[str, Task], task: Task) -> str:
     """Why a task of a later round has nothing to do; empty where it has."""
     if task.round is None:
         return ""
-    before = read_stamp(tasks[task.round.evaluate])
+    before = read_manifest(tasks[task.round.evaluate])
     if before is not None and before.skipped:
         return before.skipped
     train = tasks[task.round.train]
@@ -123,10 +123,10 @@ def reached_mm(evaluate: Task) -> float:
     """What 99.9 % of the vertices of held-out poses are within, by the evaluation of a task.
 
     Raises:
-        StampError: it does not say.
+        ManifestError: it does not say.
     """
     try:
-        return float_of(read_json(evaluate.folder / EVALUATION)["fdda"]["p999"])
+        return finite_float(read_json(evaluate.folder / EVALUATION)["fdda"]["p999"])
     except (OSError, LookupError, TypeError, ValueError, ArithmeticError) as error:
         raise _damaged(evaluate, EVALUATION, error) from error
 
@@ -139,13 +139,13 @@ def _verdict(train: Task) -> object:
         raise _damaged(train, REPORT[0], error) from error
 
 
-def _damaged(task: Task, name: str, error: Exception) -> StampError:
+def _damaged(task: Task, name: str, error: Exception) -> ManifestError:
     """What to say of a file that a task left; from now on the task is not done."""
-    task.stamp.unlink(missing_ok=True)
-    return StampError(f"'{task.folder / name}' is damaged ({error}); run the farm again, and it is made again.")
+    task.manifest.unlink(missing_ok=True)
+    return ManifestError(f"'{task.folder / name}' is damaged ({error}); run the farm again, and it is made again.")
 
 
-def _do(tasks: dict[str, Task], task: Task, key: str, run: Callable[[tuple[str, ...]], Ended]) -> Stamp:
+def _do(tasks: dict[str, Task], task: Task, key: str, run: Callable[[tuple[str, ...]], ProcessResult]) -> TaskManifest:
     notes = {}
     _check_before(tasks, task)
     _prepare(task, key)
@@ -160,7 +160,7 @@ def _do(tasks: dict[str, Task], task: Task, key: str, run: Callable[[tuple[str, 
     outputs = digest_outputs(task)
     for name, place in task.publishes:
         _copy(task.folder / name, place)
-    return Stamp(key, outputs, "", round(seconds, 3), round(peak, 1), socket.gethostname(), notes)
+    return TaskManifest(key, outputs, "", round(seconds, 3), round(peak, 1), socket.gethostname(), notes)
 
 
 def _check_before(tasks: dict[str, Task], task: Task) -> None:
@@ -168,8 +168,8 @@ def _check_before(tasks: dict[str, Task], task: Task) -> None:
     used = [argument for verb in task.verbs for argument in verb] + [str(source) for source, _ in task.copies]
     for name in task.after:
         before = tasks[name]
-        stamp = read_stamp(before)
-        if stamp is not None and stamp.skipped:
+        manifest = read_manifest(before)
+        if manifest is not None and manifest.skipped:
             continue
         wanted = tuple(path for path in used if Path(path).is_relative_to(before.folder))
         # Of a recording of several meshes, one may be used; of a model, what lies beside it is of use to others.
@@ -187,7 +187,7 @@ def _prepare(task: Task, key: str) -> None:
     begun = task.folder / KEY
     if not begun.is_file():
         check_unclaimed(task)
-    task.stamp.unlink(missing_ok=True)
+    task.manifest.unlink(missing_ok=True)
     # Nobody else holds the task: what is half is of processes that were killed, on whatever machine.
     for half in (
         *task.folder.parent.glob(f".new-{task.folder.name}-*"),
@@ -214,7 +214,7 @@ def _choose(tasks: dict[str, Task], task: Task) -> dict[str, str]:
     """Copy the best model of all rounds, for each that is bound, with what says how good it is."""
     bound = {}
     for place, rounds in task.choices:
-        done = [(train, evaluate) for train, evaluate in rounds if not read_stamp(tasks[train]).skipped]
+        done = [(train, evaluate) for train, evaluate in rounds if not read_manifest(tasks[train]).skipped]
         train, evaluate = min(done, key=lambda pair: reached_mm(tasks[pair[1]]))
         own = task.folder / place
         own.parent.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fdda_addon.core.recording.estimate import duration_in_words
 
 from .characters import Farm
-from .stamps import read_stamp
+from .fingerprints import read_manifest
 from .tasks import BIND, EVALUATE, INFLUENCES, KINDS, MERGE, RECORD, REFINE, TRAIN, Task
 
 START_SECONDS = 2.0
@@ -44,11 +44,11 @@ def task_seconds(tasks: dict[str, Task]) -> tuple[dict[str, float], int]:
     measured: dict[str, float] = {}
     rates: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for name, task in tasks.items():
-        stamp = read_stamp(task)
-        if stamp is not None:
-            measured[name] = stamp.seconds
-            if not stamp.skipped:
-                rates[task.kind].append((max(0.0, stamp.seconds - START_SECONDS)) / max(1, task.poses))
+        manifest = read_manifest(task)
+        if manifest is not None:
+            measured[name] = manifest.seconds
+            if not manifest.skipped:
+                rates[task.kind].append((max(0.0, manifest.seconds - START_SECONDS)) / max(1, task.poses))
     return {name: measured.get(name, _estimated(task, rates[task.kind])) for name, task in tasks.items()}, len(measured)
 
 

@@ -73,7 +73,7 @@ class Task:
     poses: int = 0
 
     @property
-    def stamp(self) -> Path:
+    def manifest(self) -> Path:
         """What is written when it is done."""
         return self.folder.with_name(f"{self.folder.name}.json")
 

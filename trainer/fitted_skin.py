@@ -12,7 +12,7 @@ from fdda_addon.core.messages import MessageType
 from fdda_addon.core.metrics import distances
 from fdda_addon.core.recording.fit_folder import FitPoses, read_fit_poses, write_fitted
 from fdda_addon.core.rig import Rig
-from fdda_addon.core.skin_fit import INFLUENCES, Gain, SkinFit
+from fdda_addon.core.skin_fit import INFLUENCES, FitReport, SkinFit
 from fdda_addon.core.skinning import LinearSkinning
 
 from .announcements import Announcer
@@ -56,7 +56,7 @@ def fit_folder(
     return result
 
 
-def measure(poses: FitPoses, fitted: Rig) -> Gain:
+def measure(poses: FitPoses, fitted: Rig) -> FitReport:
     """How far skinning with the rig's own and with the fitted weights is from the poses."""
     step, metres_per_unit = max(1, BLOCK_FLOATS // (3 * fitted.vertex_count)), fitted.metres_per_unit
     rms, largest = {}, {}
@@ -69,4 +69,4 @@ def measure(poses: FitPoses, fitted: Rig) -> Gain:
             squares, most = squares + float((apart**2).sum()), max(most, float(apart.max()))
         rms[name] = 1000 * (squares / (len(poses.positions) * fitted.vertex_count)) ** 0.5
         largest[name] = 1000 * most
-    return Gain(rms, largest)
+    return FitReport(rms, largest)

@@ -13,7 +13,7 @@ import numpy as np
 
 from fdda_addon.core.model import read_model
 from fdda_addon.core.stop_signals import INTERRUPTED
-from fdda_addon.training import lasting, process
+from fdda_addon.training import detached_process, process
 
 from .cases import ShortfallError, attempt, say
 
@@ -26,7 +26,7 @@ KINDS = ("cancelled", "followed", "interrupted", "killed")
 
 def run(folder: Path, seed: int, first: int, end: int) -> None:
     """Stop trainings in four ways: by the sidebar, by another Blender, by a signal to the verb, by its death."""
-    lasting.user_folder = lambda: folder / "user"
+    detached_process.user_folder = lambda: folder / "user"
     for number in range(first, end):
         random, kind = np.random.default_rng((seed, number)), KINDS[number % len(KINDS)]
         action = {"cancelled": _cancel, "followed": _follow, "interrupted": _interrupt, "killed": _kill}[kind]
@@ -64,10 +64,10 @@ def _cancel(arguments: list[str], _model: Path, random: np.random.Generator) -> 
 
 
 def _follow(arguments: list[str], model: Path, random: np.random.Generator) -> int:
-    with lasting.LastingTraining(arguments, model) as training:
-        training.leave()
-    popen = lasting._started.pop(training._process.pid)
-    with lasting.FollowedTraining(model) as followed:
+    with detached_process.DetachedTraining(arguments, model) as training:
+        training.detach()
+    popen = detached_process._child_processes.pop(training._process.pid)
+    with detached_process.AttachedTraining(model) as followed:
         _wait(followed, random)
         _cancelled(followed)
     return popen.wait()

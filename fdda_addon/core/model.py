@@ -10,7 +10,7 @@ import numpy as np
 from .controls import Control, read_controls
 from .errors import ModelError, os_reason
 from .input_file import read_input
-from .model_graph import Explained, check_ends, check_graph, explain
+from .model_graph import Budget, check_ends, check_graph, compute_budget
 from .onnx_file import read_onnx
 from .partition import Partition, make_partitions
 from .poses import Channel
@@ -102,10 +102,10 @@ class ModelInfo:
             {p.joint: p.taken for p in self.partitions},
         )
 
-    def explained(self) -> Explained:
+    def budget(self) -> Budget:
         """What its graph may cost."""
         partitions = [(p.vertices, p.basis, len(p.influencing) + len(p.controls)) for p in self.partitions]
-        return explain(len(self.joints), len(self.controls), partitions, self.training)
+        return compute_budget(len(self.joints), len(self.controls), partitions, self.training)
 
     @property
     def limits(self) -> tuple[Channel, ...]:
@@ -266,7 +266,7 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
         raise ModelError(f"'{name}' asks for inputs that no rig gives ({', '.join(extra)}); train it again.")
     try:
         check_ends(contents, inputs, outputs)
-        check_graph(contents, info.explained(), len(data), outputs)
+        check_graph(contents, info.budget(), len(data), outputs)
     except ValueError as error:
         raise ModelError(f"The model '{name}' is refused: {error}; give one that train made.") from error
     if contents.metadata.get(CHECKSUM_KEY) != contents.checksum:

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from .features import FEATURES_PER_JOINT
+from .onnx_cost import GraphCost, Shape, compute_graph_cost
 from .onnx_file import ITEM_BYTES, OnnxContents
-from .onnx_work import Shape, Work, measure_work
 
 WHAT_COUNTS = {3: "joints", 1: "controls"}
 """What the first number of an input's shape counts, by how many there are."""
 ROOM = 8
-"""How many times what is explained is allowed."""
+"""How many times the budget a graph may cost."""
 SMALL = 1 << 16
 """Elements that need no explanation."""
 MAX_NODES = 20_000
@@ -29,7 +29,7 @@ MAX_UNITS = 1 << 16
 
 
 @dataclass(frozen=True)
-class Explained:
+class Budget:
     """What the metadata of a model explains, elements for one pose.
 
     Attributes:
@@ -41,7 +41,7 @@ class Explained:
     constants: int
 
 
-def explain(joints: int, controls: int, partitions: Sequence[tuple[int, int, int]], training: dict) -> Explained:
+def compute_budget(joints: int, controls: int, partitions: Sequence[tuple[int, int, int]], training: dict) -> Budget:
     """What there is to compute and to keep for a character.
 
     Args:
@@ -61,7 +61,7 @@ def explain(joints: int, controls: int, partitions: Sequence[tuple[int, int, int
     values = 3 * sum(vertices) + 4 * features + len(shapes) * (sum(widths) + 9 * max(shapes)) + 3 * rows
     matrices = sum(own * (8 * joints + 3 * basis) for own, basis, _ in partitions)
     constants = matrices + len(shapes) * (network + sum(widths) + 2 * features) + 4 * features
-    return Explained(values, constants)
+    return Budget(values, constants)
 
 
 def _hidden(training: dict) -> list[int]:
@@ -92,12 +92,12 @@ def check_ends(contents: OnnxContents, inputs: dict[str, Shape], outputs: dict[s
         raise ValueError(f"its output '{positions}' does not fit its {shape[0]} vertices")
 
 
-def check_graph(contents: OnnxContents, explained: Explained, size: int, outputs: dict[str, Shape]) -> None:
+def check_graph(contents: OnnxContents, budget: Budget, size: int, outputs: dict[str, Shape]) -> None:
     """Fail where a graph is none that `train` writes, or costs more than its metadata explains.
 
     Args:
         contents: of the file.
-        explained: by its metadata.
+        budget: by its metadata.
         size: of the file, bytes.
         outputs: shapes that the outputs have for one pose, without the poses.
 
@@ -106,30 +106,30 @@ def check_graph(contents: OnnxContents, explained: Explained, size: int, outputs
     """
     if contents.oddities:
         raise ValueError(f"it has {contents.oddities[0]}, which train does not write")
-    if explained.values > 2 * size + 16 * SMALL:
+    if budget.values > 2 * size + 16 * SMALL:
         raise ValueError(f"its metadata tells of a character that {size} bytes cannot hold")
     partitions = outputs.get("confidence", (1,))[0]
     if len(contents.nodes) > min(MAX_NODES, NODES + NODES_PER_PARTITION * partitions):
         raise ValueError(f"it has {len(contents.nodes)} nodes, more than its {partitions} partitions explain")
     held = sum(len(constant.data) for constant in contents.constants.values())
-    if held > ITEM_BYTES[1] * ROOM * (explained.constants + SMALL):
+    if held > ITEM_BYTES[1] * ROOM * (budget.constants + SMALL):
         raise ValueError(f"its constants have {held} bytes, more than its joints, vertices and shapes explain")
-    single, several = (measure_work(contents, poses) for poses in (1, SEVERAL))
-    _check_work(single, explained, size, 1)
-    _check_work(several, explained, size, SEVERAL)
+    single, several = (compute_graph_cost(contents, poses) for poses in (1, SEVERAL))
+    _check_cost(single, budget, size, 1)
+    _check_cost(several, budget, size, SEVERAL)
     for name, shape in outputs.items():
-        for work, poses in ((single, 1), (several, SEVERAL)):
-            if name in contents.outputs and work.shapes.get(name) != (poses, *shape):
-                raise ValueError(f"its output '{name}' comes out as {work.shapes.get(name)}, not as {(poses, *shape)}")
+        for cost, poses in ((single, 1), (several, SEVERAL)):
+            if name in contents.outputs and cost.shapes.get(name) != (poses, *shape):
+                raise ValueError(f"its output '{name}' comes out as {cost.shapes.get(name)}, not as {(poses, *shape)}")
 
 
-def _check_work(work: Work, explained: Explained, size: int, poses: int) -> None:
-    if work.elements > ROOM * poses * (explained.values + SMALL):
+def _check_cost(cost: GraphCost, budget: Budget, size: int, poses: int) -> None:
+    if cost.elements > ROOM * poses * (budget.values + SMALL):
         raise ValueError(
-            f"it computes {work.elements} numbers for {poses} poses, more than its joints, vertices and shapes explain"
+            f"it computes {cost.elements} numbers for {poses} poses, more than its joints, vertices and shapes explain"
         )
     # A constant is used once for each pose and axis.
-    if work.products > ROOM * poses * (size + 64 * (explained.values + SMALL)):
-        raise ValueError(f"it multiplies {work.products} numbers for {poses} poses, more than its size explains")
-    if work.folded > 2 * size + SMALL:
-        raise ValueError(f"it unpacks {work.folded} numbers, more than its size explains")
+    if cost.products > ROOM * poses * (size + 64 * (budget.values + SMALL)):
+        raise ValueError(f"it multiplies {cost.products} numbers for {poses} poses, more than its size explains")
+    if cost.folded > 2 * size + SMALL:
+        raise ValueError(f"it unpacks {cost.folded} numbers, more than its size explains")

@@ -18,7 +18,7 @@ MAX_INFLUENCES = 64
 
 
 @dataclass(frozen=True)
-class Gain:
+class FitReport:
     """Distances of linear skinning from the rig over poses and vertices, mm.
 
     Attributes:
@@ -45,8 +45,8 @@ class SkinFit:
 
     kind: str
     poses: int
-    held_out: Gain
-    training: Gain
+    held_out: FitReport
+    training: FitReport
 
     def to_json(self) -> dict:
         """What `recording.json` and messages say of it."""
@@ -61,7 +61,7 @@ class SkinFit:
         """
         if value["kind"] not in KINDS or type(value["poses"]) is not int or value["poses"] < 0:
             raise ValueError(f"skin weights were fitted {value['kind']!r} to {value['poses']!r} poses")
-        return SkinFit(value["kind"], value["poses"], _gain(value), _gain(value["training"]))
+        return SkinFit(value["kind"], value["poses"], _read_fit_report(value), _read_fit_report(value["training"]))
 
     def sentence(self) -> str:
         """The gain, for people."""
@@ -74,11 +74,11 @@ class SkinFit:
         )
 
 
-def _gain(value: dict) -> Gain:
+def _read_fit_report(value: dict) -> FitReport:
     rows = [{way: float(value[name][way]) for way in ("rig", "fitted")} for name in ("rms_mm", "max_mm")]
     if not np.isfinite([list(row.values()) for row in rows]).all():
         raise ValueError("the errors of a fit are not numbers")
-    return Gain(*rows)
+    return FitReport(*rows)
 
 
 def are_skin_weights(joints: np.ndarray, weights: np.ndarray, joint_count: int) -> bool:

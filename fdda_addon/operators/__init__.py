@@ -12,7 +12,7 @@ MODULES: tuple[str, ...] = (
     "recording",
     "training",
     "playback",
-    "one_go",
+    "build_model",
     "baking",
     "evaluation",
     "worst_poses",

@@ -7,11 +7,11 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError, OutputError
-from .asking import AsksFirst
+from .confirm import ConfirmFirst
 from .playback import OnModel
 
 
-class FDDA_OT_bake(OnModel, AsksFirst, bpy.types.Operator):
+class FDDA_OT_bake(OnModel, ConfirmFirst, bpy.types.Operator):
     bl_idname = "fdda.bake"
     bl_label = "Bake…"
     bl_description = (
@@ -43,7 +43,7 @@ class FDDA_OT_bake(OnModel, AsksFirst, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if self.filepath:
-            return AsksFirst.invoke(self, context, event)
+            return ConfirmFirst.invoke(self, context, event)
         try:
             name = bpy.path.clean_name(self.bound_rig(context).mesh_object.name)
         except FDDAError as error:
@@ -51,13 +51,13 @@ class FDDA_OT_bake(OnModel, AsksFirst, bpy.types.Operator):
             return {"CANCELLED"}
         file = Path(bpy.data.filepath).stem or "character"
         self.filepath = bpy.path.abspath(f"//{file}_{name}_baked.blend")
-        self._is_asking = True
+        self._is_confirming = True
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    execute = AsksFirst.execute
+    execute = ConfirmFirst.execute
 
-    def answer(self) -> dict[str, object]:
+    def confirmed_properties(self) -> dict[str, object]:
         return {name: getattr(self, name) for name in ("object", "filepath", "action", "shape_keys")}
 
     def draw(self, _context: bpy.types.Context) -> None:

@@ -12,7 +12,7 @@ from ..scene.active_rig import rigs_together, shown_rig, shown_together
 from .on_rig import OnRig
 
 BUTTONS = (
-    ("fdda.add_arm", "fdda.make_model"),
+    ("fdda.add_arm", "fdda.build_model"),
     ("fdda.measure",),
     ("fdda.preview_pose", "fdda.rest_pose", "fdda.use_selected_bones", "fdda.limits_from_actions"),
     ("fdda.limits_preset", "fdda.copy_ranges", "fdda.mirror_ranges", "fdda.edit_ranges", "fdda.forget_ranges"),

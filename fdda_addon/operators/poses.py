@@ -41,13 +41,13 @@ class FDDA_OT_preview_pose(OnPose, bpy.types.Operator):
 
     def change(self, context: bpy.types.Context) -> str:
         from ..core.poses import sample_pose
-        from ..recording.plan import planned_rig
+        from ..recording.plan import read_sampled_rig
         from ..scene.armature import Poser, clear_pose
 
         rig = self.rig(context)
         settings, session = rig.mesh_object.fdda.settings, context.window_manager.fdda
         wanted = recording_settings(rig)
-        _, channels = planned_rig(rig, replace(wanted, poses=max(1, wanted.poses)))
+        _, channels = read_sampled_rig(rig, replace(wanted, poses=max(1, wanted.poses)))
         start = self.number if self.number >= 0 else session.pose_number
         number = max(0, start + self.step)
         clear_pose(rig.armature_object)
@@ -80,10 +80,10 @@ class FDDA_OT_rest_pose(OnPose, bpy.types.Operator):
 
 def _sampled_controls(rig: SceneRig) -> "tuple[Control, ...]":
     """The controls that random poses change; none while the choice is not complete, which the section Rig says."""
-    from ..recording.plan import planned_choice
+    from ..recording.plan import read_sampling_choice
 
     try:
-        return planned_choice(rig, recording_settings(rig))[0].controls
+        return read_sampling_choice(rig, recording_settings(rig))[0].controls
     except RigError:
         return ()
 

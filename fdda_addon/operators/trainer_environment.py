@@ -17,10 +17,10 @@ from ..jobs.background import in_thread, look_after, unregister
 from ..jobs.job import ENVIRONMENT, JobState, Run, current, request_cancel
 from ..properties.preferences import wheels_folder
 from ..training.environment import choice, folder, session
-from ..training.environment.answer import Answer
+from ..training.environment.check_result import CheckResult
 
 WAIT_SECONDS = 0.05
-_Work = tuple[Iterator[Progress | Answer], Callable[[], None] | None]
+_Work = tuple[Iterator[Progress | CheckResult], Callable[[], None] | None]
 """The steps, and what has them end soon."""
 
 
@@ -39,7 +39,7 @@ class _OnEnvironment:
         raise NotImplementedError
 
     @staticmethod
-    def keep(outcome: Answer) -> None:
+    def keep(outcome: CheckResult) -> None:
         """Have the outcome shown."""
         session.remember(None, outcome)
 
@@ -66,7 +66,7 @@ class _OnEnvironment:
         try:
             steps, cancel = self.steps()
         except FDDAError as error:
-            steps, cancel = iter([Answer("ERROR", str(error))]), None
+            steps, cancel = iter([CheckResult("ERROR", str(error))]), None
         return begin(self.bl_idname.partition("_OT_")[2], self.bl_label, steps, cancel, type(self).keep)
 
     def _end(self, state: JobState) -> set[str]:
@@ -77,9 +77,9 @@ class _OnEnvironment:
 def begin(
     verb: str,
     title: str,
-    steps: Iterator[Progress | Answer],
+    steps: Iterator[Progress | CheckResult],
     cancel: Callable[[], None] | None,
-    keep: Callable[[Answer], None],
+    keep: Callable[[CheckResult], None],
 ) -> Run:
     """Begin a job on the trainer's environment.
 
@@ -95,10 +95,10 @@ def begin(
         try:
             yield from in_thread(steps, state, cancel)
         except FDDAError as error:
-            yield Answer("WARNING" if state.cancel_requested else "ERROR", str(error))
+            yield CheckResult("WARNING" if state.cancel_requested else "ERROR", str(error))
 
-    def finish(outcome: Answer | None) -> str:
-        outcome = outcome or Answer("ERROR", f"{title} ended without a word.")
+    def finish(outcome: CheckResult | None) -> str:
+        outcome = outcome or CheckResult("ERROR", f"{title} ended without a word.")
         keep(outcome)
         if outcome.level != "INFO":
             raise TrainerEnvironmentError(outcome.message)
@@ -116,11 +116,11 @@ class FDDA_OT_check_trainer(_OnEnvironment, bpy.types.Operator):
         return _check(choice.chosen_python()), None
 
     @staticmethod
-    def keep(outcome: Answer) -> None:
+    def keep(outcome: CheckResult) -> None:
         session.remember(outcome)
 
 
-def _check(python: choice.TrainerPython) -> Iterator[Progress | Answer]:
+def _check(python: choice.TrainerPython) -> Iterator[Progress | CheckResult]:
     yield Progress(f"asking '{python.path}'", 0, 0)
     yield choice.ping(python)
 
@@ -153,7 +153,7 @@ class FDDA_OT_create_trainer_environment(_OnEnvironment, bpy.types.Operator):
         return creation.steps(), creation.cancel
 
     @staticmethod
-    def keep(outcome: Answer) -> None:
+    def keep(outcome: CheckResult) -> None:
         origin = choice.chosen_python().origin
         if outcome.level != "INFO":
             session.remember(None, outcome)
@@ -162,7 +162,7 @@ class FDDA_OT_create_trainer_environment(_OnEnvironment, bpy.types.Operator):
         else:
             what = "the field Python" if origin is choice.Origin.PREFERENCES else choice.PYTHON_VARIABLE
             text = f"The trainer environment is ready, but {what} names another Python, which is used in its place."
-            session.remember(None, Answer("WARNING", text))
+            session.remember(None, CheckResult("WARNING", text))
 
 
 class FDDA_OT_remove_trainer_environment(_OnEnvironment, bpy.types.Operator):
@@ -179,12 +179,12 @@ class FDDA_OT_remove_trainer_environment(_OnEnvironment, bpy.types.Operator):
         return _remove(folder.own_folder()), None
 
 
-def _remove(path: Path) -> Iterator[Progress | Answer]:
+def _remove(path: Path) -> Iterator[Progress | CheckResult]:
     yield Progress(f"removing '{path}'", 0, 0)
     with folder.claimed(path):
         existed = path.exists()
         folder.remove(path)
-    yield Answer("INFO", "The trainer environment was removed." if existed else "There is no trainer environment.")
+    yield CheckResult("INFO", "The trainer environment was removed." if existed else "There is no trainer environment.")
 
 
 class FDDA_OT_cancel_trainer_environment(bpy.types.Operator):

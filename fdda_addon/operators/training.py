@@ -14,7 +14,7 @@ from ..core.progress import Progress
 from ..jobs.job import current
 from ..properties.character import model_file, recording_folder
 from ..scene.scene_rig import armature_of
-from .asking import AsksFirst
+from .confirm import ConfirmFirst
 from .on_rig import OnRig
 
 STARTING = "starting"
@@ -22,7 +22,10 @@ LOOK_SECONDS = 0.5
 
 
 class TrainsModels(OnRig):
-    """Mixin for the operator of a job that trains. A training goes on when Blender is closed (`training.lasting`)."""
+    """Mixin for the operator of a job that trains.
+
+    A training goes on when Blender is closed (`training.detached_process`).
+    """
 
     def train(
         self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool = False
@@ -56,15 +59,15 @@ class TrainsModels(OnRig):
             except GeneratorExit:
                 if not bpy.app.background:
                     # Another file is opened, or Blender is closed.
-                    training.leave()
+                    training.detach()
                 raise
 
     def _training(self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool) -> object:
-        from ..training.lasting import FollowedTraining, LastingTraining, is_known
+        from ..training.detached_process import AttachedTraining, DetachedTraining, is_detached
         from ..training.process import Training
 
-        if not bpy.app.background and is_known(model):
-            return FollowedTraining(model)
+        if not bpy.app.background and is_detached(model):
+            return AttachedTraining(model)
         _check_recording(recording)
         _make_folder(model)
         settings = mesh_object.fdda.settings
@@ -74,7 +77,7 @@ class TrainsModels(OnRig):
             arguments += ["--goal-mm", f"{settings.goal_mm:.6g}"]
         if warm_start:
             arguments += ["--warm-start"]
-        return Training(arguments) if bpy.app.background else LastingTraining(arguments, model)
+        return Training(arguments) if bpy.app.background else DetachedTraining(arguments, model)
 
     def _note(self, message: object) -> object:
         """What a message of the trainer is to a job: progress, a line of its log, or the result."""
@@ -123,7 +126,7 @@ class TrainsModels(OnRig):
         return self._trained
 
 
-class FDDA_OT_train(TrainsModels, AsksFirst, bpy.types.Operator):
+class FDDA_OT_train(TrainsModels, ConfirmFirst, bpy.types.Operator):
     bl_idname = "fdda.train"
     bl_label = "Train"
     bl_description = "Train a model on the recording, in another process; Blender can be used meanwhile, and closed"
@@ -165,25 +168,25 @@ class FDDA_OT_train(TrainsModels, AsksFirst, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if not (self.replace or bpy.app.background) and (foreign := self._foreign_models(context)):
-            self._is_asking = True
+            self._is_confirming = True
             return context.window_manager.invoke_confirm(
                 self, event, title="Replace Another Model?", message=foreign, confirm_text="Replace", icon="WARNING"
             )
-        return AsksFirst.invoke(self, context, event)
+        return ConfirmFirst.invoke(self, context, event)
 
-    def answer(self) -> dict[str, object]:
+    def confirmed_properties(self) -> dict[str, object]:
         given = {name: getattr(self, name) for name in ("object", "all_meshes", "recording", "model", "warm_start")}
         return {**given, "replace": True}
 
     def _foreign_models(self, context: bpy.types.Context) -> str:
         """Which models a training would replace that are of another rig: a sentence, empty for none."""
         from ..models.model_list import check
-        from ..training.lasting import is_known
+        from ..training.detached_process import is_detached
 
         try:
             for rig in self.rigs(context):
                 model = self._files(rig.mesh_object)[1]
-                if model.is_file() and not is_known(model):
+                if model.is_file() and not is_detached(model):
                     check(rig, model)
         except FDDAError as error:
             return f"{error} Training writes over it; to keep it, name another file under Model."
@@ -232,7 +235,7 @@ def _make_folder(model: Path) -> None:
 
 def _follow_left_training() -> None:
     """Follow a training of the open file that was left when Blender was closed or another file opened."""
-    from ..training.lasting import is_known
+    from ..training.detached_process import is_detached
 
     windows = bpy.context.window_manager.windows
     if current() is not None or not windows:
@@ -241,7 +244,7 @@ def _follow_left_training() -> None:
         if mesh_object.type != "MESH" or mesh_object.library or armature_of(mesh_object) is None:
             continue
         try:
-            is_left = is_known(model_file(mesh_object))
+            is_left = is_detached(model_file(mesh_object))
         except FDDAError:
             continue
         if is_left and mesh_object.name in bpy.context.scene.objects:

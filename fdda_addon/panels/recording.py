@@ -38,7 +38,7 @@ def content_of(rig: SceneRig, path: Path) -> "FolderContent":
     """What is in the folder of a recording; it is read again when it, the rig or the settings have changed."""
     from ..core.recording.folder import read_folder
     from ..core.recording.index import INDEX
-    from ..recording.plan import planned_sampling
+    from ..recording.plan import make_sampling
 
     check, wanted = checks.known(rig), recording_settings(rig)
     try:
@@ -50,7 +50,7 @@ def content_of(rig: SceneRig, path: Path) -> "FolderContent":
     if uid not in _contents or _contents[uid][0] != question:
         own, sampling = None, None
         if check is not None and check.rig is not None:
-            own, sampling = check.rig, json.loads(json.dumps(planned_sampling(rig, wanted, check.channels).to_json()))
+            own, sampling = check.rig, json.loads(json.dumps(make_sampling(rig, wanted, check.channels).to_json()))
         _contents[uid] = (question, read_folder(path, own, sampling, wanted.fit_linear))
     return _contents[uid][1]
 

@@ -20,7 +20,7 @@ MODIFIER_ICONS = {
 class FDDA_PT_rig(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_rig"
     bl_label = "Rig"
-    verbs = ("measure", "make_model")
+    verbs = ("measure", "build_model")
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -39,7 +39,7 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
             draw_sentence(layout, context, sentence, "INFO")
             layout.operator("fdda.add_arm", text="Add Sample Arm", icon="ADD")
             return
-        _draw_one_go(layout, context)
+        _draw_build_model(layout, context)
         _draw_meshes(layout, context, rig)
         _draw_counts(layout, rig)
         check = checks.known(rig)
@@ -93,16 +93,16 @@ def _draw_replaced(layout: bpy.types.UILayout, mesh_object: bpy.types.Object, re
         column.label(text=f"{count} shape {'key' if count == 1 else 'keys'}", icon="SHAPEKEY_DATA")
 
 
-def _draw_one_go(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """All steps below in one, for the impatient."""
-    if draw_job(layout, context, "make_model"):
-        state = job.state_of("make_model")
+    if draw_job(layout, context, "build_model"):
+        state = job.state_of("build_model")
         if not state.borrows_scene:
             curves.draw(layout, state.curves)
         return
     row = layout.row()
     row.scale_y = 1.3
-    draw_button(row, context, "fdda.make_model", "Prepare, Train, Bind", "PLAY")
+    draw_button(row, context, "fdda.build_model", "Prepare, Train, Bind", "PLAY")
 
 
 def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:

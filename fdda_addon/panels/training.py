@@ -70,7 +70,7 @@ class FDDA_PT_training(Section, bpy.types.Panel):
 
 def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
     """Which Python trains and what is known of it; returns whether it may be tried."""
-    answer = session.answer
+    answer = session.check_result
     if answer is not None and answer.level == "INFO":
         draw_sentence(layout, context, answer.message, "CHECKMARK")
         return True

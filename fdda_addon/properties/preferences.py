@@ -10,7 +10,7 @@ from bpy.props import BoolProperty, CollectionProperty, StringProperty
 from ..jobs.job import ENVIRONMENT, JobState, current
 from ..scene import model_trust
 from ..training.environment import choice, session
-from ..training.environment.answer import Answer
+from ..training.environment.check_result import CheckResult
 from ..training.environment.folder import EXTENSION, FolderState, obstacle, own_folder
 
 MODULE = EXTENSION or __package__.partition(".")[0]
@@ -116,7 +116,7 @@ def draw_check(layout: bpy.types.UILayout) -> None:
     _, right = _split(layout)
     right.operator("fdda.check_trainer", text="Check", icon="QUESTION")
     if current(ENVIRONMENT) is None:
-        draw_answer(layout, session.answer)
+        draw_check_result(layout, session.check_result)
 
 
 def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -> None:
@@ -142,7 +142,7 @@ def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -
         row.operator("fdda.open_trainer_log", text="", icon="TEXT")
         if reason:
             draw_lines(layout, f"{reason}.", "INFO")
-        draw_answer(layout, session.notice)
+        draw_check_result(layout, session.notice)
     draw_lines(layout, f"Folder: {own_folder()}")
 
 
@@ -166,7 +166,7 @@ def draw_job(layout: bpy.types.UILayout, job: JobState) -> None:
         row.operator("fdda.cancel_trainer_environment", text="", icon="CANCEL")
 
 
-def draw_answer(layout: bpy.types.UILayout, answer: Answer | None) -> None:
+def draw_check_result(layout: bpy.types.UILayout, answer: CheckResult | None) -> None:
     """What was found out, if anything was."""
     if answer is None:
         return

@@ -44,7 +44,7 @@ class TimedEvaluator:
 
 
 @dataclass(frozen=True)
-class Planned:
+class MeshPlanned:
     """A mesh whose recording is planned.
 
     Attributes:
@@ -80,7 +80,7 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class WeightsFitted:
     """A mesh that has the weights of its linear skinning.
 
     Attributes:
@@ -89,7 +89,7 @@ class Fitted:
         fit: of the weights; None where they are the rig's own.
     """
 
-    planned: Planned
+    planned: MeshPlanned
     rig: Rig
     fit: SkinFit | None
 
@@ -100,7 +100,7 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class Found:
+class InfluencesReady:
     """A mesh whose influences are found: its poses can be recorded.
 
     Attributes:
@@ -109,12 +109,12 @@ class Found:
         evaluator: of the poses, which knows by now what one takes.
     """
 
-    fitted: Fitted
+    fitted: WeightsFitted
     partitions: tuple[Partition, ...]
     evaluator: TimedEvaluator
 
 
-def estimate(meshes: Sequence[Found], poses: int, left: int, seconds_a_pose: float | None = None) -> str:
+def estimate(meshes: Sequence[InfluencesReady], poses: int, left: int, seconds_a_pose: float | None = None) -> str:
     """A sentence about what poses of some meshes will take; empty without poses.
 
     Args:

@@ -73,13 +73,13 @@ class RecordingSettings:
     overwrite: bool = False
 
 
-def planned_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
+def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
     """The rig with its controls, and the channels of its random poses, as these settings record it.
 
     Raises:
         RigError: the rig cannot be read, or nothing may be sampled.
     """
-    choice, besides = planned_choice(scene_rig, settings)
+    choice, besides = read_sampling_choice(scene_rig, settings)
     rig = read_rig(scene_rig, besides, depends_on_time(scene_rig, settings))
     channels = sampled_channels(scene_rig, rig, choice) if settings.poses else ()
     return replace(rig, controls=choice.controls), channels
@@ -94,7 +94,7 @@ def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings) -> bool:
     return bool(settings.target.name) and find_target(scene_rig, settings.target.name).follows != POSE
 
 
-def planned_choice(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Choice, frozenset[str] | None]:
+def read_sampling_choice(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Choice, frozenset[str] | None]:
     """What these settings sample, and which joints the rig has beside the bones that have weights (`read_rig`).
 
     The joints of a rig whose control bones are sampled are the bones that have weights, and those that the mesh depends
@@ -103,7 +103,7 @@ def planned_choice(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Ch
     Raises:
         RigError: the rig lacks what the settings name.
     """
-    dependencies = read_dependencies(scene_rig, planned_actions(settings))
+    dependencies = read_dependencies(scene_rig, find_actions(settings))
 
     def find_controls(sampled: Ranges) -> Iterator[Control]:
         yield from dependencies.controls
@@ -123,12 +123,12 @@ def listed_controls(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[C
     return stated_controls(scene_rig, settings.controls, sampled)
 
 
-def planned_actions(settings: RecordingSettings) -> tuple[bpy.types.Action, ...]:
+def find_actions(settings: RecordingSettings) -> tuple[bpy.types.Action, ...]:
     """The actions whose frames these settings record, as far as the file has them."""
     return tuple(bpy.data.actions[name] for name in settings.actions if name in bpy.data.actions)
 
 
-def planned_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]) -> Sampling:
+def make_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]) -> Sampling:
     """How the poses of a recording with these settings are chosen.
 
     Raises:
@@ -138,11 +138,11 @@ def planned_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels:
     clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
     sources += [clip.source for clip in clips]
     own = channels if settings.poses else ()
-    margin = planned_margin(scene_rig, settings, own)
+    margin = make_margin(scene_rig, settings, own)
     return Sampling(settings.seed, settings.spread, own, tuple(sources), margin)
 
 
-def planned_margin(scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]) -> Margin | None:
+def make_margin(scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]) -> Margin | None:
     """The margin of the random poses of a recording, of which `channels` are sampled inside the range of motion."""
     locked = locked_channels(scene_rig.armature_object, channels)
     return margin_of(channels, locked, settings.margin, settings.poses if channels else 0)

@@ -14,12 +14,12 @@ from ..core.recording.target import Repeatability
 from ..core.recording.writer import RecordingWriter
 from ..core.skinning import LinearSkinning
 from ..poses.clip_player import ClipPlayer
-from .phases import Found
+from .phases import InfluencesReady
 from .pose_plan import PosePlan
 
 
 def measure_repeatability(
-    mesh: Found, plan: PosePlan, player: ClipPlayer | None, writer: RecordingWriter, count: int
+    mesh: InfluencesReady, plan: PosePlan, player: ClipPlayer | None, writer: RecordingWriter, count: int
 ) -> Iterator[Progress]:
     """Reach some poses of a recording over another way, and note how far the target is from what was recorded.
 

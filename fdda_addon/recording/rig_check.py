@@ -12,7 +12,7 @@ from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..rig.reading import read_rig
 from ..rig.time_inputs import check_inputs
 from ..scene.scene_rig import SceneRig
-from .plan import RecordingSettings, depends_on_time, listed_controls, planned_actions, planned_choice
+from .plan import RecordingSettings, depends_on_time, find_actions, listed_controls, read_sampling_choice
 
 DEFAULTS = RecordingSettings()
 
@@ -59,10 +59,10 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, before: RigCheck | 
             problems.append(str(error))
     try:
         result = replace(result, replaced=tuple(m.name for m in deforming_modifiers(scene_rig.mesh_object)))
-        choice, besides = planned_choice(scene_rig, settings)
+        choice, besides = read_sampling_choice(scene_rig, settings)
         if stack is not None and not settings.target.name:
             try:
-                check_inputs(scene_rig, choice.controls, stack, planned_actions(settings))
+                check_inputs(scene_rig, choice.controls, stack, find_actions(settings))
             except RigError as error:
                 problems.append(str(error))
         with_unmoved = depends_on_time(scene_rig, settings)

@@ -29,17 +29,17 @@ from ..rig.time_inputs import check_inputs
 from ..scene.scene_rig import SceneRig
 from .appender import Appender, append_poses
 from .influences import Search, find_influences
-from .known import check_found_for, recorded_partitions, recorded_weights
 from .mesh_group import common_armature, controls_of_each, in_passes
-from .phases import Fitted, Found, Planned, TimedEvaluator, estimate
-from .plan import RecordingSettings, planned_actions, planned_rig, planned_sampling
+from .phases import InfluencesReady, MeshPlanned, TimedEvaluator, WeightsFitted, estimate
+from .plan import RecordingSettings, find_actions, make_sampling, read_sampled_rig
 from .pose_plan import PosePlan
+from .previous_recording import check_influences_match, read_previous_partitions, read_previous_weights
 from .repeatability import measure_repeatability
 from .target_check import check_moves
 from .time_check import check_follows_pose
 from .weight_fitting import check_has_weights, fit_weights, poses_to_fit
 
-Before, After = TypeVar("Before", Planned, Fitted), TypeVar("After")
+Before, After = TypeVar("Before", MeshPlanned, WeightsFitted), TypeVar("After")
 INFLUENCE_SEED_OFFSET = 1 << 32
 """Poses of the influence detection are drawn from indices that no pose of a recording reaches."""
 
@@ -84,7 +84,7 @@ def record_meshes(rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSett
 
 
 def _record_planned(
-    planned: list[Planned], settings: RecordingSettings, clips: tuple[Clip, ...], plan: PosePlan
+    planned: list[MeshPlanned], settings: RecordingSettings, clips: tuple[Clip, ...], plan: PosePlan
 ) -> Iterator[Progress]:
     meshes, posed = [mesh.scene_rig for mesh in planned], [mesh.posed for mesh in planned]
     with borrowed_rigs(posed, clips) if settings.fit_linear else nullcontext() as player:
@@ -102,7 +102,7 @@ def _record_planned(
 
 def _plan(
     rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSettings, clips: tuple[Clip, ...]
-) -> tuple[list[Planned], PosePlan]:
+) -> tuple[list[MeshPlanned], PosePlan]:
     """The meshes with what moves them, and the poses that they share; all that can be refused is refused here."""
     if settings.mirror and not clips:
         raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
@@ -113,9 +113,9 @@ def _plan(
     read = []
     for (scene_rig, path), own in zip(rigs, controls, strict=True):
         stack = check_evaluable(scene_rig)
-        read.append(planned_rig(scene_rig, replace(settings, controls=own)))
+        read.append(read_sampled_rig(scene_rig, replace(settings, controls=own)))
         if not settings.target.name:
-            check_inputs(scene_rig, read[-1][0].controls, stack, planned_actions(settings))
+            check_inputs(scene_rig, read[-1][0].controls, stack, find_actions(settings))
         check_recordable(path, settings.resume, settings.overwrite)
     channels = [(scene_rig, own) for scene_rig, (_, own) in zip(meshes, read, strict=True)]
     approach = make_approach(meshes[0], settings.target, clips, settings.poses)
@@ -126,7 +126,7 @@ def _plan(
     check_room([(path, recording_bytes(rig, wanted)) for (_, path), (rig, _) in zip(rigs, read, strict=True)])
     known = [_known(path, settings, len(rigs) > 1) for _, path in rigs]
     planned = [
-        Planned(scene_rig, rig, path, own, plan.channels_of(number), known[number], approach.target)
+        MeshPlanned(scene_rig, rig, path, own, plan.channels_of(number), known[number], approach.target)
         for number, ((scene_rig, path), (rig, own)) in enumerate(zip(rigs, read, strict=True))
     ]
     return planned, plan
@@ -165,24 +165,24 @@ def _in_turn(
 
 
 def _fit(
-    mesh: Planned, settings: RecordingSettings, plan: PosePlan, player: ClipPlayer | None
-) -> Generator[Progress, None, Fitted]:
+    mesh: MeshPlanned, settings: RecordingSettings, plan: PosePlan, player: ClipPlayer | None
+) -> Generator[Progress, None, WeightsFitted]:
     """Give a mesh the weights that its linear skinning is to have."""
     if mesh.known:
-        return Fitted(mesh, *recorded_weights(mesh.known, mesh.rig, settings.fit_linear))
+        return WeightsFitted(mesh, *read_previous_weights(mesh.known, mesh.rig, settings.fit_linear))
     if not settings.fit_linear:
         check_has_weights(mesh.scene_rig, mesh.rig)
-        return Fitted(mesh, mesh.rig, None)
+        return WeightsFitted(mesh, mesh.rig, None)
     numbers = poses_to_fit(plan.total, mesh.rig.vertex_count)
     posed = plan.poses(player, frozenset(numbers))
     evaluator = mesh.evaluator(mesh.rig)
     fitted = yield from fit_weights(mesh.rig, settings.fit_linear, posed, len(numbers), evaluator)
-    return Fitted(mesh, *fitted)
+    return WeightsFitted(mesh, *fitted)
 
 
 def _find_influences(
-    mesh: Fitted, settings: RecordingSettings, clips: tuple[Clip, ...], player: ClipPlayer
-) -> Generator[Progress, None, Found]:
+    mesh: WeightsFitted, settings: RecordingSettings, clips: tuple[Clip, ...], player: ClipPlayer
+) -> Generator[Progress, None, InfluencesReady]:
     """Find what influences the partitions of a mesh; what moves it alone is moved, not what moves others."""
     scene_rig, channels = mesh.planned.scene_rig, mesh.planned.channels
     search = Search(
@@ -196,8 +196,8 @@ def _find_influences(
     )
     evaluator = TimedEvaluator(mesh.planned.evaluator(mesh.rig))
     known = mesh.planned.known
-    if known and (partitions := recorded_partitions(known, mesh.rig, settings.min_partition_vertices)):
-        return Found(mesh, partitions, evaluator)
+    if known and (partitions := read_previous_partitions(known, mesh.rig, settings.min_partition_vertices)):
+        return InfluencesReady(mesh, partitions, evaluator)
     if known and known != mesh.planned.path:
         raise RecordingError(
             f"The influences in '{known}' are of other partitions than those of '{mesh.name}'; find them with the same "
@@ -207,13 +207,13 @@ def _find_influences(
     target = mesh.planned.target
     if target and target.follows != POSE:
         # What depends on time does not answer when a joint is moved.
-        return Found(mesh, nearby_influences(mesh.rig, cut), evaluator)
+        return InfluencesReady(mesh, nearby_influences(mesh.rig, cut), evaluator)
     partitions = yield from find_influences(scene_rig, mesh.rig, cut, evaluator, search)
-    return Found(mesh, partitions, evaluator)
+    return InfluencesReady(mesh, partitions, evaluator)
 
 
 def _record_poses(
-    meshes: list[Found], settings: RecordingSettings, plan: PosePlan, player: ClipPlayer
+    meshes: list[InfluencesReady], settings: RecordingSettings, plan: PosePlan, player: ClipPlayer
 ) -> Iterator[Progress]:
     wanted = _wanted(settings, plan.total)
     with ExitStack() as stack:
@@ -240,16 +240,16 @@ def _record_poses(
             yield Progress("poses", len(wanted), len(wanted))
 
 
-def _info(mesh: Found, settings: RecordingSettings, plan: PosePlan, wanted: range) -> RecordingInfo:
+def _info(mesh: InfluencesReady, settings: RecordingSettings, plan: PosePlan, wanted: range) -> RecordingInfo:
     """What the recording of a mesh will say of itself."""
     planned = mesh.fitted.planned
-    sampling = planned_sampling(planned.scene_rig, settings, planned.limits)
+    sampling = make_sampling(planned.scene_rig, settings, planned.limits)
     file, version = Path(bpy.data.filepath).name, bpy.app.version_string
     is_part = settings.shard is not None or settings.detect_influences
     shard = Shard(wanted.start, plan.total) if is_part else None
     info = RecordingInfo(len(wanted), 0, file, planned.name, version, sampling, mesh.fitted.fit, shard)
     if planned.known and planned.known != planned.path:
-        check_found_for(planned.known, mesh.fitted.rig, info)
+        check_influences_match(planned.known, mesh.fitted.rig, info)
     return info
 
 

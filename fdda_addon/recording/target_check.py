@@ -12,7 +12,7 @@ from ..core.progress import Progress
 from ..core.recording.target import SIMULATION
 from ..core.skinning import LinearSkinning
 from ..poses.clip_player import ClipPlayer
-from .phases import Fitted
+from .phases import WeightsFitted
 from .pose_plan import PosePlan
 
 MOST_POSES = 20
@@ -21,7 +21,7 @@ RIG_MOVES, TARGET_STANDS = 0.02, 1e-5
 first, does not follow it."""
 
 
-def check_moves(mesh: Fitted, plan: PosePlan, player: ClipPlayer) -> Iterator[Progress]:
+def check_moves(mesh: WeightsFitted, plan: PosePlan, player: ClipPlayer) -> Iterator[Progress]:
     """Fail where a target stands still in poses of a plan in which the rig moves.
 
     A simulation is looked at in its first frames, all else in poses that lie far apart. Poses that are held come to
@@ -60,5 +60,5 @@ def check_moves(mesh: Fitted, plan: PosePlan, player: ClipPlayer) -> Iterator[Pr
         )
 
 
-def _mm(mesh: Fitted, units: float) -> str:
+def _mm(mesh: WeightsFitted, units: float) -> str:
     return f"{units * mesh.rig.metres_per_unit * 1000:.0f} mm"

@@ -13,14 +13,14 @@ from ..core.partition import INFLUENCE_TOLERANCE
 from ..core.recording.target import POSE
 from ..poses.clip_player import ClipPlayer
 from ..scene.armature import clear_pose
-from .phases import Fitted
+from .phases import WeightsFitted
 from .pose_plan import PosePlan
 
 POSE_TOLERANCE = 1e-5
 """Matrices and controls that differ by less are those of one pose (no unit, or mesh units)."""
 
 
-def check_follows_pose(meshes: Sequence[Fitted], plan: PosePlan, player: ClipPlayer) -> None:
+def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: ClipPlayer) -> None:
     """Fail where a mesh shows other surfaces in other frames while its pose and its controls are the same.
 
     Two poses of the plan are held at the ends and in the middle of the scene. Targets that depend on time are left out.
@@ -59,7 +59,9 @@ def check_follows_pose(meshes: Sequence[Fitted], plan: PosePlan, player: ClipPla
         scene.frame_set(frame, subframe=subframe)
 
 
-def _compare(mesh: Fitted, frames: tuple[int, int], before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> None:
+def _compare(
+    mesh: WeightsFitted, frames: tuple[int, int], before: Sequence[np.ndarray], after: Sequence[np.ndarray]
+) -> None:
     (pose, positions, controls), (other_pose, other_positions, other_controls) = before, after
     if not all(
         np.allclose(*pair, rtol=POSE_TOLERANCE, atol=POSE_TOLERANCE)

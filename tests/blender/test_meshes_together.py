@@ -50,18 +50,18 @@ def test_recorded_trained_bound_switched_and_evaluated_in_one_go(two, tmp_path):
 
 def test_one_button_records_trains_and_binds(two):
     bpy.context.view_layer.objects.active = two[0]
-    assert bpy.ops.fdda.make_model() == {"FINISHED"}
+    assert bpy.ops.fdda.build_model() == {"FINISHED"}
     assert bpy.data.is_dirty, "Blender asks before it closes the file"
     assert two[0].fdda.mode == "FDDA" and two[0].fdda.packed is not None and not two[1].fdda.is_bound
     # Recorded already: it is trained again, and the new model plays.
     before = two[0].fdda.packed.session_uid
     two[0].fdda.settings.training_seed = 5
-    assert bpy.ops.fdda.make_model() == {"FINISHED"}
+    assert bpy.ops.fdda.build_model() == {"FINISHED"}
     assert two[0].fdda.packed.session_uid != before
 
 
 def test_one_button_for_all_meshes(two):
-    assert bpy.ops.fdda.make_model(all_meshes=True) == {"FINISHED"}
+    assert bpy.ops.fdda.build_model(all_meshes=True) == {"FINISHED"}
     assert all(mesh_object.fdda.mode == "FDDA" for mesh_object in two)
 
 

@@ -17,7 +17,7 @@ from fdda_addon.panels.recording import content_of
 from fdda_addon.panels.sampled import counted
 from fdda_addon.properties.character import recording_folder
 from fdda_addon.properties.choices import recording_settings
-from fdda_addon.recording.plan import planned_rig
+from fdda_addon.recording.plan import read_sampled_rig
 from fdda_addon.scene.compatibility import curves_of
 from fdda_addon.scene.control_names import resting_value, suggested_controls
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
@@ -281,7 +281,7 @@ class TestControls:
         rig = saved(tmp_path)
         check = checks.check_now(rig)
         assert [control.name for control in check.found] == ['armature_object/["flex"]']
-        _, channels = planned_rig(rig, recording_settings(rig))
+        _, channels = read_sampled_rig(rig, recording_settings(rig))
         assert channels == check.channels
 
     def test_shape_keys_are_suggested_and_driven_ones_are_not(self, face):

@@ -93,9 +93,9 @@ def test_it_is_created_from_a_folder_of_wheels(user: Path, wheels: Path):
     assert create(wheels=str(wheels)) == {"FINISHED"}
     assert session.own_state() is FolderState.READY and not junk.exists()
     assert choice.chosen_python() == (str(folder.python_in(folder.own_folder())), Origin.OWN)
-    assert session.answer.message.endswith(f"torch {pinned('torch')}.")
-    assert session.answer.message.startswith("Ready to train on the processor: Python 3.")
-    assert f"onnx {pinned('onnx')}" in session.answer.details
+    assert session.check_result.message.endswith(f"torch {pinned('torch')}.")
+    assert session.check_result.message.startswith("Ready to train on the processor: Python 3.")
+    assert f"onnx {pinned('onnx')}" in session.check_result.details
     log = folder.log_path().read_text()
     assert "-m venv" in log and "Successfully installed" in log and "Ready to train" in log
     assert sorted(path.name for path in user.iterdir()) == ["trainer", "trainer.lock", "trainer.log"]
@@ -119,7 +119,7 @@ def test_without_any_it_is_the_python_that_runs_this():
 def test_one_that_another_python_hides_says_so(user: Path, wheels: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv(choice.PYTHON_VARIABLE, sys.executable)
     assert create(wheels=str(wheels)) == {"FINISHED"}
-    assert session.answer is None and session.notice.level == "WARNING"
+    assert session.check_result is None and session.notice.level == "WARNING"
     assert "FDDA_TRAINER_PYTHON names another Python, which is used in its place" in session.notice.message
 
 
@@ -261,8 +261,8 @@ def test_a_check_in_the_background_is_kept(own: Path):
     run = begin("check_trainer", "Check", steps, None, session.remember)
     assert not run.work(0) and not run.state.can_cancel and not bpy.ops.fdda.cancel_trainer_environment.poll()
     wait_for(lambda: run.work(0))
-    assert state_of("check_trainer").outcome == session.answer.message
-    assert session.answer.level == "INFO" and session.notice is None
+    assert state_of("check_trainer").outcome == session.check_result.message
+    assert session.check_result.level == "INFO" and session.notice is None
 
 
 def test_an_environment_whose_python_is_gone(own: Path, elbow, tmp_path: Path, capfd: pytest.CaptureFixture):
@@ -280,7 +280,7 @@ def test_an_environment_whose_torch_is_gone(own: Path):
     shutil.rmtree(own / "torch")
     text = refused(bpy.ops.fdda.check_trainer)
     assert text.endswith("lacks torch; create the trainer environment again, in the add-on's preferences.")
-    assert session.answer.level == "ERROR" and "torch is missing" in session.answer.details
+    assert session.check_result.level == "ERROR" and "torch is missing" in session.check_result.details
 
 
 def test_an_environment_of_other_versions_still_trains(own: Path):

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from fdda_addon.core.errors import TrainerEnvironmentError
-from fdda_addon.training.environment import bases, check, creation
-from fdda_addon.training.environment.answer import Answer
-from fdda_addon.training.environment.bases import ask, find_bases
+from fdda_addon.training.environment import check, creation, interpreters
+from fdda_addon.training.environment.check_result import CheckResult
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 from fdda_addon.training.environment.folder import MARK, PACKAGES, missing_letters, python_in
+from fdda_addon.training.environment.interpreters import ask, find_interpreters
 
 from .conftest import run
 from .stand_ins import program
@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[2]
 ADVICE = "do this"
 
 
-def asked(python: object) -> Answer:
+def asked(python: object) -> CheckResult:
     return check.check(str(python), ADVICE)
 
 
@@ -133,7 +133,7 @@ def test_a_base_is_run_and_not_just_found(tmp_path: Path):
     python, real = sys.executable, sys.executable
     if os.name != "nt":
         real = program(tmp_path / "real", f"os.execv({python!r}, [{python!r}, *sys.argv[1:]])")
-    found = list(find_bases(iter([[shim], [hangs], ["/none"], [real], [sys.executable]])))
+    found = list(find_interpreters(iter([[shim], [hangs], ["/none"], [real], [sys.executable]])))
     assert [(base.path, base.version, base.lacks) for base in found] == [(sys.executable, sys.version_info[:2], "")]
 
 
@@ -151,8 +151,8 @@ def test_what_a_base_lacks(tmp_path: Path, answer: list, lacks: str):
 
 
 def test_blenders_own_python_is_the_first(monkeypatch: pytest.MonkeyPatch):
-    assert next(bases.usual_candidates()) == [sys.executable]
-    assert next(find_bases()).path == sys.executable
+    assert next(interpreters.usual_candidates()) == [sys.executable]
+    assert next(find_interpreters()).path == sys.executable
 
 
 def test_a_training_without_blenders_program_finds_the_environment_that_blender_made(tmp_path: Path):
@@ -196,7 +196,9 @@ def windows_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for variable, name in names.items():
         monkeypatch.setenv(variable, str(tmp_path / name))
     monkeypatch.delenv("UV_PYTHON_INSTALL_DIR", raising=False)
-    monkeypatch.setattr(bases, "_registered", lambda version: iter([tmp_path / f"of_registry/{version}/python.exe"]))
+    monkeypatch.setattr(
+        interpreters, "_registered", lambda version: iter([tmp_path / f"of_registry/{version}/python.exe"])
+    )
     monkeypatch.setenv(
         "PATH", os.pathsep.join(str(tmp_path / name) for name in ("Local/Microsoft/WindowsApps", "path"))
     )
@@ -218,7 +220,10 @@ def windows_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_pythons_of_windows_are_looked_for(windows_folders: Path):
     """Of python.org for one and for all, the launcher, uv and pyenv-win; never the Store's, which opens the shop."""
-    found = [(Path(path).relative_to(windows_folders).as_posix(), *rest) for path, *rest in bases._windows_candidates()]
+    found = [
+        (Path(path).relative_to(windows_folders).as_posix(), *rest)
+        for path, *rest in interpreters._windows_candidates()
+    ]
     assert found == [
         ("of_registry/3.13/python.exe",),
         ("Local/Programs/Python/Python313/python.exe",),
@@ -240,7 +245,7 @@ def test_a_python_of_the_registry_is_found(tmp_path: Path):
     with winreg.CreateKey(winreg.HKEY_CURRENT_USER, rf"{key}\3.13-64\InstallPath") as opened:
         winreg.SetValue(opened, "", winreg.REG_SZ, str(tmp_path))
     try:
-        assert tmp_path / "python.exe" in bases._registered("3.13") and not [*bases._registered("3.1")]
+        assert tmp_path / "python.exe" in interpreters._registered("3.13") and not [*interpreters._registered("3.1")]
     finally:
         for name in (rf"{key}\3.13-64\InstallPath", rf"{key}\3.13-64", key):
             winreg.DeleteKey(winreg.HKEY_CURRENT_USER, name)

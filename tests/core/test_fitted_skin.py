@@ -14,7 +14,7 @@ from fdda_addon.core.model import SKIN_KEY, read_model, read_skin
 from fdda_addon.core.recording.fit_folder import FitPosesWriter, read_fit_poses
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.core.skin_fit import Gain, SkinFit, skin_from_text, skin_to_text
+from fdda_addon.core.skin_fit import FitReport, SkinFit, skin_from_text, skin_to_text
 
 from .damage import edit, refused
 from .limb import make_rig, partitions_of, random_poses, random_residuals, recording_info
@@ -23,8 +23,8 @@ from .tiny_model import J, V, tiny_info, tiny_model
 FIT = SkinFit(
     "smooth",
     25,
-    Gain({"rig": 4.25, "fitted": 1.5}, {"rig": 40.0, "fitted": 21.25}),
-    Gain({"rig": 4.0, "fitted": 1.25}, {"rig": 39.0, "fitted": 20.0}),
+    FitReport({"rig": 4.25, "fitted": 1.5}, {"rig": 40.0, "fitted": 21.25}),
+    FitReport({"rig": 4.0, "fitted": 1.25}, {"rig": 39.0, "fitted": 20.0}),
 )
 JOINTS = np.array([[0, 2, 0, 0], [1, 0, 0, 0], [2, 1, 0, 0], [0, 1, 2, 0]], np.int32)
 WEIGHTS = np.array([[0.75, 0.25, 0, 0], [1, 0, 0, 0], [0.5, 0.5, 0, 0], [0.5, 0.3, 0.2, 0]], np.float32)

@@ -9,8 +9,8 @@ from onnx import TensorProto, helper, numpy_helper
 
 from fdda_addon.core.errors import ModelError
 from fdda_addon.core.model import CHECKSUM_KEY, ModelPartition, check_model
+from fdda_addon.core.onnx_cost import OPERATORS, compute_graph_cost
 from fdda_addon.core.onnx_file import read_onnx
-from fdda_addon.core.onnx_work import OPERATORS, measure_work
 
 from .tiny_model import J, V, constant, tiny_info, tiny_model
 
@@ -290,7 +290,7 @@ def test_the_shapes_are_those_that_the_runtime_finds():
     model = onnx.shape_inference.infer_shapes(model)
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     for poses in (1, 4):
-        found = measure_work(read_onnx(model.SerializeToString()), poses).shapes
+        found = compute_graph_cost(read_onnx(model.SerializeToString()), poses).shapes
         values = session.run(outputs, {"pose_matrices": rng.normal(size=(poses, J, 4, 4)).astype(np.float32)})
         assert {name: found[name] for name in outputs} == {
             name: value.shape for name, value in zip(outputs, values, strict=True)

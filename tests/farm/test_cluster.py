@@ -10,7 +10,7 @@ import psutil
 import pytest
 
 from farm.__main__ import main
-from farm.stamps import check_outputs
+from farm.fingerprints import check_outputs
 from farm.tasks import make_tasks
 
 from .conftest import ONE, ROOT
@@ -79,7 +79,7 @@ def test_a_farm(farm_started, tmp_path):
 
 def test_a_farm_that_is_up_to_date_starts_nothing(written, capsys, monkeypatch):
     plan = written()
-    monkeypatch.setattr("farm.stamps.is_up_to_date", lambda task, key: True)
+    monkeypatch.setattr("farm.fingerprints.is_up_to_date", lambda task, key: True)
     assert main([str(plan.path)]) == 0
     out = capsys.readouterr().out
     assert "to do" not in out and out.endswith("report.html: 1 characters\n")

@@ -8,13 +8,22 @@ from pathlib import Path
 import pytest
 
 from farm.__main__ import main
+from farm.fingerprints import (
+    InputFingerprints,
+    ManifestError,
+    TaskManifest,
+    digest_file,
+    is_up_to_date,
+    outdated_tasks,
+    read_manifest,
+    write_manifest,
+)
 from farm.run import reached_mm
-from farm.stamps import Keys, Stamp, StampError, digest_file, is_up_to_date, read_stamp, to_do, write_stamp
 from farm.tasks import make_tasks
 
 from .conftest import ONE
 
-STAMP = {
+MANIFEST = {
     **{"format": "fdda-farm-task", "version": 1, "key": "k", "outputs": {}, "skipped": ""},
     **{"seconds": 1.0, "peak_mb": 2.0, "host": "here", "notes": {}},
 }
@@ -38,8 +47,8 @@ def put(path: Path, content: bytes | None) -> None:
 def test_a_damaged_fingerprint_is_of_a_task_that_is_not_done(written, capsys, content):
     plan = written()
     task = make_tasks(plan)["elbow/bind"]
-    put(task.stamp, content)
-    assert read_stamp(task) is None
+    put(task.manifest, content)
+    assert read_manifest(task) is None
     for option in ("--list", "--dry-run", "--report-only"):
         assert main([str(plan.path), option]) == 0
     assert "elbow/bind: to do" in capsys.readouterr().out
@@ -49,7 +58,7 @@ def test_fingerprints_of_wrong_values(written, capsys):
     """They are refused, or what they say is of use to all that reads it."""
     plan = written()
     tasks = make_tasks(plan)
-    for key in STAMP:
+    for key in MANIFEST:
         for value in (
             *VALUES,
             {"a": [1]},
@@ -59,7 +68,7 @@ def test_fingerprints_of_wrong_values(written, capsys):
             {"bound": {"elbow.onnx": 3}},
         ):
             for task in tasks.values():
-                put(task.stamp, json.dumps(STAMP | {key: value}).encode())
+                put(task.manifest, json.dumps(MANIFEST | {key: value}).encode())
             for option in ("--list", "--dry-run", "--report-only"):
                 assert main([str(plan.path), option]) == 0, (key, value)
     assert capsys.readouterr().err == ""
@@ -70,21 +79,21 @@ def bound(written):
     """A farm whose tasks are all done, by their fingerprints, and its task `bind`."""
     plan = written(ONE + "goal_mm = 1.0\nrounds = 1\n")
     tasks = make_tasks(plan)
-    keys = Keys(plan.farm, tasks)
+    fingerprints = InputFingerprints(plan.farm, tasks)
     for name, task in tasks.items():
         for output in task.outputs:
             put(task.folder / output, f"{name} left {output}".encode())
         outputs = {output: digest_file(task.folder / output) for output in task.outputs}
         for output, place in task.publishes:
             put(place, (task.folder / output).read_bytes())
-        write_stamp(task, Stamp(keys.of(name), outputs))
-    assert to_do(tasks, keys) == ([], {})
-    return plan, tasks, keys
+        write_manifest(task, TaskManifest(fingerprints.of_task(name), outputs))
+    assert outdated_tasks(tasks, fingerprints) == ([], {})
+    return plan, tasks, fingerprints
 
 
 def test_junk_in_an_output_is_not_up_to_date(bound):
-    _, tasks, keys = bound
-    task, key = tasks["elbow/bind"], keys.of("elbow/bind")
+    _, tasks, fingerprints = bound
+    task, key = tasks["elbow/bind"], fingerprints.of_task("elbow/bind")
     for path in [place for _, place in task.publishes] + [task.folder / name for name in task.outputs]:
         kept = path.read_bytes()
         for junk in (b"x" * len(kept), b"", None):
@@ -96,12 +105,12 @@ def test_junk_in_an_output_is_not_up_to_date(bound):
         assert is_up_to_date(task, key)
     record = tasks["elbow/record-1"]
     (record.folder / "recording").write_bytes(b"x" * len("elbow/record-1 left recording"))
-    task.stamp.unlink()
+    task.manifest.unlink()
     for before in task.after:
-        tasks[before].stamp.unlink()
-    assert "elbow/record-1" not in to_do(tasks, keys)[0], "merge is done, and needs it no more"
-    tasks["elbow/merge"].stamp.unlink()
-    assert "elbow/record-1" in to_do(tasks, keys)[0], "and is made again before it is used"
+        tasks[before].manifest.unlink()
+    assert "elbow/record-1" not in outdated_tasks(tasks, fingerprints)[0], "merge is done, and needs it no more"
+    tasks["elbow/merge"].manifest.unlink()
+    assert "elbow/record-1" in outdated_tasks(tasks, fingerprints)[0], "and is made again before it is used"
 
 
 @pytest.mark.parametrize("content", [*JUNK, None, b"pipe"])
@@ -117,10 +126,10 @@ def test_damaged_evaluations_and_reports(bound, content):
     (evaluate.folder / "evaluation.json").unlink()
     put(evaluate.folder / "evaluation.json", content)
     with pytest.raises(
-        StampError, match=r"evaluation\.json' is damaged \(.*\); run the farm again, and it is made again"
+        ManifestError, match=r"evaluation\.json' is damaged \(.*\); run the farm again, and it is made again"
     ):
         reached_mm(evaluate)
-    assert read_stamp(evaluate) is None
+    assert read_manifest(evaluate) is None
 
 
 def test_evaluations_and_reports_of_wrong_values(bound):
@@ -133,7 +142,7 @@ def test_evaluations_and_reports_of_wrong_values(bound):
         evaluate = tasks["elbow/evaluate-0"]
         for wrong in ({"fdda": value}, {"fdda": {"p999": value}} if value != -1 else {}, value):
             (evaluate.folder / "evaluation.json").write_text(json.dumps(wrong))
-            with pytest.raises(StampError):
+            with pytest.raises(ManifestError):
                 reached_mm(evaluate)
 
 

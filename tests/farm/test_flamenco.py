@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from farm.__main__ import main
-from farm.stamps import read_stamp
+from farm.fingerprints import read_manifest
 from farm.tasks import make_tasks
 
 from .conftest import ONE, ROOT
@@ -86,7 +86,7 @@ def test_its_commands_do_the_tasks(written):
     start = [command["parameters"]["exe"], *command["parameters"]["args"]]
     result = subprocess.run(start, cwd=Path("/"), capture_output=True, text=True, check=False)
     assert result.returncode == 0 and "elbow/influences: done" in result.stdout, result.stderr
-    assert read_stamp(make_tasks(plan)["elbow/influences"]) is not None
+    assert read_manifest(make_tasks(plan)["elbow/influences"]) is not None
 
 
 def test_trainings_go_to_workers_with_a_gpu(written):

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 from farm.__main__ import main
+from farm.fingerprints import read_manifest
 from farm.openjd import make_template
-from farm.stamps import read_stamp
 from farm.tasks import make_tasks
 
 from .conftest import ONE
@@ -58,7 +58,7 @@ def test_it_runs(written):
     plan = written()
     run = openjd("run", template_of(plan), "--step", "elbow/merge", "--run-dependencies")
     assert run.returncode == 0, run.stdout[-3000:] + run.stderr
-    done = [name for name, task in make_tasks(plan).items() if read_stamp(task)]
+    done = [name for name, task in make_tasks(plan).items() if read_manifest(task)]
     assert done == ["elbow/influences", "elbow/record-1", "elbow/record-2", "elbow/merge"]
 
 

@@ -4,9 +4,9 @@
 import pytest
 
 from farm.__main__ import main
+from farm.fingerprints import TaskManifest, digest_file, write_manifest
 from farm.outputs import check_published
 from farm.run import FAILED, run_task
-from farm.stamps import Stamp, digest_file, write_stamp
 from farm.tasks import make_tasks
 from fdda_addon.core.errors import OutputError
 
@@ -97,7 +97,7 @@ def test_a_bound_file_that_somebody_has_changed_stays(written):
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(next(content for end, content in contents_of.items() if name.endswith(end)))
     task.folder.mkdir(parents=True)
-    write_stamp(task, Stamp("key", {name: digest_file(place) for name, place in task.publishes}))
+    write_manifest(task, TaskManifest("key", {name: digest_file(place) for name, place in task.publishes}))
     check_published(task)
     bound = next(place for _, place in task.publishes if place.suffix == ".blend")
     bound.write_bytes(b"BLENDER with animation")

@@ -4,10 +4,10 @@
 import json
 from html.parser import HTMLParser
 
+from farm.fingerprints import TaskManifest, write_manifest
 from farm.page import render_page
 from farm.report import write_report
 from farm.run import FAILED, Outcome
-from farm.stamps import Stamp, write_stamp
 from farm.tasks import make_tasks
 
 from .conftest import ONE
@@ -20,7 +20,7 @@ def bound(plan, mean: float, key: str = "first") -> None:
     for task in make_tasks(plan).values():
         task.folder.mkdir(parents=True, exist_ok=True)
         notes = {"bound": {"elbow.onnx": "elbow/train-0"}} if task.kind == "bind" else {}
-        write_stamp(task, Stamp(key, {}, seconds=2.0, peak_mb=100.0, host="here", notes=notes))
+        write_manifest(task, TaskManifest(key, {}, seconds=2.0, peak_mb=100.0, host="here", notes=notes))
     errors = {"mean": mean, "p999": 10 * mean, "max": 20 * mean}
     folder = make_tasks(plan)["elbow/bind"].folder
     (folder / "evaluation.json").write_text(json.dumps({"vertices": 300, "fdda": errors, "linear": errors}))

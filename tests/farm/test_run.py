@@ -14,9 +14,9 @@ import pytest
 
 from farm import process
 from farm.characters import Farm, read_plan
+from farm.fingerprints import InputFingerprints, outdated_tasks, read_manifest
 from farm.process import TryAgainError, VerbError, held, run_verb, verb_environment
 from farm.run import AGAIN, DONE, FAILED, NOT_NEEDED, UP_TO_DATE, run_task
-from farm.stamps import Keys, read_stamp, to_do
 from farm.tasks import make_tasks
 from fdda_addon.core.errors import TRY_AGAIN
 from fdda_addon.core.model import read_model_info
@@ -51,7 +51,7 @@ def test_all_tasks_of_a_character(elbow_farm):
         (0, 1),
         key=lambda n: json.loads((plan.farm.work / f"elbow/evaluate-{n}/evaluation.json").read_text())["fdda"]["p999"],
     )
-    bound = read_stamp(make_tasks(plan)["elbow/bind"]).notes["bound"]
+    bound = read_manifest(make_tasks(plan)["elbow/bind"]).notes["bound"]
     assert bound == {"elbow.onnx": f"elbow/train-{best}"}
     assert (out / "elbow.onnx").read_bytes() == (plan.farm.work / f"elbow/train-{best}/elbow.onnx").read_bytes()
 
@@ -60,7 +60,7 @@ def test_nothing_is_done_twice(elbow_farm):
     plan, _ = elbow_farm
     before = contents(plan.farm.work)
     tasks = make_tasks(plan)
-    assert to_do(tasks, Keys(plan.farm, tasks)) == ([], {})
+    assert outdated_tasks(tasks, InputFingerprints(plan.farm, tasks)) == ([], {})
     assert set(states(do_all(plan)).values()) == {UP_TO_DATE}
     assert contents(plan.farm.work) == before
 
@@ -68,14 +68,14 @@ def test_nothing_is_done_twice(elbow_farm):
 def test_a_lost_file_is_made_again_with_what_it_needs_alone(elbow_farm):
     plan, _ = elbow_farm
     tasks = make_tasks(plan)
-    keys = Keys(plan.farm, tasks)
+    fingerprints = InputFingerprints(plan.farm, tasks)
     lost = plan.farm.work / "elbow/evaluate-1/evaluation.json"
     kept = lost.read_bytes()
     lost.unlink()
     # What is done needs nothing before it: bind is.
-    assert to_do(tasks, keys) == ([], {})
+    assert outdated_tasks(tasks, fingerprints) == ([], {})
     (plan.characters[0].output / "elbow.blend").unlink()
-    assert to_do(tasks, keys)[0] == ["elbow/evaluate-1", "elbow/bind"]
+    assert outdated_tasks(tasks, fingerprints)[0] == ["elbow/evaluate-1", "elbow/bind"]
     assert run_task(plan.farm, tasks, "elbow/evaluate-1").state == DONE
     assert json.loads(lost.read_bytes())["fdda"] == json.loads(kept)["fdda"]
     assert run_task(plan.farm, tasks, "elbow/bind").state == DONE
@@ -87,12 +87,14 @@ def test_what_was_changed_is_not_used(elbow_farm):
     model = plan.farm.work / "elbow/train-1/elbow.onnx"
     kept = model.read_bytes()
     model.write_bytes(kept[:-1] + b"x")
-    tasks["elbow/evaluate-1"].stamp.unlink()
+    tasks["elbow/evaluate-1"].manifest.unlink()
     outcome = run_task(plan.farm, tasks, "elbow/evaluate-1")
     assert outcome.state == FAILED
     assert f"'{model}' is not what 'elbow/train-1' left" in outcome.sentence and "it is made again" in outcome.sentence
-    tasks["elbow/bind"].stamp.unlink()
-    assert to_do(tasks, Keys(plan.farm, tasks))[0] == [f"elbow/{name}" for name in ("train-1", "evaluate-1", "bind")]
+    tasks["elbow/bind"].manifest.unlink()
+    assert outdated_tasks(tasks, InputFingerprints(plan.farm, tasks))[0] == [
+        f"elbow/{name}" for name in ("train-1", "evaluate-1", "bind")
+    ]
     made = [run_task(plan.farm, tasks, f"elbow/{name}").state for name in ("train-1", "evaluate-1", "bind")]
     assert made == [DONE] * 3
     assert model.read_bytes() == kept, "the same recording and settings give the same bytes"
@@ -114,7 +116,7 @@ def test_keys_follow_what_a_task_depends_on(written, tmp_path):
     def keys(text: str, head: str = "") -> dict[str, str]:
         plan = written(text, head)
         tasks = make_tasks(plan)
-        return {name: Keys(plan.farm, tasks).of(name) for name in tasks}
+        return {name: InputFingerprints(plan.farm, tasks).of_task(name) for name in tasks}
 
     first = keys(ONE)
 
@@ -185,7 +187,7 @@ def test_a_worker_that_is_killed_loses_nothing(written, with_verb):
         for child in children:
             os.kill(int(child), signal.SIGKILL)
     before = complete(recording)
-    assert 0 < before < 4000 and read_stamp(task) is None
+    assert 0 < before < 4000 and read_manifest(task) is None
     assert run_task(plan.farm, tasks, task.name).state == DONE
     last = task.log.read_text().rpartition("$ record")[2]
     first = next(int(line.split()[1]) for line in last.splitlines() if line.startswith("poses: "))
@@ -256,7 +258,7 @@ def test_a_rig_that_is_broken_fails_with_its_sentence(written, tmp_path):
     tasks = make_tasks(plan)
     outcome = run_task(plan.farm, tasks, "bad/influences")
     assert outcome.state == FAILED and "Blender cannot open" in outcome.sentence
-    names, unreadable = to_do(tasks, Keys(plan.farm, tasks))
+    names, unreadable = outdated_tasks(tasks, InputFingerprints(plan.farm, tasks))
     assert "bad/influences" in names and list(unreadable) == ["gone/bind"]
     assert (
         unreadable["gone/bind"]

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from farm.characters import Farm
+from farm.fingerprints import TaskManifest, write_manifest
 from farm.simulation import ONCE, START_SECONDS, longest_path, print_estimate, rest_seconds, simulate, task_seconds
-from farm.stamps import Stamp, write_stamp
 from farm.tasks import RECORD, Task, make_tasks
 
 from .conftest import ONE
@@ -61,11 +61,11 @@ def test_no_number_of_workers_beats_the_longest_path_nor_the_sum(written):
 def test_what_was_measured_is_taken_and_carried_over(written):
     plan = written(ONE + '[characters.other]\nrig = "elbow.blend"\noutput = "o"\nposes = 60\n')
     tasks = make_tasks(plan)
-    stamp = Stamp("key", {}, seconds=START_SECONDS + 5.0)
+    manifest = TaskManifest("key", {}, seconds=START_SECONDS + 5.0)
     (plan.farm.work / "elbow").mkdir(parents=True)
-    write_stamp(tasks["elbow/record-1"], stamp)
+    write_manifest(tasks["elbow/record-1"], manifest)
     seconds, measured = task_seconds(tasks)
-    assert measured == 1 and seconds["elbow/record-1"] == stamp.seconds
+    assert measured == 1 and seconds["elbow/record-1"] == manifest.seconds
     # 10 poses took 5 seconds, and 30 take 15.
     assert seconds["other/record-1"] == pytest.approx(START_SECONDS + 15)
     assert seconds["other/influences"] == START_SECONDS + ONCE["influences"]

@@ -93,7 +93,7 @@ def test_what_a_farm_has_started_ends_with_it(in_training, arguments, number, st
                 os.kill(process, signal.SIGKILL)
         printed.seek(0)
         text = printed.read().decode()
-    assert not make_tasks(in_training)["elbow/train-0"].stamp.exists()
+    assert not make_tasks(in_training)["elbow/train-0"].manifest.exists()
     assert "Traceback" not in text and "Warning" not in text
     assert ("Interrupted; run the same command to go on.\n" in text) == (number != signal.SIGKILL)
 

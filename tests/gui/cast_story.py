@@ -127,14 +127,16 @@ def cancel_all_in_one(folder: Path) -> Iterator[float]:
     before, job = shape(), part("jobs.job")
     yield from sidebar.show()
     yield from sidebar.open_section("rig")
-    yield from sidebar.push("fdda.make_model")
-    yield from until(lambda: job.state_of("make_model") and job.state_of("make_model").done > 5, 60, "nothing is done")
-    yield from picture(folder / "one_go.png")
-    check(job.state_of("make_model").total, "there is no bar")
+    yield from sidebar.push("fdda.build_model")
+    yield from until(
+        lambda: job.state_of("build_model") and job.state_of("build_model").done > 5, 60, "nothing is done"
+    )
+    yield from picture(folder / "build_model.png")
+    check(job.state_of("build_model").total, "there is no bar")
     yield from rest_mouse()
     yield from press("Escape")
-    yield from until(lambda: not job.state_of("make_model").is_running, 20, "ESC does not end it")
-    said = job.state_of("make_model").outcome
+    yield from until(lambda: not job.state_of("build_model").is_running, 20, "ESC does not end it")
+    said = job.state_of("build_model").outcome
     check("Cancelled" in said, f"it says '{said}'")
     check(not arm().fdda.is_bound and np.allclose(shape(), before, atol=1e-6), "the arm is not as before")
 

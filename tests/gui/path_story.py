@@ -169,8 +169,8 @@ def check_the_trainer(_folder: Path) -> Iterator[float]:
     session = part("training.environment.session")
     yield from sidebar.open_section("training")
     yield from sidebar.push("fdda.check_trainer", across=0.2)
-    yield from until(lambda: session.answer is not None, 60, "the check does not end")
-    check(session.answer.level == "INFO", f"the check says '{session.answer.message}'")
+    yield from until(lambda: session.check_result is not None, 60, "the check does not end")
+    check(session.check_result.level == "INFO", f"the check says '{session.check_result.message}'")
     yield 0.3
 
 

@@ -223,7 +223,7 @@ def close_the_file_while_it_trains(folder: Path) -> Iterator[float]:
 
 def make_a_model_in_one_go(folder: Path) -> Iterator[float]:
     """A new file with the arm, saved; one button: it is recorded, trained and bound."""
-    own = emptied(folder / "work" / "one_go")
+    own = emptied(folder / "work" / "build_model")
     bpy.ops.wm.read_homefile(app_template="", load_ui=False)
     yield 0.5
     bpy.ops.fdda.add_arm(density="1")
@@ -232,11 +232,13 @@ def make_a_model_in_one_go(folder: Path) -> Iterator[float]:
     bpy.ops.wm.save_as_mainfile(filepath=str(own / BLEND))
     yield from redraw()
     yield from sidebar.open_section("rig")
-    yield from sidebar.push("fdda.make_model")
+    yield from sidebar.push("fdda.build_model")
     job = part("jobs.job")
-    yield from until(lambda: job.state_of("make_model") and job.state_of("make_model").curves, 90, "nothing is trained")
+    yield from until(
+        lambda: job.state_of("build_model") and job.state_of("build_model").curves, 90, "nothing is trained"
+    )
     yield from picture(folder / "one_go_trains.png")
-    yield from job_done("make_model", 180)
+    yield from job_done("build_model", 180)
     check(arm().fdda.is_bound and arm().fdda.mode == "FDDA", f"it is not bound: {arm().fdda.status}")
     check(arm().fdda.packed is not None, "the model is not packed")
     check(np.isfinite(shape()).all(), "the arm has no shape")

@@ -10,8 +10,8 @@ import pytest
 from fdda_addon.core.errors import ModelError
 from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY, check_model
 from fdda_addon.core.model_graph import ROOM, SMALL
+from fdda_addon.core.onnx_cost import OPERATORS, compute_graph_cost
 from fdda_addon.core.onnx_file import read_onnx
-from fdda_addon.core.onnx_work import OPERATORS, measure_work
 from trainer.__main__ import main
 from trainer.config import ACTIVATIONS
 
@@ -45,9 +45,9 @@ def test_the_metadata_explains_the_size_with_room_to_spare(models):
     """An exporter that comes near the bounds is to widen them, before a character fails on them."""
     for data in models:
         info, contents = check_model(data, "m.onnx"), read_onnx(data)
-        explained, work = info.explained(), measure_work(contents, 1)
-        assert work.elements < ROOM / 2 * (explained.values + SMALL)
-        assert sum(len(c.data) for c in contents.constants.values()) < 4 * ROOM / 2 * (explained.constants + SMALL)
+        budget, cost = info.budget(), compute_graph_cost(contents, 1)
+        assert cost.elements < ROOM / 2 * (budget.values + SMALL)
+        assert sum(len(c.data) for c in contents.constants.values()) < 4 * ROOM / 2 * (budget.constants + SMALL)
 
 
 def test_weights_that_were_changed_are_noticed(trained):

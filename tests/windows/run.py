@@ -43,7 +43,7 @@ BLENDER = (
     "background_jobs",
     "trainer_environment",
     "trainer_python",
-    "lasting_trainings",
+    "detached_trainings",
     "refinement",
     "packed_by_default",
     "playback",

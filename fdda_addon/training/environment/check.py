@@ -8,7 +8,7 @@ import subprocess
 from ...core.errors import os_reason
 from ...core.native_library import runtime_advice
 from ..endings import explain_status
-from .answer import Answer
+from .check_result import CheckResult
 from .folder import PACKAGES, ROOT
 from .subprocesses import UTF8_OUTPUT, hidden
 
@@ -38,7 +38,7 @@ print(json.dumps(answer))
 """
 
 
-def check(python: str, advice: str) -> Answer:
+def check(python: str, advice: str) -> CheckResult:
     """Ask a Python whether it can train. Takes seconds: never while drawing.
 
     Args:
@@ -59,9 +59,13 @@ def check(python: str, advice: str) -> Answer:
             **hidden(),
         )
     except OSError as error:
-        return Answer("ERROR", f"The trainer's Python '{python}' cannot be started ({os_reason(error)}); {advice}.")
+        return CheckResult(
+            "ERROR", f"The trainer's Python '{python}' cannot be started ({os_reason(error)}); {advice}."
+        )
     except subprocess.TimeoutExpired:
-        return Answer("ERROR", f"The trainer's Python '{python}' did not answer in {TIMEOUT_SECONDS:.0f} s; {advice}.")
+        return CheckResult(
+            "ERROR", f"The trainer's Python '{python}' did not answer in {TIMEOUT_SECONDS:.0f} s; {advice}."
+        )
     said = result.stdout.decode("utf-8", "replace").strip().splitlines()
     try:
         answer = json.loads(said[-1])
@@ -71,10 +75,10 @@ def check(python: str, advice: str) -> Answer:
         ending = explain_status(result.returncode, is_silent=True)
         reason = ending.text if ending.is_machines else f"status {result.returncode}"
         reason = text[-1].strip() if text else reason
-        return Answer("ERROR", f"'{python}' does not answer as a Python does ({reason}); {advice}.")
+        return CheckResult("ERROR", f"'{python}' does not answer as a Python does ({reason}); {advice}.")
 
 
-def _judge(python: str, answer: dict, advice: str) -> Answer:
+def _judge(python: str, answer: dict, advice: str) -> CheckResult:
     version = ".".join(str(number) for number in answer["version"])
     packages, broken = answer["packages"], answer["broken"]
     details = [f"Python {version}: {python}"]
@@ -83,15 +87,15 @@ def _judge(python: str, answer: dict, advice: str) -> Answer:
     if tuple(answer["version"]) < OLDEST:
         oldest = ".".join(str(number) for number in OLDEST)
         message = f"'{python}' is Python {version}, and the trainer needs {oldest} or later; {advice}."
-        return Answer("ERROR", message, tuple(details))
+        return CheckResult("ERROR", message, tuple(details))
     if missing := [name for name in PACKAGES if name in packages and packages[name] is None]:
         names = " and ".join([", ".join(missing[:-1]), missing[-1]] if missing[:-1] else missing)
-        return Answer("ERROR", f"'{python}' (Python {version}) lacks {names}; {advice}.", tuple(details))
+        return CheckResult("ERROR", f"'{python}' (Python {version}) lacks {names}; {advice}.", tuple(details))
     if broken:
         name, reason = next(iter(broken.items()))
         advice = runtime_advice(reason) or advice
-        return Answer("ERROR", f"{name} of '{python}' cannot be imported ({reason}); {advice}.", tuple(details))
+        return CheckResult("ERROR", f"{name} of '{python}' cannot be imported ({reason}); {advice}.", tuple(details))
     device = answer["device"]
     details.append(f"Device: {'the processor' if device == 'cpu' else f'{device} (CUDA)'}")
     where = "on the processor" if device == "cpu" else f"on {device}"
-    return Answer("INFO", f"Ready to train {where}: Python {version}, torch {packages['torch']}.", tuple(details))
+    return CheckResult("INFO", f"Ready to train {where}: Python {version}, torch {packages['torch']}.", tuple(details))

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from .answer import Answer
+from .check_result import CheckResult
 from .folder import own_python, python_in
 
 PYTHON_VARIABLE = "FDDA_TRAINER_PYTHON"
@@ -54,7 +54,7 @@ def chosen_python() -> TrainerPython:
     return TrainerPython(sys.executable, Origin.THIS)
 
 
-def ping(python: TrainerPython | None = None) -> Answer:
+def ping(python: TrainerPython | None = None) -> CheckResult:
     """Ask the Python that runs the trainer whether it can train. Takes seconds: never while drawing."""
     from .check import check
 

@@ -16,9 +16,8 @@ from typing import IO
 
 from ...core.errors import TrainerEnvironmentError, os_reason
 from ...core.progress import Progress
-from .answer import Answer
-from .bases import BasePython, ask, find_bases
 from .check import check
+from .check_result import CheckResult
 from .folder import (
     PACKAGES,
     claimed,
@@ -30,6 +29,7 @@ from .folder import (
     site_packages,
     write_mark,
 )
+from .interpreters import Interpreter, ask, find_interpreters
 from .subprocesses import clean_environment, hidden
 
 NEEDED_GB = 9 if sys.platform.startswith("linux") else 2
@@ -57,7 +57,7 @@ class Creation:
         self._last_lines: list[str] = []
         self._has_begun = False
 
-    def steps(self) -> Iterator[Progress | Answer]:
+    def steps(self) -> Iterator[Progress | CheckResult]:
         """Make the environment; yields how far it is, and last the answer of its Python.
 
         Raises:
@@ -71,11 +71,11 @@ class Creation:
                 "make room or see to the permissions, and create it again."
             ) from error
 
-    def _steps(self) -> Iterator[Progress | Answer]:
+    def _steps(self) -> Iterator[Progress | CheckResult]:
         with claimed(self.folder), _written(self.log) as log:
             self._check_source()
             yield Progress("looking for a Python", 0, 0)
-            bases = self._find_bases(log)
+            bases = self._find_interpreters(log)
             if self.wheels is not None:
                 self._check_wheels(bases[0], log)
             complete = False
@@ -119,7 +119,7 @@ class Creation:
         elif not self.wheels.is_dir():
             raise TrainerEnvironmentError(f"'{self.wheels}' is no folder; choose the one that holds the wheels.")
 
-    def _check_wheels(self, base: BasePython, log: IO[str]) -> None:
+    def _check_wheels(self, base: Interpreter, log: IO[str]) -> None:
         """Before what is there is removed: pip would find a missing wheel late, and call it a conflict of versions."""
         pinned = [line for line in pins(base.version).read_text(encoding="utf-8").splitlines() if "==" in line]
         wanted = [line.split("==") for line in pinned if line.partition("==")[0] in PACKAGES]
@@ -136,7 +136,7 @@ class Creation:
                 f"them on a machine that is online, '{self.log}' has the command."
             )
 
-    def _find_bases(self, log: IO[str]) -> list[BasePython]:
+    def _find_interpreters(self, log: IO[str]) -> list[Interpreter]:
         """The Pythons that may make it, the best first."""
         if self.base:
             asked = ask([self.base])
@@ -144,7 +144,7 @@ class Creation:
                 raise TrainerEnvironmentError(f"'{self.base}' is no Python that runs; name another, or leave it out.")
             found = [asked]
         else:
-            found = list(find_bases())
+            found = list(find_interpreters())
         log.writelines(f"{base} {base.lacks or 'can be tried'}\n" for base in found)
         suitable = [base for base in found if not base.lacks]
         self._stop_if_cancelled()
@@ -152,7 +152,7 @@ class Creation:
             raise self._no_python(f"{found[0]} {found[0].lacks}" if found else "none runs")
         return suitable
 
-    def _make(self, bases: list[BasePython], log: IO[str]) -> Iterator[Progress]:
+    def _make(self, bases: list[Interpreter], log: IO[str]) -> Iterator[Progress]:
         """Make the virtual environment from the first Python that can; returns that Python."""
         for base in bases:
             yield Progress(f"making it from {base}", 0, 0)
@@ -167,7 +167,7 @@ class Creation:
             f"module, or choose an existing Python that has torch. '{self.log}' lists what was tried."
         )
 
-    def _install(self, base: BasePython, log: IO[str]) -> Iterator[Progress]:
+    def _install(self, base: Interpreter, log: IO[str]) -> Iterator[Progress]:
         with self._temporary() as temporary:
             yield from self._install_with(temporary, base, log)
 
@@ -184,7 +184,7 @@ class Creation:
         finally:
             shutil.rmtree(path, ignore_errors=True)
 
-    def _install_with(self, temporary: Path, base: BasePython, log: IO[str]) -> Iterator[Progress]:
+    def _install_with(self, temporary: Path, base: Interpreter, log: IO[str]) -> Iterator[Progress]:
         packages = site_packages(self.folder, base.version)
         # The folder itself, found through a .pth file: paths in site-packages would be 18 letters longer.
         (packages / "fdda.pth").write_text(os.path.relpath(self.folder, packages) + "\n", encoding="ascii")
@@ -213,7 +213,7 @@ class Creation:
             environment["PIP_CONFIG_FILE"] = os.devnull
         return environment | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
 
-    def _check(self, log: IO[str]) -> Answer:
+    def _check(self, log: IO[str]) -> CheckResult:
         answer = check(str(python_in(self.folder)), f"the log is '{self.log}'")
         log.writelines(f"{line}\n" for line in (answer.message, *answer.details))
         self._stop_if_cancelled()

@@ -12,7 +12,7 @@ import pytest
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.model import read_model_info
-from fdda_addon.training import lasting
+from fdda_addon.training import detached_process
 
 pytestmark = pytest.mark.one_line
 
@@ -20,18 +20,18 @@ LEAVING = """
 import sys
 sys.path.insert(0, {root!r})
 from pathlib import Path
-from fdda_addon.training import lasting
-lasting.user_folder = lambda: Path({user!r})
-with lasting.LastingTraining([{recording!r}, {model!r}, "--epochs", "{epochs}"], Path({model!r})) as training:
+from fdda_addon.training import detached_process
+detached_process.user_folder = lambda: Path({user!r})
+with detached_process.DetachedTraining([{recording!r}, {model!r}, "--epochs", "{epochs}"], Path({model!r})) as training:
     next(training.messages())
-    training.leave()
+    training.detach()
 """
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(autouse=True)
 def _user(tmp_path, monkeypatch):
-    monkeypatch.setattr(lasting, "user_folder", lambda: tmp_path / "user")
+    monkeypatch.setattr(detached_process, "user_folder", lambda: tmp_path / "user")
 
 
 def leave_in_another_process(elbow, model: Path, epochs: int) -> None:
@@ -46,68 +46,68 @@ def leave_in_another_process(elbow, model: Path, epochs: int) -> None:
 def test_it_goes_on_when_its_blender_is_closed_and_is_followed_from_the_start(elbow, tmp_path):
     model = tmp_path / "m.onnx"
     leave_in_another_process(elbow, model, 30)
-    assert lasting.is_known(model) and not model.exists()
-    with lasting.FollowedTraining(model) as training:
+    assert detached_process.is_detached(model) and not model.exists()
+    with detached_process.AttachedTraining(model) as training:
         kinds = [message.type for message in training.messages()]
     assert kinds[0] is MessageType.STARTED and kinds.count(MessageType.PROGRESS) == 30
     assert kinds[-1] is MessageType.FINISHED
     assert read_model_info(model).training["epochs"] == 30
-    assert not lasting.is_known(model)
+    assert not detached_process.is_detached(model)
 
 
 def test_one_that_ended_meanwhile_is_followed_too(elbow, tmp_path):
     model = tmp_path / "m.onnx"
     leave_in_another_process(elbow, model, 3)
     end = time.monotonic() + 60
-    while lasting._Record(model).is_written() and time.monotonic() < end:
+    while detached_process._ProcessFiles(model).is_running() and time.monotonic() < end:
         time.sleep(0.1)
-    with lasting.FollowedTraining(model) as training:
+    with detached_process.AttachedTraining(model) as training:
         assert [message.type for message in training.messages()][-1] is MessageType.FINISHED
 
 
 def test_one_that_was_killed_says_so(elbow, tmp_path):
     model = tmp_path / "m.onnx"
     leave_in_another_process(elbow, model, 100_000)
-    with lasting.FollowedTraining(model) as training:
+    with detached_process.AttachedTraining(model) as training:
         training._process.kill()
         with pytest.raises(TrainingError, match="before it was done; no model was written, train again"):
             list(training.messages())
-    assert not lasting.is_known(model)
+    assert not detached_process.is_detached(model)
 
 
 def test_one_that_is_followed_can_be_cancelled(elbow, tmp_path):
     model = tmp_path / "m.onnx"
     leave_in_another_process(elbow, model, 100_000)
-    with lasting.FollowedTraining(model) as training:
+    with detached_process.AttachedTraining(model) as training:
         messages = training.messages()
         next(messages)
         training.cancel()
         assert list(messages)[-1].type is MessageType.CANCELLED
-    assert not model.exists() and not lasting.is_known(model)
+    assert not model.exists() and not detached_process.is_detached(model)
     assert list((tmp_path / "user" / "trainings").iterdir()) == []
 
 
 def test_one_that_died_says_why_to_another_blender(tmp_path):
-    record = lasting._Record(tmp_path / "m.onnx")
-    with record.new_messages(), record.new_errors() as errors:
+    files = detached_process._ProcessFiles(tmp_path / "m.onnx")
+    with files.new_messages(), files.new_errors() as errors:
         errors.write("Traceback\nImportError: Jürgen 李\n")
-    record.name(1)
+    files.write_process_id(1)
     with (
-        lasting.FollowedTraining(tmp_path / "m.onnx") as training,
+        detached_process.AttachedTraining(tmp_path / "m.onnx") as training,
         pytest.raises(
             TrainingError, match=r"The trainer ended before it was done \(ImportError: Jürgen 李\); no model"
         ),
     ):
         list(training.messages())
-    assert not lasting.is_known(tmp_path / "m.onnx")
+    assert not detached_process.is_detached(tmp_path / "m.onnx")
 
 
 def test_one_that_is_not_left_ends_with_its_block(elbow, tmp_path):
     model = tmp_path / "m.onnx"
-    with lasting.LastingTraining([str(elbow.recording), str(model), "--epochs", "100000"], model) as training:
+    with detached_process.DetachedTraining([str(elbow.recording), str(model), "--epochs", "100000"], model) as training:
         next(training.messages())
         process = training._process
-    assert process.poll() is not None and not lasting.is_known(model)
+    assert process.poll() is not None and not detached_process.is_detached(model)
 
 
 def test_a_number_of_another_process_is_never_ended(tmp_path):
@@ -115,10 +115,10 @@ def test_a_number_of_another_process_is_never_ended(tmp_path):
     model = tmp_path / "m.onnx"
     bystander = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     try:
-        record = lasting._Record(model)
-        record.new_messages().close()
-        record.name(bystander.pid)
-        with lasting.FollowedTraining(model) as training:
+        files = detached_process._ProcessFiles(model)
+        files.new_messages().close()
+        files.write_process_id(bystander.pid)
+        with detached_process.AttachedTraining(model) as training:
             training.cancel()
             training._process.kill()
             list(training.messages())
@@ -129,11 +129,11 @@ def test_a_number_of_another_process_is_never_ended(tmp_path):
 
 
 def test_what_is_no_record_is_none(tmp_path):
-    record = lasting._Record(tmp_path / "m.onnx")
-    record.new_messages().close()
+    files = detached_process._ProcessFiles(tmp_path / "m.onnx")
+    files.new_messages().close()
     for text in ("", "[]", '{"process": "x"}', '{"process": null}'):
-        record._path.write_text(text)
-        assert not lasting.is_known(tmp_path / "m.onnx")
+        files._path.write_text(text)
+        assert not detached_process.is_detached(tmp_path / "m.onnx")
 
 
 def test_adjust_last_operation_is_not_offered_for_any_job():

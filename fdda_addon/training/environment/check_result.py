@@ -4,7 +4,7 @@
 from typing import NamedTuple
 
 
-class Answer(NamedTuple):
+class CheckResult(NamedTuple):
     """What is known of a Python, or how something ended.
 
     Attributes:

@@ -13,15 +13,15 @@ from .recording import is_recorded, record_rigs
 from .training import TrainsModels
 
 
-class FDDA_OT_make_model(TrainsModels, JobOperator, bpy.types.Operator):
-    bl_idname = "fdda.make_model"
+class FDDA_OT_build_model(TrainsModels, JobOperator, bpy.types.Operator):
+    bl_idname = "fdda.build_model"
     bl_label = "Prepare, Train, Bind"
     bl_description = (
         "Record with the settings below, train, and bind the model, one after the other; what is recorded already is "
         "trained on. ESC cancels while it records, and Cancel always"
     )
     bl_options = {"REGISTER"}
-    verb, title = "make_model", "Prepare, Train, Bind"
+    verb, title = "build_model", "Prepare, Train, Bind"
     ends_itself = True
 
     @classmethod
@@ -66,4 +66,4 @@ class FDDA_OT_make_model(TrainsModels, JobOperator, bpy.types.Operator):
         return "Cancelled; what was recorded is kept, and the next time goes on from there."
 
 
-CLASSES = (FDDA_OT_make_model,)
+CLASSES = (FDDA_OT_build_model,)

@@ -25,11 +25,11 @@ from .environment.subprocesses import hidden
 from .process import Training
 
 POLL_SECONDS = 0.1
-_started: dict[int, subprocess.Popen] = {}
+_child_processes: dict[int, subprocess.Popen] = {}
 """Processes of this Blender, by their number: somebody has to ask for their status once they have ended."""
 
 
-class LastingTraining(Training):
+class DetachedTraining(Training):
     """A training that goes on when `leave` was called before the block ends; otherwise its process is gone then."""
 
     lost = "no model was written, train again"
@@ -45,25 +45,25 @@ class LastingTraining(Training):
             TrainingError: the interpreter cannot be started.
             OutputError: the folder for what it says cannot be written.
         """
-        self._record, self._is_left = _Record(model), False
+        self._files, self._is_detached = _ProcessFiles(model), False
         super().__init__(arguments)
-        _started[self._process.pid] = self._process
+        _child_processes[self._process.pid] = self._process
         try:
-            self._record.name(self._process.pid)
+            self._files.write_process_id(self._process.pid)
         except OutputError:
             # Nobody would find it again.
             self.__exit__()
             raise
 
     def _new_stop_file(self) -> Path:
-        self._record.remove()
-        return self._record.stop_file
+        self._files.remove()
+        return self._files.stop_file
 
     def _new_errors(self) -> TextIO:
-        return self._record.new_errors()
+        return self._files.new_errors()
 
     def _start(self, command: list[str], environment: dict[str, str]) -> subprocess.Popen:
-        with self._record.new_messages() as file:
+        with self._files.new_messages() as file:
             return subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -75,15 +75,15 @@ class LastingTraining(Training):
 
     def _read(self) -> None:
         place, rest = 0, b""
-        while not self._is_left:
+        while not self._is_detached:
             # Asked before reading: what was written before it ended is read.
             is_alive = self._process.poll() is None
             try:
-                with self._record.messages.open("rb") as file:
+                with self._files.messages.open("rb") as file:
                     file.seek(place)
                     read = file.read()
             except PermissionError:
-                # On Windows, while `is_written` of another thread tries the file.
+                # On Windows, while `is_running` of another thread tries the file.
                 time.sleep(POLL_SECONDS)
                 continue
             place += len(read)
@@ -95,39 +95,39 @@ class LastingTraining(Training):
             time.sleep(0 if lines else POLL_SECONDS)
         self._lines.put(None)
 
-    def leave(self) -> None:
+    def detach(self) -> None:
         """Let it go on when the block ends."""
-        self._is_left = True
+        self._is_detached = True
         if self._abandoned is not None:
             self._abandoned.detach()
 
     def __exit__(self, *error: object) -> None:
-        if self._is_left:
+        if self._is_detached:
             self._reader.join()
             self._errors.close()
             return
         super().__exit__(*error)
-        self._record.remove()
+        self._files.remove()
 
 
-class FollowedTraining(LastingTraining):
+class AttachedTraining(DetachedTraining):
     """A training that was left, followed from its first message."""
 
     def __init__(self, model: Path):
-        """Follow the training of a model; `is_known` has to be true."""
-        self._record, self._is_left = _Record(model), False
-        self._stop_file, self._errors = self._record.stop_file, self._record.errors()
-        pid = self._record.process
-        self._process = _started.get(pid) or _OtherProcess(pid, self._record)
+        """Follow the training of a model; `is_detached` has to be true."""
+        self._files, self._is_detached = _ProcessFiles(model), False
+        self._stop_file, self._errors = self._files.stop_file, self._files.errors()
+        pid = self._files.process_id
+        self._process = _child_processes.get(pid) or _ForeignProcess(pid, self._files)
         self._follow()
 
 
-def is_known(model: Path) -> bool:
+def is_detached(model: Path) -> bool:
     """Whether a training of a model was left and nobody has seen its end yet."""
-    return _Record(model).process > 0
+    return _ProcessFiles(model).process_id > 0
 
 
-class _Record:
+class _ProcessFiles:
     """What is known of the training of a model, on the disk: its process, and what that has said."""
 
     def __init__(self, model: Path):
@@ -169,19 +169,19 @@ class _Record:
         except OSError as error:
             raise OutputError(f"Cannot write '{path}': {os_reason(error)}; make room there.") from error
 
-    def name(self, process: int) -> None:
+    def write_process_id(self, process_id: int) -> None:
         """Keep the number of the process; raises OutputError."""
-        write_json(self._path, {"process": process})
+        write_json(self._path, {"process": process_id})
 
     @property
-    def process(self) -> int:
+    def process_id(self) -> int:
         """Number of the process, 0 when there is none."""
         try:
             return int(json.loads(self._path.read_text(encoding="utf-8"))["process"]) * self.messages.is_file()
         except (OSError, ValueError, KeyError, TypeError):
             return 0
 
-    def is_written(self) -> bool:
+    def is_running(self) -> bool:
         """Whether a process still has the file of the messages. Its number alone may be another's by now."""
         if sys.platform == "win32":
             # There a file that is open cannot be renamed.
@@ -207,16 +207,16 @@ class _Record:
                 path.unlink(missing_ok=True)
 
 
-class _OtherProcess:
+class _ForeignProcess:
     """A process that another Blender has started, as far as `Training` uses one. Its exit status is not known."""
 
     stdout = None
 
-    def __init__(self, pid: int, record: _Record):
-        self.pid, self._record = pid, record
+    def __init__(self, pid: int, files: _ProcessFiles):
+        self.pid, self._files = pid, files
 
     def poll(self) -> str | None:
-        return None if self._record.is_written() else "ended"
+        return None if self._files.is_running() else "ended"
 
     def wait(self, seconds: float = float("inf")) -> None:
         end = time.monotonic() + seconds
@@ -233,6 +233,6 @@ class _OtherProcess:
 
     def _send(self, number: int) -> None:
         # Its number alone may be that of another process by now.
-        if self._record.is_written():
+        if self._files.is_running():
             with contextlib.suppress(OSError):
                 os.kill(self.pid, number)

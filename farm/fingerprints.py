@@ -24,12 +24,12 @@ ROOT = Path(__file__).resolve().parent.parent
 PIECE = 4 << 20
 
 
-class StampError(FDDAError):
+class ManifestError(FDDAError):
     """What a task left is not as it was left."""
 
 
 @dataclass(frozen=True)
-class Stamp:
+class TaskManifest:
     """What is written when a task is done.
 
     Attributes:
@@ -59,7 +59,7 @@ def read_json(path: Path) -> dict:
         ValueError: it holds something else.
     """
     try:
-        value = json.loads(read_input(path, MAX_JSON_BYTES), parse_constant=float_of, parse_float=float_of)
+        value = json.loads(read_input(path, MAX_JSON_BYTES), parse_constant=finite_float, parse_float=finite_float)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
     if not isinstance(value, dict):
@@ -67,7 +67,7 @@ def read_json(path: Path) -> dict:
     return value
 
 
-def float_of(value: object) -> float:
+def finite_float(value: object) -> float:
     """A number as a float.
 
     Raises:
@@ -78,31 +78,31 @@ def float_of(value: object) -> float:
     return number
 
 
-def read_stamp(task: Task) -> Stamp | None:
-    """The stamp of a task; None where there is none that can be read: the task is not done."""
+def read_manifest(task: Task) -> TaskManifest | None:
+    """The manifest of a task; None where there is none that can be read: the task is not done."""
     try:
-        value = read_json(task.stamp)
+        value = read_json(task.manifest)
         if (value["format"], value["version"]) != (FORMAT, VERSION):
             return None
         outputs = {name: (int(size), str(digest)) for name, (size, digest) in value["outputs"].items()}
         texts = [value[name] for name in ("key", "skipped", "host")]
         if not all(isinstance(text, str) for text in texts) or not isinstance(value["notes"], dict):
             return None
-        seconds, peak_mb = float_of(value["seconds"]), float_of(value["peak_mb"])
+        seconds, peak_mb = finite_float(value["seconds"]), finite_float(value["peak_mb"])
         if not (0 <= seconds < LARGEST and 0 <= peak_mb < LARGEST):
             return None
-        return Stamp(texts[0], outputs, texts[1], seconds, peak_mb, texts[2], value["notes"])
+        return TaskManifest(texts[0], outputs, texts[1], seconds, peak_mb, texts[2], value["notes"])
     except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError):
         return None
 
 
-def write_stamp(task: Task, stamp: Stamp) -> None:
+def write_manifest(task: Task, manifest: TaskManifest) -> None:
     """Say that a task is done.
 
     Raises:
         OutputError: the disk is full.
     """
-    write_json(task.stamp, {"format": FORMAT, "version": VERSION, **asdict(stamp)})
+    write_json(task.manifest, {"format": FORMAT, "version": VERSION, **asdict(manifest)})
 
 
 def digest_file(path: Path) -> tuple[int, str]:
@@ -119,7 +119,7 @@ def digest_file(path: Path) -> tuple[int, str]:
     return size, digest.hexdigest()
 
 
-def files_of(folder: Path, names: Iterable[str]) -> dict[str, Path]:
+def output_files(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     """The files that outputs are, or that are in outputs that are folders, by their names below the folder."""
     found = {}
     for name in names:
@@ -138,18 +138,18 @@ def digest_outputs(task: Task) -> dict[str, tuple[int, str]]:
     """Size and SHA-256 of every file that a task has left.
 
     Raises:
-        StampError: an output is missing.
+        ManifestError: an output is missing.
     """
     try:
-        return {name: digest_file(path) for name, path in files_of(task.folder, task.outputs).items()}
+        return {name: digest_file(path) for name, path in output_files(task.folder, task.outputs).items()}
     except OSError as error:
-        raise StampError(f"'{task.name}' ended without '{error.filename}' ({error.strerror}).") from error
+        raise ManifestError(f"'{task.name}' ended without '{error.filename}' ({error.strerror}).") from error
 
 
-def are_intact(task: Task, stamp: Stamp) -> bool:
+def outputs_are_intact(task: Task, manifest: TaskManifest) -> bool:
     """Whether the outputs, and what was published of them, hold what they held when the task was done."""
-    published = {place: stamp.outputs.get(name) for name, place in task.publishes if not stamp.skipped}
-    expected = {task.folder / name: output for name, output in stamp.outputs.items()} | published
+    published = {place: manifest.outputs.get(name) for name, place in task.publishes if not manifest.skipped}
+    expected = {task.folder / name: output for name, output in manifest.outputs.items()} | published
     try:
         # Most of what differs is not there, or has another size: nothing large is read for that.
         return all(output and path.stat().st_size == output[0] for path, output in expected.items()) and all(
@@ -159,16 +159,16 @@ def are_intact(task: Task, stamp: Stamp) -> bool:
         return False
 
 
-def check_outputs(task: Task, only: Callable[[str], bool] = lambda _: True) -> Stamp:
+def check_outputs(task: Task, only: Callable[[str], bool] = lambda _: True) -> TaskManifest:
     """Check that the outputs of a task are as it left them, before they are used.
 
     Raises:
-        StampError: it is not done, or an output was changed.
+        ManifestError: it is not done, or an output was changed.
     """
-    stamp = read_stamp(task)
-    if stamp is None:
-        raise StampError(f"'{task.name}' is not done; run the farm again.")
-    for name, expected in stamp.outputs.items():
+    manifest = read_manifest(task)
+    if manifest is None:
+        raise ManifestError(f"'{task.name}' is not done; run the farm again.")
+    for name, expected in manifest.outputs.items():
         if not only(name):
             continue
         path = task.folder / name
@@ -177,15 +177,15 @@ def check_outputs(task: Task, only: Callable[[str], bool] = lambda _: True) -> S
         except OSError as error:
             found = (-1, str(error.strerror))
         if found != expected:
-            task.stamp.unlink(missing_ok=True)
-            raise StampError(
+            task.manifest.unlink(missing_ok=True)
+            raise ManifestError(
                 f"'{path}' is not what '{task.name}' left ({found[0]:,} bytes, {expected[0]:,} were written); run the "
                 "farm again, and it is made again."
             )
-    return stamp
+    return manifest
 
 
-class Keys:
+class InputFingerprints:
     """Fingerprints of what tasks depend on: verbs, files from outside, settings, and the tasks before."""
 
     def __init__(self, farm: Farm, tasks: dict[str, Task]):
@@ -193,16 +193,16 @@ class Keys:
         self._keys: dict[str, str] = {}
         self._files: dict[Path, tuple[int, str]] = {}
 
-    def of(self, name: str) -> str:
+    def of_task(self, name: str) -> str:
         """The key of a task.
 
         Raises:
-            StampError: a file from outside cannot be read.
+            ManifestError: a file from outside cannot be read.
         """
         if name not in self._keys:
             task = self._tasks[name]
             files = [self._file(path) for path in task.files]
-            before = [self.of(other) for other in task.after]
+            before = [self.of_task(other) for other in task.after]
             own = [_without(str(self._farm.work), task.verbs), list(task.outputs), task.poses, str(task.round)]
             # Where the verbs run counts where it changes what they make.
             settings = [self._farm.threads, self._farm.gpu, self._farm.trainer_python] if task.kind == TRAIN else []
@@ -216,7 +216,7 @@ class Keys:
             try:
                 self._files[path] = digest_file(path)
             except OSError as error:
-                raise StampError(f"There is no file '{path}' ({error.strerror}); see the plan.") from error
+                raise ManifestError(f"There is no file '{path}' ({error.strerror}); see the plan.") from error
         return self._files[path]
 
 
@@ -234,7 +234,7 @@ def version() -> str:
         return ""
 
 
-def to_do(tasks: dict[str, Task], keys: Keys) -> tuple[list[str], dict[str, str]]:
+def outdated_tasks(tasks: dict[str, Task], fingerprints: InputFingerprints) -> tuple[list[str], dict[str, str]]:
     """Names of the tasks that have to run, and why some cannot even be looked at.
 
     As `make` does, from the end: what is done, and whose outputs are there, needs nothing before it.
@@ -249,8 +249,8 @@ def to_do(tasks: dict[str, Task], keys: Keys) -> tuple[list[str], dict[str, str]
     while waiting:
         name = waiting.pop()
         try:
-            is_done = is_up_to_date(tasks[name], keys.of(name))
-        except StampError as error:
+            is_done = is_up_to_date(tasks[name], fingerprints.of_task(name))
+        except ManifestError as error:
             failed[name] = str(error)
             continue
         if not is_done:
@@ -264,5 +264,5 @@ def to_do(tasks: dict[str, Task], keys: Keys) -> tuple[list[str], dict[str, str]
 
 def is_up_to_date(task: Task, key: str) -> bool:
     """Whether a task is done, with what it depends on now."""
-    stamp = read_stamp(task)
-    return stamp is not None and stamp.key == key and are_intact(task, stamp)
+    manifest = read_manifest(task)
+    return manifest is not None and manifest.key == key and outputs_are_intact(task, manifest)

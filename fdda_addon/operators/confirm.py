@@ -10,22 +10,22 @@ import bpy
 from .job import JobOperator
 
 
-class AsksFirst(JobOperator):
-    """Mixin for an operator of a job that may ask first; `invoke` does, with `_is_asking` set."""
+class ConfirmFirst(JobOperator):
+    """Mixin for an operator of a job that may ask first; `invoke` does, with `_is_confirming` set."""
 
-    _is_asking = False
+    _is_confirming = False
 
-    def answer(self) -> dict[str, object]:
+    def confirmed_properties(self) -> dict[str, object]:
         """The properties that it is invoked with once the question was answered."""
         return {}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        if self._is_asking:
+        if self._is_confirming:
             return getattr(bpy.ops.fdda, self.bl_idname.lower().rpartition("_ot_")[2])(
-                "INVOKE_DEFAULT", **self.answer()
+                "INVOKE_DEFAULT", **self.confirmed_properties()
             )
         return JobOperator.execute(self, context)
 
     def cancel(self, context: bpy.types.Context) -> None:
-        if not self._is_asking:
+        if not self._is_confirming:
             JobOperator.cancel(self, context)

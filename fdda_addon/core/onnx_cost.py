@@ -17,7 +17,7 @@ MOST = 1 << 40
 
 
 @dataclass
-class Work:
+class GraphCost:
     """What running a graph takes.
 
     Attributes:
@@ -204,7 +204,7 @@ UNFOLDED = ("Cast", "DequantizeLinear")
 """Operators whose inputs may all be constants; of others the result would be the constant."""
 
 
-def measure_work(contents: OnnxContents, poses: int) -> Work:
+def compute_graph_cost(contents: OnnxContents, poses: int) -> GraphCost:
     """Follow the shapes of all values of a graph.
 
     Args:
@@ -216,24 +216,24 @@ def measure_work(contents: OnnxContents, poses: int) -> Work:
     """
     shapes = {name: (poses, *shape[1:]) for name, shape in contents.inputs.items()}
     fixed = {name: constant.shape for name, constant in contents.constants.items()}
-    work = Work(0, 0, 0, {**shapes, **fixed})
-    if len(work.shapes) != len(shapes) + len(fixed):
+    cost = GraphCost(0, 0, 0, {**shapes, **fixed})
+    if len(cost.shapes) != len(shapes) + len(fixed):
         raise ValueError("an input and a constant have one name")
     constant_names = set(fixed)
     for node in contents.nodes:
-        _add_node(node, contents.constants, constant_names, work)
-    return work
+        _add_node(node, contents.constants, constant_names, cost)
+    return cost
 
 
-def _add_node(node: OnnxNode, constants: dict[str, OnnxConstant], known: set[str], work: Work) -> None:
+def _add_node(node: OnnxNode, constants: dict[str, OnnxConstant], known: set[str], cost: GraphCost) -> None:
     if node.operator not in RULES:
         raise ValueError(f"it has the operator {node.operator!r}, which train does not write")
     inputs = [name for name in node.inputs if name]
-    if not inputs or (missing := [name for name in inputs if name not in work.shapes]):
+    if not inputs or (missing := [name for name in inputs if name not in cost.shapes]):
         raise ValueError(
             f"a {node.operator} takes {missing[0]!r}, which nothing gives" if inputs else "a node takes nothing"
         )
-    call = _Call(node, [work.shapes[name] for name in inputs], [constants.get(name) for name in inputs])
+    call = _Call(node, [cost.shapes[name] for name in inputs], [constants.get(name) for name in inputs])
     try:
         found = RULES[node.operator](call)
     except IndexError as error:
@@ -245,18 +245,18 @@ def _add_node(node: OnnxNode, constants: dict[str, OnnxConstant], known: set[str
         raise ValueError(
             f"a {node.operator} gives {elements} numbers, more than its joints, vertices and shapes explain"
         )
-    work.elements += elements
+    cost.elements += elements
     if node.operator in PRODUCTS:
-        work.products += math.prod(found[0]) * call.shapes[0][-1 if not call.attribute("transA", 0) else -2]
+        cost.products += math.prod(found[0]) * call.shapes[0][-1 if not call.attribute("transA", 0) else -2]
     if known.issuperset(inputs):
         if node.operator not in UNFOLDED:
             raise ValueError(f"a {node.operator} of constants alone")
-        work.folded += elements
+        cost.folded += elements
         known.update(node.outputs)
     for name, shape in zip(node.outputs, found, strict=False):
-        if name in work.shapes:
+        if name in cost.shapes:
             raise ValueError(f"two values are called {name!r}")
-        work.shapes[name] = shape
+        cost.shapes[name] = shape
 
 
 def constant_elements(contents: OnnxContents) -> int:

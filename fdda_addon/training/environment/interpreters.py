@@ -37,7 +37,7 @@ print(json.dumps([list(sys.version_info[:2]), sys.maxsize > 2**32, missing, sys.
 
 
 @dataclass(frozen=True)
-class BasePython:
+class Interpreter:
     """A Python that runs: its path, version, and what it lacks to make an environment, empty for nothing."""
 
     path: str
@@ -48,7 +48,7 @@ class BasePython:
         return f"'{self.path}' (Python {self.version[0]}.{self.version[1]})"
 
 
-def find_bases(candidates: Iterator[list[str]] | None = None) -> Iterator[BasePython]:
+def find_interpreters(candidates: Iterator[list[str]] | None = None) -> Iterator[Interpreter]:
     """The Pythons of this machine that run, each once, Blender's own first.
 
     Args:
@@ -62,7 +62,7 @@ def find_bases(candidates: Iterator[list[str]] | None = None) -> Iterator[BasePy
             yield base
 
 
-def ask(command: list[str]) -> BasePython | None:
+def ask(command: list[str]) -> Interpreter | None:
     """What a command line starts; None when that is no Python."""
     try:
         result = subprocess.run(
@@ -85,7 +85,7 @@ def ask(command: list[str]) -> BasePython | None:
         lacks = "is not 64-bit"
     elif missing:
         lacks = f"lacks the module {missing[0]}"
-    return BasePython(path, tuple(version), lacks)
+    return Interpreter(path, tuple(version), lacks)
 
 
 def usual_candidates() -> Iterator[list[str]]:

@@ -13,7 +13,7 @@ from ..core.rig import Fingerprint, Rig, differences, read_joints
 from ..core.skin_fit import SkinFit
 
 
-def recorded_weights(path: Path, rig: Rig, kind: str) -> tuple[Rig, SkinFit | None]:
+def read_previous_weights(path: Path, rig: Rig, kind: str) -> tuple[Rig, SkinFit | None]:
     """The rig with the weights of linear skinning that a recording has, complete or not.
 
     Args:
@@ -39,7 +39,7 @@ def recorded_weights(path: Path, rig: Rig, kind: str) -> tuple[Rig, SkinFit | No
     return replace(rig, skin_joints=joints, skin_weights=weights), fit
 
 
-def recorded_partitions(path: Path, rig: Rig, min_partition_vertices: int) -> tuple[Partition, ...] | None:
+def read_previous_partitions(path: Path, rig: Rig, min_partition_vertices: int) -> tuple[Partition, ...] | None:
     """The partitions of a rig with the influences that a recording of it has; None where it has none for this rig.
 
     Args:
@@ -62,7 +62,7 @@ def recorded_partitions(path: Path, rig: Rig, min_partition_vertices: int) -> tu
     return read_partitions(rig, index["partitions"])
 
 
-def check_found_for(path: Path, rig: Rig, info: RecordingInfo) -> None:
+def check_influences_match(path: Path, rig: Rig, info: RecordingInfo) -> None:
     """Fail when the influences in a folder were found for other poses, or for another rig.
 
     Args:
