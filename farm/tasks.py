@@ -18,7 +18,7 @@ INFLUENCES, RECORD, MERGE, TRAIN, EVALUATE, REFINE, BIND = KINDS = (
 )
 RECORDING, EVALUATION, PICTURE = "recording", "evaluation.json", "heat_map.png"
 REPORT = ("report.json", "report.html")
-WEIGHTS = ".weights.npz"
+CHECKPOINT = ".checkpoint.npz"
 PICTURE_POSES = 20
 
 
@@ -204,15 +204,15 @@ class _Tasks:
                     poses=own.refine_poses,
                 )
                 recording, refined = source.folder / RECORDING, (source,)
-            weights = model.removesuffix(".onnx") + WEIGHTS
+            checkpoint = model.removesuffix(".onnx") + CHECKPOINT
             train = self._task(
                 f"{TRAIN}-{number}",
                 ("train", str(recording), model, *_options(own), *(("--warm-start",) if number else ())),
-                (model, weights, *REPORT),
+                (model, checkpoint, *REPORT),
                 after=(*before[:1], source),
                 mesh=mesh,
                 files=(),
-                copies=((last.with_name(weights), weights),) if number else (),
+                copies=((last.with_name(checkpoint), checkpoint),) if number else (),
                 round=condition,
                 poses=own.poses + number * own.refine_poses,
             )

@@ -70,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
         "--messages", action="store_true", help="JSON messages on stdout, for a program, in place of text"
     )
     parser.add_argument(
-        "--warm-start", action="store_true", help="start from the last weights of the model, on a recording that grew"
+        "--warm-start", action="store_true", help="start from the checkpoint of the model, on a recording that grew"
     )
     parser.add_argument("--strict", action="store_true", help="let warnings about the recording be errors")
     parser.add_argument(

@@ -103,7 +103,7 @@ def _add_first_layer(graph: Graph, clamped: str, layers: list[tuple[np.ndarray, 
 
 
 def _add_last_layer(graph: Graph, values: str, layers: dict[int, np.ndarray]) -> Coefficients:
-    """(L, N, H) values of hidden units to coefficients; `layers` has the last weights by partition."""
+    """(L, N, H) values of hidden units to coefficients; `layers` has the weights of the output layer by partition."""
     sizes, units = [weights.shape[1] for weights in layers.values()], next(iter(layers.values())).shape[0]
     size = _piece_size(sizes, units, units)
     pieces, partitions = _pieces(sizes, size), list(layers)
@@ -113,7 +113,7 @@ def _add_last_layer(graph: Graph, values: str, layers: dict[int, np.ndarray]) ->
         weights[number, :, : own.shape[1]] = own
     if len(pieces) > len(layers):
         values = graph.add("Gather", [values, graph.integers("piece_owners", owners)], "hidden_of_pieces", axis=0)
-    values = graph.add("MatMul", [values, graph.floats("last_weights", weights)], "coefficients_by_piece")
+    values = graph.add("MatMul", [values, graph.floats("output_weights", weights)], "coefficients_by_piece")
     values = graph.add("Transpose", [values], "coefficients", perm=[1, 0, 2])
     confidence = graph.integers("confidence_of_pieces", np.array([[partitions[n]] for n in owners]))
     confidence = graph.add("Gather", [CONFIDENCE_OUTPUT, confidence], "confidence_by_piece", axis=1)

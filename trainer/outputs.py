@@ -3,14 +3,14 @@
 
 from pathlib import Path
 
-from fdda_addon.core.file_kind import MODEL, PAGE, REPORT, WEIGHTS
+from fdda_addon.core.file_kind import CHECKPOINT, MODEL, PAGE, REPORT
 from fdda_addon.core.output import check_outputs
-from fdda_addon.core.report import page_path, report_path, weights_path
+from fdda_addon.core.report import checkpoint_path, page_path, report_path
 
 
 def training_outputs(model: Path) -> tuple[Path, Path, Path, Path]:
-    """The model, its last weights, and the report as JSON and as a page."""
-    return model, weights_path(model), report_path(model), page_path(model)
+    """The model, its checkpoint, and the report as JSON and as a page."""
+    return model, checkpoint_path(model), report_path(model), page_path(model)
 
 
 def check_training_outputs(model: Path, overwrite: bool) -> None:
@@ -19,4 +19,4 @@ def check_training_outputs(model: Path, overwrite: bool) -> None:
     Raises:
         OutputError: says which and why.
     """
-    check_outputs(zip(training_outputs(model), (MODEL, WEIGHTS, REPORT, PAGE), strict=True), overwrite=overwrite)
+    check_outputs(zip(training_outputs(model), (MODEL, CHECKPOINT, REPORT, PAGE), strict=True), overwrite=overwrite)

@@ -18,12 +18,13 @@ from fdda_addon.core.output import replacing_all
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.estimate import sizes_in_words
 from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.report import report_text, weights_path
+from fdda_addon.core.report import checkpoint_path, report_text
 from fdda_addon.core.rig import UNMOVED_LABEL
 
 from . import report
 from .announcements import Announcer
 from .borders import better_borders, partition_of
+from .checkpoint import Checkpoint, initial_networks, read_checkpoint, write_checkpoint
 from .confidence import measure_training_range
 from .config import TrainingConfig
 from .data import PreparedPartition, Split, held_back_digest, partitions_of, prepare_together, split_recording
@@ -38,7 +39,6 @@ from .page import render_html
 from .process import Cancelled
 from .sagging import without_needless_down
 from .turns import turns_help
-from .weights import LastWeights, initial_networks, read_weights, write_weights
 from .worst import find_worst
 
 WARM_EPOCHS, WARM_RATE = 0.5, 0.3
@@ -55,7 +55,7 @@ def train_model(
     strict: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Train a model, and write it with its report and its last weights beside it.
+    """Train a model, and write it with its report and its checkpoint beside it.
 
     Args:
         recording_path: folder of a complete recording.
@@ -63,7 +63,7 @@ def train_model(
         config: the settings.
         announcer: told everything from `STARTED` to `FINISHED`; not told of errors.
         should_stop: asked often; nothing has been written when it is heeded.
-        warm_start: start from the last weights of the model, on a recording that may have grown since.
+        warm_start: start from the checkpoint of the model, on a recording that may have grown since.
         strict: warnings about the recording are errors.
         overwrite: write over files of another kind.
 
@@ -76,7 +76,7 @@ def train_model(
     recording = read_recording(recording_path)
     split = split_recording(recording, config)
     held_back = held_back_digest(recording, split)
-    last = _last_weights(model_path, recording, held_back, config) if warm_start else None
+    checkpoint = _initial_checkpoint(model_path, recording, held_back, config) if warm_start else None
     device = choose_device()
     announcer.say(
         MessageType.STARTED,
@@ -90,15 +90,15 @@ def train_model(
     _check_stop(should_stop)
     recording = without_needless_down(recording, split)
     # What is gone on with goes on to see the same.
-    deltas = last.deltas if last else find_deltas(recording, split, config.tolerance_mm, should_stop)
+    deltas = checkpoint.deltas if checkpoint else find_deltas(recording, split, config.tolerance_mm, should_stop)
     if len(deltas):
         announcer.say(MessageType.LOG, text=f"The rig smooths: networks see the deltas of {len(deltas)} vertices.")
     # Deltas say what turns would, and more.
     turns = not len(deltas) and turns_help(recording, split.training, should_stop)
     if turns:
         announcer.say(MessageType.LOG, text="The rig blends rotations: residuals are fitted to turns of joints, too.")
-    if last:
-        partitions = last.cut(recording.partitions)
+    if checkpoint:
+        partitions = checkpoint.cut(recording.partitions)
     else:
         partitions = better_borders(recording, split, turns, config.tolerance_mm, config.hidden[-1], should_stop)
     if moved := int((partition_of(partitions) != partition_of(recording.partitions)).sum()):
@@ -109,7 +109,7 @@ def train_model(
     trained = train(
         prepared,
         split,
-        _shorter(config) if last else config,
+        _shorter(config) if checkpoint else config,
         device,
         lambda p: announcer.say(
             MessageType.PROGRESS,
@@ -119,7 +119,7 @@ def train_model(
             validation_mm=round(p.validation_mm, 6),
         ),
         should_stop,
-        initial_networks(last, prepared, seen) if last else None,
+        initial_networks(checkpoint, prepared, seen) if checkpoint else None,
     )
     deformation = _deformation(recording, partitions, inputs, split, prepared, trained, config)
     _check_stop(should_stop)
@@ -150,7 +150,7 @@ def train_model(
         content["repeatability"] = recording.info.repeatability.to_json()
     content["warnings"] = [warning.to_json() for warning in warnings]
     poses, p999 = len(recording.pose_matrices), exported.info.held_out_mm["p999"]
-    history = [*(last.history if last else ()), {"poses": poses, "p999": p999}]
+    history = [*(checkpoint.history if checkpoint else ()), {"poses": poses, "p999": p999}]
     goal_result = None
     if config.goal_mm:
         training_p999 = content["fdda"]["training"]["p999"]
@@ -159,9 +159,9 @@ def train_model(
     page = render_html(content)
     _check_stop(should_stop)
     # From here on nothing stops: the model and what lies beside it belong together.
-    with replacing_all(*training_outputs(model_path)) as (model, weights, report_file, page_file):
+    with replacing_all(*training_outputs(model_path)) as (model, checkpoint_file, report_file, page_file):
         write_model(model, exported.content)
-        write_weights(weights, deformation, held_back, config.hidden, history)
+        write_checkpoint(checkpoint_file, deformation, held_back, config.hidden, history)
         report_file.write_text(report_text(content), encoding="utf-8")
         page_file.write_text(page, encoding="utf-8", errors="backslashreplace")
     _announce_end(announcer, model_path, content, goal_result, time.perf_counter() - started)
@@ -204,31 +204,31 @@ def _announce_end(
     )
 
 
-def _last_weights(model_path: Path, recording: Recording, held_back: str, config: TrainingConfig) -> LastWeights:
-    """The weights to start from.
+def _initial_checkpoint(model_path: Path, recording: Recording, held_back: str, config: TrainingConfig) -> Checkpoint:
+    """Read the checkpoint to start from.
 
     Raises:
-        TrainingError: there are none, of another rig, other controls or networks, or of poses that are held back now.
+        TrainingError: there is none, or it is of another rig, other controls, other networks or another split.
     """
-    path = weights_path(model_path)
-    last = read_weights(path)
-    if last.fingerprint != recording.rig.fingerprint:
-        raise TrainingError(f"The last weights '{path}' are of another rig; train without --warm-start.")
-    if last.controls != tuple(control.name for control in recording.rig.controls):
-        raise TrainingError(f"The last weights '{path}' are of other controls; train without --warm-start.")
-    if not last.deltas.may_be_of(recording.rig):
-        raise TrainingError(f"The last weights '{path}' are damaged; train without --warm-start.")
-    if last.held_back != held_back:
+    path = checkpoint_path(model_path)
+    checkpoint = read_checkpoint(path)
+    if checkpoint.fingerprint != recording.rig.fingerprint:
+        raise TrainingError(f"The checkpoint '{path}' is of another rig; train without --warm-start.")
+    if checkpoint.controls != tuple(control.name for control in recording.rig.controls):
+        raise TrainingError(f"The checkpoint '{path}' is of other controls; train without --warm-start.")
+    if not checkpoint.deltas.may_be_of(recording.rig):
+        raise TrainingError(f"The checkpoint '{path}' is damaged; train without --warm-start.")
+    if checkpoint.held_back != held_back:
         raise TrainingError(
-            f"The last weights '{path}' are of another recording or seed, and may have been trained on poses that are "
+            f"The checkpoint '{path}' is of another recording or seed, and may have been trained on poses that are "
             "held out now; train with the same, or without --warm-start."
         )
-    if (last.hidden, last.activation) != (config.hidden, config.activation):
+    if (checkpoint.hidden, checkpoint.activation) != (config.hidden, config.activation):
         raise TrainingError(
-            f"The last weights '{path}' are of networks --hidden {' '.join(map(str, last.hidden))} --activation "
-            f"{last.activation}; train with the same, or without --warm-start."
+            f"The checkpoint '{path}' is of networks --hidden {' '.join(map(str, checkpoint.hidden))} --activation "
+            f"{checkpoint.activation}; train with the same, or without --warm-start."
         )
-    return last
+    return checkpoint
 
 
 def _shorter(config: TrainingConfig) -> TrainingConfig:

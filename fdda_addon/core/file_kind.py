@@ -38,7 +38,7 @@ _OF_OBJECTS = rb'\s*\{\s*(?:"objects":\s*\{\s*"(?:[^"\\]|\\.)*":\s*\{\s*)?'
 BLEND = FileKind("a .blend file", rb"BLENDER|\x28\xb5\x2f\xfd|\x1f\x8b")
 """Plain, or compressed by a new or an old Blender."""
 MODEL = FileKind("a model", rb"\x08[\x01-\x1f][\x12\x1a\x22\x3a]")
-WEIGHTS = FileKind("the last weights of a training", rb"PK\x03\x04.{26}about\.npy")
+CHECKPOINT = FileKind("the checkpoint of a training", rb"PK\x03\x04.{26}about\.npy")
 REPORT = FileKind("a training report", rb'\s*\{\s*"format":\s*"fdda-report"')
 PAGE = FileKind("the page of a training report", rb"<!doctype html>.*training report</title>")
 EVALUATION = FileKind("the JSON of an evaluation", _OF_OBJECTS + rb'"unit":\s*"mm"')

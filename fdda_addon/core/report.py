@@ -13,7 +13,7 @@ from .input_file import read_input
 from .output import json_text, write_text
 
 REPORT_JSON, REPORT_HTML = "report.json", "report.html"
-WEIGHTS_SUFFIX = ".weights.npz"
+CHECKPOINT_SUFFIX = ".checkpoint.npz"
 FORMAT, VERSION = "fdda-report", 1
 MAX_BYTES = 1 << 27
 """Fifty times the report of 100 partitions and 1000 epochs."""
@@ -101,9 +101,9 @@ def page_path(model: Path) -> Path:
     return model.with_name(REPORT_HTML)
 
 
-def weights_path(model: Path) -> Path:
-    """Where the last weights of a model lie, which a training goes on from."""
-    return model.with_suffix(WEIGHTS_SUFFIX)
+def checkpoint_path(model: Path) -> Path:
+    """Where the checkpoint of a model lies, which a training goes on from."""
+    return model.with_suffix(CHECKPOINT_SUFFIX)
 
 
 def write_report(path: Path, report: dict) -> None:

@@ -151,7 +151,7 @@ class FDDA_OT_train(TrainsModels, ConfirmFirst, bpy.types.Operator):
 
     warm_start: bpy.props.BoolProperty(
         name="Train On",
-        description="Start from the last weights of the model, on a recording that has grown",
+        description="Start from the checkpoint of the model, on a recording that has grown",
         options={"SKIP_SAVE"},
     )
     replace: bpy.props.BoolProperty(options={"SKIP_SAVE", "HIDDEN"})
@@ -159,7 +159,7 @@ class FDDA_OT_train(TrainsModels, ConfirmFirst, bpy.types.Operator):
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         if properties.warm_start:
-            return "Go on from the model's last weights, on a recording that has grown: half as long as a training"
+            return "Go on from the model's checkpoint, on a recording that has grown: half as long as a training"
         return cls.bl_description
 
     @classmethod

@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import TrainingError
-from ..core.report import Verdict, read_report, report_path, weights_path
+from ..core.report import Verdict, checkpoint_path, read_report, report_path
 from ..jobs import job
 from ..properties.preferences import MODULE, preferences
 from ..scene.scene_rig import SceneRig
@@ -127,10 +127,10 @@ def _draw_settings(
     on = layout.column(align=True)
     on.enabled = ready
     on.operator("fdda.refine", text="Add Poses Where It Is Worst", icon="ADD")
-    if weights_path(found.path).is_file():
+    if checkpoint_path(found.path).is_file():
         on.operator("fdda.train", text="Train On", icon="FF").warm_start = True
     else:
-        draw_sentence(layout, context, "Its last weights are gone, so it cannot be trained on.", "INFO")
+        draw_sentence(layout, context, "Its checkpoint is gone, so it cannot be trained on.", "INFO")
     if not rig.mesh_object.fdda.is_bound:
         bind = layout.operator("fdda.bind", text=f"Bind '{found.path.name}'", icon="LINKED")
         bind.object, bind.filepath = rig.mesh_object.name, str(found.path)

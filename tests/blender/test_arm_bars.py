@@ -42,7 +42,7 @@ def errors(made: Path) -> dict:
 
 def test_files(made):
     assert {path.name for path in made.iterdir()} == {
-        *("arm.blend", "recording", "arm.onnx", "arm.weights.npz", "report.json", "report.html"),
+        *("arm.blend", "recording", "arm.onnx", "arm.checkpoint.npz", "report.json", "report.html"),
         *("evaluation.json", "arm_bound.blend", "pictures"),
     }
 

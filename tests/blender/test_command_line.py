@@ -81,7 +81,7 @@ def test_train_passes_its_options_on(elbow, tmp_path, capfd):
     captured = capfd.readouterr()
     assert captured.out.splitlines()[-1].startswith(f"{model}: trained in ")
     assert "training: 3 of 3, " in captured.err and "validation " in captured.err
-    assert sorted(files(tmp_path)) == ["m.onnx", "m.weights.npz", "report.html", "report.json"]
+    assert sorted(files(tmp_path)) == ["m.checkpoint.npz", "m.onnx", "report.html", "report.json"]
 
 
 def test_an_impossible_setting_fails(elbow, tmp_path, capfd):

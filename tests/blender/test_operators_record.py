@@ -320,7 +320,7 @@ class TestTraining:
         settings = saved.mesh_object.fdda.settings
         settings.poses, settings.epochs, settings.goal_mm = 40, 4, 0.001
         assert bpy.ops.fdda.record() == {"FINISHED"}
-        with pytest.raises(RuntimeError, match="There are no last weights"):
+        with pytest.raises(RuntimeError, match="There is no checkpoint"):
             bpy.ops.fdda.train(warm_start=True)
         assert bpy.ops.fdda.train() == {"FINISHED"}
         before = scene_state(saved)

@@ -98,7 +98,7 @@ def test_the_report_and_the_weights_are_looked_at_too(place, capfd, monkeypatch)
     for name, kind in (
         ("report.json", "a training report"),
         ("report.html", "the page of a training report"),
-        ("new.weights.npz", "the last weights of a training"),
+        ("new.checkpoint.npz", "the checkpoint of a training"),
     ):
         (place / name).write_text('{"mine": 1}')
         text = Refusal(place, capfd)("train", "recording", "new.onnx", "--epochs", "1")

@@ -169,7 +169,7 @@ def test_each_mesh_has_a_model_and_a_report_of_its_own(two):
     for name in (BODY, SLEEVE):
         assert read_model_info(two.models / name / f"{name}.onnx").object_name == name
         assert {path.name for path in (two.models / name).iterdir()} == {
-            *(f"{name}.onnx", f"{name}.weights.npz", "report.json", "report.html")
+            *(f"{name}.onnx", f"{name}.checkpoint.npz", "report.json", "report.html")
         }
 
 

@@ -15,7 +15,7 @@ from .tiny_model import tiny_model
 SAMPLES = {
     file_kind.BLEND: [b"BLENDER-v405", b"BLENDER17-01v0502", b"\x28\xb5\x2f\xfd\x00", b"\x1f\x8b\x08"],
     file_kind.MODEL: [tiny_model().SerializeToString()],
-    file_kind.WEIGHTS: [b"PK\x03\x04" + bytes(26) + b"about.npy" + bytes(9)],
+    file_kind.CHECKPOINT: [b"PK\x03\x04" + bytes(26) + b"about.npy" + bytes(9)],
     file_kind.REPORT: [json_text({"format": "fdda-report", "version": 1}).encode()],
     file_kind.PAGE: [b"<!doctype html>\n<html><head><title>m.onnx: training report</title>"],
     file_kind.EVALUATION: [

@@ -8,7 +8,7 @@ import pytest
 
 from fdda_addon.core import report as report_format
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.report import page_path, read_report, report_path, weights_path, write_report
+from fdda_addon.core.report import checkpoint_path, page_path, read_report, report_path, write_report
 
 ERRORS = {"mean": 0.1, "rms": 0.2, "p99": 0.5, "p999": 1, "max": 2.5}
 REPORT = {
@@ -62,8 +62,8 @@ def damaged(place: tuple, value: object) -> dict:
 
 def test_what_lies_beside_a_model():
     model = Path("folder/arm.onnx")
-    assert [path(model).as_posix() for path in (report_path, page_path, weights_path)] == [
-        *("folder/report.json", "folder/report.html", "folder/arm.weights.npz")
+    assert [path(model).as_posix() for path in (report_path, page_path, checkpoint_path)] == [
+        *("folder/report.json", "folder/report.html", "folder/arm.checkpoint.npz")
     ]
 
 

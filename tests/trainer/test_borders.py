@@ -13,15 +13,15 @@ from fdda_addon.core.model import read_model_info
 from fdda_addon.core.partition import Partition, make_partitions
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.core.report import weights_path
+from fdda_addon.core.report import checkpoint_path
 from fdda_addon.core.skinning import LinearSkinning
 from trainer import borders, training
 from trainer.__main__ import main
 from trainer.borders import better_borders, partition_of, recut
+from trainer.checkpoint import read_checkpoint
 from trainer.config import TrainingConfig
 from trainer.data import residuals_of, split_recording
 from trainer.process import Cancelled
-from trainer.weights import read_weights
 
 from .chain import chain_angles, chain_info, pose_chain
 from .conftest import QUICK
@@ -159,11 +159,11 @@ def test_it_takes_fewer_numbers_for_no_larger_error(odd, trained, tmp_path, monk
 
 
 def test_a_training_goes_on_with_the_same_borders(odd, trained, tmp_path, monkeypatch, capsys):
-    last = read_weights(weights_path(trained))
-    assert np.array_equal(last.partition_of, partition_of(moved(odd)))
+    checkpoint = read_checkpoint(checkpoint_path(trained))
+    assert np.array_equal(checkpoint.partition_of, partition_of(moved(odd)))
     before = json.loads((trained.parent / "report.json").read_text())["fdda"]["held_out"]["mean"]
     model = tmp_path / "tube.onnx"
-    weights_path(model).write_bytes(weights_path(trained).read_bytes())
+    checkpoint_path(model).write_bytes(checkpoint_path(trained).read_bytes())
     monkeypatch.setattr(training, "better_borders", None)
     assert main([str(odd.path), str(model), *QUICK, "--tolerance-mm", "0.2", "--epochs", "2", "--warm-start"]) == 0
     assert "Borders moved: 36 vertices count to the partition beside their own." in capsys.readouterr().out
@@ -172,21 +172,12 @@ def test_a_training_goes_on_with_the_same_borders(odd, trained, tmp_path, monkey
     assert after < 1.5 * before
 
 
-def changed_weights(trained: Path, path: Path, **changes) -> Path:
-    with np.load(weights_path(trained)) as arrays:
+def changed_checkpoint(trained: Path, path: Path, **changes) -> Path:
+    with np.load(checkpoint_path(trained)) as arrays:
         kept = {**arrays, **changes}
     with open(path, "wb") as file:
         np.savez(file, **kept)
     return path
-
-
-def test_weights_of_before_have_the_borders_of_the_recording(odd, trained, tmp_path):
-    with np.load(weights_path(trained)) as arrays:
-        about = json.loads(arrays["about"].tobytes())
-    assert about["version"] == 5
-    old = np.frombuffer(json.dumps({**about, "version": 4}).encode(), np.uint8)
-    last = read_weights(changed_weights(trained, tmp_path / "old.npz", about=old))
-    assert last.partition_of is None and last.cut(odd.partitions) is odd.partitions
 
 
 @pytest.mark.parametrize(
@@ -201,16 +192,16 @@ def test_weights_of_before_have_the_borders_of_the_recording(odd, trained, tmp_p
     ],
 )
 def test_damaged_borders_are_refused(trained, tmp_path, change):
-    with np.load(weights_path(trained)) as arrays:
+    with np.load(checkpoint_path(trained)) as arrays:
         own = arrays["partition_of"]
     with pytest.raises(TrainingError, match="its arrays contradict each other"):
-        read_weights(changed_weights(trained, tmp_path / "bad.npz", partition_of=change(own)))
+        read_checkpoint(changed_checkpoint(trained, tmp_path / "bad.npz", partition_of=change(own)))
 
 
 def test_borders_of_another_mesh_are_refused(odd, trained):
-    last = read_weights(weights_path(trained))
+    checkpoint = read_checkpoint(checkpoint_path(trained))
     with pytest.raises(TrainingError, match="are of other partitions; train without --warm-start"):
-        last.cut(odd.partitions[:2])
+        checkpoint.cut(odd.partitions[:2])
 
 
 def test_it_can_be_stopped(odd):

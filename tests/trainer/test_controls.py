@@ -200,7 +200,7 @@ def test_a_model_without_controls_looks_at_none(trained):
 
 
 def test_a_warm_start_takes_the_same_controls(controlled, model, tmp_path, capsys):
-    for path in (model, model.with_suffix(".weights.npz")):
+    for path in (model, model.with_suffix(".checkpoint.npz")):
         shutil.copy(path, tmp_path)
     again = tmp_path / "model.onnx"
     before = json.loads(model.with_name("report.json").read_text())["fdda"]["held_out"]["mean"]
@@ -214,7 +214,7 @@ def test_a_warm_start_takes_the_same_controls(controlled, model, tmp_path, capsy
 
 
 def test_poses_that_differ_in_controls_alone_are_other_poses(controlled, model, tmp_path, capsys):
-    for path in (model, model.with_suffix(".weights.npz")):
+    for path in (model, model.with_suffix(".checkpoint.npz")):
         shutil.copy(path, tmp_path)
     shutil.copytree(controlled, tmp_path / "recording")
     values = np.load(tmp_path / "recording" / "controls.npy")

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Deltas: found where a rig smooths, as it smooths, and nowhere else; the same in the graph and without it."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,16 +9,16 @@ import pytest
 
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.report import weights_path
+from fdda_addon.core.report import checkpoint_path
 from fdda_addon.core.skinning import LinearSkinning
 from trainer.__main__ import main
+from trainer.checkpoint import read_checkpoint
 from trainer.config import TrainingConfig
 from trainer.data import split_recording
 from trainer.delta_fit import LEAST_EXPLAINED, find_deltas
 from trainer.deltas import NO_DELTAS, Deltas
 from trainer.inputs import inputs_with_deltas
 from trainer.process import Cancelled
-from trainer.weights import read_weights
 
 from .chain import rotation, write_chain
 from .conftest import QUICK
@@ -174,19 +173,8 @@ def test_the_graph_agrees_with_pytorch_in_other_rigs(tmp_path, way):
     assert "seen_deltas" in {node.name for node in onnx.load(tmp_path / "tube.onnx").graph.node}
 
 
-def test_weights_of_before_have_none(trained, tmp_path):
-    with np.load(weights_path(trained)) as arrays:
-        kept = {name: array for name, array in arrays.items() if not name.startswith("deltas/")}
-    about = json.loads(kept["about"].tobytes())
-    assert about["version"] == 5
-    kept["about"] = np.frombuffer(json.dumps({**about, "version": 2}).encode(), np.uint8)
-    with open(tmp_path / "old.npz", "wb") as file:
-        np.savez(file, **kept)
-    assert read_weights(tmp_path / "old.npz").deltas is NO_DELTAS
-
-
 def test_a_training_goes_on_with_the_same(recording, deltas, trained, capsys):
-    last = read_weights(weights_path(trained)).deltas
+    last = read_checkpoint(checkpoint_path(trained)).deltas
     for name, array in vars(deltas).items():
         assert np.array_equal(getattr(last, name), array), name
     offered = inputs_with_deltas(recording.rig, recording.partitions, last).columns
@@ -210,10 +198,10 @@ DAMAGE = {
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_damaged_deltas_are_refused(recording, trained, tmp_path, capsys, damage):
     name, change = DAMAGE[damage]
-    with np.load(weights_path(trained)) as arrays:
+    with np.load(checkpoint_path(trained)) as arrays:
         changed = {**arrays, f"deltas/{name}": change(arrays[f"deltas/{name}"])}
     model = tmp_path / "tube.onnx"
-    with open(weights_path(model), "wb") as file:
+    with open(checkpoint_path(model), "wb") as file:
         np.savez(file, **changed)
     model.write_bytes(trained.read_bytes())
     assert main([str(recording.path), str(model), *QUICK, "--warm-start"]) == 1

@@ -150,7 +150,9 @@ def test_a_full_disk_leaves_nothing(recording, trained, tmp_path, limit):
     out, err = process.communicate(timeout=120)
     assert process.returncode == 1
     assert decode(out)[-1].type is MessageType.FAILED
-    assert err.startswith(f"Cannot write '{tmp_path / 'm.onnx'}' with 'm.weights.npz', 'report.json', 'report.html': ")
+    assert err.startswith(
+        f"Cannot write '{tmp_path / 'm.onnx'}' with 'm.checkpoint.npz', 'report.json', 'report.html': "
+    )
     assert err.endswith("File too large; nothing was changed.\n")
     assert [p.name for p in tmp_path.iterdir()] == ["m.onnx"]
     assert (tmp_path / "m.onnx").read_bytes() == old

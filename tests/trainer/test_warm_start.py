@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A training goes on from the last weights, on a recording that has grown."""
+"""A training continues from the checkpoint, on a recording that has grown."""
 
 import json
 import os
@@ -11,12 +11,12 @@ import pytest
 
 from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.core.report import weights_path
+from fdda_addon.core.report import checkpoint_path
 from trainer.__main__ import main
+from trainer.checkpoint import initial_networks, read_checkpoint
 from trainer.config import TrainingConfig
 from trainer.data import partitions_of, prepare, split_recording
 from trainer.inputs import inputs_with_deltas
-from trainer.weights import initial_networks, read_weights
 
 from .. import systems
 from .chain import chain_angles, chain_residuals, pose_chain, write_chain
@@ -40,17 +40,17 @@ def grown(recording, tmp_path):
 
 @pytest.fixture
 def model(trained, tmp_path):
-    """A model with its last weights, to train on."""
-    for path in (trained / "model.onnx", weights_path(trained / "model.onnx")):
+    """A model with its checkpoint, to train on."""
+    for path in (trained / "model.onnx", checkpoint_path(trained / "model.onnx")):
         shutil.copy(path, tmp_path)
     return tmp_path / "model.onnx"
 
 
-def prepared_of(path, config, last):
+def prepared_of(path, config, checkpoint):
     recording = read_recording(path)
     split = split_recording(recording, config)
-    partitions = last.cut(recording.partitions)
-    inputs = inputs_with_deltas(recording.rig, partitions, last.deltas)
+    partitions = checkpoint.cut(recording.partitions)
+    inputs = inputs_with_deltas(recording.rig, partitions, checkpoint.deltas)
     data = partitions_of(recording, partitions, inputs)
     prepared = [prepare(p, split, config.tolerance_mm, config.seed) for p in data]
     return split, prepared, [c[p.columns] for c, p in zip(inputs.columns, prepared, strict=True)]
@@ -58,20 +58,20 @@ def prepared_of(path, config, last):
 
 def test_networks_start_with_nearly_the_answers_they_gave(recording, trained, grown):
     config = TrainingConfig(tolerance_mm=1e-4)
-    last = read_weights(weights_path(trained / "model.onnx"))
-    _, prepared, columns = prepared_of(grown, config, last)
-    networks = initial_networks(last, prepared, columns)
+    checkpoint = read_checkpoint(checkpoint_path(trained / "model.onnx"))
+    _, prepared, columns = prepared_of(grown, config, checkpoint)
+    networks = initial_networks(checkpoint, prepared, columns)
     compared = 0
-    for before, now, network in zip(last.partitions, prepared, networks, strict=True):
+    for before, now, network in zip(checkpoint.partitions, prepared, networks, strict=True):
         if network is None:
             continue
         features = now.inputs * now.feature_scale + now.feature_mean
         assert np.array_equal(before.columns, columns[compared]) or len(before.columns) == len(now.columns)
         old = before.network.coefficients(
-            ((features - before.feature_mean) / before.feature_scale).astype(np.float32), last.activation
+            ((features - before.feature_mean) / before.feature_scale).astype(np.float32), checkpoint.activation
         )
         expected = old @ before.basis_shapes + before.basis_mean
-        answered = now.basis.residuals(network.coefficients(now.inputs, last.activation))
+        answered = now.basis.residuals(network.coefficients(now.inputs, checkpoint.activation))
         # Not quite the same: the linear fit that comes before is another one, and so are the shapes of what it leaves.
         assert np.linalg.norm(answered - expected) < 0.05 * np.linalg.norm(expected)
         compared += 1
@@ -89,7 +89,7 @@ def test_training_goes_on_and_does_not_start_again(grown, model, trained):
     assert cold["fdda"]["held_out"]["mean"] > 2 * report["fdda"]["held_out"]["mean"]
     assert main([str(grown), str(model), *QUICK, "--epochs", "12", "--warm-start"]) == 0
     assert report["training"]["warm_start"] and report["poses"] == 120 + GROWN
-    history = read_weights(weights_path(model)).history
+    history = read_checkpoint(checkpoint_path(model)).history
     assert [entry["poses"] for entry in history] == [120 + GROWN] * 2
 
 
@@ -108,11 +108,11 @@ def refused(capsys, *arguments) -> str:
     return capsys.readouterr().err
 
 
-def test_there_must_be_weights(recording, tmp_path, capsys):
-    assert "There are no last weights" in refused(capsys, recording, tmp_path / "m.onnx")
+def test_there_must_be_a_checkpoint(recording, tmp_path, capsys):
+    assert "There is no checkpoint" in refused(capsys, recording, tmp_path / "m.onnx")
 
 
-def test_weights_of_other_networks_or_rigs_are_refused(recording, model, tmp_path, capsys):
+def test_a_checkpoint_of_other_networks_or_rigs_are_refused(recording, model, tmp_path, capsys):
     assert "are of networks --hidden 24 24 --activation silu" in refused(capsys, recording, model, "--hidden", "8")
     write_chain(tmp_path / "other", joints=4)
     assert "are of another rig" in refused(capsys, tmp_path / "other", model)
@@ -131,8 +131,8 @@ def test_another_recording_of_the_rig_is_refused(model, tmp_path, capsys):
 @pytest.mark.parametrize(
     "damage", ["cut", "text", "packed", "shapes", "nan", "types", pytest.param("pipe", marks=systems.named_pipes)]
 )
-def test_damaged_weights_are_refused(recording, model, capsys, damage):
-    path = weights_path(model)
+def test_a_damaged_checkpoint_is_refused(recording, model, capsys, damage):
+    path = checkpoint_path(model)
     if damage == "cut":
         path.write_bytes(path.read_bytes()[:1000])
     elif damage == "text":
@@ -157,7 +157,7 @@ def test_damaged_weights_are_refused(recording, model, capsys, damage):
     if damage == "pipe":
         assert "it is no ordinary file" in text
     elif damage == "text":
-        assert "another file is there, which is not the last weights of a training" in text
+        assert "another file is there, which is not the checkpoint of a training" in text
     else:
         assert "cannot be used" in text and "train without --warm-start" in text
     assert model.read_bytes() == before
