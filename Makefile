@@ -75,6 +75,9 @@ sampling: .venv  ## compare ways to choose poses, into out/sampling (20 minutes)
 soak: .venv  ## hostile files, kills, full disks, frames, undo: what held and what fell short, into out/soak (20 minutes at most)
 	.venv/bin/python benchmarks/soak.py out/soak $(OPTIONS)
 
+faults: .venv  ## seed faults into a copy of the code and say which tests catch them, into out/faults (OPTIONS="--only ID"; 30 minutes)
+	.venv/bin/python benchmarks/faults.py out/faults $(OPTIONS)
+
 study: .venv  ## compare sizes and activations of the networks, into out/study (30 minutes)
 	.venv/bin/python benchmarks/study.py out/study
 
@@ -112,4 +115,4 @@ requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
 clean:  ## remove what was built and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-examples test-gui test-windows test-all test-line bench sampling soak study simulation characters pictures map fixtures lint package requirements clean
+.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-examples test-gui test-windows test-all test-line bench sampling soak faults study simulation characters pictures map fixtures lint package requirements clean

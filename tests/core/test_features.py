@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What networks see of a pose, against the formula."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from fdda_addon.core.features import joint_features
+from fdda_addon.core.features import joint_features, steady_features
 
 from .limb import JOINTS, make_rig, random_poses, random_transforms
 
@@ -41,3 +43,20 @@ def test_moving_the_root_moves_the_features_of_the_root_alone():
     after = joint_features(moved, rig.rest_matrices, rig.parents)
     np.testing.assert_allclose(after[:, 1:], before[:, 1:], atol=1e-5)
     assert np.abs(after[:, 0] - before[:, 0]).max() > 0.1
+
+
+def test_lengths_of_steady_features_are_metres():
+    rig, poses = replace(make_rig(), metres_per_unit=0.01), random_poses(8)
+    scale = np.where(np.arange(12) % 4 == 3, 0.01, 1)
+    expected = joint_features(poses, rig.rest_matrices, rig.parents) * scale
+    np.testing.assert_allclose(steady_features(poses, rig), expected, atol=1e-6)
+
+
+def test_rounding_does_not_move_steady_features():
+    """The character turns as a whole, 100 m from the origin: its joints stay where they are in their parents."""
+    rig, rng = make_rig(), np.random.default_rng(5)
+    turns = np.array([random_transforms(rng) for _ in range(8)])
+    turns[:, :3, 3] += 100
+    poses = (turns[:, None] @ rig.rest_matrices).astype(np.float32)
+    assert np.ptp(joint_features(poses, rig.rest_matrices, rig.parents)[:, 1:, 3::4], axis=0).max() > 0
+    assert np.ptp(steady_features(poses, rig)[:, 1:, 3::4], axis=0).max() == 0

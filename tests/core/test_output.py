@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from fdda_addon.core import output
 from fdda_addon.core.errors import OutputError
 from fdda_addon.core.output import (
     check_folder_writable,
@@ -118,6 +119,32 @@ def test_a_rename_that_fails_changes_no_file_and_keeps_what_was_made(tmp_path, o
     assert {(tmp_path / f"new-2-{path.name}").read_text() for path in paths} == {"new"}
 
 
+def test_the_first_of_two_files_is_restored_when_the_second_is_refused(tmp_path, monkeypatch):
+    paths, rename = [tmp_path / "a", tmp_path / "b"], output.replace_file
+    for path in paths:
+        path.write_text("old")
+
+    def refuse(source: Path, target: Path) -> None:
+        if target == paths[1]:
+            raise OSError(errno.EACCES, os.strerror(errno.EACCES))
+        rename(source, target)
+
+    monkeypatch.setattr(output, "replace_file", refuse)
+    with pytest.raises(OutputError, match="nothing was changed"), replacing_all(*paths) as temporaries:
+        for temporary in temporaries:
+            temporary.write_text("new")
+    assert [path.read_text() for path in paths] == ["old", "old"] and names(tmp_path) == ["a", "b", "new-a", "new-b"]
+
+
+def test_a_file_is_on_the_disk_before_it_takes_its_place(tmp_path, monkeypatch):
+    calls = []
+    for name in ("fsync", "replace"):
+        function = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *a, name=name, function=function: (calls.append(name), function(*a))[1])
+    write_text(tmp_path / "a", "new")
+    assert calls == ["fsync", "replace"]
+
+
 def test_a_new_file_has_the_usual_permissions(tmp_path):
     write_text(tmp_path / "a", "")
     (tmp_path / "b").touch()
@@ -198,6 +225,7 @@ def test_a_folder_that_takes_no_files():
 CHECK_AS_NOBODY = """
 import os, sys
 from pathlib import Path
+from fdda_addon.core import output
 from fdda_addon.core.errors import OutputError
 from fdda_addon.core.output import check_folder_writable, check_writable
 os.setuid(65534)

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Writing a recording: what is written is read back, and an interruption leaves a recording that resumes."""
 
+import errno
 import json
 import math
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -123,6 +125,29 @@ def test_a_torn_write_is_never_read(tmp_path, recording):
             file.write(b"\xff" * 2 * row)
     record_limb(path, POSES, resume=True)
     assert files(path) == files(recording)
+
+
+def test_poses_do_not_count_when_the_index_cannot_be_written(tmp_path, monkeypatch):
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    rig = make_rig()
+    with (
+        pytest.raises(OutputError, match="5 of 12 poses are complete, continue with --resume"),
+        RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSES)) as writer,
+    ):
+        writer.append(random_poses(POSES)[:5], random_residuals(POSES)[:5])
+        monkeypatch.setattr(f"{RecordingWriter.__module__}.write_index", refuse)
+        writer.append(random_poses(POSES)[5:], random_residuals(POSES)[5:])
+
+
+def test_poses_that_did_not_settle_are_counted_from_the_first_of_the_recording(tmp_path):
+    rig = make_rig()
+    with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSES)) as writer:
+        for start in (0, 6):
+            batch = slice(start, start + 6)
+            writer.append(random_poses(POSES)[batch], random_residuals(POSES)[batch], unsettled=(1, 4))
+    assert read_index(tmp_path / "r")["unsettled"] == [1, 4, 7, 10]
 
 
 @pytest.mark.parametrize("name", ["residuals.npy", "pose_matrices.npy"])

@@ -63,6 +63,14 @@ def test_rest_pose_of_the_armature(rig):
     assert found(rig, rest_matrices=moved) == [], "versions of Blender compute a rest matrix a few steps apart"
 
 
+def test_rest_poses_are_compared_in_metres(rig):
+    moved = rig.rest_matrices.copy()
+    moved[2, 0, 3] += 50 * REST_TOLERANCE
+    assert found(replace(rig, metres_per_unit=0.01), rest_matrices=moved) == []
+    moved[2, 0, 3] += 100 * REST_TOLERANCE
+    assert found(replace(rig, metres_per_unit=0.01), rest_matrices=moved) == ["the rest pose of the armature differs"]
+
+
 @pytest.mark.parametrize(
     ("part", "sentence"),
     [
@@ -112,6 +120,10 @@ def with_key(**settings: object) -> dict:
     return {**DEFORMATION, "shape_keys": {"smile": DEFORMATION["shape_keys"]["smile"] | settings}}
 
 
+def with_another_key(**settings: object) -> dict:
+    return {**DEFORMATION, "shape_keys": {**DEFORMATION["shape_keys"], "frown": settings}}
+
+
 NEW = {"name": "New", "type": "CAST", "settings": {}}
 CHANGED = {
     "the same": (DEFORMATION, []),
@@ -132,6 +144,8 @@ CHANGED = {
     ),
     "a shape": (with_key(shape="b"), ["'shape' of the shape key 'smile' differs"]),
     "a value": (with_key(value=1.0), ["'value' of the shape key 'smile' was 0.0 and is 1.0"]),
+    "another key": (with_another_key(value=1.0), ["it was recorded without the shape key 'frown'"]),
+    "a key that is muted": (with_another_key(value=1.0, mute=True), []),
     "no key": ({**DEFORMATION, "shape_keys": {}}, ["the shape key 'smile' is gone"]),
     "B-Bones": (
         {**DEFORMATION, "b_bones": {"tail": {"segments": 4, "curve": [0.0, 1.0]}, "arm": {"segments": 2}}},

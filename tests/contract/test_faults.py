@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The table of seeded faults fits the code: each fault can be seeded, and names test files that exist."""
+
+import ast
+
+import pytest
+
+from benchmarks.faults import ROOT, Fault, read_faults
+
+FAULTS = read_faults()
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.id)
+def test_a_fault_can_be_seeded(fault: Fault):
+    text = (ROOT / fault.file).read_text(encoding="utf-8")
+    assert text.count(fault.old) == 1, fault.file
+    # A fault that is a syntax error would be caught by any test.
+    assert ast.dump(ast.parse(fault.applied(text))) != ast.dump(ast.parse(text))
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.id)
+def test_the_tests_that_catch_a_fault_exist(fault: Fault):
+    assert fault.tests
+    assert [test for test in fault.tests if not (ROOT / test).is_file()] == []
+
+
+def test_each_fault_has_an_id_of_its_own():
+    assert len({fault.id for fault in FAULTS}) == len(FAULTS)
