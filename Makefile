@@ -10,7 +10,7 @@ OTHER_LINE = $$(.venv/bin/python -c 'import sys; print("4.5" if sys.version_info
 
 # A process for each core, of which each runs whole files: there is one Blender to a process.
 SIDE_BY_SIDE = -n auto --maxprocesses 4 --dist loadfile
-MARKS = -m "not one_line"
+MARKS = -m "not to_single_line"
 
 # Where torch is. Blender's Python, or a line's environment, starts this one for training.
 export FDDA_TRAINER_PYTHON ?= $(CURDIR)/.venv/bin/python

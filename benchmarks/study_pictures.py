@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from fdda_addon.core.output import replacing
+from fdda_addon.core.output import atomic_write
 
 from .study_tables import held_out
 
@@ -104,5 +104,5 @@ def _legend(figure: Figure, colours: dict[str, str]) -> None:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=160, format="png")

@@ -12,7 +12,7 @@ import torch
 
 from fdda_addon.core.errors import RecordingError, TrainingError
 from fdda_addon.core.metrics import error_statistics
-from fdda_addon.core.output import replacing, write_json
+from fdda_addon.core.output import atomic_write, write_json
 from fdda_addon.core.recording.reader import Recording, partitions_json, read_partitions, read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
@@ -120,7 +120,7 @@ def train_once(material: Material, config: TrainingConfig, model_path: Path) -> 
     held_out = measure(
         exported.session, material.held_out, deformation, np.arange(len(material.held_out.pose_matrices))
     )
-    with replacing(model_path) as temporary:
+    with atomic_write(model_path) as temporary:
         write_model(temporary, exported.content)
     return {
         "seconds": {key: round(value, 2) for key, value in seconds.items()},

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from fdda_addon.core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status, machine_sentence
+from fdda_addon.core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status, machine_fault_sentence
 
 if TYPE_CHECKING:
     from .characters import Plan
@@ -30,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"Error: {error}" if status != WrongUsageError.exit_status else error, file=sys.stderr)
         return status
     except (OSError, MemoryError) as error:
-        if not (text := machine_sentence(error)):
+        if not (text := machine_fault_sentence(error)):
             raise
         print(f"Error: {text}", file=sys.stderr)
         return TRY_AGAIN

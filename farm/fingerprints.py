@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fdda_addon.core.errors import FDDAError
 from fdda_addon.core.input_file import read_input
-from fdda_addon.core.output import is_left_over, write_json
+from fdda_addon.core.output import is_temporary_name, write_json
 
 from .characters import Farm
 from .tasks import TRAIN, Task
@@ -131,7 +131,7 @@ def output_files(folder: Path, names: Iterable[str]) -> dict[str, Path]:
 
 def _is_kept(path: Path) -> bool:
     """Whether a file belongs to an output, and is no lock and no temporary file."""
-    return path.is_file() and path.suffix != ".lock" and not is_left_over(path.name)
+    return path.is_file() and path.suffix != ".lock" and not is_temporary_name(path.name)
 
 
 def digest_outputs(task: Task) -> dict[str, tuple[int, str]]:

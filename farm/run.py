@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fdda_addon.core.errors import FDDAError, exit_status
-from fdda_addon.core.output import is_left_over, replacing, write_text
+from fdda_addon.core.output import atomic_write, is_temporary_name, write_text
 
 from .characters import Farm
 from .fingerprints import (
@@ -199,7 +199,7 @@ def _prepare(task: Task, key: str) -> None:
         os.replace(task.folder, old)
         shutil.rmtree(old, ignore_errors=True)
     for path in task.folder.rglob("*") if task.folder.exists() else ():
-        if is_left_over(path.name) or path.name == "recording.lock":
+        if is_temporary_name(path.name) or path.name == "recording.lock":
             path.unlink(missing_ok=True)
     if not task.folder.exists():
         new = task.folder.with_name(f".new-{task.folder.name}-{os.getpid()}")
@@ -235,7 +235,7 @@ def _copy(source: Path, target: Path) -> None:
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     if not source.is_dir():
-        with replacing(target) as temporary:
+        with atomic_write(target) as temporary:
             shutil.copyfile(source, temporary)
         return
     if target.exists():

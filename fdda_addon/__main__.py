@@ -3,14 +3,14 @@
 
 import sys
 
-from .core.stop_signals import exit_when_asked
+from .core.stop_signals import exit_on_stop_signal
 
 if __name__ == "__main__":
-    exit_when_asked()
+    exit_on_stop_signal()
     from .cli.main import main
-    from .core.terminal import use_utf8
+    from .core.terminal import restart_in_utf8_mode
 
-    use_utf8()
+    restart_in_utf8_mode()
     if sys.argv[1:2] == ["farm"]:
         from .cli.farm import become_farm
 

@@ -9,13 +9,13 @@ import argparse
 import sys
 from pathlib import Path
 
-from fdda_addon.core.stop_signals import exit_when_asked
+from fdda_addon.core.stop_signals import exit_on_stop_signal
 from fdda_addon.core.temporary import check_temporary_folder
-from fdda_addon.core.terminal import show_all_names
+from fdda_addon.core.terminal import escape_unencodable_output
 
 if __name__ == "__main__":
     # Before the rest is imported: until `main` a request to stop would end in a traceback.
-    exit_when_asked()
+    exit_on_stop_signal()
 
 from .announcements import Announcer, MessageLines, Text
 from .config import add_options, config_from_arguments
@@ -25,7 +25,7 @@ from .process import StopRequest, missing_package, run_announced
 
 def main(arguments: list[str] | None = None) -> int:
     """Train as the arguments say; returns the exit status."""
-    show_all_names()
+    escape_unencodable_output()
     options = _parser().parse_args(arguments)
     announcer: Announcer = MessageLines() if options.messages else Text()
     stop = StopRequest()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.features import rounding
+from fdda_addon.core.features import float32_rounding
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.index import RANDOM, REFINED, Source
 from fdda_addon.core.recording.reader import Recording
@@ -262,7 +262,7 @@ def partitions_of(
     rig = recording.rig
     features = inputs.features(recording.pose_matrices, rig.rest_matrices, recording.controls)
     matrices = fit_matrices(recording.pose_matrices, rig, turns)
-    of_lengths = max(MIN_SPREAD / rig.metres_per_unit, rounding(recording.pose_matrices))
+    of_lengths = max(MIN_SPREAD / rig.metres_per_unit, float32_rounding(recording.pose_matrices))
     least = np.where(inputs.are_lengths(), of_lengths, MIN_SPREAD)
     return [
         PartitionData(

@@ -15,7 +15,7 @@ from scipy import sparse
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
-from fdda_addon.core.surface import corners_beside
+from fdda_addon.core.surface import adjacent_corners
 
 from .data import Split
 from .deltas import MOST_PARTS, NO_DELTAS, Deltas
@@ -144,7 +144,7 @@ def find_deltas(
 def _corners(rig: Rig) -> _Corners:
     order = np.argsort(rig.face_vertices, kind="stable")
     starts = np.searchsorted(rig.face_vertices[order], np.arange(rig.vertex_count + 1))
-    beside = corners_beside(rig.face_starts, rig.face_vertices)
+    beside = adjacent_corners(rig.face_starts, rig.face_vertices)
     return _Corners(starts, *(rig.face_vertices[corners[order]] for corners in beside))
 
 

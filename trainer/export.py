@@ -9,14 +9,14 @@ import onnx
 import onnxruntime
 
 from fdda_addon.core.errors import TrainingError
-from fdda_addon.core.features import FEATURES_PER_JOINT, ROUNDING
+from fdda_addon.core.features import FEATURES_PER_JOINT, FLOAT32_ROUNDING_RATIO
 from fdda_addon.core.metrics import distances, error_statistics
 from fdda_addon.core.model import (
     CHECKSUM_KEY,
     CONTROLS_INPUT,
-    LIMITS,
+    LIMITS_KEY,
     METADATA_KEY,
-    OBJECT,
+    OBJECT_KEY,
     POSE_INPUT,
     POSITIONS_OUTPUT,
     SKIN_KEY,
@@ -171,7 +171,10 @@ def check_parity(
             )
         largest = max(largest, difference)
     reach = float(np.abs(recording.rig.rest_positions).max() + np.abs(recording.pose_matrices[..., :3, 3]).max())
-    allowed = MAX_DIFFERENCE * max(1.0, recording.rig.size * metres_per_unit) + 2 * ROUNDING * reach * metres_per_unit
+    allowed = (
+        MAX_DIFFERENCE * max(1.0, recording.rig.size * metres_per_unit)
+        + 2 * FLOAT32_ROUNDING_RATIO * reach * metres_per_unit
+    )
     if largest > allowed:
         raise TrainingError(
             f"The exported model differs from PyTorch by {largest * 1000:.3g} mm, more than the allowed "
@@ -206,7 +209,7 @@ def model_info(recording: Recording, deformation: Deformation, held_out: np.ndar
         deformation.training_range.controls,
         error_statistics(held_out).to_json(),
         0.0,
-        {**training, OBJECT: recording.info.object_name, LIMITS: recording.info.sampling.to_json()["limits"]},
+        {**training, OBJECT_KEY: recording.info.object_name, LIMITS_KEY: recording.info.sampling.to_json()["limits"]},
         rig.metres_per_unit,
     )
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
 from fdda_addon.core.partition import Partition
-from fdda_addon.core.rig import UNMOVED, Rig
+from fdda_addon.core.rig import STATIC_JOINT, Rig
 
 from .deltas import FEATURES_PER_DELTA, NO_DELTAS, Deltas
 
@@ -172,7 +172,7 @@ def middles(rig: Rig, partitions: Sequence[Partition]) -> np.ndarray:
 
 def unmoved_joints(rig: Rig) -> frozenset[int]:
     """The joints of a rig that never move: they influence nothing, and hide nothing that does."""
-    return frozenset(number for number, joint in enumerate(rig.joints) if joint.name == UNMOVED)
+    return frozenset(number for number, joint in enumerate(rig.joints) if joint.name == STATIC_JOINT)
 
 
 def _columns(start: int, number: int, width: int) -> np.ndarray:

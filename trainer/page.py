@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 
 from fdda_addon.core.input_file import read_input
-from fdda_addon.core.rig import UNMOVED_LABEL
+from fdda_addon.core.rig import STATIC_JOINT_LABEL
 
 from .causes import CAUSES
 from .charts import curve_limits, error_bars, histogram, learning_curves
@@ -149,7 +149,7 @@ STATISTICS = {"mean": "mean", "rms": "rms", "p99": "99 %", "p999": "99.9 %", "ma
 def _errors(report: dict) -> str:
     partitions = report["partitions"]
     bars = error_bars(
-        [p["joint"] or UNMOVED_LABEL for p in partitions],
+        [p["joint"] or STATIC_JOINT_LABEL for p in partitions],
         [p["held_out"]["mean"] for p in partitions],
         [p["linear"]["mean"] for p in partitions],
         [p["held_out"]["p999"] for p in partitions],
@@ -251,7 +251,7 @@ def _table(partitions: list[dict], fdda: dict, linear: dict, report: dict) -> st
     rows = []
     for p in partitions:
         seen = escape(", ".join(p["influencing"])) or "none"
-        merged = escape(", ".join(name or UNMOVED_LABEL for name in p.get("merged", [])))
+        merged = escape(", ".join(name or STATIC_JOINT_LABEL for name in p.get("merged", [])))
         rows.append(
             f'<tr><td title="{f"with {merged}" if merged else ""}">{_joint(p)}</td><td>{p["vertices"]:,}</td>'
             f'<td title="{seen}">{len(p["influencing"])}</td>{_controls(p) if controlled else ""}'
@@ -278,7 +278,7 @@ def _controls(partition: dict) -> str:
 
 
 def _joint(partition: dict) -> str:
-    return escape(partition["joint"] or UNMOVED_LABEL)
+    return escape(partition["joint"] or STATIC_JOINT_LABEL)
 
 
 def _settings(report: dict) -> str:

@@ -10,7 +10,14 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
-from fdda_addon.core.errors import TRY_AGAIN, FDDAError, TrainingError, exit_status, machine_sentence, one_line
+from fdda_addon.core.errors import (
+    TRY_AGAIN,
+    FDDAError,
+    TrainingError,
+    exit_status,
+    machine_fault_sentence,
+    to_single_line,
+)
 from fdda_addon.core.messages import STOP_FILE_VARIABLE, MessageType
 from fdda_addon.core.native_library import runtime_advice
 from fdda_addon.core.stop_signals import INTERRUPTED, handle_stop_signals
@@ -127,11 +134,13 @@ def _explain(error: Exception) -> tuple[str, int]:
     while cause.__cause__ is not None and not isinstance(cause, OSError | MemoryError):
         cause = cause.__cause__
     if _lacks_memory(cause):
-        return one_line(f"The training lacks memory ({cause}); free some, or train on a larger machine."), TRY_AGAIN
-    if text := machine_sentence(cause):
+        return to_single_line(
+            f"The training lacks memory ({cause}); free some, or train on a larger machine."
+        ), TRY_AGAIN
+    if text := machine_fault_sentence(cause):
         return text, TRY_AGAIN
     if advice := runtime_advice(str(error)):
-        return one_line(f"A library of '{sys.executable}' cannot be loaded ({error}); {advice}."), 1
+        return to_single_line(f"A library of '{sys.executable}' cannot be loaded ({error}); {advice}."), 1
     with suppress(OSError):
         traceback.print_exc()
     return f"The trainer stopped on an error of its own ({error!r}); please report it.", 1

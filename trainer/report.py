@@ -16,7 +16,7 @@ from fdda_addon.core.file_kind import PAGE
 from fdda_addon.core.metrics import error_statistics
 from fdda_addon.core.output import check_outputs, write_text
 from fdda_addon.core.report import page_path, read_report
-from fdda_addon.core.terminal import show_all_names
+from fdda_addon.core.terminal import escape_unencodable_output
 
 from .page import render_html
 from .report_file import check_drawable, read_evaluation
@@ -131,7 +131,7 @@ def write_html(report: dict, path: Path, pictures: Sequence[Path] = (), evaluati
 
 def main(arguments: list[str] | None = None) -> int:
     """Write the page again: `python -m trainer.report REPORT.json`; returns the exit status."""
-    show_all_names()
+    escape_unencodable_output()
     parser = argparse.ArgumentParser("trainer.report", description="Write the page of a training report again.")
     parser.add_argument("report", type=Path, help="report.json; the page is written beside it")
     parser.add_argument("--pictures", type=Path, help="folder of PNG or JPEG files to show, in order of their names")

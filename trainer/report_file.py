@@ -10,7 +10,7 @@ import math
 from itertools import pairwise
 from pathlib import Path
 
-from fdda_addon.core.errors import TrainingError, os_reason
+from fdda_addon.core.errors import TrainingError, os_error_text
 from fdda_addon.core.input_file import read_input
 
 from .charts import SMALLEST
@@ -56,7 +56,9 @@ def read_evaluation(path: Path) -> dict:
     try:
         evaluation = json.loads(read_input(path, MAX_BYTES))
     except OSError as error:
-        raise TrainingError(f"The evaluation '{path}' cannot be read ({os_reason(error)}); evaluate again.") from error
+        raise TrainingError(
+            f"The evaluation '{path}' cannot be read ({os_error_text(error)}); evaluate again."
+        ) from error
     except (ValueError, RecursionError) as error:
         raise TrainingError(f"The evaluation '{path}' cannot be read ({error}); evaluate again.") from error
     try:

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdda_addon.core.features import steady_features
-from fdda_addon.core.partition import Partition, nearby_influences
+from fdda_addon.core.features import joint_features_in_metres
+from fdda_addon.core.partition import Partition, assume_nearby_influences
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.target import POSE
 
@@ -37,10 +37,10 @@ def without_needless_down(recording: Recording, split: Split) -> Recording:
     target = recording.info.target
     if target is None or target.follows == POSE:
         return recording
-    plain = nearby_influences(recording.rig, recording.partitions, sags=False)
+    plain = assume_nearby_influences(recording.rig, recording.partitions, sags=False)
     poses = np.sort(np.concatenate([split.training, split.validation]))
     poses = poses[np.unique(np.linspace(0, len(poses) - 1, MOST_POSES).astype(np.int64))]
-    features = steady_features(recording.pose_matrices[poses], recording.rig).astype(np.float64)
+    features = joint_features_in_metres(recording.pose_matrices[poses], recording.rig).astype(np.float64)
     joints = [_squared_distances(features[:, joint]) for joint in range(features.shape[1])]
     controls = [_squared_distances(values[:, None]) for values in recording.controls[poses].T.astype(np.float64)]
     errors = np.zeros(2)

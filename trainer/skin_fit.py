@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from fdda_addon.core.terminal import show_all_names
+from fdda_addon.core.terminal import escape_unencodable_output
 
 from .announcements import Announcer, MessageLines
 from .process import StopRequest, missing_package, run_announced
@@ -17,7 +17,7 @@ from .process import StopRequest, missing_package, run_announced
 
 def main(arguments: list[str] | None = None) -> int:
     """Fit as the arguments say; returns the exit status."""
-    show_all_names()
+    escape_unencodable_output()
     parser = argparse.ArgumentParser("trainer.skin_fit", description="Fit skin weights to the poses in a folder.")
     parser.add_argument("folder", type=Path, help="folder that record made")
     parser.add_argument("kind", choices=("hard", "smooth"), help="one joint a vertex, or at most four")

@@ -14,12 +14,12 @@ from fdda_addon.core.checks.recording import check_recording
 from fdda_addon.core.checks.warning import RecordingWarning, refuse
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.messages import MessageType
-from fdda_addon.core.output import replacing_all
+from fdda_addon.core.output import atomic_write_all
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.estimate import sizes_in_words
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.report import checkpoint_path, report_text
-from fdda_addon.core.rig import UNMOVED_LABEL
+from fdda_addon.core.rig import STATIC_JOINT_LABEL
 
 from . import report
 from .announcements import Announcer
@@ -159,7 +159,7 @@ def train_model(
     page = render_html(content)
     _check_stop(should_stop)
     # From here on nothing stops: the model and what lies beside it belong together.
-    with replacing_all(*training_outputs(model_path)) as (model, checkpoint_file, report_file, page_file):
+    with atomic_write_all(*training_outputs(model_path)) as (model, checkpoint_file, report_file, page_file):
         write_model(model, exported.content)
         write_checkpoint(checkpoint_file, deformation, held_back, config.hidden, history)
         report_file.write_text(report_text(content), encoding="utf-8")
@@ -187,7 +187,7 @@ def _announce_end(
     for partition in content["partitions"]:
         announcer.say(
             MessageType.PARTITION_FINISHED,
-            joint=partition["joint"] or UNMOVED_LABEL,
+            joint=partition["joint"] or STATIC_JOINT_LABEL,
             basis=partition["basis"],
             held_out_mm=partition["held_out"]["mean"],
         )

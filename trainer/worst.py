@@ -8,7 +8,7 @@ import numpy as np
 from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.reader import Recording
-from fdda_addon.core.refinement import nearest_distances
+from fdda_addon.core.refinement import nearest_recorded_distances
 
 from .causes import CORNERS, EVEN, POSES, SHAPES, STEEP
 from .data import PreparedPartition, Split, residuals_of
@@ -87,7 +87,7 @@ def find_worst(
             np.concatenate([array, np.array(recording.controls[rows])[:, list(partition.controls)]], axis=1)
             for array, rows in ((values, split.held_out), (recorded, training))
         )
-        near = nearest_distances(values, recorded) if values.shape[1] else np.zeros(len(values))
+        near = nearest_recorded_distances(values, recorded) if values.shape[1] else np.zeros(len(values))
         distance = _over(float(near[poses].mean()), float(np.median(near)))
         name, extreme = _furthest(recording, partition, values, recorded, poses)
         shapes = _truncated(recording, partition, prepared, split.held_out, poses, vertices, errors)

@@ -19,7 +19,7 @@ from fdda_addon.runtime.model_files import network_of
 from fdda_addon.scene.scene_rig import find_rig
 
 from .cases import ShortfallError, attempt, say
-from .odd_values import json_text, mutated_bytes, mutated_json
+from .odd_values import mutated_bytes, mutated_json, to_json_text
 
 OPERATORS = (
     "Loop", "If", "Scan", "ConstantOfShape", "Expand", "Tile", "Range", "RandomNormal", "Identity", "Concat", "MatMul",
@@ -99,7 +99,7 @@ def _metadata(random: np.random.Generator, model: onnx.ModelProto) -> None:
             if random.random() < 0.15:
                 prop.value = mutated_bytes(random, prop.value.encode()).decode("utf-8", "replace")
             else:
-                prop.value = json_text(mutated_json(random, json.loads(prop.value))).replace("\ud800", "?")
+                prop.value = to_json_text(mutated_json(random, json.loads(prop.value))).replace("\ud800", "?")
 
 
 def _graph(random: np.random.Generator, model: onnx.ModelProto) -> None:

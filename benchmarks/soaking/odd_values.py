@@ -65,7 +65,7 @@ def mutated_json(random: np.random.Generator, value: object) -> object:
     return value
 
 
-def json_text(value: object) -> str:
+def to_json_text(value: object) -> str:
     """As JSON; what JSON has no words for as Python writes it."""
     return json.dumps(value)
 

@@ -15,7 +15,7 @@ from trainer.config import TrainingConfig
 from trainer.training import train_model
 
 from .cases import ShortfallError, attempt, say
-from .odd_values import json_text, mutated_bytes, mutated_json
+from .odd_values import mutated_bytes, mutated_json, to_json_text
 
 CONFIG = TrainingConfig(epochs=1, hidden=(4,), tolerance_mm=0.1)
 NUMBERS = np.float32([0, -1, 1e3, 1e-30, 1e30, 3e38, np.inf, -np.inf, np.nan])
@@ -90,7 +90,7 @@ def mutate(random: np.random.Generator, recording: Path) -> str:
             value = json.loads(path.read_text())
         except ValueError:
             return "the index is none"
-        path.write_text(json_text(mutated_json(random, value)))
+        path.write_text(to_json_text(mutated_json(random, value)))
         return "index"
     if kind == 4:
         path.write_bytes(mutated_bytes(random, path.read_bytes()))

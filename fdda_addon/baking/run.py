@@ -11,9 +11,9 @@ import bpy
 import numpy as np
 
 from ..core import file_kind
-from ..core.errors import FDDAError, OutputError, WrongUsageError, os_reason
-from ..core.mask import Blend
-from ..core.output import check_outputs, replacing, replacing_all
+from ..core.errors import FDDAError, OutputError, WrongUsageError, os_error_text
+from ..core.mask import SkinningBlend
+from ..core.output import atomic_write, atomic_write_all, check_outputs
 from ..core.point_cache import PointCacheWriter, read_point_cache
 from ..core.progress import Progress
 from ..poses.action_range import action_frames
@@ -99,7 +99,7 @@ def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSe
         stack = read_stack(scene_rig.mesh_object)
         borrowed.enter_context(_animated(scene_rig.armature_object, action))
         if out.suffix == POINT_CACHE:
-            with replacing(out) as cache:
+            with atomic_write(out) as cache:
                 yield from _write_frames(cache, reader, frames)
         elif settings.shape_keys:
             with _scratch(out) as cache:
@@ -108,7 +108,7 @@ def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSe
                     play_shape_keys(mesh_object, stack, read_point_cache(cache).positions, frames.start)
                     save_copy(out)
         else:
-            with replacing_all(*files) as (blend, cache):
+            with atomic_write_all(*files) as (blend, cache):
                 yield from _write_frames(cache, reader, frames)
                 with stand_in(scene_rig.mesh_object) as mesh_object:
                     play_point_cache(mesh_object, stack, files[1], frames.start)
@@ -171,7 +171,7 @@ class FrameReader:
         self._strength = strength
         # The rest pose of the model: the objects may have moved since.
         rig = replace(opened.linear_rig, rest_matrices=info.rest_matrices)
-        self._blend = Blend(rig, read_mask(scene_rig.mesh_object))
+        self._blend = SkinningBlend(rig, read_mask(scene_rig.mesh_object))
 
     def read(self, frame: int) -> tuple[np.ndarray, ...]:
         """Go to a frame; returns the inputs of the model, each without its first axis, and its strength there."""
@@ -249,4 +249,4 @@ def _scratch(out: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix=".fdda-", dir=out.parent, ignore_cleanup_errors=True) as folder:
             yield Path(folder) / f"positions{POINT_CACHE}"
     except OSError as error:
-        raise OutputError(f"Cannot write '{out}': {os_reason(error)}; nothing was changed.") from error
+        raise OutputError(f"Cannot write '{out}': {os_error_text(error)}; nothing was changed.") from error

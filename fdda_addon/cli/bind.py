@@ -66,7 +66,7 @@ def _bind(scene_rig: "SceneRig", model: Path, use_in_render: bool) -> None:
 
 def _put_beside(scene_rig: "SceneRig", model: Path, out: Path) -> Path:
     """Let the bound object find its model from the file; returns the copy if one was made, else the model."""
-    from ..core.output import replacing
+    from ..core.output import atomic_write
     from ..models.entries import bound_entry
     from ..models.model_list import adopt
     from ..scene.stored_paths import stored_path
@@ -79,7 +79,7 @@ def _put_beside(scene_rig: "SceneRig", model: Path, out: Path) -> Path:
     entry.path = binding.model = stored_path(out.parent / place.resolve().relative_to(out.resolve().parent))
     if place.exists():
         return model
-    with replacing(place) as temporary:
+    with atomic_write(place) as temporary:
         temporary.write_bytes(model.read_bytes())
     return place
 

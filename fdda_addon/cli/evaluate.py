@@ -7,7 +7,7 @@ from pathlib import Path
 from ..core.defaults import EVALUATION_POSES, EVALUATION_SEED
 from ..core.errors import WrongUsageError
 from ..core.file_kind import EVALUATION, PICTURE
-from ..core.output import check_outputs, json_text, replacing_all
+from ..core.output import atomic_write_all, check_outputs, to_json_text
 from ..core.progress import Progress
 from ..evaluation.run import Evaluation, EvaluationSettings, evaluate
 from ..runtime.binding import true_rig
@@ -77,7 +77,7 @@ def run(options: argparse.Namespace) -> None:
     if options.target and len(rigs) > 1:
         raise WrongUsageError("--target is of one mesh; give --object.")
     evaluations = {name: run_evaluation(*rig_and_model, settings) for name, rig_and_model in rigs.items()}
-    with replacing_all(*(path for path, _ in outputs)) as (errors, *pictures):
+    with atomic_write_all(*(path for path, _ in outputs)) as (errors, *pictures):
         for picture in pictures:
             from ..evaluation.pictures import draw_comparison, worst_poses
 
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> None:
             poses = worst_poses(evaluations[name].held_out)
             draw_comparison(scene_rig, model, poses, picture, heat=True, true=true)
         content = by_object({name: evaluation.to_json() for name, evaluation in evaluations.items()})
-        errors.write_text(json_text(content), encoding="utf-8")
+        errors.write_text(to_json_text(content), encoding="utf-8")
     for name, evaluation in evaluations.items():
         print(headed(name, table(evaluation)))
 

@@ -9,9 +9,9 @@ import argparse
 import sys
 from importlib import import_module
 
-from ..core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status, machine_sentence
+from ..core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status, machine_fault_sentence
 from ..core.stop_signals import INTERRUPTED
-from ..core.terminal import show_all_names
+from ..core.terminal import escape_unencodable_output
 from .interruption import interruptible
 
 VERBS = {
@@ -44,7 +44,7 @@ def main(arguments: list[str], program: str) -> int:
     Returns:
         The exit status.
     """
-    show_all_names()
+    escape_unencodable_output()
     try:
         with interruptible():
             return _run(arguments, program)
@@ -83,7 +83,7 @@ def _run(arguments: list[str], program: str) -> int:
         print(f"Error: {error}" if status != WrongUsageError.exit_status else error, file=sys.stderr)
         return status
     except (MemoryError, OSError) as error:
-        if not (text := machine_sentence(error)):
+        if not (text := machine_fault_sentence(error)):
             raise
         print(f"Error: {text}", file=sys.stderr)
         return TRY_AGAIN

@@ -15,7 +15,7 @@ from typing import BinaryIO
 from .input_file import open_input
 
 SIGNATURE = b"Ogawa"
-TIME_SAMPLINGS = 4
+TIME_SAMPLINGS_INDEX = 4
 IS_DATA = 1 << 63
 MAX_CHILDREN, MAX_BYTES = 64, 1 << 20
 """The root group has six children, and a table of time samplings has a few numbers for each rate."""
@@ -33,7 +33,7 @@ def time_range(path: Path) -> tuple[float, float] | None:
     """
     with open_input(path) as file:
         try:
-            return _range(_time_samplings(file))
+            return _time_range(_time_samplings(file))
         except (struct.error, ValueError, OverflowError):
             return None
 
@@ -45,24 +45,24 @@ def _time_samplings(file: BinaryIO) -> bytes:
         raise ValueError("another container")
     file.seek(struct.unpack("<8xQ", head)[0])
     count = struct.unpack("<Q", file.read(8))[0]
-    if not TIME_SAMPLINGS < count <= MAX_CHILDREN:
+    if not TIME_SAMPLINGS_INDEX < count <= MAX_CHILDREN:
         raise ValueError("another archive")
-    place = struct.unpack(f"<{count}Q", file.read(8 * count))[TIME_SAMPLINGS]
-    if not place & IS_DATA:
+    child = struct.unpack(f"<{count}Q", file.read(8 * count))[TIME_SAMPLINGS_INDEX]
+    if not child & IS_DATA:
         raise ValueError("no data")
-    file.seek(place & ~IS_DATA)
+    file.seek(child & ~IS_DATA)
     size = struct.unpack("<Q", file.read(8))[0]
     if size > MAX_BYTES:
         raise ValueError("too many samplings")
     return file.read(size)
 
 
-def _range(table: bytes) -> tuple[float, float] | None:
-    place, found = 0, []
-    while place < len(table):
-        samples, cycle, count = struct.unpack_from("<IdI", table, place)
-        times = struct.unpack_from(f"<{count}d", table, place + 16)
-        place += 16 + 8 * count
+def _time_range(table: bytes) -> tuple[float, float] | None:
+    offset, found = 0, []
+    while offset < len(table):
+        samples, cycle, count = struct.unpack_from("<IdI", table, offset)
+        times = struct.unpack_from(f"<{count}d", table, offset + 16)
+        offset += 16 + 8 * count
         # One sample is what does not move; Alembic begins each table with it.
         if samples > 1 and times:
             last = times[min(samples, count) - 1] if cycle > ACYCLIC else 0.0

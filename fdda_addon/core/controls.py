@@ -9,7 +9,7 @@ ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS = "armature_object", "armatur
 OWNERS = (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS)
 OTHER_OBJECT = "object:"
 """Begins the owner of a control of another object; its name follows."""
-LONGEST_PATH = 1000
+MAX_TEXT_LENGTH = 1000
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Control:
         """
         control = Control(value["owner"], value["path"], float(value["low"]), float(value["high"]))
         for text in (control.owner, control.path):
-            if not isinstance(text, str) or not 0 < len(text) <= LONGEST_PATH:
+            if not isinstance(text, str) or not 0 < len(text) <= MAX_TEXT_LENGTH:
                 raise ValueError(f"a control is called {text!r}")
         for end in (value["low"], value["high"]):
             if type(end) not in (int, float):

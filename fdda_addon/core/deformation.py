@@ -13,8 +13,8 @@ from difflib import SequenceMatcher
 from .controls import MESH_OBJECT, SHAPE_KEYS, Control
 
 MAX_ENTRIES = 10_000
-MAX_SHOWN = 3
-TOLERANCE = 1e-4
+MAX_SHOWN_DIFFERENCES = 3
+SETTING_TOLERANCE = 1e-4
 """Largest relative difference of a setting that counts as the same; a file of float32 has less."""
 _GROUPS = {"shape_keys": "shape key", "b_bones": "bone"}
 
@@ -54,7 +54,9 @@ def deformation_differences(recorded: dict, now: dict, controls: Iterable[Contro
         found += _group_differences(kind, recorded.get(group, {}), now.get(group, {}), inputs)
     if recorded.get("drivers", "") != now.get("drivers", ""):
         found.append("the drivers that deform the mesh differ")
-    return found[:MAX_SHOWN] + ([f"{len(found) - MAX_SHOWN} more"] if len(found) > MAX_SHOWN else [])
+    return found[:MAX_SHOWN_DIFFERENCES] + (
+        [f"{len(found) - MAX_SHOWN_DIFFERENCES} more"] if len(found) > MAX_SHOWN_DIFFERENCES else []
+    )
 
 
 def _modifier_differences(recorded: list[dict], now: list[dict], inputs: set[tuple[str, str]]) -> list[str]:
@@ -118,5 +120,5 @@ def _is_same(value: object, now: object) -> bool:
     if isinstance(value, list) and isinstance(now, list):
         return len(value) == len(now) and all(map(_is_same, value, now))
     if isinstance(value, int | float) and isinstance(now, int | float):
-        return math.isclose(value, now, rel_tol=TOLERANCE, abs_tol=TOLERANCE * TOLERANCE)
+        return math.isclose(value, now, rel_tol=SETTING_TOLERANCE, abs_tol=SETTING_TOLERANCE * SETTING_TOLERANCE)
     return value == now

@@ -12,7 +12,7 @@ import re
 
 TRY_AGAIN = 75
 """Exit status of what may work when it is run again, as it is or on another machine: EX_TEMPFAIL of sysexits.h."""
-MACHINE = {
+MACHINE_ERRNOS = {
     getattr(errno, name)
     for name in (
         *("ENOSPC", "EDQUOT", "EIO", "ENOMEM", "EAGAIN", "EBUSY", "EINTR", "EMFILE", "ENFILE", "ENXIO", "ENODEV"),
@@ -22,35 +22,35 @@ MACHINE = {
     if hasattr(errno, name)
 }
 """What the system says when a disk, the memory or a shared folder gave out, and not when a path is wrong."""
-MACHINE_WINDOWS = {8, 14, 21, 32, 33, 39, 53, 59, 64, 112, 121, 1117, 1224, 1231, 1450, 1455}
+MACHINE_WINERRORS = {8, 14, 21, 32, 33, 39, 53, 59, 64, 112, 121, 1117, 1224, 1231, 1450, 1455}
 """The same as Windows numbers it, and that another program has a file open; Python knows few of these by `errno`."""
-_WINDOWS_WORDS = {
+_WINERROR_TEXTS = {
     **dict.fromkeys((32, 33, 1224), "another program has it open"),
     **dict.fromkeys((39, 112), os.strerror(errno.ENOSPC)),
     **dict.fromkeys((8, 14, 1450, 1455), os.strerror(errno.ENOMEM)),
     206: os.strerror(errno.ENAMETOOLONG),
 }
-LONGEST = 1000
+MAX_SENTENCE_LENGTH = 1000
 """Letters of a sentence. What a file of somebody else's says is quoted in it, and may be a million letters long."""
-_CONTROL = r"[\x00-\x1f\x7f-\x9f\u2028\u2029]"
+_CONTROL_CHARACTERS = r"[\x00-\x1f\x7f-\x9f\u2028\u2029]"
 
 
-def one_line(text: str) -> str:
+def to_single_line(text: str) -> str:
     """A text of a readable length that a terminal shows as one line: what would steer it is written out."""
-    if len(text) > LONGEST:
-        half = LONGEST // 2
+    if len(text) > MAX_SENTENCE_LENGTH:
+        half = MAX_SENTENCE_LENGTH // 2
         text = f"{text[:half]} […] {text[-half:]}"
-    return re.sub(_CONTROL, lambda found: repr(found.group())[1:-1], text)
+    return re.sub(_CONTROL_CHARACTERS, lambda found: repr(found.group())[1:-1], text)
 
 
-def os_reason(error: OSError) -> str:
+def os_error_text(error: OSError) -> str:
     """What the system says of an error, in English; Windows says it in its own language."""
     number = getattr(error, "winerror", None)
     if not number:
         return error.strerror or str(error)
     # What Python has no number of its own for is EINVAL.
     words = f"error {number} of Windows" if error.errno == errno.EINVAL else os.strerror(error.errno)
-    return _WINDOWS_WORDS.get(number, words)
+    return _WINERROR_TEXTS.get(number, words)
 
 
 class FDDAError(Exception):
@@ -59,7 +59,7 @@ class FDDAError(Exception):
     exit_status = 1
 
     def __str__(self) -> str:
-        return one_line(super().__str__())
+        return to_single_line(super().__str__())
 
 
 def exit_status(error: BaseException) -> int:
@@ -69,24 +69,24 @@ def exit_status(error: BaseException) -> int:
         return status
     cause: BaseException | None = error
     while cause is not None:
-        if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and _is_of_machine(cause)):
+        if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and _is_machine_fault(cause)):
             return TRY_AGAIN
         cause = cause.__cause__
     return status
 
 
-def machine_sentence(error: BaseException) -> str:
+def machine_fault_sentence(error: BaseException) -> str:
     """What to say of an error that nobody foresaw where the machine caused it; empty where it may be a bug."""
     if isinstance(error, MemoryError):
         return "The memory of this machine is used up; free some, or use a larger one."
-    if isinstance(error, OSError) and _is_of_machine(error):
+    if isinstance(error, OSError) and _is_machine_fault(error):
         name = f"'{error.filename}': " if error.filename else ""
-        return f"{name}{os_reason(error)}; make room, end other programs, or try again."
+        return f"{name}{os_error_text(error)}; make room, end other programs, or try again."
     return ""
 
 
-def _is_of_machine(error: OSError) -> bool:
-    return error.errno in MACHINE or getattr(error, "winerror", None) in MACHINE_WINDOWS
+def _is_machine_fault(error: OSError) -> bool:
+    return error.errno in MACHINE_ERRNOS or getattr(error, "winerror", None) in MACHINE_WINERRORS
 
 
 class WrongUsageError(FDDAError):
@@ -132,7 +132,7 @@ class OutputError(FDDAError):
     """An output path cannot be written."""
 
 
-class NoRoomError(OutputError):
+class DiskFullError(OutputError):
     """The disk lacks the room."""
 
     exit_status = TRY_AGAIN

@@ -6,8 +6,8 @@ import numpy as np
 from .rig import Rig
 
 FEATURES_PER_JOINT = 12
-ROUNDING = 2.0**-21
-"""Part of the largest coordinate by which the rounding of float32 moves what stays where it is: a few steps."""
+FLOAT32_ROUNDING_RATIO = 2.0**-21
+"""Rounding of float32 as a ratio of the largest coordinate: a few units in the last place."""
 
 
 def joint_features(pose_matrices: np.ndarray, rest_matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:
@@ -37,19 +37,21 @@ def relative_to_parent(matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:
     return relative
 
 
-def rounding(pose_matrices: np.ndarray) -> float:
-    """By how much (N, J, 4, 4) pose matrices may seem to move a joint that does not move, in their unit of length."""
-    return ROUNDING * float(np.abs(pose_matrices[..., :3, 3]).max(initial=0))
+def float32_rounding(pose_matrices: np.ndarray) -> float:
+    """Return how far rounding may move a joint at rest in (N, J, 4, 4) pose matrices, mesh units."""
+    return FLOAT32_ROUNDING_RATIO * float(np.abs(pose_matrices[..., :3, 3]).max(initial=0))
 
 
-def steady_features(pose_matrices: np.ndarray, rig: Rig) -> np.ndarray:
-    """As `joint_features`, lengths in true mesh units, and what nothing but rounding moves exactly at its mean.
+def joint_features_in_metres(pose_matrices: np.ndarray, rig: Rig) -> np.ndarray:
+    """Compute `joint_features` with translations in metres.
+
+    A translation that differs by no more than `float32_rounding` is set to its mean.
 
     Returns:
         (N, J, 12) float32.
     """
     features = joint_features(pose_matrices, rig.rest_matrices, rig.parents)
     translations = features[:, :, 3::4]
-    still = np.ptp(translations, axis=0) <= rounding(pose_matrices)
+    still = np.ptp(translations, axis=0) <= float32_rounding(pose_matrices)
     features[:, :, 3::4] = rig.metres_per_unit * np.where(still, translations.mean(axis=0), translations)
     return features

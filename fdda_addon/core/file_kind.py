@@ -7,7 +7,7 @@ from pathlib import Path
 
 from .input_file import open_input
 
-HEAD_BYTES = 4096
+SIGNATURE_BYTES = 4096
 
 
 @dataclass(frozen=True)
@@ -16,24 +16,24 @@ class FileKind:
 
     Attributes:
         name: for sentences, with its article.
-        head: what such a file begins with, a pattern.
+        signature: what such a file begins with, a pattern.
     """
 
     name: str
-    head: bytes
+    signature: bytes
 
-    def is_of(self, path: Path) -> bool:
+    def matches(self, path: Path) -> bool:
         """Whether a file is of this kind. An empty one is of every kind.
 
         Raises:
             OSError: it cannot be read.
         """
         with open_input(path) as file:
-            head = file.read(HEAD_BYTES)
-        return not head or re.match(self.head, head, re.DOTALL) is not None
+            signature = file.read(SIGNATURE_BYTES)
+        return not signature or re.match(self.signature, signature, re.DOTALL) is not None
 
 
-_OF_OBJECTS = rb'\s*\{\s*(?:"objects":\s*\{\s*"(?:[^"\\]|\\.)*":\s*\{\s*)?'
+_OBJECTS_PREFIX = rb'\s*\{\s*(?:"objects":\s*\{\s*"(?:[^"\\]|\\.)*":\s*\{\s*)?'
 
 BLEND = FileKind("a .blend file", rb"BLENDER|\x28\xb5\x2f\xfd|\x1f\x8b")
 """Plain, or compressed by a new or an old Blender."""
@@ -41,8 +41,8 @@ MODEL = FileKind("a model", rb"\x08[\x01-\x1f][\x12\x1a\x22\x3a]")
 CHECKPOINT = FileKind("the checkpoint of a training", rb"PK\x03\x04.{26}about\.npy")
 REPORT = FileKind("a training report", rb'\s*\{\s*"format":\s*"fdda-report"')
 PAGE = FileKind("the page of a training report", rb"<!doctype html>.*training report</title>")
-EVALUATION = FileKind("the JSON of an evaluation", _OF_OBJECTS + rb'"unit":\s*"mm"')
-BENCHMARK = FileKind("the JSON of a benchmark", _OF_OBJECTS + rb'"unit":\s*"ms"')
+EVALUATION = FileKind("the JSON of an evaluation", _OBJECTS_PREFIX + rb'"unit":\s*"mm"')
+BENCHMARK = FileKind("the JSON of a benchmark", _OBJECTS_PREFIX + rb'"unit":\s*"ms"')
 WARNINGS = FileKind("the JSON of a check", rb'\s*\{\s*"warnings":')
 RECORDING = FileKind("the index of a recording", rb'\s*\{\s*"format":\s*"fdda-recording"')
 PICTURE = FileKind("a PNG picture", rb"\x89PNG\r\n")

@@ -7,13 +7,13 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
-from .open_files import open_patiently
+from .open_files import open_with_retry
 
-NOT_ORDINARY = "it is no ordinary file"
-LINK = "it is a link to another place"
+NOT_A_REGULAR_FILE = "it is no ordinary file"
+IS_A_LINK = "it is a link to another place"
 # A pipe that took the place of the file meanwhile must not block. Windows has neither flag, nor pipes in folders.
-_FLAGS = getattr(os, "O_NONBLOCK", 0)
-_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+_NONBLOCK = getattr(os, "O_NONBLOCK", 0)
+_NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 
 
 def open_input(path: Path, mode: str = "rb", follow: bool = True) -> BinaryIO:
@@ -27,13 +27,13 @@ def open_input(path: Path, mode: str = "rb", follow: bool = True) -> BinaryIO:
     Raises:
         OSError: it cannot be opened, or is a pipe, a device, a folder or, unless `follow`, a link; `strerror` says so.
     """
-    return open_patiently(lambda: _open(path, mode, follow))
+    return open_with_retry(lambda: _open(path, mode, follow))
 
 
 def _open(path: Path, mode: str, follow: bool) -> BinaryIO:
     if "x" not in mode:
         _check(os.stat(path, follow_symlinks=follow), path)
-    flags = _FLAGS | (0 if follow else _NO_LINK)
+    flags = _NONBLOCK | (0 if follow else _NO_FOLLOW)
     file = open(path, mode, opener=lambda name, own: os.open(name, own | flags))  # noqa: SIM115 - the caller closes it
     try:
         _check(os.fstat(file.fileno()), path)
@@ -43,23 +43,23 @@ def _open(path: Path, mode: str, follow: bool) -> BinaryIO:
     return file
 
 
-def read_input(path: Path, most: int, follow: bool = True) -> bytes:
+def read_input(path: Path, max_bytes: int, follow: bool = True) -> bytes:
     """The bytes of an ordinary file; all else as `open_input`.
 
     Raises:
-        OSError: as `open_input`, or it has more than `most` bytes.
+        OSError: as `open_input`, or it has more than `max_bytes` bytes.
     """
     with open_input(path, follow=follow) as file:
-        data = file.read(most + 1)
-    if len(data) > most:
-        raise OSError(errno.EFBIG, f"it is larger than {most >> 20} MB")
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise OSError(errno.EFBIG, f"it is larger than {max_bytes >> 20} MB")
     return data
 
 
 def _check(status: os.stat_result, path: Path) -> None:
     if stat.S_ISLNK(status.st_mode):
-        raise OSError(errno.ELOOP, LINK, str(path))
+        raise OSError(errno.ELOOP, IS_A_LINK, str(path))
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(status.st_mode):
-        raise OSError(errno.EINVAL, NOT_ORDINARY, str(path))
+        raise OSError(errno.EINVAL, NOT_A_REGULAR_FILE, str(path))

@@ -22,7 +22,7 @@ class Mask:
     partial: np.ndarray
 
     @staticmethod
-    def of(weights: np.ndarray) -> "Mask":
+    def from_weights(weights: np.ndarray) -> "Mask":
         """The mask with these weights, (V,); what is beyond 0 and 1 is brought to them."""
         weights = np.clip(np.asarray(weights, np.float32), 0, 1)
         return Mask(weights, np.flatnonzero(weights < 1))
@@ -39,7 +39,7 @@ class Mask:
     __hash__ = None
 
 
-class Blend:
+class SkinningBlend:
     """Blends what a model gives with linear skinning: linear + strength * weight * (model - linear)."""
 
     def __init__(self, rig: Rig, mask: Mask | None = None):
@@ -49,13 +49,13 @@ class Blend:
         """
         self.mask = mask
         self._rig = rig
-        self._whole: LinearSkinning | None = None
-        self._partial: LinearSkinning | None = None
+        self._full_skinning: LinearSkinning | None = None
+        self._partial_skinning: LinearSkinning | None = None
 
-    def with_mask(self, mask: Mask | None) -> "Blend":
+    def with_mask(self, mask: Mask | None) -> "SkinningBlend":
         """The same with another mask."""
-        other = Blend(self._rig, mask)
-        other._whole = self._whole
+        other = SkinningBlend(self._rig, mask)
+        other._full_skinning = self._full_skinning
         return other
 
     def apply(self, positions: np.ndarray, pose_matrices: np.ndarray, strengths: np.ndarray) -> np.ndarray:
@@ -71,7 +71,7 @@ class Blend:
             (N, V, 3) float32, mesh-object space, mesh units; `positions` itself where it was written into.
         """
         if strengths.min() < 1:
-            linear = self._whole_layer().positions(pose_matrices)
+            linear = self._make_full_skinning().positions(pose_matrices)
             factors = strengths.astype(np.float32)[:, None]
             if self.mask is not None:
                 factors = factors * self.mask.weights
@@ -80,21 +80,21 @@ class Blend:
             return linear
         if self.mask is not None and len(self.mask.partial):
             partial = self.mask.partial
-            linear = self._partial_layer().positions(pose_matrices)
+            linear = self._make_partial_skinning().positions(pose_matrices)
             weights = self.mask.weights[partial][:, None]
             positions[:, partial] = linear + weights * (positions[:, partial] - linear)
         return positions
 
-    def _whole_layer(self) -> LinearSkinning:
-        if self._whole is None:
-            self._whole = LinearSkinning(self._rig)
-        return self._whole
+    def _make_full_skinning(self) -> LinearSkinning:
+        if self._full_skinning is None:
+            self._full_skinning = LinearSkinning(self._rig)
+        return self._full_skinning
 
-    def _partial_layer(self) -> LinearSkinning:
+    def _make_partial_skinning(self) -> LinearSkinning:
         """Of the vertices alone that the model does not have for itself: a mask costs as much as it covers."""
-        if self._partial is None:
+        if self._partial_skinning is None:
             rig, partial = self._rig, self.mask.partial
-            self._partial = LinearSkinning(
+            self._partial_skinning = LinearSkinning(
                 replace(
                     rig,
                     rest_positions=rig.rest_positions[partial],
@@ -102,4 +102,4 @@ class Blend:
                     skin_weights=rig.skin_weights[partial],
                 )
             )
-        return self._partial
+        return self._partial_skinning

@@ -4,11 +4,11 @@
 import struct
 from pathlib import Path
 
-from .errors import PointCacheError, os_reason
+from .errors import PointCacheError, os_error_text
 from .input_file import open_input
 from .point_cache import read_point_cache
 
-_MDD = struct.Struct(">ii")
+_MDD_HEADER = struct.Struct(">ii")
 """Frames and points; then float32 seconds of each frame, then x, y, z of each point, frame by frame; big-endian."""
 
 
@@ -22,11 +22,11 @@ def mesh_cache_frames(path: Path) -> int:
         return len(read_point_cache(path).positions)
     try:
         with open_input(path) as file:
-            head, size = file.read(_MDD.size), path.stat().st_size
+            head, size = file.read(_MDD_HEADER.size), path.stat().st_size
     except OSError as error:
-        raise PointCacheError(f"The point cache '{path}' cannot be read: {os_reason(error)}.") from error
-    frames, points = _MDD.unpack(head) if len(head) == _MDD.size else (0, 0)
-    if frames < 1 or points < 1 or size != _MDD.size + 4 * frames + 12 * frames * points:
+        raise PointCacheError(f"The point cache '{path}' cannot be read: {os_error_text(error)}.") from error
+    frames, points = _MDD_HEADER.unpack(head) if len(head) == _MDD_HEADER.size else (0, 0)
+    if frames < 1 or points < 1 or size != _MDD_HEADER.size + 4 * frames + 12 * frames * points:
         raise PointCacheError(
             f"The point cache '{path}' is damaged: it has {size} bytes and its header says {frames} frames of {points} "
             "points; write it again."

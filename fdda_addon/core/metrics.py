@@ -5,11 +5,11 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-NO_ERROR = 1e-6
+NO_ERROR_METRES = 1e-6
 """Metres. Below this the heat map is green: no error."""
-HEAT_STOPS = ((NO_ERROR, (0.10, 0.25, 0.95)), (0.005, (0.60, 0.10, 0.80)), (0.01, (0.95, 0.05, 0.05)))
+HEAT_MAP_STOPS = ((NO_ERROR_METRES, (0.10, 0.25, 0.95)), (0.005, (0.60, 0.10, 0.80)), (0.01, (0.95, 0.05, 0.05)))
 """Error in metres and sRGB colour: blue just above no error, violet at 0.5 cm, red at 1 cm and above."""
-HEAT_NONE = (0.10, 0.70, 0.20)
+NO_ERROR_COLOR = (0.10, 0.70, 0.20)
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def error_statistics(errors: np.ndarray) -> ErrorStatistics:
     return ErrorStatistics(float(mm.mean()), float(np.sqrt((mm**2).mean())), float(p99), float(p999), float(mm.max()))
 
 
-def heat_colors(errors: np.ndarray, most: float = HEAT_STOPS[-1][0]) -> np.ndarray:
+def heat_colors(errors: np.ndarray, most: float = HEAT_MAP_STOPS[-1][0]) -> np.ndarray:
     """Colours of a heat map of errors.
 
     Args:
@@ -52,10 +52,10 @@ def heat_colors(errors: np.ndarray, most: float = HEAT_STOPS[-1][0]) -> np.ndarr
     Returns:
         (V, 3) float32 sRGB, 0 to 1: green below 1e-4 cm, then from blue through violet (half of `most`) to red.
     """
-    stops = [stop * most / HEAT_STOPS[-1][0] for stop, _ in HEAT_STOPS]
-    colors = np.array([color for _, color in HEAT_STOPS])
+    stops = [stop * most / HEAT_MAP_STOPS[-1][0] for stop, _ in HEAT_MAP_STOPS]
+    colors = np.array([color for _, color in HEAT_MAP_STOPS])
     heat = np.stack([np.interp(errors, stops, colors[:, channel]) for channel in range(3)], axis=-1)
-    heat[np.asarray(errors) < NO_ERROR] = HEAT_NONE
+    heat[np.asarray(errors) < NO_ERROR_METRES] = NO_ERROR_COLOR
     return heat.astype(np.float32)
 
 
@@ -73,7 +73,7 @@ def worst_poses(errors: np.ndarray, count: int, apart: int) -> list[int]:
     largest = np.asarray(errors).max(axis=1)
     chosen: list[int] = []
     for index in np.argsort(-largest, kind="stable"):
-        if len(chosen) == count or largest[index] < NO_ERROR:
+        if len(chosen) == count or largest[index] < NO_ERROR_METRES:
             break
         if all(abs(int(index) - other) >= apart for other in chosen):
             chosen.append(int(index))

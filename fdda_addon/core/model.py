@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from .controls import Control, read_controls
-from .errors import ModelError, os_reason
+from .errors import ModelError, os_error_text
 from .input_file import read_input
-from .model_graph import Budget, check_ends, check_graph, compute_budget
+from .model_graph import Budget, check_graph, check_inputs_and_outputs, compute_budget
 from .onnx_file import read_onnx
 from .partition import Partition, make_partitions
 from .poses import Channel
-from .rig import Fingerprint, Joint, Rig, differences, read_joints
+from .rig import Fingerprint, Joint, Rig, read_joints, rig_differences
 from .skin_fit import skin_from_text
-from .unit import read_unit, unit_json
+from .unit import read_unit, unit_to_json
 
 VERSION = 1
 METADATA_KEY = "fdda"
@@ -26,12 +26,12 @@ POSE_INPUT = "pose_matrices"
 CONTROLS_INPUT = "controls"
 POSITIONS_OUTPUT = "positions"
 CONFIDENCE_OUTPUT = "confidence"
-LIMITS = "limits"
+LIMITS_KEY = "limits"
 """Key of `ModelInfo.training`."""
-OBJECT = "object"
+OBJECT_KEY = "object"
 """Key of `ModelInfo.training`."""
 MAX_BYTES = 768 << 20
-MAX_METADATA = 16 << 20  # letters
+MAX_METADATA_LENGTH = 16 << 20  # letters
 CHECKSUM_KEY = "fdda_checksum"
 """Metadata property with the SHA-256 of the graph."""
 
@@ -110,7 +110,7 @@ class ModelInfo:
     @property
     def limits(self) -> tuple[Channel, ...]:
         """The range of motion that random poses were drawn from; empty where there were none, or nobody knows."""
-        return tuple(Channel.from_json(channel) for channel in self.training.get(LIMITS, ()))
+        return tuple(Channel.from_json(channel) for channel in self.training.get(LIMITS_KEY, ()))
 
     @property
     def trained_poses(self) -> int:
@@ -121,7 +121,7 @@ class ModelInfo:
     @property
     def object_name(self) -> str:
         """Name of the mesh object that was recorded; empty where nobody knows."""
-        name = self.training.get(OBJECT, "")
+        name = self.training.get(OBJECT_KEY, "")
         return name if isinstance(name, str) else ""
 
     def to_json(self) -> str:
@@ -138,7 +138,7 @@ class ModelInfo:
             "held_out_mm": self.held_out_mm,
             "parity_mm": self.parity_mm,
             "training": self.training,
-            **unit_json(self.metres_per_unit),
+            **unit_to_json(self.metres_per_unit),
             **({"constant_bytes": self.constant_bytes} if self.constant_bytes else {}),
         }
         return json.dumps(value, allow_nan=False)
@@ -151,7 +151,7 @@ class ModelInfo:
             ValueError: it is damaged or of another version; the text is a clause about the model.
         """
         try:
-            if len(text) > MAX_METADATA:
+            if len(text) > MAX_METADATA_LENGTH:
                 raise ValueError(f"its metadata has {len(text)} letters")
             return _read_info(json.loads(text))
         except json.JSONDecodeError as error:
@@ -206,7 +206,7 @@ def _read_info(value: dict) -> ModelInfo:
     )
     if info.constant_bytes < 0:
         raise ValueError(f"its constants are said to take {info.constant_bytes} bytes")
-    if not isinstance(info.training.get(LIMITS, []), list) or not all(info.limits):
+    if not isinstance(info.training.get(LIMITS_KEY, []), list) or not all(info.limits):
         raise ValueError("its range of motion cannot be read")
     if not np.isfinite([*info.held_out_mm.values()]).all():
         raise ValueError("its errors are not numbers")
@@ -226,7 +226,7 @@ def read_model(path: Path) -> tuple[ModelInfo, bytes]:
         data = read_input(path, MAX_BYTES)
     except OSError as error:
         raise ModelError(
-            f"The model '{path}' cannot be read: {os_reason(error)}; give one that train made, or train it first."
+            f"The model '{path}' cannot be read: {os_error_text(error)}; give one that train made, or train it first."
         ) from error
     return check_model(data, path), data
 
@@ -265,7 +265,7 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
     if extra := sorted(set(contents.inputs) - set(inputs)):
         raise ModelError(f"'{name}' asks for inputs that no rig gives ({', '.join(extra)}); train it again.")
     try:
-        check_ends(contents, inputs, outputs)
+        check_inputs_and_outputs(contents, inputs, outputs)
         check_graph(contents, info.budget(), len(data), outputs)
     except ValueError as error:
         raise ModelError(f"The model '{name}' is refused: {error}; give one that train made.") from error
@@ -307,7 +307,7 @@ def check_rig(path: Path, info: ModelInfo, rig: Rig) -> None:
     Raises:
         ModelError: says in what they differ.
     """
-    found = differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
+    found = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
     if found:
         raise ModelError(
             f"The model '{path}' was trained for another rig: {'; '.join(found)}. Record and train this rig."

@@ -2,7 +2,7 @@
 """Whether the graph of a model is one that `train` writes, of a size that its metadata explains.
 
 What a graph may cost to load and to run is bounded before any runtime sees it. The bounds leave room for other ways to
-write the same deformation: they are several times what the largest of those costs that are known.
+write the same deformation: they are several times the largest known cost.
 """
 
 from collections.abc import Sequence
@@ -13,19 +13,19 @@ from .features import FEATURES_PER_JOINT
 from .onnx_cost import GraphCost, Shape, compute_graph_cost
 from .onnx_file import ITEM_BYTES, OnnxContents
 
-WHAT_COUNTS = {3: "joints", 1: "controls"}
+INPUT_ITEM_NAMES = {3: "joints", 1: "controls"}
 """What the first number of an input's shape counts, by how many there are."""
-ROOM = 8
+COST_FACTOR = 8
 """How many times the budget a graph may cost."""
-SMALL = 1 << 16
+FREE_ELEMENTS = 1 << 16
 """Elements that need no explanation."""
 MAX_NODES = 20_000
-NODES, NODES_PER_PARTITION = 256, 32
-SEVERAL = 32
+BASE_NODES, NODES_PER_PARTITION = 256, 32
+BATCH_POSES = 32
 """Poses for which the work is measured too: more poses may not cost more than so many times one."""
-DEFAULT_HIDDEN = [128, 128]
-MAX_HIDDEN = 16
-MAX_UNITS = 1 << 16
+DEFAULT_HIDDEN_UNITS = [128, 128]
+MAX_HIDDEN_LAYERS = 16
+MAX_LAYER_UNITS = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def compute_budget(joints: int, controls: int, partitions: Sequence[tuple[int, i
     vertices, shapes, seen = map(list, zip(*partitions, strict=True))
     # Joints as their parents see them, and as main joints see them.
     features = 16 * joints + 3 * controls + 3 * sum(seen)
-    widths = [(FEATURES_PER_JOINT + 3) * max(seen), *_hidden(training), max(shapes)]
+    widths = [(FEATURES_PER_JOINT + 3) * max(seen), *_read_hidden_units(training), max(shapes)]
     network = sum(one * other for one, other in pairwise(widths))
     rows = 4 * (joints + sum(own + 2 * joints for own in shapes))
     values = 3 * sum(vertices) + 4 * features + len(shapes) * (sum(widths) + 9 * max(shapes)) + 3 * rows
@@ -64,17 +64,17 @@ def compute_budget(joints: int, controls: int, partitions: Sequence[tuple[int, i
     return Budget(values, constants)
 
 
-def _hidden(training: dict) -> list[int]:
+def _read_hidden_units(training: dict) -> list[int]:
     """Units of the hidden layers of its networks."""
-    units = training.get("hidden", DEFAULT_HIDDEN)
-    if not isinstance(units, list) or len(units) > MAX_HIDDEN:
+    units = training.get("hidden", DEFAULT_HIDDEN_UNITS)
+    if not isinstance(units, list) or len(units) > MAX_HIDDEN_LAYERS:
         raise ValueError("its networks have hidden layers that are none")
-    if not all(type(own) is int and 0 < own <= MAX_UNITS for own in units):
+    if not all(type(own) is int and 0 < own <= MAX_LAYER_UNITS for own in units):
         raise ValueError("its networks have hidden layers that are none")
     return units
 
 
-def check_ends(contents: OnnxContents, inputs: dict[str, Shape], outputs: dict[str, Shape]) -> None:
+def check_inputs_and_outputs(contents: OnnxContents, inputs: dict[str, Shape], outputs: dict[str, Shape]) -> None:
     """Fail where a graph does not take and give what its metadata says.
 
     Args:
@@ -86,7 +86,7 @@ def check_ends(contents: OnnxContents, inputs: dict[str, Shape], outputs: dict[s
     """
     for name, shape in inputs.items():
         if contents.inputs.get(name, ())[1:] != shape:
-            raise ValueError(f"its input '{name}' does not fit its {shape[0]} {WHAT_COUNTS[len(shape)]}")
+            raise ValueError(f"its input '{name}' does not fit its {shape[0]} {INPUT_ITEM_NAMES[len(shape)]}")
     positions, shape = next(iter(outputs.items()))
     if contents.outputs.get(positions, ())[1:] != shape:
         raise ValueError(f"its output '{positions}' does not fit its {shape[0]} vertices")
@@ -104,32 +104,32 @@ def check_graph(contents: OnnxContents, budget: Budget, size: int, outputs: dict
     Raises:
         ValueError: a clause about the graph.
     """
-    if contents.oddities:
-        raise ValueError(f"it has {contents.oddities[0]}, which train does not write")
-    if budget.values > 2 * size + 16 * SMALL:
+    if contents.unsupported:
+        raise ValueError(f"it has {contents.unsupported[0]}, which train does not write")
+    if budget.values > 2 * size + 16 * FREE_ELEMENTS:
         raise ValueError(f"its metadata tells of a character that {size} bytes cannot hold")
     partitions = outputs.get("confidence", (1,))[0]
-    if len(contents.nodes) > min(MAX_NODES, NODES + NODES_PER_PARTITION * partitions):
+    if len(contents.nodes) > min(MAX_NODES, BASE_NODES + NODES_PER_PARTITION * partitions):
         raise ValueError(f"it has {len(contents.nodes)} nodes, more than its {partitions} partitions explain")
     held = sum(len(constant.data) for constant in contents.constants.values())
-    if held > ITEM_BYTES[1] * ROOM * (budget.constants + SMALL):
+    if held > ITEM_BYTES[1] * COST_FACTOR * (budget.constants + FREE_ELEMENTS):
         raise ValueError(f"its constants have {held} bytes, more than its joints, vertices and shapes explain")
-    single, several = (compute_graph_cost(contents, poses) for poses in (1, SEVERAL))
+    single, batch = (compute_graph_cost(contents, poses) for poses in (1, BATCH_POSES))
     _check_cost(single, budget, size, 1)
-    _check_cost(several, budget, size, SEVERAL)
+    _check_cost(batch, budget, size, BATCH_POSES)
     for name, shape in outputs.items():
-        for cost, poses in ((single, 1), (several, SEVERAL)):
+        for cost, poses in ((single, 1), (batch, BATCH_POSES)):
             if name in contents.outputs and cost.shapes.get(name) != (poses, *shape):
                 raise ValueError(f"its output '{name}' comes out as {cost.shapes.get(name)}, not as {(poses, *shape)}")
 
 
 def _check_cost(cost: GraphCost, budget: Budget, size: int, poses: int) -> None:
-    if cost.elements > ROOM * poses * (budget.values + SMALL):
+    if cost.elements > COST_FACTOR * poses * (budget.values + FREE_ELEMENTS):
         raise ValueError(
             f"it computes {cost.elements} numbers for {poses} poses, more than its joints, vertices and shapes explain"
         )
     # A constant is used once for each pose and axis.
-    if cost.products > ROOM * poses * (size + 64 * (budget.values + SMALL)):
+    if cost.products > COST_FACTOR * poses * (size + 64 * (budget.values + FREE_ELEMENTS)):
         raise ValueError(f"it multiplies {cost.products} numbers for {poses} poses, more than its size explains")
-    if cost.folded > 2 * size + SMALL:
+    if cost.folded > 2 * size + FREE_ELEMENTS:
         raise ValueError(f"it unpacks {cost.folded} numbers, more than its size explains")

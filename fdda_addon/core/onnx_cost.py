@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What it takes to run a graph, found without running it: the shapes of all its values, node by node.
 
-`RULES` is the list of the operators that a model may have: those that `train` writes. An exporter that needs
+`SHAPE_RULES` is the list of the operators that a model may have: those that `train` writes. An exporter that needs
 another adds it here, with the rule of its shape (https://onnx.ai/onnx/operators/).
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from .onnx_file import INT64, ITEM_BYTES, OnnxConstant, OnnxContents, OnnxNode
 
 Shape = tuple[int, ...]
-MOST = 1 << 40
+MAX_ELEMENTS = 1 << 40
 """No value has so many elements."""
 
 
@@ -34,7 +34,7 @@ class GraphCost:
 
 
 @dataclass
-class _Call:
+class _NodeCall:
     """A node with what is known of its inputs: their shapes, and which of them are constants."""
 
     node: OnnxNode
@@ -77,28 +77,28 @@ def _broadcast(shapes: Sequence[Shape]) -> Shape:
     return result
 
 
-def _same(call: _Call) -> list[Shape]:
+def _same_shape(call: _NodeCall) -> list[Shape]:
     return [call.shapes[0]]
 
 
-def _elementwise(call: _Call) -> list[Shape]:
+def _elementwise(call: _NodeCall) -> list[Shape]:
     return [_broadcast(call.shapes)]
 
 
-def _cast(call: _Call) -> list[Shape]:
+def _cast(call: _NodeCall) -> list[Shape]:
     if call.attribute("to", 0) not in ITEM_BYTES:
         raise ValueError("a Cast to what is no number")
     return [call.shapes[0]]
 
 
-def _matmul(call: _Call) -> list[Shape]:
+def _matmul(call: _NodeCall) -> list[Shape]:
     left, right = call.shapes[:2]
     if min(len(left), len(right)) < 2 or left[-1] != right[-2]:
         raise ValueError(f"matrices of {left} and {right} have no product")
     return [(*_broadcast((left[:-2], right[:-2])), left[-2], right[-1])]
 
 
-def _gemm(call: _Call) -> list[Shape]:
+def _gemm(call: _NodeCall) -> list[Shape]:
     left, right = call.shapes[:2]
     left, right = (
         shape[::-1] if call.attribute(name, 0) else shape for name, shape in (("transA", left), ("transB", right))
@@ -111,7 +111,7 @@ def _gemm(call: _Call) -> list[Shape]:
     return [shape]
 
 
-def _transpose(call: _Call) -> list[Shape]:
+def _transpose(call: _NodeCall) -> list[Shape]:
     shape = call.shapes[0]
     order = call.node.attributes.get("perm") or tuple(reversed(range(len(shape))))
     if not isinstance(order, tuple) or sorted(order) != list(range(len(shape))):
@@ -119,7 +119,7 @@ def _transpose(call: _Call) -> list[Shape]:
     return [tuple(shape[axis] for axis in order)]
 
 
-def _reshape(call: _Call) -> list[Shape]:
+def _reshape(call: _NodeCall) -> list[Shape]:
     shape, wanted = call.shapes[0], list(call.integers(1))
     if call.attribute("allowzero", 0) == 0:
         wanted = [shape[i] if size == 0 and i < len(shape) else size for i, size in enumerate(wanted)]
@@ -131,7 +131,7 @@ def _reshape(call: _Call) -> list[Shape]:
     return [tuple(wanted)]
 
 
-def _concat(call: _Call) -> list[Shape]:
+def _concat(call: _NodeCall) -> list[Shape]:
     first = call.shapes[0]
     axis = call.axis(len(first))
     if any(
@@ -141,7 +141,7 @@ def _concat(call: _Call) -> list[Shape]:
     return [(*first[:axis], sum(shape[axis] for shape in call.shapes), *first[axis + 1 :])]
 
 
-def _split(call: _Call) -> list[Shape]:
+def _split(call: _NodeCall) -> list[Shape]:
     shape, sizes = call.shapes[0], call.integers(1)
     axis = call.axis(len(shape))
     if min(sizes, default=-1) < 0 or sum(sizes) != shape[axis] or len(sizes) != len(call.node.outputs):
@@ -149,7 +149,7 @@ def _split(call: _Call) -> list[Shape]:
     return [(*shape[:axis], size, *shape[axis + 1 :]) for size in sizes]
 
 
-def _slice(call: _Call) -> list[Shape]:
+def _slice(call: _NodeCall) -> list[Shape]:
     shape = list(call.shapes[0])
     starts, ends = call.integers(1), call.integers(2)
     axes = call.integers(3) if len(call.shapes) > 3 else tuple(range(len(starts)))
@@ -162,13 +162,13 @@ def _slice(call: _Call) -> list[Shape]:
     return [tuple(shape)]
 
 
-def _gather(call: _Call) -> list[Shape]:
+def _gather(call: _NodeCall) -> list[Shape]:
     shape, chosen = call.shapes[:2]
     axis = call.axis(len(shape))
     return [(*shape[:axis], *chosen, *shape[axis + 1 :])]
 
 
-def _unsqueeze(call: _Call) -> list[Shape]:
+def _unsqueeze(call: _NodeCall) -> list[Shape]:
     shape, axes = list(call.shapes[0]), call.integers(1)
     places = sorted({_axis(axis, len(shape) + len(axes)) for axis in axes})
     if len(places) != len(axes):
@@ -178,7 +178,7 @@ def _unsqueeze(call: _Call) -> list[Shape]:
     return [tuple(shape)]
 
 
-def _reduce(call: _Call) -> list[Shape]:
+def _reduce(call: _NodeCall) -> list[Shape]:
     shape = call.shapes[0]
     axes = {_axis(axis, len(shape)) for axis in call.integers(1)}
     if call.attribute("keepdims", 1):
@@ -186,21 +186,21 @@ def _reduce(call: _Call) -> list[Shape]:
     return [tuple(size for axis, size in enumerate(shape) if axis not in axes)]
 
 
-def _quantize(call: _Call) -> list[Shape]:
+def _quantize(call: _NodeCall) -> list[Shape]:
     return [call.shapes[0], (), ()]
 
 
-RULES: dict[str, Callable[[_Call], list[Shape]]] = {
+SHAPE_RULES: dict[str, Callable[[_NodeCall], list[Shape]]] = {
     **dict.fromkeys(("Add", "Sub", "Mul", "Div", "Max", "Min"), _elementwise),
-    **dict.fromkeys(("Relu", "Sigmoid", "Tanh", "Erf", "Sqrt"), _same),
+    **dict.fromkeys(("Relu", "Sigmoid", "Tanh", "Erf", "Sqrt"), _same_shape),
     **dict.fromkeys(("MatMul", "MatMulInteger"), _matmul),
-    **{"Gemm": _gemm, "Cast": _cast, "DequantizeLinear": _same, "DynamicQuantizeLinear": _quantize},
+    **{"Gemm": _gemm, "Cast": _cast, "DequantizeLinear": _same_shape, "DynamicQuantizeLinear": _quantize},
     **{"Transpose": _transpose, "Reshape": _reshape, "Concat": _concat, "Split": _split, "Slice": _slice},
     **{"Gather": _gather, "Unsqueeze": _unsqueeze, "ReduceSum": _reduce},
 }
-OPERATORS = tuple(RULES)
-PRODUCTS = ("MatMul", "MatMulInteger", "Gemm")
-UNFOLDED = ("Cast", "DequantizeLinear")
+OPERATORS = tuple(SHAPE_RULES)
+MATRIX_PRODUCT_OPERATORS = ("MatMul", "MatMulInteger", "Gemm")
+CONSTANT_INPUT_OPERATORS = ("Cast", "DequantizeLinear")
 """Operators whose inputs may all be constants; of others the result would be the constant."""
 
 
@@ -226,30 +226,30 @@ def compute_graph_cost(contents: OnnxContents, poses: int) -> GraphCost:
 
 
 def _add_node(node: OnnxNode, constants: dict[str, OnnxConstant], known: set[str], cost: GraphCost) -> None:
-    if node.operator not in RULES:
+    if node.operator not in SHAPE_RULES:
         raise ValueError(f"it has the operator {node.operator!r}, which train does not write")
     inputs = [name for name in node.inputs if name]
     if not inputs or (missing := [name for name in inputs if name not in cost.shapes]):
         raise ValueError(
             f"a {node.operator} takes {missing[0]!r}, which nothing gives" if inputs else "a node takes nothing"
         )
-    call = _Call(node, [cost.shapes[name] for name in inputs], [constants.get(name) for name in inputs])
+    call = _NodeCall(node, [cost.shapes[name] for name in inputs], [constants.get(name) for name in inputs])
     try:
-        found = RULES[node.operator](call)
+        found = SHAPE_RULES[node.operator](call)
     except IndexError as error:
         raise ValueError(f"a {node.operator} has too few inputs") from error
     if len(node.outputs) > len(found):
         raise ValueError(f"a {node.operator} gives too many values")
     elements = sum(math.prod(shape) for shape in found)
-    if elements > MOST:
+    if elements > MAX_ELEMENTS:
         raise ValueError(
             f"a {node.operator} gives {elements} numbers, more than its joints, vertices and shapes explain"
         )
     cost.elements += elements
-    if node.operator in PRODUCTS:
+    if node.operator in MATRIX_PRODUCT_OPERATORS:
         cost.products += math.prod(found[0]) * call.shapes[0][-1 if not call.attribute("transA", 0) else -2]
     if known.issuperset(inputs):
-        if node.operator not in UNFOLDED:
+        if node.operator not in CONSTANT_INPUT_OPERATORS:
             raise ValueError(f"a {node.operator} of constants alone")
         cost.folded += elements
         known.update(node.outputs)

@@ -15,11 +15,11 @@ ITEM_BYTES = {1: 4, 2: 1, 3: 1, 6: 4, 7: 8, 10: 2}
 """Bytes of an element by ONNX's number of its type: float, uint8, int8, int32, int64, float16."""
 INT64 = 7
 MAX_DIMENSIONS = 8
-MAX_INTEGERS = 1 << 16
+MAX_CONSTANT_INTEGERS = 1 << 16
 """Of a constant that is read: the longest has the sizes of all partitions."""
-LONGEST_ATTRIBUTE = 16
+MAX_ATTRIBUTE_LENGTH = 16
 STANDARD_DOMAINS = ("", "ai.onnx")
-KNOWN_OPSETS = range(13, 24)
+SUPPORTED_OPSETS = range(13, 24)
 """Versions in which the operators of models mean the same."""
 MAX_DEPTH = 8
 """Deepest nesting of subgraphs that is followed."""
@@ -35,7 +35,7 @@ class OnnxConstant:
 
     def integers(self) -> tuple[int, ...]:
         """The elements of a short constant of int64; ValueError where it is long or of another type."""
-        if self.type != INT64 or math.prod(self.shape) > MAX_INTEGERS:
+        if self.type != INT64 or math.prod(self.shape) > MAX_CONSTANT_INTEGERS:
             raise ValueError("a shape is no list of whole numbers")
         size = ITEM_BYTES[INT64]
         return tuple(
@@ -64,7 +64,7 @@ class OnnxContents:
         custom_operators: operators outside the standard domains, "domain::name".
         external_files: files that tensors refer to; "" for one that says its data lies outside and not where.
         nodes, constants: of the graph itself, in their order and by name.
-        oddities: what no model needs, clauses: graphs inside of nodes, tensors in odd forms.
+        unsupported: clauses about what `train` never writes: graphs inside of nodes, tensors in other forms.
         checksum: SHA-256 of the graph, hexadecimal.
     """
 
@@ -75,7 +75,7 @@ class OnnxContents:
     external_files: set[str] = field(default_factory=set)
     nodes: list[OnnxNode] = field(default_factory=list)
     constants: dict[str, OnnxConstant] = field(default_factory=dict)
-    oddities: list[str] = field(default_factory=list)
+    unsupported: list[str] = field(default_factory=list)
     checksum: str = ""
     has_graph: bool = False
 
@@ -95,10 +95,10 @@ def read_onnx(data: bytes) -> OnnxContents:
                 _read_graph(value, contents, top=True)
             elif number == 8:
                 opset = dict(_fields(value))
-                if _text(opset.get(1, b"")) in STANDARD_DOMAINS and opset.get(2) not in KNOWN_OPSETS:
-                    contents.oddities.append(f"operators of version {opset.get(2)!r}")
+                if _text(opset.get(1, b"")) in STANDARD_DOMAINS and opset.get(2) not in SUPPORTED_OPSETS:
+                    contents.unsupported.append(f"operators of version {opset.get(2)!r}")
             elif number == 20:
-                contents.oddities.append("a training of its own")
+                contents.unsupported.append("a training of its own")
             elif number == 14:
                 prop = dict(_fields(value))
                 contents.metadata[_text(prop.get(1, b""))] = _text(prop.get(2, b""))
@@ -161,11 +161,11 @@ def _read_graph(data: memoryview, contents: OnnxContents, top: bool = False, dep
         elif number == 5:
             name, constant = _read_tensor(value, contents)
             if name in contents.constants:
-                contents.oddities.append(f"two constants '{name}'")
+                contents.unsupported.append(f"two constants '{name}'")
             elif top:
                 contents.constants[name] = constant
         elif number == 15:
-            contents.oddities.append("sparse tensors")
+            contents.unsupported.append("sparse tensors")
             _read_sparse_tensor(value, contents)
         elif top and number in (11, 12):
             name, shape = _read_value_info(value)
@@ -197,58 +197,58 @@ def _read_attribute(data: memoryview, contents: OnnxContents, depth: int) -> tup
         if number == 1:
             name = _text(value)
         elif number == 3:
-            single = _signed(value)
+            single = _to_signed(value)
         elif number == 8:
-            several += _numbers(value)
+            several += _read_integers(value)
         elif number in (5, 10):
-            contents.oddities.append("tensors inside of nodes")
+            contents.unsupported.append("tensors inside of nodes")
             _read_tensor(value, contents)
         elif number in (6, 11):
-            contents.oddities.append("graphs inside of nodes")
+            contents.unsupported.append("graphs inside of nodes")
             _read_graph(value, contents, depth=depth + 1)
         elif number in (22, 23):
-            contents.oddities.append("sparse tensors")
+            contents.unsupported.append("sparse tensors")
             _read_sparse_tensor(value, contents)
         elif number not in (2, 13, 20, 21):
             is_other = True
-    if len(several) > LONGEST_ATTRIBUTE:
-        contents.oddities.append("a node with a long list")
+    if len(several) > MAX_ATTRIBUTE_LENGTH:
+        contents.unsupported.append("a node with a long list")
     return name, None if is_other else tuple(several) or single
 
 
-def _signed(value: int) -> int:
+def _to_signed(value: int) -> int:
     """A number of 64 bits as protobuf writes it."""
     if not isinstance(value, int):
         raise TypeError("text where a number belongs")
     return value - (1 << 64) if value >> 63 else value
 
 
-def _numbers(value: int | memoryview) -> list[int]:
+def _read_integers(value: int | memoryview) -> list[int]:
     """One of a list of numbers, or all of them in one piece."""
     if isinstance(value, int):
-        return [_signed(value)]
+        return [_to_signed(value)]
     found, position = [], 0
     while position < len(value):
         number, position = _varint(value, position)
-        found.append(_signed(number))
+        found.append(_to_signed(number))
     return found
 
 
 def _read_tensor(data: memoryview, contents: OnnxContents) -> tuple[str, OnnxConstant]:
     is_external, location = False, ""
-    name, kind, shape, content, is_odd = "", 0, [], [], False
+    name, element_type, shape, content, is_unsupported = "", 0, [], [], False
     for number, value in _fields(data):
         if number == 1:
-            shape += _numbers(value)
+            shape += _read_integers(value)
         elif number == 2:
-            kind = value
+            element_type = value
         elif number == 8:
             name = _text(value)
         elif number == 9:
             content.append(value)
         elif number in (3, 4, 5, 6, 7, 10, 11):
             # A segment, or elements one by one: train writes neither.
-            is_odd = True
+            is_unsupported = True
         if number == 13:
             is_external = True
             entry = dict(_fields(value))
@@ -260,11 +260,16 @@ def _read_tensor(data: memoryview, contents: OnnxContents) -> tuple[str, OnnxCon
         contents.external_files.add(location)
     raw = content[0] if len(content) == 1 and not isinstance(content[0], int) else memoryview(b"")
     is_shape = len(shape) <= MAX_DIMENSIONS and min(shape, default=0) >= 0
-    if is_odd or len(content) > 1 or not is_shape or math.prod(shape) * ITEM_BYTES.get(kind, 0) != len(raw):
-        contents.oddities.append(f"a constant '{name}' that is not of the size that it says")
-    elif kind not in ITEM_BYTES:
-        contents.oddities.append(f"a constant '{name}' of another type than numbers")
-    return name, OnnxConstant(kind, tuple(shape), raw)
+    if (
+        is_unsupported
+        or len(content) > 1
+        or not is_shape
+        or math.prod(shape) * ITEM_BYTES.get(element_type, 0) != len(raw)
+    ):
+        contents.unsupported.append(f"a constant '{name}' that is not of the size that it says")
+    elif element_type not in ITEM_BYTES:
+        contents.unsupported.append(f"a constant '{name}' of another type than numbers")
+    return name, OnnxConstant(element_type, tuple(shape), raw)
 
 
 def _read_sparse_tensor(data: memoryview, contents: OnnxContents) -> None:

@@ -13,12 +13,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-PATIENCE_SECONDS = 10.0
-OPEN_PATIENCE_SECONDS = 1.0
+RETRY_SECONDS = 10.0
+OPEN_RETRY_SECONDS = 1.0
 """How long it takes until a file counts as in use. Who only reads is told sooner: the file may simply be forbidden."""
 MAX_PAUSE_SECONDS = 0.1
-IN_USE = "another program has it open"
-SHARING_ERRORS = {5, 32, 33, 1224}
+IN_USE_TEXT = "another program has it open"
+SHARING_WINERRORS = {5, 32, 33, 1224}
 """Windows' access denied, sharing violation, lock violation, and user-mapped file."""
 
 Result = TypeVar("Result")
@@ -28,27 +28,27 @@ def replace_file(source: Path, target: Path) -> None:
     """Rename a file to a path where another may be.
 
     Raises:
-        OSError: as `os.replace`; EBUSY where another program has one of them open for longer than `PATIENCE_SECONDS`.
+        OSError: as `os.replace`; EBUSY where another program has one of them open for longer than `RETRY_SECONDS`.
     """
-    _insist(lambda: os.replace(source, target), target)
+    _retry_while_in_use(lambda: os.replace(source, target), target)
 
 
 def remove_file(path: Path) -> None:
     """Remove a file, where there is one.
 
     Raises:
-        OSError: as `os.unlink`; EBUSY where another program has it open for longer than `PATIENCE_SECONDS`.
+        OSError: as `os.unlink`; EBUSY where another program has it open for longer than `RETRY_SECONDS`.
     """
-    _insist(lambda: path.unlink(missing_ok=True), path)
+    _retry_while_in_use(lambda: path.unlink(missing_ok=True), path)
 
 
-def open_patiently(opened: Callable[[], Result]) -> Result:
+def open_with_retry(opened: Callable[[], Result]) -> Result:
     """Call what opens a file, again for a moment where Windows refuses it.
 
     Raises:
         OSError: as `opened`.
     """
-    end = time.monotonic() + OPEN_PATIENCE_SECONDS
+    end = time.monotonic() + OPEN_RETRY_SECONDS
     while True:
         try:
             return opened()
@@ -59,16 +59,16 @@ def open_patiently(opened: Callable[[], Result]) -> Result:
         _pause()
 
 
-def _insist(action: Callable[[], None], path: Path) -> None:
-    end = time.monotonic() + PATIENCE_SECONDS
+def _retry_while_in_use(action: Callable[[], None], path: Path) -> None:
+    end = time.monotonic() + RETRY_SECONDS
     while True:
         try:
             return action()
         except PermissionError as error:
-            if getattr(error, "winerror", None) not in SHARING_ERRORS or _is_forbidden(path):
+            if getattr(error, "winerror", None) not in SHARING_WINERRORS or _is_forbidden(path):
                 raise
             if time.monotonic() > end:
-                raise OSError(errno.EBUSY, IN_USE, str(path)) from error
+                raise OSError(errno.EBUSY, IN_USE_TEXT, str(path)) from error
         _pause()
 
 

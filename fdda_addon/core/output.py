@@ -13,16 +13,16 @@ from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
-from .errors import OutputError, os_reason
+from .errors import OutputError, os_error_text
 from .file_kind import FileKind
 from .open_files import remove_file, replace_file
-from .path_limits import check_path, is_windows, same_place
+from .path_limits import check_path, comparable_path, is_windows
 
-TEMPORARY = ".fdda-"
-KEPT = "new-"
+TEMPORARY_PREFIX = ".fdda-"
+KEPT_PREFIX = "new-"
 """Begins the name of a file that could not take the place of another."""
-_LEFT_OVER = r"\.fdda-[0-9a-f]{12}(\..*)?"
-"""Names that `replacing` gives."""
+_TEMPORARY_NAME = r"\.fdda-[0-9a-f]{12}(\..*)?"
+"""Names that `atomic_write` gives."""
 
 
 def check_outputs(
@@ -45,7 +45,7 @@ def check_outputs(
     inputs, places = list(inputs), {}
     for path, kind in outputs:
         check_writable(path)
-        place = same_place(path)
+        place = comparable_path(path)
         if place in places:
             raise OutputError(f"Cannot write '{path}': it would be {places[place]} and {kind.name}; give two names.")
         places[place] = kind.name
@@ -53,19 +53,19 @@ def check_outputs(
             continue
         if any(os.path.exists(other) and os.path.samefile(path, other) for other in inputs):
             raise OutputError(f"Cannot write '{path}': it is read for this; give another name, or --overwrite.")
-        if not _is_of(path, kind):
+        if not _has_kind(path, kind):
             raise OutputError(
                 f"Cannot write '{path}': another file is there, which is not {kind.name}; give another name, or "
                 "--overwrite."
             )
 
 
-def _is_of(path: Path, kind: FileKind) -> bool:
+def _has_kind(path: Path, kind: FileKind) -> bool:
     try:
-        return kind.is_of(path)
+        return kind.matches(path)
     except OSError as error:
         raise OutputError(
-            f"Cannot write '{path}': another file is there, {os_reason(error)}; give another name."
+            f"Cannot write '{path}': another file is there, {os_error_text(error)}; give another name."
         ) from error
 
 
@@ -89,7 +89,7 @@ def check_writable(path: Path) -> None:
         raise OutputError(f"Cannot write '{path}': it is write-protected; give another name, or let it be written.")
     if not os.path.isdir(folder):
         raise OutputError(f"Cannot write '{path}': the folder '{folder}' does not exist; create it first.")
-    _probe(path, folder)
+    _check_can_create_file(path, folder)
 
 
 def check_folder_writable(path: Path, names: Iterable[str] = ()) -> None:
@@ -105,13 +105,13 @@ def check_folder_writable(path: Path, names: Iterable[str] = ()) -> None:
     """
     files = [path / name for name in names]
     check_path(path, path, *files, *(file.with_name(_temporary_name(file)) for file in files))
-    folder = nearest_folder(path)
+    folder = nearest_existing_folder(path)
     if not os.path.isdir(folder):
         raise OutputError(f"Cannot write into '{path}': '{folder}' is a file; choose another folder.")
-    _probe(path, folder)
+    _check_can_create_file(path, folder)
 
 
-def nearest_folder(path: Path) -> Path:
+def nearest_existing_folder(path: Path) -> Path:
     """Find what exists of a path: the path itself, or the nearest folder above it.
 
     Raises:
@@ -125,18 +125,20 @@ def nearest_folder(path: Path) -> Path:
     return folder
 
 
-def _probe(path: Path, folder: Path) -> None:
+def _check_can_create_file(path: Path, folder: Path) -> None:
     try:
-        handle, probe = tempfile.mkstemp(prefix=TEMPORARY, dir=folder)
+        handle, probe = tempfile.mkstemp(prefix=TEMPORARY_PREFIX, dir=folder)
     except OSError as error:
-        raise OutputError(f"Cannot write '{path}': {os_reason(error)}; choose a folder that you may write.") from error
+        raise OutputError(
+            f"Cannot write '{path}': {os_error_text(error)}; choose a folder that you may write."
+        ) from error
     os.close(handle)
     with suppress(OSError):
         remove_file(Path(probe))
 
 
 @contextmanager
-def replacing(path: Path, keep: bool = True) -> Iterator[Path]:
+def atomic_write(path: Path, keep: bool = True) -> Iterator[Path]:
     """Give a temporary file beside `path`, and rename it to `path` when the block ends without an error.
 
     Args:
@@ -146,13 +148,13 @@ def replacing(path: Path, keep: bool = True) -> Iterator[Path]:
     Raises:
         OutputError: the file cannot be written or renamed, for instance because the disk is full.
     """
-    with replacing_all(path, keep=keep) as (temporary,):
+    with atomic_write_all(path, keep=keep) as (temporary,):
         yield temporary
 
 
 @contextmanager
-def replacing_all(*paths: Path, keep: bool = True) -> Iterator[tuple[Path, ...]]:
-    """As `replacing`, of files that belong together: when one cannot be written or renamed, none is changed.
+def atomic_write_all(*paths: Path, keep: bool = True) -> Iterator[tuple[Path, ...]]:
+    """As `atomic_write`, of files that belong together: when one cannot be written or renamed, none is changed.
 
     Raises:
         OutputError: one cannot be written or renamed.
@@ -167,16 +169,16 @@ def replacing_all(*paths: Path, keep: bool = True) -> Iterator[tuple[Path, ...]]
                 os.fsync(file.fileno())
     except OSError as error:
         beside = f" with {_quoted(paths[1:])}" if len(paths) > 1 else ""
-        raise OutputError(f"Cannot write '{paths[0]}'{beside}: {os_reason(error)}; nothing was changed.") from error
+        raise OutputError(f"Cannot write '{paths[0]}'{beside}: {os_error_text(error)}; nothing was changed.") from error
     else:
-        _put_in_place(temporaries, paths, keep)
+        _commit(temporaries, paths, keep)
     finally:
         for temporary in temporaries:
             with suppress(OSError):
                 remove_file(temporary)
 
 
-def _put_in_place(temporaries: list[Path], paths: tuple[Path, ...], keep: bool) -> None:
+def _commit(temporaries: list[Path], paths: tuple[Path, ...], keep: bool) -> None:
     """Rename all files, or none."""
     backups: dict[Path, Path | None] = {}
     replaced: list[tuple[Path, Path]] = []
@@ -192,11 +194,11 @@ def _put_in_place(temporaries: list[Path], paths: tuple[Path, ...], keep: bool) 
         if not isinstance(error, OSError):
             raise
         text = f"{_quoted(changed)} was replaced, and no other" if changed else "nothing was changed"
-        if keep and not changed and (kept := _keep(temporaries, paths)):
+        if keep and not changed and (kept := _keep_beside(temporaries, paths)):
             rename = f"rename {'it' if len(kept) == 1 else 'them'}"
             way = f"close what has '{refused.name}' open, and" if error.errno == errno.EBUSY else "then"
             text += f", and what was made is kept as {_quoted(kept)}; {way} {rename}"
-        raise OutputError(f"Cannot write '{refused}': {os_reason(error)}; {text}.") from error
+        raise OutputError(f"Cannot write '{refused}': {os_error_text(error)}; {text}.") from error
     finally:
         for path, backup in backups.items():
             if backup and os.path.lexists(path):
@@ -228,10 +230,10 @@ def _restore(temporary: Path, path: Path, backup: Path | None) -> bool:
     return True
 
 
-def _keep(temporaries: list[Path], paths: tuple[Path, ...]) -> list[Path]:
+def _keep_beside(temporaries: list[Path], paths: tuple[Path, ...]) -> list[Path]:
     """Give files that could not take their place names beside it; returns the names."""
     for number in count(1):
-        prefix = KEPT if number == 1 else f"{KEPT}{number}-"
+        prefix = KEPT_PREFIX if number == 1 else f"{KEPT_PREFIX}{number}-"
         places = [path.with_name(f"{prefix}{path.name}") for path in paths]
         if not any(os.path.lexists(place) for place in places):
             break
@@ -258,21 +260,21 @@ def _new_file(path: Path) -> Path:
 
 
 def _temporary_name(path: Path) -> str:
-    return f"{TEMPORARY}{secrets.token_hex(6)}{path.suffix}"
+    return f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}{path.suffix}"
 
 
-def is_left_over(name: str) -> bool:
+def is_temporary_name(name: str) -> bool:
     """Whether a file of this name was left by a process that was ended while it wrote."""
-    return re.fullmatch(_LEFT_OVER, name, re.DOTALL) is not None
+    return re.fullmatch(_TEMPORARY_NAME, name, re.DOTALL) is not None
 
 
 def write_text(path: Path, text: str) -> None:
     """Replace a file with text, UTF-8; parts of file names that are none are escaped.
 
     Raises:
-        OutputError: as `replacing`.
+        OutputError: as `atomic_write`.
     """
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
@@ -280,11 +282,11 @@ def write_json(path: Path, value: object) -> None:
     """Replace a file with JSON; NaN and infinity are refused.
 
     Raises:
-        OutputError: as `replacing`.
+        OutputError: as `atomic_write`.
     """
-    write_text(path, json_text(value))
+    write_text(path, to_json_text(value))
 
 
-def json_text(value: object) -> str:
+def to_json_text(value: object) -> str:
     """A value as `write_json` writes it; ValueError for NaN and infinity."""
     return json.dumps(value, indent=1, allow_nan=False) + "\n"

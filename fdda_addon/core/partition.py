@@ -83,7 +83,7 @@ def make_partitions(
     )
 
 
-def merged_partitions(rig: Rig, min_vertices: int = MIN_PARTITION_VERTICES) -> tuple[Partition, ...]:
+def make_merged_partitions(rig: Rig, min_vertices: int = MIN_PARTITION_VERTICES) -> tuple[Partition, ...]:
     """Cut the mesh by main joint, and merge partitions of fewer vertices as in `small_partition_merges`."""
     return make_partitions(rig, merged=small_partition_merges(rig, min_vertices))
 
@@ -142,7 +142,7 @@ def _steps_down(rig: Rig, ancestor: int, joint: int) -> int:
     return steps if joint >= 0 else 0
 
 
-def nearby_influences(rig: Rig, partitions: tuple[Partition, ...], sags: bool = True) -> tuple[Partition, ...]:
+def assume_nearby_influences(rig: Rig, partitions: tuple[Partition, ...], sags: bool = True) -> tuple[Partition, ...]:
     """Partitions with the joints that are likely to influence them, where none can be moved to see whether it does.
 
     These are the main joint, those that skin a vertex of the partition or one that shares a face with it, the parents
@@ -188,7 +188,7 @@ def _root_of(rig: Rig, joint: int) -> int:
     return joint
 
 
-def residual_changes(partitions: tuple[Partition, ...], moved: np.ndarray, base: np.ndarray) -> np.ndarray:
+def max_residual_changes(partitions: tuple[Partition, ...], moved: np.ndarray, base: np.ndarray) -> np.ndarray:
     """How far local residuals move between poses, the most in each partition.
 
     Args:

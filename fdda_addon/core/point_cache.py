@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from .errors import PointCacheError, os_reason
+from .errors import PointCacheError, os_error_text
 
 SIGNATURE = b"POINTCACHE2\0"
 VERSION = 1
@@ -70,7 +70,7 @@ def read_point_cache(path: Path) -> PointCache:
         with open(path, "rb") as file:
             head, size = file.read(HEADER.size), path.stat().st_size
     except OSError as error:
-        raise PointCacheError(f"The point cache '{path}' cannot be read: {os_reason(error)}.") from error
+        raise PointCacheError(f"The point cache '{path}' cannot be read: {os_error_text(error)}.") from error
     if len(head) < HEADER.size or not head.startswith(SIGNATURE):
         raise PointCacheError(f"'{path}' is not a point cache; give a .pc2 file.")
     _, version, points, start, rate, samples = HEADER.unpack(head)

@@ -13,13 +13,13 @@ KINDS = (ROTATION, ROTATION_VECTOR, LOCATION, SCALE, CONTROL)
 DEFAULT_RANGE = (-np.pi / 4, np.pi / 4)
 """Range of a rotation axis that the rig neither limits nor locks, radians."""
 
-LONGEST_BONE = 2100
+MAX_CHANNEL_NAME_LENGTH = 2100
 """Letters of what a channel is called in a file: a control has an owner and a path."""
-MARGIN_PART = 0.25
+MARGIN_POSE_RATIO = 0.25
 """Part of the random poses that lies in the margin, where there is one."""
 MAX_MARGIN = 4.0
 """Wider is no pose of anybody."""
-LOCKED_RANGE = np.pi / 4
+LOCKED_AXIS_ANGLE = np.pi / 4
 """How far a locked axis turns in the margin, radians: by this for every range that the margin adds to a range."""
 RANGE_TOLERANCE = 1e-4
 """Radians or metres. Ranges that differ by less count as the same: Blender keeps them as float32."""
@@ -69,7 +69,7 @@ class Channel:
         """
         values = dict(value)
         channel = Channel(values.pop("bone"), **values)
-        if not isinstance(channel.name, str) or not 0 < len(channel.name) <= LONGEST_BONE:
+        if not isinstance(channel.name, str) or not 0 < len(channel.name) <= MAX_CHANNEL_NAME_LENGTH:
             raise ValueError(f"its range of motion is of a bone called {channel.name!r}")
         if channel.kind not in KINDS or type(channel.axis) is not int or channel.axis not in range(3):
             raise ValueError(f"its range of motion of {channel.name!r} is of {channel.kind!r}, axis {channel.axis!r}")
@@ -104,7 +104,7 @@ def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: fl
     return np.clip((low + high) / 2 + (high - low) / 2 * places, low, high)
 
 
-def beyond_range(channels: tuple[Channel, ...], factor: float) -> tuple[Channel, ...]:
+def scale_ranges(channels: tuple[Channel, ...], factor: float) -> tuple[Channel, ...]:
     """Channels whose ranges are `factor` times as wide, about the same middle."""
     widened = []
     for channel in channels:
@@ -148,32 +148,32 @@ class Margin:
         return Margin(float(factor), poses, tuple(Channel.from_json(channel) for channel in value["limits"]))
 
 
-def margin_of(channels: tuple[Channel, ...], locked: tuple[Channel, ...], factor: float, poses: int) -> Margin | None:
+def make_margin(channels: tuple[Channel, ...], locked: tuple[Channel, ...], factor: float, poses: int) -> Margin | None:
     """The margin of random poses; None where there is none.
 
     Controls keep their ranges, which their properties hold them to, and scales stay above zero.
 
     Args:
         channels: of the poses inside the range of motion.
-        locked: axes of the same bones that do not turn there (`LOCKED_RANGE`), whatever their ranges say.
+        locked: axes of the same bones that do not turn there (`LOCKED_AXIS_ANGLE`), whatever their ranges say.
         factor: how many times as wide as the range the margin is; 1 for none.
         poses: how many random poses there are in all.
     """
-    count = round(poses * MARGIN_PART)
+    count = round(poses * MARGIN_POSE_RATIO)
     if factor == 1 or not count:
         return None
     widened = []
-    for own, wide in zip(channels, beyond_range(channels, factor), strict=True):
+    for own, wide in zip(channels, scale_ranges(channels, factor), strict=True):
         if own.kind == CONTROL:
             wide = own
         elif own.kind == SCALE:
             wide = replace(wide, low=max(wide.low, min(own.low, own.low / factor)))
         widened.append(wide)
-    turn = LOCKED_RANGE * (factor - 1)
+    turn = LOCKED_AXIS_ANGLE * (factor - 1)
     return Margin(factor, count, (*widened, *(replace(channel, low=-turn, high=turn) for channel in locked)))
 
 
-def range_changes(before: tuple[Channel, ...], after: tuple[Channel, ...]) -> list[str]:
+def bones_with_changed_range(before: tuple[Channel, ...], after: tuple[Channel, ...]) -> list[str]:
     """Names of the bones whose range of motion differs, in the order of `after`, those that are gone last."""
 
     def by_bone(channels: tuple[Channel, ...]) -> dict[str, dict[tuple[str, int], tuple[float, float]]]:

@@ -7,11 +7,11 @@ import numpy as np
 
 from .poses import Channel
 
-THIN_PART = 1 / 3
+SPARSE_CHOICE_RATIO = 1 / 3
 """Part of the choices that go where the recorded poses are few, the others go where the error is large."""
-JITTER = 0.15
+JITTER_RATIO = 0.15
 """Standard deviation around a chosen pose, as a part of half the range of motion."""
-WORST_PART = 0.1
+WORST_PROBE_RATIO = 0.1
 """The error that a partition is weighed by is its mean over this part of the probes, the worst."""
 
 
@@ -30,7 +30,7 @@ class Probes:
     distances: np.ndarray
 
 
-def nearest_distances(points: np.ndarray, recorded: np.ndarray) -> np.ndarray:
+def nearest_recorded_distances(points: np.ndarray, recorded: np.ndarray) -> np.ndarray:
     """Distance of each point to the nearest recorded one, each feature in units of its spread in the recording.
 
     Args:
@@ -49,18 +49,22 @@ def nearest_distances(points: np.ndarray, recorded: np.ndarray) -> np.ndarray:
 
 
 def choose_poses(
-    probes: Probes, channels: tuple[Channel, ...], owned: list[np.ndarray], base: np.ndarray, rng: np.random.Generator
+    probes: Probes,
+    channels: tuple[Channel, ...],
+    channels_by_partition: list[np.ndarray],
+    base: np.ndarray,
+    rng: np.random.Generator,
 ) -> np.ndarray:
     """Make poses that help a model most.
 
     Each pose serves as many partitions as it can: partition after partition, in a random order that prefers those
-    with large errors, sets its channels as in one of its probes, unless another has set one of them; what is left
-    stays as in `base`.
+    with large errors, sets its channels as in one of its probes, unless another has set one of them; a channel that no
+    partition sets stays as in `base`.
 
     Args:
         probes: where the model errs.
         channels: C channels with their ranges.
-        owned: for each of P partitions, indices of the channels that influence it.
+        channels_by_partition: for each of P partitions, indices of the channels that influence it.
         base: (n, C) random poses to start from.
         rng: makes the choices.
 
@@ -68,26 +72,26 @@ def choose_poses(
         (n, C) float64, inside the ranges.
     """
     low, high = np.array([(channel.low, channel.high) for channel in channels]).T
-    worst = np.sort(probes.errors, axis=0)[-max(1, round(len(probes.errors) * WORST_PART)) :]
+    worst = np.sort(probes.errors, axis=0)[-max(1, round(len(probes.errors) * WORST_PROBE_RATIO)) :]
     weights = worst.mean(axis=0)
-    by_error, by_distance = (_shares(scores) for scores in (probes.errors, probes.distances))
+    by_error, by_distance = (_to_probabilities(scores) for scores in (probes.errors, probes.distances))
     poses = base.copy()
     for pose in poses:
-        left = np.ones(len(channels), bool)
+        is_free = np.ones(len(channels), bool)
         # Exponential races: the order of a draw without replacement, with these weights.
         for partition in np.argsort(rng.exponential(size=len(weights)) / np.maximum(weights, 1e-12)):
-            own = owned[partition]
-            if not len(own) or not left[own].all():
+            channel_indices = channels_by_partition[partition]
+            if not len(channel_indices) or not is_free[channel_indices].all():
                 continue
-            shares = by_distance if rng.random() < THIN_PART else by_error
-            probe = rng.choice(len(probes.values), p=shares[:, partition])
-            noise = rng.standard_normal(len(own)) * JITTER * (high - low)[own] / 2
-            pose[own] = probes.values[probe, own] + noise
-            left[own] = False
+            probabilities = by_distance if rng.random() < SPARSE_CHOICE_RATIO else by_error
+            probe = rng.choice(len(probes.values), p=probabilities[:, partition])
+            noise = rng.standard_normal(len(channel_indices)) * JITTER_RATIO * (high - low)[channel_indices] / 2
+            pose[channel_indices] = probes.values[probe, channel_indices] + noise
+            is_free[channel_indices] = False
     return np.clip(poses, low, high)
 
 
-def _shares(scores: np.ndarray) -> np.ndarray:
+def _to_probabilities(scores: np.ndarray) -> np.ndarray:
     """(M, P) scores to probabilities over the M probes: the squares, so that the worst are chosen most."""
     squared = np.square(scores, dtype=np.float64) + 1e-30
     return squared / squared.sum(axis=0)

@@ -8,16 +8,16 @@ import enum
 import json
 from pathlib import Path
 
-from .errors import TrainingError, os_reason
+from .errors import TrainingError, os_error_text
 from .input_file import read_input
-from .output import json_text, write_text
+from .output import to_json_text, write_text
 
 REPORT_JSON, REPORT_HTML = "report.json", "report.html"
 CHECKPOINT_SUFFIX = ".checkpoint.npz"
 FORMAT, VERSION = "fdda-report", 1
 MAX_BYTES = 1 << 27
 """Fifty times the report of 100 partitions and 1000 epochs."""
-MOST = 1e300
+MAX_ABSOLUTE_VALUE = 1e300
 """No number of a report is larger: it can be shown."""
 
 
@@ -38,7 +38,7 @@ class _OrNull:
 
 _ERRORS = dict.fromkeys(("mean", "rms", "p99", "p999", "max"), float)
 _ANGLES = dict.fromkeys(("mean", "p99", "max"), float)
-_LENGTHS = dict.fromkeys(("inside", "beside", "across"), _OrNull(float))
+_EDGE_ERRORS = dict.fromkeys(("inside", "beside", "across"), _OrNull(float))
 _PARTITION = {
     "joint": str,
     "vertices": int,
@@ -81,7 +81,7 @@ _REPORT = {
     "fdda": {"training": _ERRORS, "held_out": _ERRORS},
     "linear": {"held_out": _ERRORS},
     "normals?": _OrNull({"fdda": _ANGLES, "linear": _ANGLES}),
-    "edges?": _OrNull({"fdda": _LENGTHS, "linear": _LENGTHS}),
+    "edges?": _OrNull({"fdda": _EDGE_ERRORS, "linear": _EDGE_ERRORS}),
     "histogram": {"edges": [float], "fdda": [int], "linear": [int]},
     "partitions": [_PARTITION],
     "warnings?": [{"name": str, "text": str}],
@@ -118,8 +118,8 @@ def write_report(path: Path, report: dict) -> None:
 
 def report_text(report: dict) -> str:
     """What `write_report` writes; raises its ValueError."""
-    _check(report, _REPORT, "")
-    return json_text({"format": FORMAT, "version": VERSION, **report})
+    _check_value(report, _REPORT, "")
+    return to_json_text({"format": FORMAT, "version": VERSION, **report})
 
 
 def read_report(path: Path) -> dict:
@@ -134,44 +134,44 @@ def read_report(path: Path) -> dict:
     try:
         report = json.loads(read_input(path, MAX_BYTES))
     except OSError as error:
-        raise TrainingError(f"The report '{path}' cannot be read ({os_reason(error)}); train again.") from error
+        raise TrainingError(f"The report '{path}' cannot be read ({os_error_text(error)}); train again.") from error
     except (ValueError, RecursionError) as error:
         raise TrainingError(f"The report '{path}' cannot be read ({error}); train again.") from error
     if not isinstance(report, dict) or (report.get("format"), report.get("version")) != (FORMAT, VERSION):
         raise TrainingError(f"'{path}' is not a training report of this version; train again.")
     try:
-        _check(report, _REPORT, "")
+        _check_value(report, _REPORT, "")
     except ValueError as error:
         raise TrainingError(f"The report '{path}' is damaged: {error}; train again.") from error
     return report
 
 
-def _check(value: object, kind: object, place: str) -> None:
-    """ValueError, which names the place: the value is not of its kind."""
+def _check_value(value: object, kind: object, key_path: str) -> None:
+    """Raise ValueError, with the path of the key, where a value is not of its kind."""
     if isinstance(kind, _OrNull):
         if value is not None:
-            _check(value, kind.kind, place)
+            _check_value(value, kind.kind, key_path)
     elif isinstance(kind, dict):
         if not isinstance(value, dict):
-            raise ValueError(f"{place or 'it'} is no object")
-        for key, inner in kind.items():
+            raise ValueError(f"{key_path or 'it'} is no object")
+        for key, value_kind in kind.items():
             name = key.removesuffix("?")
             if name in value:
-                _check(value[name], inner, f"{place}.{name}".lstrip("."))
+                _check_value(value[name], value_kind, f"{key_path}.{name}".lstrip("."))
             elif name == key:
-                raise ValueError(f"{place or 'it'} has no {name}")
+                raise ValueError(f"{key_path or 'it'} has no {name}")
     elif isinstance(kind, list):
         if not isinstance(value, list):
-            raise ValueError(f"{place} is no list")
+            raise ValueError(f"{key_path} is no list")
         for number, entry in enumerate(value):
-            _check(entry, kind[0], f"{place}[{number}]")
+            _check_value(entry, kind[0], f"{key_path}[{number}]")
     elif kind is Verdict:
         if value not in [verdict.value for verdict in Verdict]:
-            raise ValueError(f"{place} is no verdict")
+            raise ValueError(f"{key_path} is no verdict")
     elif kind is str:
         if not isinstance(value, str):
-            raise ValueError(f"{place} is no text")
+            raise ValueError(f"{key_path} is no text")
     elif isinstance(value, bool) or not isinstance(value, int if kind is int else int | float):
-        raise ValueError(f"{place} is no {'whole ' * (kind is int)}number")
-    elif not -MOST <= value <= MOST:
-        raise ValueError(f"{place} is out of all bounds")
+        raise ValueError(f"{key_path} is no {'whole ' * (kind is int)}number")
+    elif not -MAX_ABSOLUTE_VALUE <= value <= MAX_ABSOLUTE_VALUE:
+        raise ValueError(f"{key_path} is out of all bounds")

@@ -9,21 +9,21 @@ import numpy as np
 from .controls import Control
 from .deformation import check_deformation, deformation_differences
 
-UNMOVED = ""
+STATIC_JOINT = ""
 """Name of the joint that never moves; no bone has it. What follows no bone follows this one.
 
 Its rest and its pose matrix are the identity, its parent is -1."""
-UNMOVED_LABEL = "no bone"
+STATIC_JOINT_LABEL = "no bone"
 """What people read in place of that name."""
 
-LONGEST_HASH = 128
-REST_TOLERANCE = 1e-4
+MAX_HASH_LENGTH = 128
+REST_MATRIX_TOLERANCE = 1e-4
 """Largest difference of a rest matrix element (metres, or no unit) at which two rest poses count as the same.
 
 Blender's versions compute a bone's matrix a few float32 steps apart, so the comparison cannot be exact."""
 
 
-LONGEST_NAME = 1000
+MAX_NAME_LENGTH = 1000
 """Letters of a name in a file; Blender's are at most a quarter of it."""
 
 
@@ -31,7 +31,7 @@ def read_name(value: object) -> str:
     """A name from a file; TypeError or ValueError where it is none."""
     if not isinstance(value, str):
         raise TypeError(f"{value!r} stands where a name belongs")
-    if len(value) > LONGEST_NAME:
+    if len(value) > MAX_NAME_LENGTH:
         raise ValueError(f"a name has {len(value)} letters")
     return value
 
@@ -81,7 +81,7 @@ class Fingerprint:
     def from_json(value: dict) -> "Fingerprint":
         """Read a fingerprint from a file; KeyError, TypeError or ValueError where it is damaged."""
         parts = [value[name] for name in ("topology", "rest_positions", "skin_weights")]
-        if not all(isinstance(part, str) and len(part) <= LONGEST_HASH for part in parts):
+        if not all(isinstance(part, str) and len(part) <= MAX_HASH_LENGTH for part in parts):
             raise ValueError("its fingerprint holds no hashes")
         return Fingerprint(*parts, check_deformation(value.get("deformation", {})))
 
@@ -149,14 +149,14 @@ class Rig:
         return float(np.linalg.norm(np.ptp(self.rest_positions, axis=0)))
 
 
-def are_same_rest(rest_matrices: np.ndarray, rig: Rig) -> bool:
-    """Whether (J, 4, 4) rest matrices are those of a rig, to `REST_TOLERANCE`."""
+def rest_matrices_match(rest_matrices: np.ndarray, rig: Rig) -> bool:
+    """Whether (J, 4, 4) rest matrices are those of a rig, to `REST_MATRIX_TOLERANCE`."""
     apart = np.abs(rest_matrices - rig.rest_matrices)
     apart[:, :3, 3] *= rig.metres_per_unit
-    return bool(apart.max(initial=0) <= REST_TOLERANCE)
+    return bool(apart.max(initial=0) <= REST_MATRIX_TOLERANCE)
 
 
-def differences(
+def rig_differences(
     joints: tuple[Joint, ...], rest_matrices: np.ndarray, vertex_count: int, fingerprint: Fingerprint, rig: Rig
 ) -> list[str]:
     """Say in what a rig differs from the one that a recording or model was made of.
@@ -175,13 +175,13 @@ def differences(
     if theirs != ours:
         if missing := sorted(theirs - ours):
             found.append(f"the armature lacks {_names(missing)}")
-        if UNMOVED in ours - theirs:
+        if STATIC_JOINT in ours - theirs:
             found.append("some vertices follow no bone")
-        if extra := sorted(ours - theirs - {UNMOVED}):
+        if extra := sorted(ours - theirs - {STATIC_JOINT}):
             found.append(f"it does not know {_names(extra)}")
     elif joints != rig.joints:
         found.append("its joints have other parents")
-    elif rest_matrices.shape != rig.rest_matrices.shape or (not are_same_rest(rest_matrices, rig)):
+    elif rest_matrices.shape != rig.rest_matrices.shape or (not rest_matrices_match(rest_matrices, rig)):
         found.append("the rest pose of the armature differs")
     if not found:
         for part, name in (

@@ -7,14 +7,14 @@ that a range over all of them is as narrow as the rotations are.
 
 import numpy as np
 
-TURN = 2 * np.pi
+FULL_TURN = 2 * np.pi
 MAX_ITERATIONS = 10
 """The center of a range settles after a few choices of the nearest triples."""
-STARTS = 8
+MAX_CENTER_CANDIDATES = 8
 """Number of rotations that are tried as the center of a range wider than a half turn."""
-LOCKED = 1e-12
+GIMBAL_LOCK_TOLERANCE = 1e-12
 """Euler angles are in gimbal lock where the sine of the middle one is this near to 1."""
-MIN_ANGLE = 1e-9
+MIN_ANGLE_RADIANS = 1e-9
 """Radians. A rotation by less has no axis."""
 
 
@@ -31,7 +31,9 @@ def rotation_vectors(quaternions: np.ndarray) -> np.ndarray:
     vectors = _logarithm(unit)
     angles = np.linalg.norm(vectors, axis=1, keepdims=True)
     # The same rotation the other way round.
-    others = np.where(angles > MIN_ANGLE, vectors * (1 - TURN / np.maximum(angles, MIN_ANGLE)), vectors)
+    others = np.where(
+        angles > MIN_ANGLE_RADIANS, vectors * (1 - FULL_TURN / np.maximum(angles, MIN_ANGLE_RADIANS)), vectors
+    )
     return _nearest(np.stack([vectors, others], axis=1), _logarithm(_mean(unit)[None])[0])
 
 
@@ -47,10 +49,10 @@ def euler_angles(quaternions: np.ndarray) -> np.ndarray:
     unit = _normalized(quaternions)
     angles = _xyz(unit)
     others = angles * (1, -1, 1) + np.pi
-    return _nearest(np.stack([angles, others], axis=1), _xyz(_mean(unit)[None])[0], TURN)
+    return _nearest(np.stack([angles, others], axis=1), _xyz(_mean(unit)[None])[0], FULL_TURN)
 
 
-def total_width(values: np.ndarray) -> float:
+def total_range_width(values: np.ndarray) -> float:
     """Sum of the widths of the ranges of (F, 3) values."""
     return float(np.ptp(values, axis=0).sum())
 
@@ -60,10 +62,10 @@ def _nearest(candidates: np.ndarray, mean: np.ndarray, period: float = 0.0) -> n
     best = _nearest_to(np.zeros(3), candidates, period)
     if np.ptp(best, axis=0).max() <= np.pi:
         return best
-    some = candidates[np.linspace(0, len(candidates) - 1, STARTS).astype(int), 0]
+    some = candidates[np.linspace(0, len(candidates) - 1, MAX_CENTER_CANDIDATES).astype(int), 0]
     for center in (mean, *some):
         values = _nearest_to(center, candidates, period)
-        if total_width(values) < total_width(best) - MIN_ANGLE:
+        if total_range_width(values) < total_range_width(best) - MIN_ANGLE_RADIANS:
             best = values
     return best
 
@@ -75,7 +77,7 @@ def _nearest_to(center: np.ndarray, candidates: np.ndarray, period: float) -> np
         shifted = candidates - period * np.round((candidates - center) / period) if period else candidates
         nearest = np.square(shifted - center).sum(axis=2).argmin(axis=1)
         values = shifted[np.arange(len(shifted)), nearest]
-        if best is not None and total_width(values) >= total_width(best) - MIN_ANGLE:
+        if best is not None and total_range_width(values) >= total_range_width(best) - MIN_ANGLE_RADIANS:
             break
         best, center = values, (values.min(axis=0) + values.max(axis=0)) / 2
     return best
@@ -97,7 +99,7 @@ def _logarithm(unit: np.ndarray) -> np.ndarray:
     unit = np.where(unit[:, :1] < 0, -unit, unit)
     sines = np.linalg.norm(unit[:, 1:], axis=1, keepdims=True)
     angles = 2 * np.arctan2(sines, unit[:, :1])
-    return unit[:, 1:] * np.where(sines > MIN_ANGLE, angles / np.maximum(sines, MIN_ANGLE), 2.0)
+    return unit[:, 1:] * np.where(sines > MIN_ANGLE_RADIANS, angles / np.maximum(sines, MIN_ANGLE_RADIANS), 2.0)
 
 
 def _xyz(unit: np.ndarray) -> np.ndarray:
@@ -107,7 +109,7 @@ def _xyz(unit: np.ndarray) -> np.ndarray:
     first = np.arctan2(2 * (y * z + x * w), 1 - 2 * (x * x + y * y))
     last = np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z))
     # In gimbal lock the first and the last angle turn about one axis.
-    is_locked = np.abs(sine) > 1 - LOCKED
+    is_locked = np.abs(sine) > 1 - GIMBAL_LOCK_TOLERANCE
     return np.stack(
         [np.where(is_locked, 2 * np.arctan2(x, w), first), np.arcsin(sine), np.where(is_locked, 0, last)], 1
     )

@@ -27,20 +27,20 @@ def skin_matrices(pose_matrices: np.ndarray, rest_matrices: np.ndarray) -> np.nd
     return (pose_matrices @ np.linalg.inv(rest_matrices.astype(np.float64))).astype(np.float32)
 
 
-MIN_LENGTH = 1e-12
-MIN_VOLUME = 1e-6
+MIN_COLUMN_LENGTH = 1e-12
+MIN_COLUMN_VOLUME = 1e-6
 """Of the box that three columns of length 1 span."""
 
 
-def have_inverse(matrices: np.ndarray) -> np.ndarray:
+def are_invertible(matrices: np.ndarray) -> np.ndarray:
     """Which of (..., 4, 4) matrices can be inverted: their columns have a length and a volume, the last row is that of
     an affine transform. (...,) bool."""
     columns = matrices[..., :3, :3].astype(np.float64)
     lengths = np.linalg.norm(columns, axis=-2)
-    unit = columns / np.maximum(lengths, MIN_LENGTH)[..., None, :]
+    unit = columns / np.maximum(lengths, MIN_COLUMN_LENGTH)[..., None, :]
     volume = np.abs(np.einsum("...a,...a->...", np.cross(unit[..., 0], unit[..., 1]), unit[..., 2]))
     affine = np.abs(matrices[..., 3, :] - np.array([0, 0, 0, 1])).max(axis=-1) <= 1e-3
-    return (lengths > MIN_LENGTH).all(axis=-1) & (volume > MIN_VOLUME) & affine
+    return (lengths > MIN_COLUMN_LENGTH).all(axis=-1) & (volume > MIN_COLUMN_VOLUME) & affine
 
 
 class SkinBlock:
@@ -77,7 +77,7 @@ class LinearSkinning:
         self._blocks = [SkinBlock(rig, partition) for partition in self.partitions]
         # Vertices in the order of the partitions, and back: one gather of all is far cheaper than one each.
         self._order = np.concatenate([partition.vertices for partition in self.partitions])
-        self._back = np.argsort(self._order)
+        self._inverse_order = np.argsort(self._order)
 
     def positions(self, pose_matrices: np.ndarray) -> np.ndarray:
         """Skin the mesh.
@@ -90,9 +90,9 @@ class LinearSkinning:
         """
         skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
         ordered = np.empty((len(skin), self.rig.vertex_count, 3), np.float32)
-        for _, block, own in self._parts(ordered):
-            own[:] = _moved(skin, block)
-        return np.take(ordered, self._back, axis=1)
+        for _, block, own in self._iterate_partitions(ordered):
+            own[:] = _skinned_positions(skin, block)
+        return np.take(ordered, self._inverse_order, axis=1)
 
     def local_residuals(self, pose_matrices: np.ndarray, positions: np.ndarray) -> np.ndarray:
         """Residuals in the frames of the main joints, l_v = R_m^-1 (complex_v - lin_v).
@@ -117,10 +117,10 @@ class LinearSkinning:
                 "look for a constraint or driver that sets it."
             ) from error
         ordered = np.take(np.asarray(positions, np.float32), self._order, axis=1)
-        for partition, block, own in self._parts(ordered):
-            own -= _moved(skin, block)
+        for partition, block, own in self._iterate_partitions(ordered):
+            own -= _skinned_positions(skin, block)
             own[:] = own @ inverse[:, partition.joint].transpose(0, 2, 1)
-        return np.take(ordered, self._back, axis=1)
+        return np.take(ordered, self._inverse_order, axis=1)
 
     def complex_positions(self, pose_matrices: np.ndarray, local_residuals: np.ndarray) -> np.ndarray:
         """The inverse of `local_residuals`: lin_v + R_m l_v.
@@ -129,12 +129,12 @@ class LinearSkinning:
         """
         skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
         ordered = np.take(np.asarray(local_residuals, np.float32), self._order, axis=1)
-        for partition, block, own in self._parts(ordered):
+        for partition, block, own in self._iterate_partitions(ordered):
             own[:] = own @ skin[:, partition.joint, :, :3].transpose(0, 2, 1)
-            own += _moved(skin, block)
-        return np.take(ordered, self._back, axis=1)
+            own += _skinned_positions(skin, block)
+        return np.take(ordered, self._inverse_order, axis=1)
 
-    def _parts(self, ordered: np.ndarray) -> Iterator[tuple[Partition, SkinBlock, np.ndarray]]:
+    def _iterate_partitions(self, ordered: np.ndarray) -> Iterator[tuple[Partition, SkinBlock, np.ndarray]]:
         """Each partition with its part of an (N, V, 3) array in the order of the partitions."""
         start = 0
         for partition, block in zip(self.partitions, self._blocks, strict=True):
@@ -142,7 +142,7 @@ class LinearSkinning:
             start += len(partition.vertices)
 
 
-def _moved(skin: np.ndarray, block: SkinBlock) -> np.ndarray:
+def _skinned_positions(skin: np.ndarray, block: SkinBlock) -> np.ndarray:
     """(N, J, 3, 4) skin matrices to the (N, Vp, 3) skinned vertices of a partition, mesh units."""
     # A product for each pose: in one product of all, the last bits of a pose would depend on how many others there are,
     # and a recording that was resumed must have the bytes of one that was not.

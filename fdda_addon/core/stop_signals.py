@@ -31,6 +31,6 @@ def restore_handlers(handlers: dict[int, object]) -> None:
         signal.signal(number, default if handler is None else handler)
 
 
-def exit_when_asked() -> None:
+def exit_on_stop_signal() -> None:
     """Let stop signals end the process at once, without a traceback: for the time before there is anything to lose."""
     handle_stop_signals(lambda *_: os._exit(INTERRUPTED))

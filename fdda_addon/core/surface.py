@@ -24,7 +24,7 @@ def are_faces(face_starts: np.ndarray, face_vertices: np.ndarray, vertex_count: 
     )
 
 
-def corners_beside(face_starts: np.ndarray, face_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def adjacent_corners(face_starts: np.ndarray, face_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The corner before and the corner after each, along its face: (C,) int64 both.
 
     Args:
@@ -52,7 +52,7 @@ class Surface:
         counts = np.diff(face_starts, append=len(face_vertices))
         self._starts, self._corners = face_starts, face_vertices
         self._face_of_corner = np.repeat(np.arange(len(face_starts)), counts)
-        self._previous, self._next = corners_beside(face_starts, face_vertices)
+        self._previous, self._next = adjacent_corners(face_starts, face_vertices)
         # Corners in the order of their vertices: the sums at a vertex are then sums of neighbours.
         self._by_vertex = np.argsort(face_vertices, kind="stable")
         self.vertices, self._vertex_starts = np.unique(face_vertices[self._by_vertex], return_index=True)

@@ -3,23 +3,23 @@
 
 import tempfile
 
-from .errors import NoRoomError, os_reason
+from .errors import DiskFullError, os_error_text
 
 
 def check_temporary_folder() -> None:
     """Fail where the system's temporary folder takes no file: packages that are imported may need one.
 
     Raises:
-        NoRoomError: it takes none.
+        DiskFullError: it takes none.
     """
     try:
         tempfile.gettempdir()
     except OSError as error:
-        raise temporary_failed(error) from error
+        raise temporary_folder_error(error) from error
 
 
-def temporary_failed(error: OSError) -> NoRoomError:
+def temporary_folder_error(error: OSError) -> DiskFullError:
     """The error where the system's temporary folder takes no file; Python looks for one that does."""
-    return NoRoomError(
-        f"No temporary file can be written ({os_reason(error)}); make room there, or name another folder in TMPDIR."
+    return DiskFullError(
+        f"No temporary file can be written ({os_error_text(error)}); make room there, or name another folder in TMPDIR."
     )

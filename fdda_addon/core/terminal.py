@@ -5,7 +5,7 @@ import os
 import sys
 
 
-def show_all_names() -> None:
+def escape_unencodable_output() -> None:
     """Let stdout and stderr escape what their encoding lacks: `\\xc4rmel` where there is nothing but ASCII."""
     for stream in (sys.stdout, sys.stderr):
         # Whoever calls a verb may have put something else in their place.
@@ -13,7 +13,7 @@ def show_all_names() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def use_utf8() -> None:
+def restart_in_utf8_mode() -> None:
     """Start this program of Python again where it takes names and paths for ASCII: those of objects are UTF-8.
 
     With LC_ALL=C Python does so by itself, unless it was told not to (PYTHONUTF8=0). Blender always does.

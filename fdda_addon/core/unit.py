@@ -5,12 +5,12 @@ import math
 
 METRES_PER_UNIT = "metres_per_unit"
 """Key of `recording.json` and of a model's metadata, left out where a unit is a metre."""
-TOLERANCE = 1e-6
+UNIT_TOLERANCE = 1e-6
 
 
-def unit_json(metres_per_unit: float) -> dict[str, float]:
+def unit_to_json(metres_per_unit: float) -> dict[str, float]:
     """What a file says of the unit: nothing where it is a metre."""
-    return {} if abs(metres_per_unit - 1) <= TOLERANCE else {METRES_PER_UNIT: metres_per_unit}
+    return {} if abs(metres_per_unit - 1) <= UNIT_TOLERANCE else {METRES_PER_UNIT: metres_per_unit}
 
 
 def read_unit(value: dict) -> float:

@@ -15,8 +15,8 @@ import numpy as np
 from mathutils import Matrix
 
 from ..core.errors import OutputError
-from ..core.metrics import HEAT_NONE, HEAT_STOPS, heat_colors
-from ..core.output import replacing
+from ..core.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, heat_colors
+from ..core.output import atomic_write
 from ..scene.arrays import COLOR, LOOP_START, VERTEX_INDEX, write
 from ..scene.blend_file import blender_path
 from ..scene.mesh import set_mesh_positions, topology
@@ -167,11 +167,13 @@ class _Picture:
         """The colours of the heat map: a box for no error, a strip from the first to the last stop."""
         x, y = place
         box = 1.2 * text
-        self._strip((x, y - box), (box, box), np.array([HEAT_NONE, HEAT_NONE]))
+        self._strip((x, y - box), (box, box), np.array([NO_ERROR_COLOR, NO_ERROR_COLOR]))
         self._text("none (below 0.0001 cm)", (x + 1.5 * box, y - box + 0.2 * text), 0.9 * text)
         left, width = x + 16 * text, self._width * 0.35
-        self._strip((left, y - box), (width, box), heat_colors(np.linspace(HEAT_STOPS[0][0], HEAT_STOPS[-1][0], 64)))
-        last = HEAT_STOPS[-1][0]
+        self._strip(
+            (left, y - box), (width, box), heat_colors(np.linspace(HEAT_MAP_STOPS[0][0], HEAT_MAP_STOPS[-1][0], 64))
+        )
+        last = HEAT_MAP_STOPS[-1][0]
         for metres, words in ((0.0, "error 0 cm"), (0.005, "0.5 cm"), (last, "1 cm and above")):
             self._text(words, (left + width * metres / last - 0.6 * text, y - box - 1.2 * text), 0.9 * text)
 
@@ -220,7 +222,7 @@ class _Picture:
         world.color = _linear(BACKGROUND)
         scene.world = world
         self._made.append(world)
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             scene.render.filepath = blender_path(temporary)
             try:
                 bpy.ops.render.render(write_still=True, scene=scene.name)

@@ -14,7 +14,7 @@ import numpy as np
 from ..core.defaults import MIN_PARTITION_VERTICES
 from ..core.errors import ModelError
 from ..core.metrics import heat_colors
-from ..core.partition import merged_partitions, partition_colors
+from ..core.partition import make_merged_partitions, partition_colors
 from ..rig.reading import read_rig
 from ..runtime.model_files import network_of
 from ..runtime.opened_model import open_model
@@ -52,7 +52,7 @@ def paint_partitions(scene_rig: SceneRig, min_partition_vertices: int = MIN_PART
         RigError: the rig cannot be read.
     """
     rig = read_rig(scene_rig)
-    partitions = merged_partitions(rig, min_partition_vertices)
+    partitions = make_merged_partitions(rig, min_partition_vertices)
     if scene_rig.mesh_object.fdda.is_bound:
         with suppress(ModelError):
             opened = open_model(scene_rig, network_of(scene_rig.mesh_object))

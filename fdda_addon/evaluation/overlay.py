@@ -10,7 +10,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ..core.metrics import HEAT_NONE, NO_ERROR, heat_colors
+from ..core.metrics import NO_ERROR_COLOR, NO_ERROR_METRES, heat_colors
 from ..scene.arrays import TRIANGLE, VECTOR, read
 from ..scene.mesh import mesh_positions
 
@@ -199,10 +199,10 @@ def _draw_legend(legend: Callable[[bpy.types.Context], tuple[list[str], float | 
 def _draw_scale(left: float, bottom: float, unit: float, range_mm: float) -> None:
     box, width = 14 * unit, 240 * unit
     top = bottom + 18 * unit
-    _draw_strip(left, top, box, box, np.tile(np.float32(HEAT_NONE), (2, 1)))
+    _draw_strip(left, top, box, box, np.tile(np.float32(NO_ERROR_COLOR), (2, 1)))
     _write("none", left - 2 * unit, bottom)
     start = left + 44 * unit
-    _draw_strip(start, top, width, box, heat_colors(np.linspace(NO_ERROR, range_mm / 1000, 64), range_mm / 1000))
+    _draw_strip(start, top, width, box, heat_colors(np.linspace(NO_ERROR_METRES, range_mm / 1000, 64), range_mm / 1000))
     for part, words in ((0, "0"), (0.5, f"{range_mm / 2:.4g}"), (1, f"{range_mm:.4g} mm and more")):
         across = blf.dimensions(0, words.split(" ")[0])[0] / 2
         _write(words, start + part * width - across, bottom)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.metrics import distances, heat_colors
-from ..core.partition import merged_partitions, partition_colors
+from ..core.partition import make_merged_partitions, partition_colors
 from ..core.skinning import LinearSkinning
 from ..rig.reading import read_rig
 from ..runtime.opened_model import open_model
@@ -49,7 +49,7 @@ def draw_partitions(scene_rig: SceneRig, path: Path, view: View = View()) -> Non
         OutputError: the file cannot be written.
     """
     rig = read_rig(scene_rig)
-    partitions = merged_partitions(rig)
+    partitions = make_merged_partitions(rig)
     colors = partition_colors(partitions, rig.vertex_count)
     cell = Cell(rig.rest_positions, colors, f"{len(partitions)} partitions, {rig.vertex_count} vertices")
     draw(scene_rig.mesh_object.data, [[cell]], path, "Partitions by main joint", view)

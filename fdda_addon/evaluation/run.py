@@ -13,7 +13,7 @@ from ..core.errors import FDDAError, RigError
 from ..core.mask import Mask
 from ..core.metrics import ErrorStatistics, distances, error_statistics
 from ..core.partition import Partition
-from ..core.poses import Channel, beyond_range, sample_pose
+from ..core.poses import Channel, sample_pose, scale_ranges
 from ..core.progress import Progress
 from ..core.skinning import LinearSkinning
 from ..core.surface import Surface, SurfaceComparison, SurfaceErrors, surface_errors, surface_json
@@ -193,7 +193,7 @@ def evaluate(
         scaled_ranges = []
         for number, factor in enumerate(settings.range_scales, 1):
             first = HELD_OUT_INDEX * (1 + number)
-            poses = _random_poses(scene_rig, beyond_range(channels, factor), settings.seed, first, extra, approach)
+            poses = _random_poses(scene_rig, scale_ranges(channels, factor), settings.seed, first, extra, approach)
             scaled_ranges.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
         named = []
         for pose in settings.named:

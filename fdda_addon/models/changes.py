@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import bpy
 
 from ..core.model import ModelInfo
-from ..core.poses import ROTATION_VECTOR, Channel, range_changes
-from ..core.rig import Rig, differences
+from ..core.poses import ROTATION_VECTOR, Channel, bones_with_changed_range
+from ..core.rig import Rig, rig_differences
 from ..poses.sampling import sampled_channels
 from ..rig.reading import read_model_rig
 from ..scene.scene_rig import SceneRig
@@ -60,9 +60,11 @@ def changes(name: str, info: ModelInfo, rig: Rig, channels: tuple[Channel, ...])
         channels: of the rig as it stands. The ranges of control bones and those of actions were chosen by the user and
             are not compared.
     """
-    clauses = differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
+    clauses = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
     is_own = all(c.name in rig.joint_names and c.kind != ROTATION_VECTOR for c in info.limits)
-    return Changes(name, tuple(clauses), tuple(range_changes(info.limits, channels)) if info.limits and is_own else ())
+    return Changes(
+        name, tuple(clauses), tuple(bones_with_changed_range(info.limits, channels)) if info.limits and is_own else ()
+    )
 
 
 def changes_since(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> Changes:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import ModelError, OutputError, os_reason
+from ..core.errors import ModelError, OutputError, os_error_text
 from ..core.model import MAX_BYTES, ModelInfo, check_model, read_model, read_model_info
-from ..core.output import check_writable, replacing
+from ..core.output import atomic_write, check_writable
 from ..evaluation import last_evaluation
 from ..runtime import model_files, packed, playback
 from ..runtime.binding import bind, unbind
@@ -191,7 +191,7 @@ def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, 
     if not (os.path.lexists(path) and path.is_file() and _same(path, data)):
         if os.path.lexists(path):
             raise OutputError(f"There is another file '{path}'; choose another name.")
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_bytes(data)
     bound = is_bound(mesh_object, entry)
     entry.path, entry.packed, entry.packed_bytes = path_for(mesh_object, path), None, 0
@@ -227,7 +227,7 @@ def info_of(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> Mo
         status = os.stat(path)
     except OSError as error:
         raise ModelError(
-            f"The model '{path}' cannot be read: {os_reason(error)}; find it, or choose another."
+            f"The model '{path}' cannot be read: {os_error_text(error)}; find it, or choose another."
         ) from error
     key = (path, status.st_mtime_ns, status.st_size)
     if key not in _infos:

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
-from ..core.errors import FDDAError, OutputError, RecordingError, os_reason
+from ..core.errors import FDDAError, OutputError, RecordingError, os_error_text
 from ..core.progress import Progress
 from ..jobs.job import current
 from ..properties.character import model_file, recording_folder
@@ -230,7 +230,9 @@ def _make_folder(model: Path) -> None:
     try:
         model.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"Cannot make the folder '{model.parent}': {os_reason(error)}; choose another.") from error
+        raise OutputError(
+            f"Cannot make the folder '{model.parent}': {os_error_text(error)}; choose another."
+        ) from error
 
 
 def _follow_left_training() -> None:

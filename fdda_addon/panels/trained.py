@@ -47,12 +47,12 @@ def _trained(rig: SceneRig) -> tuple[Trained | None]:
 
 def _foreign(scene_rig: SceneRig, rig: object, path: Path) -> str:
     from ..core.model import read_model_info
-    from ..core.rig import differences
+    from ..core.rig import rig_differences
     from .models import rig_of_model
 
     try:
         info = read_model_info(path)
         own = rig_of_model(scene_rig, rig, info)
-        return "; ".join(differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, own))
+        return "; ".join(rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, own))
     except FDDAError as error:
         return str(error)

@@ -17,7 +17,7 @@ from mathutils import Euler, Quaternion, Vector
 from ..core.controls import ARMATURE, ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS, Control
 from ..core.errors import RigError
 from ..core.poses import CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
-from ..core.rotations import euler_angles, rotation_vectors, total_width
+from ..core.rotations import euler_angles, rotation_vectors, total_range_width
 from ..scene.arrays import KEYFRAME, read
 from ..scene.compatibility import curves_of
 from ..scene.controls import is_driven, is_number, make_control, owner_of
@@ -114,7 +114,7 @@ def keyed_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.
         quaternions = np.concatenate(parts)
         angles = euler_angles(quaternions)
         width = sum(high - low for low, high in (found[bone, ROTATION, axis] for axis in range(3)))
-        if total_width(angles) < CONTINUOUS_PREFERENCE * width:
+        if total_range_width(angles) < CONTINUOUS_PREFERENCE * width:
             found |= _by_axis(bone, ROTATION, angles)
         found |= _by_axis(bone, ROTATION_VECTOR, rotation_vectors(quaternions))
     return found

@@ -10,7 +10,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ..core.errors import RigError
-from ..core.rig import UNMOVED, Joint
+from ..core.rig import STATIC_JOINT, Joint
 from ..scene.armature import PoseMatrices, rest_matrices
 from ..scene.scene_rig import SMALLEST_VOLUME, SceneRig, is_flat
 
@@ -63,7 +63,7 @@ class HeldPose:
         for joint, matrix in zip(self._joints, relative, strict=True):
             above = wanted[self._joints[joint.parent].name] if joint.parent >= 0 else Matrix()
             wanted[joint.name] = above @ Matrix(matrix)
-        wanted.pop(UNMOVED, None)
+        wanted.pop(STATIC_JOINT, None)
         reached: dict[str, Matrix] = {}
         for bone in self._armature_object.pose.bones:
             own = bone.bone

@@ -13,11 +13,11 @@ import bpy
 import numpy as np
 
 from ..core.defaults import INFLUENCE_POSES
-from ..core.features import ROUNDING
-from ..core.partition import INFLUENCE_TOLERANCE, Partition, make_partitions, residual_changes
+from ..core.features import FLOAT32_ROUNDING_RATIO
+from ..core.partition import INFLUENCE_TOLERANCE, Partition, make_partitions, max_residual_changes
 from ..core.poses import CONTROL, Channel
 from ..core.progress import Progress
-from ..core.rig import UNMOVED, Rig
+from ..core.rig import STATIC_JOINT, Rig
 from ..core.skinning import LinearSkinning
 from ..poses.bone_numbers import control_name
 from ..poses.sampling import is_moved_by_constraints
@@ -62,14 +62,16 @@ class _Found:
 
     def __init__(self, rig: Rig, tolerance: float, partitions: tuple[Partition, ...]):
         # Far from the origin, rounding alone moves vertices.
-        self._threshold = max(tolerance * rig.size, 2 * ROUNDING * float(np.abs(rig.rest_positions).max()))
+        self._threshold = max(
+            tolerance * rig.size, 2 * FLOAT32_ROUNDING_RATIO * float(np.abs(rig.rest_positions).max())
+        )
         self.partitions = partitions
         self._joints: dict[int, set[int]] = {p.joint: set() for p in partitions}
         self._controls: dict[int, set[int]] = {p.joint: set() for p in partitions}
 
     def note(self, moves: list[tuple[str, int]], moved: np.ndarray, base: np.ndarray) -> None:
         """Compare residuals with and without a joint or control moved: (n, V, 3) of n moves, (1, V, 3) without."""
-        changes = residual_changes(self.partitions, moved, base)
+        changes = max_residual_changes(self.partitions, moved, base)
         for (kind, index), influenced in zip(moves, changes > self._threshold, strict=True):
             into = self._controls if kind == CONTROL else self._joints
             for number in np.flatnonzero(influenced):
@@ -149,7 +151,7 @@ def _follows_control_bones(scene_rig: SceneRig, rig: Rig, channels: tuple[Channe
     animation = scene_rig.armature_object.animation_data
     paths = [curve.data_path for curve in (animation.drivers if animation else ())]
     driven = {path.split('"')[1] for path in paths if '"' in path}
-    others = [name for name in rig.joint_names if name not in sampled and name != UNMOVED]
+    others = [name for name in rig.joint_names if name not in sampled and name != STATIC_JOINT]
     if any(name not in rig.joint_names for name in sampled if name in bones):
         return True
     return not sampled or any(is_moved_by_constraints(bones[name]) or name in driven for name in others)

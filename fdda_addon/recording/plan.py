@@ -10,7 +10,7 @@ import bpy
 from ..core.controls import Control
 from ..core.defaults import INFLUENCE_POSES, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD
 from ..core.partition import INFLUENCE_TOLERANCE
-from ..core.poses import Channel, Margin, margin_of
+from ..core.poses import Channel, Margin, make_margin
 from ..core.recording.index import RANDOM, Sampling, Source
 from ..core.recording.target import POSE
 from ..core.rig import Rig
@@ -33,7 +33,7 @@ class RecordingSettings:
         poses: number of random poses.
         seed: of the random poses.
         spread: standard deviation of the random poses as a part of half the range of motion.
-        margin: how many times as wide as the range of motion some of the random poses are (`core.poses.margin_of`); 1
+        margin: how many times as wide as the range of motion some of the random poses are (`core.poses.make_margin`); 1
             for none of them.
         actions, strips: names of actions, and of strips of the NLA, whose frames are recorded after the random poses.
         mirror: record each of these frames a second time, mirrored.
@@ -138,11 +138,13 @@ def make_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tu
     clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
     sources += [clip.source for clip in clips]
     own = channels if settings.poses else ()
-    margin = make_margin(scene_rig, settings, own)
+    margin = make_recording_margin(scene_rig, settings, own)
     return Sampling(settings.seed, settings.spread, own, tuple(sources), margin)
 
 
-def make_margin(scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]) -> Margin | None:
+def make_recording_margin(
+    scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]
+) -> Margin | None:
     """The margin of the random poses of a recording, of which `channels` are sampled inside the range of motion."""
     locked = locked_channels(scene_rig.armature_object, channels)
-    return margin_of(channels, locked, settings.margin, settings.poses if channels else 0)
+    return make_margin(channels, locked, settings.margin, settings.poses if channels else 0)

@@ -13,7 +13,7 @@ from ..poses.suspended_limits import SuspendedLimits
 from ..rig.target_time import DIRECT, Approach, shown_again, way
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
-from .plan import RecordingSettings, make_margin
+from .plan import RecordingSettings, make_recording_margin
 
 REPEAT_INDEX = 1 << 36
 """Poses that are passed through are drawn from indices that neither a recording nor an evaluation reaches."""
@@ -52,7 +52,7 @@ class PosePlan:
                 found.setdefault((own, channel.name, channel.kind, channel.axis), (own, channel))
         self._owners = np.array([own for own, _ in found.values()], np.int64)
         self._channels = tuple(channel for _, channel in found.values())
-        self._margin = make_margin(self._rigs[0], settings, self._channels)
+        self._margin = make_recording_margin(self._rigs[0], settings, self._channels)
         self.inside = settings.poses - (self._margin.poses if self._margin else 0)
 
     def channels_of(self, number: int) -> tuple[Channel, ...]:

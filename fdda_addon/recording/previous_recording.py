@@ -5,11 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..core.errors import RecordingError
-from ..core.partition import Partition, merged_partitions
+from ..core.partition import Partition, make_merged_partitions
 from ..core.recording.index import RecordingInfo, read_index, read_info
 from ..core.recording.reader import read_partitions, read_recorded_skin
 from ..core.recording.writer import different_keys
-from ..core.rig import Fingerprint, Rig, differences, read_joints
+from ..core.rig import Fingerprint, Rig, read_joints, rig_differences
 from ..core.skin_fit import SkinFit
 
 
@@ -55,7 +55,7 @@ def read_previous_partitions(path: Path, rig: Rig, min_partition_vertices: int) 
     controls = [control.to_json() for control in rig.controls]
     if joints != rig.joints or index["controls"] != controls or index["vertices"] != rig.vertex_count:
         return None
-    cut = merged_partitions(rig, min_partition_vertices)
+    cut = make_merged_partitions(rig, min_partition_vertices)
     own = [(partition.joint, list(partition.merged)) for partition in cut]
     if own != [(value["joint"], value.get("merged", [])) for value in index["partitions"]]:
         return None
@@ -76,7 +76,7 @@ def check_influences_match(path: Path, rig: Rig, info: RecordingInfo) -> None:
     index = read_index(path)
     found = read_info(index)
     joints = read_joints(index["joints"])
-    different = differences(
+    different = rig_differences(
         joints, rig.rest_matrices, index["vertices"], Fingerprint.from_json(index["rig"]["fingerprint"]), rig
     )
     if found.blender != info.blender:

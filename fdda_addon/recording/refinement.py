@@ -18,8 +18,8 @@ from ..core.progress import Progress
 from ..core.recording.extension import RecordingExtension
 from ..core.recording.index import REFINED
 from ..core.recording.reader import Recording, read_recording
-from ..core.refinement import Probes, choose_poses, nearest_distances
-from ..core.rig import Rig, differences
+from ..core.refinement import Probes, choose_poses, nearest_recorded_distances
+from ..core.rig import Rig, rig_differences
 from ..core.skinning import LinearSkinning
 from ..poses.sampling import model_channels, states_channels
 from ..rig.borrowed_rig import borrowed_rig
@@ -120,7 +120,7 @@ def _probe(channels: tuple[Channel, ...], seed: int, index: int) -> np.ndarray:
 
 def _check_recording(scene_rig: SceneRig, recording: Recording, rig: Rig, channels: tuple[Channel, ...]) -> None:
     own = recording.rig
-    found = differences(own.joints, own.rest_matrices, own.vertex_count, own.fingerprint, rig)
+    found = rig_differences(own.joints, own.rest_matrices, own.vertex_count, own.fingerprint, rig)
     if found:
         raise RecordingError(f"'{recording.path}' is a recording of another rig: {'; '.join(found)}. Record this rig.")
     if not recording.info.sampling.channels:
@@ -160,7 +160,7 @@ def _thinness(recording: Recording, first: int, pose_matrices: np.ndarray) -> np
     )
     return np.stack(
         [
-            nearest_distances(*(f[:, list(p.influencing)].reshape(len(f), -1) for f in (probes, recorded)))
+            nearest_recorded_distances(*(f[:, list(p.influencing)].reshape(len(f), -1) for f in (probes, recorded)))
             for p in recording.partitions
         ],
         axis=1,

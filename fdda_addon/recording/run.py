@@ -10,7 +10,7 @@ from typing import TypeVar
 import bpy
 
 from ..core.errors import RecordingError
-from ..core.partition import GOLDEN_RATIO, merged_partitions, nearby_influences
+from ..core.partition import GOLDEN_RATIO, assume_nearby_influences, make_merged_partitions
 from ..core.poses import sample_pose
 from ..core.progress import Progress
 from ..core.recording.estimate import check_room, recording_bytes
@@ -203,11 +203,11 @@ def _find_influences(
             f"The influences in '{known}' are of other partitions than those of '{mesh.name}'; find them with the same "
             "rig and options (record --detect-influences)."
         )
-    cut = merged_partitions(mesh.rig, settings.min_partition_vertices)
+    cut = make_merged_partitions(mesh.rig, settings.min_partition_vertices)
     target = mesh.planned.target
     if target and target.follows != POSE:
         # What depends on time does not answer when a joint is moved.
-        return InfluencesReady(mesh, nearby_influences(mesh.rig, cut), evaluator)
+        return InfluencesReady(mesh, assume_nearby_influences(mesh.rig, cut), evaluator)
     partitions = yield from find_influences(scene_rig, mesh.rig, cut, evaluator, search)
     return InfluencesReady(mesh, partitions, evaluator)
 

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import RigError
-from ..core.features import ROUNDING
+from ..core.features import FLOAT32_ROUNDING_RATIO
 from ..core.partition import INFLUENCE_TOLERANCE
 from ..core.recording.target import POSE
 from ..poses.clip_player import ClipPlayer
@@ -71,7 +71,7 @@ def _compare(
     apart = float(np.linalg.norm(positions - other_positions, axis=1).max())
     mesh_object = mesh.planned.scene_rig.mesh_object
     extent = max(float(np.abs(mesh.rig.rest_positions).max()), *map(abs, mesh_object.matrix_world.translation))
-    if apart > max(INFLUENCE_TOLERANCE * mesh.rig.size, 4 * ROUNDING * extent):
+    if apart > max(INFLUENCE_TOLERANCE * mesh.rig.size, 4 * FLOAT32_ROUNDING_RATIO * extent):
         raise RigError(
             f"The surface of '{mesh.name}' differs by {apart * mesh.rig.metres_per_unit * 1000:.2g} mm between frames "
             f"{frames[0]} and {frames[1]} in the same pose, so it does not follow from the pose; look for what reads "

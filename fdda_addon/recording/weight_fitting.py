@@ -13,9 +13,9 @@ from ..core.errors import RecordingError, RigError, TrainingError
 from ..core.messages import MessageType
 from ..core.progress import Progress
 from ..core.recording.fit_folder import MIN_POSES, FitPosesWriter, read_fitted
-from ..core.rig import UNMOVED, Rig
+from ..core.rig import STATIC_JOINT, Rig
 from ..core.skin_fit import SkinFit
-from ..core.temporary import temporary_failed
+from ..core.temporary import temporary_folder_error
 from ..rig.reading import PoseEvaluator
 from ..scene.scene_rig import SceneRig
 from ..training.process import TrainerProcess
@@ -71,7 +71,7 @@ def fit_weights(rig: Rig, kind: str, poses: Iterator[None], count: int, evaluato
         # On Windows a virus scanner may still read what is to be removed.
         temporary = tempfile.TemporaryDirectory(prefix="fdda-fit-", ignore_cleanup_errors=True)
     except OSError as error:
-        raise temporary_failed(error) from error
+        raise temporary_folder_error(error) from error
     with temporary as name:
         folder = Path(name)
         with FitPosesWriter(folder, rig, count) as writer:
@@ -106,7 +106,7 @@ def check_has_weights(scene_rig: SceneRig, rig: Rig) -> None:
         RigError: no vertex follows a bone.
     """
     names = {rig.joint_names[joint] for joint in np.unique(rig.skin_joints[rig.skin_weights > 0])}
-    if names <= {UNMOVED}:
+    if names <= {STATIC_JOINT}:
         raise RigError(
             f"The vertices of '{scene_rig.mesh_object.name}' have no weights on deforming bones of "
             f"'{scene_rig.armature_object.name}', so there is no linear skinning to learn from; have one fitted "

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import bpy
 import numpy as np
 
-from ..core.rig import UNMOVED, Joint
+from ..core.rig import STATIC_JOINT, Joint
 from ..poses.sampling import own_channels
 from ..scene.scene_rig import SceneRig
 from .dependencies import read_dependencies
@@ -25,7 +25,7 @@ def choose_joints(
 
     Args:
         scene_rig: the rig.
-        skinning: names of the bones that have weights; all deforming bones when there are none. `UNMOVED` counts.
+        skinning: names of the bones that have weights; all deforming bones when there are none. `STATIC_JOINT` counts.
         besides: names of other joints; those that the armature lacks are left out. Where they are all of the joints,
             theirs is the order of the joints: that of the bones changes with bones that are none. When it is not
             given, the bones that state a range of motion, those that the mesh depends on otherwise, and all bones
@@ -35,26 +35,26 @@ def choose_joints(
     bones = armature_object.data.bones
     wanted = set(skinning)
     besides = None if besides is None else list(besides)
-    if not wanted - {UNMOVED}:
+    if not wanted - {STATIC_JOINT}:
         wanted |= {bone.name for bone in bones if bone.use_deform}
     if besides is not None:
-        wanted |= {name for name in besides if name in bones or name == UNMOVED}
+        wanted |= {name for name in besides if name in bones or name == STATIC_JOINT}
     else:
         wanted |= {channel.name for channel in own_channels(armature_object, set())}
         wanted |= read_dependencies(scene_rig).bones
-        wanted |= {above.name for name in wanted - {UNMOVED} for above in bones[name].parent_recursive}
+        wanted |= {above.name for name in wanted - {STATIC_JOINT} for above in bones[name].parent_recursive}
     own = [bone for bone in bones if bone.name in wanted]
     parents = _parents(own)
     depths = {bone.name: _depth(bone.name, parents) for bone in own}
     ordered = sorted((bone.name for bone in own), key=depths.__getitem__)
-    given = [name for name in besides or () if name != UNMOVED]
+    given = [name for name in besides or () if name != STATIC_JOINT]
     if set(given) == set(ordered):
         places = {name: place for place, name in enumerate(given)}
         if all(places.get(parents[name], -1) < places[name] for name in given):
             ordered = given
     index = {name: number for number, name in enumerate(ordered)}
     joints = [Joint(name, index[parents[name]] if parents[name] else -1) for name in ordered]
-    return (*joints, *([Joint(UNMOVED, -1)] if UNMOVED in wanted else []))
+    return (*joints, *([Joint(STATIC_JOINT, -1)] if STATIC_JOINT in wanted else []))
 
 
 def _parents(own: list[bpy.types.Bone]) -> dict[str, str]:

@@ -9,9 +9,9 @@ import numpy as np
 from mathutils import Matrix
 
 from ..core.errors import RigError
-from ..core.features import ROUNDING
+from ..core.features import FLOAT32_ROUNDING_RATIO
 from ..core.model import ModelInfo
-from ..core.rig import UNMOVED, Fingerprint, Rig
+from ..core.rig import STATIC_JOINT, Fingerprint, Rig
 from ..poses.sampling import model_channels, sampled_channels
 from ..scene import armature as armature_io
 from ..scene import mesh as mesh_io
@@ -62,7 +62,7 @@ def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None, with_unm
     rest_positions = mesh_io.rest_positions(mesh_object.data)
     _check_rest_positions(mesh_object, rest_positions)
     skin = read_skin(mesh_object, armature_object, armature_modifier(mesh_object))
-    joints = choose_joints(scene_rig, (*skin.bones, UNMOVED) if with_unmoved else skin.bones, besides)
+    joints = choose_joints(scene_rig, (*skin.bones, STATIC_JOINT) if with_unmoved else skin.bones, besides)
     names = tuple(joint.name for joint in joints)
     skin_joints, skin_weights = skin.arrays({name: number for number, name in enumerate(names)})
     rest = joint_rest_matrices(scene_rig, names)
@@ -99,7 +99,7 @@ def _check_rest_positions(mesh_object: bpy.types.Object, rest_positions: np.ndar
         )
     if count == 1:
         raise RigError(f"The mesh of '{name}' has one vertex, and no surface to learn; choose another object.")
-    if np.ptp(rest_positions, axis=0).max() <= ROUNDING * np.abs(rest_positions).max():
+    if np.ptp(rest_positions, axis=0).max() <= FLOAT32_ROUNDING_RATIO * np.abs(rest_positions).max():
         raise RigError(
             f"All {count:,} vertices of '{name}' lie at one point in the rest pose, so the mesh has no size; give the "
             "mesh, or its Basis shape key, its shape."
@@ -129,7 +129,7 @@ def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
 def joint_rest_matrices(scene_rig: SceneRig, names: tuple[str, ...]) -> np.ndarray:
     """(J, 4, 4) float64 rest pose of joints, mesh-object space, mesh units; the identity for the unmoved joint."""
     rest = armature_io.rest_matrices(scene_rig.armature_object.data, names)
-    moved = np.array([name != UNMOVED for name in names], bool)
+    moved = np.array([name != STATIC_JOINT for name in names], bool)
     rest[moved] = mesh_from_armature(scene_rig.mesh_object, scene_rig.armature_object) @ rest[moved]
     return rest
 

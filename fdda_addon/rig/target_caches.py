@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 
 from ..core.alembic import time_range
-from ..core.errors import PointCacheError, RigError, os_reason
+from ..core.errors import PointCacheError, RigError, os_error_text
 from ..core.mesh_cache import mesh_cache_frames
 from ..scene.node_groups import SIMULATION_NODES, time_node
 from ..scene.scene_rig import SceneRig
@@ -99,7 +99,7 @@ def _of_file(cache_file: bpy.types.CacheFile, words: str) -> Cache:
         try:
             found = _frames_of(path, bpy.context.scene.render.fps / bpy.context.scene.render.fps_base)
         except OSError as error:
-            raise RigError(f"'{path}' of {words} cannot be read: {os_reason(error)}.") from error
+            raise RigError(f"'{path}' of {words} cannot be read: {os_error_text(error)}.") from error
     if found is None:
         return Cache(words)
     # Blender asks a file for the frame of the scene less the offset.

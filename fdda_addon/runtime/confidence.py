@@ -4,7 +4,7 @@
 import bpy
 
 from ..core.errors import FDDAError
-from ..core.rig import UNMOVED
+from ..core.rig import STATIC_JOINT
 from ..rig.reading import PoseReader
 from ..scene.controls import ControlReader
 from ..scene.scene_rig import SceneRig, armature_of
@@ -27,7 +27,7 @@ def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float
     try:
         network = model_files.network_of(mesh_object)
         names = tuple(joint.name for joint in network.info.joints)
-        if any(name not in armature_object.data.bones for name in names if name != UNMOVED):
+        if any(name not in armature_object.data.bones for name in names if name != STATIC_JOINT):
             return None
         depsgraph = bpy.context.evaluated_depsgraph_get()
         evaluated = [o.evaluated_get(depsgraph) for o in (mesh_object, armature_object)]

@@ -11,8 +11,8 @@ import bpy
 import numpy as np
 
 from ..core.errors import FDDAError, ModelError, RigError
-from ..core.mask import Blend
-from ..core.rig import UNMOVED
+from ..core.mask import SkinningBlend
+from ..core.rig import STATIC_JOINT
 from ..rig.reading import PoseReader, read_model_rig
 from ..scene.arrays import MUTE, write
 from ..scene.controls import ControlReader
@@ -77,7 +77,7 @@ class LiveBinding:
         self._reader = self._make_reader(scene_rig)
         self._controls = ControlReader(scene_rig, info.controls)
         self._mask_key, self._mask = mask_key(mesh_object), read_mask(mesh_object)
-        self._blend: Blend | None = None
+        self._blend: SkinningBlend | None = None
         self.execution = self._own_execution = Execution(self.network, 1)
         self.job: Job | None = None
         self.was_executed = False
@@ -300,11 +300,11 @@ class LiveBinding:
         )
         return (skin @ info.rest_matrices).astype(np.float32)
 
-    def _make_blend(self, scene_rig: SceneRig) -> Blend:
+    def _make_blend(self, scene_rig: SceneRig) -> SkinningBlend:
         """What blends the model with linear skinning."""
         rig = self.network.linear_rig(read_model_rig(scene_rig, self.network.info))
         # The rest pose of the model: the objects may have moved since, and pose matrices refer to it.
-        return Blend(replace(rig, rest_matrices=self.network.info.rest_matrices), self._mask)
+        return SkinningBlend(replace(rig, rest_matrices=self.network.info.rest_matrices), self._mask)
 
     def _look_for_numbers(self, positions: np.ndarray) -> None:
         if not np.isfinite(positions).all():
@@ -332,7 +332,7 @@ class LiveBinding:
     def _make_reader(self, scene_rig: SceneRig) -> PoseReader:
         info, armature_object = self.network.info, scene_rig.armature_object
         known = armature_object.data.bones
-        if missing := [name for name in info.joint_names if name not in known and name != UNMOVED]:
+        if missing := [name for name in info.joint_names if name not in known and name != STATIC_JOINT]:
             raise ModelError(
                 f"The armature '{armature_object.name}' lacks the joint '{missing[0]}' of the model "
                 f"'{self.network.path.name}'; name it as before, or bind a model of this rig."

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from ..core.errors import ModelError, os_reason
+from ..core.errors import ModelError, os_error_text
 from ..scene.model_trust import is_trusted
 from ..scene.stored_paths import absolute_path, origin, resolved
 from . import packed
@@ -35,7 +35,7 @@ def load_network(path: Path) -> Network:
     try:
         status = os.stat(path)
     except OSError as error:
-        raise ModelError(f"The model '{path}' cannot be read: {os_reason(error)}; bind another.") from error
+        raise ModelError(f"The model '{path}' cannot be read: {os_error_text(error)}; bind another.") from error
     stamp = (status.st_mtime_ns, status.st_size)
     if path not in _networks or _networks[path][0] != stamp:
         _networks[path] = (stamp, Network(path))

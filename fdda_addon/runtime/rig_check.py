@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import ModelError
-from ..core.rig import UNMOVED, Fingerprint, Rig, are_same_rest, differences
+from ..core.rig import STATIC_JOINT, Fingerprint, Rig, rest_matrices_match, rig_differences
 from ..rig.deformation import read_b_bones, read_deformation
 from ..rig.reading import read_model_rig
 from ..scene.arrays import Element, read
@@ -125,7 +125,7 @@ def check(scene_rig: SceneRig, network: Network, form: Form) -> None:
         return
     rig = read_model_rig(scene_rig, info)
     rig = replace(rig, rest_matrices=_beside(rig, info.joint_names, info.rest_matrices))
-    found = differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
+    found = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
     if found:
         raise ModelError(
             f"The rig of '{mesh_object.name}' is not the one that its model '{network.path.name}' was trained for: "
@@ -151,8 +151,8 @@ def _beside(rig: Rig, names: tuple[str, ...], rest_matrices: np.ndarray) -> np.n
     Animation moves either of them on its own, which changes no rig. Where the relation is another, the first joint
     tells which.
     """
-    moved = [place for place, name in enumerate(rig.joint_names) if name != UNMOVED]
-    if rig.joint_names != names or not moved or are_same_rest(rest_matrices, rig):
+    moved = [place for place, name in enumerate(rig.joint_names) if name != STATIC_JOINT]
+    if rig.joint_names != names or not moved or rest_matrices_match(rest_matrices, rig):
         return rig.rest_matrices
     ours, theirs = rig.rest_matrices.astype(np.float64), rest_matrices.astype(np.float64)
     ours[moved] = theirs[moved[0]] @ np.linalg.inv(ours[moved[0]]) @ ours[moved]

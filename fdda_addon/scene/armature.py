@@ -6,7 +6,7 @@ import numpy as np
 from mathutils import Euler, Quaternion
 
 from ..core.poses import CONTROL, LOCATION, ROTATION, ROTATION_VECTOR, SCALE, Channel
-from ..core.rig import UNMOVED
+from ..core.rig import STATIC_JOINT
 from .arrays import POSE_CHANNELS, POSE_MATRIX, Reader, write
 from .controls import set_control
 from .scene_rig import SceneRig
@@ -15,7 +15,7 @@ from .scene_rig import SceneRig
 def rest_matrices(armature: bpy.types.Armature, names: tuple[str, ...]) -> np.ndarray:
     """Rest matrices of bones, (J, 4, 4) float64, armature space, its units; the identity for the unmoved joint."""
     identity = np.eye(4)
-    matrices = [identity if name == UNMOVED else armature.bones[name].matrix_local for name in names]
+    matrices = [identity if name == STATIC_JOINT else armature.bones[name].matrix_local for name in names]
     return np.array(matrices, np.float64).reshape(-1, 4, 4)
 
 
@@ -34,7 +34,7 @@ class PoseMatrices:
         index = {bone.name: number for number, bone in enumerate(armature_object.pose.bones)}
         self._count = len(index)
         # Behind the bones there is an identity, for the joint that never moves.
-        order = np.array([index[name] if name != UNMOVED else self._count for name in names], np.int32)
+        order = np.array([index[name] if name != STATIC_JOINT else self._count for name in names], np.int32)
         in_a_row = np.array_equal(order, np.arange(len(order)))
         self._order = slice(0, len(order)) if in_a_row else order
         self._matrices = np.empty((self._count + 1, 4, 4), np.float32)

@@ -11,8 +11,8 @@ import bpy
 
 from ..core.errors import FDDAError
 from ..core.open_files import remove_file
-from ..core.output import check_writable, replacing
-from ..core.path_limits import too_long
+from ..core.output import atomic_write, check_writable
+from ..core.path_limits import path_length_problem
 
 SEEK_TABLE_END = bytes.fromhex("b1ea928f")
 """Last bytes of a compressed .blend file, which is one of Zstandard's seekable format."""
@@ -25,7 +25,7 @@ def save_copy(path: Path) -> None:
         OutputError: it cannot be written.
     """
     check_writable(path)
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         # Blender keeps a second copy of a file that it saves over.
         remove_file(temporary)
         try:
@@ -47,7 +47,7 @@ def blender_path(path: Path) -> str:
         FDDAError: it is too long.
     """
     absolute = path.absolute()
-    if limit := too_long(absolute):
+    if limit := path_length_problem(absolute):
         raise FDDAError(f"Blender cannot open or write '{path}': {limit}; choose a shorter folder.")
     return str(absolute)
 

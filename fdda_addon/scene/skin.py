@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from ..core.rig import UNMOVED
+from ..core.rig import STATIC_JOINT
 from .mesh import rest_positions
 
 MIN_INFLUENCES = 4
@@ -26,7 +26,7 @@ class Skin:
     """Weights of a mesh, one entry for each vertex and bone with a weight.
 
     Attributes:
-        bones: names of the bones that have weights, `UNMOVED` where something follows no bone.
+        bones: names of the bones that have weights, `STATIC_JOINT` where something follows no bone.
         vertices: (n,) int64, ascending.
         places: (n,) int64 indices into `bones`.
         weights: (n,) float32; those of a vertex sum to 1.
@@ -87,7 +87,7 @@ def read_skin(
     unmoved = np.flatnonzero(kept < 1)
     here = np.full(len(unmoved), len(bones))
     entries = entries.joined(_Entries(unmoved, here, (1 - kept[unmoved]).astype(np.float32))).sorted()
-    names = np.array([*(bone.name for bone in bones), UNMOVED], object)
+    names = np.array([*(bone.name for bone in bones), STATIC_JOINT], object)
     used, places = np.unique(entries.places, return_inverse=True)
     return Skin(tuple(names[used]), entries.vertices, places, entries.weights, count)
 

@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import BinaryIO, TextIO
 
-from ..core.errors import OutputError, os_reason
+from ..core.errors import OutputError, os_error_text
 from ..core.output import write_json
 from .environment.folder import user_folder
 from .environment.subprocesses import hidden
@@ -167,7 +167,7 @@ class _ProcessFiles:
             path.parent.mkdir(parents=True, exist_ok=True)
             return path.open("w+b")
         except OSError as error:
-            raise OutputError(f"Cannot write '{path}': {os_reason(error)}; make room there.") from error
+            raise OutputError(f"Cannot write '{path}': {os_error_text(error)}; make room there.") from error
 
     def write_process_id(self, process_id: int) -> None:
         """Keep the number of the process; raises OutputError."""

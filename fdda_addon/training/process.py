@@ -18,11 +18,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self, TextIO
 
-from ..core.errors import TRY_AGAIN, TrainingDiedError, TrainingError, WrongUsageError, os_reason
+from ..core.errors import TRY_AGAIN, TrainingDiedError, TrainingError, WrongUsageError, os_error_text
 from ..core.messages import STOP_FILE_VARIABLE, Message, MessageType
 from ..core.native_library import runtime_advice
 from ..core.stop_signals import INTERRUPTED
-from ..core.temporary import temporary_failed
+from ..core.temporary import temporary_folder_error
 from .endings import explain_status
 from .environment.choice import chosen_python
 from .environment.folder import ROOT
@@ -86,7 +86,7 @@ class TrainerProcess:
         try:
             self._stop_file, self._errors = self._new_stop_file(), self._new_errors()
         except OSError as error:
-            raise temporary_failed(error) from error
+            raise temporary_folder_error(error) from error
         environment |= {STOP_FILE_VARIABLE: str(self._stop_file), **UTF8_OUTPUT}
         # Ctrl-C may strike between the start of the process and the block that ends it.
         self._abandoned = weakref.finalize(self, Path.touch, self._stop_file)
@@ -96,7 +96,7 @@ class TrainerProcess:
             self._abandoned.detach()
             self._errors.close()
             raise TrainingError(
-                f"The trainer's Python '{command[0]}' cannot be started ({os_reason(error)}); {advice}."
+                f"The trainer's Python '{command[0]}' cannot be started ({os_error_text(error)}); {advice}."
             ) from error
         self._follow()
 

@@ -15,7 +15,7 @@ import pytest
 from .. import systems
 from .refusals import Refusal, files, save_elbow, small_files
 
-pytestmark = pytest.mark.one_line
+pytestmark = pytest.mark.to_single_line
 
 
 @pytest.fixture

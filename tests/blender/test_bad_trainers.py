@@ -18,7 +18,7 @@ from .conftest import run
 from .refusals import Refusal
 from .stand_ins import say, stand_in_trainer
 
-pytestmark = pytest.mark.one_line
+pytestmark = pytest.mark.to_single_line
 
 
 @pytest.fixture

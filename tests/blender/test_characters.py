@@ -17,7 +17,7 @@ from blend_fixtures.characters.comparison import compare_row, record_row
 from blend_fixtures.characters.rows import ROWS, Row
 from blend_fixtures.characters.training import SMALL, Trainings
 
-pytestmark = pytest.mark.one_line
+pytestmark = pytest.mark.to_single_line
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "characters.md"

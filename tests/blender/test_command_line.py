@@ -16,7 +16,7 @@ from fdda_addon.runtime import model_files, playback
 from .conftest import assert_plays, evaluated, pose, run
 from .refusals import files, save_elbow
 
-pytestmark = pytest.mark.one_line
+pytestmark = pytest.mark.to_single_line
 
 
 @pytest.mark.parametrize("arguments", [["--help"], *([verb, "--help"] for verb in VERBS)], ids=" ".join)

@@ -18,7 +18,7 @@ from fdda_addon.training.process import trainer_python
 
 from .conftest import run
 
-pytestmark = pytest.mark.one_line
+pytestmark = pytest.mark.to_single_line
 
 ROOT = Path(__file__).resolve().parents[2]
 

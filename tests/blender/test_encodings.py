@@ -12,7 +12,7 @@ import pytest
 
 from .refusals import save_elbow
 
-pytestmark = pytest.mark.one_line
+pytestmark = pytest.mark.to_single_line
 
 ROOT = Path(__file__).resolve().parents[2]
 ASCII = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}

@@ -14,7 +14,7 @@ from .. import systems
 from .conftest import run
 from .refusals import Refusal, files
 
-pytestmark = pytest.mark.one_line
+pytestmark = pytest.mark.to_single_line
 
 IS_READ = "it is read for this; give another name, or --overwrite."
 IS_OTHER = "another file is there, which is not {}; give another name, or --overwrite."

@@ -24,7 +24,7 @@ from .conftest import ELBOW_RIG, run, train
 from .refusals import files
 from .scene_state import scene_state
 
-pytestmark = pytest.mark.one_line
+pytestmark = pytest.mark.to_single_line
 
 
 @pytest.fixture

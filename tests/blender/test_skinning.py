@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from blend_fixtures.elbow import build_elbow
-from fdda_addon.core.rig import UNMOVED
+from fdda_addon.core.rig import STATIC_JOINT
 from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.rig.reading import PoseEvaluator, read_rig
 from fdda_addon.scene.scene_rig import find_rig
@@ -132,7 +132,7 @@ def test_linear_skinning_is_blenders(smooth: bpy.types.Object, change: Callable)
 def test_what_follows_no_bone_follows_the_unmoved_joint(smooth: bpy.types.Object, change: Callable):
     change(smooth)
     rig = read_rig(find_rig())
-    (unmoved,) = (number for number, joint in enumerate(rig.joints) if joint.name == UNMOVED)
+    (unmoved,) = (number for number, joint in enumerate(rig.joints) if joint.name == STATIC_JOINT)
     assert rig.joints[unmoved].parent == -1 and np.array_equal(rig.rest_matrices[unmoved], np.eye(4))
     assert rig.skin_weights[rig.skin_joints == unmoved].sum() > 1
 

@@ -10,7 +10,7 @@ import pytest
 
 from .conftest import run
 
-pytestmark = pytest.mark.one_line
+pytestmark = pytest.mark.to_single_line
 
 ROOT = Path(__file__).resolve().parents[2]
 SEED = 77

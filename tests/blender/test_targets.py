@@ -12,7 +12,7 @@ from blend_fixtures.characters import targets
 from blend_fixtures.elbow import ACTION, FRAMES
 from fdda_addon.core.alembic import time_range
 from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.rig import UNMOVED
+from fdda_addon.core.rig import STATIC_JOINT
 from fdda_addon.scene.blend_file import save_copy
 
 from .conftest import run, train
@@ -72,7 +72,7 @@ def test_a_target_is_recorded_as_the_rig_that_it_shows(build, own, tmp_path):
     recording = of_flesh(rig, tmp_path / "recording", *(["--poses", 0] if build is targets.target_copy else []))
     assert len(recording.pose_matrices) == FRAMES
     # Beside the bones is the joint that never moves, where the target may know which way is down.
-    names = ["upper", "lower"] if build is targets.target_copy else ["upper", "lower", UNMOVED]
+    names = ["upper", "lower"] if build is targets.target_copy else ["upper", "lower", STATIC_JOINT]
     assert list(recording.rig.joint_names) == names
     assert np.array_equal(recording.pose_matrices[:, :2], own.pose_matrices)
     apart = np.abs(complex_positions(recording) - complex_positions(own)).max()

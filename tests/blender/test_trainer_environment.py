@@ -24,7 +24,7 @@ from .conftest import run
 from .stand_ins import program
 from .tiny_wheels import pinned, write_wheel, write_wheels
 
-pytestmark = pytest.mark.one_line
+pytestmark = pytest.mark.to_single_line
 
 ROOT = Path(__file__).resolve().parents[2]
 

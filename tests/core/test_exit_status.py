@@ -8,15 +8,15 @@ import pytest
 from fdda_addon.core.errors import (
     TRY_AGAIN,
     BusyError,
-    NoRoomError,
+    DiskFullError,
     OutputError,
     RigError,
     TrainingDiedError,
     WrongUsageError,
     exit_status,
-    os_reason,
+    os_error_text,
 )
-from fdda_addon.core.output import replacing
+from fdda_addon.core.output import atomic_write
 
 
 def caused_by(cause: BaseException) -> OutputError:
@@ -37,14 +37,14 @@ def test_what_windows_says_of_the_machine(number):
     error = OSError(errno.EINVAL, "in the language of the system")
     error.winerror = number
     assert exit_status(caused_by(error)) == TRY_AGAIN
-    assert os_reason(error) != error.strerror and os_reason(error).isascii()
+    assert os_error_text(error) != error.strerror and os_error_text(error).isascii()
 
 
 def test_what_windows_says_is_not_quoted():
     error = PermissionError(errno.EACCES, "Zugriff verweigert")
     error.winerror = 5
-    assert os_reason(error) == "Permission denied" and exit_status(caused_by(error)) == 1
-    assert os_reason(OSError(errno.EINVAL, "it is no ordinary file")) == "it is no ordinary file"
+    assert os_error_text(error) == "Permission denied" and exit_status(caused_by(error)) == 1
+    assert os_error_text(OSError(errno.EINVAL, "it is no ordinary file")) == "it is no ordinary file"
 
 
 @pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES, errno.EISDIR, errno.EROFS, errno.ENAMETOOLONG])
@@ -53,12 +53,12 @@ def test_what_the_user_caused_will_never_work(number):
 
 
 def test_errors_that_say_so_themselves():
-    assert [exit_status(kind("text")) for kind in (BusyError, NoRoomError, TrainingDiedError)] == [TRY_AGAIN] * 3
+    assert [exit_status(kind("text")) for kind in (BusyError, DiskFullError, TrainingDiedError)] == [TRY_AGAIN] * 3
     assert exit_status(RigError("text")) == 1 and exit_status(WrongUsageError("text")) == 2
     assert exit_status(caused_by(MemoryError())) == TRY_AGAIN
 
 
 def test_a_full_disk_through_the_writer_of_files(tmp_path):
-    with pytest.raises(OutputError) as failed, replacing(tmp_path / "a.json"):
+    with pytest.raises(OutputError) as failed, atomic_write(tmp_path / "a.json"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert exit_status(failed.value) == TRY_AGAIN and list(tmp_path.iterdir()) == []

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdda_addon.core.features import joint_features, steady_features
+from fdda_addon.core.features import joint_features, joint_features_in_metres
 
 from .limb import JOINTS, make_rig, random_poses, random_transforms
 
@@ -45,18 +45,18 @@ def test_moving_the_root_moves_the_features_of_the_root_alone():
     assert np.abs(after[:, 0] - before[:, 0]).max() > 0.1
 
 
-def test_lengths_of_steady_features_are_metres():
+def test_translations_are_in_metres():
     rig, poses = replace(make_rig(), metres_per_unit=0.01), random_poses(8)
     scale = np.where(np.arange(12) % 4 == 3, 0.01, 1)
     expected = joint_features(poses, rig.rest_matrices, rig.parents) * scale
-    np.testing.assert_allclose(steady_features(poses, rig), expected, atol=1e-6)
+    np.testing.assert_allclose(joint_features_in_metres(poses, rig), expected, atol=1e-6)
 
 
-def test_rounding_does_not_move_steady_features():
+def test_rounding_does_not_move_features():
     """The character turns as a whole, 100 m from the origin: its joints stay where they are in their parents."""
     rig, rng = make_rig(), np.random.default_rng(5)
     turns = np.array([random_transforms(rng) for _ in range(8)])
     turns[:, :3, 3] += 100
     poses = (turns[:, None] @ rig.rest_matrices).astype(np.float32)
     assert np.ptp(joint_features(poses, rig.rest_matrices, rig.parents)[:, 1:, 3::4], axis=0).max() > 0
-    assert np.ptp(steady_features(poses, rig)[:, 1:, 3::4], axis=0).max() == 0
+    assert np.ptp(joint_features_in_metres(poses, rig)[:, 1:, 3::4], axis=0).max() == 0

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.metrics import HEAT_NONE, distances, error_statistics, heat_colors, worst_poses
+from fdda_addon.core.metrics import NO_ERROR_COLOR, distances, error_statistics, heat_colors, worst_poses
 
 
 def test_distances_are_of_vertices():
@@ -42,8 +42,8 @@ BLUE, VIOLET, RED = (0.10, 0.25, 0.95), (0.60, 0.10, 0.80), (0.95, 0.05, 0.05)
 @pytest.mark.parametrize(
     ("error", "color"),
     [
-        (0.0, HEAT_NONE),
-        (0.99e-6, HEAT_NONE),
+        (0.0, NO_ERROR_COLOR),
+        (0.99e-6, NO_ERROR_COLOR),
         (1e-6, BLUE),
         (0.005, VIOLET),
         (0.0075, np.mean([VIOLET, RED], axis=0)),
@@ -70,7 +70,7 @@ def test_more_error_is_more_red():
 
 def test_a_narrower_range_moves_the_colours_and_not_what_counts_as_none():
     np.testing.assert_allclose(heat_colors(np.array([0.0005, 0.001]), 0.001), [VIOLET, RED], atol=1e-5)
-    assert np.array_equal(heat_colors(np.array([0.5e-6]), 0.001)[0], np.float32(HEAT_NONE))
+    assert np.array_equal(heat_colors(np.array([0.5e-6]), 0.001)[0], np.float32(NO_ERROR_COLOR))
 
 
 def test_worst_poses_are_apart_and_in_order():

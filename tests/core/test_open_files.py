@@ -13,7 +13,7 @@ import pytest
 
 from fdda_addon.core import open_files
 from fdda_addon.core.errors import TRY_AGAIN, OutputError, exit_status
-from fdda_addon.core.output import replacing_all, write_text
+from fdda_addon.core.output import atomic_write_all, write_text
 from fdda_addon.core.recording.folder import remove_recording
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.place import check_recordable
@@ -72,7 +72,7 @@ def refused(monkeypatch):
         rename(source, target)
 
     monkeypatch.setattr(os, "replace", replace)
-    monkeypatch.setattr(open_files, "PATIENCE_SECONDS", 0.3)
+    monkeypatch.setattr(open_files, "RETRY_SECONDS", 0.3)
     monkeypatch.setattr(open_files, "MAX_PAUSE_SECONDS", 0.01)
     return left.update
 
@@ -82,7 +82,7 @@ def contents(folder: Path) -> dict[str, str]:
 
 
 def test_what_is_open_for_a_moment_is_waited_for(tmp_path, refused, monkeypatch):
-    monkeypatch.setattr(open_files, "PATIENCE_SECONDS", 30)
+    monkeypatch.setattr(open_files, "RETRY_SECONDS", 30)
     write_text(tmp_path / "a", "old")
     refused({"a": 5})
     write_text(tmp_path / "a", "new")
@@ -95,7 +95,7 @@ def test_what_stays_open_is_not_replaced_and_what_was_made_is_kept(tmp_path, ref
     for path in paths[:2]:
         path.write_text("old")
     refused({paths[number].name: 10**9})
-    with pytest.raises(OutputError) as failed, replacing_all(*paths) as temporaries:
+    with pytest.raises(OutputError) as failed, atomic_write_all(*paths) as temporaries:
         for temporary in temporaries:
             temporary.write_text("new")
     assert str(failed.value) == (
@@ -135,7 +135,7 @@ def test_a_file_is_replaced_while_another_process_reads_it_all_the_time(tmp_path
 
 @on_windows
 def test_a_file_that_another_process_keeps_open_stays_and_the_new_one_is_kept(tmp_path, read, monkeypatch):
-    monkeypatch.setattr(open_files, "PATIENCE_SECONDS", 0.5)
+    monkeypatch.setattr(open_files, "RETRY_SECONDS", 0.5)
     paths = [tmp_path / "a", tmp_path / "b"]
     for path in paths:
         path.write_text("old")
@@ -143,7 +143,7 @@ def test_a_file_that_another_process_keeps_open_stays_and_the_new_one_is_kept(tm
     time.sleep(0.2)
     with (
         pytest.raises(OutputError, match="another program has it open; nothing was changed") as failed,
-        replacing_all(*paths) as temporaries,
+        atomic_write_all(*paths) as temporaries,
     ):
         for temporary in temporaries:
             temporary.write_text("new")
@@ -165,7 +165,7 @@ def test_a_recording_is_written_while_another_process_reads_it_all_the_time(tmp_
 
 @on_windows
 def test_a_recording_that_is_mapped_is_neither_removed_nor_replaced(tmp_path, monkeypatch):
-    monkeypatch.setattr(open_files, "PATIENCE_SECONDS", 0.2)
+    monkeypatch.setattr(open_files, "RETRY_SECONDS", 0.2)
     record_limb(tmp_path / "r", 12)
     opened = read_recording(tmp_path / "r")
     with pytest.raises(OutputError, match=r"Cannot remove .*: another program has it open; end what uses it"):

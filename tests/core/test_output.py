@@ -14,11 +14,11 @@ import pytest
 from fdda_addon.core import output
 from fdda_addon.core.errors import OutputError
 from fdda_addon.core.output import (
+    atomic_write,
+    atomic_write_all,
     check_folder_writable,
     check_writable,
-    is_left_over,
-    replacing,
-    replacing_all,
+    is_temporary_name,
     write_json,
     write_text,
 )
@@ -36,7 +36,7 @@ def names(folder: Path) -> list[str]:
 def test_a_file_is_replaced(tmp_path):
     path = tmp_path / "a.txt"
     write_text(path, "old")
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text("new")
         assert path.read_text() == "old"
         assert temporary.parent == tmp_path
@@ -48,7 +48,7 @@ def test_a_file_is_replaced(tmp_path):
 def test_an_error_leaves_the_old_file(tmp_path, error):
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(error), replacing(path) as temporary:
+    with pytest.raises(error), atomic_write(path) as temporary:
         temporary.write_text("half")
         raise error
     assert path.read_text() == "old" and names(tmp_path) == ["a.txt"]
@@ -70,10 +70,10 @@ def test_names_of_temporary_files_cannot_be_foreseen_and_no_link_is_followed(tmp
     (tmp_path / f".{os.getpid()}-a.json").symlink_to(victim)
     seen = set()
     for _ in range(20):
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             seen.add(temporary.name)
             temporary.write_text("new")
-    assert len(seen) == 20 and all(is_left_over(name) for name in seen)
+    assert len(seen) == 20 and all(is_temporary_name(name) for name in seen)
     assert victim.read_text() == "precious" and path.read_text() == "new"
     # Even one who knows the name gains nothing.
     monkeypatch.setattr("secrets.token_hex", lambda _: "0" * 12)
@@ -89,13 +89,13 @@ def test_files_that_belong_together_are_replaced_together(tmp_path):
         path.write_text("old")
     with (
         pytest.raises(OutputError, match=r"'.*a' with 'b', 'c': No space left on device; nothing was changed"),
-        replacing_all(*paths) as temporaries,
+        atomic_write_all(*paths) as temporaries,
     ):
         for temporary in temporaries[:2]:
             temporary.write_text("new")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert [path.read_text() for path in paths[:2]] == ["old", "old"] and names(tmp_path) == ["a", "b"]
-    with replacing_all(*paths) as temporaries:
+    with atomic_write_all(*paths) as temporaries:
         for temporary in temporaries:
             temporary.write_text("new")
     assert [path.read_text() for path in paths] == ["new"] * 3 and names(tmp_path) == ["a", "b", "c"]
@@ -109,7 +109,7 @@ def test_a_rename_that_fails_changes_no_file_and_keeps_what_was_made(tmp_path, o
     (tmp_path / "new-a").write_text("somebody's")
     with (
         pytest.raises(OutputError, match=r"(directory|denied); nothing .* kept as 'new-2-a', 'new-2-b'; then"),
-        replacing_all(*paths) as temporaries,
+        atomic_write_all(*paths) as temporaries,
     ):
         for temporary in temporaries:
             temporary.write_text("new")
@@ -130,7 +130,7 @@ def test_the_first_of_two_files_is_restored_when_the_second_is_refused(tmp_path,
         rename(source, target)
 
     monkeypatch.setattr(output, "replace_file", refuse)
-    with pytest.raises(OutputError, match="nothing was changed"), replacing_all(*paths) as temporaries:
+    with pytest.raises(OutputError, match="nothing was changed"), atomic_write_all(*paths) as temporaries:
         for temporary in temporaries:
             temporary.write_text("new")
     assert [path.read_text() for path in paths] == ["old", "old"] and names(tmp_path) == ["a", "b", "new-a", "new-b"]

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from fdda_addon.core.partition import main_joints, make_partitions, partition_colors, residual_changes
+from fdda_addon.core.partition import main_joints, make_partitions, max_residual_changes, partition_colors
 
 from .limb import INFLUENCING, VERTICES, make_rig, partitions_of
 
@@ -49,8 +49,8 @@ def test_residual_changes_are_the_largest_distance_in_each_partition():
     moved[0, partitions[1].vertices[0]] += (0.1, 0, 0)
     moved[0, partitions[3].vertices[-1]] += (0, 0.25, 0)
     expected = [[0, 0.1, 0, 0.25], [0, 0.5, 0, 0]]
-    np.testing.assert_allclose(residual_changes(partitions, moved, base), expected, atol=1e-6)
-    np.testing.assert_allclose(residual_changes(partitions, moved[1:], base[1:]), expected[1:], atol=1e-6)
+    np.testing.assert_allclose(max_residual_changes(partitions, moved, base), expected, atol=1e-6)
+    np.testing.assert_allclose(max_residual_changes(partitions, moved[1:], base[1:]), expected[1:], atol=1e-6)
 
 
 def test_every_partition_has_one_colour_of_its_own():

@@ -11,7 +11,7 @@ from fdda_addon.core import path_limits
 from fdda_addon.core.errors import OutputError
 from fdda_addon.core.file_kind import EVALUATION, PICTURE
 from fdda_addon.core.output import check_folder_writable, check_outputs, check_writable
-from fdda_addon.core.path_limits import windows_problem
+from fdda_addon.core.path_limits import windows_name_problem
 from fdda_addon.core.recording.index import INDEX
 from fdda_addon.core.recording.place import check_recordable
 
@@ -35,18 +35,18 @@ GOOD = ("console.onnx", "com10", "null.onnx", ".con", "a.con", ".hidden", "a b.c
 def windows(monkeypatch):
     """The checks of a Windows that takes no long paths."""
     monkeypatch.setattr(path_limits, "is_windows", lambda: True)
-    monkeypatch.setattr(path_limits, "takes_long_paths", lambda: False)
+    monkeypatch.setattr(path_limits, "supports_long_windows_paths", lambda: False)
 
 
 @pytest.mark.parametrize(("name", "words"), PROBLEMS.items())
 def test_names_that_windows_takes_for_something_else(name, words):
     for anchor in ("C:\\", "\\\\server\\share\\", "\\\\?\\C:\\"):
-        assert windows_problem(PureWindowsPath(anchor) / "folder" / name) == words
+        assert windows_name_problem(PureWindowsPath(anchor) / "folder" / name) == words
 
 
 @pytest.mark.parametrize("name", GOOD)
 def test_names_that_windows_takes(name):
-    assert windows_problem(PureWindowsPath("C:\\") / name) == ""
+    assert windows_name_problem(PureWindowsPath("C:\\") / name) == ""
 
 
 @pytest.mark.usefixtures("windows")
@@ -91,13 +91,13 @@ def test_a_file_has_to_fit_with_the_name_that_it_has_while_it_is_written(tmp_pat
 
 def test_long_paths_are_taken_where_windows_takes_them(tmp_path, monkeypatch):
     monkeypatch.setattr(path_limits, "is_windows", lambda: True)
-    monkeypatch.setattr(path_limits, "takes_long_paths", lambda: True)
+    monkeypatch.setattr(path_limits, "supports_long_windows_paths", lambda: True)
     check_recordable(folder_of(300, tmp_path), resume=False)
 
 
 @pytest.mark.skipif(sys.platform != "win32", reason="asks Windows")
 def test_windows_says_whether_it_takes_long_paths():
-    assert path_limits.takes_long_paths() in (True, False)
+    assert path_limits.supports_long_windows_paths() in (True, False)
 
 
 def test_a_path_that_blender_would_cut_is_refused_on_every_system(tmp_path):

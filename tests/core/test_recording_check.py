@@ -16,7 +16,7 @@ from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.poses import Channel
 from fdda_addon.core.recording.index import Source
 from fdda_addon.core.recording.reader import Recording
-from fdda_addon.core.rig import UNMOVED, Joint
+from fdda_addon.core.rig import STATIC_JOINT, Joint
 
 from .good_recording import (
     BONE,
@@ -262,7 +262,7 @@ def test_vertices_without_a_bone(good):
     skin_joints, skin_weights = good.rig.skin_joints.copy(), good.rig.skin_weights.copy()
     skin_joints[-20:], skin_weights[-20:] = 4, (1, 0)
     good.residuals[:, -20:] = 0
-    joints = (*good.rig.joints, Joint(UNMOVED, -1))
+    joints = (*good.rig.joints, Joint(STATIC_JOINT, -1))
     good = with_rig(good, joints=joints, rest_matrices=rest, skin_joints=skin_joints, skin_weights=skin_weights)
     good = replace(good, pose_matrices=np.concatenate([good.pose_matrices, still], axis=1))
     good = replace(good, partitions=make_partitions(good.rig))
@@ -284,7 +284,7 @@ def test_small_partitions(good):
 
 
 def test_merges_in_words():
-    joints = [{"name": name} for name in ("root", "a", "b", UNMOVED, *map(str, range(20)))]
+    joints = [{"name": name} for name in ("root", "a", "b", STATIC_JOINT, *map(str, range(20)))]
     none = {"joints": joints, "partitions": [{"joint": 0}]}
     assert merges_in_words(none, 8) == ""
     few = {"joints": joints, "partitions": [{"joint": 0, "merged": [2, 3]}, {"joint": 1}]}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.poses import Channel
-from fdda_addon.core.refinement import Probes, choose_poses, nearest_distances
+from fdda_addon.core.refinement import Probes, choose_poses, nearest_recorded_distances
 
 CHANNELS = (
     Channel("a", "rotation", 0, -1, 1),
@@ -59,7 +59,7 @@ def test_a_partition_without_channels_changes_nothing():
 
 def test_nearest_distances_are_in_units_of_the_spread():
     recorded = np.array([[0.0, 0, 5], [2, 0, 5], [2, 20, 5], [0, 20, 5]])
-    found = nearest_distances(np.array([[1.0, 0, 5], [2, 20, 5], [0, -10, 9]]), recorded)
+    found = nearest_recorded_distances(np.array([[1.0, 0, 5], [2, 20, 5], [0, -10, 9]]), recorded)
     # The spread is 1 and 10; the third feature does not vary and does not count.
     assert found == pytest.approx([1, 0, 1])
-    assert nearest_distances(np.zeros((3, 1)), np.zeros((4, 1))).tolist() == [0, 0, 0]
+    assert nearest_recorded_distances(np.zeros((3, 1)), np.zeros((4, 1))).tolist() == [0, 0, 0]

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.controls import Control
-from fdda_addon.core.rig import REST_TOLERANCE, Fingerprint, Joint, Rig, differences
+from fdda_addon.core.rig import REST_MATRIX_TOLERANCE, Fingerprint, Joint, Rig, rig_differences
 
 from .limb import JOINTS, make_rig
 
 
 def found(rig: Rig, **changes) -> list[str]:
     """Differences between the rig, as a model knows it, and itself with changes."""
-    return differences(rig.joints, rig.rest_matrices, rig.vertex_count, rig.fingerprint, replace(rig, **changes))
+    return rig_differences(rig.joints, rig.rest_matrices, rig.vertex_count, rig.fingerprint, replace(rig, **changes))
 
 
 @pytest.fixture(scope="module")
@@ -57,17 +57,17 @@ def test_joints(rig, joints, sentences):
 
 def test_rest_pose_of_the_armature(rig):
     moved = rig.rest_matrices.copy()
-    moved[2, 0, 3] += 2 * REST_TOLERANCE
+    moved[2, 0, 3] += 2 * REST_MATRIX_TOLERANCE
     assert found(rig, rest_matrices=moved) == ["the rest pose of the armature differs"]
-    moved[2, 0, 3] -= 1.5 * REST_TOLERANCE
+    moved[2, 0, 3] -= 1.5 * REST_MATRIX_TOLERANCE
     assert found(rig, rest_matrices=moved) == [], "versions of Blender compute a rest matrix a few steps apart"
 
 
 def test_rest_poses_are_compared_in_metres(rig):
     moved = rig.rest_matrices.copy()
-    moved[2, 0, 3] += 50 * REST_TOLERANCE
+    moved[2, 0, 3] += 50 * REST_MATRIX_TOLERANCE
     assert found(replace(rig, metres_per_unit=0.01), rest_matrices=moved) == []
-    moved[2, 0, 3] += 100 * REST_TOLERANCE
+    moved[2, 0, 3] += 100 * REST_MATRIX_TOLERANCE
     assert found(replace(rig, metres_per_unit=0.01), rest_matrices=moved) == ["the rest pose of the armature differs"]
 
 

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.rotations import euler_angles, rotation_vectors, total_width
+from fdda_addon.core.rotations import euler_angles, rotation_vectors, total_range_width
 
 
 def about(axis: int, angles: np.ndarray) -> np.ndarray:
@@ -53,7 +53,7 @@ def test_the_numbers_are_of_the_same_rotations(quaternions, compute, compose):
 @pytest.mark.parametrize("axis", [0, 2])
 def test_a_range_about_one_axis_is_as_wide_as_the_motion(compute, low, high, axis):
     values = compute(about(axis, np.linspace(low, high, 40)))
-    assert total_width(values) == pytest.approx(high - low)
+    assert total_range_width(values) == pytest.approx(high - low)
 
 
 def test_a_quaternion_without_length_does_not_rotate():

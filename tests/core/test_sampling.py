@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.poses import Channel, Margin, beyond_range, margin_of, range_changes, sample_pose
+from fdda_addon.core.poses import Channel, Margin, bones_with_changed_range, make_margin, sample_pose, scale_ranges
 
 CHANNELS = (
     Channel("a", "rotation", 0, -1.0, 3.0),
@@ -65,27 +65,27 @@ def test_a_range_of_one_value_gives_that_value():
 
 
 def test_beyond_range_widens_about_the_middle():
-    widened = beyond_range(CHANNELS, 2.5)
+    widened = scale_ranges(CHANNELS, 2.5)
     found = [(c.low, c.high) for c in widened]
     np.testing.assert_allclose(found, [(-4, 6), (0.0625, 0.6875), (-0.035, 0.015)], atol=1e-12)
     assert [(c.name, c.kind, c.axis) for c in widened] == [(c.name, c.kind, c.axis) for c in CHANNELS]
 
 
 def test_range_changes_name_the_bones():
-    assert range_changes(CHANNELS, CHANNELS[::-1]) == []
+    assert bones_with_changed_range(CHANNELS, CHANNELS[::-1]) == []
     nearly = (Channel("a", "rotation", 0, -1.0 + 5e-5, 3.0), *CHANNELS[1:])
-    assert range_changes(CHANNELS, nearly) == []
+    assert bones_with_changed_range(CHANNELS, nearly) == []
     wider = (Channel("a", "rotation", 0, -1.0, 3.1), *CHANNELS[1:])
-    assert range_changes(CHANNELS, wider) == ["a"]
-    assert range_changes(CHANNELS, (CHANNELS[0], CHANNELS[2])) == ["a"]
+    assert bones_with_changed_range(CHANNELS, wider) == ["a"]
+    assert bones_with_changed_range(CHANNELS, (CHANNELS[0], CHANNELS[2])) == ["a"]
     other = (*CHANNELS[:2], Channel("c", "location", 1, -0.02, 0.0))
-    assert range_changes(CHANNELS, other) == ["c", "b"]
+    assert bones_with_changed_range(CHANNELS, other) == ["c", "b"]
 
 
 def test_a_margin_widens_ranges_about_their_middles_and_unlocks_axes():
     locked = (Channel("a", "rotation", 1, 0.0, 0.0),)
     others = (Channel("b", "scale", 0, 0.5, 1.5), Channel("shape_keys/x", "control", 0, 0.0, 1.0))
-    margin = margin_of((*CHANNELS, *others), locked, 3.0, 100)
+    margin = make_margin((*CHANNELS, *others), locked, 3.0, 100)
     assert (margin.factor, margin.poses) == (3.0, 25)
     bounds = [(c.name, c.kind, c.axis, round(c.low, 6), round(c.high, 6)) for c in margin.channels]
     assert bounds == [
@@ -100,5 +100,5 @@ def test_a_margin_widens_ranges_about_their_middles_and_unlocks_axes():
 
 
 def test_no_margin():
-    assert margin_of(CHANNELS, (), 1.0, 100) is None
-    assert margin_of((), (), 2.0, 0) is None
+    assert make_margin(CHANNELS, (), 1.0, 100) is None
+    assert make_margin((), (), 2.0, 0) is None

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.partition import main_joints, make_partitions, small_partition_merges
-from fdda_addon.core.rig import UNMOVED, Fingerprint, Joint, Rig
+from fdda_addon.core.rig import STATIC_JOINT, Fingerprint, Joint, Rig
 
 
 def rig_of(parents: list[int], vertices: list[tuple[dict[int, float], int]], names: list[str] | None = None) -> Rig:
@@ -77,7 +77,7 @@ def test_one_partition_is_left():
 
 
 def test_vertices_without_a_bone_stay_by_themselves():
-    rig = rig_of([-1, 0, -1], [({0: 1}, 20), ({1: 1}, 20), ({2: 1}, 3)], ["a", "b", UNMOVED])
+    rig = rig_of([-1, 0, -1], [({0: 1}, 20), ({1: 1}, 20), ({2: 1}, 3)], ["a", "b", STATIC_JOINT])
     assert small_partition_merges(rig, 8) == {}
 
 

@@ -14,7 +14,7 @@ from fdda_addon.core.controls import Control
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.core.rig import UNMOVED, Joint
+from fdda_addon.core.rig import STATIC_JOINT, Joint
 from trainer.__main__ import main as train
 
 from ..trainer.chain import chain_angles, chain_residuals, chain_rig, pose_chain, write_chain
@@ -60,7 +60,7 @@ def controlled(tmp_path_factory: pytest.TempPathFactory) -> Character:
     residuals[:, lowest] = 0
     rig = replace(
         rig,
-        joints=(*rig.joints, Joint(UNMOVED, -1)),
+        joints=(*rig.joints, Joint(STATIC_JOINT, -1)),
         rest_matrices=np.concatenate([rig.rest_matrices, np.eye(4, dtype=np.float32)[None]]),
         skin_joints=np.where(lowest[:, None], [JOINTS, 0], rig.skin_joints).astype(np.int32),
         skin_weights=np.where(lowest[:, None], [1, 0], rig.skin_weights).astype(np.float32),

@@ -12,7 +12,7 @@ from fdda_addon.core.metrics import distances
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.partition import Partition, main_joints, make_partitions
 from fdda_addon.core.recording.writer import RecordingWriter
-from fdda_addon.core.rig import UNMOVED, Joint, Rig
+from fdda_addon.core.rig import STATIC_JOINT, Joint, Rig
 from fdda_addon.core.skinning import LinearSkinning, skin_matrices
 from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
@@ -35,7 +35,7 @@ def odd_rig() -> Rig:
     start = rig.rest_positions[:, 2] < 0.1
     skin_joints[start], skin_weights[start] = [UNMOVED_JOINT, 0], [1, 0]
     rest = np.append(rig.rest_matrices, np.eye(4, dtype=np.float32)[None], axis=0)
-    joints = (*rig.joints, Joint(UNMOVED, -1))
+    joints = (*rig.joints, Joint(STATIC_JOINT, -1))
     return replace(rig, joints=joints, rest_matrices=rest, skin_joints=skin_joints, skin_weights=skin_weights)
 
 
@@ -88,7 +88,7 @@ def test_model_and_report_say_what_was_merged(model):
     assert [(p.joint, p.merged) for p in info.partitions] == [(0, ()), (1, ()), (2, (3,)), (4, ())]
     assert sum(p.vertices for p in info.partitions) == info.vertex_count
     names = [(p["joint"], p.get("merged")) for p in report["partitions"]]
-    assert names == [("bone_0", None), ("bone_1", None), ("bone_2", ["bone_3"]), (UNMOVED, None)]
+    assert names == [("bone_0", None), ("bone_1", None), ("bone_2", ["bone_3"]), (STATIC_JOINT, None)]
     # The recorded positions come back from residuals in the frame of the joint that took others in.
     assert all(p["held_out"]["mean"] < 0.1 * p["linear"]["mean"] for p in report["partitions"])
     page = model.with_name("report.html").read_text()

@@ -9,7 +9,7 @@ import pytest
 
 from fdda_addon.core.errors import ModelError
 from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY, check_model
-from fdda_addon.core.model_graph import ROOM, SMALL
+from fdda_addon.core.model_graph import COST_FACTOR, FREE_ELEMENTS
 from fdda_addon.core.onnx_cost import OPERATORS, compute_graph_cost
 from fdda_addon.core.onnx_file import read_onnx
 from trainer.__main__ import main
@@ -46,8 +46,10 @@ def test_the_metadata_explains_the_size_with_room_to_spare(models):
     for data in models:
         info, contents = check_model(data, "m.onnx"), read_onnx(data)
         budget, cost = info.budget(), compute_graph_cost(contents, 1)
-        assert cost.elements < ROOM / 2 * (budget.values + SMALL)
-        assert sum(len(c.data) for c in contents.constants.values()) < 4 * ROOM / 2 * (budget.constants + SMALL)
+        assert cost.elements < COST_FACTOR / 2 * (budget.values + FREE_ELEMENTS)
+        assert sum(len(c.data) for c in contents.constants.values()) < 4 * COST_FACTOR / 2 * (
+            budget.constants + FREE_ELEMENTS
+        )
 
 
 def test_weights_that_were_changed_are_noticed(trained):

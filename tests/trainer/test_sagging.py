@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdda_addon.core.partition import make_partitions, nearby_influences
+from fdda_addon.core.partition import assume_nearby_influences, make_partitions
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.target import FRAMES, POSE, SIMULATION, RecordedTarget
@@ -33,7 +33,7 @@ def of_chain(follows: str, sag: float) -> Recording:
         POSES, POSES, "chain.blend", "chain", "5.2.0", Sampling(0, 1.0, (), (Source("random", POSES),)),
         target=RecordedTarget("flesh", follows, 0),
     )  # fmt: skip
-    partitions = nearby_influences(rig, bare)
+    partitions = assume_nearby_influences(rig, bare)
     return Recording(Path(), info, rig, partitions, matrices, residuals, np.zeros((POSES, 0), np.float32))
 
 
@@ -76,5 +76,5 @@ def test_roots_that_move_against_each_other_stay():
         tuple(type(joint)(joint.name, -1) for joint in rig.joints), rig.rest_positions, rig.rest_matrices,
         rig.skin_joints, rig.skin_weights, rig.fingerprint, rig.face_starts, rig.face_vertices,
     )  # fmt: skip
-    found = nearby_influences(apart, make_partitions(apart, {0: (), 1: ()}), sags=False)
+    found = assume_nearby_influences(apart, make_partitions(apart, {0: (), 1: ()}), sags=False)
     assert [partition.influencing for partition in found] == [(0, 1), (0, 1)]

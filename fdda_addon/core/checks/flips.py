@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..features import steady_features
+from ..features import joint_features_in_metres
 from ..partition import Partition
 from ..recording.reader import Recording
 from .residual_scan import ResidualScan
@@ -82,7 +82,7 @@ def check_flips(recording: Recording, scan: ResidualScan) -> list[RecordingWarni
 def find_flips(recording: Recording, scan: ResidualScan) -> list[Flip]:
     """The jumps of every partition that has some."""
     rig, found = recording.rig, []
-    features = steady_features(np.array(recording.pose_matrices[scan.poses]), rig)
+    features = joint_features_in_metres(np.array(recording.pose_matrices[scan.poses]), rig)
     controls = np.array(recording.controls[scan.poses])
     turned = {j: pairs for j, pairs in _pairs_of_joints(features, recording.partitions) if len(pairs[0])}
     for number, (partition, residuals) in enumerate(zip(recording.partitions, scan.residuals, strict=True)):

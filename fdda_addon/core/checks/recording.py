@@ -4,9 +4,9 @@
 import numpy as np
 
 from ..defaults import MIN_PARTITION_VERTICES
-from ..features import rounding, steady_features
+from ..features import float32_rounding, joint_features_in_metres
 from ..recording.reader import Recording
-from ..rig import UNMOVED_LABEL, Rig
+from ..rig import STATIC_JOINT_LABEL, Rig
 from .flips import check_flips
 from .poses import check_poses
 from .residual_scan import ResidualScan, scan_residuals
@@ -66,7 +66,7 @@ def merges_in_words(index: dict, least: int) -> str:
     Returns:
         The line, empty when none were merged.
     """
-    names = [joint["name"] or UNMOVED_LABEL for joint in index["joints"]]
+    names = [joint["name"] or STATIC_JOINT_LABEL for joint in index["joints"]]
     merges = [f"'{names[j]}' into '{names[p['joint']]}'" for p in index["partitions"] for j in p.get("merged", ())]
     if not merges:
         return ""
@@ -90,7 +90,7 @@ def moving_joints(recording: Recording) -> np.ndarray:
     """(J,) bool, the joints whose pose matrices are not the same in all poses."""
     low, high = (function(recording.pose_matrices, axis=0) for function in (np.min, np.max))
     rig, moved = recording.rig, high - low
-    least = max(STILL * max(1 / rig.metres_per_unit, rig.size), rounding(recording.pose_matrices))
+    least = max(STILL * max(1 / rig.metres_per_unit, rig.size), float32_rounding(recording.pose_matrices))
     return (moved[:, :3, :3].max(axis=(1, 2)) > STILL) | (moved[:, :3, 3].max(axis=1) > least)
 
 
@@ -182,7 +182,7 @@ def _sampled_features(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """(n,) indices of evenly spaced poses, and their (n, J, 12) joint features."""
     rig, count = recording.rig, len(recording.pose_matrices)
     poses = np.unique(np.linspace(0, count - 1, MAX_RELATED).round().astype(np.int64))
-    return poses, steady_features(np.array(recording.pose_matrices[poses]), rig)
+    return poses, joint_features_in_metres(np.array(recording.pose_matrices[poses]), rig)
 
 
 def _are_related(first: np.ndarray, second: np.ndarray) -> bool:

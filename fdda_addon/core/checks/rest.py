@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 
 from ..partition import main_joints
-from ..rig import UNMOVED, Rig
+from ..rig import STATIC_JOINT, Rig
 from .warning import RecordingWarning, length
 
 SMALLEST, LARGEST = 0.005, 100.0
@@ -29,7 +29,7 @@ def check_rest(rig: Rig) -> list[RecordingWarning]:
         )
         return [RecordingWarning("units", text)]
     main = main_joints(rig.skin_joints, rig.skin_weights)
-    joints = np.array([j for j in np.unique(main) if rig.joints[j].name != UNMOVED], np.int64)
+    joints = np.array([j for j in np.unique(main) if rig.joints[j].name != STATIC_JOINT], np.int64)
     if len(joints) < 2:
         # One joint may be anywhere: a door turns on its hinge.
         return []

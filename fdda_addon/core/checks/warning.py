@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 
 from ..errors import RecordingError
 from ..messages import WARNING_LINE
-from ..rig import UNMOVED_LABEL, Rig
+from ..rig import STATIC_JOINT_LABEL, Rig
 
 MAX_LISTED = 3
 
@@ -60,7 +60,7 @@ def counted(names: Sequence[object], noun: str, plural: str = "") -> str:
 
 def joint_name(rig: Rig, joint: int) -> str:
     """Name of a joint for people, also of the one that never moves."""
-    return rig.joints[joint].name or UNMOVED_LABEL
+    return rig.joints[joint].name or STATIC_JOINT_LABEL
 
 
 def length(rig: Rig, units: float) -> str:

@@ -9,9 +9,9 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ..errors import RecordingError, os_reason
+from ..errors import RecordingError, os_error_text
 from ..input_file import open_input
-from ..skinning import have_inverse
+from ..skinning import are_invertible
 
 HEADER_ERRORS = (TypeError, SyntaxError, RecursionError, MemoryError, tokenize.TokenError)
 """What numpy raises beside ValueError for a damaged header of an array, which is the text of a Python dictionary."""
@@ -24,7 +24,7 @@ SHRUNK = "joints that have shrunk to nothing"
 _CHECKS = {
     "values that are not numbers": np.isfinite,
     "values beyond all bounds": lambda values: np.abs(values) <= LARGEST,
-    SHRUNK: have_inverse,
+    SHRUNK: are_invertible,
 }
 """What poses are searched for, in this order."""
 
@@ -94,7 +94,7 @@ def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -
                 raise ValueError(f"it is truncated: {size} of {expected} bytes")
             return np.memmap(file, dtype, "r", start, mapped)
     except OSError as error:
-        raise RecordingError(f"'{path}' cannot be used: {os_reason(error)}; record again.") from error
+        raise RecordingError(f"'{path}' cannot be used: {os_error_text(error)}; record again.") from error
     except ValueError as error:
         raise RecordingError(f"'{path}' cannot be used: {error}; record again.") from error
     except HEADER_ERRORS as error:

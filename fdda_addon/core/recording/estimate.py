@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import NoRoomError
-from ..output import nearest_folder
-from ..rig import UNMOVED_LABEL, Rig
+from ..errors import DiskFullError
+from ..output import nearest_existing_folder
+from ..rig import STATIC_JOINT_LABEL, Rig
 from .arrays import array_shapes
 from .reader import Recording
 
@@ -59,7 +59,7 @@ def sizes_in_words(recording: Recording) -> str:
     vertices = len(largest.vertices)
     return (
         f"{poses:,} poses of {rig.vertex_count:,} vertices: {size_in_words(recording_bytes(rig, poses))} on the disk; "
-        f"residuals of the largest partition, '{rig.joints[largest.joint].name or UNMOVED_LABEL}', of "
+        f"residuals of the largest partition, '{rig.joints[largest.joint].name or STATIC_JOINT_LABEL}', of "
         f"{vertices:,} vertices: {size_in_words(12 * poses * vertices)}, in memory two or three times."
     )
 
@@ -72,15 +72,15 @@ def check_room(sizes: Iterable[tuple[Path, int]]) -> None:
             on one disk.
 
     Raises:
-        NoRoomError: says how much there is and how much it takes.
+        DiskFullError: says how much there is and how much it takes.
         OutputError: no folder above one of them exists.
     """
     sizes = list(sizes)
     needed = sum(size - min(size, _taken(folder)) for folder, size in sizes)
     folder = sizes[0][0]
-    free = shutil.disk_usage(nearest_folder(folder)).free
+    free = shutil.disk_usage(nearest_existing_folder(folder)).free
     if needed > free:
-        raise NoRoomError(
+        raise DiskFullError(
             f"Cannot write the recording '{folder}': it takes {size_in_words(needed)} and the disk has "
             f"{size_in_words(free)} left; make room, record fewer poses, or choose another folder."
         )

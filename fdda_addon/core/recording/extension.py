@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from ..errors import BusyError, OutputError, RecordingError, os_reason
+from ..errors import BusyError, OutputError, RecordingError, os_error_text
 from ..input_file import open_input
 from .arrays import STREAMED, array_shapes, streamed_arrays
 from .index import REFINED, Source, read_index
@@ -127,7 +127,7 @@ class RecordingExtension:
 
     def _failed(self, error: OSError) -> OutputError:
         return OutputError(
-            f"Cannot add poses to the recording '{self.path}': {os_reason(error)}; it holds {self.complete} "
+            f"Cannot add poses to the recording '{self.path}': {os_error_text(error)}; it holds {self.complete} "
             "poses and can be trained on as it is."
         )
 

@@ -10,11 +10,11 @@ from types import TracebackType
 
 import numpy as np
 
-from ..errors import OutputError, RecordingError, os_reason
+from ..errors import OutputError, RecordingError, os_error_text
 from ..input_file import open_input
 from ..rig import Fingerprint, Joint, Rig
 from ..skin_fit import INFLUENCES, are_skin_weights
-from ..skinning import have_inverse
+from ..skinning import are_invertible
 from .arrays import HEADER_ERRORS
 from .writer import array_header, check_finite
 
@@ -94,7 +94,9 @@ class FitPosesWriter:
             raise self._failed(error) from error
 
     def _failed(self, error: OSError) -> OutputError:
-        return OutputError(f"Cannot write the poses to fit into '{self._folder}': {os_reason(error)}; make room there.")
+        return OutputError(
+            f"Cannot write the poses to fit into '{self._folder}': {os_error_text(error)}; make room there."
+        )
 
     def close(self) -> None:
         """Close the files.
@@ -141,7 +143,7 @@ def read_fit_poses(folder: Path) -> FitPoses:
         raise _damaged(folder, "a joint stands before its parent")
     if joints.min() < 0 or joints.max() >= sizes["J"] or weights.min() < 0:
         raise _damaged(folder, "the skin weights name no joints")
-    if not have_inverse(arrays["rest_matrices"]).all():
+    if not are_invertible(arrays["rest_matrices"]).all():
         raise _damaged(folder, "a rest matrix is singular")
     rig = Rig(
         tuple(Joint(str(number), int(parent)) for number, parent in enumerate(parents)),
@@ -161,7 +163,7 @@ def write_fitted(folder: Path, joints: np.ndarray, weights: np.ndarray) -> None:
         np.save(folder / "fitted_joints.npy", joints, allow_pickle=False)
         np.save(folder / "fitted_weights.npy", weights, allow_pickle=False)
     except OSError as error:
-        raise OutputError(f"Cannot write the fitted weights into '{folder}': {os_reason(error)}.") from error
+        raise OutputError(f"Cannot write the fitted weights into '{folder}': {os_error_text(error)}.") from error
 
 
 def read_fitted(folder: Path, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
@@ -192,7 +194,7 @@ def _read_array(path: Path, dimensions: int, dtype: type) -> np.ndarray:
         open_input(path, follow=False).close()
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except OSError as error:
-        raise _damaged(path.parent, f"'{path.name}' cannot be read ({os_reason(error)})") from error
+        raise _damaged(path.parent, f"'{path.name}' cannot be read ({os_error_text(error)})") from error
     except (ValueError, *HEADER_ERRORS) as error:
         raise _damaged(path.parent, f"'{path.name}' is no array, or truncated") from error
     # A zip file of arrays is none either.

@@ -7,8 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ..errors import OutputError, RecordingError, os_reason
-from ..rig import Fingerprint, Rig, differences, read_joints
+from ..errors import OutputError, RecordingError, os_error_text
+from ..rig import Fingerprint, Rig, read_joints, rig_differences
 from .index import INDEX, REFINED, read_index, read_info
 from .lock import RecordingLock
 from .place import is_free, is_recording, remove_files
@@ -120,7 +120,7 @@ def _differences(index: dict, rig: Rig) -> list[str]:
     joints = read_joints(index["joints"])
     fingerprint = Fingerprint.from_json(index["rig"]["fingerprint"])
     # The rest pose of the joints is in an array; what differs there is found when the recording is used.
-    return differences(joints, rig.rest_matrices, index["vertices"], fingerprint, rig)
+    return rig_differences(joints, rig.rest_matrices, index["vertices"], fingerprint, rig)
 
 
 def remove_recording(path: Path) -> None:
@@ -143,7 +143,8 @@ def remove_recording(path: Path) -> None:
     except OSError as error:
         name = f", '{os.path.basename(error.filename)}'" if error.filename else ""
         raise OutputError(
-            f"Cannot remove the recording '{path}'{name}: {os_reason(error)}; end what uses it, a training for example."
+            f"Cannot remove the recording '{path}'{name}: {os_error_text(error)}; end what "
+            "uses it, a training for example."
         ) from error
     finally:
         lock.release()

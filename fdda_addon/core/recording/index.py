@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ..controls import read_controls
-from ..errors import RecordingError, os_reason
+from ..errors import RecordingError, os_error_text
 from ..input_file import read_input
 from ..poses import Channel, Margin
 from ..rig import Fingerprint, read_joints, read_name
@@ -107,7 +107,7 @@ def read_index(path: Path) -> dict:
     except FileNotFoundError as error:
         raise RecordingError(f"'{path}' is not a recording: it has no {INDEX}; make one with record.") from error
     except OSError as error:
-        raise RecordingError(f"'{index_path}' cannot be read ({os_reason(error)}); record again.") from error
+        raise RecordingError(f"'{index_path}' cannot be read ({os_error_text(error)}); record again.") from error
     except (ValueError, RecursionError) as error:
         raise RecordingError(f"'{index_path}' cannot be read ({error}); record again with --overwrite.") from error
     if not isinstance(index, dict) or index.get("format") != FORMAT:

@@ -4,10 +4,10 @@
 import os
 from pathlib import Path
 
-from ..errors import OutputError, RecordingError, os_reason
+from ..errors import OutputError, RecordingError, os_error_text
 from ..file_kind import RECORDING
 from ..open_files import remove_file
-from ..output import check_folder_writable, is_left_over
+from ..output import check_folder_writable, is_temporary_name
 from .arrays import ARRAYS, STREAMED
 from .index import INDEX
 from .lock import LOCK, RecordingLock
@@ -36,7 +36,7 @@ def check_recordable(path: Path, resume: bool, overwrite: bool = False) -> None:
         try:
             lock.acquire()
         except OSError as error:
-            raise OutputError(f"Cannot record into '{path}': {os_reason(error)}; choose another.") from error
+            raise OutputError(f"Cannot record into '{path}': {os_error_text(error)}; choose another.") from error
         lock.release()
     if os.path.exists(path / INDEX) and not overwrite:
         check_resumable(path)
@@ -65,7 +65,7 @@ def is_free(path: Path) -> bool:
     """Whether a folder can be recorded into: it is not there, or holds nothing but what an interruption has left."""
     if not os.path.exists(path):
         return True
-    return os.path.isdir(path) and all(name == LOCK or is_left_over(name) for name in os.listdir(path))
+    return os.path.isdir(path) and all(name == LOCK or is_temporary_name(name) for name in os.listdir(path))
 
 
 def is_recording(path: Path) -> bool:
@@ -85,7 +85,7 @@ def remove_left_over(path: Path) -> None:
         OSError: a file cannot be removed.
     """
     for name in os.listdir(path):
-        if is_left_over(name):
+        if is_temporary_name(name):
             remove_file(path / name)
 
 

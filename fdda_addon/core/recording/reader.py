@@ -15,7 +15,7 @@ from ..errors import RecordingError
 from ..partition import Partition, make_partitions
 from ..rig import Fingerprint, Rig, read_joints
 from ..skin_fit import are_skin_weights
-from ..skinning import have_inverse
+from ..skinning import are_invertible
 from ..surface import are_faces
 from ..unit import read_unit
 from .arrays import LARGEST, STREAMED, array_shapes, bad_pose, open_array
@@ -188,7 +188,7 @@ def _shapes(index: dict) -> dict[str, tuple[tuple, type]]:
 def _check_rest(path: Path, arrays: dict[str, np.ndarray], joints: int) -> None:
     """Fail where rest pose and skin weights are none."""
     rest, positions = arrays["rest_matrices"], arrays["rest_positions"]
-    good = bool((np.abs(rest) <= LARGEST).all()) and bool(have_inverse(rest).all())
+    good = bool((np.abs(rest) <= LARGEST).all()) and bool(are_invertible(rest).all())
     for start in range(0, len(positions), BLOCK_VERTICES):
         block = slice(start, start + BLOCK_VERTICES)
         good = good and bool((np.abs(positions[block]) <= LARGEST).all())

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import OutputError, RecordingError, os_reason
+from ..errors import OutputError, RecordingError, os_error_text
 from ..input_file import open_input
 from ..open_files import remove_file
-from ..output import json_text, replacing
+from ..output import atomic_write, to_json_text
 from ..partition import Partition
-from ..rig import Rig, are_same_rest
-from ..unit import read_unit, unit_json
+from ..rig import Rig, rest_matrices_match
+from ..unit import read_unit, unit_to_json
 from .arrays import ARRAYS, STREAMED, array_shapes, bad_pose, open_array, streamed_arrays
 from .index import FORMAT, INDEX, VERSION, RecordingInfo, read_index
 from .lock import RecordingLock
@@ -150,7 +150,7 @@ class RecordingWriter:
 
     def _is_own(self, name: str, found: np.ndarray, own: np.ndarray) -> bool:
         """Whether an array that does not grow is that of the rig."""
-        return are_same_rest(found, self.rig) if name == "rest_matrices" else np.array_equal(found, own)
+        return rest_matrices_match(found, self.rig) if name == "rest_matrices" else np.array_equal(found, own)
 
     def _check_array(self, path: Path, header: bytes, end: int) -> None:
         """Fail when an array lacks what the index calls complete; to fill it up with zeros would make poses up."""
@@ -177,7 +177,7 @@ class RecordingWriter:
             "influences": int(self.rig.skin_joints.shape[1]),
             **({"faces": self._faces, "corners": self._corners} if self._faces else {}),
             "units": {"length": "m", "angle": "rad"},
-            **unit_json(self.rig.metres_per_unit),
+            **unit_to_json(self.rig.metres_per_unit),
             "blender": info.blender,
             "rig": {
                 "file": info.rig_file,
@@ -248,7 +248,7 @@ class RecordingWriter:
     def _failed(self, error: OSError) -> OutputError:
         kept = f"{self.complete} of {self.info.poses} poses are complete, continue with --resume"
         return OutputError(
-            f"Cannot write the recording '{self.path}': {os_reason(error)}; "
+            f"Cannot write the recording '{self.path}': {os_error_text(error)}; "
             f"{kept if self.complete else 'make room or choose another folder'}."
         )
 
@@ -287,8 +287,8 @@ def write_index(path: Path, index: dict) -> None:
         OSError: it cannot be written.
     """
     try:
-        with replacing(path / INDEX, keep=False) as temporary:
-            temporary.write_text(json_text(index), encoding="utf-8")
+        with atomic_write(path / INDEX, keep=False) as temporary:
+            temporary.write_text(to_json_text(index), encoding="utf-8")
     except OutputError as error:
         raise error.__cause__ from None
 

@@ -5,7 +5,7 @@ import json
 import os
 import subprocess
 
-from ...core.errors import os_reason
+from ...core.errors import os_error_text
 from ...core.native_library import runtime_advice
 from ..endings import explain_status
 from .check_result import CheckResult
@@ -60,7 +60,7 @@ def check(python: str, advice: str) -> CheckResult:
         )
     except OSError as error:
         return CheckResult(
-            "ERROR", f"The trainer's Python '{python}' cannot be started ({os_reason(error)}); {advice}."
+            "ERROR", f"The trainer's Python '{python}' cannot be started ({os_error_text(error)}); {advice}."
         )
     except subprocess.TimeoutExpired:
         return CheckResult(

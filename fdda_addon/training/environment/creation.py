@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from ...core.errors import TrainerEnvironmentError, os_reason
+from ...core.errors import TrainerEnvironmentError, os_error_text
 from ...core.progress import Progress
 from .check import check
 from .check_result import CheckResult
@@ -67,8 +67,8 @@ class Creation:
             yield from self._steps()
         except OSError as error:
             raise TrainerEnvironmentError(
-                f"The trainer environment cannot be written ({os_reason(error)}: '{error.filename or self.folder}'); "
-                "make room or see to the permissions, and create it again."
+                f"The trainer environment cannot be written ({os_error_text(error)}: "
+                f"'{error.filename or self.folder}'); make room or see to the permissions, and create it again."
             ) from error
 
     def _steps(self) -> Iterator[Progress | CheckResult]:
@@ -282,7 +282,9 @@ def _written(log: Path) -> Iterator[IO[str]]:
     try:
         file = log.open("w", encoding="utf-8")
     except OSError as error:
-        raise TrainerEnvironmentError(f"The log '{log}' cannot be written ({os_reason(error)}); remove it.") from error
+        raise TrainerEnvironmentError(
+            f"The log '{log}' cannot be written ({os_error_text(error)}); remove it."
+        ) from error
     with file:
         yield file
 

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ...core.errors import TrainerEnvironmentError, os_reason
-from ...core.path_limits import MAX_WINDOWS_CHARACTERS
+from ...core.errors import TrainerEnvironmentError, os_error_text
+from ...core.path_limits import MAX_WINDOWS_PATH_LENGTH
 
 EXTENSION = __package__.rpartition(".fdda_addon")[0]
 """The extension's module, "bl_ext.REPOSITORY.fdda"; empty where the add-on was imported and not installed."""
@@ -76,11 +76,11 @@ def missing_letters(folder: Path, temporary: Path) -> int:
         temporary: the folder for temporary files while it is made.
     """
     longest = max(len(str(folder)), len(str(temporary)) + len(PIP_TARGET)) + 1 + LONGEST_PATH
-    return max(0, longest - MAX_WINDOWS_CHARACTERS)
+    return max(0, longest - MAX_WINDOWS_PATH_LENGTH)
 
 
 def has_path_limit() -> bool:
-    """Whether this system refuses paths of more than `MAX_WINDOWS_CHARACTERS` letters."""
+    """Whether this system refuses paths of more than `MAX_WINDOWS_PATH_LENGTH` letters."""
     if os.name != "nt":
         return False
     import winreg
@@ -168,8 +168,8 @@ def remove(folder: Path) -> None:
             shutil.rmtree(folder)
     except OSError as error:
         raise TrainerEnvironmentError(
-            f"The trainer environment cannot be removed ({os_reason(error)}: '{error.filename}'); end what uses it, a "
-            f"training perhaps, or remove the folder '{folder}' yourself."
+            f"The trainer environment cannot be removed ({os_error_text(error)}: '{error.filename}'); end what uses "
+            f"it, a training perhaps, or remove the folder '{folder}' yourself."
         ) from error
 
 
@@ -186,8 +186,8 @@ def claimed(folder: Path) -> Iterator[None]:
         file = lock.open("a+b")
     except OSError as error:
         raise TrainerEnvironmentError(
-            f"The folder '{folder.parent}' cannot be written ({os_reason(error)}); see to its permissions, or choose "
-            "an existing Python that has torch."
+            f"The folder '{folder.parent}' cannot be written ({os_error_text(error)}); see to its permissions, or "
+            "choose an existing Python that has torch."
         ) from error
     with file:
         try:
