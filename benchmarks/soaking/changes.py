@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from fdda_addon.runtime.binding import bind, true_rig
+from fdda_addon.runtime.binding import bind, model_disabled
 from fdda_addon.scene.scene_rig import find_rig
 from tests.blender.conftest import ELBOW, ELBOW_RIG, evaluated
 from tests.blender.test_broken_characters import with_control
@@ -120,7 +120,7 @@ def _change(bound: bpy.types.Object, random: Random, actions: list[Callable[[], 
         bpy.context.scene.frame_set(int(random.integers(1, 31)))
     bpy.context.view_layer.update()
     shown, is_playing, status = evaluated(bound), bound.fdda.is_playing, bound.fdda.status
-    with true_rig(bound):
+    with model_disabled(bound):
         if random.random() < 0.2:
             bound.modifiers["FDDA"].show_viewport = True
         bpy.context.view_layer.update()

@@ -20,7 +20,7 @@ from ..poses.action_range import action_frames
 from ..poses.clip import find_action
 from ..rig.modifier_stack import check_evaluable, read_stack
 from ..rig.reading import PoseReader
-from ..runtime.binding import true_rig
+from ..runtime.binding import model_disabled
 from ..runtime.network import Network
 from ..runtime.opened_model import OpenedModel, open_model
 from ..scene.armature import clear_pose
@@ -93,7 +93,7 @@ def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSe
     frames = _frames(action, settings.frames)
     if out.suffix == BLEND:
         check_local(scene_rig.mesh_object)
-    with true_rig(scene_rig.mesh_object), ExitStack() as borrowed:
+    with model_disabled(scene_rig.mesh_object), ExitStack() as borrowed:
         check_evaluable(scene_rig)
         reader = FrameReader(scene_rig, open_model(scene_rig, model), settings.strength)
         stack = read_stack(scene_rig.mesh_object)

@@ -8,7 +8,7 @@ from ..core.errors import WrongUsageError
 from ..core.file_kind import BENCHMARK
 from ..core.output import check_outputs, write_json
 from ..core.progress import Progress
-from ..runtime.binding import true_rig
+from ..runtime.binding import model_disabled
 from ..timing.benchmark import benchmark
 from .files import add_rig_options
 from .folders import by_object, headed, open_rigs
@@ -30,7 +30,7 @@ def run(options: argparse.Namespace) -> None:
     check_outputs({options.json: BENCHMARK}, (options.rig, options.model), options.overwrite)
     benchmarks = {}
     for name, (scene_rig, model) in open_rigs(options).items():
-        with ProgressPrinter() as progress, true_rig(scene_rig.mesh_object):
+        with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
             for step in benchmark(scene_rig, model, options.frames):
                 if isinstance(step, Progress):
                     progress.show(step.stage, step.done, step.total)

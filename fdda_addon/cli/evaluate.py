@@ -10,7 +10,7 @@ from ..core.file_kind import EVALUATION, PICTURE
 from ..core.output import atomic_write_all, check_outputs, to_json_text
 from ..core.progress import Progress
 from ..evaluation.run import Evaluation, EvaluationSettings, evaluate
-from ..runtime.binding import true_rig
+from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig
 from .files import add_rig_options
 from .folders import by_object, headed, open_rigs
@@ -93,7 +93,7 @@ def run(options: argparse.Namespace) -> None:
 
 def run_evaluation(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> Evaluation:
     """Evaluate with progress on stderr."""
-    with ProgressPrinter() as progress, true_rig(scene_rig.mesh_object):
+    with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
         for step in evaluate(scene_rig, model, settings):
             if isinstance(step, Progress):
                 progress.show(step.stage, step.done, step.total)

@@ -134,7 +134,7 @@ def run(options: argparse.Namespace) -> None:
     from ..core.errors import WrongUsageError
     from ..core.poses import MAX_MARGIN
     from ..core.recording.index import read_index, read_info
-    from ..runtime.binding import true_rig
+    from ..runtime.binding import model_disabled
     from .files import open_file
     from .progress import ProgressPrinter
     from .target import target_settings
@@ -179,7 +179,7 @@ def run(options: argparse.Namespace) -> None:
     start = time.monotonic()
     with ProgressPrinter() as progress, ExitStack() as stack:
         for scene_rig, _ in rigs:
-            stack.enter_context(true_rig(scene_rig.mesh_object))
+            stack.enter_context(model_disabled(scene_rig.mesh_object))
         for step in _steps(rigs, options):
             if step.note:
                 progress.end_line()

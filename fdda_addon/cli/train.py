@@ -126,11 +126,11 @@ def _open_rig(options: argparse.Namespace) -> "SceneRig":
 
 def _refine(recording: Path, model: Path, options: argparse.Namespace, number: int) -> None:
     from ..recording.refinement import RefinementSettings, refine
-    from ..runtime.binding import true_rig
+    from ..runtime.binding import model_disabled
 
     scene_rig = _open_rig(options)
     given = {} if options.poses is None else {"poses": options.poses}
-    with ProgressPrinter() as progress, true_rig(scene_rig.mesh_object):
+    with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
         for step in refine(scene_rig, recording, model, RefinementSettings(seed=number, **given)):
             progress.show(step.stage, step.done, step.total)
     print(f"{recording}: {step.total} poses added where the model is worst")

@@ -10,7 +10,7 @@ from ..core.errors import ModelError, OutputError, os_error_text
 from ..core.model import MAX_BYTES, ModelInfo, check_model, read_model, read_model_info
 from ..core.output import atomic_write, check_writable
 from ..evaluation import last_evaluation
-from ..runtime import model_files, packed, playback
+from ..runtime import model_files, packed_model, playback, registry
 from ..runtime.binding import bind, unbind
 from ..runtime.opened_model import fitting_rig
 from ..scene.scene_rig import SceneRig
@@ -36,10 +36,12 @@ def remember(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGro
         if absolute_path(mesh_object, entry.path) == Path(os.path.normpath(path.absolute())):
             binding.model_index = index
             was_bound = is_bound(mesh_object, entry)
-            is_other = _pack_anew(mesh_object, entry, path) if entry.packed else playback.is_outdated(mesh_object)
+            is_other = (
+                _pack_anew(mesh_object, entry, path) if entry.packed else playback.has_outdated_model(mesh_object)
+            )
             if was_bound and is_other:
                 last_evaluation.forget(mesh_object)
-                playback.forget()
+                registry.reset_players()
                 mesh_object.update_tag()
             return entry
     entry = binding.models.add()
@@ -55,7 +57,7 @@ def adopt(mesh_object: bpy.types.Object) -> None:
     if binding.is_bound and bound_entry(mesh_object) is None:
         entry = binding.models.add()
         entry.name, entry.path, entry.packed = bound_name(mesh_object), binding.model, binding.packed
-        entry.packed_bytes = len(packed.read(binding.packed)) if binding.packed else 0
+        entry.packed_bytes = len(packed_model.read(binding.packed)) if binding.packed else 0
 
 
 def chosen(mesh_object: bpy.types.Object) -> bpy.types.PropertyGroup:
@@ -125,7 +127,7 @@ def relink(scene_rig: SceneRig, path: Path) -> None:
         return
     entry, mesh_object.fdda.model_index = mesh_object.fdda.models[index], index
     entry.path, entry.packed, entry.packed_bytes = mesh_object.fdda.model, None, 0
-    packed.remove_unused()
+    packed_model.remove_unused()
 
 
 def forget_entry(mesh_object: bpy.types.Object, index: int) -> str:
@@ -145,7 +147,7 @@ def forget_entry(mesh_object: bpy.types.Object, index: int) -> str:
         unbind(mesh_object)
     binding.models.remove(index)
     binding.model_index = max(0, min(binding.model_index, len(binding.models) - 1))
-    packed.remove_unused()
+    packed_model.remove_unused()
     return name
 
 
@@ -162,19 +164,19 @@ def pack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pa
     path = path or entry_path(mesh_object, entry)
     bound = is_bound(mesh_object, entry)
     data = read_model(path)[1]
-    entry.packed, entry.packed_bytes = packed.pack(path.name, data), len(data)
+    entry.packed, entry.packed_bytes = packed_model.pack(path.name, data), len(data)
     if bound:
         mesh_object.fdda.packed = entry.packed
-        playback.forget()
+        registry.reset_players()
     return len(data)
 
 
 def _pack_anew(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path) -> bool:
     """Pack the file of a packed model where it is another now; returns whether it was."""
-    if entry.packed.get(packed.KEY) == read_model(path)[1]:
+    if entry.packed.get(packed_model.KEY) == read_model(path)[1]:
         return False
     pack_entry(mesh_object, entry, path)
-    packed.remove_unused()
+    packed_model.remove_unused()
     return True
 
 
@@ -185,7 +187,7 @@ def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, 
         ModelError: what is packed is no model any more.
         OutputError: the file cannot be written, or another is there.
     """
-    data = packed.read(entry.packed)
+    data = packed_model.read(entry.packed)
     check_model(data, entry.packed.name)
     check_writable(path)
     if not (os.path.lexists(path) and path.is_file() and _same(path, data)):
@@ -198,8 +200,8 @@ def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, 
     model_files.choose(path)
     if bound:
         mesh_object.fdda.model, mesh_object.fdda.packed = entry.path, None
-        playback.forget()
-    packed.remove_unused()
+        registry.reset_players()
+    packed_model.remove_unused()
 
 
 def entry_path(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> Path:
@@ -220,7 +222,7 @@ def info_of(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> Mo
     if entry.packed:
         key = (entry.packed.session_uid,)
         if key not in _infos:
-            _infos[key] = check_model(packed.read(entry.packed), entry.packed.name)
+            _infos[key] = check_model(packed_model.read(entry.packed), entry.packed.name)
         return _infos[key]
     path = entry_path(mesh_object, entry)
     try:

@@ -25,7 +25,7 @@ class FDDA_OT_copy_objects(bpy.types.Operator):
     def execute(self, _context: bpy.types.Context) -> set[str]:
         from ..runtime import playback
 
-        with playback.rigs_given_back():
+        with playback.suspended_playback():
             result = bpy.ops.view3d.copybuffer()
         return result
 

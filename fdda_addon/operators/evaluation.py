@@ -53,7 +53,7 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         from ..evaluation.run import EvaluationSettings, evaluate, evaluate_action
-        from ..runtime.binding import true_rig
+        from ..runtime.binding import model_disabled
         from ..runtime.model_files import network_of
 
         rigs = self.bound_rigs(context)
@@ -64,7 +64,7 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
             self.state.begin_part(mesh_object.name if len(rigs) > 1 else "")
             network, uid = network_of(mesh_object), mesh_object.session_uid
             target = target_settings(mesh_object.fdda.settings)
-            with true_rig(mesh_object):
+            with model_disabled(mesh_object):
                 if self._action:
                     steps = evaluate_action(scene_rig, network, self._action, replace(target, max_settle_frames=0))
                 else:

@@ -321,11 +321,11 @@ class FDDA_OT_measure_model(OnModel, JobOperator, bpy.types.Operator):
         return cls.is_idle() and cls.has_bound(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        from ..runtime.binding import true_rig
+        from ..runtime.binding import model_disabled
         from ..timing.benchmark import benchmark
 
         scene_rig = self.bound_rig(context)
-        with true_rig(scene_rig.mesh_object):
+        with model_disabled(scene_rig.mesh_object):
             yield from benchmark(scene_rig, None, self.frames)
 
     def finish(self, context: bpy.types.Context, result: object) -> str:

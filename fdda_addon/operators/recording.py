@@ -25,11 +25,11 @@ def record_rigs(shown: SceneRig, rigs: list[tuple[SceneRig, Path]], resume: bool
         FDDAError: as `recording.run.record_meshes`.
     """
     from ..recording.run import record_meshes
-    from ..runtime.binding import true_rig
+    from ..runtime.binding import model_disabled
 
     with ExitStack() as borrowed:
         for rig, _ in rigs:
-            borrowed.enter_context(true_rig(rig.mesh_object))
+            borrowed.enter_context(model_disabled(rig.mesh_object))
             if rig.mesh_object != shown.mesh_object:
                 take_over_sampling(rig.mesh_object.fdda.settings, shown.mesh_object.fdda.settings)
         # The one that is shown may be recorded already, and its settings still count.
@@ -111,12 +111,12 @@ class FDDA_OT_refine(OnRig, JobOperator, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         from ..recording.refinement import RefinementSettings, refine
-        from ..runtime.binding import true_rig
+        from ..runtime.binding import model_disabled
 
         rig = self.rig(context)
         self._path, model = recording_folder(rig.mesh_object), model_file(rig.mesh_object)
         wanted = RefinementSettings(self.poses, rig.mesh_object.fdda.settings.seed)
-        with true_rig(rig.mesh_object):
+        with model_disabled(rig.mesh_object):
             yield from refine(rig, self._path, model, wanted)
 
     def finish(self, _context: bpy.types.Context, _result: object) -> str:

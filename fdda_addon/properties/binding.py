@@ -22,15 +22,15 @@ INSERTABLE = OVERRIDABLE | {"USE_INSERTION"}
 
 
 def _apply(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
-    from ..runtime.binding import apply
+    from ..runtime.binding import on_property_update
 
-    apply(binding.id_data)
+    on_property_update(binding.id_data)
 
 
 def _apply_mask(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
-    from ..runtime.binding import apply_mask
+    from ..runtime.binding import on_mask_update
 
-    apply_mask(binding.id_data)
+    on_mask_update(binding.id_data)
 
 
 @without_keys

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What Blender calls: the getter that plays, inside an evaluation, and the handlers, after it.
+"""The entry points that Blender calls: the getter that plays models during an evaluation, and the handlers after it.
 
-`registration.handler_table` adds and removes the handlers. numpy and the modules that play are imported with the first
+`registration.handler_table` adds and removes the handlers. numpy and the playback modules are imported with the first
 bound object, not when Blender starts.
 """
 
@@ -13,136 +13,133 @@ from bpy.app.handlers import persistent
 
 _PLAYBACK = f"{__package__}.playback"
 _MODEL_FILES = f"{__package__}.model_files"
-_count_without_bound = -1
+_object_count_without_bound = -1
+"""Number of objects in the file when none of them was bound."""
 
 
 def _playback() -> ModuleType | None:
-    """The module `playback`; None while nothing was ever bound in this session."""
-    global _count_without_bound
+    """Return the module `playback`; None if no object was bound in this session."""
+    global _object_count_without_bound
     if _PLAYBACK in sys.modules:
         return sys.modules[_PLAYBACK]
     count = len(bpy.data.objects)
-    if count == _count_without_bound:
+    if count == _object_count_without_bound:
         return None
     if not any(o.type == "MESH" and o.fdda.is_bound for o in bpy.data.objects):
-        _count_without_bound = count
+        _object_count_without_bound = count
         return None
     from . import playback
 
     return playback
 
 
-def _play(buffer: bpy.types.Object) -> float:
-    """The getter that the driver of a position buffer reads: what it is for is that it is called."""
-    if buffer.is_evaluated and _PLAYBACK in sys.modules:
-        sys.modules[_PLAYBACK].play(buffer)
+def _get_playback_property(driven: bpy.types.Object) -> float:
+    """Play the models of an evaluated object; the driver needs some number."""
+    if driven.is_evaluated and _PLAYBACK in sys.modules:
+        sys.modules[_PLAYBACK].on_evaluate(driven)
     return 0.0
 
 
 @persistent
-def _on_frame(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+def _on_frame_change_post(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     if playback := _playback():
-        playback.note_data(depsgraph)
-        playback.follow(depsgraph)
-        playback.gather(frame_changed=True)
+        playback.on_frame_change(depsgraph)
 
 
 @persistent
-def _on_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+def _on_depsgraph_update_post(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     if playback := _playback():
-        playback.note_changes(depsgraph)
-        playback.follow(depsgraph)
-        playback.gather(frame_changed=False)
+        playback.on_depsgraph_update(depsgraph)
 
 
-def _play_anew() -> None:
-    global _count_without_bound
-    _count_without_bound = -1
+def _resume_any_file() -> None:
+    """Play the models of the open file, which may be another one than before."""
+    global _object_count_without_bound
+    _object_count_without_bound = -1
+    _resume()
+
+
+def _resume() -> None:
     if playback := _playback():
         playback.resume()
 
 
 @persistent
-def _on_loaded(*_: object) -> None:
-    if _PLAYBACK in sys.modules:
-        sys.modules[_PLAYBACK].forget_rigs()
-    # A file holds the true rig, whatever plays in it.
-    _play_anew()
+def _on_load_post(*_: object) -> None:
+    if playback := sys.modules.get(_PLAYBACK):
+        playback.registry.reset_rigs()
+    # Files are saved with the rigs shown, even if models played.
+    _resume_any_file()
     if _MODEL_FILES in sys.modules:
         sys.modules[_MODEL_FILES].release_unused()
 
 
 @persistent
-def _on_undo_begins(*_: object) -> None:
+def _on_undo_pre(*_: object) -> None:
     if playback := _playback():
-        playback.remove_buffers()
+        playback.registry.remove_buffers()
 
 
 @persistent
-def _on_undone(*_: object) -> None:
-    # The step that was read may have brought position buffers back, of which evaluated copies are left from before.
-    _on_undo_begins()
-    _play_anew()
+def _on_undo_post(*_: object) -> None:
+    # The undo step may have brought back position buffers whose evaluated copies are outdated.
+    _on_undo_pre()
+    _resume_any_file()
 
 
 @persistent
-def _on_linking(*_: object) -> None:
-    # A library that is reloaded brings other objects under the same names.
+def _on_blend_import_pre(*_: object) -> None:
+    # Reloading a library replaces objects by others of the same names.
     if playback := _playback():
-        playback.forget_rigs()
+        playback.registry.reset_rigs()
 
 
 @persistent
-def _on_save_begins(*_: object) -> None:
+def _on_save_pre(*_: object) -> None:
     if playback := _playback():
-        playback.give_back_rigs()
+        playback.restore_rigs()
 
 
 @persistent
-def _on_save_ended(*_: object) -> None:
-    if playback := _playback():
-        playback.resume()
+def _on_save_post(*_: object) -> None:
+    _resume()
 
 
 HANDLERS = {
-    "frame_change_post": _on_frame,
-    "depsgraph_update_post": _on_changed,
-    "load_post": _on_loaded,
-    "undo_pre": _on_undo_begins,
-    "redo_pre": _on_undo_begins,
-    "undo_post": _on_undone,
-    "redo_post": _on_undone,
-    "blend_import_pre": _on_linking,
-    "save_pre": _on_save_begins,
-    "save_post": _on_save_ended,
-    "save_post_fail": _on_save_ended,
+    "frame_change_post": _on_frame_change_post,
+    "depsgraph_update_post": _on_depsgraph_update_post,
+    "load_post": _on_load_post,
+    "undo_pre": _on_undo_pre,
+    "redo_pre": _on_undo_pre,
+    "undo_post": _on_undo_post,
+    "redo_post": _on_undo_post,
+    "blend_import_pre": _on_blend_import_pre,
+    "save_pre": _on_save_pre,
+    "save_post": _on_save_post,
+    "save_post_fail": _on_save_post,
 }
 
 
 def register() -> None:
-    """Add the getter, and let what is bound in the open file play."""
-    global _count_without_bound
-    _count_without_bound = -1
-    bpy.types.Object.fdda_playback = bpy.props.FloatProperty(get=_play, options={"HIDDEN", "SKIP_SAVE"})
+    """Add the playback property, and play what is bound in the open file."""
+    global _object_count_without_bound
+    _object_count_without_bound = -1
+    bpy.types.Object.fdda_playback = bpy.props.FloatProperty(
+        get=_get_playback_property, options={"HIDDEN", "SKIP_SAVE"}
+    )
     if hasattr(bpy.data, "objects"):
-        _resume_open_file()
+        _resume()
     else:
-        # An add-on that is being enabled does not see the file yet.
-        bpy.app.timers.register(_resume_open_file, first_interval=0)
-
-
-def _resume_open_file() -> None:
-    """Let the models of a file play that was open before the add-on was there."""
-    if playback := _playback():
-        playback.resume()
+        # Blender restricts access to the file while it enables an add-on.
+        bpy.app.timers.register(_resume, first_interval=0)
 
 
 def unregister() -> None:
-    """Remove getter and position buffers; rigs are given back."""
-    if bpy.app.timers.is_registered(_resume_open_file):
-        bpy.app.timers.unregister(_resume_open_file)
-    if _PLAYBACK in sys.modules:
-        # Nothing would move their meshes any more.
-        sys.modules[_PLAYBACK].give_back_rigs()
-        sys.modules[_PLAYBACK].remove_buffers()
+    """Restore the rigs, and remove the position buffers and the playback property."""
+    if bpy.app.timers.is_registered(_resume):
+        bpy.app.timers.unregister(_resume)
+    if playback := sys.modules.get(_PLAYBACK):
+        # Without the property nothing would update the buffers.
+        playback.restore_rigs()
+        playback.registry.remove_buffers()
     del bpy.types.Object.fdda_playback

@@ -9,7 +9,7 @@ import bpy
 from ..core.errors import ModelError, os_error_text
 from ..scene.model_trust import is_trusted
 from ..scene.stored_paths import absolute_path, origin, resolved
-from . import packed
+from . import packed_model
 from .network import Network
 
 _networks: dict[Path, tuple[tuple, Network]] = {}
@@ -23,7 +23,7 @@ def network_of(mesh_object: bpy.types.Object) -> Network:
         ModelError: it cannot be loaded.
     """
     binding = mesh_object.fdda
-    return load_network(model_path(mesh_object)) if binding.packed is None else packed.load(binding.packed)
+    return load_network(model_path(mesh_object)) if binding.packed is None else packed_model.load(binding.packed)
 
 
 def load_network(path: Path) -> Network:
@@ -48,7 +48,7 @@ def release_unused() -> None:
     used = {absolute_path(o, o.fdda.model) for o in bound if o.fdda.packed is None}
     for path in _networks.keys() - used:
         del _networks[path]
-    packed.release_unused({o.fdda.packed.session_uid for o in bound if o.fdda.packed is not None})
+    packed_model.release_unused({o.fdda.packed.session_uid for o in bound if o.fdda.packed is not None})
 
 
 def model_path(mesh_object: bpy.types.Object) -> Path:

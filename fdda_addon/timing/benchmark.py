@@ -21,7 +21,7 @@ from ..poses.sampling import model_channels, sampled_channels
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..rig.reading import read_rig
 from ..runtime import model_files, playback
-from ..runtime.binding import borrowed_binding, borrowed_mode, true_rig
+from ..runtime.binding import model_disabled, temporary_binding, temporary_mode
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser, clear_pose
 from ..scene.borrow import assign_action, borrowed_attributes, borrowed_pose
@@ -131,8 +131,13 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
     mesh_object = scene_rig.mesh_object
     opened = open_model(scene_rig, model or model_files.network_of(mesh_object))
     channels = model_channels(scene_rig, opened.rig, opened.network.info)
-    with playing(scene_rig, channels) as played, borrowed_binding(scene_rig, model):
-        ways = {"rig": true_rig, "linear": armature_alone, "fdda": partial(borrowed_mode, mode="FDDA"), "floor": _floor}
+    with playing(scene_rig, channels) as played, temporary_binding(scene_rig, model):
+        ways = {
+            "rig": model_disabled,
+            "linear": armature_alone,
+            "fdda": partial(temporary_mode, mode="FDDA"),
+            "floor": _floor,
+        }
         times: dict[str, list[float]] = {way: [] for way in ways}
         each = max(1, -(-frames // ROUNDS))
         for number in range(ROUNDS):
@@ -219,7 +224,7 @@ def armature_alone(mesh_object: bpy.types.Object) -> Iterator[None]:
     skinning = armature_modifier(mesh_object)
     if skinning is None:
         raise RigError(f"'{mesh_object.name}' has no Armature modifier: there is no linear skinning to time.")
-    with true_rig(mesh_object), ExitStack() as stack:
+    with model_disabled(mesh_object), ExitStack() as stack:
         for modifier in deforming_modifiers(mesh_object):
             if modifier != skinning:
                 stack.enter_context(borrowed_attributes(modifier, show_viewport=False))
@@ -232,7 +237,7 @@ def armature_alone(mesh_object: bpy.types.Object) -> Iterator[None]:
 @contextmanager
 def _floor(mesh_object: bpy.types.Object) -> Iterator[None]:
     """The playback with a model that costs nothing: it answers the same positions for every pose."""
-    with borrowed_mode(mesh_object, "FDDA"):
+    with temporary_mode(mesh_object, "FDDA"):
         bpy.context.view_layer.update()
-        with playback.constant_positions():
+        with playback.without_model_runs():
             yield

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core.progress import Progress
 from ..rig.modifier_stack import check_evaluable
-from ..runtime.binding import true_rig
+from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig
 from .benchmark import armature_alone, playing, time_frames
 
@@ -72,7 +72,7 @@ def measure(scene_rig: SceneRig) -> Iterator[Progress | RigCost]:
         RigError: the rig cannot be evaluated.
     """
     mesh_object = scene_rig.mesh_object
-    with true_rig(mesh_object):
+    with model_disabled(mesh_object):
         check_evaluable(scene_rig)
         times: dict[str, list[float]] = {"rig": [], "linear": []}
         with playing(scene_rig) as frames:

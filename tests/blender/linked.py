@@ -14,7 +14,7 @@ import pytest
 
 import fdda_addon
 from fdda_addon.models import model_list
-from fdda_addon.runtime import model_files, nodes
+from fdda_addon.runtime import model_files, playback_modifier
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier
 from fdda_addon.scene.stored_paths import stored_path
 
@@ -112,7 +112,7 @@ def own_characters() -> list[bpy.types.Object]:
 
 
 def buffer_name(mesh_object: bpy.types.Object) -> str:
-    return nodes.buffer_of(nodes.find_modifier(mesh_object)).name
+    return playback_modifier.buffer_of(playback_modifier.find_modifier(mesh_object)).name
 
 
 def assert_play(library: Library, angles: tuple[float, ...] = ANGLES) -> list[np.ndarray]:

@@ -9,7 +9,7 @@ from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.evaluation.run import EvaluationSettings, evaluate
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
-from fdda_addon.runtime.binding import true_rig
+from fdda_addon.runtime.binding import model_disabled
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 from fdda_addon.timing.benchmark import benchmark
 
@@ -159,6 +159,6 @@ def test_timing_a_bound_rig_that_has_no_action(bound, elbow):
     rig.armature_object.animation_data_clear()
     before = scene_state(rig)
     assert before["binding"] == (True, "FDDA", "")
-    with true_rig(rig.mesh_object):
+    with model_disabled(rig.mesh_object):
         drain(benchmark(rig, elbow.model, 5))
     assert_same_state(before, scene_state(rig))

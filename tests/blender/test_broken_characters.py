@@ -13,13 +13,13 @@ from onnx import TensorProto, helper
 
 from fdda_addon.core.model import CHECKSUM_KEY, CONTROLS_INPUT, METADATA_KEY
 from fdda_addon.core.onnx_file import read_onnx
-from fdda_addon.runtime import playback
+from fdda_addon.runtime import registry
 from fdda_addon.runtime.binding import bind
-from fdda_addon.runtime.live_binding import LiveBinding
+from fdda_addon.runtime.player import Player
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
-from .test_crowd import crowd_of
+from .test_player_batch import crowd_of
 
 
 def edit_mesh(mesh_object: bpy.types.Object, change: Callable[[], object]) -> None:
@@ -51,10 +51,10 @@ def test_a_mesh_without_vertices(bound, elbow, count):
 
 
 STEPS = {
-    "when it is found": (LiveBinding, "__init__"),
-    "when it has changed": (LiveBinding, "fits"),
-    "when its rig is checked": (LiveBinding, "check_rig"),
-    "when its mask is read": (LiveBinding, "follow_mask"),
+    "when it is found": (Player, "__init__"),
+    "when it has changed": (Player, "fits_object"),
+    "when its rig is checked": (Player, "check_rig"),
+    "when its mask is read": (Player, "update_mask"),
 }
 
 
@@ -65,14 +65,14 @@ def test_what_nobody_expected_harms_one_character(bound, elbow, monkeypatch, whe
     owner, name = STEPS[where]
     real, broken = getattr(owner, name), crowd[1].session_uid
 
-    def fail(live: LiveBinding, *arguments: object, **named: object) -> object:
-        if broken in (getattr(live, "uid", 0), getattr(arguments[0], "session_uid", 0)):
+    def fail(player: Player, *arguments: object, **named: object) -> object:
+        if broken in (getattr(player, "object_uid", 0), getattr(arguments[0], "session_uid", 0)):
             raise KeyError("position")
-        return real(live, *arguments, **named)
+        return real(player, *arguments, **named)
 
     monkeypatch.setattr(owner, name, fail)
     if where == "when it is found":
-        playback.forget()
+        registry.reset_players()
     for mesh_object in crowd:
         mesh_object.data.update()
         mesh_object.update_tag()
@@ -119,7 +119,7 @@ def rename_property() -> None:
 
 def rename_object() -> None:
     bpy.data.objects["dials"].name = "others"
-    playback.forget()
+    registry.reset_players()
 
 
 KEY = ("shape_keys", 'key_blocks["smile"].value')

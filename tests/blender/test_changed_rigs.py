@@ -13,8 +13,8 @@ from fdda_addon.runtime.model_files import network_of
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
-from .test_crowd import crowd_of
 from .test_evaluations import keyed
+from .test_player_batch import crowd_of
 
 
 def edit(scene_object: bpy.types.Object, change: Callable[[], object]) -> None:
@@ -234,7 +234,7 @@ def test_objects_that_move_on_their_own_play_on(bound, elbow):
     bpy.data.objects[ELBOW_RIG].rotation_euler = (0.2, 0.1, 0.4)
     bpy.context.view_layer.update()
     bound.data.update()
-    rig_check.forget()
+    rig_check.invalidate_all()
     pose(angle=1.1)
     assert_plays(bound, elbow.model)
 

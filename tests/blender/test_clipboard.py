@@ -22,7 +22,7 @@ def to_clipboard(_: bpy.types.Object, folder: Path) -> Path:
 
 
 def to_library(mesh_object: bpy.types.Object, folder: Path) -> Path:
-    with playback.rigs_given_back():
+    with playback.suspended_playback():
         bpy.data.libraries.write(str(folder / "library.blend"), {mesh_object})
     return folder / "library.blend"
 

@@ -11,7 +11,7 @@ import fdda_addon
 from fdda_addon.cli.main import VERBS
 from fdda_addon.cli.progress import ProgressPrinter
 from fdda_addon.core.recording.reader import read_recording
-from fdda_addon.runtime import model_files, playback
+from fdda_addon.runtime import model_files, registry
 
 from .conftest import assert_plays, evaluated, pose, run
 from .refusals import files, save_elbow
@@ -152,7 +152,7 @@ def test_a_name_chooses_the_object(elbow, tmp_path, capfd):
 
 def opened(path) -> bpy.types.Object:
     """The elbow of a file, opened as a user would who never chose a model in this session."""
-    playback.forget()
+    registry.reset_players()
     model_files._chosen.clear()
     bpy.ops.wm.open_mainfile(filepath=str(path))
     return bpy.data.objects["elbow"]

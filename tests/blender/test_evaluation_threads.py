@@ -17,7 +17,7 @@ MOST_POSES = 2000
 def test_python_knows_the_threads_that_evaluate(bound, elbow, monkeypatch):
     """What is local to a thread goes with the state that Python has of it."""
     calls, remembered, own = Counter(), {}, threading.local()
-    play = playback.play
+    play = playback.on_evaluate
 
     def counted(driven: bpy.types.Object) -> None:
         play(driven)
@@ -39,14 +39,14 @@ def test_python_knows_the_threads_that_evaluate(bound, elbow, monkeypatch):
 
 def test_states_of_threads_that_end_are_few(monkeypatch):
     monkeypatch.setattr(evaluation_threads, "_kept", {threading.get_ident()})
-    count, ended = evaluation_threads.MOST_KEPT + 5, []
+    count, ended = evaluation_threads.MAX_KEPT_STATES + 5, []
     # Threads that are there at once are told apart; the next one has the name of one that has ended.
     all_there = threading.Barrier(count)
 
     def short() -> None:
         all_there.wait(10)
-        evaluation_threads.keep_thread()
-        evaluation_threads.keep_thread()
+        evaluation_threads.keep_thread_state()
+        evaluation_threads.keep_thread_state()
         ended.append(threading.get_ident())
 
     at_once = [threading.Thread(target=short) for _ in range(count)]
@@ -55,4 +55,4 @@ def test_states_of_threads_that_end_are_few(monkeypatch):
     for thread in at_once:
         thread.join(10)
     assert len(ended) == count and not any(thread.is_alive() for thread in at_once)
-    assert len(evaluation_threads._kept) == evaluation_threads.MOST_KEPT
+    assert len(evaluation_threads._threads_with_state) == evaluation_threads.MAX_KEPT_STATES

@@ -9,10 +9,10 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.runtime import playback
+from fdda_addon.runtime import registry
 from fdda_addon.runtime.binding import bind
-from fdda_addon.runtime.live_binding import VIEWPORT_KEY
 from fdda_addon.runtime.model_files import model_path
+from fdda_addon.runtime.player import VIEWPORT_KEY
 from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, predicted, without_deformation
@@ -220,12 +220,12 @@ def test_a_driver_that_reads_another_pose(bound, elbow):
 
 
 def test_a_character_that_stands_still_is_not_evaluated(bound, monkeypatch):
-    from fdda_addon.runtime.live_binding import LiveBinding
+    from fdda_addon.runtime.player import Player
 
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     bpy.context.view_layer.update()
-    calls, real = [], LiveBinding.play
-    monkeypatch.setattr(LiveBinding, "play", lambda self, buffer: calls.append(buffer) or real(self, buffer))
+    calls, real = [], Player.play
+    monkeypatch.setattr(Player, "play", lambda self, buffer: calls.append(buffer) or real(self, buffer))
     bpy.context.scene.frame_set(7)
     assert calls == []
     pose(angle=0.7)
@@ -271,6 +271,6 @@ def test_graphs_are_known_by_what_they_are_of(bound, tmp_path):
             still(tmp_path / "still.png")
             bpy.context.scene.frame_set(number)
     assert set(seen) == {("RENDER", False), ("VIEWPORT", True)}
-    (live,) = playback._live.values()
+    (player,) = registry.players.values()
     uid, name = bpy.context.scene.session_uid, bpy.context.view_layer.name
-    assert live.graphs == {("RENDER", uid, name), ("VIEWPORT", uid, name)}
+    assert player.depsgraphs == {("RENDER", uid, name), ("VIEWPORT", uid, name)}

@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.runtime.binding import true_rig
+from fdda_addon.runtime.binding import model_disabled
 from fdda_addon.scene.blend_file import save_copy
 
 from .conftest import ELBOW_RIG, assert_plays, evaluated, pose, rig_positions, run
@@ -42,7 +42,7 @@ def test_the_rig_is_held_while_it_is_borrowed(bound, elbow, how):
     ANIMATED[how](bound)
     pose(angle=1.0)
     assert_plays(bound, elbow.model)
-    with true_rig(bound):
+    with model_disabled(bound):
         for _ in range(3):
             pose(angle=1.0)
             assert np.array_equal(evaluated(bound), expected)
@@ -116,7 +116,7 @@ def test_an_eye_that_is_animated_is_followed(bound, elbow, is_keyed):
         bpy.context.scene.frame_set(frame)
         if 10 <= frame < 20:
             shown = evaluated(bound)
-            with true_rig(bound):
+            with model_disabled(bound):
                 bpy.context.view_layer.update()
                 assert np.array_equal(evaluated(bound), shown), frame
         else:

@@ -5,9 +5,9 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.runtime import nodes
+from fdda_addon.runtime import playback_modifier
 
-from . import test_crowd as crowd_tests
+from . import test_player_batch as crowd_tests
 from .conftest import assert_plays, predicted
 from .linked import (
     ANGLES,
@@ -127,7 +127,7 @@ def test_an_override_of_what_plays_already(library, tmp_path):
     armature_of(mesh_object).animation_data.action = None
     bend(mesh_object, 0.8)
     assert_play(library, (0.8,))
-    assert nodes.buffer_of(nodes.find_modifier(mesh_object)).is_runtime_data
+    assert playback_modifier.buffer_of(playback_modifier.find_modifier(mesh_object)).is_runtime_data
     save_and_open(tmp_path)
     assert_play(library, (0.8,))
 

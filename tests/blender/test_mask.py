@@ -8,15 +8,15 @@ import pytest
 from fdda_addon.evaluation import last_evaluation
 from fdda_addon.panels.playback import mask_sentence
 from fdda_addon.rig.reading import read_model_rig
-from fdda_addon.runtime import playback
-from fdda_addon.runtime.live_binding import LiveBinding
+from fdda_addon.runtime import registry
 from fdda_addon.runtime.network import Network
+from fdda_addon.runtime.player import Player
 from fdda_addon.scene import mask as masks
 from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
 from .baked_files import read_pc2
 from .conftest import ELBOW, assert_plays, evaluated, pose
-from .test_crowd import animate, crowd_of
+from .test_player_batch import animate, crowd_of
 
 GROUP = "learned"
 
@@ -144,8 +144,8 @@ def test_in_a_frame_a_mask_costs_nothing_where_there_is_none(bound, monkeypatch)
     """Neither read nor blended, however the character is posed."""
     asked = []
     monkeypatch.setattr(masks, "read_mask", lambda *_: asked.append("read"))
-    monkeypatch.setattr("fdda_addon.runtime.live_binding.read_mask", lambda *_: asked.append("read"))
-    monkeypatch.setattr(LiveBinding, "_make_blend", lambda *_: asked.append("blended"))
+    monkeypatch.setattr("fdda_addon.runtime.player.read_mask", lambda *_: asked.append("read"))
+    monkeypatch.setattr(Player, "_create_blend", lambda *_: asked.append("blended"))
     for angle in (0.3, 0.9):
         pose(angle=angle)
     bpy.context.scene.frame_set(7)
@@ -154,7 +154,7 @@ def test_in_a_frame_a_mask_costs_nothing_where_there_is_none(bound, monkeypatch)
 
 def test_weights_are_not_read_again_while_it_is_posed(masked, monkeypatch):
     read = []
-    monkeypatch.setattr("fdda_addon.runtime.live_binding.read_mask", lambda *_: read.append(1))
+    monkeypatch.setattr("fdda_addon.runtime.player.read_mask", lambda *_: read.append(1))
     for angle in (0.3, 0.9):
         pose(angle=angle)
     for frame in (3, 4):
@@ -200,7 +200,7 @@ def test_members_of_a_crowd_have_masks_of_their_own(bound):
     scene = bpy.context.scene
     for frame in (1, 2, 3, 4):
         scene.frame_set(frame)
-    assert playback._crowds.by_hub, "they play together"
+    assert registry.batches.by_driver, "they play together"
     shown = [evaluated(mesh_object) for mesh_object in crowd]
     ramps = ramp(bound)[:, None]
     for mesh_object, positions, weights in zip(crowd, shown, (1, ramps, 1 - ramps, 0.5 * ramps, 1, 1), strict=True):

@@ -10,7 +10,7 @@ from fdda_addon.core.partition import make_partitions
 from fdda_addon.evaluation import heat_map, last_evaluation, markers
 from fdda_addon.evaluation.run import EvaluationSettings, evaluate, evaluate_action
 from fdda_addon.rig.reading import read_rig
-from fdda_addon.runtime.binding import true_rig
+from fdda_addon.runtime.binding import model_disabled
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW_RIG, pose
@@ -43,7 +43,7 @@ def test_error_on_the_active_action(active, elbow):
     before = scene_state(find_rig())
     assert bpy.ops.fdda.evaluate() == {"FINISHED"}
     assert_same_state(before, scene_state(find_rig()))
-    with true_rig(active):
+    with model_disabled(active):
         expected = drain(evaluate_action(find_rig(), elbow.model, "elbow_wave"))
     last = last_evaluation.of(active)
     np.testing.assert_allclose(last.errors["fdda"], expected.held_out.fdda, atol=1e-6)
@@ -56,7 +56,7 @@ def test_error_on_the_active_action(active, elbow):
 
 def test_error_on_random_poses(active, elbow):
     assert bpy.ops.fdda.evaluate(source="RANDOM", poses=7, seed=4) == {"FINISHED"}
-    with true_rig(active):
+    with model_disabled(active):
         expected = drain(evaluate(find_rig(), elbow.model, EvaluationSettings(7, 4)))
     last = last_evaluation.of(active)
     np.testing.assert_allclose(last.errors["fdda"], expected.held_out.fdda, atol=1e-6)
@@ -151,7 +151,7 @@ def test_the_worst_random_pose_is_set(active, view):
     pose(angle=0.0)
     bpy.data.objects[ELBOW_RIG].animation_data.action = None
     assert bpy.ops.fdda.jump_to_worst() == {"FINISHED"}
-    with true_rig(active):
+    with model_disabled(active):
         compared = drain(evaluate(find_rig(), active_model(active), EvaluationSettings(9)))
     bone = bpy.data.objects[ELBOW_RIG].pose.bones["lower"]
     index = [joint.name for joint in read_rig(find_rig()).joints].index("lower")

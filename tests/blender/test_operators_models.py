@@ -8,7 +8,7 @@ import pytest
 
 from fdda_addon.core.errors import ModelError
 from fdda_addon.models.entries import bound_entry, megabytes
-from fdda_addon.runtime import packed
+from fdda_addon.runtime import packed_model
 
 from .. import systems
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose
@@ -83,7 +83,7 @@ def test_packed_model_plays_without_its_file(packed_elbow, elbow, tmp_path):
     mesh_object = bpy.data.objects[ELBOW]
     pose(angle=1.4)
     assert_plays(mesh_object, elbow.model)
-    assert bytes(packed.read(mesh_object.fdda.packed)) == elbow.model.read_bytes()
+    assert bytes(packed_model.read(mesh_object.fdda.packed)) == elbow.model.read_bytes()
 
 
 def test_a_refused_find_model_changes_nothing(packed_elbow, elbow, tmp_path):
@@ -129,11 +129,11 @@ def test_unbinding_and_binding_a_packed_model(packed_elbow, elbow):
 def test_borrowing_gives_a_packed_model_back(packed_elbow, elbow, second):
     from pathlib import Path
 
-    from fdda_addon.runtime.binding import borrowed_binding
+    from fdda_addon.runtime.binding import temporary_binding
     from fdda_addon.scene.scene_rig import find_rig
 
     before = packed_elbow.fdda.model
-    with borrowed_binding(find_rig(), Path(second)):
+    with temporary_binding(find_rig(), Path(second)):
         assert packed_elbow.fdda.packed is None
     assert packed_elbow.fdda.packed is not None and packed_elbow.fdda.model == before
     assert bound_entry(packed_elbow) is not None
@@ -165,18 +165,18 @@ def test_removing_a_packed_model_deletes_it(packed_elbow):
 
 
 def test_a_packed_model_passes_the_same_checks(packed_elbow, elbow):
-    packed_elbow.fdda.packed[packed.KEY] = b"\x08\x08" + elbow.model.read_bytes()[:100]
+    packed_elbow.fdda.packed[packed_model.KEY] = b"\x08\x08" + elbow.model.read_bytes()[:100]
     path = elbow.bound.with_name("damaged.blend")
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
     bpy.ops.wm.open_mainfile(filepath=str(path))
     mesh_object = bpy.data.objects[ELBOW]
     bpy.context.view_layer.update()
     assert "is not a model" in mesh_object.fdda.status and mesh_object.fdda.mode == "RIG"
-    del mesh_object.fdda.packed[packed.KEY]
+    del mesh_object.fdda.packed[packed_model.KEY]
     with pytest.raises(ModelError, match="does not hold a model any more"):
-        packed.read(mesh_object.fdda.packed)
+        packed_model.read(mesh_object.fdda.packed)
     with pytest.raises(ModelError, match="is not a model"):
-        packed.pack("text", b"no model")
+        packed_model.pack("text", b"no model")
 
 
 def test_a_packed_model_is_appended_with_its_object(packed_elbow, elbow, tmp_path):

@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.runtime import confidence, model_files, nodes
+from fdda_addon.runtime import confidence, model_files, playback_modifier
 from fdda_addon.runtime.network import Network
 from fdda_addon.timing import frame_times
 
@@ -115,7 +115,7 @@ def test_switch(bound, elbow):
 def test_switch_says_why_a_model_cannot_play(bound):
     bpy.context.view_layer.objects.active = bound
     bpy.ops.fdda.switch(mode="RIG")
-    bound.modifiers.remove(nodes.find_modifier(bound))
+    bound.modifiers.remove(playback_modifier.find_modifier(bound))
     refused(lambda: bpy.ops.fdda.switch(mode="FDDA"), "was removed; bind the model again")
 
 

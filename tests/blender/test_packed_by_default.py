@@ -9,7 +9,7 @@ import pytest
 from fdda_addon.core.errors import ModelError
 from fdda_addon.operators import playback
 from fdda_addon.properties import character
-from fdda_addon.runtime import model_files, packed
+from fdda_addon.runtime import model_files, packed_model
 from fdda_addon.scene import model_trust
 
 from .. import systems
@@ -91,7 +91,7 @@ def test_a_packed_model_that_is_trained_anew_is_packed_anew(rig, elbow, model):
         # A field that nobody knows: another file, the same model.
         file.write(b"\xfa\x3f\x00")
     remember(rig.mesh_object, model_files.Path(model))
-    assert packed.read(rig.mesh_object.fdda.packed) == model_files.Path(model).read_bytes()
+    assert packed_model.read(rig.mesh_object.fdda.packed) == model_files.Path(model).read_bytes()
     assert len(rig.mesh_object.fdda.models) == 1 and len(bpy.data.texts) == 1
 
 

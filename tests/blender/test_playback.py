@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.runtime import nodes
+from fdda_addon.runtime import playback_modifier
 from fdda_addon.runtime.binding import bind, unbind
 from fdda_addon.scene.scene_rig import find_rig
 
@@ -33,7 +33,7 @@ def test_posing(bound, elbow):
 
 def test_each_bone_of_a_chain(bound, elbow):
     """The driver names the last bone alone: Blender evaluates it after those above, with a solver too."""
-    buffer = nodes.buffer_of(nodes.find_modifier(bound))
+    buffer = playback_modifier.buffer_of(playback_modifier.find_modifier(bound))
     variables = buffer.animation_data.drivers[0].driver.variables
     assert {v.targets[0].bone_target for v in variables if v.type == "TRANSFORMS"} == {"", "lower"}
     shown = [assert_plays(bound, elbow.model)]
@@ -252,7 +252,7 @@ def test_a_bone_that_is_added(bound, elbow):
 
 
 def test_removed_modifier_is_reported(bound):
-    bound.modifiers.remove(nodes.find_modifier(bound))
+    bound.modifiers.remove(playback_modifier.find_modifier(bound))
     pose(angle=1.0)
     bound.fdda.mode = "LINEAR"
     assert bound.fdda.mode == "RIG"

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import fdda_addon
-from fdda_addon.runtime import nodes
+from fdda_addon.runtime import playback_modifier
 from fdda_addon.scene.scene_rig import armature_modifier
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, predicted, rig_positions
-from .test_crowd import crowd_of
 from .test_evaluations import handler, shown_in
+from .test_player_batch import crowd_of
 from .test_renders import FRAME, animation, set_camera
 
 RENDER_HANDLERS = ("render_pre", "render_post", "render_write")
@@ -54,7 +54,7 @@ def test_without_its_modifier_the_rig_is_back_at_once(bound, is_applied, capsys)
         with bpy.context.temp_override(object=bound):
             bpy.ops.object.modifier_apply(modifier="FDDA")
     else:
-        bound.modifiers.remove(nodes.find_modifier(bound))
+        bound.modifiers.remove(playback_modifier.find_modifier(bound))
     bpy.context.view_layer.update()
     assert bound.fdda.mode == "RIG" and "was removed; bind the model again" in bound.fdda.status
     assert [m.show_viewport for m in bound.modifiers] == [True, True]
@@ -279,18 +279,18 @@ def test_a_joint_that_is_not_a_number(bound, elbow):
 
 
 def test_one_character_that_fails_in_any_way_leaves_the_others(bound, elbow, monkeypatch, capsys):
-    from fdda_addon.runtime.live_binding import LiveBinding
+    from fdda_addon.runtime.player import Player
 
     crowd = crowd_of(bound, 3)
     bpy.context.view_layer.update()
-    real = LiveBinding.write
+    real = Player.write_positions
 
     def write(self, buffer, mesh_object):
         if mesh_object.name == crowd[1].name:
             raise SystemExit("out")
         real(self, buffer, mesh_object)
 
-    monkeypatch.setattr(LiveBinding, "write", write)
+    monkeypatch.setattr(Player, "write_positions", write)
     for mesh_object in crowd:
         armature_modifier(mesh_object).object.pose.bones["lower"].rotation_euler[0] += 0.1
     bpy.context.view_layer.update()

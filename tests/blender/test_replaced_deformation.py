@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.rig.deformation import read_deformation
-from fdda_addon.runtime import nodes
+from fdda_addon.runtime import playback_modifier
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import find_rig
 
@@ -95,7 +95,7 @@ def assert_shows_rig(mesh_object: bpy.types.Object, clause: str) -> np.ndarray:
     """The rig is shown, as it is where nothing is bound, and the status says why."""
     assert clause in mesh_object.fdda.status and mesh_object.fdda.mode == "RIG"
     shown = evaluated(mesh_object)
-    modifier = nodes.find_modifier(mesh_object)
+    modifier = playback_modifier.find_modifier(mesh_object)
     if modifier is not None:
         mesh_object.modifiers.remove(modifier)
     assert np.array_equal(evaluated(mesh_object), shown)

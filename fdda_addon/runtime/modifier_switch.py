@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Switches a bound mesh object between the modifiers of its rig and the FDDA modifier, which shows the model."""
+
+import bpy
+
+from ..rig.modifier_stack import deforming_modifiers
+from ..scene.borrow import animated_paths
+from . import playback_modifier
+from .mode_override import overridden_mode, uses_model
+
+
+def animated_settings(mesh_object: bpy.types.Object) -> frozenset[str]:
+    """Return which of "mode", and of "show_viewport" and "show_render" of the FDDA modifier, are keyed or driven."""
+    paths = animated_paths(mesh_object)
+    if not paths:
+        return frozenset()
+    modifier = playback_modifier.find_modifier(mesh_object)
+    settings = {"fdda.mode": "mode"}
+    if modifier is not None:
+        settings |= {modifier.path_from_id(name): name for name in ("show_viewport", "show_render")}
+    return frozenset(settings[path] for path in paths & settings.keys())
+
+
+def evaluated_uses_model(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph, animated: frozenset[str]) -> bool:
+    """Return whether the evaluated settings of a bound object show its model.
+
+    Args:
+        evaluated: the evaluated object.
+        depsgraph: the graph that evaluated it.
+        animated: the result of `animated_settings`.
+    """
+    visibility = "show_render" if depsgraph.mode == "RENDER" else "show_viewport"
+    if visibility in animated:
+        modifier = playback_modifier.find_modifier(evaluated)
+        if modifier is not None and not getattr(modifier, visibility):
+            return False
+    return evaluated.fdda.mode != "RIG"
+
+
+def apply_visibility(mesh_object: bpy.types.Object, animated: frozenset[str]) -> None:
+    """Set the mode from the visibility of the FDDA modifier, which the user may have changed: off shows the rig.
+
+    Args:
+        mesh_object: the bound object.
+        animated: the result of `animated_settings`; the user does not set these.
+    """
+    binding, modifier = mesh_object.fdda, playback_modifier.find_modifier(mesh_object)
+    if modifier is None or overridden_mode(mesh_object.session_uid):
+        return
+    if modifier.show_viewport != binding.is_playing:
+        if "show_viewport" in animated:
+            return
+        if "mode" in animated:
+            # Keyframes or drivers would set the mode back, so set the visibility instead.
+            modifier.show_viewport = binding.is_playing
+        else:
+            binding.mode = "FDDA" if modifier.show_viewport else "RIG"
+            if binding.mode == "RIG":
+                binding.status = (
+                    f"The modifier '{modifier.name}' of '{mesh_object.name}' was switched off, so the rig is shown; "
+                    "switch it on, or choose another mode, to play the model."
+                )
+    elif binding.is_playing and modifier.show_render != binding.use_in_render and "show_render" not in animated:
+        binding.use_in_render = modifier.show_render
+
+
+def disconnect_visible(mesh_object: bpy.types.Object, animated: frozenset[str]) -> None:
+    """Disconnect an FDDA modifier that is or may become visible while no model plays, so that it changes nothing.
+
+    Args:
+        mesh_object: the bound object.
+        animated: the result of `animated_settings`.
+    """
+    if mesh_object.fdda.is_playing:
+        return
+    modifier = playback_modifier.find_modifier(mesh_object)
+    if modifier is not None and (modifier.show_viewport or modifier.show_render or animated - {"mode"}):
+        disconnect(modifier)
+
+
+def disconnect(modifier: bpy.types.NodesModifier) -> None:
+    """Remove the position buffer from an FDDA modifier; the next scan connects it again if the model plays."""
+    if playback_modifier.buffer_of(modifier) is not None:
+        playback_modifier.set_buffer(modifier, None)
+
+
+def switch_modifiers(mesh_object: bpy.types.Object, playing: bool | None = None) -> None:
+    """Switch the modifiers of a bound object to those of its rig or to the FDDA modifier.
+
+    While a model plays, the modifiers of the rig are off in the viewport, and in renders if the user chose so. Their
+    visibility is stored in the object's properties, and mode RIG restores it.
+
+    Args:
+        mesh_object: the bound object.
+        playing: whether the model plays; None to follow the mode.
+    """
+    binding = mesh_object.fdda
+    modifier = playback_modifier.find_modifier(mesh_object)
+    if binding.mode != "RIG" and modifier is None:
+        binding.status = "The FDDA modifier was removed; bind the model again."
+        binding.mode = "RIG"
+        return
+    if playing is None:
+        playing = uses_model(mesh_object)
+    if playing and not binding.is_playing:
+        _store_visibility(mesh_object)
+    elif not playing and binding.is_playing:
+        _restore_visibility(mesh_object)
+    if modifier is not None:
+        modifier.show_viewport = playing
+        modifier.show_render = playing and binding.use_in_render
+    if playing:
+        binding.status = ""
+        for stored, rig_modifier in _stored_modifiers(mesh_object):
+            rig_modifier.show_viewport = False
+            rig_modifier.show_render = stored.show_render and not binding.use_in_render
+
+
+def restore_rig(mesh_object: bpy.types.Object) -> None:
+    """Show the rig as if no model played, without changing the mode; `switch_modifiers` shows the model again."""
+    if mesh_object.fdda.is_playing:
+        _restore_visibility(mesh_object)
+    modifier = playback_modifier.find_modifier(mesh_object)
+    if modifier is not None:
+        modifier.show_viewport = modifier.show_render = False
+
+
+def _store_visibility(mesh_object: bpy.types.Object) -> None:
+    binding = mesh_object.fdda
+    binding.modifiers.clear()
+    for modifier in deforming_modifiers(mesh_object):
+        stored = binding.modifiers.add()
+        stored.uid = modifier.persistent_uid
+        stored.show_viewport, stored.show_render = modifier.show_viewport, modifier.show_render
+    binding.is_playing = True
+
+
+def _restore_visibility(mesh_object: bpy.types.Object) -> None:
+    for stored, modifier in _stored_modifiers(mesh_object):
+        modifier.show_viewport, modifier.show_render = stored.show_viewport, stored.show_render
+    mesh_object.fdda.modifiers.clear()
+    mesh_object.fdda.is_playing = False
+    if mesh_object.data.shape_keys is not None:
+        # The player has muted the evaluated shape keys.
+        mesh_object.data.shape_keys.update_tag()
+
+
+def _stored_modifiers(mesh_object: bpy.types.Object) -> list[tuple]:
+    """Return the stored visibility of each modifier of the rig, with the modifier."""
+    by_uid = {modifier.persistent_uid: modifier for modifier in mesh_object.modifiers}
+    return [(stored, by_uid[stored.uid]) for stored in mesh_object.fdda.modifiers if stored.uid in by_uid]

@@ -1,0 +1,379 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A player: reads the evaluated pose of one bound object, runs its model and writes the positions."""
+
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import NamedTuple
+
+import bpy
+import numpy as np
+
+from ..core.errors import FDDAError, ModelError, RigError
+from ..core.mask import SkinningBlend
+from ..core.rig import STATIC_JOINT
+from ..rig.reading import PoseReader, read_model_rig
+from ..scene.arrays import MUTE, write
+from ..scene.controls import ControlReader
+from ..scene.mask import mask_key, read_mask
+from ..scene.mesh import set_mesh_positions
+from ..scene.scene_rig import SceneRig, armature_of
+from . import driver, rig_check
+from .mode_override import overridden_mode
+from .model_files import network_of
+from .network import Execution
+
+VIEWPORT_KEY = "fdda_viewport"
+"""Custom property of the evaluated mesh objects of a viewport; it is removed with the evaluated copy."""
+
+
+class ModelInputs(NamedTuple):
+    """The inputs of a model for one pose.
+
+    Attributes:
+        pose_matrices: (J, 4, 4) float32, mesh-object space, mesh units.
+        controls: (C,) float32.
+        strength: 0 for linear skinning alone, 1 for the model.
+    """
+
+    pose_matrices: np.ndarray
+    controls: np.ndarray
+    strength: float
+
+
+class Player:
+    """Plays the model of one bound object.
+
+    Attributes:
+        object_uid: session id of the object.
+        network: its model.
+        signature: the rig's signature when it was last checked.
+        error: the exception that stopped playback during an evaluation.
+        needs_recreation: its armature has other bones now.
+        new_inputs: inputs that the model has to run for; None while they are unchanged.
+        has_moved: it had new inputs since the last update of the batches, which resets this.
+        execution: the execution whose arrays hold its positions.
+        depsgraphs: keys of the dependency graphs that have evaluated its buffer (`playback`).
+        needs_viewport_record: it was evaluated with shape keys, perhaps for a viewport (`VIEWPORT_KEY`).
+        lock: held from `read_pose` to `write_positions`.
+    """
+
+    skips_models = False
+    """Keep the positions that were shown last instead of running models (`playback.without_model_runs`)."""
+
+    def __init__(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object):
+        """Create the player of a bound object.
+
+        Args:
+            mesh_object: the bound object.
+            buffer: its position buffer.
+
+        Raises:
+            FDDAError: the model cannot be loaded, or no longer fits the object.
+        """
+        self._name, self.object_uid = mesh_object.name, mesh_object.session_uid
+        self.network = network_of(mesh_object)
+        self.error: FDDAError | None = None
+        self.needs_recreation = False
+        info = self.network.info
+        scene_rig = self.scene_rig(mesh_object)
+        self._armature_uid = scene_rig.armature_object.session_uid
+        self._check_vertex_count(mesh_object)
+        self.signature = rig_check.RigSignature.read(scene_rig)
+        self.check_rig(mesh_object)
+        self._pose_reader = self._create_pose_reader(scene_rig)
+        self._control_reader = ControlReader(scene_rig, info.controls)
+        self._mask_key, self._mask = mask_key(mesh_object), read_mask(mesh_object)
+        self._blend: SkinningBlend | None = None
+        self.execution = self._single_execution = Execution(self.network, 1)
+        self.new_inputs: ModelInputs | None = None
+        self.has_moved = False
+        self.depsgraphs: set[tuple[str, int, str]] = set()
+        self.needs_viewport_record = False
+        # A render may evaluate on another thread while the window does.
+        self.lock = threading.Lock()
+        self._shown_inputs: tuple | None = None
+        self._positions: np.ndarray | None = None
+        self._reported_warning = self._warning = ""
+        self.execution.poses[0] = info.rest_matrices
+        # The handlers have run already when the first pose is played, so check the model's output here.
+        self._check_finite(self.execution.run())
+        self.update_driver(mesh_object, buffer)
+
+    def update_driver(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object) -> None:
+        """Make Blender evaluate the position buffer whenever an input of the model has changed."""
+        pose_inputs, dependencies = self.pose_inputs(mesh_object, buffer), self.dependency_inputs(mesh_object)
+        driver.set_driver_inputs(buffer, [driver.playback_input(buffer), *pose_inputs, *dependencies])
+
+    @property
+    def pose_input_count(self) -> int:
+        """Return the number of `pose_inputs`."""
+        return 3 + len(self.network.info.controls)
+
+    def pose_inputs(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object) -> list[driver.DriverInput]:
+        """Return the driver variables whose datablocks `play` reads."""
+        return driver.pose_inputs(buffer, self.scene_rig(mesh_object), self.network.info.controls)
+
+    def dependency_inputs(self, mesh_object: bpy.types.Object) -> list[driver.DriverInput]:
+        """Return the driver variables that only add dependencies."""
+        return driver.dependency_inputs(self.scene_rig(mesh_object), self.network.info.joint_names)
+
+    def find_object(self) -> bpy.types.Object | None:
+        """Find the object, also when it was renamed; return None when it was removed or is no longer bound."""
+        mesh_object = bpy.data.objects.get(self._name)
+        if mesh_object is None or mesh_object.session_uid != self.object_uid:
+            mesh_object = next((o for o in bpy.data.objects if o.session_uid == self.object_uid), None)
+            if mesh_object is None:
+                return None
+            self._name = mesh_object.name
+        return mesh_object if mesh_object.fdda.is_bound else None
+
+    def fits_object(self, mesh_object: bpy.types.Object) -> bool:
+        """Return whether the object has the same armature, mesh, vertex count and Armature modifier settings."""
+        try:
+            self._check_vertex_count(mesh_object)
+        except ModelError:
+            return False
+        armature_object = armature_of(mesh_object)
+        return (
+            armature_object is not None
+            and armature_object.session_uid == self._armature_uid
+            and mesh_object.data.session_uid == self.signature.mesh
+            and self.signature.skin[0] == rig_check.armature_modifier_settings(mesh_object)
+        )
+
+    def has_same_skin(self, mesh_object: bpy.types.Object) -> bool:
+        """Return whether the object has the same vertex groups and Armature modifier settings."""
+        return self.signature.skin == rig_check.skin_signature(mesh_object)
+
+    def has_same_bones(self, mesh_object: bpy.types.Object, compare_parents: bool) -> bool:
+        """Return whether its armature has the same bones in the same order, with the same rest pose."""
+        armature_object = armature_of(mesh_object)
+        if armature_object is None:
+            return False
+        armature = armature_object.data
+        return rig_check.bone_signature(armature) == self.signature.bones and not (
+            compare_parents and rig_check.parent_names(armature) != self.signature.parents
+        )
+
+    def has_same_rest_positions(self, mesh_object: bpy.types.Object) -> bool:
+        """Return whether its vertices have the same rest positions."""
+        return rig_check.rest_digest(mesh_object.data) == self.signature.rest
+
+    def check_rig(self, mesh_object: bpy.types.Object) -> None:
+        """Check that the rig is the one that the model was trained for.
+
+        Raises:
+            FDDAError: as `rig_check.check`.
+        """
+        rig_check.check(self.scene_rig(mesh_object), self.network, self.signature)
+
+    @property
+    def has_mask(self) -> bool:
+        """Return whether a mask limits the model to a part of the mesh."""
+        return self._mask is not None
+
+    def update_mask(self, mesh_object: bpy.types.Object, weights_changed: bool) -> bool:
+        """Read the mask of the object again where it may have changed.
+
+        Args:
+            mesh_object: the object.
+            weights_changed: its vertex groups may have other weights.
+
+        Returns:
+            Whether the mask changed, so that the pose has to be played again.
+        """
+        key = mask_key(mesh_object)
+        if key == self._mask_key and not (weights_changed and self._mask is not None):
+            return False
+        mask = read_mask(mesh_object)
+        with self.lock:
+            self._mask_key, previous, self._mask = key, self._mask, mask
+            if mask == previous:
+                return False
+            self._blend = None if self._blend is None else self._blend.with_mask(mask)
+            # The positions that are shown have the previous mask.
+            self._shown_inputs = None
+        return True
+
+    @property
+    def has_new_warning(self) -> bool:
+        """Return whether the warning has changed since the last `pop_warning`."""
+        return self._warning != self._reported_warning
+
+    def pop_warning(self) -> str:
+        """Return the current warning of the playback, empty for none, and mark it as reported."""
+        self._reported_warning = self._warning
+        return self._warning
+
+    def play(self, buffer: bpy.types.Object) -> None:
+        """Write the positions of the evaluated pose to an evaluated position buffer; store exceptions in `error`."""
+        with self.lock, self.capture_errors():
+            _, mesh_object, armature_object, *owners = driver.evaluated_inputs(buffer, self.pose_input_count)
+            if self.read_pose(mesh_object, armature_object, owners):
+                if self.new_inputs is not None:
+                    self.run_model()
+                self.write_positions(buffer, mesh_object)
+
+    @contextmanager
+    def capture_errors(self) -> Iterator[None]:
+        """Store any exception in `error`: a getter would lose it, and SystemExit would end Blender."""
+        try:
+            yield
+        except FDDAError as error:
+            self.error = error
+        except BaseException as error:  # SystemExit too.
+            self.error = ModelError(f"The model '{self.network.path}' cannot be played ({error!r}); bind it again.")
+
+    def read_pose(
+        self,
+        mesh_object: bpy.types.Object | None,
+        armature_object: bpy.types.Object | None,
+        owners: Sequence[bpy.types.ID | None],
+    ) -> bool:
+        """Read the pose of evaluated objects into `new_inputs`.
+
+        Args:
+            mesh_object: the bound object.
+            armature_object: its armature object.
+            owners: the datablocks that own the controls of the model, in their order.
+
+        Returns:
+            Whether there are positions to write.
+        """
+        self.new_inputs = None
+        if armature_object is None or mesh_object is None:
+            return False
+        if not self._pose_reader.fits(armature_object):
+            self.needs_recreation = True
+            return False
+        self._check_vertex_count(mesh_object.original)
+        binding = mesh_object.fdda
+        try:
+            pose_matrices = self._pose_reader.read(mesh_object, armature_object)
+        except RigError:
+            # Animators hide a character with a scale of zero.
+            return False
+        controls = self._control_reader.values(owners)
+        # In mode RIG the modifiers are just being switched, so the strength does not matter.
+        strength = 0.0 if (overridden_mode(self.object_uid) or binding.mode) == "LINEAR" else binding.strength
+        inputs = pose_matrices.tobytes(), controls.tobytes(), strength
+        if inputs != self._shown_inputs and not (Player.skips_models and self._positions is not None):
+            self._warning = ""
+            if not np.isfinite(pose_matrices).all():
+                pose_matrices = self._repair_pose(pose_matrices, armature_object.name)
+            if self._blend is None and (strength < 1 or self._mask is not None):
+                self._blend = self._create_blend(SceneRig(mesh_object.original, armature_object.original))
+            self._shown_inputs = inputs
+            self.new_inputs = ModelInputs(pose_matrices, controls, strength)
+            self.has_moved = True
+        return True
+
+    def run_model(self) -> None:
+        """Run the model for `new_inputs` alone."""
+        # An exception leaves nothing shown, so the next evaluation tries again.
+        self._shown_inputs, shown_inputs = None, self._shown_inputs
+        self.execution = self._single_execution
+        if self.new_inputs.strength > 0:
+            self.execution.poses[0] = self.new_inputs.pose_matrices
+            self.execution.controls[0] = self.new_inputs.controls
+            self.execution.run()
+        self.take_positions(self.execution, 0)
+        self._shown_inputs = shown_inputs
+
+    def take_positions(self, execution: Execution, index: int) -> None:
+        """Take the positions of `new_inputs` from one pose of an execution, without copying them."""
+        self.execution, self._positions = execution, execution.positions[index]
+        self._check_finite(self._positions)
+        strength = self.new_inputs.strength
+        if strength < 1 or self._mask is not None:
+            model_positions = execution.positions[index : index + 1]
+            pose_matrices, strengths = self.new_inputs.pose_matrices[None], np.array([strength], np.float32)
+            self._positions = self._blend.apply(model_positions, pose_matrices, strengths)[0]
+
+    def write_positions(self, buffer: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
+        """Write the positions to an evaluated position buffer, also unchanged ones: evaluation may have reset them."""
+        set_mesh_positions(buffer.data, self._positions)
+        # A bake also comes here where renders show the rig, and needs the shape keys.
+        if mesh_object.data.shape_keys is not None:
+            if VIEWPORT_KEY in mesh_object:
+                _mute_shape_keys(mesh_object)
+            else:
+                self.needs_viewport_record = True
+
+    def _repair_pose(self, pose_matrices: np.ndarray, armature_name: str) -> np.ndarray:
+        """Replace joint matrices that are not finite: such a joint moves with its parent.
+
+        Args:
+            pose_matrices: (J, 4, 4) float32, mesh-object space.
+            armature_name: name of the armature object, for the warning.
+
+        Returns:
+            (J, 4, 4) float32, mesh-object space.
+        """
+        info = self.network.info
+        skin_matrices = pose_matrices @ np.linalg.inv(info.rest_matrices)
+        is_finite = np.isfinite(skin_matrices).all(axis=(1, 2))
+        for joint in np.flatnonzero(~is_finite):
+            parent = info.joints[joint].parent  # Repaired already: parents come before their children.
+            skin_matrices[joint] = skin_matrices[parent] if parent >= 0 else np.eye(4)
+        first_name = info.joints[int(np.argmin(is_finite))].name
+        self._warning = (
+            f"The pose of the joint '{first_name}' of '{armature_name}' is not a number; what it moves follows the "
+            "joint above."
+        )
+        return (skin_matrices @ info.rest_matrices).astype(np.float32)
+
+    def _create_blend(self, scene_rig: SceneRig) -> SkinningBlend:
+        """Create the blend of the model with linear skinning."""
+        rig = self.network.linear_rig(read_model_rig(scene_rig, self.network.info))
+        # The objects may have moved since training; pose matrices refer to the rest pose of the model.
+        return SkinningBlend(replace(rig, rest_matrices=self.network.info.rest_matrices), self._mask)
+
+    def _check_finite(self, positions: np.ndarray) -> None:
+        if not np.isfinite(positions).all():
+            self._warning = (
+                f"The model '{self.network.path.name}' gives positions that are not numbers; train it again."
+            )
+
+    def _check_vertex_count(self, mesh_object: bpy.types.Object) -> None:
+        count, expected = len(mesh_object.data.vertices), self.network.info.vertex_count
+        if count != expected and mesh_object.mode != "EDIT":
+            raise ModelError(
+                f"'{mesh_object.name}' has {count} vertices and its model was trained for {expected}; "
+                "undo the change, or record and train again."
+            )
+
+    def scene_rig(self, mesh_object: bpy.types.Object) -> SceneRig:
+        """Return the rig of the object.
+
+        Raises:
+            RigError: its armature was removed.
+        """
+        armature_object = armature_of(mesh_object)
+        if armature_object is None:
+            raise RigError(f"The armature of '{mesh_object.name}' is gone; give its Armature modifier an armature.")
+        return SceneRig(mesh_object, armature_object)
+
+    def _create_pose_reader(self, scene_rig: SceneRig) -> PoseReader:
+        info, armature_object = self.network.info, scene_rig.armature_object
+        bones = armature_object.data.bones
+        if missing := [name for name in info.joint_names if name not in bones and name != STATIC_JOINT]:
+            raise ModelError(
+                f"The armature '{armature_object.name}' lacks the joint '{missing[0]}' of the model "
+                f"'{self.network.path.name}'; name it as before, or bind a model of this rig."
+            )
+        return PoseReader(scene_rig, info.joint_names, info.rest_matrices)
+
+
+def _mute_shape_keys(mesh_object: bpy.types.Object) -> None:
+    """Mute the shape keys of an evaluated object: Blender mixes them whether anything reads them or not.
+
+    Only for viewports in which the model is on: whatever shows the rig has its shape keys. The user's settings come
+    back when Blender copies the shape keys again. Shape keys that another object shares stay as they are.
+    """
+    keys = mesh_object.data.shape_keys
+    # A muted first key means that all were muted since they were copied, or that the user muted it.
+    if keys is not None and not keys.key_blocks[0].mute and mesh_object.original.data.users == 1:
+        write(keys.key_blocks, MUTE, np.ones(len(keys.key_blocks), bool))
