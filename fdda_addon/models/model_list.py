@@ -12,7 +12,7 @@ from ..core.output import atomic_write, check_writable
 from ..evaluation import last_evaluation
 from ..runtime import model_files, packed_model, playback, registry
 from ..runtime.binding import bind, unbind
-from ..runtime.opened_model import fitting_rig
+from ..runtime.opened_model import read_matching_rig
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import absolute_path, path_for
 from .entries import bound_entry, bound_name, chosen_entry, is_bound
@@ -31,7 +31,7 @@ def remember(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGro
         ModelError: a packed model is to be replaced, and the file cannot be read or is no model.
     """
     binding = mesh_object.fdda
-    model_files.choose(path)
+    model_files.allow(path)
     for index, entry in enumerate(binding.models):
         if absolute_path(mesh_object, entry.path) == Path(os.path.normpath(path.absolute())):
             binding.model_index = index
@@ -78,7 +78,7 @@ def check(scene_rig: SceneRig, path: Path) -> None:
     Raises:
         FDDAError: says why.
     """
-    fitting_rig(scene_rig, path, read_model_info(path))
+    read_matching_rig(scene_rig, path, read_model_info(path))
 
 
 def bind_entry(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> None:
@@ -121,7 +121,7 @@ def relink(scene_rig: SceneRig, path: Path) -> None:
     entry = bound_entry(mesh_object)
     index = list(mesh_object.fdda.models).index(entry) if entry else -1
     _bind(scene_rig, path)
-    model_files.choose(path)
+    model_files.allow(path)
     if index < 0:
         remember(mesh_object, path)
         return
@@ -197,7 +197,7 @@ def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, 
             temporary.write_bytes(data)
     bound = is_bound(mesh_object, entry)
     entry.path, entry.packed, entry.packed_bytes = path_for(mesh_object, path), None, 0
-    model_files.choose(path)
+    model_files.allow(path)
     if bound:
         mesh_object.fdda.model, mesh_object.fdda.packed = entry.path, None
         registry.reset_players()

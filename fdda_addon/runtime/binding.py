@@ -46,7 +46,7 @@ def bind(
         unbind(mesh_object)
 
     if packed_text is None:
-        model_files.choose(model)
+        model_files.allow(model)
     # The modifiers after the last deforming one stay on and work on the model's output.
     playback_modifier.add_modifier(mesh_object, stack.place)
     binding = mesh_object.fdda
@@ -73,7 +73,7 @@ def unbind(mesh_object: bpy.types.Object) -> None:
     if modifier is not None:
         buffer = playback_modifier.buffer_of(modifier)
         playback_modifier.set_buffer(modifier, None)
-        if not playback_modifier.is_inherited(modifier):
+        if not playback_modifier.is_from_library(modifier):
             mesh_object.modifiers.remove(modifier)
         if buffer is not None and buffer not in playback_modifier.used_buffers():
             position_buffer.remove_buffer(buffer)
@@ -141,7 +141,7 @@ def temporary_binding(scene_rig: SceneRig, model: Path | None) -> Iterator[None]
 
     Args:
         scene_rig: the rig.
-        model: path of the model; None for the one that is bound.
+        model: path of the model; None to keep the bound model and show the rig.
 
     Raises:
         FDDAError: as `bind`.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The confidence of a bound model in the current pose, by partition."""
+"""Evaluates the confidence of a bound model in the current pose, by partition."""
 
 import bpy
 
@@ -10,16 +10,16 @@ from ..scene.controls import ControlReader
 from ..scene.scene_rig import SceneRig, armature_of
 from . import model_files
 
-_last: dict[int, tuple[object, bytes, list[tuple[str, float]] | None]] = {}
+_cache: dict[int, tuple[object, bytes, list[tuple[str, float]] | None]] = {}
+"""By the session id of the mesh object: the model, its inputs and the result of the last call."""
 
 
 def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float]] | None:
-    """Name of the main joint and confidence, 0 to 1, of each partition in the pose that Blender has evaluated.
-
-    The model is executed once for a pose, however often this is asked.
+    """Evaluate the confidence of each partition in the evaluated pose; runs the model once for each pose.
 
     Returns:
-        The least confident first; None when the model does not say, or the pose cannot be read.
+        Name of the main joint and confidence, 0 to 1, of each partition, in ascending order of confidence; None if the
+        model has no such output, or the pose cannot be read.
     """
     armature_object = armature_of(mesh_object)
     if armature_object is None or not mesh_object.fdda.is_bound:
@@ -34,19 +34,19 @@ def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float
         if not all(o.is_evaluated for o in evaluated):
             return None
         scene_rig = SceneRig(mesh_object, armature_object)
-        pose = PoseReader(scene_rig, names, network.info.rest_matrices).read(*evaluated)
+        pose_matrices = PoseReader(scene_rig, names, network.info.rest_matrices).read(*evaluated)
         controls = ControlReader(scene_rig, network.info.controls).read(scene_rig, depsgraph)
-        shown = pose.tobytes() + controls.tobytes()
-        kept = _last.get(mesh_object.session_uid)
-        if kept is None or kept[0] is not network or kept[1] != shown:
-            confidence = network.confidence(pose[None], controls[None])
+        inputs = pose_matrices.tobytes() + controls.tobytes()
+        cached = _cache.get(mesh_object.session_uid)
+        if cached is None or cached[0] is not network or cached[1] != inputs:
+            confidence = network.confidence(pose_matrices[None], controls[None])
             values = None
             if confidence is not None:
                 partitions = zip(network.info.partitions, confidence[0].tolist(), strict=True)
                 values = sorted(((names[p.joint], value) for p, value in partitions), key=lambda pair: pair[1])
-            _last.clear()
-            kept = _last[mesh_object.session_uid] = (network, shown, values)
-        return kept[2]
+            _cache.clear()
+            cached = _cache[mesh_object.session_uid] = (network, inputs, values)
+        return cached[2]
     except FDDAError:
-        # The playback itself says what is wrong.
+        # Playback reports the error itself.
         return None

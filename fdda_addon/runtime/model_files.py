@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The networks of models, loaded once, and which paths of a .blend file are followed to a model."""
+"""Loads each model once, and decides which paths in a .blend file may be followed to a model."""
 
 import os
 from pathlib import Path
@@ -13,37 +13,39 @@ from . import packed_model
 from .network import Network
 
 _networks: dict[Path, tuple[tuple, Network]] = {}
-_chosen: set[Path] = set()
+"""By the path of the model: modification time and size of the file, and what was loaded from it."""
+_chosen_paths: set[Path] = set()
+"""The models that the user chose in this session."""
 
 
 def network_of(mesh_object: bpy.types.Object) -> Network:
-    """The network of a bound object: of the model that is packed into the .blend file, else of its file.
+    """Return the model of a bound object: the one that is packed into the .blend file, else the one in its file.
 
     Raises:
-        ModelError: it cannot be loaded.
+        ModelError: the model cannot be loaded.
     """
     binding = mesh_object.fdda
     return load_network(model_path(mesh_object)) if binding.packed is None else packed_model.load(binding.packed)
 
 
 def load_network(path: Path) -> Network:
-    """A network by its file, loaded once for all objects that use it and again when the file changes.
+    """Load a model once for all objects that use it, and again when its file has changed.
 
     Raises:
-        ModelError: it cannot be loaded.
+        ModelError: the model cannot be loaded.
     """
     try:
         status = os.stat(path)
     except OSError as error:
         raise ModelError(f"The model '{path}' cannot be read: {os_error_text(error)}; bind another.") from error
-    stamp = (status.st_mtime_ns, status.st_size)
-    if path not in _networks or _networks[path][0] != stamp:
-        _networks[path] = (stamp, Network(path))
+    file_state = (status.st_mtime_ns, status.st_size)
+    if path not in _networks or _networks[path][0] != file_state:
+        _networks[path] = (file_state, Network(path))
     return _networks[path][1]
 
 
 def release_unused() -> None:
-    """Let go of the networks that no object of the open file is bound to: those of files that were open before."""
+    """Free the models that no object of the open file is bound to."""
     bound = [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]
     used = {absolute_path(o, o.fdda.model) for o in bound if o.fdda.packed is None}
     for path in _networks.keys() - used:
@@ -52,26 +54,31 @@ def release_unused() -> None:
 
 
 def model_path(mesh_object: bpy.types.Object) -> Path:
-    """Where the model of a binding is.
+    """Return the absolute path of the model of a bound object.
 
     Raises:
-        ModelError: the path of a saved file leads out of the file's folder.
+        ModelError: as `allowed_path`.
     """
     return allowed_path(mesh_object, mesh_object.fdda.model)
 
 
 def allowed_path(mesh_object: bpy.types.Object, stored: str) -> Path:
-    """The absolute path of a model that is stored with an object.
+    """Return the absolute path of a model if it may be followed.
+
+    Args:
+        mesh_object: the object that stores the path.
+        stored: the path as it is stored.
 
     Raises:
-        ModelError: the path of a saved file leads out of the file's folder.
+        ModelError: the path leads out of the folder of the saved file, and the user has neither chosen the model nor
+            trusted its folder.
     """
     path = absolute_path(mesh_object, stored)
     library = origin(mesh_object, stored).library
     file = str(resolved(library.filepath)) if library else bpy.data.filepath
-    # Resolved: the way from the open file to the model leads through "..".
+    # Resolved, because a path relative to the open file may contain "..".
     in_folder = not file or path.resolve().is_relative_to(Path(file).resolve().parent)
-    if not (in_folder or path.resolve() in _chosen or is_trusted(path)):
+    if not (in_folder or path.resolve() in _chosen_paths or is_trusted(path)):
         raise ModelError(
             f"The model '{path}' lies outside the folder of '{Path(file).name}' and is not followed; "
             "choose it again and pack it, move it beside the file, or trust its folder in the preferences."
@@ -79,6 +86,6 @@ def allowed_path(mesh_object: bpy.types.Object, stored: str) -> Path:
     return path
 
 
-def choose(model: Path) -> None:
-    """The user chose this model in this session: it may lie anywhere until the file is loaded again."""
-    _chosen.add(model.resolve())
+def allow(model: Path) -> None:
+    """Allow a model that the user chose in this session to be in any folder."""
+    _chosen_paths.add(model.resolve())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Executes a model with ONNX Runtime."""
+"""Runs a model with ONNX Runtime."""
 
 import os
 import sys
@@ -21,30 +21,30 @@ from ..core.model import (
 from ..core.native_library import runtime_advice
 from ..core.rig import Rig
 
-THREADED_VERTICES = 100_000
-"""From this many vertices on a second thread gains more than it costs."""
+MULTITHREADED_VERTICES = 100_000
+"""From this number of vertices on, a second thread gains more time than it costs."""
 MAX_THREADS = 4
-MAX_BOUND = 4
-"""Numbers of poses for which arrays are kept."""
+MAX_KEPT_EXECUTIONS = 4
+"""Executions that `Network.positions` keeps, one for each number of poses."""
 
 
 class Network:
-    """A model that is ready to play.
+    """A model that is loaded into ONNX Runtime.
 
     Attributes:
-        path: the file.
-        info: what the model says of itself.
+        path: path of the file.
+        info: metadata of the model.
     """
 
     def __init__(self, path: Path, data: bytes | None = None):
         """Load a model.
 
         Args:
-            path: the file.
-            data: its bytes, where it is no file; `path` is then what errors call it.
+            path: path of the file.
+            data: the bytes of a model that is not in a file; `path` is then its name in error messages.
 
         Raises:
-            ModelError: the file is no model or ONNX Runtime refuses it.
+            ModelError: the file is no model, or ONNX Runtime refuses it.
         """
         self.path = path
         self.info, data = read_model(path) if data is None else (check_model(data, path), data)
@@ -62,14 +62,14 @@ class Network:
         onnxruntime.set_default_logger_severity(3)
         onnxruntime.disable_telemetry_events()
         options = onnxruntime.SessionOptions()
-        large = self.info.vertex_count >= THREADED_VERTICES
-        options.intra_op_num_threads = min(MAX_THREADS, os.cpu_count() or 1) if large else 1
+        is_large = self.info.vertex_count >= MULTITHREADED_VERTICES
+        options.intra_op_num_threads = min(MAX_THREADS, os.cpu_count() or 1) if is_large else 1
         options.inter_op_num_threads = 1
-        # Threads that spin between frames would take the processor from Blender's own.
+        # Threads that spin between frames would take processor time from Blender.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
             self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # ONNX Runtime's exceptions have no common base but this.
+        except Exception as error:  # ONNX Runtime's exceptions have no other common base.
             raise ModelError(
                 f"ONNX Runtime refuses the model '{path}' ({_first_line(error)}); train it again."
             ) from error
@@ -80,43 +80,43 @@ class Network:
 
         Args:
             pose_matrices: (N, J, 4, 4) float32, mesh-object space, mesh units.
-            controls: (N, C) float32, values in the order of `info.controls`; a model without controls looks at none.
+            controls: (N, C) float32, in the order of `info.controls`; ignored by a model without controls.
 
         Returns:
-            (N, V, 3) float32, mesh-object space, mesh units. The array is the network's own: the next call with as many
-            poses writes into it, so that a frame needs no new memory.
+            (N, V, 3) float32, mesh-object space, mesh units. The next call with the same number of poses overwrites
+            this array, so that a frame needs no new memory.
 
         Raises:
-            ModelError: the model fails, or values of its controls are missing.
+            ModelError: the model fails, or the values of its controls are missing.
         """
-        count = len(pose_matrices)
-        if count not in self._executions:
-            if len(self._executions) >= MAX_BOUND:
+        pose_count = len(pose_matrices)
+        if pose_count not in self._executions:
+            if len(self._executions) >= MAX_KEPT_EXECUTIONS:
                 self._executions.clear()
-            self._executions[count] = Execution(self, count)
-        execution = self._executions[count]
+            self._executions[pose_count] = Execution(self, pose_count)
+        execution = self._executions[pose_count]
         execution.poses[:] = pose_matrices
         if self.info.controls:
-            execution.controls[:] = self._controls(controls, count)
+            execution.controls[:] = self._check_controls(controls, pose_count)
         return execution.run()
 
     def confidence(self, pose_matrices: np.ndarray, controls: np.ndarray | None = None) -> np.ndarray | None:
-        """Evaluate the confidence of the networks; it takes as long as the positions, so not for every frame.
+        """Evaluate the confidence of each partition; it takes as long as the positions, so not for every frame.
 
         Args:
             pose_matrices, controls: as for `positions`.
 
         Returns:
-            (N, P) float32, 0 to 1, in the order of `info.partitions`; None when the model does not say.
+            (N, P) float32, 0 to 1, in the order of `info.partitions`; None if the model has no such output.
 
         Raises:
-            ModelError: the model fails, answers in another shape, or values of its controls are missing.
+            ModelError: the model fails, its output has another shape, or the values of its controls are missing.
         """
         if CONFIDENCE_OUTPUT not in {output.name for output in self._session.get_outputs()}:
             return None
         inputs = {POSE_INPUT: pose_matrices}
         if self.info.controls:
-            inputs[CONTROLS_INPUT] = np.asarray(self._controls(controls, len(pose_matrices)), np.float32)
+            inputs[CONTROLS_INPUT] = np.asarray(self._check_controls(controls, len(pose_matrices)), np.float32)
         try:
             (confidence,) = self._session.run([CONFIDENCE_OUTPUT], inputs)
         except Exception as error:  # As above.
@@ -126,38 +126,39 @@ class Network:
         return confidence
 
     def linear_rig(self, rig: Rig) -> Rig:
-        """A rig that the model fits, with the skin weights of the model's linear skinning, which may be fitted ones."""
+        """Return a rig with the skin weights of the model's linear skinning, which may have been fitted."""
         if self._skin is None:
             return rig
         joints, weights = self._skin
         return replace(rig, skin_joints=joints, skin_weights=weights)
 
-    def _controls(self, controls: np.ndarray | None, count: int) -> np.ndarray:
-        """Values of the controls, sure to be there and to be as many as the model takes."""
-        shape, found = (count, len(self.info.controls)), None if controls is None else np.shape(controls)
-        if found != shape:
+    def _check_controls(self, controls: np.ndarray | None, pose_count: int) -> np.ndarray:
+        """Return the values of the controls, (N, C), if they have the shape that the model takes."""
+        expected = (pose_count, len(self.info.controls))
+        shape = None if controls is None else np.shape(controls)
+        if shape != expected:
             raise ModelError(
-                f"The model '{self.path}' has {shape[1]} controls and takes their values as an array {shape}; "
-                f"it was given {'none' if found is None else found}."
+                f"The model '{self.path}' has {expected[1]} controls and takes their values as an array {expected}; "
+                f"it was given {'none' if shape is None else shape}."
             )
         return controls
 
 
 class Execution:
-    """Executes a network with arrays of its own, so that several threads may execute one network at a time.
+    """Input and output arrays for a number of poses, bound to a session; several threads can run one model at a time.
 
     Attributes:
-        poses: (N, J, 4, 4) float32, to be written before `run`: pose matrices, mesh-object space, mesh units.
-        controls: (N, C) float32, likewise: values in the order of `info.controls`.
-        positions: (N, V, 3) float32, mesh-object space, mesh units: what the last `run` gave.
+        poses: (N, J, 4, 4) float32, pose matrices, mesh-object space, mesh units. Set them before `run`.
+        controls: (N, C) float32, in the order of `info.controls`. Set them before `run`.
+        positions: (N, V, 3) float32, mesh-object space, mesh units, written by `run`.
     """
 
-    def __init__(self, network: Network, count: int):
+    def __init__(self, network: Network, pose_count: int):
         info = network.info
         self._path, self._session = network.path, network._session
-        self.poses = np.zeros((count, len(info.joints), 4, 4), np.float32)
-        self.controls = np.zeros((count, len(info.controls)), np.float32)
-        self.positions = np.empty((count, info.vertex_count, 3), np.float32)
+        self.poses = np.zeros((pose_count, len(info.joints), 4, 4), np.float32)
+        self.controls = np.zeros((pose_count, len(info.controls)), np.float32)
+        self.positions = np.empty((pose_count, info.vertex_count, 3), np.float32)
         self._binding = self._session.io_binding()
         self._binding.bind_input(POSE_INPUT, "cpu", 0, np.float32, self.poses.shape, self.poses.ctypes.data)
         if info.controls:
@@ -167,7 +168,7 @@ class Execution:
         self._binding.bind_output(POSITIONS_OUTPUT, "cpu", 0, np.float32, self.positions.shape, address)
 
     def run(self) -> np.ndarray:
-        """Deform the mesh; gives `positions`.
+        """Run the model on `poses` and `controls`, and return `positions`.
 
         Raises:
             ModelError: the model fails.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A model that is opened for a rig: its network, and the rig as the model sees it."""
+"""Opens a model for a rig and checks that they fit."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +13,11 @@ from .network import Network
 
 @dataclass(frozen=True)
 class OpenedModel:
-    """A model and a rig that fit each other.
+    """A model and the rig that it fits.
 
     Attributes:
-        network: of the model.
-        rig: that of the scene, with joints, controls and unit of the model, and the skin weights that its mesh has.
+        network: the loaded model.
+        rig: the rig of the scene, with the joints, controls and unit of the model, and the skin weights of its mesh.
     """
 
     network: Network
@@ -25,7 +25,7 @@ class OpenedModel:
 
     @property
     def linear_rig(self) -> Rig:
-        """The rig with the skin weights of the model's linear skinning."""
+        """Return the rig with the skin weights of the model's linear skinning."""
         return self.network.linear_rig(self.rig)
 
 
@@ -33,19 +33,24 @@ def open_model(scene_rig: SceneRig, model: Path | Network) -> OpenedModel:
     """Open a model for a rig.
 
     Args:
-        scene_rig: the rig; all that deforms it as it was when it was recorded.
-        model: the file, or what was loaded of it.
+        scene_rig: the rig, with the deformation that was recorded.
+        model: path of the model, or the loaded model.
 
     Raises:
-        ModelError: it cannot be read, or was trained for another rig.
+        ModelError: the model cannot be read, or was trained for another rig.
         RigError: the rig cannot be read.
     """
     network = model if isinstance(model, Network) else Network(model)
-    return OpenedModel(network, fitting_rig(scene_rig, network.path, network.info))
+    return OpenedModel(network, read_matching_rig(scene_rig, network.path, network.info))
 
 
-def fitting_rig(scene_rig: SceneRig, path: Path, info: ModelInfo) -> Rig:
-    """Read a rig as a model sees it, which says so much of itself.
+def read_matching_rig(scene_rig: SceneRig, path: Path, info: ModelInfo) -> Rig:
+    """Read a rig with the joints and controls of a model, and check that it is the one that the model was trained for.
+
+    Args:
+        scene_rig: the rig.
+        path: path of the model, for error messages.
+        info: metadata of the model.
 
     Raises:
         ModelError: the model was trained for another rig.

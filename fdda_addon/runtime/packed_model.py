@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Models inside the .blend file.
+"""Packs models into the .blend file.
 
-The bytes are a custom property of a text datablock, which nothing evaluates: on the mesh object they would be copied
-whenever Blender copies the object for an evaluation. The text itself says to people what it is. The objects that use
-the model point to it, so it comes along when they are appended or linked, and goes when the last of them goes.
+The bytes are a custom property of a text datablock, which Blender never evaluates: those of a mesh object would be
+copied with each evaluated copy. The text explains what it is. The objects that use the model point to it, so Blender
+appends and links it with them, and removes it with the last of them.
 """
 
 from pathlib import Path
@@ -15,21 +15,26 @@ from ..core.model import MAX_BYTES, check_model
 from .network import Network
 
 KEY = "fdda_model"
+"""Custom property of a text datablock that holds a model."""
 MAX_PROPERTY_BYTES = (1 << 31) - 1
-"""A custom property holds no more."""
+"""Blender's limit for a custom property."""
 
 _networks: dict[int, Network] = {}
+"""The loaded models by the session ids of their text datablocks."""
 
 
 def pack(name: str, data: bytes) -> bpy.types.Text:
-    """Put a model into the open file.
+    """Pack a model into the open file.
 
     Args:
-        name: of the model.
-        data: its bytes.
+        name: name of the model.
+        data: bytes of the model.
+
+    Returns:
+        The text datablock.
 
     Raises:
-        ModelError: it is no model, or too large.
+        ModelError: the bytes are no model, or too large.
     """
     check_model(data, name)
     if len(data) > min(MAX_BYTES, MAX_PROPERTY_BYTES):
@@ -42,10 +47,10 @@ def pack(name: str, data: bytes) -> bpy.types.Text:
 
 
 def read(text: bpy.types.Text) -> bytes:
-    """The bytes of a packed model, not checked.
+    """Return the bytes of a packed model without checking them.
 
     Raises:
-        ModelError: the text holds none.
+        ModelError: the text holds no model.
     """
     data = text.get(KEY)
     if not isinstance(data, bytes):
@@ -54,7 +59,7 @@ def read(text: bpy.types.Text) -> bytes:
 
 
 def load(text: bpy.types.Text) -> Network:
-    """The network of a packed model, loaded once.
+    """Load a packed model, once.
 
     Raises:
         ModelError: the text holds no model, or one that is refused.
@@ -67,12 +72,12 @@ def load(text: bpy.types.Text) -> Network:
 
 
 def release_unused(used: set[int]) -> None:
-    """Let go of the networks of all texts but those of some session ids."""
+    """Free all loaded models except those of the texts with these session ids."""
     for uid in _networks.keys() - used:
         del _networks[uid]
 
 
 def remove_unused() -> None:
-    """Remove the packed models that no object uses any more."""
+    """Remove the text datablocks of models that no object uses any more."""
     for text in [text for text in bpy.data.texts if KEY in text and text.users == 0]:
         bpy.data.texts.remove(text)

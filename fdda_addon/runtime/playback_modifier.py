@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Geometry Nodes modifier that gives a mesh the positions of a position buffer.
+"""The FDDA modifier: a Geometry Nodes modifier that moves the vertices of a mesh to the positions of a position buffer.
 
-The positions lie in a mesh of their own, which is in no scene: the user's mesh is never touched, and objects that
-share one mesh datablock can still have different positions.
+The positions are in a mesh of their own, so the user's mesh is never changed, and objects that share a mesh can have
+different positions.
 """
 
 import bpy
@@ -14,59 +14,63 @@ from ..scene.scene_rig import MODIFIER_NAME
 GROUP_NAME = "FDDA Playback"
 
 
-def add_modifier(mesh_object: bpy.types.Object, place: int) -> bpy.types.NodesModifier:
-    """Add the modifier at a place of the stack; it is given a position buffer when it plays.
+def add_modifier(mesh_object: bpy.types.Object, index: int) -> bpy.types.NodesModifier:
+    """Add the FDDA modifier to a mesh object, without a position buffer, or reuse one that it already has.
 
-    A library override may have one of its library, which cannot be removed; that one serves again. So does one that is
-    left from a binding that is gone: an override forgets its binding when it is saved where the add-on is missing.
+    A library override may have the modifier from its library and cannot remove it. An override also loses its binding,
+    but not the modifier, when it is saved where the add-on is missing.
+
+    Args:
+        mesh_object: the object.
+        index: index of the modifier in the stack.
     """
     modifier = find_modifier(mesh_object)
     if modifier is not None:
-        if not is_inherited(modifier):
-            now = mesh_object.modifiers.find(modifier.name)
-            mesh_object.modifiers.move(now, place - (now < place))
+        if not is_from_library(modifier):
+            current_index = mesh_object.modifiers.find(modifier.name)
+            mesh_object.modifiers.move(current_index, index - (current_index < index))
         return modifier
     modifier = mesh_object.modifiers.new(MODIFIER_NAME, "NODES")
-    modifier.node_group = _node_group()
+    modifier.node_group = _ensure_node_group()
     modifier.show_viewport = modifier.show_render = False
     modifier.show_in_editmode = True
     modifier.show_on_cage = False
     modifier.show_expanded = False
-    # Not the last where another modifier is pinned to the end.
-    mesh_object.modifiers.move(mesh_object.modifiers.find(modifier.name), place)
+    # A new modifier is not the last where another one is pinned to the end.
+    mesh_object.modifiers.move(mesh_object.modifiers.find(modifier.name), index)
     return modifier
 
 
 def find_modifier(mesh_object: bpy.types.Object) -> bpy.types.NodesModifier | None:
-    """The modifier that plays a model, None when it was removed."""
-    return next((modifier for modifier in mesh_object.modifiers if plays(modifier)), None)
+    """Find the FDDA modifier of a mesh object; return None when it was removed."""
+    return next((modifier for modifier in mesh_object.modifiers if is_fdda_modifier(modifier)), None)
 
 
-def plays(modifier: bpy.types.Modifier) -> bool:
-    """Whether a modifier is one that plays a model."""
+def is_fdda_modifier(modifier: bpy.types.Modifier) -> bool:
+    """Return whether a modifier is an FDDA modifier."""
     return modifier.type == "NODES" and modifier.node_group is not None and PLAYBACK_KEY in modifier.node_group
 
 
-def is_inherited(modifier: bpy.types.NodesModifier) -> bool:
-    """Whether a library override has a modifier from its library."""
+def is_from_library(modifier: bpy.types.NodesModifier) -> bool:
+    """Return whether a library override has a modifier from its library."""
     return modifier.id_data.override_library is not None and modifier.is_override_data
 
 
 def buffer_of(modifier: bpy.types.NodesModifier) -> bpy.types.Object | None:
-    """The position buffer of a modifier."""
+    """Return the position buffer of an FDDA modifier."""
     return node_input(modifier, _buffer_socket(modifier.node_group))
 
 
 def set_buffer(modifier: bpy.types.NodesModifier, buffer: bpy.types.Object | None) -> None:
-    """Give a modifier another position buffer, or none."""
+    """Set the position buffer of an FDDA modifier; None to disconnect it."""
     set_node_input(modifier, _buffer_socket(modifier.node_group), buffer)
-    # Setting the input alone does not tell the dependency graph of the new relation.
+    # Setting the input alone does not update the relations of the dependency graph.
     modifier.node_group = modifier.node_group
 
 
 def used_buffers() -> set[bpy.types.Object]:
-    """The position buffers that modifiers read."""
-    modifiers = (m for o in bpy.data.objects if o.type == "MESH" for m in o.modifiers if plays(m))
+    """Return the position buffers that FDDA modifiers read."""
+    modifiers = (m for o in bpy.data.objects if o.type == "MESH" for m in o.modifiers if is_fdda_modifier(m))
     return {buffer for modifier in modifiers if (buffer := buffer_of(modifier)) is not None}
 
 
@@ -77,10 +81,10 @@ def _buffer_socket(group: bpy.types.NodeTree) -> str:
     raise KeyError(f"the node group '{group.name}' has no input for the positions")
 
 
-def _node_group() -> bpy.types.NodeTree:
-    """Object Info → Sample Index → Set Position; one group serves all bindings of a file.
+def _ensure_node_group() -> bpy.types.NodeTree:
+    """Return the node group of the file, or create it: Object Info → Sample Index → Set Position.
 
-    Where the position buffer is missing or has another number of vertices, the mesh stays as it is.
+    It leaves the mesh unchanged if the position buffer is missing or has another number of vertices.
     """
     for group in bpy.data.node_groups:
         if PLAYBACK_KEY in group and group.library is None:
@@ -91,33 +95,33 @@ def _node_group() -> bpy.types.NodeTree:
     group.interface.new_socket("Positions", in_out="INPUT", socket_type="NodeSocketObject")
     group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
 
-    def node(kind: str, column: int, row: int, **settings: str) -> bpy.types.Node:
-        new = group.nodes.new(kind)
-        new.location = (200 * column, -200 * row)
+    def add_node(node_type: str, column: int, row: int, **settings: str) -> bpy.types.Node:
+        node = group.nodes.new(node_type)
+        node.location = (200 * column, -200 * row)
         for name, value in settings.items():
-            setattr(new, name, value)
-        return new
+            setattr(node, name, value)
+        return node
 
-    inputs = node("NodeGroupInput", 0, 0)
-    info = node("GeometryNodeObjectInfo", 1, 1, transform_space="ORIGINAL")
-    position = node("GeometryNodeInputPosition", 1, 2)
-    index = node("GeometryNodeInputIndex", 1, 3)
-    sample = node("GeometryNodeSampleIndex", 2, 1, data_type="FLOAT_VECTOR", domain="POINT")
-    mesh_size, buffer_size = (node("GeometryNodeAttributeDomainSize", 2, row) for row in (2, 3))
-    set_position = node("GeometryNodeSetPosition", 3, 0)
-    equal = node("FunctionNodeCompare", 3, 2, data_type="INT", operation="EQUAL")
+    inputs = add_node("NodeGroupInput", 0, 0)
+    object_info = add_node("GeometryNodeObjectInfo", 1, 1, transform_space="ORIGINAL")
+    position = add_node("GeometryNodeInputPosition", 1, 2)
+    index = add_node("GeometryNodeInputIndex", 1, 3)
+    sample = add_node("GeometryNodeSampleIndex", 2, 1, data_type="FLOAT_VECTOR", domain="POINT")
+    mesh_size, buffer_size = (add_node("GeometryNodeAttributeDomainSize", 2, row) for row in (2, 3))
+    set_position = add_node("GeometryNodeSetPosition", 3, 0)
+    equal = add_node("FunctionNodeCompare", 3, 2, data_type="INT", operation="EQUAL")
     first, second = (socket for socket in equal.inputs if socket.type == "INT")
-    switch = node("GeometryNodeSwitch", 4, 0, input_type="GEOMETRY")
-    outputs = node("NodeGroupOutput", 5, 0)
+    switch = add_node("GeometryNodeSwitch", 4, 0, input_type="GEOMETRY")
+    outputs = add_node("NodeGroupOutput", 5, 0)
     for source, target in (
         (inputs.outputs["Geometry"], set_position.inputs["Geometry"]),
-        (inputs.outputs["Positions"], info.inputs["Object"]),
-        (info.outputs["Geometry"], sample.inputs["Geometry"]),
+        (inputs.outputs["Positions"], object_info.inputs["Object"]),
+        (object_info.outputs["Geometry"], sample.inputs["Geometry"]),
         (position.outputs["Position"], sample.inputs["Value"]),
         (index.outputs["Index"], sample.inputs["Index"]),
         (sample.outputs["Value"], set_position.inputs["Position"]),
         (inputs.outputs["Geometry"], mesh_size.inputs["Geometry"]),
-        (info.outputs["Geometry"], buffer_size.inputs["Geometry"]),
+        (object_info.outputs["Geometry"], buffer_size.inputs["Geometry"]),
         (mesh_size.outputs["Point Count"], first),
         (buffer_size.outputs["Point Count"], second),
         (equal.outputs["Result"], switch.inputs["Switch"]),

@@ -51,7 +51,7 @@ def save_character(source: Path, path: Path) -> None:
 
 def make_library(elbow: ElbowFiles, folder: Path) -> Library:
     """The bound elbow in a folder of its own; the open file is an empty shot, saved in another."""
-    model_files._chosen.clear()
+    model_files._chosen_paths.clear()
     files = Library(folder / "characters" / "elbow.blend", folder / "characters" / "elbow.onnx")
     files.path.parent.mkdir()
     shutil.copy(elbow.model, files.model)

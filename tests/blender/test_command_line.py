@@ -153,7 +153,7 @@ def test_a_name_chooses_the_object(elbow, tmp_path, capfd):
 def opened(path) -> bpy.types.Object:
     """The elbow of a file, opened as a user would who never chose a model in this session."""
     registry.reset_players()
-    model_files._chosen.clear()
+    model_files._chosen_paths.clear()
     bpy.ops.wm.open_mainfile(filepath=str(path))
     return bpy.data.objects["elbow"]
 

@@ -130,7 +130,7 @@ def test_a_path_out_of_the_folder_of_the_library_is_not_followed(library, tmp_pa
     outside = library.model.rename(tmp_path / "shots" / "elbow.onnx")
     bpy.data.objects[ELBOW].fdda.model = f"//../shots/{outside.name}"
     bpy.ops.wm.save_as_mainfile(filepath=str(library.path))
-    model_files._chosen.clear()
+    model_files._chosen_paths.clear()
     new_shot(tmp_path)
     mesh_object = override(link(library.path), 0.5)
     bpy.context.view_layer.update()

@@ -29,7 +29,7 @@ def save_elsewhere(tmp_path):
     path = tmp_path / "elsewhere" / "shot.blend"
     path.parent.mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    model_files._chosen.clear()
+    model_files._chosen_paths.clear()
     bpy.ops.wm.open_mainfile(filepath=str(path))
     return bpy.data.objects[ELBOW]
 
@@ -55,7 +55,7 @@ def test_a_bound_model_comes_along_with_append(rig, elbow, model, tmp_path):
     path.parent.mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    model_files._chosen.clear()
+    model_files._chosen_paths.clear()
     before = set(bpy.context.scene.objects.keys())
     with bpy.data.libraries.load(str(path)) as (_, wanted):
         wanted.objects = [ELBOW, ELBOW_RIG]
@@ -97,7 +97,7 @@ def test_a_packed_model_that_is_trained_anew_is_packed_anew(rig, elbow, model):
 
 def test_a_trusted_folder_is_followed_and_no_other(bound, elbow, model, tmp_path, monkeypatch):
     bound.fdda.model = bound.fdda.models[0].path = str(model)
-    model_files._chosen.clear()
+    model_files._chosen_paths.clear()
     with pytest.raises(ModelError, match="or trust its folder in the preferences"):
         model_files.model_path(bound)
     monkeypatch.setattr(model_trust, "trusted_folders", lambda: [(tmp_path / "other").resolve()])

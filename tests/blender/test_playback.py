@@ -274,7 +274,7 @@ def test_path_out_of_the_folder_is_not_followed(bound, elbow, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
     from fdda_addon.runtime import model_files
 
-    model_files._chosen.clear()
+    model_files._chosen_paths.clear()
     bpy.ops.wm.open_mainfile(filepath=str(path))
     bpy.context.view_layer.update()
     assert "outside the folder of 'elsewhere.blend'" in bpy.data.objects[ELBOW].fdda.status

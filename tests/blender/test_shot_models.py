@@ -38,7 +38,7 @@ def test_binding_to_an_override(elbow, tmp_path):
     bpy.context.view_layer.update()
     true = evaluated(mesh_object)
     model_list.bind_entry(rig_of(mesh_object), model_list.remember(mesh_object, model))
-    model_files._chosen.clear()
+    model_files._chosen_paths.clear()
     for _ in range(2):
         mesh_object = own_characters()[0]
         assert_plays(mesh_object, model)
@@ -85,7 +85,7 @@ def test_another_model_in_the_shot(pair, library, elbow, tmp_path):
     first, second = own_characters()
     assert not first.fdda.is_bound and second.fdda.is_bound
     model_list.bind_entry(rig_of(first), model_list.remember(first, model))
-    model_files._chosen.clear()
+    model_files._chosen_paths.clear()
     assert sum(m.type == "NODES" for m in first.modifiers) == 1
     assert model_files.model_path(first) == model
     library.model.unlink()
@@ -99,7 +99,7 @@ def test_another_model_in_the_shot(pair, library, elbow, tmp_path):
 def test_an_override_keeps_the_name_of_the_librarys_model(pair, library, tmp_path):
     model_list.adopt(pair[0])
     model_list.bind_entry(rig_of(pair[0]), pair[0].fdda.models[0])
-    model_files._chosen.clear()
+    model_files._chosen_paths.clear()
     assert pair[0].fdda.model == "//elbow.onnx"
     save_and_open(tmp_path)
     assert_play(library)
