@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-import torch._dynamo  # noqa: F401 - an optimizer would at its first step: seconds in which nobody can stop it
 from torch.func import functional_call
 
 from fdda_addon.core.errors import TrainingError
@@ -14,6 +13,7 @@ from fdda_addon.core.errors import TrainingError
 from .config import TrainingConfig
 from .data import PreparedPartition, Split
 from .model import Network, PartitionNetworks
+from .optimizer import OneCycleAdamW
 from .process import Cancelled
 
 WARM_UP = 0.15
@@ -197,11 +197,8 @@ class _Loop:
     ) -> None:
         config, poses = self.config, self.x.shape[1]
         steps = -(-poses // config.batch_size)
-        optimizer = torch.optim.AdamW(
-            self.model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
-        )
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, config.learning_rate, total_steps=config.epochs * steps, pct_start=WARM_UP
+        optimizer = OneCycleAdamW(
+            self.model.parameters(), config.learning_rate, config.weight_decay, config.epochs * steps, WARM_UP
         )
         order_generator = torch.Generator().manual_seed(config.seed + 1)
         drop_generator = torch.Generator(self.device).manual_seed(config.seed + 2)
@@ -220,7 +217,6 @@ class _Loop:
                     raise Cancelled
                 batch = order[step * config.batch_size : (step + 1) * config.batch_size]
                 errors = self._step(optimizer, batch, drop_generator)
-                schedule.step()
                 self._average((epoch - 1) * steps + step)
                 training_mm += (errors * self.to_mm.square() + self.left_mm.square()).sqrt().sum(dim=1)
             validation_mm, worst_mm = self._validate()
@@ -245,9 +241,9 @@ class _Loop:
             if config.patience and epoch - max(curve.best_epoch for curve in curves) >= config.patience:
                 break
 
-    def _step(self, optimizer: torch.optim.Optimizer, batch: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    def _step(self, optimizer: OneCycleAdamW, batch: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """One step; returns (P, n) squared errors of the poses relative to the partition's residual."""
-        optimizer.zero_grad(set_to_none=True)
+        optimizer.zero_grad()
         difference = self.model(self.x[:, batch], generator) - self.y[:, batch]
         errors = difference.square().sum(dim=2)
         # The mean distance, not its square: it is what the error is measured by, and a few odd poses do not rule it.
