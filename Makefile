@@ -36,7 +36,7 @@ test-trainer: .venv  ## the tests of the training, export and report
 test-blender: .venv  ## the tests that run in Blender
 	.venv/bin/python -m pytest $(SIDE_BY_SIDE) tests/blender
 
-test-examples: .venv  ## the examples of docs/elsewhere.md, in Python and in Chromium (CHROMIUM=/path/to/chromium)
+test-examples: .venv  ## the examples of docs/formats.md, in Python and in Chromium (CHROMIUM=/path/to/chromium)
 	.venv/bin/python -m pytest tests/examples
 
 farm: .venv-farm  ## what characters.toml says, on this machine or a cluster (PLAN=characters.toml, OPTIONS="--workers 2")

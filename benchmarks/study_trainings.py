@@ -91,7 +91,7 @@ def read_material(training: Path, held_out: Path, names: tuple[str, ...]) -> Mat
 
 
 def train_once(material: Material, config: TrainingConfig, model_path: Path) -> dict:
-    """Train, export and measure; writes the model and returns what is known of it, as docs/study.md has it."""
+    """Train, export and measure; writes the model and returns what is known of it, as docs/experiments.md has it."""
     recording = material.training
     wall, processor = time.perf_counter(), time.process_time()
     split = split_poses(np.arange(len(recording.pose_matrices)), config.validation_fraction, config.seed)

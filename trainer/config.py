@@ -13,7 +13,7 @@ ACTIVATIONS = ("silu", "gelu", "tanh", "relu")
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Settings of a training; docs/training.md has the measurements behind the defaults.
+    """Settings of a training; docs/experiments.md has the measurements behind the defaults.
 
     Attributes:
         seed: of the split, the initial weights, the order of the poses and the dropout.

@@ -5,8 +5,8 @@ Delta mush smooths the skinned surface and sets the detail of the rest pose, a d
 surface lies (Mancewicz and others, Delta Mush, 2014; Blender's Corrective Smooth). Where the surface folds, a small
 turn of a joint turns a delta over, and a network that sees joints alone cannot follow. Linear skinning that is smoothed
 is linear in the pose matrices, so at a few vertices it costs little to see how it lies: a delta is taken as a sum of
-tangents and normals of the corners of faces there, each as long as fits the recording (`delta_fit`). docs/training.md
-has the errors with and without.
+tangents and normals of the corners of faces there, each as long as fits the recording (`delta_fit`).
+docs/experiments.md has the errors with and without.
 """
 
 from dataclasses import dataclass

@@ -3,7 +3,7 @@
 
 At one pose a frame the graph costs most of a microsecond a node, whatever the node does, and the time to read its
 constants once: hence few nodes, products with matrices of ones and zeros in place of gathers, and little padding.
-docs/training.md has the measurements. In the modules of the graph: N poses, J joints, C controls, Q pairs of joints,
+docs/experiments.md has the measurements. In the modules of the graph: N poses, J joints, C controls, Q pairs of joints,
 F features, D deltas, P partitions, K basis shapes, V vertices.
 """
 

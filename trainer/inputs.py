@@ -4,7 +4,7 @@
 A smoothed surface depends on where the surface around it is. From the parent-relative transforms a network would have
 to multiply its way to that; so it is also given the middle of the partitions around it, seen from its main joint, and
 where the rig smooths, how some vertices stand out of the smoothed surface (`deltas`).
-docs/training.md has the errors with and without.
+docs/experiments.md has the errors with and without.
 """
 
 from collections.abc import Sequence

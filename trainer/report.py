@@ -43,7 +43,7 @@ def make_report(
     model_name: str,
     worst: Sequence[Worst],
 ) -> dict:
-    """What `report.json` holds (`core.report`). docs/training.md describes the keys; errors are in mm.
+    """What `report.json` holds (`core.report`). docs/formats.md describes the keys; errors are in mm.
 
     Args:
         recording, deformation, exported, curves: of the training.

@@ -27,7 +27,7 @@ TIE = 1e-5
 """Joints whose errors for a vertex differ by less than this part of the character's size count as equally good."""
 MAX_PRUNING_LOSS = 0.1
 """A weight is left out where the error grows by no larger part without it. Every joint that moves a partition a little
-is one more input to learn from: docs/training.md, Fitted skin weights."""
+is one more input to learn from: docs/experiments.md, Fitted skin weights."""
 MIN_WEIGHT = 1e-3
 """Smaller weights are left out in any case."""
 ROUNDING = 1e-12

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The model: one ONNX file that deforms a character. docs/model.md describes the format."""
+"""The model: one ONNX file that deforms a character. docs/formats.md describes the format."""
 
 import json
 from dataclasses import asdict, dataclass, field

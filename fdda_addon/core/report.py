@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report of a training, `report.json` beside its model (docs/training.md): its names, and reading what has them.
+"""The report of a training, `report.json` beside its model (docs/formats.md): its names, and reading what has them.
 
 The trainer writes it, its page and the sidebar show it.
 """
@@ -126,7 +126,7 @@ def read_report(path: Path) -> dict:
     """Read a report.
 
     Returns:
-        It, with all keys of docs/training.md and values of their kinds.
+        It, with all keys of docs/formats.md and values of their kinds.
 
     Raises:
         TrainingError: there is none that can be read, or it is none of this version, or damaged.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Fitted skin weights: what is known of a fit, and the weights as text for a model's metadata.
 
-docs/recording.md and docs/model.md describe both.
+docs/formats.md describes both.
 """
 
 import base64

@@ -129,7 +129,7 @@ class Evaluation:
         return error_statistics(self.held_out.linear)
 
     def to_json(self) -> dict:
-        """docs/evaluation.md describes it; lengths in mm, angles in degrees."""
+        """docs/formats.md describes it; lengths in mm, angles in degrees."""
         return {
             "unit": "mm",
             "poses": len(self.held_out.fdda),

@@ -16,7 +16,7 @@ from ..core.rig import STATIC_JOINT
 from .mesh import rest_positions
 
 MIN_INFLUENCES = 4
-"""Skin weights have at least this many places a vertex (docs/recording.md)."""
+"""Skin weights have at least this many places a vertex (docs/formats.md)."""
 MIN_SUM = 1e-4
 """A vertex whose weights sum to less is not moved by the modifier."""
 

@@ -71,7 +71,7 @@ class Benchmark:
         return float(np.median(self.rig) / np.median(self.fdda))
 
     def to_json(self) -> dict:
-        """docs/evaluation.md describes it."""
+        """docs/formats.md describes it."""
         return {
             "unit": "ms",
             "vertices": self.vertices,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The pages on the file formats: their code runs on what the verbs write, and their tables name every key."""
+"""The page on the file formats: its code runs on what the verbs write, and its tables name every key."""
 
 import json
 import os
@@ -23,13 +23,19 @@ pytestmark = pytest.mark.to_single_line
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def page(name: str) -> str:
-    return (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
+FORMATS = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+DEVELOPMENT = (ROOT / "docs" / "development.md").read_text(encoding="utf-8")
 
 
-def run_code(name: str, folder: Path, python: str = sys.executable, arguments: tuple[object, ...] = ()) -> str:
-    """Run the only block of code of a page in a folder; returns what it prints."""
-    (code,) = re.findall(r"```python\n(.*?)```", page(name), re.DOTALL)
+def chapter(name: str) -> str:
+    """The text of a chapter of docs/formats.md."""
+    assert f"\n## {name}\n" in FORMATS
+    return FORMATS.partition(f"\n## {name}\n")[2].partition("\n## ")[0]
+
+
+def run_code(text: str, folder: Path, python: str = sys.executable, arguments: tuple[object, ...] = ()) -> str:
+    """Run the only block of code of a text in a folder; returns what it prints."""
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     code = textwrap.dedent(code)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     result = subprocess.run(
@@ -46,7 +52,7 @@ def run_code(name: str, folder: Path, python: str = sys.executable, arguments: t
 
 @pytest.fixture(scope="module")
 def folder(elbow, tmp_path_factory) -> Path:
-    """The files of the elbow under the names that the pages use."""
+    """The files of the elbow under the names that the page uses."""
     folder = tmp_path_factory.mktemp("documents")
     shutil.copytree(elbow.recording, folder / "recording")
     (folder / "model.onnx").write_bytes(elbow.model.read_bytes())
@@ -67,16 +73,17 @@ def test_recording_code(folder):
     expected = (
         distances(skinning.complex_positions(pose, recording.residuals[:1]), skinning.positions(pose)).mean() * 1000
     )
-    shape, value = re.fullmatch(r"(\(300, 3\)) mean residual (\S+) mm\n", run_code("recording", folder)).groups()
+    output = run_code(chapter("Recording"), folder)
+    shape, value = re.fullmatch(r"(\(300, 3\)) mean residual (\S+) mm\n", output).groups()
     assert shape and float(value) == pytest.approx(expected, rel=1e-3)
 
 
 def test_model_code(folder):
-    assert run_code("model", folder).startswith("['upper', 'lower'] (2, 300, 3) [1. ")
+    assert run_code(chapter("Model"), folder).startswith("['upper', 'lower'] (2, 300, 3) [1. ")
 
 
 def test_evaluation_code(folder):
-    lines = run_code("evaluation", folder).splitlines()
+    lines = run_code(chapter("Evaluation"), folder).splitlines()
     report = json.loads((folder / "evaluation.json").read_text())
     assert lines[0].startswith(f"mean {report['fdda']['mean']:.3f} mm, linear skinning ")
     assert lines[1].startswith("largest error: ")
@@ -84,13 +91,13 @@ def test_evaluation_code(folder):
 
 def test_messages_code(folder, tmp_path):
     shutil.copytree(folder / "recording", tmp_path / "recording")
-    lines = run_code("messages", tmp_path, trainer_python()).splitlines()
+    lines = run_code(chapter("Trainer messages"), tmp_path, trainer_python()).splitlines()
     assert len(lines) == 3 and lines[1].startswith("2/2: ") and lines[2] == "finished 0"
 
 
 def test_development_code(elbow, tmp_path):
     """What plays is what the model says, the model is near the rig, and linear skinning is farther."""
-    text = run_code("development", tmp_path, arguments=(elbow.bound, "elbow", 12))
+    text = run_code(DEVELOPMENT, tmp_path, arguments=(elbow.bound, "elbow", 12))
     playback, model, linear = (float(far) for far in re.findall(r"^\w.*: ([\d.]+) at vertex", text, re.MULTILINE))
     assert playback < 1e-5 and playback < model < 0.002 < linear
 
@@ -111,8 +118,8 @@ def named(text: str, key: str) -> bool:
     return key in words or ((parts[0] in words or ".".join(parts[:-1]) in words) and parts[-1] in words)
 
 
-def test_recording_page_names_every_key_and_array(folder):
-    text = page("recording")
+def test_recording_chapter_names_every_key_and_array(folder):
+    text = chapter("Recording")
     index = json.loads((folder / "recording" / "recording.json").read_text())
     keys = dotted(index) | {key for name in ("joints", "partitions") for key in index[name][0]}
     keys |= {key for name in ("limits", "sources") for key in index["sampling"][name][0]}
@@ -120,24 +127,24 @@ def test_recording_page_names_every_key_and_array(folder):
     assert [name for name in array_shapes(1, 1, 1, 1, 1, 3) if f"`{name}.npy`" not in text] == [] and STREAMED
 
 
-def test_model_page_names_every_key(folder):
+def test_model_chapter_names_every_key(folder):
     from fdda_addon.core.model import read_model_info
 
     value = json.loads(read_model_info(folder / "model.onnx").to_json())
     keys = set(value) | {key for name in ("joints", "partitions") for key in value[name][0]}
     keys |= set(value["fingerprint"]) | set(value["held_out_mm"]) | set(value["training_ranges"])
-    assert [key for key in sorted(keys) if not named(page("model"), key)] == []
+    assert [key for key in sorted(keys) if not named(chapter("Model"), key)] == []
 
 
 @pytest.mark.parametrize("name", ["evaluation", "benchmark"])
-def test_evaluation_page_names_every_key(folder, name):
+def test_evaluation_chapter_names_every_key(folder, name):
     value = json.loads((folder / f"{name}.json").read_text())
     keys = set(value) | {key for inner in value.values() if isinstance(inner, dict) for key in inner}
-    assert [key for key in sorted(keys) if not named(page("evaluation"), key)] == []
+    assert [key for key in sorted(keys) if not named(chapter(name.capitalize()), key)] == []
 
 
-def test_messages_page_names_every_type_and_its_keys():
-    text = page("messages")
+def test_messages_chapter_names_every_type_and_its_keys():
+    text = chapter("Trainer messages")
     rows = dict(re.findall(r"^\| `(\w+)` \|(.*)$", text, re.MULTILINE))
     assert rows.pop("type")
     assert list(rows) == [kind.value for kind in MessageType]

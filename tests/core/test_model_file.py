@@ -44,7 +44,7 @@ def test_metadata_comes_back_as_it_was(tmp_path):
 
 
 def test_metadata_keys():
-    """docs/model.md lists them."""
+    """docs/formats.md lists them."""
     value = json.loads(tiny_info().to_json())
     assert list(value) == [
         "version",

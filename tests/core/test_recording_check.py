@@ -31,7 +31,7 @@ from .good_recording import (
     with_rig,
 )
 
-CHECKS = Path(__file__).resolve().parents[2] / "docs" / "checks.md"
+CHECKS = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
 
 
 @pytest.fixture
@@ -336,5 +336,5 @@ def test_lengths_are_metres_in_any_unit(good):
 
 
 def test_every_warning_is_documented():
-    headings = re.findall(r"^## `(.+)`$", CHECKS.read_text(encoding="utf-8"), re.MULTILINE)
+    headings = re.findall(r"^#### `(.+)`$", CHECKS.read_text(encoding="utf-8"), re.MULTILINE)
     assert headings == list(NAMES)

@@ -143,8 +143,8 @@ def test_a_report_that_is_too_large(tmp_path, monkeypatch):
 
 
 def test_the_manual_has_every_name():
-    text = (Path(__file__).parents[2] / "docs" / "training.md").read_text(encoding="utf-8")
-    section = text[text.index("## report.json") :]
+    text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
+    section = text.partition("\n## Training report\n")[2].partition("\n## ")[0]
 
     def names(kind: object) -> set[str]:
         if isinstance(kind, report_format._OrNull):
@@ -155,5 +155,5 @@ def test_the_manual_has_every_name():
             return set()
         return {key.removesuffix("?") for key in kind} | {name for inner in kind.values() for name in names(inner)}
 
-    elsewhere = {"inside", "beside", "across"} | set(REPORT["training"])  # evaluation.md, and the settings
+    elsewhere = {"inside", "beside", "across"} | set(REPORT["training"])  # chapter Evaluation, and the settings
     assert sorted(name for name in names(report_format._REPORT) - elsewhere if name not in section) == []

@@ -119,7 +119,7 @@ def test_a_recording_of_another_mesh_is_refused(chain: Character, tmp_path: Path
 
 def test_the_command_of_the_page_runs_as_it_is_written(chain: Character, tmp_path: Path):
     """In a folder as after `make demo`, with the chain in place of the arm."""
-    page = (ROOT / "docs" / "elsewhere.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
     (command,) = re.findall(r"^    (python examples/python/.*)$", page, re.MULTILINE)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     (tmp_path / "out" / "demo").mkdir(parents=True)

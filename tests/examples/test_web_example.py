@@ -215,6 +215,6 @@ def test_the_lock_file_names_no_host():
 
 
 def test_the_page_of_the_documents_has_the_commands_that_are_tested():
-    page = (ROOT / "docs" / "elsewhere.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
     for command in ("npm ci", "npm run build", "python prepare.py ../../out/demo/arm.onnx ../../out/demo/recording"):
         assert f"    {command}\n" in page

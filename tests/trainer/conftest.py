@@ -31,9 +31,11 @@ def start_trainer(*arguments: str | Path, **options) -> subprocess.Popen:
     )
 
 
-def run_page(name: str, folder: Path) -> str:
-    """Run the block of code of a page of the documents in a folder; returns what it prints."""
-    (code,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs" / f"{name}.md").read_text("utf-8"), re.DOTALL)
+def run_page(chapter: str, folder: Path) -> str:
+    """Run the block of code in a chapter of docs/formats.md in a folder; returns what it prints."""
+    page = (REPOSITORY / "docs" / "formats.md").read_text("utf-8")
+    text = page.partition(f"\n## {chapter}\n")[2].partition("\n## ")[0]
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     return subprocess.run([sys.executable, "-c", code], cwd=folder, check=True, capture_output=True, text=True).stdout
 
 

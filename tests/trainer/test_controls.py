@@ -189,7 +189,7 @@ def test_characters_of_a_crowd_have_their_own_values(network):
 
 
 def test_the_code_of_the_page_on_models_plays_it(model):
-    assert run_page("model", model.parent).startswith("['bone_0', 'bone_1', 'bone_2'] (2, 90, 3) [1. ")
+    assert run_page("Model", model.parent).startswith("['bone_0', 'bone_1', 'bone_2'] (2, 90, 3) [1. ")
 
 
 def test_a_model_without_controls_looks_at_none(trained):

@@ -99,7 +99,7 @@ def test_the_code_of_the_page_on_recordings_reads_it(model):
     rig = odd_rig()
     pose = odd_poses(rig, POSES, 0)[:1]
     expected = distances(smoothed(rig, pose), LinearSkinning(rig).positions(pose)).mean() * 1000
-    shape, residual = run_page("recording", model.parent).split(" mean residual ")
+    shape, residual = run_page("Recording", model.parent).split(" mean residual ")
     assert shape == "(90, 3)" and float(residual.removesuffix(" mm\n")) == pytest.approx(expected, rel=1e-4)
 
 

@@ -6,7 +6,7 @@ const KEY = 1;
 const VALUE = 2;
 
 /**
- * The joints, controls, … of a model: the JSON of its metadata property `fdda`, docs/model.md.
+ * The joints, controls, … of a model: the JSON of its metadata property `fdda`, docs/formats.md.
  *
  * @param {Uint8Array} bytes the .onnx file
  * @throws {Error} it is no FDDA model of version 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is suspicious about a recording, before a training is spent on it. docs/checks.md has causes and remedies."""
+"""What is suspicious about a recording, before a training is spent on it. docs/formats.md has causes and remedies."""
 
 import numpy as np
 

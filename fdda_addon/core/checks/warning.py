@@ -16,7 +16,7 @@ class RecordingWarning:
     """Something about a recording that makes a bad model likely.
 
     Attributes:
-        name: which kind, the heading in docs/checks.md.
+        name: which kind, the heading in docs/formats.md.
         text: one sentence for the user: what was found, with names and numbers, and what to do.
     """
 

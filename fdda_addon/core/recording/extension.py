@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Appends refined poses to a complete recording, which stays complete at every moment (docs/recording.md)."""
+"""Appends refined poses to a complete recording, which stays complete at every moment (docs/formats.md)."""
 
 import math
 import os

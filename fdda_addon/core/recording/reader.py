@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The recording: a folder of poses and local residuals. docs/recording.md describes the format.
+"""The recording: a folder of poses and local residuals. docs/formats.md describes the format.
 
 `recording.json` says how many poses are complete: an array file may be longer than that, and what lies behind it is
 never read. `writer` writes it.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Writes a recording (docs/recording.md) so that an interruption at any moment leaves one that resumes."""
+"""Writes a recording (docs/formats.md) so that an interruption at any moment leaves one that resumes."""
 
 import contextlib
 import io
