@@ -16,7 +16,7 @@ from fdda_addon.cli.evaluate import run_evaluation, table
 from fdda_addon.cli.files import open_file
 from fdda_addon.cli.main import main as run_verb
 from fdda_addon.core.output import write_json
-from fdda_addon.evaluation.drawing import View
+from fdda_addon.evaluation.picture import View
 from fdda_addon.evaluation.pictures import draw_comparison, draw_partitions, pictured
 from fdda_addon.evaluation.run import Evaluation, EvaluationSettings, NamedPose
 from fdda_addon.scene.scene_rig import find_rig

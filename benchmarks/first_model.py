@@ -65,7 +65,7 @@ def way() -> Iterator[float]:
     done("opened, Rig read")
     yield from sidebar.open_section("poses")
     yield from picture(OUT / "2_poses.png")
-    if not part("panels.poses").states_limits(part("scene.active_rig").shown_rig(bpy.context)):
+    if not part("panels.poses").states_limits(part("scene.active_rig").cached_active_rig(bpy.context)):
         yield from sidebar.push("fdda.limits_preset(")
         yield 0.5
     yield from sidebar.push("fdda.preview_pose(step=1)", across=0.54)

@@ -26,9 +26,9 @@ from fdda_addon.rig.reading import PoseReader, read_rig
 from fdda_addon.runtime import model_files
 from fdda_addon.runtime.network import Network
 from fdda_addon.scene.armature import Poser, clear_pose
-from fdda_addon.scene.borrow import borrowed_pose
 from fdda_addon.scene.mesh import evaluated_positions
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier, find_rig
+from fdda_addon.scene.temporary_state import temporary_pose
 from fdda_addon.timing.benchmark import benchmark, random_action
 
 ROUNDS = 5
@@ -56,7 +56,7 @@ def recording(rig: str, poses: str = "60") -> dict:
 def _bare_loop(scene_rig: SceneRig, count: int) -> float:
     channels = sampled_channels(scene_rig, read_rig(scene_rig))
     poser = Poser(scene_rig, channels)
-    with borrowed_pose(scene_rig.armature_object):
+    with temporary_pose(scene_rig.armature_object):
         clear_pose(scene_rig.armature_object)
         values = [sample_pose(channels, 0, index) for index in range(count)]
         return _seconds(lambda: [(poser.set(pose), bpy.context.view_layer.update()) for pose in values])

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from blend_fixtures.elbow import END, START, elbow_surface
-from fdda_addon.poses.motion_range import set_limit
+from fdda_addon.poses.motion_range import set_constraint_limit
 
 from .base import link
 
@@ -59,7 +59,7 @@ def limit(bone: bpy.types.PoseBone, kind: str, ranges: dict[int, tuple[float, fl
     constraint.owner_space = "LOCAL"
     for axis, bounds in ranges.items():
         low, high = map(radians, bounds) if kind == "LIMIT_ROTATION" else bounds
-        set_limit(constraint, axis, low, high)
+        set_constraint_limit(constraint, axis, low, high)
     setattr(bone, KINDS[kind], [axis not in ranges for axis in range(3)])
 
 

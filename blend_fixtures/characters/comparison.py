@@ -10,7 +10,7 @@ import numpy as np
 
 from fdda_addon.core.metrics import distances
 from fdda_addon.core.poses import Channel
-from fdda_addon.evaluation.run import EvaluationSettings, evaluate, pose_held_out
+from fdda_addon.evaluation.run import EvaluationSettings, evaluate, set_held_out_pose
 from fdda_addon.poses.sampling import model_channels
 from fdda_addon.recording.run import record
 from fdda_addon.rig.modifier_stack import read_stack
@@ -85,7 +85,7 @@ def compare_row(row: Row, folder: Path) -> list[Result]:
     units = [metres_per_unit(scene_rig.mesh_object) for scene_rig in rigs]
     channels = model_channels(rigs[0], read_model_rig(rigs[0], networks[0].info), networks[0].info)
     for scene_rig, network in zip(rigs, networks, strict=True):
-        live = read_stack(scene_rig.mesh_object).live
+        live = read_stack(scene_rig.mesh_object).downstream
         bind(scene_rig, network.path)
         for name in live:
             scene_rig.mesh_object.modifiers[name].show_viewport = False
@@ -124,7 +124,7 @@ def _play(rigs: list[SceneRig], networks: list[Network], channels: tuple[Channel
     differences = [0.0] * len(rigs)
     for pose in range(PLAYED):
         for seed, scene_rig in enumerate(armatures.values(), HELD_OUT.seed + 1):
-            pose_held_out(scene_rig, channels, seed, pose)
+            set_held_out_pose(scene_rig, channels, seed, pose)
         bpy.context.view_layer.update()
         now = [_difference(scene_rig, network) for scene_rig, network in zip(rigs, networks, strict=True)]
         differences = [max(pair) for pair in zip(differences, now, strict=True)]

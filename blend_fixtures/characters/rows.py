@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from blend_fixtures.elbow import ACTION
 from fdda_addon.recording.plan import RecordingSettings
-from fdda_addon.rig.target_time import TargetSettings
+from fdda_addon.rig.pose_setter import TargetSettings
 
 from . import control_rigs, controls, face, meshes, skinning, stacks, targets, transforms
 

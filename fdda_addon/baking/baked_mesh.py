@@ -12,10 +12,10 @@ from ..core.errors import RigError
 from ..rig.modifier_stack import ModifierStack
 from ..runtime.binding import unbind
 from ..scene.arrays import COORDINATE, write
-from ..scene.borrow import borrowed_attributes
 from ..scene.compatibility import animation_curves
 from ..scene.mesh import rest_positions
 from ..scene.stored_paths import stored_path
+from ..scene.temporary_state import temporary_attributes
 
 MODIFIER_NAME = "FDDA Bake"
 BASIS = "Basis"
@@ -35,7 +35,7 @@ def check_local(mesh_object: bpy.types.Object) -> None:
 
 
 @contextmanager
-def stand_in(mesh_object: bpy.types.Object) -> Iterator[bpy.types.Object]:
+def temporary_copy(mesh_object: bpy.types.Object) -> Iterator[bpy.types.Object]:
     """A copy of a mesh object that takes its place and its name in the whole file for a while.
 
     Whatever is done to the copy, its mesh excepted, the object itself is as it was afterwards. A model that is bound
@@ -49,7 +49,7 @@ def stand_in(mesh_object: bpy.types.Object) -> Iterator[bpy.types.Object]:
     copy = mesh_object.copy().make_local()
     unbind(copy)
     # With a fake user the object itself would be saved too.
-    with borrowed_attributes(mesh_object, use_fake_user=False):
+    with temporary_attributes(mesh_object, use_fake_user=False):
         mesh_object.user_remap(copy)
         try:
             mesh_object.name, copy.name = f"{name} rig", name
@@ -130,4 +130,4 @@ def _remove_deformation(mesh_object: bpy.types.Object, stack: ModifierStack) -> 
     """Remove the modifiers of the rig; returns the place where they were."""
     for name in stack.replaced:
         mesh_object.modifiers.remove(mesh_object.modifiers[name])
-    return stack.place - len(stack.replaced)
+    return stack.insert_index - len(stack.replaced)

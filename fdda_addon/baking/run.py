@@ -25,14 +25,14 @@ from ..runtime.network import Network
 from ..runtime.opened_model import OpenedModel, open_model
 from ..scene.armature import clear_pose
 from ..scene.blend_file import save_copy
-from ..scene.borrow import assign_action, borrowed_attributes, borrowed_pose, borrowed_visibility
 from ..scene.controls import ControlReader
 from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
-from .baked_mesh import check_local, play_point_cache, play_shape_keys, stand_in
+from ..scene.temporary_state import assign_action, temporary_attributes, temporary_pose, temporary_visibility
+from .baked_mesh import check_local, play_point_cache, play_shape_keys, temporary_copy
 
 POINT_CACHE, BLEND = ".pc2", ".blend"
-LAST_FRAME = 1048574
+MAX_FRAME = 1048574
 """Blender counts to it, and as far below zero."""
 BATCH_FRAMES = 32
 BATCH_BYTES = 6 << 20
@@ -104,13 +104,13 @@ def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSe
         elif settings.shape_keys:
             with _scratch(out) as cache:
                 yield from _write_frames(cache, reader, frames)
-                with stand_in(scene_rig.mesh_object) as mesh_object:
+                with temporary_copy(scene_rig.mesh_object) as mesh_object:
                     play_shape_keys(mesh_object, stack, read_point_cache(cache).positions, frames.start)
                     save_copy(out)
         else:
             with atomic_write_all(*files) as (blend, cache):
                 yield from _write_frames(cache, reader, frames)
-                with stand_in(scene_rig.mesh_object) as mesh_object:
+                with temporary_copy(scene_rig.mesh_object) as mesh_object:
                     play_point_cache(mesh_object, stack, files[1], frames.start)
                     save_copy(blend)
     yield Bake(frames, files)
@@ -147,8 +147,8 @@ def _frames(action: bpy.types.Action | None, frames: tuple[int, int] | None) -> 
     first, last = frames
     if first > last:
         raise WrongUsageError(f"There is nothing to bake from frame {first} to {last}; give the first frame first.")
-    if max(abs(first), abs(last)) > LAST_FRAME:
-        raise WrongUsageError(f"Blender has frames up to {LAST_FRAME}, not from {first} to {last}; give fewer.")
+    if max(abs(first), abs(last)) > MAX_FRAME:
+        raise WrongUsageError(f"Blender has frames up to {MAX_FRAME}, not from {first} to {last}; give fewer.")
     return range(first, last + 1)
 
 
@@ -206,7 +206,7 @@ def _write_frames(path: Path, reader: FrameReader, frames: range) -> Iterator[Pr
     frame, subframe = scene.frame_current, scene.frame_subframe
     size = max(1, min(BATCH_FRAMES, BATCH_BYTES // (12 * count)))
     scene_rig = reader.scene_rig
-    shown = borrowed_visibility((scene_rig.mesh_object, scene_rig.armature_object))
+    shown = temporary_visibility((scene_rig.mesh_object, scene_rig.armature_object))
     with open(path, "wb") as file, shown, _undeformed(scene_rig.mesh_object):
         writer = PointCacheWriter(file, count, frames.start, len(frames))
         inputs = []
@@ -223,7 +223,7 @@ def _write_frames(path: Path, reader: FrameReader, frames: range) -> Iterator[Pr
 @contextmanager
 def _animated(armature_object: bpy.types.Object, action: bpy.types.Action | None) -> Iterator[None]:
     """Let an action alone drive an armature for a while, or what drives it anyway."""
-    with borrowed_pose(armature_object, [action] if action else (), keep_animation=action is None):
+    with temporary_pose(armature_object, [action] if action else (), keep_animation=action is None):
         if action is not None:
             clear_pose(armature_object)
             assign_action(armature_object, action)
@@ -235,10 +235,10 @@ def _undeformed(mesh_object: bpy.types.Object) -> Iterator[None]:
     """Spare Blender the deformation of a mesh, most of the time of a frame: the pose is all that is read."""
     with ExitStack() as stack:
         for modifier in mesh_object.modifiers:
-            stack.enter_context(borrowed_attributes(modifier, show_viewport=False))
+            stack.enter_context(temporary_attributes(modifier, show_viewport=False))
         if mesh_object.data.shape_keys is not None:
             # A pinned key is merely copied.
-            stack.enter_context(borrowed_attributes(mesh_object, show_only_shape_key=True, active_shape_key_index=0))
+            stack.enter_context(temporary_attributes(mesh_object, show_only_shape_key=True, active_shape_key_index=0))
         yield
 
 

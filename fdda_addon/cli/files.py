@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import FDDAError
-from ..scene.blend_file import blender_path, quiet, reason
+from ..scene.blend_file import blender_path, report_message, silenced_stdout
 from ..scene.scene_rig import SceneRig, find_rig
 
 
@@ -41,7 +41,7 @@ def open_file(path: Path) -> None:
     if not path.is_file():
         raise FDDAError(f"There is no file '{path}'; give the path of a .blend file.")
     try:
-        with quiet():
+        with silenced_stdout():
             bpy.ops.wm.open_mainfile(filepath=blender_path(path), load_ui=False)
     except RuntimeError as error:
-        raise FDDAError(f"Blender cannot open '{path}' ({reason(error)}); give a .blend file.") from error
+        raise FDDAError(f"Blender cannot open '{path}' ({report_message(error)}); give a .blend file.") from error

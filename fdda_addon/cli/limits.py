@@ -28,7 +28,7 @@ def run(options: argparse.Namespace) -> None:
     from ..core.file_kind import BLEND
     from ..core.output import check_outputs
     from ..poses.clip import find_action
-    from ..poses.measured_limits import limit_lines, state_measured_limits
+    from ..poses.measured_limits import describe_limits, set_limits_from_actions
     from ..scene.blend_file import save_copy
     from .files import open_rig
 
@@ -36,9 +36,9 @@ def run(options: argparse.Namespace) -> None:
         raise WrongUsageError("--margin must be 0 to 10.")
     check_outputs({options.out: BLEND}, (options.rig,), options.overwrite)
     scene_rig = open_rig(options)
-    limits = state_measured_limits(scene_rig, [find_action(name) for name in options.action], options.margin)
+    limits = set_limits_from_actions(scene_rig, [find_action(name) for name in options.action], options.margin)
     save_copy(options.out)
-    for line in limit_lines(scene_rig.armature_object, limits):
+    for line in describe_limits(scene_rig.armature_object, limits):
         print(line)
-    bones = len({limit.bone for limit in limits if not limit.why_not})
+    bones = len({limit.bone for limit in limits if not limit.reason_unset})
     print(f"{options.out}: '{scene_rig.armature_object.name}' states the ranges of {bones} bones")

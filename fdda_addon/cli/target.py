@@ -9,7 +9,7 @@ from ..core.defaults import REPEATABILITY_POSES, REST_THRESHOLD_MM
 from ..core.errors import WrongUsageError
 
 if TYPE_CHECKING:
-    from ..rig.target_time import TargetSettings
+    from ..rig.pose_setter import TargetSettings
     from ..scene.scene_rig import SceneRig
 
 
@@ -63,7 +63,7 @@ def target_settings(options: argparse.Namespace) -> "TargetSettings":
     Raises:
         WrongUsageError: they make no sense.
     """
-    from ..rig.target_time import TargetSettings
+    from ..rig.pose_setter import TargetSettings
 
     repeatability_poses = getattr(options, "repeatability_poses", 0)
     if (

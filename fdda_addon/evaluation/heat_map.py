@@ -100,11 +100,11 @@ def colors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
 
 def errors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
     """The errors that the settings of the view ask for: (V,) metres, None when there are none at this frame."""
-    last, view = last_evaluation.of(mesh_object), bpy.context.window_manager.fdda_view
+    last, view = last_evaluation.get(mesh_object), bpy.context.window_manager.fdda_view
     if last is None:
         return None
     pose = last.pose_at(bpy.context.scene.frame_current) if last.name else view.pose
-    return last.of_vertices(view.way, view.statistic, pose)
+    return last.vertex_errors(view.way, view.statistic, pose)
 
 
 def fitting_range_mm(mesh_object: bpy.types.Object) -> float:
@@ -120,7 +120,7 @@ def _paint(mesh_object: bpy.types.Object, paint: Paint) -> None:
     redraw_views()
 
 
-def _sheets(context: bpy.types.Context) -> list["overlay.Sheet"]:
+def _sheets(context: bpy.types.Context) -> list["overlay.OverlayMesh"]:
     """What the overlay draws, object by object."""
     alive = {o.session_uid: o for o in bpy.data.objects if o.session_uid in _painted}
     for uid in _painted.keys() - alive.keys():
@@ -143,7 +143,7 @@ def _sheets(context: bpy.types.Context) -> list["overlay.Sheet"]:
     return drawn
 
 
-def _sticks(context: bpy.types.Context) -> list["overlay.Stick"]:
+def _sticks(context: bpy.types.Context) -> list["overlay.OverlayBone"]:
     """The bones of armatures in pose mode whose mesh is painted: the colours would hide them."""
     found = []
     for mesh_object in context.view_layer.objects:
@@ -155,7 +155,7 @@ def _sticks(context: bpy.types.Context) -> list["overlay.Stick"]:
             if is_bone_hidden(bone):
                 continue
             color = ACTIVE if bone.bone == active else (SELECTED if is_selected(bone) else BONE)
-            found.append(overlay.Stick(tuple(matrix @ bone.head), tuple(matrix @ bone.tail), color))
+            found.append(overlay.OverlayBone(tuple(matrix @ bone.head), tuple(matrix @ bone.tail), color))
     return found
 
 
@@ -170,7 +170,7 @@ def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:
     paint = _painted[mesh_object.session_uid]
     if paint.kind == PARTITIONS:
         return [f"{mesh_object.name}: {paint.partitions} partitions, a colour for each main joint"], None
-    last, view = last_evaluation.of(mesh_object), context.window_manager.fdda_view
+    last, view = last_evaluation.get(mesh_object), context.window_manager.fdda_view
     if last is None:
         return [], None
     errors = errors_of(mesh_object)

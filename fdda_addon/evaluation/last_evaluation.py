@@ -13,13 +13,13 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.poses import Channel
     from .run import Evaluation
 
-MAX_KEPT = 4
+MAX_STORED = 4
 """Errors of a dense mesh take some hundred megabytes."""
 FRAMES_APART = 10
 """Worst frames that are nearer belong to one movement."""
-WAYS = ("fdda", "linear")
+METHODS = ("fdda", "linear")
 
-_kept: dict[int, "LastEvaluation"] = {}
+_evaluations: dict[int, "LastEvaluation"] = {}
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class LastEvaluation:
         model: name of the model's file.
         first_frame: of the action, 0 for random poses.
         seed: of the random poses.
-        errors: (N, V) float32, metres, by the names of `WAYS`.
-        total: statistics of all vertices by the names of `WAYS`.
+        errors: (N, V) float32, metres, by the names of `METHODS`.
+        total: statistics of all vertices by the names of `METHODS`.
         partitions: the worst first, by the largest error of the model.
         channels: that the random poses were drawn from.
     """
@@ -71,7 +71,7 @@ class LastEvaluation:
         index = frame - self.first_frame
         return index if self.name and 0 <= index < self.poses else None
 
-    def of_vertices(self, way: str, statistic: str, pose: int | None = None) -> "np.ndarray | None":
+    def vertex_errors(self, way: str, statistic: str, pose: int | None = None) -> "np.ndarray | None":
         """(V,) errors in metres: the "mean" or "max" over the poses, or those of one "pose"; None without a pose."""
         errors = self.errors[way]
         if statistic == "pose":
@@ -87,7 +87,7 @@ class LastEvaluation:
         return [(index, float(errors[index].max()) * 1000) for index in found]
 
 
-def keep(
+def store(
     mesh_object: bpy.types.Object,
     evaluation: "Evaluation",
     model: str,
@@ -107,12 +107,12 @@ def keep(
     from ..core.metrics import error_statistics
 
     compared = evaluation.held_out
-    errors = {way: getattr(compared, way) for way in WAYS}
+    errors = {way: getattr(compared, way) for way in METHODS}
     partitions = [
         PartitionErrors(
             evaluation.joints[partition.joint],
             len(partition.vertices),
-            *(error_statistics(errors[way][:, partition.vertices]) for way in WAYS),
+            *(error_statistics(errors[way][:, partition.vertices]) for way in METHODS),
         )
         for partition in evaluation.partitions
     ]
@@ -123,22 +123,22 @@ def keep(
         first_frame,
         seed,
         errors,
-        {way: error_statistics(errors[way]) for way in WAYS},
+        {way: error_statistics(errors[way]) for way in METHODS},
         tuple(partitions),
         evaluation.channels,
     )
-    _kept.pop(mesh_object.session_uid, None)
-    while len(_kept) >= MAX_KEPT:
-        del _kept[next(iter(_kept))]
-    _kept[mesh_object.session_uid] = last
+    _evaluations.pop(mesh_object.session_uid, None)
+    while len(_evaluations) >= MAX_STORED:
+        del _evaluations[next(iter(_evaluations))]
+    _evaluations[mesh_object.session_uid] = last
     return last
 
 
-def of(mesh_object: bpy.types.Object) -> LastEvaluation | None:
+def get(mesh_object: bpy.types.Object) -> LastEvaluation | None:
     """The last evaluation of an object, None when there was none in this session."""
-    return _kept.get(mesh_object.session_uid)
+    return _evaluations.get(mesh_object.session_uid)
 
 
-def forget(mesh_object: bpy.types.Object) -> None:
+def remove(mesh_object: bpy.types.Object) -> None:
     """Drop the last evaluation of an object: its model is another now."""
-    _kept.pop(mesh_object.session_uid, None)
+    _evaluations.pop(mesh_object.session_uid, None)

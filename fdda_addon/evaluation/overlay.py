@@ -40,7 +40,7 @@ _triangles: dict[int, tuple[tuple[int, int], gpu.types.GPUIndexBuf]] = {}
 
 
 @dataclass(frozen=True)
-class Sheet:
+class OverlayMesh:
     """A mesh: (V, 3) float32 positions and normals in its own space, sRGB colours, triangles, and its matrix_world."""
 
     positions: np.ndarray
@@ -51,7 +51,7 @@ class Sheet:
 
 
 @dataclass(frozen=True)
-class Stick:
+class OverlayBone:
     """A bone: its ends in world space, and its colour, RGBA."""
 
     head: tuple[float, float, float]
@@ -60,9 +60,9 @@ class Stick:
 
 
 def start(
-    sheets: Callable[[bpy.types.Context], list[Sheet]],
+    sheets: Callable[[bpy.types.Context], list[OverlayMesh]],
     legend: Callable[[bpy.types.Context], tuple[list[str], float | None]],
-    sticks: Callable[[bpy.types.Context], list[Stick]],
+    sticks: Callable[[bpy.types.Context], list[OverlayBone]],
 ) -> None:
     """Draw from now on, in all viewports.
 
@@ -86,14 +86,14 @@ def stop() -> None:
     _triangles.clear()
 
 
-def sheet(context: bpy.types.Context, mesh_object: bpy.types.Object, colors: np.ndarray) -> Sheet | None:
+def sheet(context: bpy.types.Context, mesh_object: bpy.types.Object, colors: np.ndarray) -> OverlayMesh | None:
     """What Blender shows of an object, with other colours; None when its modifiers change the topology."""
     evaluated = mesh_object.evaluated_get(context.evaluated_depsgraph_get())
     mesh = evaluated.data
     if evaluated.mode == "EDIT" or len(mesh.vertices) != len(colors):
         return None
     positions, normals = mesh_positions(mesh), read(mesh.vertex_normals, VECTOR)
-    return Sheet(positions, normals, colors, _triangles_of(mesh_object, mesh), evaluated.matrix_world.copy())
+    return OverlayMesh(positions, normals, colors, _triangles_of(mesh_object, mesh), evaluated.matrix_world.copy())
 
 
 def _triangles_of(mesh_object: bpy.types.Object, mesh: bpy.types.Mesh) -> gpu.types.GPUIndexBuf:
@@ -108,7 +108,7 @@ def _triangles_of(mesh_object: bpy.types.Object, mesh: bpy.types.Mesh) -> gpu.ty
 
 
 def _draw_sheets(
-    sheets: Callable[[bpy.types.Context], list[Sheet]], sticks: Callable[[bpy.types.Context], list[Stick]]
+    sheets: Callable[[bpy.types.Context], list[OverlayMesh]], sticks: Callable[[bpy.types.Context], list[OverlayBone]]
 ) -> None:
     context = bpy.context
     shader, view = _mesh_shader(), context.region_data
@@ -133,7 +133,7 @@ def _draw_sheets(
     _draw_sticks(context, sticks(context))
 
 
-def _draw_sticks(context: bpy.types.Context, sticks: list[Stick]) -> None:
+def _draw_sticks(context: bpy.types.Context, sticks: list[OverlayBone]) -> None:
     if not sticks:
         return
     shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")

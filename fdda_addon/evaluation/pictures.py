@@ -12,7 +12,7 @@ from ..core.skinning import LinearSkinning
 from ..rig.reading import read_rig
 from ..runtime.opened_model import open_model
 from ..scene.scene_rig import SceneRig
-from .drawing import Cell, View, draw
+from .picture import Cell, View, draw
 from .run import PoseErrors
 
 PLAIN = (0.78, 0.64, 0.55)

@@ -19,18 +19,25 @@ from ..core.skinning import LinearSkinning
 from ..core.surface import Surface, SurfaceComparison, SurfaceErrors, surface_errors, surface_json
 from ..poses.clip import find_clips
 from ..poses.sampling import model_channels
-from ..rig.borrowed_rig import borrowed_rig
 from ..rig.modifier_stack import check_evaluable
+from ..rig.pose_setter import (
+    DIRECT_POSE_SETTER,
+    NO_TARGET,
+    PoseSetter,
+    TargetSettings,
+    blend_from_rest,
+    make_pose_setter,
+)
 from ..rig.reading import PoseEvaluator
-from ..rig.target_time import DIRECT, OWN_SURFACE, Approach, TargetSettings, make_approach, way
-from ..rig.time_inputs import check_inputs
+from ..rig.temporary_rig_state import temporary_rig_state
+from ..rig.time_inputs import check_time_inputs
 from ..runtime.network import Network
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser, clear_pose
 from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
 
-HELD_OUT_INDEX = 1 << 33
+FIRST_HELD_OUT_INDEX = 1 << 33
 """Held-out poses are drawn from indices that no recording reaches, so that they differ from the poses of any recording
 even when it was made with the same seed."""
 
@@ -64,7 +71,7 @@ class EvaluationSettings:
     named: tuple[NamedPose, ...] = ()
     surface: bool = True
     strips: tuple[str, ...] = ()
-    target: TargetSettings = OWN_SURFACE
+    target: TargetSettings = NO_TARGET
 
 
 @dataclass
@@ -171,7 +178,7 @@ def evaluate(
     if not settings.poses and not clips:
         raise RigError("There is nothing to evaluate: 0 poses and no action; give --poses or --action.")
     random = settings.poses or len(settings.range_scales) or len(settings.named)
-    approach = make_approach(scene_rig, settings.target, clips, random)
+    pose_setter = make_pose_setter(scene_rig, settings.target, clips, random)
     network, skinning = _prepare(scene_rig, model, is_own=not settings.target.name)
     rig = skinning.rig
     # A rig that is posed by actions alone may have nothing to sample.
@@ -180,27 +187,27 @@ def evaluate(
     total = settings.poses + extra * len(settings.range_scales) + len(settings.named)
     total += sum(len(clip.frames) for clip in clips)
     with ExitStack() as borrowed:
-        if approach.target:
-            borrowed.enter_context(approach.target.borrowed())
-        player = borrowed.enter_context(borrowed_rig(scene_rig, rig, channels, clips))
-        evaluator = PoseEvaluator(scene_rig, rig, approach.target)
+        if pose_setter.target:
+            borrowed.enter_context(pose_setter.target.prepared())
+        player = borrowed.enter_context(temporary_rig_state(scene_rig, rig, channels, clips))
+        evaluator = PoseEvaluator(scene_rig, rig, pose_setter.target)
         mask = read_mask(scene_rig.mesh_object)
         comparison = _Comparison(evaluator, network, skinning, total, settings.surface, mask)
         held_out = None
         if settings.poses:
-            poses = _random_poses(scene_rig, channels, settings.seed, HELD_OUT_INDEX, settings.poses, approach)
+            poses = _random_poses(scene_rig, channels, settings.seed, FIRST_HELD_OUT_INDEX, settings.poses, pose_setter)
             held_out = yield from comparison.compare("held-out poses", poses)
         scaled_ranges = []
         for number, factor in enumerate(settings.range_scales, 1):
-            first = HELD_OUT_INDEX * (1 + number)
-            poses = _random_poses(scene_rig, scale_ranges(channels, factor), settings.seed, first, extra, approach)
+            first = FIRST_HELD_OUT_INDEX * (1 + number)
+            poses = _random_poses(scene_rig, scale_ranges(channels, factor), settings.seed, first, extra, pose_setter)
             scaled_ranges.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
         named = []
         for pose in settings.named:
-            named.append((yield from comparison.compare(pose.name, _named_pose(scene_rig, pose, approach))))
+            named.append((yield from comparison.compare(pose.name, _named_pose(scene_rig, pose, pose_setter))))
         actions = []
         for clip in clips:
-            frames = approach.frames(player, clip, range(len(clip.frames)))
+            frames = pose_setter.show_frames(player, clip, range(len(clip.frames)))
             actions.append((yield from comparison.compare(clip.title, frames)))
     yield Evaluation(
         skinning.partitions, rig.joint_names, held_out or actions[0], actions, scaled_ranges, named, channels
@@ -208,7 +215,7 @@ def evaluate(
 
 
 def evaluate_action(
-    scene_rig: SceneRig, model: Path | Network, name: str, target: TargetSettings = OWN_SURFACE
+    scene_rig: SceneRig, model: Path | Network, name: str, target: TargetSettings = NO_TARGET
 ) -> Iterator[Progress | Evaluation]:
     """Compare positions on the frames of one action alone, which stand in the place of held-out poses.
 
@@ -227,33 +234,38 @@ def _prepare(scene_rig: SceneRig, model: Path | Network, is_own: bool) -> tuple[
     opened = open_model(scene_rig, model)
     rig = opened.linear_rig
     if is_own:
-        check_inputs(scene_rig, rig.controls, stack)
+        check_time_inputs(scene_rig, rig.controls, stack)
     return opened.network, LinearSkinning(rig, opened.network.info.partitions_of(rig))
 
 
-def pose_held_out(scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, index: int) -> None:
+def set_held_out_pose(scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, index: int) -> None:
     """Pose a rig as for one of the random poses that `evaluate` compares, with the channels of that evaluation."""
     clear_pose(scene_rig.armature_object)
-    next(_random_poses(scene_rig, channels, seed, HELD_OUT_INDEX + index, 1))
+    next(_random_poses(scene_rig, channels, seed, FIRST_HELD_OUT_INDEX + index, 1))
 
 
 def _random_poses(
-    scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, first: int, count: int, approach: Approach = DIRECT
+    scene_rig: SceneRig,
+    channels: tuple[Channel, ...],
+    seed: int,
+    first: int,
+    count: int,
+    pose_setter: PoseSetter = DIRECT_POSE_SETTER,
 ) -> Iterator[None]:
     poser, rest = Poser(scene_rig, channels), np.array([channel.rest for channel in channels])
-    with approach.borrowed():
+    with pose_setter.prepared():
         for index in range(first, first + count):
             values = sample_pose(channels, seed, index)
-            approach.reach(way(poser.set, rest, values))
+            pose_setter.set_pose(blend_from_rest(poser.set, rest, values))
             yield
 
 
-def _named_pose(scene_rig: SceneRig, pose: NamedPose, approach: Approach) -> Iterator[None]:
+def _named_pose(scene_rig: SceneRig, pose: NamedPose, pose_setter: PoseSetter) -> Iterator[None]:
     clear_pose(scene_rig.armature_object)
     channels = tuple(Channel(bone, "rotation", axis, 0, 0) for bone in pose.rotations for axis in range(3))
     values = np.array([angle for angles in pose.rotations.values() for angle in angles])
-    with approach.borrowed():
-        approach.reach(way(Poser(scene_rig, channels).set, np.zeros(len(values)), values))
+    with pose_setter.prepared():
+        pose_setter.set_pose(blend_from_rest(Poser(scene_rig, channels).set, np.zeros(len(values)), values))
         yield
 
 

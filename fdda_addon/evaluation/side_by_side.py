@@ -10,8 +10,8 @@ import bpy
 from bpy.app.handlers import persistent
 from mathutils import Vector
 
-from ..scene.comparison import KEY, comparisons
-from ..scene.kept import kept
+from ..scene.comparison import COMPARISON_KEY, comparisons
+from ..scene.draw_cache import draw_cached
 
 BESIDE, OVERLAY, NONE = "BESIDE", "OVERLAY", "NONE"
 GAP = 1.15
@@ -22,11 +22,11 @@ _object_count = -1
 
 def find(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
     """The copy that stands beside a mesh object, None where there is none."""
-    return next((other for other in comparisons() if other[KEY] == mesh_object), None)
+    return next((other for other in comparisons() if other[COMPARISON_KEY] == mesh_object), None)
 
 
-@kept
-def way_of(mesh_object: bpy.types.Object) -> str:
+@draw_cached
+def display_mode(mesh_object: bpy.types.Object) -> str:
     """How a mesh object is compared: `BESIDE`, `OVERLAY` or `NONE`."""
     other = find(mesh_object)
     if other is None:
@@ -52,7 +52,7 @@ def show(mesh_object: bpy.types.Object, way: str, distance: float = 0.0) -> None
     other.is_runtime_data = True
     unbind(other)
     other.fdda.models.clear()
-    other[KEY] = mesh_object
+    other[COMPARISON_KEY] = mesh_object
     other.name = f"{mesh_object.name} rig, to compare"
     other.hide_select = other.hide_render = True
     bpy.context.scene.collection.objects.link(other)
@@ -102,7 +102,7 @@ def _on_changed(*_: object) -> None:
     if _object_count == len(bpy.data.objects):
         return
     for other in comparisons():
-        compared = other[KEY]
+        compared = other[COMPARISON_KEY]
         if compared is None or not compared.users_scene:
             _remove(other)
     _object_count = len(bpy.data.objects)

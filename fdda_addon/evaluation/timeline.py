@@ -67,7 +67,7 @@ def _shown() -> last_evaluation.LastEvaluation | None:
         meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and armature_of(o) == active]
     else:
         meshes = [active]
-    return next((last for o in meshes if (last := last_evaluation.of(o)) is not None), None)
+    return next((last for o in meshes if (last := last_evaluation.get(o)) is not None), None)
 
 
 def _draw() -> None:

@@ -16,7 +16,7 @@ from bpy.app.handlers import persistent
 
 from ..core.errors import FDDAError
 from ..core.progress import Progress
-from ..scene import kept
+from ..scene import draw_cache
 
 LOG_LINES = 2000
 CHARACTER, ENVIRONMENT = "character", "environment"
@@ -243,7 +243,7 @@ class Run:
 
 def redraw() -> None:
     """Draw the sidebars and the preferences again, and have them look again at what they show."""
-    kept.forget()
+    draw_cache.clear()
     for window in getattr(bpy.context.window_manager, "windows", ()):
         for area in window.screen.areas:
             if area.type in {"VIEW_3D", "PREFERENCES"}:

@@ -14,7 +14,7 @@ from ..runtime import model_files, packed_model, playback, registry
 from ..runtime.binding import bind, unbind
 from ..runtime.opened_model import read_matching_rig
 from ..scene.scene_rig import SceneRig
-from ..scene.stored_paths import absolute_path, path_for
+from ..scene.stored_paths import absolute_path, stored_path_for
 from .entries import bound_entry, bound_name, chosen_entry, is_bound
 
 _infos: dict[tuple, ModelInfo] = {}
@@ -40,13 +40,13 @@ def remember(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGro
                 _pack_anew(mesh_object, entry, path) if entry.packed else playback.has_outdated_model(mesh_object)
             )
             if was_bound and is_other:
-                last_evaluation.forget(mesh_object)
+                last_evaluation.remove(mesh_object)
                 registry.reset_players()
                 mesh_object.update_tag()
             return entry
     entry = binding.models.add()
     entry.name = path.stem
-    entry.path = path_for(mesh_object, path)
+    entry.path = stored_path_for(mesh_object, path)
     binding.model_index = len(binding.models) - 1
     return entry
 
@@ -196,7 +196,7 @@ def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, 
         with atomic_write(path) as temporary:
             temporary.write_bytes(data)
     bound = is_bound(mesh_object, entry)
-    entry.path, entry.packed, entry.packed_bytes = path_for(mesh_object, path), None, 0
+    entry.path, entry.packed, entry.packed_bytes = stored_path_for(mesh_object, path), None, 0
     model_files.allow(path)
     if bound:
         mesh_object.fdda.model, mesh_object.fdda.packed = entry.path, None

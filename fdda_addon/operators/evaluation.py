@@ -12,11 +12,11 @@ from ..core.errors import ModelError, RigError
 from ..core.progress import Progress
 from ..core.report import REPORT_HTML, page_path
 from ..evaluation import last_evaluation, side_by_side
-from ..evaluation.loaded import loaded_heat_map
+from ..evaluation.loaded_heat_map import loaded_heat_map
 from ..models.entries import bound_entry, bound_name
 from ..properties.choices import target_settings
 from ..properties.view import show_graph
-from ..scene.active_rig import any_mesh
+from ..scene.active_rig import any_mesh_object
 from .job import JobOperator
 from .on_rig import OnRig
 from .playback import OnModel
@@ -87,7 +87,7 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
         sentences = []
         for uid, evaluation in result:
             mesh_object = next(o for o in bpy.data.objects if o.session_uid == uid)
-            last = last_evaluation.keep(
+            last = last_evaluation.store(
                 mesh_object, evaluation, bound_name(mesh_object), self._action, first, self.seed
             )
             fdda, linear = last.total["fdda"], last.total["linear"]
@@ -119,7 +119,7 @@ class OnEvaluation(OnModel):
         """Whether a mesh of the scene was evaluated; sets the poll message otherwise. For `poll`."""
         if not cls.is_free(context):
             return False
-        if not any_mesh(context, last_evaluation.of):
+        if not any_mesh_object(context, last_evaluation.get):
             cls.poll_message_set("Nothing was evaluated since Blender was started; evaluate first")
             return False
         return True
@@ -131,7 +131,7 @@ class OnEvaluation(OnModel):
             FDDAError: there is none.
         """
         scene_rig = self.rig(context)
-        last = last_evaluation.of(scene_rig.mesh_object)
+        last = last_evaluation.get(scene_rig.mesh_object)
         if last is None:
             raise ModelError(
                 f"'{scene_rig.mesh_object.name}' was not evaluated since Blender was started; evaluate first."

@@ -8,7 +8,7 @@ import bpy
 
 from ..core.errors import RigError
 from ..jobs.job import redraw
-from ..scene.active_rig import rigs_together, shown_rig, shown_together
+from ..scene.active_rig import cached_active_rig, cached_rigs_of_active_armature, rigs_of_active_armature
 from .on_rig import OnRig
 
 BUTTONS = (
@@ -46,7 +46,7 @@ class FDDA_OT_choose_mesh(OnRig, bpy.types.Operator):
             return {"CANCELLED"}
         context.window_manager.fdda.mesh = shown.name
         # A mesh that is selected beside the armature would be shown in its place.
-        for rig in rigs_together(context):
+        for rig in rigs_of_active_armature(context):
             if rig.mesh_object.select_get():
                 rig.mesh_object.select_set(False)
         redraw()
@@ -58,7 +58,7 @@ class FDDA_MT_all(bpy.types.Menu):
     bl_label = "FDDA"
 
     def draw(self, context: bpy.types.Context) -> None:
-        together = context.window_manager.fdda.all_meshes and bool(shown_together(context))
+        together = context.window_manager.fdda.all_meshes and bool(cached_rigs_of_active_armature(context))
         for number, group in enumerate(BUTTONS):
             if number:
                 self.layout.separator()
@@ -69,7 +69,7 @@ class FDDA_MT_all(bpy.types.Menu):
 
 
 def _draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
-    if shown_rig(context) is not None or context.mode == "OBJECT":
+    if cached_active_rig(context) is not None or context.mode == "OBJECT":
         self.layout.separator()
         self.layout.menu(FDDA_MT_all.bl_idname)
 

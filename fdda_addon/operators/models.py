@@ -5,7 +5,7 @@ import bpy
 
 from ..core.errors import ModelError
 from ..models.entries import megabytes
-from ..scene.active_rig import any_mesh
+from ..scene.active_rig import any_mesh_object
 from .playback import ChoosesModel, OnModel
 
 
@@ -29,7 +29,7 @@ class OnEntry(OnModel):
         """Whether a mesh of the scene has models; sets the poll message otherwise. For `poll`."""
         if not cls.is_free(context):
             return False
-        if not any_mesh(context, _has_models):
+        if not any_mesh_object(context, _has_models):
             cls.poll_message_set("The list of models is empty; train one, or add a file")
             return False
         return True

@@ -4,7 +4,7 @@
 import bpy
 
 from ..core.errors import RigError
-from ..scene.active_rig import active_rig, any_mesh, rigs_together, shown_rig
+from ..scene.active_rig import active_rig, any_mesh_object, cached_active_rig, rigs_of_active_armature
 from ..scene.scene_rig import SceneRig, armature_of
 
 
@@ -28,7 +28,7 @@ class OnRig:
 
         A rig anywhere in the scene will do: a script may name its object.
         """
-        if shown_rig(context) is not None or any_mesh(context, armature_of):
+        if cached_active_rig(context) is not None or any_mesh_object(context, armature_of):
             return True
         try:
             active_rig(context)
@@ -50,7 +50,7 @@ class OnRig:
         Raises:
             RigError: there is none.
         """
-        together = rigs_together(context) if self.all_meshes and not self.object else []
+        together = rigs_of_active_armature(context) if self.all_meshes and not self.object else []
         return together or [self.rig(context)]
 
     def subject(self, context: bpy.types.Context) -> int:

@@ -12,7 +12,7 @@ from ..jobs.job import current
 from ..models.entries import bound_name, chosen_entry, megabytes
 from ..properties.character import trained_file
 from ..properties.preferences import packs_models
-from ..scene.active_rig import any_mesh
+from ..scene.active_rig import any_mesh_object
 from ..scene.scene_rig import SceneRig
 from .job import JobOperator
 from .on_rig import OnRig
@@ -43,7 +43,7 @@ class OnModel(OnRig):
         """As `is_free`, and the active rig, or some other, has a model that is bound."""
         if not cls.is_free(context):
             return False
-        if not any_mesh(context, _is_bound):
+        if not any_mesh_object(context, _is_bound):
             cls.poll_message_set("No model is bound; bind one first")
             return False
         return True
@@ -333,7 +333,7 @@ class FDDA_OT_measure_model(OnModel, JobOperator, bpy.types.Operator):
 
         mesh_object = self.bound_rig(context).mesh_object
         times = result.frame_times(mesh_object.fdda.model)
-        frame_times.keep(mesh_object, times)
+        frame_times.store(mesh_object, times)
         return (
             f"A frame of '{mesh_object.name}' takes {times.rig:.2f} ms with the rig and {times.fdda:.2f} ms with FDDA, "
             f"of which Blender takes {times.floor:.2f}. {times.sentence}"

@@ -67,14 +67,14 @@ class FDDA_OT_rest_pose(OnPose, bpy.types.Operator):
 
     def change(self, context: bpy.types.Context) -> str:
         from ..scene.armature import clear_pose
-        from ..scene.control_names import resting_value
+        from ..scene.control_names import control_default
         from ..scene.controls import is_driven, owner_of, set_control
 
         rig = self.rig(context)
         clear_pose(rig.armature_object)
         for control in _sampled_controls(rig):
             if not is_driven(owner_of(rig, control.owner), control.path):
-                set_control(rig, control.name, resting_value(rig, control.name))
+                set_control(rig, control.name, control_default(rig, control.name))
         return f"'{rig.armature_object.name}' is in its rest pose."
 
 
@@ -129,10 +129,10 @@ class FDDA_OT_state_range(_OnRange, bpy.types.Operator):
     )
 
     def change(self, context: bpy.types.Context) -> str:
-        from ..poses.motion_range import state_rotation_range
+        from ..poses.motion_range import set_rotation_range
 
         bone = self.pose_bone(context)
-        state_rotation_range(bone, self.axis_index, self.low, self.high)
+        set_rotation_range(bone, self.axis_index, self.low, self.high)
         low, high = math.degrees(self.low), math.degrees(self.high)
         return f"'{bone.name}' turns about {self.axis} from {low:.0f}° to {high:.0f}°."
 
@@ -144,10 +144,10 @@ class FDDA_OT_unstate_range(_OnRange, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def change(self, context: bpy.types.Context) -> str:
-        from ..poses.motion_range import unstate_rotation_range
+        from ..poses.motion_range import clear_rotation_range
 
         bone = self.pose_bone(context)
-        unstate_rotation_range(bone, self.axis_index)
+        clear_rotation_range(bone, self.axis_index)
         return f"'{bone.name}' states no range about {self.axis} any more."
 
 
@@ -169,17 +169,17 @@ class FDDA_OT_limits_from_actions(OnPose, bpy.types.Operator):
     )
 
     def change(self, context: bpy.types.Context) -> str:
-        from ..poses.measured_limits import state_measured_limits
+        from ..poses.measured_limits import set_limits_from_actions
 
         rig = self.rig(context)
         names = recorded_actions(rig.armature_object)
         if not names:
             raise RigError("No action is ticked; tick those of Actions to record as well that show how the rig moves.")
-        limits = state_measured_limits(rig, [bpy.data.actions[name] for name in names], self.margin)
-        stated = {limit.bone for limit in limits if not limit.why_not}
-        left = [limit for limit in limits if limit.why_not]
-        others = f"; {len(left)} axes were left as they are ('{left[0].bone}' {left[0].why_not})" if left else ""
-        if wide := list(dict.fromkeys(limit.bone for limit in limits if limit.is_wide)):
+        limits = set_limits_from_actions(rig, [bpy.data.actions[name] for name in names], self.margin)
+        stated = {limit.bone for limit in limits if not limit.reason_unset}
+        left = [limit for limit in limits if limit.reason_unset]
+        others = f"; {len(left)} axes were left as they are ('{left[0].bone}' {left[0].reason_unset})" if left else ""
+        if wide := list(dict.fromkeys(limit.bone for limit in limits if limit.near_gimbal_lock)):
             others += f"; {len(wide)} ('{wide[0]}') rotate near gimbal lock, less far than these say: Ticked Actions,"
             others += " above the list, samples what the actions do"
         return f"{len(stated)} bones have the ranges of {', '.join(names)}{others}."

@@ -37,15 +37,15 @@ class _OnSelected(OnPose):
 
 def _copy(source: bpy.types.PoseBone, target: bpy.types.PoseBone, mirrored: bool = False) -> None:
     """State the ranges of one bone for another; those of one on the other side turn round about Y and Z."""
-    from ..poses.motion_range import DEFAULT, rotation_ranges, state_rotation_range, unstate_rotation_range
+    from ..poses.motion_range import DEFAULT, clear_rotation_range, rotation_ranges, set_rotation_range
 
     for axis, found in enumerate(rotation_ranges(source)):
         turned = mirrored and axis > 0
         low, high = (-found.high, -found.low) if turned else (found.low, found.high)
         if found.source == DEFAULT:
-            unstate_rotation_range(target, axis)
+            clear_rotation_range(target, axis)
         elif low < high:
-            state_rotation_range(target, axis, low, high)
+            set_rotation_range(target, axis, low, high)
         target.lock_rotation[axis] = found.is_locked or low >= high
 
 
@@ -87,7 +87,7 @@ class FDDA_OT_edit_ranges(_OnSelected, bpy.types.Operator):
             fields.prop(self, "high", index=axis, text="")
 
     def change(self, context: bpy.types.Context) -> str:
-        from ..poses.motion_range import state_rotation_range
+        from ..poses.motion_range import set_rotation_range
 
         bones = self.selected(context)
         for axis in (axis for axis in range(3) if self.axes[axis]):
@@ -95,7 +95,7 @@ class FDDA_OT_edit_ranges(_OnSelected, bpy.types.Operator):
                 raise RigError(f"The range about {AXES[axis]} is empty; give a larger maximum.")
         for bone in bones:
             for axis in (axis for axis in range(3) if self.axes[axis]):
-                state_rotation_range(bone, axis, self.low[axis], self.high[axis])
+                set_rotation_range(bone, axis, self.low[axis], self.high[axis])
         return f"{_counted(len(bones))} these ranges."
 
 
@@ -158,7 +158,7 @@ class FDDA_OT_limits_preset(OnPose, bpy.types.Operator):
 
     def change(self, context: bpy.types.Context) -> str:
         from ..poses.human_ranges import human_ranges
-        from ..poses.motion_range import DEFAULT, rotation_ranges, state_rotation_range
+        from ..poses.motion_range import DEFAULT, rotation_ranges, set_rotation_range
 
         armature_object = self.rig(context).armature_object
         done = 0
@@ -171,7 +171,7 @@ class FDDA_OT_limits_preset(OnPose, bpy.types.Operator):
                 continue
             for axis, (low, high) in enumerate(found):
                 if low < high:
-                    state_rotation_range(bone, axis, low, high)
+                    set_rotation_range(bone, axis, low, high)
                 else:
                     bone.lock_rotation[axis] = True
             done += 1
@@ -190,12 +190,12 @@ class FDDA_OT_forget_ranges(_OnSelected, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def change(self, context: bpy.types.Context) -> str:
-        from ..poses.motion_range import unstate_rotation_range
+        from ..poses.motion_range import clear_rotation_range
 
         bones = self.selected(context)
         for bone in bones:
             for axis in range(3):
-                unstate_rotation_range(bone, axis)
+                clear_rotation_range(bone, axis)
         return f"{_counted(len(bones), 'states', 'state')} no range any more."
 
 

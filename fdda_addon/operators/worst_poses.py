@@ -82,9 +82,9 @@ class FDDA_OT_jump_to_worst(OnWorst, bpy.types.Operator):
         if last.name:
             context.scene.frame_set(last.first_frame + index)
             return f"Frame {last.first_frame + index}: at most {error_mm:.2f} mm."
-        from ..evaluation.run import pose_held_out
+        from ..evaluation.run import set_held_out_pose
 
-        pose_held_out(scene_rig, last.channels, last.seed, index)
+        set_held_out_pose(scene_rig, last.channels, last.seed, index)
         context.view_layer.update()
         context.window_manager.fdda_view.pose = index
         return f"Random pose {index}: at most {error_mm:.2f} mm."

@@ -10,7 +10,7 @@ from bpy.app.handlers import persistent
 from ..core.errors import RigError
 from ..jobs import job
 from ..properties.choices import recording_settings
-from ..scene import kept
+from ..scene import draw_cache
 from ..scene.scene_rig import SceneRig, armature_of
 
 if TYPE_CHECKING:  # Blender starts without numpy.
@@ -28,7 +28,7 @@ _rest_changed: set[str] = set()
 """Names of meshes whose data has changed."""
 
 
-@kept.kept
+@draw_cache.draw_cached
 def known(scene_rig: SceneRig) -> "RigCheck | None":
     """The last check of a rig, None before the first. When something has changed since, another is on its way."""
     uid = scene_rig.mesh_object.session_uid
@@ -123,7 +123,7 @@ def _is_rest_changed(scene_rig: SceneRig) -> bool:
 
 @persistent
 def _on_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    kept.forget()
+    draw_cache.clear()
     if not _checks:
         return
     _outdated.update(_checks)
@@ -135,14 +135,14 @@ def _on_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
 
 @persistent
 def _on_undone(*_: object) -> None:
-    kept.forget()
+    draw_cache.clear()
     _outdated.update(_checks)
     _rest_changed.update(mesh.name for mesh in bpy.data.meshes)
 
 
 @persistent
 def _on_loaded(*_: object) -> None:
-    kept.forget()
+    draw_cache.clear()
     for known_things in (_checks, _wanted, _outdated, _rest_changed):
         known_things.clear()
 

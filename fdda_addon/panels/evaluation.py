@@ -4,7 +4,7 @@
 import bpy
 
 from ..evaluation import last_evaluation, markers, side_by_side
-from ..evaluation.loaded import loaded_heat_map
+from ..evaluation.loaded_heat_map import loaded_heat_map
 from ..jobs import job
 from ..models.entries import bound_name
 from ..scene.scene_rig import SceneRig
@@ -24,7 +24,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
     @classmethod
     def is_done(cls, context: bpy.types.Context) -> bool:
         rig = panel_rig(context)[0]
-        return rig is not None and last_evaluation.of(rig.mesh_object) is not None
+        return rig is not None and last_evaluation.get(rig.mesh_object) is not None
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, view = self.usable_layout(), context.window_manager.fdda_view
@@ -39,7 +39,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         else:
             _draw_side_by_side(layout, context, scene_rig)
             self._draw_start(context, scene_rig)
-        last = last_evaluation.of(scene_rig.mesh_object)
+        last = last_evaluation.get(scene_rig.mesh_object)
         if last is not None:
             _draw_figures(layout, context, view, last, scene_rig)
         _draw_colors(layout, context, view, scene_rig.mesh_object, last)
@@ -80,7 +80,7 @@ def _draw_side_by_side(layout: bpy.types.UILayout, context: bpy.types.Context, s
     column = layout.column(align=True)
     column.label(text="Show the Rig")
     row = column.row(align=True)
-    shown = side_by_side.way_of(scene_rig.mesh_object)
+    shown = side_by_side.display_mode(scene_rig.mesh_object)
     for way, text in (("NONE", "Off"), ("BESIDE", "Beside"), ("OVERLAY", "Overlay")):
         button = row.operator("fdda.compare", text=text, depress=shown == way)
         button.way = way

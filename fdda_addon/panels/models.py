@@ -7,7 +7,7 @@ import bpy
 
 from ..core.errors import FDDAError
 from ..models.entries import chosen_entry, is_bound, megabytes
-from ..scene.stored_paths import resolved
+from ..scene.stored_paths import resolve_path
 from . import checks
 from .section import Section, draw_sentence, panel_rig
 from .watch import Watch
@@ -129,7 +129,7 @@ class FDDA_PT_models(Section, bpy.types.Panel):
             draw_sentence(layout, context, f"Inside the .blend file, {megabytes(entry.packed_bytes)}.", "PACKAGE")
             layout.operator("fdda.unpack_model", icon="EXPORT")
         else:
-            draw_sentence(layout, context, str(resolved(entry.path)), "FILE")
+            draw_sentence(layout, context, str(resolve_path(entry.path)), "FILE")
             layout.operator("fdda.pack_model", text="Pack into the .blend File", icon="PACKAGE")
         if state is not None:
             box = layout.box()

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import bpy
 
-from ..scene.kept import kept
+from ..scene.draw_cache import draw_cached
 
 MIN_PREFIX = 4
 MAX_OTHERS = 0.3
@@ -31,6 +31,6 @@ def shown_name(armature_object: bpy.types.Object, name: str) -> str:
     return name.removeprefix(_prefix(armature_object)) or name
 
 
-@kept
+@draw_cached
 def _prefix(armature_object: bpy.types.Object) -> str:
     return common_prefix([bone.name for bone in armature_object.data.bones])

@@ -7,10 +7,10 @@ import bpy
 
 from ..jobs import job
 from ..models.entries import bound_name, chosen_entry
-from ..scene.kept import kept
-from ..scene.model_trust import is_trusted
+from ..scene.draw_cache import draw_cached
+from ..scene.folder_trust import is_trusted
 from ..scene.scene_rig import SceneRig, armature_of
-from ..scene.stored_paths import resolved
+from ..scene.stored_paths import resolve_path
 from ..timing import frame_times
 from .names import shown_name
 from .section import Section, draw_button, draw_job, draw_sentence, panel_rig, together
@@ -22,10 +22,10 @@ MAX_SHOWN = 6
 MODES = (("RIG", "Rig"), ("LINEAR", "Linear Layer"), ("FDDA", "FDDA"))
 
 
-@kept
+@draw_cached
 def lies_outside(mesh_object: bpy.types.Object) -> bool:
     """Whether the bound model plays in this session only, as its file may not be followed from this one."""
-    path = resolved(mesh_object.fdda.model, mesh_object.library).resolve()
+    path = resolve_path(mesh_object.fdda.model, mesh_object.library).resolve()
     file = Path(bpy.data.filepath).resolve()
     return bool(bpy.data.filepath) and not path.is_relative_to(file.parent) and not is_trusted(path)
 
@@ -137,7 +137,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         state = job.state_of("measure_model")
         if state is not None and state.outcome_level != "INFO":
             draw_job(body, context, "measure_model")
-        times = frame_times.of(mesh_object)
+        times = frame_times.get(mesh_object)
         if times is not None:
             grid = body.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
             for label, value in (

@@ -9,7 +9,7 @@ import bpy
 from ..operators.poses import FDDA_OT_state_range
 from ..properties.choices import moves_a_bone, recorded_actions
 from ..scene.compatibility import is_selected, selection_owner
-from ..scene.kept import kept
+from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks, sampled
 from .names import shown_name
@@ -49,12 +49,12 @@ class FDDA_UL_joints(bpy.types.UIList):
         row.label(text=ranges)
 
 
-@kept
+@draw_cached
 def _scale(preferences: bpy.types.Preferences) -> float:
     return preferences.system.ui_scale
 
 
-@kept
+@draw_cached
 def _flags(rig: SceneRig, text: str, flag: int) -> tuple[int, ...]:
     """Which bones the list shows: the joints of the mesh, or those that were chosen, as far as they are looked for."""
     check, channels = checks.known(rig), sampled_by_bone(rig)
@@ -65,7 +65,7 @@ def _flags(rig: SceneRig, text: str, flag: int) -> tuple[int, ...]:
     return tuple(flag if (not listed or name in listed) and text in name.lower() else 0 for name in names)
 
 
-@kept
+@draw_cached
 def _line(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[str, str, str, bool]:
     """Icon, name and ranges of a bone in the list, and whether it states any of them."""
     from ..poses.motion_range import DEFAULT, rotation_ranges
@@ -82,7 +82,7 @@ def _line(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[str, 
     return "NONE", name, "  ".join(texts), any(r.moves and r.source != DEFAULT for r in ranges)
 
 
-@kept
+@draw_cached
 def states_limits(rig: SceneRig) -> bool:
     """Whether any bone of the armature states a range of motion, or locks an axis."""
     from ..poses.motion_range import DEFAULT, rotation_ranges
@@ -91,7 +91,7 @@ def states_limits(rig: SceneRig) -> bool:
     return any(r.source != DEFAULT or r.is_locked for bone in bones for r in rotation_ranges(bone))
 
 
-@kept
+@draw_cached
 def sampled_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None":
     """Channels of the bones that a user has chosen to sample, by bone; None where none were chosen, or not known."""
     check = checks.known(rig)
@@ -194,7 +194,7 @@ def _draw_many(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Scen
         draw_sentence(body, context, text, "INFO")
 
 
-@kept
+@draw_cached
 def _selected(rig: SceneRig) -> int:
     return sum(map(is_selected, rig.armature_object.pose.bones))
 
@@ -211,7 +211,7 @@ def _draw_bone(layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBo
             _draw_ranges(layout.box(), rig, bone)
 
 
-@kept
+@draw_cached
 def _ranges_of(rig: SceneRig, bone: bpy.types.PoseBone) -> tuple[str, list, tuple[int, ...]]:
     """Name of a bone and where its ranges come from, its ranges about the axes, and the axes that it is moved along."""
     from ..poses.motion_range import CONSTRAINT, DEFAULT, IK, location_ranges, rotation_ranges
@@ -225,7 +225,7 @@ def _ranges_of(rig: SceneRig, bone: bpy.types.PoseBone) -> tuple[str, list, tupl
 
 def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
     """The ranges of a bone as the fields in which Blender keeps them."""
-    from ..poses.motion_range import CONSTRAINT, DEFAULT, local_limit
+    from ..poses.motion_range import CONSTRAINT, DEFAULT, find_local_limit
 
     text, ranges, locations = _ranges_of(rig, bone)
     box.label(text=text, icon="BONE_DATA")
@@ -241,13 +241,13 @@ def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBon
             fields.label(text="locked" if bone.lock_rotation[axis] else text)
             _draw_state_button(fields, rig, bone, axis, "fdda.state_range", "ADD")
             continue
-        owner, prefix = (local_limit(bone, "LIMIT_ROTATION"), "") if r.source == CONSTRAINT else (bone, "ik_")
+        owner, prefix = (find_local_limit(bone, "LIMIT_ROTATION"), "") if r.source == CONSTRAINT else (bone, "ik_")
         fields.prop(owner, f"{prefix}min_{AXES[axis]}", text="")
         fields.prop(owner, f"{prefix}max_{AXES[axis]}", text="")
         _draw_state_button(fields, rig, bone, axis, "fdda.unstate_range", "X")
     for axis in locations:
         row = column.row(align=True)
-        limit = local_limit(bone, "LIMIT_LOCATION")
+        limit = find_local_limit(bone, "LIMIT_LOCATION")
         row.prop(bone, "lock_location", index=axis, text=f"Move {AXES[axis].upper()}", toggle=1)
         row.prop(limit, f"min_{AXES[axis]}", text="")
         row.prop(limit, f"max_{AXES[axis]}", text="")
@@ -280,7 +280,7 @@ def _draw_random(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     row.operator("fdda.rest_pose", text="Rest Pose", icon="LOOP_BACK")
 
 
-@kept
+@draw_cached
 def _fitting_actions(rig: SceneRig) -> "tuple[bpy.types.Action, ...]":
     return tuple(action for action in bpy.data.actions if moves_a_bone(action, rig.armature_object))
 

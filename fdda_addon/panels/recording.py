@@ -12,7 +12,7 @@ from ..core.errors import FDDAError
 from ..jobs import job
 from ..properties.character import recording_folder
 from ..properties.choices import recorded_actions, recording_settings
-from ..scene.kept import kept
+from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks
 from .section import Section, draw_button, draw_job, draw_path, draw_sentence, panel_rig
@@ -24,7 +24,7 @@ _contents: "dict[int, tuple[tuple, FolderContent]]" = {}
 """What was found in the folder of a character, by session_uid of its mesh object, and for which question."""
 
 
-@kept
+@draw_cached
 def shown_content(rig: SceneRig) -> "tuple[Path, FolderContent] | str":
     """The folder of a character and what is in it; a sentence where that cannot be said."""
     try:
@@ -142,7 +142,7 @@ def _draw_record(
     draw_button(row, context, "fdda.record", text, "REC").resume = resume
 
 
-@kept
+@draw_cached
 def _plan(rig: SceneRig) -> str:
     from ..poses.action_range import action_frames
 

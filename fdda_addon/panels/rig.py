@@ -5,7 +5,7 @@ import bpy
 
 from ..jobs import job
 from ..operators.rig import cost_of
-from ..scene.active_rig import shown_together
+from ..scene.active_rig import cached_rigs_of_active_armature
 from ..scene.scene_rig import SceneRig
 from . import checks, curves
 from .section import Section, draw_button, draw_job, draw_sentence, panel_rig
@@ -52,7 +52,7 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
 
 def _draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
     """The meshes of the active armature, where there are several: which is shown, and whether buttons are about all."""
-    rigs = shown_together(context)
+    rigs = cached_rigs_of_active_armature(context)
     if not rigs:
         return
     box = layout.box().column(align=True)

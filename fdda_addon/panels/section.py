@@ -8,8 +8,8 @@ import bpy
 
 from ..core.errors import RigError
 from ..jobs import job
-from ..scene.active_rig import active_rig, shown_rig, shown_together
-from ..scene.kept import kept
+from ..scene.active_rig import active_rig, cached_active_rig, cached_rigs_of_active_armature
+from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 
 MARGIN, ICON = 74, 22
@@ -30,7 +30,7 @@ class Section:
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         running = job.current()
-        return shown_rig(context) is not None or (running is not None and running.verb in cls.verbs)
+        return cached_active_rig(context) is not None or (running is not None and running.verb in cls.verbs)
 
     def usable_layout(self) -> bpy.types.UILayout:
         """The layout of the panel; nothing in it can be changed while the job of another section borrows the scene."""
@@ -51,7 +51,7 @@ class Section:
 
 def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
     """The rig that the sidebar is about, or None and the sentence that says why there is none."""
-    if (rig := shown_rig(context)) is not None:
+    if (rig := cached_active_rig(context)) is not None:
         return rig, ""
     try:
         return active_rig(context), ""
@@ -61,7 +61,7 @@ def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
 
 def together(context: bpy.types.Context) -> int:
     """How many meshes the buttons work on at once; 0 where they work on the one that is shown."""
-    rigs = shown_together(context)
+    rigs = cached_rigs_of_active_armature(context)
     return len(rigs) if rigs and context.window_manager.fdda.all_meshes else 0
 
 
@@ -90,7 +90,7 @@ def draw_sentence(layout: bpy.types.UILayout, context: bpy.types.Context, text: 
         column.label(text=line, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
 
 
-@kept
+@draw_cached
 def _text_size(preferences: bpy.types.Preferences) -> tuple[float, float]:
     """Scale of the interface, and height of its text in points."""
     scale = preferences.system.ui_scale

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..core.errors import FDDAError
 from ..properties.character import trained_file
-from ..scene.kept import kept
+from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks
 
@@ -28,7 +28,7 @@ def trained(rig: SceneRig) -> Trained | None:
     return _trained(rig)[0]
 
 
-@kept
+@draw_cached
 def _trained(rig: SceneRig) -> tuple[Trained | None]:
     """As `trained`; in a tuple, for that there is none is kept as well."""
     path = trained_file(rig.mesh_object)

@@ -83,15 +83,15 @@ def measured_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.typ
         Euler angles as `armature.Poser` sets them (in the order of the bone, of quaternions and axis angles XYZ, and
         turning on beyond a half turn), `LOCATION` in metres and `SCALE` as factors, relative to the rest pose.
     """
-    return moved_ranges(keyed_ranges(armature_object, actions))
+    return moving_ranges(keyed_ranges(armature_object, actions))
 
 
-def moved_ranges(keyed: Ranges) -> Ranges:
+def moving_ranges(keyed: Ranges) -> Ranges:
     """Of the ranges that `keyed_ranges` returns those of `measured_ranges`."""
-    return {key: bounds for key, bounds in keyed.items() if key[1] != ROTATION_VECTOR and is_moved(bounds)}
+    return {key: bounds for key, bounds in keyed.items() if key[1] != ROTATION_VECTOR and has_width(bounds)}
 
 
-def is_moved(bounds: tuple[float, float]) -> bool:
+def has_width(bounds: tuple[float, float]) -> bool:
     """Whether a range is more than a point."""
     return bounds[1] - bounds[0] > RANGE_TOLERANCE
 
@@ -172,18 +172,18 @@ def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) 
     """
     controls = []
     for (owner, path), bounds in _keyed_controls(scene_rig, actions).items():
-        if is_moved(bounds):
+        if has_width(bounds):
             with suppress(RigError):
                 controls.append(make_control(scene_rig, owner, path, bounds))
     return tuple(controls)
 
 
-def held_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> tuple[Channel, ...]:
+def constant_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> tuple[Channel, ...]:
     """The numbers as of `measured_controls` that actions key at one value, where the file has another value now."""
     channels = []
     for (owner, path), (low, high) in _keyed_controls(scene_rig, actions).items():
         datablock = owner_of(scene_rig, owner)
-        if is_number(datablock, path) and not is_moved((low, high)):
+        if is_number(datablock, path) and not has_width((low, high)):
             channel = Channel(f"{owner}/{path}", CONTROL, 0, low, low)
             if abs(float(datablock.path_resolve(path)) - low) > RANGE_TOLERANCE and not is_driven(datablock, path):
                 channels.append(channel)

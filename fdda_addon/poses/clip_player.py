@@ -11,10 +11,10 @@ import numpy as np
 from ..core.recording.index import ACTION
 from ..scene.armature import clear_pose
 from ..scene.arrays import POSE_CHANNELS, read, write
-from ..scene.borrow import animated_values, assign_action, driving_actions, read_value, set_value
 from ..scene.compatibility import curves_of
 from ..scene.controls import owner_of, set_control
 from ..scene.scene_rig import SceneRig
+from ..scene.temporary_state import animated_values, assign_action, driving_actions, read_value, set_value
 from .clip import Clip
 from .mirror import Mirror
 
@@ -74,7 +74,7 @@ class ClipPlayer:
                 self._controls.append((scene_rig, name, owner_of(scene_rig, owner).path_resolve(path)))
 
     def show(self, clip: Clip, frame: int) -> None:
-        """Go to a frame of a clip. The armature has no animation of its own meanwhile (`borrowed_pose`)."""
+        """Go to a frame of a clip. The armature has no animation of its own meanwhile (`temporary_pose`)."""
         if clip != self._clip:
             self._start(clip)
         elif clip.is_mirrored:
@@ -133,9 +133,9 @@ class ClipPlayer:
 
     def _reset(self) -> None:
         clear_pose(self._armature_object)
-        self.give_back_numbers()
+        self.restore_numbers()
 
-    def give_back_numbers(self) -> None:
+    def restore_numbers(self) -> None:
         """Set the numbers to what they are in the file."""
         for (datablock, path), value in self._numbers.items():
             set_value(datablock, path, value)
@@ -146,10 +146,10 @@ class ClipPlayer:
 
 
 @contextmanager
-def played_clips(rigs: Controlled, clips: tuple[Clip, ...]) -> Iterator[ClipPlayer]:
+def clip_player(rigs: Controlled, clips: tuple[Clip, ...]) -> Iterator[ClipPlayer]:
     """Play clips, and give back what animates the datablocks of rigs and the numbers that the clips animate.
 
-    It is entered before `borrowed_pose`, which gives back the armature object's own animation and the frame.
+    It is entered before `temporary_pose`, which gives back the armature object's own animation and the frame.
 
     Raises:
         RigError: as `ClipPlayer`.
@@ -163,12 +163,12 @@ def played_clips(rigs: Controlled, clips: tuple[Clip, ...]) -> Iterator[ClipPlay
             _restore(datablock, state)
         # What animates them again is evaluated first: the numbers may differ from its keys.
         bpy.context.view_layer.update()
-        player.give_back_numbers()
+        player.restore_numbers()
         bpy.context.view_layer.update()
 
 
 def clip_actions(armature_object: bpy.types.Object, clips: tuple[Clip, ...]) -> list[bpy.types.Action]:
-    """The actions that drive the armature object while clips are shown, for `borrowed_pose`."""
+    """The actions that drive the armature object while clips are shown, for `temporary_pose`."""
     return _actions(clips, armature_object)
 
 

@@ -43,7 +43,7 @@ _SIDE = re.compile(r"(?P<before>^|[^a-z])(?P<side>left|right|l|r)(?=$|[^a-z])|^(
 _LETTERS = {"l": "left", "r": "right"}
 
 
-def part_of(name: str) -> tuple[Ranges | None, str]:
+def body_part_of(name: str) -> tuple[Ranges | None, str]:
     """Ranges of a bone by its name, as of the left side, and "left", "right" or ""; None for what is no such part."""
     own = name.rpartition(":")[2]
     own = re.sub(r"(?i)^(def|org|mch|cc_base|bip0+1|b)[-_ ]+", "", own)
@@ -59,7 +59,7 @@ def part_of(name: str) -> tuple[Ranges | None, str]:
 
 def human_ranges(armature_object: bpy.types.Object, bone: bpy.types.Bone) -> list[tuple[float, float]] | None:
     """Ranges of a bone about its own axes x, y and z, radians; None where its name is of no part of a body."""
-    ranges, side = part_of(bone.name)
+    ranges, side = body_part_of(bone.name)
     if ranges is None:
         return None
     if side == "right":

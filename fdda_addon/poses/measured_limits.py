@@ -11,16 +11,16 @@ from ..core.errors import RigError
 from ..core.poses import LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE
 from ..scene.scene_rig import SceneRig
 from ..scene.unit import metres_per_unit
-from .action_range import Ranges, is_moved, keyed_ranges, moved_ranges
+from .action_range import Ranges, has_width, keyed_ranges, moving_ranges
 from .motion_range import (
     AXES,
     DEFAULT,
-    held_range,
-    local_limit,
+    enforced_range,
+    ensure_range_constraint,
+    find_local_limit,
     rotation_ranges,
-    set_limit,
-    state_rotation_range,
-    stating_constraint,
+    set_constraint_limit,
+    set_rotation_range,
 )
 
 DEFAULT_MARGIN = 0.1
@@ -41,8 +41,8 @@ class MeasuredLimit:
     Attributes:
         bone, kind, axis: as of `Channel`.
         low, high: radians, metres or factors; the range that is stated now.
-        why_not: why it was left as it was; empty when it is stated.
-        is_wide: the bone turns less far than its three angles say, which are near gimbal lock (`MAX_WIDENING`).
+        reason_unset: why it was left as it was; empty when it is stated.
+        near_gimbal_lock: the bone rotates less far than its three Euler angles do (`MAX_WIDENING`).
     """
 
     bone: str
@@ -50,11 +50,11 @@ class MeasuredLimit:
     axis: int
     low: float
     high: float
-    why_not: str = ""
-    is_wide: bool = False
+    reason_unset: str = ""
+    near_gimbal_lock: bool = False
 
 
-def state_measured_limits(
+def set_limits_from_actions(
     scene_rig: SceneRig, actions: Iterable[bpy.types.Action], margin: float = DEFAULT_MARGIN
 ) -> tuple[MeasuredLimit, ...]:
     """Make what actions do the range of motion of a rig.
@@ -83,7 +83,7 @@ def state_measured_limits(
             "library override."
         )
     keyed = keyed_ranges(armature_object, actions)
-    measured = moved_ranges(keyed)
+    measured = moving_ranges(keyed)
     still = {key: bounds for key, bounds in keyed.items() if key[1] == ROTATION and _stands_away(bounds)}
     if not measured:
         names = ", ".join(f"'{action.name}'" for action in actions) or "none"
@@ -96,13 +96,13 @@ def state_measured_limits(
         own = {key[1:]: bounds for key, bounds in (measured | still).items() if key[0] == bone.name}
         limits = [_limit(bone, kind, axis, bounds, margin) for (kind, axis), bounds in sorted(own.items())]
         for kind in (ROTATION, LOCATION, SCALE):
-            stated = [limit for limit in limits if limit.kind == kind and not limit.why_not]
-            if kind == ROTATION and not has_ik and local_limit(bone, LIMIT_OF[kind]) is None and _fit_ik(stated):
+            stated = [limit for limit in limits if limit.kind == kind and not limit.reason_unset]
+            if kind == ROTATION and not has_ik and find_local_limit(bone, LIMIT_OF[kind]) is None and _fit_ik(stated):
                 for limit in stated:
-                    state_rotation_range(bone, limit.axis, limit.low, limit.high)
+                    set_rotation_range(bone, limit.axis, limit.low, limit.high)
             elif stated:
                 _state_without_holding(bone, kind, stated)
-        found += [replace(limit, is_wide=bone.name in wide and limit.kind == ROTATION) for limit in limits]
+        found += [replace(limit, near_gimbal_lock=bone.name in wide and limit.kind == ROTATION) for limit in limits]
     return tuple(found)
 
 
@@ -117,12 +117,12 @@ def _wide_bones(keyed: Ranges) -> set[str]:
 
 def _stands_away(bounds: tuple[float, float]) -> bool:
     """Whether a rotation stands still elsewhere than in the rest pose."""
-    return not is_moved(bounds) and abs(bounds[0]) > RANGE_TOLERANCE
+    return not has_width(bounds) and abs(bounds[0]) > RANGE_TOLERANCE
 
 
 def _limit(bone: bpy.types.PoseBone, kind: str, axis: int, bounds: tuple[float, float], margin: float) -> MeasuredLimit:
     """What is to be stated of an axis."""
-    if not is_moved(bounds):
+    if not has_width(bounds):
         return MeasuredLimit(bone.name, kind, axis, *bounds, "stands still away from rest, has no range")
     low, high = bounds
     added = (high - low) * margin
@@ -136,7 +136,7 @@ def _limit(bone: bpy.types.PoseBone, kind: str, axis: int, bounds: tuple[float, 
         return MeasuredLimit(bone.name, kind, axis, *bounds, "locked, left so")
     if kind == LOCATION and bone.bone.use_connect:
         return MeasuredLimit(bone.name, kind, axis, *bounds, "connected, cannot move")
-    least, most = held_range(bone, LIMIT_OF[kind], axis)
+    least, most = enforced_range(bone, LIMIT_OF[kind], axis)
     low, high = max(low, least), min(high, most)
     if not low < high:
         return MeasuredLimit(bone.name, kind, axis, *bounds, "held by its limit, left so")
@@ -149,16 +149,16 @@ def _fit_ik(limits: list[MeasuredLimit]) -> bool:
 
 
 def _state_without_holding(bone: bpy.types.PoseBone, kind: str, limits: list[MeasuredLimit]) -> None:
-    constraint = stating_constraint(bone, LIMIT_OF[kind])
+    constraint = ensure_range_constraint(bone, LIMIT_OF[kind])
     for limit in limits:
-        set_limit(constraint, limit.axis, limit.low, limit.high)
+        set_constraint_limit(constraint, limit.axis, limit.low, limit.high)
     if kind == ROTATION:
         for axis, r in enumerate(rotation_ranges(bone)):
             if r.source == DEFAULT and not r.is_locked:
-                set_limit(constraint, axis, 0.0, 0.0)
+                set_constraint_limit(constraint, axis, 0.0, 0.0)
 
 
-def limit_lines(armature_object: bpy.types.Object, limits: Iterable[MeasuredLimit]) -> list[str]:
+def describe_limits(armature_object: bpy.types.Object, limits: Iterable[MeasuredLimit]) -> list[str]:
     """A line for each bone, in degrees and millimetres."""
     factors = {ROTATION: 180 / math.pi, LOCATION: 1000 * metres_per_unit(armature_object), SCALE: 1.0}
     limits, by_bone = list(limits), dict[str, list[str]]()
@@ -167,7 +167,7 @@ def limit_lines(armature_object: bpy.types.Object, limits: Iterable[MeasuredLimi
         # Adding zero makes -0 a 0.
         low, high = (round(end * factor, digits) + 0.0 for end in (limit.low, limit.high))
         ends = f"{low:.{digits}f} to {high:.{digits}f}{unit}"
-        why_not = f" ({limit.why_not})" if limit.why_not else ""
-        by_bone.setdefault(limit.bone, []).append(f"{verb} {AXES[limit.axis].upper()} {ends}{why_not}")
-    wide = {limit.bone for limit in limits if limit.is_wide}
+        reason_unset = f" ({limit.reason_unset})" if limit.reason_unset else ""
+        by_bone.setdefault(limit.bone, []).append(f"{verb} {AXES[limit.axis].upper()} {ends}{reason_unset}")
+    wide = {limit.bone for limit in limits if limit.near_gimbal_lock}
     return [f"{bone}: {', '.join(texts)}{WIDE_NOTE if bone in wide else ''}" for bone, texts in by_bone.items()]

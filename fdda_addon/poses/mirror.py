@@ -9,7 +9,7 @@ import numpy as np
 
 from ..core.errors import RigError
 from ..scene.arrays import POSE_CHANNELS, read, write
-from ..scene.borrow import set_value
+from ..scene.temporary_state import set_value
 from ..scene.unit import metres_per_unit
 
 MIN_DISTANCE, PART_OF_SIZE = 1e-3, 1e-3

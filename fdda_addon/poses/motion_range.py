@@ -40,7 +40,7 @@ class RotationRange:
 
 def rotation_ranges(bone: bpy.types.PoseBone) -> tuple[RotationRange, RotationRange, RotationRange]:
     """Range of each rotation axis."""
-    constraint = local_limit(bone, "LIMIT_ROTATION")
+    constraint = find_local_limit(bone, "LIMIT_ROTATION")
     return tuple(_rotation_range(bone, constraint, axis) for axis in range(3))
 
 
@@ -59,12 +59,12 @@ def _rotation_range(bone: bpy.types.PoseBone, constraint: bpy.types.Constraint |
 
 def location_ranges(bone: bpy.types.PoseBone) -> dict[int, tuple[float, float]]:
     """Range by axis, metres, of the axes that a Limit Location constraint limits on both ends."""
-    return _limited(local_limit(bone, "LIMIT_LOCATION"))
+    return _limited(find_local_limit(bone, "LIMIT_LOCATION"))
 
 
 def scale_ranges(bone: bpy.types.PoseBone) -> dict[int, tuple[float, float]]:
     """Range by axis, factors, of the axes that a Limit Scale constraint limits on both ends."""
-    return _limited(local_limit(bone, "LIMIT_SCALE"))
+    return _limited(find_local_limit(bone, "LIMIT_SCALE"))
 
 
 def _limited(constraint: bpy.types.Constraint | None) -> dict[int, tuple[float, float]]:
@@ -77,7 +77,7 @@ def _limited(constraint: bpy.types.Constraint | None) -> dict[int, tuple[float, 
     }
 
 
-def local_limit(bone: bpy.types.PoseBone, kind: str) -> bpy.types.Constraint | None:
+def find_local_limit(bone: bpy.types.PoseBone, kind: str) -> bpy.types.Constraint | None:
     """The constraint of this type that states a range, None when there is none."""
     for constraint in bone.constraints:
         if constraint.type == kind and constraint.owner_space == "LOCAL" and not constraint.mute:
@@ -85,7 +85,7 @@ def local_limit(bone: bpy.types.PoseBone, kind: str) -> bpy.types.Constraint | N
     return None
 
 
-def state_rotation_range(bone: bpy.types.PoseBone, axis: int, low: float, high: float) -> None:
+def set_rotation_range(bone: bpy.types.PoseBone, axis: int, low: float, high: float) -> None:
     """Write the range of a rotation axis to a bone and unlock the axis.
 
     It is written where the bone states its range. A bone that states none gets IK limits, which leave posing by hand
@@ -101,7 +101,7 @@ def state_rotation_range(bone: bpy.types.PoseBone, axis: int, low: float, high: 
     """
     if not low < high:
         raise RigError(f"The range of '{bone.name}' about {AXES[axis].upper()} is empty; give a larger maximum.")
-    letter, constraint = AXES[axis], local_limit(bone, "LIMIT_ROTATION")
+    letter, constraint = AXES[axis], find_local_limit(bone, "LIMIT_ROTATION")
     states_ik = any(r.source == IK for r in rotation_ranges(bone))
     if constraint is None and low <= 0 <= high:
         setattr(bone, f"lock_ik_{letter}", False)
@@ -123,9 +123,9 @@ def state_rotation_range(bone: bpy.types.PoseBone, axis: int, low: float, high: 
     bone.lock_rotation[axis] = False
 
 
-def unstate_rotation_range(bone: bpy.types.PoseBone, axis: int) -> None:
+def clear_rotation_range(bone: bpy.types.PoseBone, axis: int) -> None:
     """Let a rotation axis have the default range again."""
-    letter, constraint = AXES[axis], local_limit(bone, "LIMIT_ROTATION")
+    letter, constraint = AXES[axis], find_local_limit(bone, "LIMIT_ROTATION")
     if constraint is not None:
         setattr(constraint, f"use_limit_{letter}", False)
     else:
@@ -133,7 +133,7 @@ def unstate_rotation_range(bone: bpy.types.PoseBone, axis: int) -> None:
         setattr(bone, f"lock_ik_{letter}", False)
 
 
-def stating_constraint(bone: bpy.types.PoseBone, kind: str) -> bpy.types.Constraint:
+def ensure_range_constraint(bone: bpy.types.PoseBone, kind: str) -> bpy.types.Constraint:
     """The constraint that states the ranges of a bone without holding it: one of influence 0, made where there is none.
 
     It goes before what the bone states its ranges with, and takes them over.
@@ -142,7 +142,7 @@ def stating_constraint(bone: bpy.types.PoseBone, kind: str) -> bpy.types.Constra
         bone: the pose bone.
         kind: "LIMIT_ROTATION", "LIMIT_LOCATION" or "LIMIT_SCALE".
     """
-    stated = local_limit(bone, kind)
+    stated = find_local_limit(bone, kind)
     if stated is not None and stated.influence == 0:
         return stated
     rotations = rotation_ranges(bone)
@@ -153,16 +153,16 @@ def stating_constraint(bone: bpy.types.PoseBone, kind: str) -> bpy.types.Constra
     if kind == "LIMIT_ROTATION":
         for axis, r in enumerate(rotations):
             if r.source != DEFAULT:
-                set_limit(constraint, axis, r.low, r.high)
+                set_constraint_limit(constraint, axis, r.low, r.high)
             elif r.is_locked and not bone.lock_rotation[axis]:
                 # An IK lock is not read beside a constraint.
-                set_limit(constraint, axis, 0.0, 0.0)
+                set_constraint_limit(constraint, axis, 0.0, 0.0)
     for axis, bounds in others.items():
-        set_limit(constraint, axis, *bounds)
+        set_constraint_limit(constraint, axis, *bounds)
     return constraint
 
 
-def set_limit(constraint: bpy.types.Constraint, axis: int, low: float, high: float) -> None:
+def set_constraint_limit(constraint: bpy.types.Constraint, axis: int, low: float, high: float) -> None:
     """Limit one axis in a Limit Rotation, Limit Location or Limit Scale constraint; radians, metres or factors."""
     letter = AXES[axis]
     for name in (f"use_limit_{letter}", f"use_min_{letter}", f"use_max_{letter}"):
@@ -172,7 +172,7 @@ def set_limit(constraint: bpy.types.Constraint, axis: int, low: float, high: flo
     setattr(constraint, f"max_{letter}", high)
 
 
-def held_range(bone: bpy.types.PoseBone, kind: str, axis: int) -> tuple[float, float]:
+def enforced_range(bone: bpy.types.PoseBone, kind: str, axis: int) -> tuple[float, float]:
     """What the Limit constraints in local space that hold a bone leave of an axis; infinite where none does."""
     low, high, letter = -float("inf"), float("inf"), AXES[axis]
     for constraint in bone.constraints:

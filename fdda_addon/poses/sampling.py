@@ -13,17 +13,19 @@ from ..core.poses import CONTROL, KINDS, LOCATION, RANGE_TOLERANCE, ROTATION, RO
 from ..core.rig import Rig
 from ..scene.controls import is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
-from .action_range import is_moved
-from .bone_numbers import control_name, ranges_by_control
-from .choice import OWN_BONES, Choice, Measured, choose_bones
+from .action_range import has_width
+from .bone_channels import control_name, ranges_by_control
 from .motion_range import DEFAULT, RotationRange, location_ranges, rotation_ranges, scale_ranges
+from .sample_selection import DEFAULT_SELECTION, Measured, SampleSelection, select_bones
 
 LIMITS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
 Ranges = dict[str, tuple[float, float]]
 """Ranges by the names of controls."""
 
 
-def choose(scene_rig: SceneRig, texts: Iterable[str], find_controls: Callable[[Ranges], Iterable[Control]]) -> Choice:
+def choose(
+    scene_rig: SceneRig, texts: Iterable[str], find_controls: Callable[[Ranges], Iterable[Control]]
+) -> SampleSelection:
     """Read what a user chose.
 
     Args:
@@ -37,22 +39,22 @@ def choose(scene_rig: SceneRig, texts: Iterable[str], find_controls: Callable[[R
         RigError: there is no such collection, action or bone, or it chooses nothing.
     """
     texts = list(texts)
-    choice = choose_bones(scene_rig, texts)
+    choice = select_bones(scene_rig, texts)
     controls = {control.name: control for control in choice.controls}
     controls |= {control.name: control for control in find_controls(sampled_numbers(scene_rig, choice))}
     choice = replace(choice, controls=tuple(controls.values()))
     moves = controls or choice.bones is None or choice.bones - choice.by_action
-    if not moves and not any(is_moved(bounds) for _, bounds in choice.measured):
+    if not moves and not any(has_width(bounds) for _, bounds in choice.measured):
         raise RigError(f"Nothing is chosen to sample by {', '.join(texts)}; choose bones that an animator poses.")
     return choice
 
 
-def sampled_numbers(scene_rig: SceneRig, choice: Choice) -> Ranges:
+def sampled_numbers(scene_rig: SceneRig, choice: SampleSelection) -> Ranges:
     """Ranges of the numbers of bones that a choice samples, where the rig or an action states them."""
     return ranges_by_control(scene_rig.armature_object, _bone_channels(scene_rig.armature_object, choice, set()))
 
 
-def sampled_channels(scene_rig: SceneRig, rig: Rig, choice: Choice = OWN_BONES) -> tuple[Channel, ...]:
+def sampled_channels(scene_rig: SceneRig, rig: Rig, choice: SampleSelection = DEFAULT_SELECTION) -> tuple[Channel, ...]:
     """The channels of a random pose.
 
     Args:
@@ -85,11 +87,11 @@ def sampled_channels(scene_rig: SceneRig, rig: Rig, choice: Choice = OWN_BONES) 
     return tuple(found)
 
 
-def _bone_channels(armature_object: bpy.types.Object, choice: Choice, names: set[str]) -> tuple[Channel, ...]:
-    """The channels of the bones that a choice samples; `names` as for `own_channels`."""
+def _bone_channels(armature_object: bpy.types.Object, choice: SampleSelection, names: set[str]) -> tuple[Channel, ...]:
+    """The channels of the bones that a choice samples; `names` as for `default_channels`."""
     if choice.bones is None:
-        return own_channels(armature_object, names)
-    return chosen_channels(armature_object, choice)
+        return default_channels(armature_object, names)
+    return selected_channels(armature_object, choice)
 
 
 def model_channels(scene_rig: SceneRig, rig: Rig, info: ModelInfo) -> tuple[Channel, ...]:
@@ -113,7 +115,7 @@ def model_channels(scene_rig: SceneRig, rig: Rig, info: ModelInfo) -> tuple[Chan
     return info.limits or sampled_channels(scene_rig, rig)
 
 
-def states_channels(scene_rig: SceneRig, channels: tuple[Channel, ...]) -> bool:
+def rig_states_channels(scene_rig: SceneRig, channels: tuple[Channel, ...]) -> bool:
     """Whether a rig still has the ranges that channels have, as far as it states them.
 
     A range of an action may be narrower than the limit of its bone.
@@ -147,7 +149,7 @@ def _are_free(rotations: tuple[RotationRange, ...]) -> bool:
     return all(stated.source == DEFAULT and not stated.is_locked for stated in rotations)
 
 
-def own_channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Channel, ...]:
+def default_channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Channel, ...]:
     """What of a pose may be sampled, and its range of motion.
 
     The range is that of Limit constraints in local space, for rotations else of the bone's IK limits, else the default;
@@ -168,8 +170,8 @@ def own_channels(armature_object: bpy.types.Object, names: set[str]) -> tuple[Ch
     return tuple(found)
 
 
-def chosen_channels(armature_object: bpy.types.Object, choice: Choice) -> tuple[Channel, ...]:
-    """As `own_channels`, of the bones that a user chose, whatever constraints they have.
+def selected_channels(armature_object: bpy.types.Object, choice: SampleSelection) -> tuple[Channel, ...]:
+    """As `default_channels`, of the bones that a user chose, whatever constraints they have.
 
     Of the bones that are chosen by action only what the action keys is sampled, in the ranges of the action. Limits
     narrow these. What is keyed elsewhere than in the rest pose and stands still has a range of one value.
@@ -183,7 +185,7 @@ def chosen_channels(armature_object: bpy.types.Object, choice: Choice) -> tuple[
             continue
         keyed, by_action = measured.get(bone.name, {}), bone.name in choice.by_action
         if not by_action:
-            keyed = {key: bounds for key, bounds in keyed.items() if is_moved(bounds)}
+            keyed = {key: bounds for key, bounds in keyed.items() if has_width(bounds)}
         found += (*_chosen_rotations(bone, keyed, by_action), *_chosen_others(bone, keyed, by_action))
     return tuple(found)
 

@@ -21,7 +21,7 @@ from bpy.props import (
 from ..core.defaults import EPOCHS, GOAL_MM, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD, TOLERANCE_MM
 from ..core.errors import OutputError
 from ..scene.scene_rig import SceneRig, armature_of
-from ..scene.stored_paths import resolved
+from ..scene.stored_paths import resolve_path
 from .without_keys import without_keys
 
 
@@ -42,7 +42,7 @@ def _suggested_controls(control: "FDDA_PG_control", _context: bpy.types.Context,
 
 @without_keys
 class FDDA_PG_control(bpy.types.PropertyGroup):
-    """A number that is an input of the model, as `scene.controls.stated_controls` reads it."""
+    """A number that is an input of the model, as `scene.controls.parse_controls` reads it."""
 
     name: StringProperty(
         name="Control",
@@ -269,4 +269,4 @@ def _path(stated: str, beside: str, what: str) -> Path:
         raise OutputError(
             f"The .blend file has not been saved, so there is no place beside it; save it, or name a {what}."
         )
-    return resolved(stated or f"//{beside}")
+    return resolve_path(stated or f"//{beside}")

@@ -11,10 +11,10 @@ from .character import FDDA_PG_character, wanted_fit
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..recording.plan import RecordingSettings
-    from ..rig.target_time import TargetSettings
+    from ..rig.pose_setter import TargetSettings
 
 ALL_SHAPE_KEYS = "shape_keys"
-"""Stands for all shape keys that no driver moves (`scene.controls.stated_controls`)."""
+"""Stands for all shape keys that no driver moves (`scene.controls.parse_controls`)."""
 
 
 def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingSettings":
@@ -46,7 +46,7 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
 
 def target_settings(settings: FDDA_PG_character) -> "TargetSettings":
     """Which target a character is recorded and evaluated with, and how it is brought to poses."""
-    from ..rig.target_time import TargetSettings
+    from ..rig.pose_setter import TargetSettings
 
     if not settings.target:
         return TargetSettings()
@@ -96,7 +96,7 @@ def _sample(settings: FDDA_PG_character, actions: tuple[str, ...]) -> tuple[str,
 
 
 def _controls(settings: FDDA_PG_character) -> tuple[str, ...]:
-    """The listed controls as `scene.controls.stated_controls` reads them; those without a name yet are left out."""
+    """The listed controls as `scene.controls.parse_controls` reads them; those without a name yet are left out."""
     return tuple(
         f"{control.name}={control.low!r}:{control.high!r}" if control.has_range else control.name
         for control in settings.controls

@@ -8,7 +8,7 @@ import bpy
 from bpy.props import BoolProperty, CollectionProperty, StringProperty
 
 from ..jobs.job import ENVIRONMENT, JobState, current
-from ..scene import model_trust
+from ..scene import folder_trust
 from ..training.environment import choice, session
 from ..training.environment.check_result import CheckResult
 from ..training.environment.folder import EXTENSION, FolderState, obstacle, own_folder
@@ -202,11 +202,11 @@ CLASSES = (FDDA_PG_folder, FDDA_AP_preferences)
 def register() -> None:
     """Let the trainer's Python be the one that the preferences name."""
     choice.preferred_python = _preferred_python
-    model_trust.trusted_folders = trusted_folders
+    folder_trust.trusted_folders = trusted_folders
 
 
 def unregister() -> None:
     """Undo `register`, and forget what was found out."""
     session.remember(None)
     choice.preferred_python = None
-    model_trust.trusted_folders = list
+    folder_trust.trusted_folders = list

@@ -11,8 +11,8 @@ import numpy as np
 from ..core.recording.extension import RecordingExtension
 from ..core.recording.writer import RecordingWriter
 from ..core.skinning import LinearSkinning
+from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter
 from ..rig.reading import PoseEvaluator
-from ..rig.target_time import DIRECT, Approach
 
 BATCH_BYTES = 6 << 20
 BATCH_POSES = 250
@@ -32,9 +32,9 @@ class Appender:
         evaluator: PoseEvaluator,
         skinning: LinearSkinning,
         writer: RecordingWriter | RecordingExtension,
-        approach: Approach = DIRECT,
+        pose_setter: PoseSetter = DIRECT_POSE_SETTER,
     ) -> None:
-        self._approach = approach
+        self._pose_setter = pose_setter
         self.done = writer.complete
         self._evaluator, self._skinning, self._writer = evaluator, skinning, writer
         self._size = max(1, min(BATCH_POSES, BATCH_BYTES // (skinning.rig.vertex_count * 12)))
@@ -48,10 +48,10 @@ class Appender:
         Raises:
             FDDAError: a pose before it could not be appended.
         """
-        self._batch.append((*self._evaluator.evaluate(), self._approach.is_at_rest))
+        self._batch.append((*self._evaluator.evaluate(), self._pose_setter.is_at_rest))
         self.done += 1
         # What took seconds to settle is not lost.
-        if len(self._batch) == self._size or self._approach.settler:
+        if len(self._batch) == self._size or self._pose_setter.settler:
             self._wait()
             self._previous = self._pool.submit(self._append, self._batch)
             self._batch = []

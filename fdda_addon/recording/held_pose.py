@@ -11,8 +11,8 @@ from mathutils import Matrix
 
 from ..core.errors import RigError
 from ..core.rig import STATIC_JOINT, Joint
-from ..scene.armature import PoseMatrices, rest_matrices
-from ..scene.scene_rig import SMALLEST_VOLUME, SceneRig, is_flat
+from ..scene.armature import PoseMatrixReader, rest_matrices
+from ..scene.scene_rig import MIN_VOLUME, SceneRig, is_flat
 
 _OF_POSE = re.compile(r'pose\.bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]\.(?:location|rotation_\w+|scale)')
 _CHAIN_CONSTRAINTS = {"IK", "SPLINE_IK"}
@@ -34,7 +34,7 @@ class HeldPose:
         self._armature_object = scene_rig.armature_object
         self._joints = joints
         names = tuple(joint.name for joint in joints)
-        self._matrices = PoseMatrices(scene_rig.armature_object, names)
+        self._matrices = PoseMatrixReader(scene_rig.armature_object, names)
         self.rest = self._relative(rest_matrices(scene_rig.armature_object.data, names))
 
     def read(self) -> np.ndarray:
@@ -45,7 +45,7 @@ class HeldPose:
         """
         armature_object = self._armature_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
         matrices = self._matrices.read(armature_object).astype(np.float64)
-        flat = np.abs(np.linalg.det(matrices[:, :3, :3])) < SMALLEST_VOLUME
+        flat = np.abs(np.linalg.det(matrices[:, :3, :3])) < MIN_VOLUME
         if is_flat(armature_object) or flat.any():
             name = armature_object.name if is_flat(armature_object) else self._joints[int(flat.argmax())].name
             raise RigError(f"'{name}' has a scale of zero in some pose; give it another there.")

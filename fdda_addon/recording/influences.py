@@ -19,7 +19,7 @@ from ..core.poses import CONTROL, Channel
 from ..core.progress import Progress
 from ..core.rig import STATIC_JOINT, Rig
 from ..core.skinning import LinearSkinning
-from ..poses.bone_numbers import control_name
+from ..poses.bone_channels import control_name
 from ..poses.sampling import is_moved_by_constraints
 from ..rig.reading import PoseEvaluator
 from ..scene.armature import Poser, clear_pose

@@ -7,7 +7,7 @@ from dataclasses import replace
 import bpy
 
 from ..core.errors import RigError
-from ..rig.dependencies import read_meshes
+from ..rig.dependencies import deforming_mesh_objects
 from ..rig.modifier_stack import read_stack
 from ..scene.scene_rig import SceneRig
 from .plan import RecordingSettings, listed_controls
@@ -56,7 +56,7 @@ def in_passes(rigs: Sequence[SceneRig]) -> list[list[int]]:
     Modifiers that stay live are off while their mesh is evaluated. Where another mesh reads it with them, as a sleeve
     that clings to a subdivided body, it is evaluated in a pass of its own.
     """
-    read = {mesh_object for scene_rig in rigs for mesh_object in read_meshes(scene_rig)}
-    alone = [n for n, rig in enumerate(rigs) if rig.mesh_object in read and read_stack(rig.mesh_object).live]
+    read = {mesh_object for scene_rig in rigs for mesh_object in deforming_mesh_objects(scene_rig)}
+    alone = [n for n, rig in enumerate(rigs) if rig.mesh_object in read and read_stack(rig.mesh_object).downstream]
     together = [n for n in range(len(rigs)) if n not in alone]
     return [numbers for numbers in (together, *([n] for n in alone)) if numbers]

@@ -16,9 +16,9 @@ from ..core.poses import Channel
 from ..core.recording.estimate import Estimate, recording_bytes
 from ..core.rig import Rig
 from ..core.skin_fit import SkinFit
-from ..rig.borrowed_rig import Posed
 from ..rig.reading import PoseEvaluator
 from ..rig.target import Target
+from ..rig.temporary_rig_state import Posed
 from ..scene.scene_rig import SceneRig
 
 
@@ -75,7 +75,7 @@ class MeshPlanned:
 
     @property
     def posed(self) -> Posed:
-        """The mesh as `borrowed_rigs` takes it."""
+        """The mesh as `temporary_rig_states` takes it."""
         return self.scene_rig, self.rig, self.channels
 
 

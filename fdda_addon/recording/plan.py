@@ -14,14 +14,14 @@ from ..core.poses import Channel, Margin, make_margin
 from ..core.recording.index import RANDOM, Sampling, Source
 from ..core.recording.target import POSE
 from ..core.rig import Rig
-from ..poses.choice import Choice, choose_bones
 from ..poses.clip import find_clips
+from ..poses.sample_selection import SampleSelection, select_bones
 from ..poses.sampling import Ranges, choose, locked_channels, sampled_channels, sampled_numbers
 from ..rig.dependencies import read_dependencies
+from ..rig.pose_setter import NO_TARGET, TargetSettings
 from ..rig.reading import read_rig
 from ..rig.target import find_target
-from ..rig.target_time import OWN_SURFACE, TargetSettings
-from ..scene.controls import stated_controls
+from ..scene.controls import parse_controls
 from ..scene.scene_rig import SceneRig
 
 
@@ -43,7 +43,7 @@ class RecordingSettings:
         overwrite: replace a recording that is in the folder.
         sample: which control bones the random poses move, as `sampling.choose` reads it; empty for those of the rig.
         fit_linear: kind of the skin weights that are fitted (`core.skin_fit.KINDS`); empty for those of the rig.
-        controls: which numbers are inputs and are sampled beside those that are found, as `stated_controls` reads it.
+        controls: which numbers are inputs and are sampled beside those that are found, as `parse_controls` reads it.
         min_partition_vertices: partitions of fewer vertices are merged into others; 0 merges none.
         shard: record this part of the poses, its number from 1 and how many parts there are; None for all.
         detect_influences: find what a recording needs before its first pose, and record none.
@@ -69,7 +69,7 @@ class RecordingSettings:
     shard: tuple[int, int] | None = None
     detect_influences: bool = False
     influences: Path | None = None
-    target: TargetSettings = OWN_SURFACE
+    target: TargetSettings = NO_TARGET
     overwrite: bool = False
 
 
@@ -79,8 +79,8 @@ def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[
     Raises:
         RigError: the rig cannot be read, or nothing may be sampled.
     """
-    choice, besides = read_sampling_choice(scene_rig, settings)
-    rig = read_rig(scene_rig, besides, depends_on_time(scene_rig, settings))
+    choice, extra_joints = read_sampling_choice(scene_rig, settings)
+    rig = read_rig(scene_rig, extra_joints, depends_on_time(scene_rig, settings))
     channels = sampled_channels(scene_rig, rig, choice) if settings.poses else ()
     return replace(rig, controls=choice.controls), channels
 
@@ -94,7 +94,9 @@ def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings) -> bool:
     return bool(settings.target.name) and find_target(scene_rig, settings.target.name).follows != POSE
 
 
-def read_sampling_choice(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Choice, frozenset[str] | None]:
+def read_sampling_choice(
+    scene_rig: SceneRig, settings: RecordingSettings
+) -> tuple[SampleSelection, frozenset[str] | None]:
     """What these settings sample, and which joints the rig has beside the bones that have weights (`read_rig`).
 
     The joints of a rig whose control bones are sampled are the bones that have weights, and those that the mesh depends
@@ -107,7 +109,7 @@ def read_sampling_choice(scene_rig: SceneRig, settings: RecordingSettings) -> tu
 
     def find_controls(sampled: Ranges) -> Iterator[Control]:
         yield from dependencies.controls
-        yield from stated_controls(scene_rig, settings.controls, sampled)
+        yield from parse_controls(scene_rig, settings.controls, sampled)
 
     choice = choose(scene_rig, settings.sample, find_controls)
     return choice, None if choice.bones is None else dependencies.bones
@@ -119,8 +121,8 @@ def listed_controls(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[C
     Raises:
         RigError: the rig lacks one, or nobody states its range.
     """
-    sampled = sampled_numbers(scene_rig, choose_bones(scene_rig, settings.sample)) if settings.controls else {}
-    return stated_controls(scene_rig, settings.controls, sampled)
+    sampled = sampled_numbers(scene_rig, select_bones(scene_rig, settings.sample)) if settings.controls else {}
+    return parse_controls(scene_rig, settings.controls, sampled)
 
 
 def find_actions(settings: RecordingSettings) -> tuple[bpy.types.Action, ...]:

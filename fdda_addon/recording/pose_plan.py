@@ -10,7 +10,7 @@ from ..core.poses import CONTROL, Channel, sample_pose
 from ..poses.clip import Clip
 from ..poses.clip_player import ClipPlayer
 from ..poses.suspended_limits import SuspendedLimits
-from ..rig.target_time import DIRECT, Approach, shown_again, way
+from ..rig.pose_setter import DIRECT_POSE_SETTER, PoseSetter, blend_from_rest, reversible_frames
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
 from .plan import RecordingSettings, make_recording_margin
@@ -32,17 +32,17 @@ class PosePlan:
         meshes: Sequence[tuple[SceneRig, tuple[Channel, ...]]],
         settings: RecordingSettings,
         clips: tuple[Clip, ...],
-        approach: Approach = DIRECT,
+        pose_setter: PoseSetter = DIRECT_POSE_SETTER,
     ):
         """Args:
         meshes: each with the channels that move it.
         settings: of the recording.
         clips: whose frames follow.
-        approach: how a target that depends on time is brought to the poses.
+        pose_setter: how a target that depends on time is brought to the poses.
         """
         self._rigs = [scene_rig for scene_rig, _ in meshes]
         self._settings, self._clips = settings, clips
-        self.approach = approach
+        self.pose_setter = pose_setter
         self.total = settings.poses + sum(len(clip.frames) for clip in clips)
         # The first mesh moves what all have in common.
         found: dict[tuple, tuple[int, Channel]] = {}
@@ -66,11 +66,11 @@ class PosePlan:
         Limit constraints that would hold a pose of the margin are off while it is shown.
         """
         poses, margin = self._settings.poses, self._margin
-        with self.approach.borrowed():
+        with self.pose_setter.prepared():
             set_pose = self._setter(self._channels)
             for index in range(self.inside):
                 if index in wanted:
-                    self.approach.reach(self._way_to(self._channels, index, set_pose))
+                    self.pose_setter.set_pose(self._way_to(self._channels, index, set_pose))
                     yield index
             if margin:
                 set_pose = self._setter(margin.channels)
@@ -82,44 +82,44 @@ class PosePlan:
 
                     for index in range(self.inside, poses):
                         if index in wanted:
-                            self.approach.reach(self._way_to(margin.channels, index, set_beyond))
+                            self.pose_setter.set_pose(self._way_to(margin.channels, index, set_beyond))
                             yield index
         first = poses
         for clip in self._clips:
             own = [number for number in range(len(clip.frames)) if first + number in wanted]
-            for number in self.approach.frames(player, clip, own):
+            for number in self.pose_setter.show_frames(player, clip, own):
                 yield first + number
             first += len(clip.frames)
 
     @property
     def repeatable(self) -> list[int]:
         """Numbers of the poses that `poses_again` may reach, ascending; those of a margin are not among them."""
-        if not self.approach.has_ways:
+        if not self.pose_setter.depends_on_history:
             return []
-        if self.approach.settler:
-            # There are no frames of clips (`make_approach`).
+        if self.pose_setter.settler:
+            # There are no frames of clips (`make_pose_setter`).
             return list(range(self.inside))
         first, numbers = self._settings.poses, []
         for clip in self._clips:
-            numbers += [first + number for number in shown_again(clip)]
+            numbers += [first + number for number in reversible_frames(clip)]
             first += len(clip.frames)
         return numbers
 
     def poses_again(self, player: ClipPlayer, wanted: Collection[int]) -> Iterator[int]:
         """As `poses`, over another way: random poses over one that no recording of this plan has, and frames of clips
         from those that follow them."""
-        if self.approach.settler:
+        if self.pose_setter.settler:
             set_pose = self._setter(self._channels)
-            with self.approach.borrowed():
+            with self.pose_setter.prepared():
                 for index in sorted(wanted):
                     numbers = (index, REPEAT_INDEX + index)
-                    self.approach.settler.settle(*(self._way_to(self._channels, n, set_pose) for n in numbers))
+                    self.pose_setter.settler.settle(*(self._way_to(self._channels, n, set_pose) for n in numbers))
                     yield index
             return
         first = self._settings.poses
         for clip in self._clips:
             if own := {number - first for number in wanted if 0 <= number - first < len(clip.frames)}:
-                for number in self.approach.frames_again(player, clip, own):
+                for number in self.pose_setter.show_frames_reversed(player, clip, own):
                     yield first + number
             first += len(clip.frames)
 
@@ -128,7 +128,7 @@ class PosePlan:
     ) -> Callable[[float], None]:
         """Sets what part of the way from the rest pose to a random pose is done, 0 to 1."""
         values = sample_pose(channels, self._settings.seed, index, self._settings.spread)
-        return way(set_pose, np.array([channel.rest for channel in channels]), values)
+        return blend_from_rest(set_pose, np.array([channel.rest for channel in channels]), values)
 
     def _setter(self, channels: tuple[Channel, ...]) -> Callable[[np.ndarray], None]:
         """What poses the rigs, of channels that begin with those of the plan; what follows is of the armature."""

@@ -21,11 +21,11 @@ from ..core.recording.reader import Recording, read_recording
 from ..core.refinement import Probes, choose_poses, nearest_recorded_distances
 from ..core.rig import Rig, rig_differences
 from ..core.skinning import LinearSkinning
-from ..poses.sampling import model_channels, states_channels
-from ..rig.borrowed_rig import borrowed_rig
+from ..poses.sampling import model_channels, rig_states_channels
 from ..rig.modifier_stack import check_evaluable
 from ..rig.reading import PoseEvaluator
-from ..rig.time_inputs import check_inputs
+from ..rig.temporary_rig_state import temporary_rig_state
+from ..rig.time_inputs import check_time_inputs
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
@@ -82,7 +82,7 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
     stack = check_evaluable(scene_rig)
     opened = open_model(scene_rig, model)
     network, rig = opened.network, opened.rig
-    check_inputs(scene_rig, rig.controls, stack)
+    check_time_inputs(scene_rig, rig.controls, stack)
     channels = model_channels(scene_rig, rig, network.info)
     _check_recording(scene_rig, recording, rig, channels)
     added = _added_since(recording, model, network.info) if settings.resume else 0
@@ -90,7 +90,7 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
         yield Progress("poses", settings.poses, settings.poses)
         return
     first = len(recording.pose_matrices) - added
-    with borrowed_rig(scene_rig, rig, channels):
+    with temporary_rig_state(scene_rig, rig, channels):
         evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig, channels)
         count = max(MIN_PROBES, settings.poses)
         values = np.stack([_probe(channels, settings.seed, PROBE_INDEX + first + i) for i in range(count)])
@@ -128,7 +128,7 @@ def _check_recording(scene_rig: SceneRig, recording: Recording, rig: Rig, channe
             f"'{recording.path}' has no random poses, so there is no range of motion to choose from; record with "
             "--poses."
         )
-    if recording.info.sampling.channels != channels or not states_channels(scene_rig, channels):
+    if recording.info.sampling.channels != channels or not rig_states_channels(scene_rig, channels):
         raise RecordingError(
             f"The range of motion of the rig is not that of '{recording.path}' any more; record anew into another "
             "folder."

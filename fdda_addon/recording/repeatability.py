@@ -39,7 +39,7 @@ def measure_repeatability(
     if writer.repeatability or not found:
         return
     numbers = sorted({found[int(number * GOLDEN_RATIO * len(found)) % len(found)] for number in range(count)})
-    rig, skinning, settler = writer.rig, LinearSkinning(writer.rig, writer.partitions), plan.approach.settler
+    rig, skinning, settler = writer.rig, LinearSkinning(writer.rig, writer.partitions), plan.pose_setter.settler
     recorded = open_array(writer.path / "residuals.npy", (writer.complete, rig.vertex_count, 3), np.float32)
     apart, linear = [], []
     # So that what plays is stopped.

@@ -10,7 +10,7 @@ from ..core.rig import Rig
 from ..poses.sampling import sampled_channels
 from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..rig.reading import read_rig
-from ..rig.time_inputs import check_inputs
+from ..rig.time_inputs import check_time_inputs
 from ..scene.scene_rig import SceneRig
 from .plan import RecordingSettings, depends_on_time, find_actions, listed_controls, read_sampling_choice
 
@@ -27,7 +27,7 @@ class RigCheck:
         channels: what a random pose may move, empty when nothing.
         replaced: names of the modifiers that a model takes the place of.
         found: the controls that nobody listed: drivers of the mesh read them, or the actions that are sampled key them.
-        besides, with_unmoved: what the rig was read with (`read_rig`).
+        extra_joints, include_static_joint: what the rig was read with (`read_rig`).
     """
 
     problems: tuple[str, ...]
@@ -35,8 +35,8 @@ class RigCheck:
     channels: tuple[Channel, ...]
     replaced: tuple[str, ...] = ()
     found: tuple[Control, ...] = ()
-    besides: frozenset[str] | None = None
-    with_unmoved: bool = False
+    extra_joints: frozenset[str] | None = None
+    include_static_joint: bool = False
 
     def checked_again(self, scene_rig: SceneRig, settings: RecordingSettings = DEFAULTS) -> "RigCheck":
         """The check without reading the mesh again: for changes of modifiers, modes, ranges of motion and choices."""
@@ -59,15 +59,19 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, before: RigCheck | 
             problems.append(str(error))
     try:
         result = replace(result, replaced=tuple(m.name for m in deforming_modifiers(scene_rig.mesh_object)))
-        choice, besides = read_sampling_choice(scene_rig, settings)
+        choice, extra_joints = read_sampling_choice(scene_rig, settings)
         if stack is not None and not settings.target.name:
             try:
-                check_inputs(scene_rig, choice.controls, stack, find_actions(settings))
+                check_time_inputs(scene_rig, choice.controls, stack, find_actions(settings))
             except RigError as error:
                 problems.append(str(error))
-        with_unmoved = depends_on_time(scene_rig, settings)
-        read_with = besides, with_unmoved
-        if before is not None and before.rig is not None and (before.besides, before.with_unmoved) == read_with:
+        include_static_joint = depends_on_time(scene_rig, settings)
+        read_with = extra_joints, include_static_joint
+        if (
+            before is not None
+            and before.rig is not None
+            and (before.extra_joints, before.include_static_joint) == read_with
+        ):
             rig = before.rig
         else:
             rig = read_rig(scene_rig, *read_with)
@@ -75,7 +79,9 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, before: RigCheck | 
             rig = replace(rig, controls=choice.controls)
         listed = listed_controls(scene_rig, settings)
         found = tuple(control for control in choice.controls if control not in listed)
-        result = replace(result, rig=rig, found=found, besides=besides, with_unmoved=with_unmoved)
+        result = replace(
+            result, rig=rig, found=found, extra_joints=extra_joints, include_static_joint=include_static_joint
+        )
         result = replace(result, channels=sampled_channels(scene_rig, rig, choice))
     except RigError as error:
         # A rig of which nothing may be sampled is recorded by its actions alone.

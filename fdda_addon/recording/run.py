@@ -22,10 +22,10 @@ from ..core.recording.writer import RecordingWriter
 from ..core.skinning import LinearSkinning
 from ..poses.clip import Clip, find_clips
 from ..poses.clip_player import ClipPlayer
-from ..rig.borrowed_rig import borrowed_rigs
 from ..rig.modifier_stack import check_evaluable
-from ..rig.target_time import make_approach
-from ..rig.time_inputs import check_inputs
+from ..rig.pose_setter import make_pose_setter
+from ..rig.temporary_rig_state import temporary_rig_states
+from ..rig.time_inputs import check_time_inputs
 from ..scene.scene_rig import SceneRig
 from .appender import Appender, append_poses
 from .influences import Search, find_influences
@@ -78,8 +78,8 @@ def record_meshes(rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSett
     meshes = [scene_rig for scene_rig, _ in rigs]
     clips = find_clips(common_armature(meshes), settings.actions, settings.strips, settings.mirror)
     planned, plan = _plan(rigs, settings, clips)
-    target = plan.approach.target
-    with target.borrowed() if target else nullcontext():
+    target = plan.pose_setter.target
+    with target.prepared() if target else nullcontext():
         yield from _record_planned(planned, settings, clips, plan)
 
 
@@ -87,13 +87,13 @@ def _record_planned(
     planned: list[MeshPlanned], settings: RecordingSettings, clips: tuple[Clip, ...], plan: PosePlan
 ) -> Iterator[Progress]:
     meshes, posed = [mesh.scene_rig for mesh in planned], [mesh.posed for mesh in planned]
-    with borrowed_rigs(posed, clips) if settings.fit_linear else nullcontext() as player:
+    with temporary_rig_states(posed, clips) if settings.fit_linear else nullcontext() as player:
         fitted = yield from _in_turn(planned, lambda mesh: _fit(mesh, settings, plan, player))
     for numbers in in_passes(meshes):
         together = [fitted[number] for number in numbers]
         others = [own for number, own in enumerate(posed) if number not in numbers]
-        with borrowed_rigs([posed[number] for number in numbers], clips, others) as player:
-            if plan.approach.target:
+        with temporary_rig_states([posed[number] for number in numbers], clips, others) as player:
+            if plan.pose_setter.target:
                 yield from check_moves(together[0], plan, player)
             check_follows_pose(together, plan, player)
             found = yield from _in_turn(together, lambda mesh: _find_influences(mesh, settings, clips, player))
@@ -115,18 +115,18 @@ def _plan(
         stack = check_evaluable(scene_rig)
         read.append(read_sampled_rig(scene_rig, replace(settings, controls=own)))
         if not settings.target.name:
-            check_inputs(scene_rig, read[-1][0].controls, stack, find_actions(settings))
+            check_time_inputs(scene_rig, read[-1][0].controls, stack, find_actions(settings))
         check_recordable(path, settings.resume, settings.overwrite)
     channels = [(scene_rig, own) for scene_rig, (_, own) in zip(meshes, read, strict=True)]
-    approach = make_approach(meshes[0], settings.target, clips, settings.poses)
-    plan = PosePlan(channels, settings, clips, approach)
+    pose_setter = make_pose_setter(meshes[0], settings.target, clips, settings.poses)
+    plan = PosePlan(channels, settings, clips, pose_setter)
     if plan.total < 1:
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
     wanted = len(_wanted(settings, plan.total))
     check_room([(path, recording_bytes(rig, wanted)) for (_, path), (rig, _) in zip(rigs, read, strict=True)])
     known = [_known(path, settings, len(rigs) > 1) for _, path in rigs]
     planned = [
-        MeshPlanned(scene_rig, rig, path, own, plan.channels_of(number), known[number], approach.target)
+        MeshPlanned(scene_rig, rig, path, own, plan.channels_of(number), known[number], pose_setter.target)
         for number, ((scene_rig, path), (rig, own)) in enumerate(zip(rigs, read, strict=True))
     ]
     return planned, plan
@@ -219,15 +219,15 @@ def _record_poses(
     with ExitStack() as stack:
         appenders = []
         for mesh in meshes:
-            info = replace(_info(mesh, settings, plan, wanted), target=plan.approach.recorded)
+            info = replace(_info(mesh, settings, plan, wanted), target=plan.pose_setter.recorded)
             writer = RecordingWriter(
                 mesh.fitted.planned.path,
                 *(mesh.fitted.rig, mesh.partitions, info),
                 *(settings.resume, settings.overwrite),
             )
             skinning = LinearSkinning(mesh.fitted.rig, mesh.partitions)
-            appenders.append(Appender(mesh.evaluator, skinning, stack.enter_context(writer), plan.approach))
-        first, settler = min(appender.done for appender in appenders), plan.approach.settler
+            appenders.append(Appender(mesh.evaluator, skinning, stack.enter_context(writer), plan.pose_setter))
+        first, settler = min(appender.done for appender in appenders), plan.pose_setter.settler
         seconds = settler.last.seconds if settler and settler.last else None
         yield Progress("poses", first, len(wanted), estimate(meshes, len(wanted), len(wanted) - first, seconds))
         left = plan.poses(player, wanted[first:])

@@ -34,9 +34,9 @@ def check_moves(mesh: WeightsFitted, plan: PosePlan, player: ClipPlayer) -> Iter
         RigError: it does not move.
     """
     evaluator, skinning = mesh.planned.evaluator(mesh.rig), LinearSkinning(mesh.rig)
-    in_order = plan.approach.target.follows == SIMULATION
+    in_order = plan.pose_setter.target.follows == SIMULATION
     spread = sorted({int(number * GOLDEN_RATIO * plan.total) % plan.total for number in range(MOST_POSES)})
-    wanted = range(min(plan.total, 2 if plan.approach.settler else plan.total)) if in_order else spread
+    wanted = range(min(plan.total, 2 if plan.pose_setter.settler else plan.total)) if in_order else spread
     first, rig_moved, target_moved = None, 0.0, 0.0
     with closing(plan.poses(player, wanted)) as poses:
         for done, _ in enumerate(poses, 1):
@@ -54,7 +54,7 @@ def check_moves(mesh: WeightsFitted, plan: PosePlan, player: ClipPlayer) -> Iter
     player.stop()
     if rig_moved > RIG_MOVES * mesh.rig.size and target_moved <= TARGET_STANDS * mesh.rig.size:
         raise RigError(
-            f"The target '{plan.approach.target.name}' does not move while '{mesh.name}' does, by "
+            f"The target '{plan.pose_setter.target.name}' does not move while '{mesh.name}' does, by "
             f"{_mm(mesh, rig_moved)}; look whether its modifiers are on and its cache is that of this action, or "
             "choose another target."
         )

@@ -34,7 +34,7 @@ def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: 
     Raises:
         RigError: says by how much, and between which frames.
     """
-    target = plan.approach.target
+    target = plan.pose_setter.target
     if target and target.follows != POSE:
         return
     scene = bpy.context.scene
@@ -55,7 +55,7 @@ def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: 
     finally:
         player.stop()
         clear_pose(meshes[0].planned.scene_rig.armature_object)
-        player.give_back_numbers()
+        player.restore_numbers()
         scene.frame_set(frame, subframe=subframe)
 
 

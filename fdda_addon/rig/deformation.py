@@ -8,11 +8,11 @@ import bpy
 
 from ..core.rig import Fingerprint
 from ..scene.arrays import COORDINATE, read
-from ..scene.borrow import animated_paths
 from ..scene.compatibility import node_input
 from ..scene.controls import owner_name
 from ..scene.scene_rig import SceneRig
-from .modifier_stack import BOUND, is_playback, recorded_modifiers
+from ..scene.temporary_state import animated_paths
+from .modifier_stack import BIND_PROPERTIES, is_fdda_modifier, recorded_modifiers
 
 _OF_ALL = frozenset(bpy.types.Modifier.bl_rna.properties.keys())
 """Properties that every modifier has; none of them says what it does to a mesh."""
@@ -54,7 +54,7 @@ def _modifier(scene_rig: SceneRig, modifier: bpy.types.Modifier) -> dict:
         settings = _node_inputs(modifier)
     else:
         properties = [p for p in modifier.bl_rna.properties if p.identifier not in _OF_ALL]
-        bound = BOUND.get(modifier.type)
+        bound = BIND_PROPERTIES.get(modifier.type)
         names = [p.identifier for p in properties if not p.is_readonly or p.identifier == bound]
         settings = {name: _value(scene_rig, modifier, name) for name in names if _is_setting(modifier, name)}
     animated = animated_paths(modifier.id_data)
@@ -117,7 +117,7 @@ def _drivers(scene_rig: SceneRig) -> str:
 
 
 def _is_of_deformation(mesh_object: bpy.types.Object, path: str) -> bool:
-    playback = [modifier.path_from_id() for modifier in mesh_object.modifiers if is_playback(modifier)]
+    playback = [modifier.path_from_id() for modifier in mesh_object.modifiers if is_fdda_modifier(modifier)]
     return path.startswith("modifiers[") and not any(path.startswith(f"{own}.") for own in playback)
 
 

@@ -8,7 +8,7 @@ import bpy
 
 from ..core.controls import Control
 from ..core.errors import RigError
-from ..scene.animation import played_curves, varies
+from ..scene.animation import changes_value, curves_with_actions
 from ..scene.controls import make_control
 from ..scene.scene_rig import SceneRig
 from .other_armatures import controls_of_other_armatures
@@ -46,10 +46,10 @@ def read_dependencies(scene_rig: SceneRig, actions: Iterable[bpy.types.Action] =
             continue
         controls.setdefault(control.name, control)
     known = scene_rig.armature_object.data.bones
-    return Dependencies(frozenset(name for name in sources.own_bones if name in known), tuple(controls.values()))
+    return Dependencies(frozenset(name for name in sources.rig_bones if name in known), tuple(controls.values()))
 
 
-def read_meshes(scene_rig: SceneRig) -> list[bpy.types.Object]:
+def deforming_mesh_objects(scene_rig: SceneRig) -> list[bpy.types.Object]:
     """The other mesh objects that deform a mesh."""
     objects = Sources(scene_rig, scene_rig.mesh_object).objects
     return [found for found, with_shape in list(objects.items())[1:] if with_shape and found.type == "MESH"]
@@ -64,7 +64,7 @@ def _names_read(sources: Sources) -> Iterator[str]:
 def _keyed_shapes(sources: Sources, actions: tuple[bpy.types.Action, ...]) -> Iterator[str]:
     """Values of shape keys that F-curves animate."""
     for keys in (found for found in sources.datablocks if isinstance(found, bpy.types.Key)):
-        keyed = {curve.data_path for curve in played_curves(keys, actions) if varies(curve)}
+        keyed = {curve.data_path for curve in curves_with_actions(keys, actions) if changes_value(curve)}
         for block in keys.key_blocks:
             if (path := block.path_from_id("value")) in keyed and not block.mute and block != keys.reference_key:
                 yield sources.name_of(keys, path)

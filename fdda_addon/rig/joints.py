@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 
 from ..core.rig import STATIC_JOINT, Joint
-from ..poses.sampling import own_channels
+from ..poses.sampling import default_channels
 from ..scene.scene_rig import SceneRig
 from .dependencies import read_dependencies
 
@@ -16,7 +16,7 @@ COINCIDENT = 1e-5
 
 
 def choose_joints(
-    scene_rig: SceneRig, skinning: Iterable[str], besides: Iterable[str] | None = None
+    scene_rig: SceneRig, skinning: Iterable[str], extra_joints: Iterable[str] | None = None
 ) -> tuple[Joint, ...]:
     """The joints of a rig, every parent before its children.
 
@@ -26,28 +26,27 @@ def choose_joints(
     Args:
         scene_rig: the rig.
         skinning: names of the bones that have weights; all deforming bones when there are none. `STATIC_JOINT` counts.
-        besides: names of other joints; those that the armature lacks are left out. Where they are all of the joints,
-            theirs is the order of the joints: that of the bones changes with bones that are none. When it is not
-            given, the bones that state a range of motion, those that the mesh depends on otherwise, and all bones
-            above a joint.
+        extra_joints: names of further joints; names that the armature lacks are ignored. If they include all joints,
+            they define the order. None for the bones that have a range of motion, those that the mesh depends on in
+            other ways, and all parents of joints.
     """
     armature_object = scene_rig.armature_object
     bones = armature_object.data.bones
     wanted = set(skinning)
-    besides = None if besides is None else list(besides)
+    extra_joints = None if extra_joints is None else list(extra_joints)
     if not wanted - {STATIC_JOINT}:
         wanted |= {bone.name for bone in bones if bone.use_deform}
-    if besides is not None:
-        wanted |= {name for name in besides if name in bones or name == STATIC_JOINT}
+    if extra_joints is not None:
+        wanted |= {name for name in extra_joints if name in bones or name == STATIC_JOINT}
     else:
-        wanted |= {channel.name for channel in own_channels(armature_object, set())}
+        wanted |= {channel.name for channel in default_channels(armature_object, set())}
         wanted |= read_dependencies(scene_rig).bones
         wanted |= {above.name for name in wanted - {STATIC_JOINT} for above in bones[name].parent_recursive}
     own = [bone for bone in bones if bone.name in wanted]
     parents = _parents(own)
     depths = {bone.name: _depth(bone.name, parents) for bone in own}
     ordered = sorted((bone.name for bone in own), key=depths.__getitem__)
-    given = [name for name in besides or () if name != STATIC_JOINT]
+    given = [name for name in extra_joints or () if name != STATIC_JOINT]
     if set(given) == set(ordered):
         places = {name: place for place, name in enumerate(given)}
         if all(places.get(parents[name], -1) < places[name] for name in given):

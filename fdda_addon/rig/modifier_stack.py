@@ -13,7 +13,7 @@ from enum import Enum, auto
 import bpy
 
 from ..core.errors import RigError
-from ..scene.node_groups import Effect, effect, time_node
+from ..scene.node_groups import GeometryEffect, find_time_node, geometry_effect
 from ..scene.scene_rig import MODIFIER_NAME, SceneRig, armature_modifier
 
 PLAYBACK_KEY = "fdda_playback"
@@ -28,13 +28,13 @@ TOPOLOGY_CHANGING = {
     "ARRAY", "BEVEL", "BOOLEAN", "BUILD", "DECIMATE", "EDGE_SPLIT", "EXPLODE", "MASK", "MIRROR", "MULTIRES",
     "PARTICLE_INSTANCE", "REMESH", "SCREW", "SKIN", "SOLIDIFY", "SUBSURF", "VOLUME_TO_MESH", "WELD", "WIREFRAME",
 }  # fmt: skip
-IN_TIME = {
+TIME_DEPENDENT = {
     "BUILD": "changes with time", "CLOTH": "is a simulation", "DYNAMIC_PAINT": "is a simulation",
     "EXPLODE": "is a simulation", "FLUID": "is a simulation", "MESH_CACHE": "plays a cache",
     "MESH_SEQUENCE_CACHE": "plays a cache", "OCEAN": "changes with time", "PARTICLE_INSTANCE": "is a simulation",
     "SOFT_BODY": "is a simulation", "WAVE": "changes with time",
 }  # fmt: skip
-BOUND = {
+BIND_PROPERTIES = {
     "CORRECTIVE_SMOOTH": "is_bind", "LAPLACIANDEFORM": "is_bind", "MESH_DEFORM": "is_bound",
     "SURFACE_DEFORM": "is_bound",
 }  # fmt: skip
@@ -43,7 +43,7 @@ INDIRECT = {
     "DATA_TRANSFER", "TRIANGULATE", "VERTEX_WEIGHT_EDIT", "VERTEX_WEIGHT_MIX", "VERTEX_WEIGHT_PROXIMITY",
 }  # fmt: skip
 """Modifiers that move no vertices, and change what those after them do: weights, edges."""
-NEED_ORIGINAL = {"MULTIRES", "SOFT_BODY"}
+NEEDS_ORIGINAL_MESH = {"MULTIRES", "SOFT_BODY"}
 """Blender lets no modifier that makes a mesh, as the one that plays a model does, stand before these, on or off."""
 
 
@@ -64,17 +64,17 @@ class ModifierStack:
         replaced: those that move vertices, switched on or not, up to the last of them that is on, and what a model
             cannot stand before. Of a bound object, up to the modifier that plays its model.
         misplaced: those that are on and change the topology before the last of `replaced`.
-        live: those that are on after it: they change the topology or, behind the modifier of a bound model, deform.
-        place: index after the last of `replaced`, the modifier that plays a model not counted.
+        downstream: those that are on after it. They change the topology or, after the FDDA modifier, deform.
+        insert_index: index after the last of `replaced`, the modifier that plays a model not counted.
     """
 
     replaced: tuple[str, ...]
     misplaced: tuple[str, ...]
-    live: tuple[str, ...]
-    place: int
+    downstream: tuple[str, ...]
+    insert_index: int
 
 
-def is_playback(modifier: bpy.types.Modifier) -> bool:
+def is_fdda_modifier(modifier: bpy.types.Modifier) -> bool:
     """Whether a modifier plays a model: it is never part of the rig."""
     if modifier.type != "NODES":
         return False
@@ -89,7 +89,7 @@ def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     Raises:
         RigError: they would have to be evaluated, and the object is hidden.
     """
-    modifiers = [m for m in mesh_object.modifiers if not is_playback(m)]
+    modifiers = [m for m in mesh_object.modifiers if not is_fdda_modifier(m)]
     kinds = [_kind(m) for m in modifiers]
     moving = {_Kind.DEFORMS, _Kind.UNSURE}
     unsure = [i for i, m in enumerate(modifiers) if kinds[i] is _Kind.UNSURE and m.show_viewport]
@@ -98,7 +98,7 @@ def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
         with _switched_off(mesh_object, [m for m in generating if m != modifiers[i]]):
             kinds[i] = _Kind.DEFORMS if _keeps_topology(mesh_object) else _Kind.GENERATES
     deforming = [i for i, kind in enumerate(kinds) if kind in moving]
-    original = [i for i, m in enumerate(modifiers) if m.type in NEED_ORIGINAL]
+    original = [i for i, m in enumerate(modifiers) if m.type in NEEDS_ORIGINAL_MESH]
     # Where all are off, the last of all: what the user switches on later is replaced.
     shown = [i for i in deforming if modifiers[i].show_viewport] or deforming
     last = max(shown + original, default=-1)
@@ -110,8 +110,8 @@ def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     return ModifierStack(
         replaced=tuple(m.name for i, m in enumerate(modifiers[: last + 1]) if i in deforming + original),
         misplaced=tuple(modifiers[i].name for i in generating if i <= last),
-        live=tuple(modifiers[i].name for i in behind if i > last and modifiers[i].show_viewport),
-        place=last + 1,
+        downstream=tuple(modifiers[i].name for i in behind if i > last and modifiers[i].show_viewport),
+        insert_index=last + 1,
     )
 
 
@@ -138,7 +138,7 @@ def recorded_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier
     """
     place = _playback_place(mesh_object)
     if place is None:
-        place = read_stack(mesh_object).place
+        place = read_stack(mesh_object).insert_index
     candidates = [m for m in mesh_object.modifiers[:place] if _kind(m) is not _Kind.NEUTRAL or m.type in INDIRECT]
     binding = getattr(mesh_object, "fdda", None)
     if binding is None or not binding.is_playing:
@@ -156,7 +156,7 @@ def recorded_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier
 
 def _playback_place(mesh_object: bpy.types.Object) -> int | None:
     """Where the modifier that plays a model stands, None when there is none."""
-    return next((place for place, modifier in enumerate(mesh_object.modifiers) if is_playback(modifier)), None)
+    return next((place for place, modifier in enumerate(mesh_object.modifiers) if is_fdda_modifier(modifier)), None)
 
 
 def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
@@ -170,7 +170,7 @@ def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     for name in (m.name for m in mesh_object.modifiers if m.show_viewport):
         modifier = mesh_object.modifiers[name]
         what = f"Modifier '{name}' of '{mesh_object.name}'"
-        if name in stack.replaced + stack.misplaced and (verb := in_time(modifier)):
+        if name in stack.replaced + stack.misplaced and (verb := time_dependence(modifier)):
             raise RigError(
                 f"{what} {verb}, so its result does not follow from the pose; switch it off in the viewport, or "
                 "remove it."
@@ -179,7 +179,7 @@ def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
             raise RigError(f"{what} is not bound, so it does nothing; bind it first, or switch it off in the viewport.")
     for name in stack.misplaced:
         what = f"Modifier '{name}' of '{mesh_object.name}' changes the topology of the mesh"
-        if mesh_object.modifiers[name].type in NEED_ORIGINAL:
+        if mesh_object.modifiers[name].type in NEEDS_ORIGINAL_MESH:
             raise RigError(
                 f"{what}, and Blender lets nothing that plays a model stand before it; switch it off in the viewport, "
                 "or apply it."
@@ -211,29 +211,29 @@ def check_evaluable(scene_rig: SceneRig) -> ModifierStack:
         raise RigError(f"The armature '{scene_rig.armature_object.name}' shows its rest position; set it to pose.")
     _evaluated(mesh_object)
     stack = check_stack(mesh_object)
-    if not stack.live:
+    if not stack.downstream:
         _check_count(mesh_object, stack)
     return stack
 
 
 @contextmanager
-def borrowed_stack(mesh_object: bpy.types.Object) -> Iterator[None]:
+def downstream_disabled(mesh_object: bpy.types.Object) -> Iterator[None]:
     """Switch the live modifiers off: inside, the mesh is evaluated to its own vertices, as the rig deforms them.
 
     Raises:
         RigError: it still has other vertices.
     """
     stack = read_stack(mesh_object)
-    with _switched_off(mesh_object, [mesh_object.modifiers[name] for name in stack.live]):
+    with _switched_off(mesh_object, [mesh_object.modifiers[name] for name in stack.downstream]):
         _check_count(mesh_object, stack)
         yield
 
 
 @contextmanager
-def without_live(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """As `borrowed_stack`, whatever vertices are left."""
+def downstream_disabled_unchecked(mesh_object: bpy.types.Object) -> Iterator[None]:
+    """As `downstream_disabled`, whatever vertices are left."""
     stack = read_stack(mesh_object)
-    with _switched_off(mesh_object, [mesh_object.modifiers[name] for name in stack.live]):
+    with _switched_off(mesh_object, [mesh_object.modifiers[name] for name in stack.downstream]):
         yield
 
 
@@ -256,8 +256,12 @@ def _switched_off(mesh_object: bpy.types.Object, modifiers: Iterable[bpy.types.M
 
 def _kind(modifier: bpy.types.Modifier) -> _Kind:
     if modifier.type == "NODES":
-        kinds = {Effect.ATTRIBUTES: _Kind.NEUTRAL, Effect.POSITIONS: _Kind.DEFORMS, Effect.ANY: _Kind.UNSURE}
-        return kinds[effect(modifier.node_group)]
+        kinds = {
+            GeometryEffect.ATTRIBUTES: _Kind.NEUTRAL,
+            GeometryEffect.POSITIONS: _Kind.DEFORMS,
+            GeometryEffect.ANY: _Kind.UNSURE,
+        }
+        return kinds[geometry_effect(modifier.node_group)]
     if modifier.type == "OCEAN":
         return _Kind.DEFORMS if modifier.geometry_mode == "DISPLACE" else _Kind.GENERATES
     if modifier.type == "FLUID":
@@ -270,20 +274,22 @@ def _kind(modifier: bpy.types.Modifier) -> _Kind:
     return _Kind.GENERATES if modifier.type in TOPOLOGY_CHANGING else _Kind.NEUTRAL
 
 
-def in_time(modifier: bpy.types.Modifier) -> str:
+def time_dependence(modifier: bpy.types.Modifier) -> str:
     """Say what a modifier does that depends on time, empty when it does not."""
     if modifier.type == "NODES":
-        node = time_node(modifier.node_group)
+        node = find_time_node(modifier.node_group)
         return f"changes with time (node '{node.name}' of '{node.id_data.name}')" if node else ""
     if _kind(modifier) is _Kind.NEUTRAL:
         return ""
-    return IN_TIME.get(modifier.type, "")
+    return TIME_DEPENDENT.get(modifier.type, "")
 
 
 def _is_unbound(modifier: bpy.types.Modifier) -> bool:
-    if modifier.type not in BOUND or (modifier.type == "CORRECTIVE_SMOOTH" and modifier.rest_source != "BIND"):
+    if modifier.type not in BIND_PROPERTIES or (
+        modifier.type == "CORRECTIVE_SMOOTH" and modifier.rest_source != "BIND"
+    ):
         return False
-    return not getattr(modifier, BOUND[modifier.type])
+    return not getattr(modifier, BIND_PROPERTIES[modifier.type])
 
 
 def _evaluated(mesh_object: bpy.types.Object) -> bpy.types.Object:
@@ -307,7 +313,7 @@ def _check_count(mesh_object: bpy.types.Object, stack: ModifierStack) -> None:
     count = len(_evaluated(mesh_object).data.vertices)
     if count != len(mesh_object.data.vertices):
         others = [m.name for m in mesh_object.modifiers if m.name not in stack.replaced and m.show_viewport]
-        names = stack.live or others or stack.replaced
+        names = stack.downstream or others or stack.replaced
         raise RigError(
             f"The modifiers of '{mesh_object.name}' turn {len(mesh_object.data.vertices)} vertices into {count}; "
             f"switch off the one that changes the topology ({', '.join(names)})."

@@ -9,9 +9,9 @@ from ..core.controls import OTHER_OBJECT, Control
 from ..core.errors import RigError
 from ..core.poses import LOCATION, ROTATION, SCALE
 from ..poses.motion_range import location_ranges, rotation_ranges, scale_ranges
-from ..scene.controls import make_control, place_of
+from ..scene.controls import fcurve_target, make_control
 from ..scene.scene_rig import SceneRig
-from .sources import Sources, bone_of_path, is_bone_channel
+from .sources import Sources, is_transform_channel, split_bone_path
 
 _COPIES = {"COPY_LOCATION": LOCATION, "COPY_ROTATION": ROTATION, "COPY_SCALE": SCALE}
 _FOUR_NUMBERS = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
@@ -46,7 +46,7 @@ def check_other_armatures(
     Args:
         scene_rig: the rig.
         sources: of its mesh object.
-        controls: as `scene.controls.place_of` gives them.
+        controls: as `scene.controls.fcurve_target` gives them.
 
     Raises:
         RigError: names a bone and its armature.
@@ -66,7 +66,7 @@ def check_other_armatures(
                 f"model being told; {' and '.join(_remedies(bone, untold))}, or join the armatures."
             )
     for armature_object, _, path in _channels_read(scene_rig, sources):
-        if place_of(armature_object, path) not in told:
+        if fcurve_target(armature_object, path) not in told:
             raise RigError(
                 f"A driver of '{scene_rig.mesh_object.name}' reads '{path}' of a second armature, "
                 f"'{armature_object.name}', without the model being told; name it as a control with a range "
@@ -92,8 +92,8 @@ def _bones(scene_rig: SceneRig, sources: Sources) -> Iterator[tuple[bpy.types.Ob
 def _channels_read(scene_rig: SceneRig, sources: Sources) -> Iterator[tuple[bpy.types.Object, bpy.types.PoseBone, str]]:
     """Channels of bones of other armatures that drivers read by their paths and that are not locked."""
     for datablock, path in sources.numbers:
-        name, rest = bone_of_path(path)
-        if name and datablock != scene_rig.armature_object and is_bone_channel(rest):
+        name, rest = split_bone_path(path)
+        if name and datablock != scene_rig.armature_object and is_transform_channel(rest):
             bone = datablock.pose.bones.get(name)
             if bone is not None and _varies(_bounds_of(bone, path)):
                 yield datablock, bone, path

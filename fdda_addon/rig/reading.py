@@ -17,8 +17,8 @@ from ..scene import armature as armature_io
 from ..scene import mesh as mesh_io
 from ..scene.controls import ControlReader
 from ..scene.scene_rig import (
+    MIN_VOLUME,
     MODIFIER_NAME,
-    SMALLEST_VOLUME,
     SceneRig,
     armature_modifier,
     armature_of,
@@ -36,14 +36,14 @@ IDENTITY_TOLERANCE = 1e-6
 """Mesh and armature count as unmoved, one against the other, when no matrix element differs by more."""
 
 
-def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None, with_unmoved: bool = False) -> Rig:
+def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, include_static_joint: bool = False) -> Rig:
     """Read a rig.
 
     Args:
         scene_rig: the rig.
-        besides: names of joints beside the bones that have weights, as of a model or a recording; when it is not given,
-            the bones that have a range of motion, those that the mesh depends on otherwise, and all above a joint.
-        with_unmoved: also the joint that never moves, which says which way is down.
+        extra_joints: names of joints besides the bones with weights, such as those of a model or a recording; None as
+            for `choose_joints`.
+        include_static_joint: add the joint that never moves, which tells the networks the direction of gravity.
 
     Raises:
         RigError: there is no vertex, all lie at one point, an object or a bone has a scale of zero, or a rest position
@@ -62,7 +62,7 @@ def read_rig(scene_rig: SceneRig, besides: Iterable[str] | None = None, with_unm
     rest_positions = mesh_io.rest_positions(mesh_object.data)
     _check_rest_positions(mesh_object, rest_positions)
     skin = read_skin(mesh_object, armature_object, armature_modifier(mesh_object))
-    joints = choose_joints(scene_rig, (*skin.bones, STATIC_JOINT) if with_unmoved else skin.bones, besides)
+    joints = choose_joints(scene_rig, (*skin.bones, STATIC_JOINT) if include_static_joint else skin.bones, extra_joints)
     names = tuple(joint.name for joint in joints)
     skin_joints, skin_weights = skin.arrays({name: number for number, name in enumerate(names)})
     rest = joint_rest_matrices(scene_rig, names)
@@ -109,7 +109,7 @@ def _check_rest_positions(mesh_object: bpy.types.Object, rest_positions: np.ndar
 def _check_rest_matrices(names: tuple[str, ...], rest: np.ndarray) -> None:
     """Raise a RigError where (J, 4, 4) rest matrices have no inverse."""
     for name, matrix in zip(names, rest, strict=True):
-        if not np.isfinite(matrix).all() or np.abs(np.linalg.det(matrix[:3, :3])) < SMALLEST_VOLUME:
+        if not np.isfinite(matrix).all() or np.abs(np.linalg.det(matrix[:3, :3])) < MIN_VOLUME:
             raise RigError(
                 f"The bone '{name}' has no length or no finite place in the rest pose; give its head and its tail "
                 "places in edit mode."
@@ -130,11 +130,11 @@ def joint_rest_matrices(scene_rig: SceneRig, names: tuple[str, ...]) -> np.ndarr
     """(J, 4, 4) float64 rest pose of joints, mesh-object space, mesh units; the identity for the unmoved joint."""
     rest = armature_io.rest_matrices(scene_rig.armature_object.data, names)
     moved = np.array([name != STATIC_JOINT for name in names], bool)
-    rest[moved] = mesh_from_armature(scene_rig.mesh_object, scene_rig.armature_object) @ rest[moved]
+    rest[moved] = armature_to_mesh_matrix(scene_rig.mesh_object, scene_rig.armature_object) @ rest[moved]
     return rest
 
 
-def mesh_from_armature(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
+def armature_to_mesh_matrix(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
     """(4, 4) float64, armature space to mesh-object space. Pass evaluated objects for an evaluated answer."""
     return np.array(_relation(mesh_object, armature_object), np.float64)
 
@@ -157,7 +157,7 @@ class PoseReader:
         names: J joints. KeyError when the armature lacks one.
         rest_matrices: (J, 4, 4), the joints' rest pose in mesh-object space.
         """
-        self._matrices = armature_io.PoseMatrices(scene_rig.armature_object, names)
+        self._matrices = armature_io.PoseMatrixReader(scene_rig.armature_object, names)
         self._rest = rest_matrices.astype(np.float64)
         self._from_bone_rest = np.linalg.inv(armature_io.rest_matrices(scene_rig.armature_object.data, names))
         self._relation: Matrix | None = None
@@ -238,11 +238,11 @@ __all__ = [
     "SceneRig",
     "armature_modifier",
     "armature_of",
+    "armature_to_mesh_matrix",
     "check_evaluable",
     "deforming_modifiers",
     "find_rig",
     "is_flat",
-    "mesh_from_armature",
     "model_channels",
     "read_model_rig",
     "read_rig",

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import bpy
 
 from ..scene.compatibility import node_input
-from ..scene.controls import owner_name, place_of
+from ..scene.controls import fcurve_target, owner_name
 from ..scene.scene_rig import SceneRig
 
 _OF_BONE = re.compile(r'pose\.bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]')
@@ -65,7 +65,7 @@ class Sources:
             self._follow(self._waiting.pop(0))
 
     @property
-    def own_bones(self) -> set[str]:
+    def rig_bones(self) -> set[str]:
         """Names of bones of the rig's own armature."""
         return self.bones.get(self._rig.armature_object, set())
 
@@ -82,7 +82,7 @@ class Sources:
             is_used = self._uses(datablock, datablock.modifiers.get(name)) or match["rest"] == ".show_viewport"
             is_late = self._only_active and datablock == self._root and name not in self._modifiers
             return is_used and not is_late and match["rest"] not in {".show_render", ".show_in_editmode"}
-        bone, rest = bone_of_path(path)
+        bone, rest = split_bone_path(path)
         if bone:
             return bone in self.bones.get(datablock, ()) and not rest.startswith('["')
         return datablock != self._root and path.startswith(_TRANSFORM)
@@ -235,12 +235,12 @@ class Sources:
     def _follow_number(self, reader: Curve, datablock: bpy.types.ID, path: str) -> None:
         if isinstance(datablock, bpy.types.Scene):
             self.scene_reads.append((reader, datablock, path))
-        bone, rest = bone_of_path(path)
-        if bone and datablock == self._rig.armature_object and is_bone_channel(rest):
+        bone, rest = split_bone_path(path)
+        if bone and datablock == self._rig.armature_object and is_transform_channel(rest):
             self._add_bones(datablock, [bone])
             return
         self.numbers[datablock, path] = None
-        own, array, index = place_of(datablock, path)
+        own, array, index = fcurve_target(datablock, path)
         for curve in own.animation_data.drivers if own.animation_data else ():
             if (curve.data_path, curve.array_index) == (array, index) and not curve.mute:
                 self._add_driver(own, curve)
@@ -256,13 +256,13 @@ class Sources:
                 self.numbers[target.id, path] = None
 
 
-def bone_of_path(path: str) -> tuple[str, str]:
+def split_bone_path(path: str) -> tuple[str, str]:
     """The bone that a path of an armature object begins with, empty for none, and the rest of the path."""
     match = _OF_BONE.match(path)
     return (bpy.utils.unescape_identifier(match["bone"]), path[match.end() :]) if match else ("", path)
 
 
-def is_bone_channel(rest: str) -> bool:
+def is_transform_channel(rest: str) -> bool:
     """Whether what follows the bone in a path is a location, a rotation or a scale."""
     return _CHANNEL.fullmatch(rest) is not None
 

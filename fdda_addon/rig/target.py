@@ -12,9 +12,9 @@ from ..core.errors import RigError
 from ..core.recording.target import FRAMES, POSE, SIMULATION
 from ..poses.clip import Clip
 from ..scene import mesh as mesh_io
-from ..scene.borrow import borrowed_attributes
 from ..scene.scene_rig import SceneRig, is_flat
-from .modifier_stack import is_playback, without_live
+from ..scene.temporary_state import temporary_attributes
+from .modifier_stack import downstream_disabled_unchecked, is_fdda_modifier
 from .target_caches import Cache, read_caches
 
 
@@ -96,7 +96,7 @@ class Target:
         """Of its object."""
         return self.target_object.name
 
-    def forget(self) -> None:
+    def restart_simulations(self) -> None:
         """Let its simulations begin anew at their first frame: what they keep of frames may be of another pose."""
         for cache in self.simulations:
             if cache.owner is not None:
@@ -105,9 +105,9 @@ class Target:
         self.target_object.update_tag()
 
     @contextmanager
-    def borrowed(self) -> Iterator[None]:
+    def prepared(self) -> Iterator[None]:
         """Switch off what makes new vertices after the target is deformed, a subdivision for example."""
-        with without_live(self.target_object):
+        with downstream_disabled_unchecked(self.target_object):
             yield
 
 
@@ -128,7 +128,7 @@ def find_target(scene_rig: SceneRig, name: str) -> Target:
             f"'{name}' cannot be its own target: a target is another object, which shows what '{name}' is to learn; "
             "leave the target out to record the rig itself."
         )
-    if any(is_playback(modifier) and modifier.show_viewport for modifier in target_object.modifiers):
+    if any(is_fdda_modifier(modifier) and modifier.show_viewport for modifier in target_object.modifiers):
         raise RigError(
             f"The target '{name}' plays a model, so there is nothing to learn from it but that model; let it show its "
             "rig, or choose another object."
@@ -140,7 +140,7 @@ def find_target(scene_rig: SceneRig, name: str) -> Target:
     target = Target(scene_rig, target_object, read_caches(scene_rig, target_object))
     if not target_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).is_evaluated:
         raise RigError(f"The target '{name}' is hidden, so Blender does not evaluate it; show it in the viewport.")
-    with target.borrowed():
+    with target.prepared():
         target.check_mesh()
     return target
 
@@ -179,15 +179,15 @@ def check_clips(target: Target, clips: Sequence[Clip], pre_roll: int) -> None:
 
 
 @contextmanager
-def borrowed_range(target: Target, first: int | None, last: int) -> Iterator[None]:
+def temporary_frame_range(target: Target, first: int | None, last: int) -> Iterator[None]:
     """Let the simulations of a target start at a frame, None for where each does, and last until another at least."""
     with ExitStack() as stack:
         for cache in target.simulations:
             if cache.owner is not None:
                 # The end first: Blender lets none of the two pass the other.
-                stack.enter_context(borrowed_attributes(cache.owner, frame_end=max(cache.owner.frame_end, last)))
+                stack.enter_context(temporary_attributes(cache.owner, frame_end=max(cache.owner.frame_end, last)))
                 if first is not None:
-                    stack.enter_context(borrowed_attributes(cache.owner, frame_start=first))
+                    stack.enter_context(temporary_attributes(cache.owner, frame_start=first))
         yield
 
 

@@ -10,10 +10,10 @@ import bpy
 from ..core.alembic import time_range
 from ..core.errors import PointCacheError, RigError, os_error_text
 from ..core.mesh_cache import mesh_cache_frames
-from ..scene.node_groups import SIMULATION_NODES, time_node
+from ..scene.node_groups import SIMULATION_NODES, find_time_node
 from ..scene.scene_rig import SceneRig
-from ..scene.stored_paths import resolved
-from .modifier_stack import IN_TIME
+from ..scene.stored_paths import resolve_path
+from .modifier_stack import TIME_DEPENDENT
 from .sources import Sources
 from .time_inputs import time_inputs
 
@@ -65,7 +65,7 @@ def _of_modifier(modifier: bpy.types.Modifier, words: str) -> Iterator[Cache]:
         cache = modifier.point_cache
         yield Cache(words, cache.frame_start, cache.frame_end, not cache.is_baked, cache)
     elif modifier.type == "NODES":
-        node = time_node(modifier.node_group)
+        node = find_time_node(modifier.node_group)
         if node is not None and node.bl_idname in SIMULATION_NODES:
             yield Cache(words, scene.frame_start, scene.frame_end, True, scene)
         elif node is not None:
@@ -76,8 +76,8 @@ def _of_modifier(modifier: bpy.types.Modifier, words: str) -> Iterator[Cache]:
         if modifier.cache_file is None:
             raise RigError(f"{words[0].upper()}{words[1:]} has no cache file; choose one, or another target.")
         yield _of_file(modifier.cache_file, words)
-    elif modifier.type in IN_TIME:
-        is_simulation = IN_TIME[modifier.type] == "is a simulation"
+    elif modifier.type in TIME_DEPENDENT:
+        is_simulation = TIME_DEPENDENT[modifier.type] == "is a simulation"
         yield Cache(words, scene.frame_start if is_simulation else None, None, is_simulation)
 
 
@@ -134,7 +134,7 @@ def _usd_frames(path: Path) -> tuple[float, float] | None:
 
 
 def _existing(filepath: str, words: str, owner: bpy.types.ID) -> Path:
-    path = resolved(filepath, owner.library).resolve() if filepath else None
+    path = resolve_path(filepath, owner.library).resolve() if filepath else None
     if path is None or not path.is_file():
         raise RigError(
             f"{words[0].upper()}{words[1:]} plays the file '{path or filepath}', which is not there; put it there, "

@@ -9,10 +9,10 @@ import bpy
 
 from ..core.controls import Control
 from ..core.errors import RigError
-from ..scene.animation import played_curves, value_range, varies
-from ..scene.controls import owner_of, place_of
+from ..scene.animation import changes_value, curves_with_actions, value_range
+from ..scene.controls import fcurve_target, owner_of
 from ..scene.scene_rig import SceneRig
-from .modifier_stack import ModifierStack, in_time, is_playback
+from .modifier_stack import ModifierStack, is_fdda_modifier, time_dependence
 from .other_armatures import check_other_armatures
 from .sources import Curve, Sources
 
@@ -22,7 +22,7 @@ _MOVING_IMAGES = {"MOVIE", "SEQUENCE"}
 _MUTE = "mute it, or let it read a number that is a control"
 
 Place = tuple[bpy.types.ID, str, int]
-"""A number as `scene.controls.place_of` gives it."""
+"""A number as `scene.controls.fcurve_target` gives it."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class TimeInput:
     remedy: str
 
 
-def check_inputs(
+def check_time_inputs(
     scene_rig: SceneRig,
     controls: Iterable[Control],
     stack: ModifierStack,
@@ -56,10 +56,12 @@ def check_inputs(
         RigError: names what depends on time, or a bone of another armature.
     """
     mesh_object = scene_rig.mesh_object
-    names = [modifier.name for modifier in mesh_object.modifiers if not is_playback(modifier)][: stack.place]
+    names = [modifier.name for modifier in mesh_object.modifiers if not is_fdda_modifier(modifier)][
+        : stack.insert_index
+    ]
     sources = Sources(scene_rig, mesh_object, names)
     owners = [(owner_of(scene_rig, control.owner), control.path) for control in controls]
-    places = {place_of(owner, path) for owner, path in owners if owner is not None}
+    places = {fcurve_target(owner, path) for owner, path in owners if owner is not None}
     for found in (*_modifiers_in_time(sources), *time_inputs(sources, places, actions)):
         raise RigError(
             f"The surface of '{mesh_object.name}' changes with time through {found.words}, so it does not follow from "
@@ -80,14 +82,14 @@ def time_inputs(
     """
     controls, actions = set(controls), tuple(actions)
     for datablock in (*sources.objects, *sources.datablocks):
-        for curve in played_curves(datablock, actions):
+        for curve in curves_with_actions(datablock, actions):
             place = (datablock, curve.data_path, curve.array_index)
-            if place not in controls and sources.moves(datablock, curve.data_path) and varies(curve):
+            if place not in controls and sources.moves(datablock, curve.data_path) and changes_value(curve):
                 yield _keyed(sources, datablock, curve)
     numbers = [*sources.numbers, *((scene, path) for _, scene, path in sources.scene_reads)]
-    for place in dict.fromkeys(place_of(*number) for number in numbers):
-        for curve in played_curves(place[0], actions):
-            if (curve.data_path, curve.array_index) == place[1:] and place not in controls and varies(curve):
+    for place in dict.fromkeys(fcurve_target(*number) for number in numbers):
+        for curve in curves_with_actions(place[0], actions):
+            if (curve.data_path, curve.array_index) == place[1:] and place not in controls and changes_value(curve):
                 yield _keyed(sources, place[0], curve)
     for driver, _, path in sources.scene_reads:
         if path in _FRAME:
@@ -113,7 +115,7 @@ def _modifiers_in_time(sources: Sources) -> Iterator[TimeInput]:
     """Of the objects that a mesh reads: a cage that is cloth, a lattice that waves."""
     for scene_object, with_shape in list(sources.objects.items())[1:]:
         for modifier in scene_object.modifiers if with_shape else ():
-            if modifier.show_viewport and (what := in_time(modifier)):
+            if modifier.show_viewport and (what := time_dependence(modifier)):
                 words = f"the modifier '{modifier.name}' of '{scene_object.name}', which {what}"
                 yield TimeInput(words, "switch it off in the viewport, or remove it")
 

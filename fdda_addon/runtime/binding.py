@@ -9,9 +9,9 @@ import bpy
 
 from ..core.errors import RigError
 from ..rig.modifier_stack import check_stack
-from ..rig.time_inputs import check_inputs
+from ..rig.time_inputs import check_time_inputs
 from ..scene.scene_rig import SceneRig
-from ..scene.stored_paths import path_for
+from ..scene.stored_paths import stored_path_for
 from . import model_files, modifier_switch, packed_model, playback, playback_modifier, position_buffer, registry
 from .mode_override import override_mode
 from .opened_model import open_model
@@ -41,16 +41,16 @@ def bind(
     with model_disabled(mesh_object):
         opened = open_model(scene_rig, network)
         stack = check_stack(mesh_object)
-        check_inputs(scene_rig, opened.rig.controls, stack)
+        check_time_inputs(scene_rig, opened.rig.controls, stack)
     if mesh_object.fdda.is_bound:
         unbind(mesh_object)
 
     if packed_text is None:
         model_files.allow(model)
     # The modifiers after the last deforming one stay on and work on the model's output.
-    playback_modifier.add_modifier(mesh_object, stack.place)
+    playback_modifier.add_modifier(mesh_object, stack.insert_index)
     binding = mesh_object.fdda
-    binding.model = path_for(mesh_object, model)
+    binding.model = stored_path_for(mesh_object, model)
     binding.packed = packed_text
     binding.use_in_render = use_in_render
     binding.is_bound = True

@@ -7,8 +7,8 @@ from pathlib import Path
 import bpy
 
 from ..core.errors import ModelError, os_error_text
-from ..scene.model_trust import is_trusted
-from ..scene.stored_paths import absolute_path, origin, resolved
+from ..scene.folder_trust import is_trusted
+from ..scene.stored_paths import absolute_path, path_owner, resolve_path
 from . import packed_model
 from .network import Network
 
@@ -74,8 +74,8 @@ def allowed_path(mesh_object: bpy.types.Object, stored: str) -> Path:
             trusted its folder.
     """
     path = absolute_path(mesh_object, stored)
-    library = origin(mesh_object, stored).library
-    file = str(resolved(library.filepath)) if library else bpy.data.filepath
+    library = path_owner(mesh_object, stored).library
+    file = str(resolve_path(library.filepath)) if library else bpy.data.filepath
     # Resolved, because a path relative to the open file may contain "..".
     in_folder = not file or path.resolve().is_relative_to(Path(file).resolve().parent)
     if not (in_folder or path.resolve() in _chosen_paths or is_trusted(path)):

@@ -4,7 +4,7 @@
 import bpy
 
 from ..rig.modifier_stack import deforming_modifiers
-from ..scene.borrow import animated_paths
+from ..scene.temporary_state import animated_paths
 from . import playback_modifier
 from .mode_override import overridden_mode, uses_model
 

@@ -7,8 +7,8 @@ import bpy
 
 from ..core.errors import RigError
 from .comparison import is_comparison
-from .kept import kept
-from .scene_rig import SceneRig, armature_of, find_rig, parenting_sentence
+from .draw_cache import draw_cached
+from .scene_rig import SceneRig, armature_of, find_rig, parenting_message
 
 
 def active_rig(context: bpy.types.Context, name: str = "") -> SceneRig:
@@ -33,20 +33,20 @@ def active_rig(context: bpy.types.Context, name: str = "") -> SceneRig:
         armature_object = armature_of(active)
         if armature_object is None:
             raise RigError(
-                parenting_sentence(active)
+                parenting_message(active)
                 or f"'{active.name}' has no Armature modifier with an armature; add one, or select another mesh."
             )
         return SceneRig(active, armature_object)
     return SceneRig(_mesh_of(context, active), active)
 
 
-def shown_rig(context: bpy.types.Context) -> SceneRig | None:
+def cached_active_rig(context: bpy.types.Context) -> SceneRig | None:
     """As `active_rig` for what is drawn again and again: None where there is none."""
     active = context.view_layer.objects.active
     return None if active is None else _shown_rig(context, active, context.scene)
 
 
-@kept
+@draw_cached
 def _shown_rig(context: bpy.types.Context, _active: bpy.types.Object, _scene: bpy.types.Scene) -> SceneRig | None:
     try:
         return active_rig(context)
@@ -54,29 +54,29 @@ def _shown_rig(context: bpy.types.Context, _active: bpy.types.Object, _scene: bp
         return None
 
 
-def shown_together(context: bpy.types.Context) -> tuple[SceneRig, ...]:
-    """As `rigs_together` for what is drawn again and again."""
+def cached_rigs_of_active_armature(context: bpy.types.Context) -> tuple[SceneRig, ...]:
+    """As `rigs_of_active_armature` for what is drawn again and again."""
     return _shown_together(context, context.view_layer.objects.active, context.scene)
 
 
-@kept
+@draw_cached
 def _shown_together(
     context: bpy.types.Context, _active: bpy.types.Object, _scene: bpy.types.Scene
 ) -> tuple[SceneRig, ...]:
-    return tuple(rigs_together(context))
+    return tuple(rigs_of_active_armature(context))
 
 
-def any_mesh(context: bpy.types.Context, fact: Callable[[bpy.types.Object], object]) -> bool:
+def any_mesh_object(context: bpy.types.Context, fact: Callable[[bpy.types.Object], object]) -> bool:
     """Whether something is true of a mesh object of the scene; for polls, with a function that is defined once."""
     return _any_mesh(context.scene, fact) is True
 
 
-@kept
+@draw_cached
 def _any_mesh(scene: bpy.types.Scene, fact: Callable[[bpy.types.Object], object]) -> bool | None:
     return any(o.type == "MESH" and fact(o) for o in scene.objects) or None
 
 
-def rigs_together(context: bpy.types.Context) -> list[SceneRig]:
+def rigs_of_active_armature(context: bpy.types.Context) -> list[SceneRig]:
     """The rigs of all meshes that follow the active armature, where it is active and there are several; else none."""
     active = context.view_layer.objects.active
     if active is None or active.type != "ARMATURE":
@@ -94,7 +94,7 @@ def _mesh_of(context: bpy.types.Context, armature_object: bpy.types.Object) -> b
     meshes = _meshes_of(context, armature_object)
     if not meshes:
         for child in armature_object.children:
-            if child.type == "MESH" and (sentence := parenting_sentence(child)):
+            if child.type == "MESH" and (sentence := parenting_message(child)):
                 raise RigError(sentence)
         raise RigError(f"No mesh follows the armature '{armature_object.name}'; give one an Armature modifier.")
     name = context.window_manager.fdda.mesh

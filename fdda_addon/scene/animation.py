@@ -34,12 +34,12 @@ def _flat_strips(strips: Iterable[bpy.types.NlaStrip]) -> Iterator[bpy.types.Nla
             yield from _flat_strips(strip.strips)
 
 
-def played_curves(datablock: bpy.types.ID, actions: Iterable[bpy.types.Action]) -> list[bpy.types.FCurve]:
+def curves_with_actions(datablock: bpy.types.ID, actions: Iterable[bpy.types.Action]) -> list[bpy.types.FCurve]:
     """The F-curves that animate a datablock now, or would if these actions were played."""
     return [*active_curves(datablock), *(curve for action in actions for curve in curves_of(action, datablock))]
 
 
-def varies(curve: bpy.types.FCurve) -> bool:
+def changes_value(curve: bpy.types.FCurve) -> bool:
     """Whether an F-curve changes what it animates, as far as its keys tell."""
     if any(not modifier.mute for modifier in curve.modifiers) or len(curve.sampled_points):
         return True

@@ -23,7 +23,7 @@ _REST_POSE = ((0, 0, 0), (0, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0), (1, 1, 1))
 """Values of `POSE_CHANNELS`."""
 
 
-class PoseMatrices:
+class PoseMatrixReader:
     """Reads the pose matrices of some bones of an armature, again and again."""
 
     def __init__(self, armature_object: bpy.types.Object, names: tuple[str, ...]):

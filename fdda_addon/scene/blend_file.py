@@ -29,12 +29,12 @@ def save_copy(path: Path) -> None:
         # Blender keeps a second copy of a file that it saves over.
         remove_file(temporary)
         try:
-            with quiet():
+            with silenced_stdout():
                 bpy.ops.wm.save_as_mainfile(
                     filepath=blender_path(temporary), copy=True, compress=True, check_existing=False
                 )
         except RuntimeError as error:
-            raise OSError(reason(error)) from error
+            raise OSError(report_message(error)) from error
         # Blender 4.5 saves half a compressed file to a full disk and calls it finished.
         if temporary.read_bytes()[-len(SEEK_TABLE_END) :] != SEEK_TABLE_END:
             raise OSError("Blender wrote only a part of it, the disk may be full")
@@ -52,13 +52,13 @@ def blender_path(path: Path) -> str:
     return str(absolute)
 
 
-def reason(error: RuntimeError) -> str:
+def report_message(error: RuntimeError) -> str:
     """The first of the reports that an operator failed with."""
     return str(error).strip().removeprefix("Error: ").partition("\n")[0]
 
 
 @contextlib.contextmanager
-def quiet() -> Iterator[None]:
+def silenced_stdout() -> Iterator[None]:
     """Keep Blender's own lines ("Read blend: …") off stdout, where a verb prints its results."""
     sys.stdout.flush()
     saved = os.dup(1)

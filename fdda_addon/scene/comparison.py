@@ -6,13 +6,13 @@ from contextlib import ExitStack, contextmanager
 
 import bpy
 
-KEY = "fdda_compared"
+COMPARISON_KEY = "fdda_compared"
 """Custom property of a copy: the mesh object that it is compared with."""
 
 
 def is_comparison(scene_object: bpy.types.Object) -> bool:
     """Whether an object is such a copy, and no character of the user's."""
-    return scene_object.is_runtime_data and KEY in scene_object
+    return scene_object.is_runtime_data and COMPARISON_KEY in scene_object
 
 
 def comparisons() -> list[bpy.types.Object]:
@@ -23,9 +23,9 @@ def comparisons() -> list[bpy.types.Object]:
 @contextmanager
 def hidden_comparisons() -> Iterator[None]:
     """Spare Blender their evaluation for a while."""
-    from .borrow import borrowed_attributes  # Blender starts without numpy.
+    from .temporary_state import temporary_attributes  # Blender starts without numpy.
 
     with ExitStack() as stack:
         for other in comparisons():
-            stack.enter_context(borrowed_attributes(other, hide_viewport=True))
+            stack.enter_context(temporary_attributes(other, hide_viewport=True))
         yield

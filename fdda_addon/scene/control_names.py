@@ -4,12 +4,12 @@
 import bpy
 
 from ..core.controls import ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS
-from .controls import custom_key, is_custom, is_driven, is_number, owner_of, parent_and_name
+from .controls import custom_property_key, is_custom_property, is_driven, is_number, owner_of, parent_and_name
 from .scene_rig import SceneRig
 
 
 def suggested_controls(scene_rig: SceneRig) -> list[str]:
-    """Shape keys and custom properties that no driver sets, as `stated_controls` reads them; all shape keys first."""
+    """Shape keys and custom properties that no driver sets, as `parse_controls` reads them; all shape keys first."""
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
     found = []
     if keys := mesh_object.data.shape_keys:
@@ -30,14 +30,14 @@ def _custom_numbers(datablock: bpy.types.ID, path: str) -> list[str]:
     return [one for one in paths if is_number(datablock, one) and not is_driven(datablock, one)]
 
 
-def resting_value(scene_rig: SceneRig, name: str) -> float:
+def control_default(scene_rig: SceneRig, name: str) -> float:
     """The value that a control has by default; 0 for a shape key."""
     owner, _, path = name.partition("/")
     struct, attribute, index = parent_and_name(owner_of(scene_rig, owner), path)
     if isinstance(struct, bpy.types.ShapeKey):
         return 0.0
-    if is_custom(attribute):
-        own = custom_key(attribute)
+    if is_custom_property(attribute):
+        own = custom_property_key(attribute)
         default = False if isinstance(struct[own], bool) else struct.id_properties_ui(own).as_dict()["default"]
         return float(default[index] if hasattr(default, "__len__") else default)
     prop = struct.bl_rna.properties[attribute]

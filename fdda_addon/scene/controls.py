@@ -13,7 +13,7 @@ from ..core.controls import ARMATURE, ARMATURE_OBJECT, MESH_OBJECT, OTHER_OBJECT
 from ..core.errors import RigError
 from .scene_rig import SceneRig
 
-WIDEST_RANGE = 1e4
+MAX_RANGE_WIDTH = 1e4
 """A property whose range is wider than this states none."""
 
 _STATED = re.compile(r"(?P<name>.+?)(?:=(?P<low>[-+.\deE]+):(?P<high>[-+.\deE]+))?", re.DOTALL)
@@ -68,12 +68,12 @@ def make_control(
             f"number, with OWNER one of {', '.join(OWNERS)} and {OTHER_OBJECT}NAME."
         )
     low, high = stated or sampled.get(name) or _property_range(datablock, path)
-    if not low < high or high - low > WIDEST_RANGE:
+    if not low < high or high - low > MAX_RANGE_WIDTH:
         raise RigError(f"The control '{name}' states no range; give one: '{name}=LOW:HIGH'.")
     return Control(owner, path, float(low), float(high))
 
 
-def stated_controls(
+def parse_controls(
     scene_rig: SceneRig, texts: Iterable[str], sampled: Mapping[str, tuple[float, float]] = MappingProxyType({})
 ) -> tuple[Control, ...]:
     """Controls as a user lists them.
@@ -116,7 +116,7 @@ def _meant(scene_rig: SceneRig, name: str) -> list[tuple[str, str]]:
 
 def is_driven(datablock: bpy.types.ID, path: str) -> bool:
     """Whether a driver sets a number."""
-    owner, array, index = place_of(datablock, path)
+    owner, array, index = fcurve_target(datablock, path)
     animation = owner.animation_data
     return animation is not None and any(
         (curve.data_path, curve.array_index) == (array, index) for curve in animation.drivers
@@ -143,7 +143,7 @@ def parent_and_name(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.bpy_s
     return datablock.path_resolve(owner) if owner else datablock, name, index
 
 
-def place_of(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.ID, str, int]:
+def fcurve_target(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.ID, str, int]:
     """A number as F-curves name it: the datablock that has it, the path there, the place in an array, else 0.
 
     A path may lead to another datablock: from a lattice object to the shape keys of its data.
@@ -154,15 +154,15 @@ def place_of(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.ID, str, int
         prefix = "" if struct == struct.id_data else struct.path_from_id()
     except ValueError:
         return datablock, array, place or 0
-    return struct.id_data, prefix + name if is_custom(name) or not prefix else f"{prefix}.{name}", place or 0
+    return struct.id_data, prefix + name if is_custom_property(name) or not prefix else f"{prefix}.{name}", place or 0
 
 
-def is_custom(name: str) -> bool:
+def is_custom_property(name: str) -> bool:
     """Whether a name of `parent_and_name` is that of a custom property."""
     return name.startswith('["')
 
 
-def custom_key(name: str) -> str:
+def custom_property_key(name: str) -> str:
     """The key of a custom property by such a name."""
     return bpy.utils.unescape_identifier(name[2:-2])
 
@@ -172,8 +172,8 @@ def write_value(datablock: bpy.types.ID, path: str, value: object) -> None:
     struct, name, index = parent_and_name(datablock, path)
     if index is not None:
         datablock.path_resolve(_element(path)[0])[index] = value
-    elif is_custom(name):
-        struct[custom_key(name)] = value
+    elif is_custom_property(name):
+        struct[custom_property_key(name)] = value
     else:
         setattr(struct, name, value)
 
@@ -189,8 +189,8 @@ def _value(datablock: bpy.types.ID, path: str) -> float | None:
 
 def _property_range(datablock: bpy.types.ID, path: str) -> tuple[float, float]:
     struct, name, _ = parent_and_name(datablock, path)
-    if is_custom(name):
-        key = custom_key(name)
+    if is_custom_property(name):
+        key = custom_property_key(name)
         if isinstance(struct[key], bool):
             return 0.0, 1.0
         settings = struct.id_properties_ui(key).as_dict()
@@ -258,14 +258,14 @@ def set_control(scene_rig: SceneRig, name: str, value: float) -> None:
 
 
 @contextmanager
-def borrowed_controls(scene_rig: SceneRig, names: Iterable[str]) -> Iterator[None]:
+def temporary_controls(scene_rig: SceneRig, names: Iterable[str]) -> Iterator[None]:
     """Give back the values of controls, by name, and what animates them. Inside, nothing animates them.
 
-    What animates the armature object is not touched: `borrow.borrowed_pose` takes care of it.
+    What animates the armature object is not touched: `temporary_state.temporary_pose` takes care of it.
     """
     names = list(names)
     places = [(owner_of(scene_rig, owner), path) for owner, _, path in (name.partition("/") for name in names)]
-    owners = {place_of(*place)[0] for place in places} - {scene_rig.armature_object}
+    owners = {fcurve_target(*place)[0] for place in places} - {scene_rig.armature_object}
     animations = [a for a in (owner.animation_data for owner in owners) if a is not None]
     kept = [(a, a.action, getattr(a, "action_slot", None), a.use_nla) for a in animations]
     values = {name: owner_of(scene_rig, name.partition("/")[0]).path_resolve(name.partition("/")[2]) for name in names}

@@ -18,7 +18,7 @@ TIME_NODES = {"GeometryNodeInputSceneTime", *SIMULATION_NODES}
 UNLINKED = "unlinked"
 
 
-class Effect(Enum):
+class GeometryEffect(Enum):
     """What the nodes between the geometry that comes in and the one that goes out can do to a mesh."""
 
     ATTRIBUTES = auto()
@@ -29,24 +29,24 @@ class Effect(Enum):
     """More than the nodes alone tell."""
 
 
-def effect(tree: bpy.types.NodeTree | None) -> Effect:
+def geometry_effect(tree: bpy.types.NodeTree | None) -> GeometryEffect:
     """What a node group can do to a mesh. A modifier without a group does nothing."""
     if tree is None:
-        return Effect.ATTRIBUTES
+        return GeometryEffect.ATTRIBUTES
     kinds = set(_on_the_way(tree))
     if kinds <= ATTRIBUTE_NODES:
-        return Effect.ATTRIBUTES
-    return Effect.POSITIONS if kinds <= ATTRIBUTE_NODES | {POSITION_NODE} else Effect.ANY
+        return GeometryEffect.ATTRIBUTES
+    return GeometryEffect.POSITIONS if kinds <= ATTRIBUTE_NODES | {POSITION_NODE} else GeometryEffect.ANY
 
 
-def time_node(tree: bpy.types.NodeTree | None) -> bpy.types.Node | None:
+def find_time_node(tree: bpy.types.NodeTree | None) -> bpy.types.Node | None:
     """A node, in the group or in groups that it uses, whose result depends on time; None when there is none."""
     for node in tree.nodes if tree is not None else ():
         if node.mute:
             continue
         if node.bl_idname in TIME_NODES:
             return node
-        if node.type == "GROUP" and (found := time_node(node.node_tree)):
+        if node.type == "GROUP" and (found := find_time_node(node.node_tree)):
             return found
     return None
 

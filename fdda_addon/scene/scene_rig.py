@@ -12,7 +12,7 @@ from .comparison import is_comparison
 MODIFIER_NAME = "FDDA"
 """Name of the Geometry Nodes modifier that plays a model; it is never part of the rig."""
 
-SMALLEST_VOLUME = 1e-15
+MIN_VOLUME = 1e-15
 """An object whose scales multiply to less is flat: no position could be brought into its space."""
 
 
@@ -46,7 +46,7 @@ def find_rig(name: str = "") -> SceneRig:
         o for o in meshes if armature_of(o) is not None
     ]
     if not rigged:
-        if parented := [sentence for o in meshes if (sentence := parenting_sentence(o))]:
+        if parented := [sentence for o in meshes if (sentence := parenting_message(o))]:
             raise RigError(parented[0])
         what = f"'{name}' has no" if name else f"None of the {len(meshes)} meshes of the scene has an"
         raise RigError(f"{what} Armature modifier with an armature; add one, or choose another object.")
@@ -69,7 +69,7 @@ def find_rigs() -> list[SceneRig]:
 
 def is_flat(scene_object: bpy.types.Object) -> bool:
     """Whether an object has a scale of zero along an axis, its own or its parents'."""
-    return abs(scene_object.matrix_world.to_3x3().determinant()) < SMALLEST_VOLUME
+    return abs(scene_object.matrix_world.to_3x3().determinant()) < MIN_VOLUME
 
 
 def armature_modifier(mesh_object: bpy.types.Object) -> bpy.types.ArmatureModifier | None:
@@ -80,7 +80,7 @@ def armature_modifier(mesh_object: bpy.types.Object) -> bpy.types.ArmatureModifi
     return None
 
 
-def parenting_sentence(mesh_object: bpy.types.Object) -> str:
+def parenting_message(mesh_object: bpy.types.Object) -> str:
     """Why a mesh that no modifier ties to an armature is no rig though it is parented to one; empty when it is not."""
     parent = mesh_object.parent
     if parent is None or parent.type != "ARMATURE":
@@ -111,7 +111,7 @@ def armature_of(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
     if modifier is not None:
         return modifier.object
     seen = {mesh_object}
-    waiting = list(read_objects(mesh_object))
+    waiting = list(objects_read_by_modifiers(mesh_object))
     while waiting:
         found = waiting.pop(0)
         if found.type == "ARMATURE":
@@ -119,11 +119,13 @@ def armature_of(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
         if found not in seen:
             seen.add(found)
             targets = [getattr(constraint, "target", None) for constraint in found.constraints if not constraint.mute]
-            waiting += [other for other in (*read_objects(found), found.parent, *targets) if other is not None]
+            waiting += [
+                other for other in (*objects_read_by_modifiers(found), found.parent, *targets) if other is not None
+            ]
     return None
 
 
-def read_objects(owner: bpy.types.Object) -> Iterator[bpy.types.Object]:
+def objects_read_by_modifiers(owner: bpy.types.Object) -> Iterator[bpy.types.Object]:
     """The objects that the modifiers of an object read."""
     for modifier in owner.modifiers:
         for prop in modifier.bl_rna.properties:

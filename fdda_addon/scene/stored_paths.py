@@ -18,14 +18,14 @@ _rebased: list[tuple[bpy.types.PropertyGroup, str, str]] = []
 _saved_from = ""
 
 
-def resolved(stored: str, library: bpy.types.Library | None = None) -> Path:
+def resolve_path(stored: str, library: bpy.types.Library | None = None) -> Path:
     """Make a path of a .blend file absolute, as Blender does.
 
     Args:
         stored: the path; `//` stands for the folder of the file.
         library: the linked file that has the path; the open file when it is left out.
     """
-    folder = resolved(library.filepath).parent if library else Path(bpy.data.filepath).parent
+    folder = resolve_path(library.filepath).parent if library else Path(bpy.data.filepath).parent
     if stored.startswith(RELATIVE):
         # Blender on Windows separates folders by backslashes, and reads both on every system.
         stored = stored.replace("\\", "/")
@@ -34,7 +34,7 @@ def resolved(stored: str, library: bpy.types.Library | None = None) -> Path:
 
 def absolute_path(mesh_object: bpy.types.Object, stored: str) -> Path:
     """Where a path leads that is stored with an object, whether it is followed or not."""
-    return Path(os.path.normpath(resolved(stored, origin(mesh_object, stored).library)))
+    return Path(os.path.normpath(resolve_path(stored, path_owner(mesh_object, stored).library)))
 
 
 def stored_path(path: Path) -> str:
@@ -42,7 +42,7 @@ def stored_path(path: Path) -> str:
     return _relative(path.absolute(), Path(bpy.data.filepath).parent) if bpy.data.filepath else str(path.absolute())
 
 
-def path_for(mesh_object: bpy.types.Object, path: Path) -> str:
+def stored_path_for(mesh_object: bpy.types.Object, path: Path) -> str:
     """How an object remembers where a file is; a library override calls the library's own as the library does."""
     for stored in _inherited_paths(mesh_object):
         if stored and absolute_path(mesh_object, stored) == Path(os.path.normpath(path.absolute())):
@@ -55,7 +55,7 @@ def _unlike_inherited(mesh_object: bpy.types.Object, stored: str) -> str:
     return f"{RELATIVE}./{stored.removeprefix(RELATIVE)}" if stored in _inherited_paths(mesh_object) else stored
 
 
-def origin(mesh_object: bpy.types.Object, stored: str) -> bpy.types.Object:
+def path_owner(mesh_object: bpy.types.Object, stored: str) -> bpy.types.Object:
     """The object that a path was stored with first: a library override may have it from its library."""
     while stored in _inherited_paths(mesh_object):
         mesh_object = mesh_object.override_library.reference
@@ -102,7 +102,7 @@ def _on_save_begins(file: str = "", *_: object) -> None:
         return
     for mesh_object, owner, name in _own_paths():
         stored = getattr(owner, name)
-        path = Path(os.path.normpath(resolved(stored)))
+        path = Path(os.path.normpath(resolve_path(stored)))
         # What is given in full stays so, but for what goes wherever the file goes.
         if (stored.startswith(RELATIVE) and _saved_from) or path.is_relative_to(folder):
             _rebased.append((owner, name, stored))

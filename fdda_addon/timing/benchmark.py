@@ -24,9 +24,9 @@ from ..runtime import model_files, playback
 from ..runtime.binding import model_disabled, temporary_binding, temporary_mode
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser, clear_pose
-from ..scene.borrow import assign_action, borrowed_attributes, borrowed_pose
 from ..scene.comparison import hidden_comparisons
 from ..scene.scene_rig import SceneRig, armature_modifier
+from ..scene.temporary_state import assign_action, temporary_attributes, temporary_pose
 from .frame_times import FrameTimes, verdict
 
 ROUNDS = 5
@@ -134,7 +134,7 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
     with playing(scene_rig, channels) as played, temporary_binding(scene_rig, model):
         ways = {
             "rig": model_disabled,
-            "linear": armature_alone,
+            "linear": skinning_only,
             "fdda": partial(temporary_mode, mode="FDDA"),
             "floor": _floor,
         }
@@ -166,7 +166,7 @@ def playing(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> Iterator
     """
     animation = scene_rig.armature_object.animation_data
     own_action = animation.action if animation else None
-    with hidden_comparisons(), borrowed_pose(scene_rig.armature_object, [own_action] if own_action else []):
+    with hidden_comparisons(), temporary_pose(scene_rig.armature_object, [own_action] if own_action else []):
         action = own_action or random_action(scene_rig, channels)
         assign_action(scene_rig.armature_object, action)
         try:
@@ -219,7 +219,7 @@ def _time(calls: list[Callable[[], object]]) -> list[float]:
 
 
 @contextmanager
-def armature_alone(mesh_object: bpy.types.Object) -> Iterator[None]:
+def skinning_only(mesh_object: bpy.types.Object) -> Iterator[None]:
     """Blender's own linear skinning: the Armature modifier alone, shape keys pinned."""
     skinning = armature_modifier(mesh_object)
     if skinning is None:
@@ -227,10 +227,10 @@ def armature_alone(mesh_object: bpy.types.Object) -> Iterator[None]:
     with model_disabled(mesh_object), ExitStack() as stack:
         for modifier in deforming_modifiers(mesh_object):
             if modifier != skinning:
-                stack.enter_context(borrowed_attributes(modifier, show_viewport=False))
-        stack.enter_context(borrowed_attributes(skinning, use_deform_preserve_volume=False))
+                stack.enter_context(temporary_attributes(modifier, show_viewport=False))
+        stack.enter_context(temporary_attributes(skinning, use_deform_preserve_volume=False))
         if mesh_object.data.shape_keys:
-            stack.enter_context(borrowed_attributes(mesh_object, show_only_shape_key=True, active_shape_key_index=0))
+            stack.enter_context(temporary_attributes(mesh_object, show_only_shape_key=True, active_shape_key_index=0))
         yield
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import bpy
 
-_kept: dict[int, "FrameTimes"] = {}
+_frame_times: dict[int, "FrameTimes"] = {}
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,12 @@ def verdict(rig: float, fdda: float) -> str:
     return f"FDDA is {rig / fdda:.1f} times as fast as the rig: it pays."
 
 
-def keep(mesh_object: bpy.types.Object, times: FrameTimes) -> None:
+def store(mesh_object: bpy.types.Object, times: FrameTimes) -> None:
     """Note what was measured with the bound model."""
-    _kept[mesh_object.session_uid] = times
+    _frame_times[mesh_object.session_uid] = times
 
 
-def of(mesh_object: bpy.types.Object) -> FrameTimes | None:
+def get(mesh_object: bpy.types.Object) -> FrameTimes | None:
     """The times with the model that is bound now, None when nothing was measured."""
-    times = _kept.get(mesh_object.session_uid)
+    times = _frame_times.get(mesh_object.session_uid)
     return times if times and times.model == mesh_object.fdda.model else None

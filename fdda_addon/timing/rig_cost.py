@@ -10,14 +10,14 @@ from ..core.progress import Progress
 from ..rig.modifier_stack import check_evaluable
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig
-from .benchmark import armature_alone, playing, time_frames
+from .benchmark import playing, skinning_only, time_frames
 
 ROUNDS = 4
 FRAMES_EACH = 5
 
 PLAYBACK_MS = ((1_476, 0.50), (9_960, 0.51), (50_618, 0.73))
 """By vertex count: what a frame with a model costs beyond the Armature modifier alone, ms; from docs/benchmarks.md."""
-CLEAR_GAIN = 1.3
+MIN_CLEAR_SPEEDUP = 1.3
 """Below this an estimate is too close to call."""
 
 
@@ -44,9 +44,9 @@ class RigCost:
     def sentence(self) -> str:
         """Whether a model would pay."""
         gain = self.rig / self.model
-        if gain >= CLEAR_GAIN:
+        if gain >= MIN_CLEAR_SPEEDUP:
             return f"A model would pay: a frame is about {gain:.1f} times as fast."
-        if gain >= 1 / CLEAR_GAIN:
+        if gain >= 1 / MIN_CLEAR_SPEEDUP:
             return "A model would make little difference to the time of a frame."
         return "A model would not pay: this rig costs less than the playback of a model."
 
@@ -79,7 +79,7 @@ def measure(scene_rig: SceneRig) -> Iterator[Progress | RigCost]:
             for number in range(ROUNDS):
                 times["rig"] += time_frames(frames, number * FRAMES_EACH, FRAMES_EACH)
                 yield Progress("frames", 2 * number + 1, 2 * ROUNDS)
-                with armature_alone(mesh_object):
+                with skinning_only(mesh_object):
                     times["linear"] += time_frames(frames, number * FRAMES_EACH, FRAMES_EACH)
                 yield Progress("frames", 2 * number + 2, 2 * ROUNDS)
     yield RigCost(len(mesh_object.data.vertices), *(float(np.median(times[way])) for way in ("rig", "linear")))

@@ -5,8 +5,8 @@ import bpy
 import pytest
 
 from fdda_addon.core.errors import RigError
-from fdda_addon.scene.control_names import resting_value
-from fdda_addon.scene.controls import ControlReader, is_driven, set_control, stated_controls
+from fdda_addon.scene.control_names import control_default
+from fdda_addon.scene.controls import ControlReader, is_driven, parse_controls, set_control
 
 from .conftest import ELBOW_RIG
 
@@ -40,13 +40,13 @@ def armature_object(rig) -> bpy.types.Object:
 )
 def test_a_control_is_read_and_set(rig, armature_object, path, limits, value):
     text = f"armature_object/{path}" + ("" if limits else "=-1:1")
-    (control,) = stated_controls(rig, [text])
+    (control,) = parse_controls(rig, [text])
     assert (control.low, control.high) == (limits or (-1, 1)) and not is_driven(armature_object, path)
     reader = ControlReader(rig, (control,))
     set_control(rig, control.name, value)
     assert type(armature_object.path_resolve(path)) is type(value) or not isinstance(value, bool | int)
     assert reader.read(rig, bpy.context.evaluated_depsgraph_get()).tolist() == [value]
-    assert isinstance(resting_value(rig, control.name), float)
+    assert isinstance(control_default(rig, control.name), float)
 
 
 def test_only_the_named_element_is_set(rig, armature_object):
@@ -57,9 +57,9 @@ def test_only_the_named_element_is_set(rig, armature_object):
 @pytest.mark.parametrize("name", ['armature_object/["none"]', 'armature_object/["many"]', "elsewhere/location[0]", "x"])
 def test_what_is_no_number_is_refused(rig, armature_object, name):
     with pytest.raises(RigError, match=r"'elbow' has no control '.*'; give the name of a shape key, or OWNER/PATH"):
-        stated_controls(rig, [name])
+        parse_controls(rig, [name])
 
 
 def test_a_number_without_a_range_is_refused(rig, armature_object):
     with pytest.raises(RigError, match=r"states no range; give one: 'armature_object/location\[0\]=LOW:HIGH'"):
-        stated_controls(rig, ["armature_object/location[0]"])
+        parse_controls(rig, ["armature_object/location[0]"])

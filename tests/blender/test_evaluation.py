@@ -14,7 +14,7 @@ from fdda_addon.core.poses import sample_pose, scale_ranges
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.evaluation.run import (
-    HELD_OUT_INDEX,
+    FIRST_HELD_OUT_INDEX,
     Evaluation,
     EvaluationSettings,
     NamedPose,
@@ -89,7 +89,7 @@ def test_figures_are_what_a_direct_computation_gives(report, rig, elbow):
     rig.armature_object.animation_data_clear()
     clear_pose(rig.armature_object)
     channels = sampled_channels(rig, read_rig(rig))
-    fdda, linear = by_hand(rig, elbow, channels, 3, range(HELD_OUT_INDEX, HELD_OUT_INDEX + 12))
+    fdda, linear = by_hand(rig, elbow, channels, 3, range(FIRST_HELD_OUT_INDEX, FIRST_HELD_OUT_INDEX + 12))
     for errors, name in ((fdda, "fdda"), (linear, "linear")):
         assert report[name] == pytest.approx(error_statistics(errors).to_json(), abs=2e-4)
         mm = errors * 1000

@@ -175,7 +175,7 @@ def test_what_is_baked_is_what_is_shown(masked, tmp_path):
 
 def test_what_is_evaluated_is_what_is_shown(masked):
     bpy.ops.fdda.evaluate()
-    errors = last_evaluation.of(masked).errors
+    errors = last_evaluation.get(masked).errors
     weights = ramp(masked)
     assert (errors["fdda"][:, weights == 0] == errors["linear"][:, weights == 0]).all()
     for frame in (5, 20):
@@ -186,7 +186,7 @@ def test_what_is_evaluated_is_what_is_shown(masked):
         apart = np.linalg.norm(shown - evaluated(masked), axis=1)
         masked.fdda.mode = "FDDA"
         bpy.context.view_layer.update()
-        pose_index = last_evaluation.of(masked).pose_at(frame)
+        pose_index = last_evaluation.get(masked).pose_at(frame)
         assert np.abs(errors["fdda"][pose_index] - apart).max() < 1e-5
 
 

@@ -10,8 +10,8 @@ from mathutils import Euler
 
 from fdda_addon.core.errors import RigError
 from fdda_addon.poses.action_range import measured_controls, measured_ranges
-from fdda_addon.poses.measured_limits import state_measured_limits
-from fdda_addon.poses.motion_range import local_limit, location_ranges, rotation_ranges, scale_ranges
+from fdda_addon.poses.measured_limits import set_limits_from_actions
+from fdda_addon.poses.motion_range import find_local_limit, location_ranges, rotation_ranges, scale_ranges
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
@@ -115,15 +115,17 @@ def test_keyed_numbers_are_measured_as_controls(figure):
 
 def test_limits_state_the_ranges_with_their_margin_and_change_no_pose(figure):
     before = poses(figure)
-    limits = state_measured_limits(figure, [wave()], 0.5)
-    assert all(not limit.why_not for limit in limits) and len(limits) == 9
+    limits = set_limits_from_actions(figure, [wave()], 0.5)
+    assert all(not limit.reason_unset for limit in limits) and len(limits) == 9
     np.testing.assert_array_equal(poses(figure), before)
     bones = figure.armature_object.pose.bones
     # A range that holds the rest pose: IK limits; one that does not: a constraint that holds nothing.
     spine, left, right = (rotation_ranges(bones[name]) for name in ("spine", "arm.L", "arm.R"))
-    assert [r.source for r in spine] == ["IK", "IK", "DEFAULT"] and not local_limit(bones["spine"], "LIMIT_ROTATION")
+    assert [r.source for r in spine] == ["IK", "IK", "DEFAULT"] and not find_local_limit(
+        bones["spine"], "LIMIT_ROTATION"
+    )
     assert (spine[1].low, spine[1].high) == pytest.approx((-0.2, 0.6), abs=5e-3)
-    assert local_limit(bones["arm.L"], "LIMIT_ROTATION") is None and left[0].low == pytest.approx(-0.3, abs=5e-3)
+    assert find_local_limit(bones["arm.L"], "LIMIT_ROTATION") is None and left[0].low == pytest.approx(-0.3, abs=5e-3)
     assert [r.source for r in right] == ["IK", "IK", "DEFAULT"]
     (moved,) = [c for c in bones["spine"].constraints]
     assert (moved.type, moved.influence, moved.owner_space) == ("LIMIT_LOCATION", 0, "LOCAL")
@@ -138,27 +140,27 @@ def test_a_range_without_the_rest_pose_is_stated_by_a_constraint(figure):
     arm = figure.armature_object.pose.bones["arm.L"]
     arm.use_ik_limit_y, arm.ik_min_y, arm.ik_max_y = True, -0.4, 0.3
     before = poses(figure)
-    state_measured_limits(figure, [wave()], 0.0)
+    set_limits_from_actions(figure, [wave()], 0.0)
     np.testing.assert_array_equal(poses(figure), before)
     ranges = rotation_ranges(arm)
-    assert {r.source for r in ranges} == {"CONSTRAINT"} and local_limit(arm, "LIMIT_ROTATION").influence == 0
+    assert {r.source for r in ranges} == {"CONSTRAINT"} and find_local_limit(arm, "LIMIT_ROTATION").influence == 0
     assert (ranges[0].low, ranges[0].high) == pytest.approx((0.2, 1.2), abs=5e-3)
     assert (ranges[1].low, ranges[1].high) == pytest.approx((-0.4, 0.3)), "what was stated stays"
-    assert not any(limit.axis == 1 for limit in state_measured_limits(figure, [wave()]) if limit.bone == "arm.L")
+    assert not any(limit.axis == 1 for limit in set_limits_from_actions(figure, [wave()]) if limit.bone == "arm.L")
     assert len(arm.constraints) == 1, "the constraint is made once"
     right = figure.armature_object.pose.bones["arm.R"]
     assert rotation_ranges(right)[2].source == "DEFAULT", "what does not move is left alone without a constraint"
 
 
 def test_an_axis_that_stands_still_is_stated_so_beside_a_constraint(figure):
-    state_measured_limits(figure, [wave()], 0.0)
+    set_limits_from_actions(figure, [wave()], 0.0)
     still = rotation_ranges(figure.armature_object.pose.bones["arm.L"])[1]
     assert (still.low, still.high, still.source, still.moves) == (0, 0, "CONSTRAINT", False)
 
 
 def test_a_bone_that_ik_may_move_gets_no_ik_limits(figure):
     figure.armature_object.pose.bones["arm.R"].constraints.new("IK").influence = 0
-    state_measured_limits(figure, [wave()])
+    set_limits_from_actions(figure, [wave()])
     for bone in figure.armature_object.pose.bones:
         assert not (bone.use_ik_limit_x or bone.use_ik_limit_y), bone.name
         assert rotation_ranges(bone)[0].source == "CONSTRAINT"
@@ -169,7 +171,7 @@ def test_limits_that_hold_stay_and_end_the_range():
     lower = elbow.armature_object.pose.bones["lower"]
     held = lower.constraints[0]
     limits = {
-        (limit.bone, limit.axis): limit for limit in state_measured_limits(elbow, [bpy.data.actions["elbow_wave"]])
+        (limit.bone, limit.axis): limit for limit in set_limits_from_actions(elbow, [bpy.data.actions["elbow_wave"]])
     }
     assert (held.influence, held.min_x, held.max_x) == (1, 0, pytest.approx(math.radians(120)))
     assert (limits["lower", 0].low, limits["lower", 0].high) == pytest.approx((0, math.radians(110)), abs=1e-3)
@@ -178,7 +180,7 @@ def test_limits_that_hold_stay_and_end_the_range():
     assert not rotation_ranges(lower)[1].moves, "the range 0 to 0 that it had"
     held.max_x = -0.4
     held.min_x = -0.5
-    left = {(x.bone, x.axis): x.why_not for x in state_measured_limits(elbow, [bpy.data.actions["elbow_wave"]])}
+    left = {(x.bone, x.axis): x.reason_unset for x in set_limits_from_actions(elbow, [bpy.data.actions["elbow_wave"]])}
     assert left["lower", 0] == "held by its limit, left so"
 
 
@@ -194,7 +196,9 @@ def test_locked_axes_and_connected_bones_are_left(figure):
         edited["arm.L"].use_connect = True
 
     edit_bones(figure, connect)
-    left = {(x.bone, x.kind, x.axis): x.why_not for x in state_measured_limits(figure, [wave()]) if x.why_not}
+    left = {
+        (x.bone, x.kind, x.axis): x.reason_unset for x in set_limits_from_actions(figure, [wave()]) if x.reason_unset
+    }
     assert left == {
         ("spine", "rotation", 1): "locked, left so",
         ("spine", "location", 0): "locked, left so",
@@ -207,7 +211,7 @@ def test_locked_axes_and_connected_bones_are_left(figure):
 def test_actions_of_another_rig_are_refused(figure):
     other = bpy.data.actions.new("other")
     with pytest.raises(RigError, match=r"The actions \('other'\) move no bone of 'figure_rig'; choose actions of this"):
-        state_measured_limits(figure, [other])
+        set_limits_from_actions(figure, [other])
 
 
 def test_linked_rigs_are_refused_and_overrides_are_not(figure, tmp_path):
@@ -218,9 +222,9 @@ def test_linked_rigs_are_refused_and_overrides_are_not(figure, tmp_path):
     for linked_object in bpy.data.objects:
         bpy.context.scene.collection.objects.link(linked_object)
     with pytest.raises(RigError, match="'figure_rig' is linked and its limits belong to another file; set them there"):
-        state_measured_limits(find_rig(), [wave()])
+        set_limits_from_actions(find_rig(), [wave()])
     override = bpy.data.objects["figure_rig"].override_create(remap_local_usages=True)
-    state_measured_limits(SceneRig(bpy.data.objects["body"], override), [wave()])
+    set_limits_from_actions(SceneRig(bpy.data.objects["body"], override), [wave()])
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shot.blend"))
     (own,) = [o for o in bpy.data.objects if o.override_library is not None]

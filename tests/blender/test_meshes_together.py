@@ -6,7 +6,7 @@ import pytest
 
 from fdda_addon.evaluation import last_evaluation
 from fdda_addon.jobs import job
-from fdda_addon.scene.active_rig import rigs_together
+from fdda_addon.scene.active_rig import rigs_of_active_armature
 
 from .conftest import ELBOW, ELBOW_RIG
 from .scene_state import fresh_elbow
@@ -30,7 +30,7 @@ def two(tmp_path) -> tuple[bpy.types.Object, bpy.types.Object]:
 
 
 def test_recorded_trained_bound_switched_and_evaluated_in_one_go(two, tmp_path):
-    assert [rig.mesh_object for rig in rigs_together(bpy.context)] == list(two)
+    assert [rig.mesh_object for rig in rigs_of_active_armature(bpy.context)] == list(two)
     assert bpy.ops.fdda.record(all_meshes=True) == {"FINISHED"}
     assert two[1].fdda.settings.poses == 30, "the other takes over how the first is recorded"
     assert bpy.ops.fdda.train(all_meshes=True) == {"FINISHED"}
@@ -40,7 +40,7 @@ def test_recorded_trained_bound_switched_and_evaluated_in_one_go(two, tmp_path):
         bpy.ops.fdda.switch(mode=mode, all_meshes=True)
         assert [mesh_object.fdda.mode for mesh_object in two] == [mode, mode]
     bpy.ops.fdda.evaluate(source="RANDOM", poses=3, all_meshes=True)
-    assert all(last_evaluation.of(mesh_object).poses == 3 for mesh_object in two)
+    assert all(last_evaluation.get(mesh_object).poses == 3 for mesh_object in two)
     assert "of 'elbow.001'" in job.state_of("evaluate").outcome
     bpy.ops.fdda.switch(mode="RIG")
     assert [mesh_object.fdda.mode for mesh_object in two] == ["RIG", "FDDA"]
@@ -67,7 +67,7 @@ def test_one_button_for_all_meshes(two):
 
 def test_all_meshes_is_nothing_where_a_mesh_is_active(two):
     bpy.context.view_layer.objects.active = two[1]
-    assert rigs_together(bpy.context) == []
+    assert rigs_of_active_armature(bpy.context) == []
     two[1].fdda.settings.poses = 5
     assert bpy.ops.fdda.record(all_meshes=True) == {"FINISHED"}
     assert job.state_of("record").subject == two[1].session_uid

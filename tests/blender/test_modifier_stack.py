@@ -63,7 +63,7 @@ def test_a_deforming_stack_is_recorded_and_played(build, loose_model, tmp_path):
 def read_live(rig: SceneRig) -> tuple[str, ...]:
     """The live modifiers of a bound object."""
     with_rig, rig.mesh_object.fdda.mode = rig.mesh_object.fdda.mode, "RIG"
-    live = read_stack(rig.mesh_object).live
+    live = read_stack(rig.mesh_object).downstream
     rig.mesh_object.fdda.mode = with_rig
     return live
 
@@ -166,7 +166,7 @@ def test_the_modifier_that_plays_goes_before_one_that_is_pinned_to_the_end(loose
 def test_what_makes_vertices_in_time_after_the_rig_is_live(kind):
     rig = character(stacks.corrective_smooth)
     at(2, kind)(rig.mesh_object)
-    assert read_stack(rig.mesh_object).live == ("It",)
+    assert read_stack(rig.mesh_object).downstream == ("It",)
     assert check(rig).problems == ()
 
 
@@ -194,7 +194,7 @@ def test_geometry_nodes_are_sorted_by_what_they_do(kinds, expected, after):
     before = scene_state(rig)
     stack = read_stack(rig.mesh_object)
     assert stack.replaced == ("Armature", "Mush") + (("It",) if expected == "replaced" else ())
-    assert stack.live == (("It",) if expected == "live" else ()) + (("After",) if after else ())
+    assert stack.downstream == (("It",) if expected == "live" else ()) + (("After",) if after else ())
     assert_same_state(before, scene_state(rig))
 
 
@@ -203,7 +203,7 @@ def test_a_group_whose_geometry_leads_nowhere_leaves_no_vertices():
     nodes_at(1)(rig.mesh_object)
     group = rig.mesh_object.modifiers["It"].node_group
     group.links.clear()
-    assert read_stack(rig.mesh_object).live == ("It",)
+    assert read_stack(rig.mesh_object).downstream == ("It",)
 
 
 def test_an_attribute_that_is_the_position_moves_vertices():

@@ -35,7 +35,7 @@ def view():
 @pytest.fixture
 def evaluated_action(active):
     bpy.ops.fdda.evaluate()
-    yield last_evaluation.of(active)
+    yield last_evaluation.get(active)
     heat_map.clear_all()
 
 
@@ -45,7 +45,7 @@ def test_error_on_the_active_action(active, elbow):
     assert_same_state(before, scene_state(find_rig()))
     with model_disabled(active):
         expected = drain(evaluate_action(find_rig(), elbow.model, "elbow_wave"))
-    last = last_evaluation.of(active)
+    last = last_evaluation.get(active)
     np.testing.assert_allclose(last.errors["fdda"], expected.held_out.fdda, atol=1e-6)
     assert last.total["linear"].max == pytest.approx(error_statistics(expected.held_out.linear).max, rel=1e-3)
     assert (last.name, last.model, last.poses) == ("elbow_wave", "elbow", len(expected.held_out.fdda))
@@ -58,7 +58,7 @@ def test_error_on_random_poses(active, elbow):
     assert bpy.ops.fdda.evaluate(source="RANDOM", poses=7, seed=4) == {"FINISHED"}
     with model_disabled(active):
         expected = drain(evaluate(find_rig(), elbow.model, EvaluationSettings(7, 4)))
-    last = last_evaluation.of(active)
+    last = last_evaluation.get(active)
     np.testing.assert_allclose(last.errors["fdda"], expected.held_out.fdda, atol=1e-6)
     assert not last.name and last.seed == 4
 
@@ -70,7 +70,7 @@ def test_what_cannot_be_evaluated_says_why(active):
     for name in ("fit_range", "mark_worst", "jump_to_worst"):
         refused(getattr(bpy.ops.fdda, name), "Nothing was evaluated since Blender was started; evaluate first")
     refused(lambda: bpy.ops.fdda.paint(colors="ERRORS"), "'elbow' was not evaluated since Blender was started")
-    assert last_evaluation.of(active) is None and active.fdda.mode == "FDDA"
+    assert last_evaluation.get(active) is None and active.fdda.mode == "FDDA"
 
 
 def test_colours_are_those_of_the_report(active, evaluated_action, view):
@@ -145,7 +145,7 @@ def test_worst_frames_are_marked_and_jumped_to(active, evaluated_action):
 
 def test_the_worst_random_pose_is_set(active, view):
     bpy.ops.fdda.evaluate(source="RANDOM", poses=9)
-    last = last_evaluation.of(active)
+    last = last_evaluation.get(active)
     worst = int(last.errors["fdda"].max(axis=1).argmax())
     refused(bpy.ops.fdda.mark_worst, "Random poses have no frames to mark")
     pose(angle=0.0)
@@ -179,11 +179,11 @@ def test_report_is_opened_beside_the_model(active, elbow, monkeypatch):
 
 def test_an_evaluation_does_not_outlive_many_others(active):
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
-    assert last_evaluation.of(active) is not None
-    kept = last_evaluation._kept[active.session_uid]
-    for uid in range(-last_evaluation.MAX_KEPT, 0):
-        last_evaluation._kept[uid] = kept
+    assert last_evaluation.get(active) is not None
+    kept = last_evaluation._evaluations[active.session_uid]
+    for uid in range(-last_evaluation.MAX_STORED, 0):
+        last_evaluation._evaluations[uid] = kept
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
-    assert len(last_evaluation._kept) <= last_evaluation.MAX_KEPT and last_evaluation.of(active) is not None
-    for uid in range(-last_evaluation.MAX_KEPT, 0):
-        last_evaluation._kept.pop(uid, None)
+    assert len(last_evaluation._evaluations) <= last_evaluation.MAX_STORED and last_evaluation.get(active) is not None
+    for uid in range(-last_evaluation.MAX_STORED, 0):
+        last_evaluation._evaluations.pop(uid, None)

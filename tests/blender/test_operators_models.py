@@ -281,7 +281,7 @@ def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_pa
     bpy.context.view_layer.update()
     after = assert_plays(bound, path)
     np.testing.assert_allclose(after, 2 * before, atol=1e-5)
-    assert last_evaluation.of(bound) is None and len(bound.fdda.models) == 2
+    assert last_evaluation.get(bound) is None and len(bound.fdda.models) == 2
 
 
 def test_what_the_section_says_of_the_models(bound, elbow):

@@ -122,16 +122,16 @@ def test_switch_says_why_a_model_cannot_play(bound):
 def test_measure(bound):
     bpy.context.view_layer.objects.active = bound
     bound.fdda.mode = "LINEAR"
-    assert frame_times.of(bound) is None
+    assert frame_times.get(bound) is None
     assert bpy.ops.fdda.measure_model(frames=5) == {"FINISHED"}
-    times = frame_times.of(bound)
+    times = frame_times.get(bound)
     assert min(times.rig, times.linear, times.fdda, times.floor, times.inference) > 0
     assert times.constant_bytes == model_files.network_of(bound).info.constant_bytes > 0
     worth = times.rig > times.fdda
     assert times.sentence.startswith("FDDA is" if worth else "Not worth it here")
     assert bound.fdda.mode == "LINEAR" and bound.fdda.is_bound and bound.fdda.model == "//elbow.onnx"
     bpy.ops.fdda.unbind()
-    assert frame_times.of(bound) is None
+    assert frame_times.get(bound) is None
 
 
 def test_a_model_that_was_moved_is_found_again(elbow, tmp_path):

@@ -7,7 +7,7 @@ import bpy
 import pytest
 from mathutils import Vector
 
-from fdda_addon.poses.human_ranges import human_ranges, part_of
+from fdda_addon.poses.human_ranges import body_part_of, human_ranges
 from fdda_addon.poses.motion_range import DEFAULT, rotation_ranges
 from fdda_addon.scene.compatibility import is_selected, select_bone
 
@@ -120,10 +120,10 @@ def test_a_person(armature_object):
     ],
 )
 def test_names_of_parts(name, side):
-    ranges, found = part_of(name)
+    ranges, found = body_part_of(name)
     assert ranges is not None and found == side
 
 
 @pytest.mark.parametrize("name", ["tail", "skirt_01.L", "armor", "eye.L", "IK_target", "Bone.001"])
 def test_names_of_no_part(name):
-    assert part_of(name)[0] is None
+    assert body_part_of(name)[0] is None

@@ -19,7 +19,7 @@ from fdda_addon.properties.character import recording_folder
 from fdda_addon.properties.choices import recording_settings
 from fdda_addon.recording.plan import read_sampled_rig
 from fdda_addon.scene.compatibility import curves_of
-from fdda_addon.scene.control_names import resting_value, suggested_controls
+from fdda_addon.scene.control_names import control_default, suggested_controls
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 DEFORMING = ("upper", "lower")
@@ -299,7 +299,7 @@ class TestControls:
         arm.armature_object["on"] = True
         arm.armature_object.pose.bones["fk_upper"]["follow"] = 3
         bone = 'armature_object/pose.bones["fk_upper"]'
-        assert resting_value(arm, IK) == 0.25
-        assert resting_value(arm, 'armature_object/["on"]') == 0
-        assert resting_value(arm, f"{bone}.scale[1]") == 1 and resting_value(arm, f"{bone}.location[1]") == 0
-        assert resting_value(arm, f'{bone}["follow"]') == 0
+        assert control_default(arm, IK) == 0.25
+        assert control_default(arm, 'armature_object/["on"]') == 0
+        assert control_default(arm, f"{bone}.scale[1]") == 1 and control_default(arm, f"{bone}.location[1]") == 0
+        assert control_default(arm, f'{bone}["follow"]') == 0

@@ -10,7 +10,7 @@ from fdda_addon.core.errors import ModelError
 from fdda_addon.operators import playback
 from fdda_addon.properties import character
 from fdda_addon.runtime import model_files, packed_model
-from fdda_addon.scene import model_trust
+from fdda_addon.scene import folder_trust
 
 from .. import systems
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose, run
@@ -100,10 +100,10 @@ def test_a_trusted_folder_is_followed_and_no_other(bound, elbow, model, tmp_path
     model_files._chosen_paths.clear()
     with pytest.raises(ModelError, match="or trust its folder in the preferences"):
         model_files.model_path(bound)
-    monkeypatch.setattr(model_trust, "trusted_folders", lambda: [(tmp_path / "other").resolve()])
+    monkeypatch.setattr(folder_trust, "trusted_folders", lambda: [(tmp_path / "other").resolve()])
     with pytest.raises(ModelError, match="is not followed"):
         model_files.model_path(bound)
-    monkeypatch.setattr(model_trust, "trusted_folders", lambda: [tmp_path.resolve()])
+    monkeypatch.setattr(folder_trust, "trusted_folders", lambda: [tmp_path.resolve()])
     assert model_files.model_path(bound) == model_files.Path(model)
 
 
@@ -112,16 +112,16 @@ def test_a_link_out_of_a_trusted_folder_is_not_followed(elbow, tmp_path, monkeyp
     trusted = tmp_path / "trusted"
     trusted.mkdir()
     (trusted / "way_out.onnx").symlink_to(elbow.model)
-    monkeypatch.setattr(model_trust, "trusted_folders", lambda: [trusted.resolve()])
-    assert not model_trust.is_trusted(trusted / "way_out.onnx")
-    assert not model_trust.is_trusted(trusted / ".." / "m.onnx") and model_trust.is_trusted(trusted / "m.onnx")
+    monkeypatch.setattr(folder_trust, "trusted_folders", lambda: [trusted.resolve()])
+    assert not folder_trust.is_trusted(trusted / "way_out.onnx")
+    assert not folder_trust.is_trusted(trusted / ".." / "m.onnx") and folder_trust.is_trusted(trusted / "m.onnx")
 
 
 @pytest.fixture
 def followed(rig, model, tmp_path, monkeypatch):
     """The elbow in a saved file, bound to a model that stays in a trusted folder; a recording is named as well."""
     monkeypatch.setattr(playback, "packs_models", lambda: False)
-    monkeypatch.setattr(model_trust, "trusted_folders", lambda: [tmp_path.resolve()])
+    monkeypatch.setattr(folder_trust, "trusted_folders", lambda: [tmp_path.resolve()])
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "first.blend"))
     bpy.ops.fdda.bind(filepath=str(model))
     settings = bpy.data.objects[ELBOW].fdda.settings

@@ -11,9 +11,9 @@ from mathutils import Euler, Quaternion
 from fdda_addon.core.poses import CONTROL, ROTATION_VECTOR, Channel, sample_pose
 from fdda_addon.panels.poses import _sampled_text
 from fdda_addon.poses.action_range import measured_ranges
-from fdda_addon.poses.choice import choose_bones
-from fdda_addon.poses.measured_limits import WIDE_NOTE, limit_lines, state_measured_limits
-from fdda_addon.poses.sampling import chosen_channels, sampled_channels, states_channels
+from fdda_addon.poses.measured_limits import WIDE_NOTE, describe_limits, set_limits_from_actions
+from fdda_addon.poses.sample_selection import select_bones
+from fdda_addon.poses.sampling import rig_states_channels, sampled_channels, selected_channels
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene.armature import Poser
 from fdda_addon.scene.compatibility import curves_of
@@ -31,7 +31,7 @@ def figure() -> SceneRig:
 
 def sampled(rig: SceneRig, *texts: str) -> tuple[Channel, ...]:
     texts = texts or tuple(f"action:{action.name}" for action in bpy.data.actions)
-    return chosen_channels(rig.armature_object, choose_bones(rig, texts))
+    return selected_channels(rig.armature_object, select_bones(rig, texts))
 
 
 def ranges(channels: tuple[Channel, ...], bone: str) -> dict:
@@ -62,9 +62,9 @@ def test_limits_narrow_what_an_action_keys_and_add_nothing(figure):
         ("location", 0): pytest.approx((0, 0.01)),
         ("location", 1): pytest.approx((0, 0.05), abs=1e-3),
     }
-    assert states_channels(figure, channels), "poses can be added to such a recording"
+    assert rig_states_channels(figure, channels), "poses can be added to such a recording"
     spine.constraints["Limit Rotation"].max_y = 0.2
-    assert not states_channels(figure, channels)
+    assert not rig_states_channels(figure, channels)
     # Whoever is chosen by name too moves in all of its limits.
     both = ranges(sampled(figure, "bone:spine", f"action:{WAVE}"), "spine")
     assert both["scale", 0] == (0, 2) and both["rotation", 0] == (-1.5, 1.5)
@@ -76,7 +76,7 @@ def test_what_is_muted_in_an_action_is_not_sampled(figure):
     curves['pose.bones["spine"].rotation_euler', 1].mute = True
     curves['pose.bones["arm.L"]["fist"]', 0].mute = True
     assert ("rotation", 1) not in ranges(sampled(figure), "spine")
-    assert choose_bones(figure, [f"action:{WAVE}"]).controls == ()
+    assert select_bones(figure, [f"action:{WAVE}"]).controls == ()
 
 
 def test_what_stands_still_beside_the_rest_pose_stays_there(figure):
@@ -85,8 +85,8 @@ def test_what_stands_still_beside_the_rest_pose_stays_there(figure):
     for frame, turn in ((1, -0.2), (9, 0.2)):
         key(spine, frame, "rotation_euler", (0.75, turn, 0))
         key(spine, frame, "location", (0, 0.5, 0))
-    limits = state_measured_limits(figure, bpy.data.actions, 0.0)
-    assert limit_lines(figure.armature_object, limits) == [
+    limits = set_limits_from_actions(figure, bpy.data.actions, 0.0)
+    assert describe_limits(figure.armature_object, limits) == [
         "spine: turns X 43.0 to 43.0° (stands still away from rest, has no range), turns Y -11.5 to 11.5°"
     ]
     channels = sampled(figure)
@@ -108,7 +108,7 @@ def test_a_number_that_an_action_keys_at_one_value_has_it(figure):
             arm.keyframe_insert(f'["{name}"]', frame=frame)
     figure.armature_object.animation_data.action = None
     arm["switch"] = 0.0
-    channels = sampled_channels(figure, read_rig(figure), choose_bones(figure, [f"action:{WAVE}"]))
+    channels = sampled_channels(figure, read_rig(figure), select_bones(figure, [f"action:{WAVE}"]))
     found = {c.name.partition("/")[2]: (c.low, c.high) for c in channels if c.kind == CONTROL}
     assert found.keys() == {f'pose.bones["{ARM}"]["switch"]', f'pose.bones["{ARM}"]["fist"]'}
     assert found[f'pose.bones["{ARM}"]["switch"]'] == (1, 1)
@@ -151,7 +151,7 @@ def test_random_poses_are_near_what_actions_do(figure, motion, mode):
         drawn[-1] = drawn[-1].copy()
     apart = 2 * np.arccos(np.clip(np.abs(np.array(drawn) @ keyed.T).max(axis=1), 0, 1))
     assert np.degrees(apart.max()) < 20
-    wide = [line for line in limit_lines(figure.armature_object, state_measured_limits(figure, bpy.data.actions))]
+    wide = [line for line in describe_limits(figure.armature_object, set_limits_from_actions(figure, bpy.data.actions))]
     assert [WIDE_NOTE in line for line in wide] == [motion == "gimbal lock"]
 
 

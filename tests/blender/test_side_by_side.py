@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.evaluation import side_by_side
-from fdda_addon.scene.active_rig import rigs_together
+from fdda_addon.scene.active_rig import rigs_of_active_armature
 from fdda_addon.scene.comparison import comparisons, hidden_comparisons, is_comparison
 from fdda_addon.scene.scene_rig import armature_of, find_rig, find_rigs
 
@@ -66,7 +66,7 @@ def test_overlay_is_the_rig_as_a_wireframe_where_it_is(active, elbow):
     pose(angle=0.8)
     np.testing.assert_allclose(world(other), rig_world(active), atol=1e-6)
     assert_plays(active, elbow.model)
-    assert other.display_type == "WIRE" and side_by_side.way_of(active) == "OVERLAY"
+    assert other.display_type == "WIRE" and side_by_side.display_mode(active) == "OVERLAY"
     assert other.hide_select and other.hide_render and other.data == active.data and not other.fdda.is_bound
 
 
@@ -78,7 +78,7 @@ def test_off_leaves_nothing(active):
     for way in ("BESIDE", "OVERLAY", "NONE"):
         bpy.ops.fdda.compare(way=way)
     assert before == counts()
-    assert side_by_side.way_of(active) == "NONE" and not comparisons()
+    assert side_by_side.display_mode(active) == "NONE" and not comparisons()
     bpy.ops.fdda.compare(way="BESIDE")
     bpy.ops.fdda.unbind()
     assert not comparisons()
@@ -89,7 +89,7 @@ def test_it_is_no_character(active):
     bpy.ops.fdda.compare(way="BESIDE")
     assert find_rig().mesh_object == active and [rig.mesh_object for rig in find_rigs()] == [active]
     bpy.context.view_layer.objects.active = armature_of(active)
-    assert rigs_together(bpy.context) == []
+    assert rigs_of_active_armature(bpy.context) == []
 
 
 def test_no_file_has_it_and_it_stays_in_view(active, elbow, tmp_path):

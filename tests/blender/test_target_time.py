@@ -16,7 +16,7 @@ from blend_fixtures.elbow import ACTION, FRAMES
 from fdda_addon.core.recording.reader import open_recording, read_recording
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
-from fdda_addon.rig.target_time import APPROACH, TargetSettings
+from fdda_addon.rig.pose_setter import APPROACH_FRAMES, TargetSettings
 from fdda_addon.scene.compatibility import animation_curves
 from fdda_addon.scene.scene_rig import find_rig
 
@@ -257,7 +257,7 @@ def test_frames_of_an_action_are_repeated_on_the_way_back(options, tmp_path):
     rig = built(lags, tmp_path / "rig.blend")
     recording = of_flesh(rig, tmp_path / "recording", *options, "--repeatability-poses", 5)
     repeatability = recording.info.repeatability
-    turn = max(repeatability.poses) + APPROACH
+    turn = max(repeatability.poses) + APPROACH_FRAMES
     both = of_flesh(
         built(there_and_back, tmp_path / "both.blend"), tmp_path / "both", *options, "--repeatability-poses", 0
     )

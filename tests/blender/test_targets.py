@@ -351,5 +351,5 @@ def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
     bind(find_rig("elbow"), model)
     bpy.context.view_layer.objects.active = mesh_object
     assert bpy.ops.fdda.evaluate(source="ACTION", action=ACTION) == {"FINISHED"}
-    linear = last_evaluation.of(mesh_object).total["linear"]
+    linear = last_evaluation.get(mesh_object).total["linear"]
     assert linear.mean > 0.5  # The rig itself is its linear skinning.

@@ -14,7 +14,7 @@ from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.rig_check import check
 from fdda_addon.recording.run import record
 from fdda_addon.rig import time_inputs
-from fdda_addon.rig.target_time import TargetSettings
+from fdda_addon.rig.pose_setter import TargetSettings
 from fdda_addon.scene.controls import ControlReader
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 

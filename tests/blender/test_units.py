@@ -163,7 +163,7 @@ def test_the_heat_map_shows_millimetres(characters, name):
     bpy.ops.wm.open_mainfile(filepath=str(character.rig))
     rig = find_rig()
     *_, evaluation = evaluate(rig, character.model, EvaluationSettings(poses=4, surface=False))
-    last = last_evaluation.keep(rig.mesh_object, evaluation, character.model.name)
+    last = last_evaluation.store(rig.mesh_object, evaluation, character.model.name)
     assert last.worst(1)[0][1] == pytest.approx(last.total["fdda"].max, rel=1e-5)
     assert 0.05 < last.total["fdda"].max < 50
     heat_map.paint_errors(rig.mesh_object)

@@ -171,7 +171,7 @@ def trust_a_folder(folder: Path) -> Iterator[float]:
     ):
         bpy.ops.file.execute()
     yield from until(lambda: len(preferences.folders) == 1, 5, "no folder is trusted")
-    check(part("scene.model_trust").is_trusted(trusted / "arm.onnx"), "a model in it is not trusted")
+    check(part("scene.folder_trust").is_trusted(trusted / "arm.onnx"), "a model in it is not trusted")
     area = next(a for a in main_screen().areas if a.type == "PREFERENCES")
     yield from redraw()
     yield from picture(folder / "trusted.png")

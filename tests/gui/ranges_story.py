@@ -92,7 +92,7 @@ def mirror_and_copy_ranges(folder: Path) -> Iterator[float]:
     ranges = part("poses.motion_range")
     for axis in range(3):
         left.lock_rotation[axis] = right.lock_rotation[axis] = False
-    ranges.state_rotation_range(left, 0, -0.25, 0.5)
+    ranges.set_rotation_range(left, 0, -0.25, 0.5)
     for bone in bones:
         compatibility.select_bone(bone, bone == left)
     session.joint_index = bones.find(left.name)

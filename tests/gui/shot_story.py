@@ -126,7 +126,7 @@ def show_the_rig_over_it(folder: Path) -> Iterator[float]:
     side = part("evaluation.side_by_side")
     bpy.context.scene.frame_set(FRAME)
     yield from sidebar.push("fdda.compare(way='OVERLAY')", across=0.85)
-    yield from until(lambda: side.way_of(arm()) == "OVERLAY", 5, "the button shows no overlay")
+    yield from until(lambda: side.display_mode(arm()) == "OVERLAY", 5, "the button shows no overlay")
     look_at(arm())
     yield 0.5
     yield from picture(folder / "overlay.png")
@@ -181,7 +181,7 @@ def click_a_bone_for_its_partition(folder: Path) -> Iterator[float]:
     )
     yield from redraw()
     yield from picture(folder / "partition_of_bone.png")
-    rig = part("scene.active_rig").shown_rig(bpy.context)
+    rig = part("scene.active_rig").cached_active_rig(bpy.context)
     shown = part("panels.evaluation").active_bone_name(bpy.context, rig)
     check(shown == "elbow", f"the table has '{shown}' on top")
     with over("WINDOW"):

@@ -17,13 +17,13 @@ from ..poses.clip_player import ClipPlayer
 from ..scene.arrays import POSE_CHANNELS, write
 from ..scene.scene_rig import SceneRig
 from ..scene.unit import metres_per_unit
-from .target import Target, borrowed_range, check_clips, find_target
+from .target import Target, check_clips, find_target, temporary_frame_range
 
-APPROACH = 10
+APPROACH_FRAMES = 10
 """Frames in which a pose is approached that is held afterwards."""
-AGAIN = 100
+MAX_REVERSED_FRAMES = 100
 """Frames of a clip beyond so many are not shown from the other side: all that are before them are played twice."""
-QUIET = 3
+REST_FRAMES = 3
 """So many frames in a row no vertex may move: what swings stands still for one at each turn."""
 
 
@@ -47,7 +47,7 @@ class TargetSettings:
     repeatability_poses: int = REPEATABILITY_POSES
 
 
-OWN_SURFACE = TargetSettings()
+NO_TARGET = TargetSettings()
 """No target: the rig is evaluated itself."""
 
 
@@ -92,9 +92,9 @@ class Settler:
         self.last: RestState | None = None
 
     @contextmanager
-    def borrowed(self) -> Iterator[None]:
+    def prepared(self) -> Iterator[None]:
         """Let the simulations of the target last for as long as it takes; poses are settled inside."""
-        with borrowed_range(self._target, self._first, self._first + 2 * APPROACH + self.frames):
+        with temporary_frame_range(self._target, self._first, self._first + 2 * APPROACH_FRAMES + self.frames):
             yield
 
     def settle(self, pose: Callable[[float], None], over: Callable[[float], None] | None = None) -> RestState:
@@ -105,21 +105,25 @@ class Settler:
             over: the same of another pose, which is passed through on the way.
         """
         start, scene, frame = time.perf_counter(), bpy.context.scene, self._first
-        self._target.forget()
-        ways = [(over, range(APPROACH + 1)), (pose, range(1, APPROACH + 1))] if over else [(pose, range(APPROACH + 1))]
+        self._target.restart_simulations()
+        ways = (
+            [(over, range(APPROACH_FRAMES + 1)), (pose, range(1, APPROACH_FRAMES + 1))]
+            if over
+            else [(pose, range(APPROACH_FRAMES + 1))]
+        )
         for way, steps in ways:
             for step in steps:
-                way(step / APPROACH)
+                way(step / APPROACH_FRAMES)
                 scene.frame_set(frame)
                 frame += 1
         before, quiet, held, speed = self._positions(), 0, 0, 0.0
-        while held < self.frames and quiet < QUIET:
+        while held < self.frames and quiet < REST_FRAMES:
             scene.frame_set(frame + held)
             now = self._positions()
             speed = float(np.sqrt(np.einsum("vc,vc->v", now - before, now - before).max())) * self._mm_per_unit
             before, held = now, held + 1
             quiet = quiet + 1 if speed <= self.rest_threshold_mm else 0
-        self.last = RestState(held, speed, quiet >= QUIET, time.perf_counter() - start)
+        self.last = RestState(held, speed, quiet >= REST_FRAMES, time.perf_counter() - start)
         return self.last
 
     def _positions(self) -> np.ndarray:
@@ -153,12 +157,12 @@ def show_frames(
                 yield number
 
 
-def shown_again(clip: Clip) -> range:
+def reversible_frames(clip: Clip) -> range:
     """Numbers of the frames of a clip that can be shown from the other side: there are some to come back from."""
-    return range(min(len(clip.frames) - APPROACH, AGAIN))
+    return range(min(len(clip.frames) - APPROACH_FRAMES, MAX_REVERSED_FRAMES))
 
 
-def show_frames_again(
+def show_frames_reversed(
     player: ClipPlayer, clip: Clip, wanted: Collection[int], target: Target, pre_roll: int = 0
 ) -> Iterator[int]:
     """Show frames of a clip from the other side: it is played past the last, and back to the first, as time goes on.
@@ -166,14 +170,14 @@ def show_frames_again(
     Args:
         player: plays the clip.
         clip: the clip.
-        wanted: numbers of the frames that are yielded, at least one, each of `shown_again`.
+        wanted: numbers of the frames that are yielded, at least one, each of `reversible_frames`.
         target: a simulation.
         pre_roll: as in `show_frames`.
 
     Yields:
         Their numbers in the clip, the last one first.
     """
-    turn = max(wanted) + APPROACH
+    turn = max(wanted) + APPROACH_FRAMES
     with _begun(player, clip, target, pre_roll, beyond=turn):
         ways = []
         for frame in clip.frames[: turn + 1]:
@@ -189,11 +193,11 @@ def show_frames_again(
 def _begun(player: ClipPlayer, clip: Clip, target: Target, pre_roll: int, beyond: int = 0) -> Iterator[None]:
     """A simulation is at the frame before the first of a clip, and goes on until so many frames beyond its last."""
     first, last = (clip.frames[0] - pre_roll if pre_roll else None), clip.frames[-1] + beyond
-    with borrowed_range(target, first, last) if pre_roll or beyond else nullcontext():
+    with temporary_frame_range(target, first, last) if pre_roll or beyond else nullcontext():
         if pre_roll:
             _roll_in(target, player, clip, first)
         else:
-            target.forget()
+            target.restart_simulations()
             for frame in range(target.first_frame, clip.frames[0]):
                 player.show(clip, frame)
         yield
@@ -207,7 +211,7 @@ def _roll_in(target: Target, player: ClipPlayer, clip: Clip, first: int) -> None
     goal = player.shown.channels
     player.stop()
     rest = player.shown.channels
-    target.forget()
+    target.restart_simulations()
     for frame in range(first, clip.frames[0]):
         part = (frame - first) / (clip.frames[0] - first)
         for channel, start, end in zip(POSE_CHANNELS, rest, goal, strict=True):
@@ -223,7 +227,9 @@ def _between(name: str, start: np.ndarray, end: np.ndarray, part: np.float32) ->
     return start + part * (end - start)
 
 
-def way(set_values: Callable[[np.ndarray], None], rest: np.ndarray, values: np.ndarray) -> Callable[[float], None]:
+def blend_from_rest(
+    set_values: Callable[[np.ndarray], None], rest: np.ndarray, values: np.ndarray
+) -> Callable[[float], None]:
     """Sets what part of the way from values (C,) of the rest pose to those of a pose is done, 0 to 1."""
 
     def pose(part: float) -> None:
@@ -232,7 +238,7 @@ def way(set_values: Callable[[np.ndarray], None], rest: np.ndarray, values: np.n
     return pose
 
 
-class Approach:
+class PoseSetter:
     """How a rig, or a target, is brought to poses.
 
     Attributes:
@@ -257,28 +263,28 @@ class Approach:
         return RecordedTarget(self.target.name, self.target.follows, self._pre_roll, *held)
 
     @contextmanager
-    def borrowed(self) -> Iterator[None]:
+    def prepared(self) -> Iterator[None]:
         """Random poses are reached inside."""
-        with self.settler.borrowed() if self.settler else nullcontext():
+        with self.settler.prepared() if self.settler else nullcontext():
             yield
 
-    def reach(self, pose: Callable[[float], None]) -> None:
+    def set_pose(self, pose: Callable[[float], None]) -> None:
         """Bring it to a random pose; `pose` sets what part of the way from the rest pose is done, 0 to 1."""
         if self.settler:
             self.settler.settle(pose)
         else:
             pose(1)
 
-    def frames(self, player: ClipPlayer, clip: Clip, wanted: Container[int]) -> Iterator[int]:
+    def show_frames(self, player: ClipPlayer, clip: Clip, wanted: Container[int]) -> Iterator[int]:
         """As `show_frames`."""
         yield from show_frames(player, clip, wanted, self.target, self._pre_roll)
 
-    def frames_again(self, player: ClipPlayer, clip: Clip, wanted: Collection[int]) -> Iterator[int]:
-        """As `show_frames_again`."""
-        yield from show_frames_again(player, clip, wanted, self.target, self._pre_roll)
+    def show_frames_reversed(self, player: ClipPlayer, clip: Clip, wanted: Collection[int]) -> Iterator[int]:
+        """As `show_frames_reversed`."""
+        yield from show_frames_reversed(player, clip, wanted, self.target, self._pre_roll)
 
     @property
-    def has_ways(self) -> bool:
+    def depends_on_history(self) -> bool:
         """Whether what is shown may depend on the way to a pose, and not on the pose alone."""
         return self.target is not None and bool(self.target.simulations)
 
@@ -288,11 +294,11 @@ class Approach:
         return self.settler is None or self.settler.last is None or self.settler.last.is_at_rest
 
 
-DIRECT = Approach()
+DIRECT_POSE_SETTER = PoseSetter()
 """Of a rig, which follows from its pose at once."""
 
 
-def make_approach(scene_rig: SceneRig, settings: TargetSettings, clips: Sequence[Clip], random: int) -> Approach:
+def make_pose_setter(scene_rig: SceneRig, settings: TargetSettings, clips: Sequence[Clip], random: int) -> PoseSetter:
     """How poses are reached with these settings; all that can be refused is refused.
 
     Args:
@@ -309,7 +315,7 @@ def make_approach(scene_rig: SceneRig, settings: TargetSettings, clips: Sequence
             raise RigError(
                 "There is no target whose time a pre-roll or settling would change; give one, or none of both."
             )
-        return DIRECT
+        return DIRECT_POSE_SETTER
     target = find_target(scene_rig, settings.name)
     if random and target.follows == FRAMES:
         raise RigError(
@@ -332,7 +338,7 @@ def make_approach(scene_rig: SceneRig, settings: TargetSettings, clips: Sequence
     settler = (
         Settler(target, settings.max_settle_frames, settings.rest_threshold_mm) if settings.max_settle_frames else None
     )
-    return Approach(target, settings.pre_roll, settler)
+    return PoseSetter(target, settings.pre_roll, settler)
 
 
 def _why_not(target: Target) -> str:

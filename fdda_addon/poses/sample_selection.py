@@ -9,7 +9,7 @@ from ..core.errors import RigError
 from ..core.poses import Channel
 from ..scene.compatibility import is_selected
 from ..scene.scene_rig import SceneRig
-from .action_range import held_controls, keyed_ranges, measured_controls
+from .action_range import constant_controls, keyed_ranges, measured_controls
 from .clip import find_action
 
 SELECTED, COLLECTION, ACTION, BONE = "selected", "collection:", "action:", "bone:"
@@ -20,11 +20,11 @@ Measured = dict[tuple[str, str, int], tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class Choice:
+class SampleSelection:
     """What a user chose to sample.
 
     Attributes:
-        bones: names of the control bones; None for the bones of the rig as it stands (`own_channels`).
+        bones: names of the control bones; None for the bones of the rig as it stands (`default_channels`).
         measured: ranges of what actions key. Bones that are chosen by action move in these, as far as the rig's limits
             let them; other chosen bones do where the rig states no range.
         by_action: names of the bones that are chosen by action alone.
@@ -39,11 +39,11 @@ class Choice:
     held: tuple[Channel, ...] = ()
 
 
-OWN_BONES = Choice()
+DEFAULT_SELECTION = SampleSelection()
 """Nothing was chosen: the bones of the rig as it stands are sampled."""
 
 
-def choose_bones(scene_rig: SceneRig, texts: Iterable[str]) -> Choice:
+def select_bones(scene_rig: SceneRig, texts: Iterable[str]) -> SampleSelection:
     """Read what a user chose; the choice may be empty.
 
     Raises:
@@ -51,7 +51,7 @@ def choose_bones(scene_rig: SceneRig, texts: Iterable[str]) -> Choice:
     """
     texts = list(texts)
     if not texts:
-        return OWN_BONES
+        return DEFAULT_SELECTION
     chosen: set[str] = set()
     actions = []
     for text in texts:
@@ -61,8 +61,10 @@ def choose_bones(scene_rig: SceneRig, texts: Iterable[str]) -> Choice:
             chosen |= _bones_of(scene_rig, text)
     measured = keyed_ranges(scene_rig.armature_object, actions)
     keyed = {bone for bone, _, _ in measured}
-    controls, held = measured_controls(scene_rig, actions), held_controls(scene_rig, actions)
-    return Choice(frozenset(chosen | keyed), tuple(measured.items()), frozenset(keyed - chosen), controls, held)
+    controls, held = measured_controls(scene_rig, actions), constant_controls(scene_rig, actions)
+    return SampleSelection(
+        frozenset(chosen | keyed), tuple(measured.items()), frozenset(keyed - chosen), controls, held
+    )
 
 
 def _bones_of(scene_rig: SceneRig, text: str) -> set[str]:

@@ -11,7 +11,7 @@ from .compatibility import animation_curves, slot_of
 
 
 @contextmanager
-def borrowed_pose(
+def temporary_pose(
     armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action] = (), keep_animation: bool = False
 ) -> Iterator[None]:
     """Give back the pose of an armature, its animation and the current frame.
@@ -106,7 +106,7 @@ def set_value(owner: bpy.types.ID, path: str, value: object) -> None:
 
 
 @contextmanager
-def borrowed_attributes(owner: object, **values: object) -> Iterator[None]:
+def temporary_attributes(owner: object, **values: object) -> Iterator[None]:
     """Set attributes of an RNA struct and give the old values back."""
     old = {name: getattr(owner, name) for name in values}
     try:
@@ -119,7 +119,7 @@ def borrowed_attributes(owner: object, **values: object) -> Iterator[None]:
 
 
 @contextmanager
-def borrowed_visibility(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
+def temporary_visibility(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
     """Show objects that animation hides in some frames: Blender evaluates no pose of what it does not show.
 
     What is hidden in all frames stays hidden, and is evaluated when something that shows needs it.
@@ -130,8 +130,8 @@ def borrowed_visibility(objects: Iterable[bpy.types.Object]) -> Iterator[None]:
             curves = [curve for action in driving_actions(animation) for curve in animation_curves(action)]
             if hiding := [curve for curve in (*curves, *animation.drivers) if curve.data_path == "hide_viewport"]:
                 for curve in hiding:
-                    stack.enter_context(borrowed_attributes(curve, mute=True))
-                stack.enter_context(borrowed_attributes(scene_object, hide_viewport=False))
+                    stack.enter_context(temporary_attributes(curve, mute=True))
+                stack.enter_context(temporary_attributes(scene_object, hide_viewport=False))
         yield
 
 
