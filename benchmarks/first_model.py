@@ -68,7 +68,7 @@ def way() -> Iterator[float]:
     if not part("panels.poses").states_limits(part("scene.active_rig").cached_active_rig(bpy.context)):
         yield from sidebar.push("fdda.limits_preset(")
         yield 0.5
-    yield from sidebar.push("fdda.preview_pose(step=1)", across=0.54)
+    yield from sidebar.push("fdda.preview_pose", across=0.45)
     yield 0.5
     yield from picture(OUT / "3_pose.png")
     yield from sidebar.push("fdda.rest_pose", across=0.85)

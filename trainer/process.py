@@ -159,6 +159,6 @@ def missing_package(work: str, error: ModuleNotFoundError) -> TrainingError:
     package = str(error.name).partition(".")[0]
     return TrainingError(
         f"{work} needs the Python package '{package}', which {sys.executable} does not have; install torch, onnx, "
-        "onnxruntime, numpy, scipy and matplotlib there, create the trainer environment in the preferences of the "
+        "onnxruntime, numpy, scipy and matplotlib there, install the training environment in the preferences of the "
         "add-on, or set FDDA_TRAINER_PYTHON to a Python that has them."
     )

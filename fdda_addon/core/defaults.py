@@ -25,6 +25,8 @@ TOLERANCE_MM = 0.04
 EPOCHS = 200
 GOAL_MM = 0.0
 """What 99.9 % of the held-out vertices are to be within; 0 for no goal."""
+SUGGESTED_GOAL_MM = 0.5
+"""The goal that the sidebar suggests when a user turns it on."""
 
 EVALUATION_POSES, SIDEBAR_EVALUATION_POSES = 200, 100
 """Random poses that a model is compared on; fewer where a user waits for them."""

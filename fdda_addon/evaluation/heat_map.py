@@ -169,12 +169,12 @@ def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:
         return [], None
     paint = _painted[mesh_object.session_uid]
     if paint.kind == PARTITIONS:
-        return [f"{mesh_object.name}: {paint.partitions} partitions, a colour for each main joint"], None
+        return [f"{mesh_object.name}: {paint.partitions} body parts"], None
     last, view = last_evaluation.get(mesh_object), context.window_manager.fdda_view
     if last is None:
         return [], None
     errors = errors_of(mesh_object)
-    way = "linear skinning" if view.way == "linear" else "FDDA"
+    way = "skinning" if view.way == "linear" else "model"
     what = _what(last, view.statistic, context.scene.frame_current, view.pose)
     if errors is None:
         return [f"{mesh_object.name}, {way}: {what}"], None
@@ -185,7 +185,7 @@ def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:
 def _what(last: last_evaluation.LastEvaluation, statistic: str, frame: int, pose: int) -> str:
     if statistic != "pose":
         over = f"{last.poses} frames of {last.name}" if last.name else f"{last.poses} random poses"
-        return f"{'mean' if statistic == 'mean' else 'largest'} error over {over}"
+        return f"{'mean' if statistic == 'mean' else 'max'} error over {over}"
     if not last.name:
         return f"error in random pose {pose}"
     return f"error at frame {frame}" if last.pose_at(frame) is not None else f"frame {frame} was not compared"

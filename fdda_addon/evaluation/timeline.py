@@ -92,7 +92,7 @@ def _draw() -> None:
     blf.size(0, 11 * scale)
     blf.color(0, 1, 1, 1, 0.9)
     blf.position(0, 8 * scale, bottom + 3 * scale, 0)
-    blf.draw(0, f"FDDA: largest error by frame, up to {largest:.2f} mm")
+    blf.draw(0, f"FDDA: max error per frame, up to {largest:.2f} mm")
 
 
 def _batches(

@@ -24,12 +24,20 @@ CHARACTER, ENVIRONMENT = "character", "environment"
 Blender's, and goes on when its window is closed and another file is opened.
 """
 UNITS = {
-    "influences": "joint tests",
     "fit": "vertices fitted",
     "probes": "poses compared with the rig",
-    "starting": "the trainer starts and reads the recording",
+    "epochs": "training passes",
+    "repeats": "poses repeated",
+    "evaluation": "poses compared",
+    "benchmark": "measurements",
 }
 """What the stages of jobs count, where their names do not say it."""
+EARLY_STAGES = {
+    "influences": "Step 1 of 2: testing bones",
+    "starting": "Step 1 of 3: reading the recording",
+    "partitions prepared": "Step 2 of 3: preparing body parts",
+}
+"""How panels name the stages that another one follows."""
 
 
 @dataclass
@@ -92,14 +100,23 @@ class JobState:
     @property
     def sentence(self) -> str:
         """How far it is: "212 of 1,000 poses"."""
-        unit = UNITS.get(self.stage, self.stage)
+        stage, of_mesh, mesh = self.stage.partition(" of '")
+        unit = UNITS.get(stage, stage) + of_mesh + mesh
         if not self.stage:
             text = "Starting…"
+        elif stage in EARLY_STAGES:
+            count = f"{self.done:,} of {self.total:,}" if self.total else f"{self.done} s"
+            text = f"{EARLY_STAGES[stage]}{of_mesh}{mesh} ({count})"
         elif not self.total:
             text = f"{unit[:1].upper()}{unit[1:]}: {self.done} s"
         else:
             text = f"{self.done:,} of {self.total:,} {unit}"
         return f"{self.part}: {text}" if self.part else text
+
+    @property
+    def is_finishing(self) -> bool:
+        """Whether all of the last stage is done."""
+        return 0 < self.total == self.done and self.stage.partition(" of '")[0] not in EARLY_STAGES
 
     def begin_part(self, name: str) -> None:
         """Note that the work on another of several objects begins."""

@@ -13,27 +13,27 @@ from .playback import OnModel
 
 class FDDA_OT_bake(OnModel, ConfirmFirst, bpy.types.Operator):
     bl_idname = "fdda.bake"
-    bl_label = "Bake…"
+    bl_label = "Bake"
     bl_description = (
-        "Write what the bound model shows, frame by frame, into a file that plays without the add-on: a .pc2 point "
-        "cache, or a copy of this .blend file"
+        "Write the mesh as the model deforms it to a file that plays without the add-on: a .pc2 point cache, or a copy "
+        "of this .blend file"
     )
     bl_options = {"REGISTER"}
     verb, title = "bake", "Bake"
 
     filepath: bpy.props.StringProperty(
-        name="File", description="Where to write, a .pc2 or a .blend file", subtype="FILE_PATH", options={"SKIP_SAVE"}
+        name="File", description="File to write, .pc2 or .blend", subtype="FILE_PATH", options={"SKIP_SAVE"}
     )
     filter_glob: bpy.props.StringProperty(default="*.pc2;*.blend", options={"HIDDEN"})
     check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
     action: bpy.props.StringProperty(
         name="Action",
-        description="Name of the action; empty for the frames of the scene as it is animated",
+        description="Action to bake. Empty for the animation of the scene",
         options={"SKIP_SAVE"},
     )
     shape_keys: bpy.props.BoolProperty(
         name="Shape Keys",
-        description="Keep the positions in the .blend file, a shape key each frame, and not in a .pc2 file beside it",
+        description="Write one shape key per frame to the .blend file, instead of a .pc2 file next to it",
         options={"SKIP_SAVE"},
     )
 
@@ -78,7 +78,7 @@ class FDDA_OT_bake(OnModel, ConfirmFirst, bpy.types.Operator):
 
     def finish(self, _context: bpy.types.Context, result: object) -> str:
         names = " and ".join(path.name for path in result.files)
-        return f"{len(result.frames)} frames are in {names}."
+        return f"Baked {len(result.frames)} frames to {names}."
 
 
 CLASSES = (FDDA_OT_bake,)

@@ -15,13 +15,13 @@ from .training import TrainsModels
 
 class FDDA_OT_build_model(TrainsModels, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.build_model"
-    bl_label = "Prepare, Train, Bind"
+    bl_label = "Record, Train & Bind"
     bl_description = (
-        "Record with the settings below, train, and bind the model, one after the other; what is recorded already is "
-        "trained on. ESC cancels while it records, and Cancel always"
+        "Record with the settings below, train, and bind the model, one after the other. An existing recording is used "
+        "as it is. Press ESC or Cancel to stop"
     )
     bl_options = {"REGISTER"}
-    verb, title = "build_model", "Prepare, Train, Bind"
+    verb, title = "build_model", "Record, Train & Bind"
     ends_itself = True
 
     @classmethod
@@ -63,7 +63,7 @@ class FDDA_OT_build_model(TrainsModels, JobOperator, bpy.types.Operator):
 
     def cancelled(self, _context: bpy.types.Context) -> str:
         self.list_models()
-        return "Cancelled; what was recorded is kept, and the next time goes on from there."
+        return "Canceled. What was recorded is kept, and the next run continues from there."
 
 
 CLASSES = (FDDA_OT_build_model,)

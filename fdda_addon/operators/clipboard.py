@@ -13,12 +13,12 @@ _keys: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
 class FDDA_OT_copy_objects(bpy.types.Operator):
     bl_idname = "fdda.copy_objects"
     bl_label = "Copy Objects with Their Rigs"
-    bl_description = "Copy the selected objects to the clipboard, characters as their rigs whatever model plays on them"
+    bl_description = "Copy the selected objects to the clipboard, and restore the rigs of characters that play a model"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if context.mode != "OBJECT":
-            cls.poll_message_set("Objects are copied in object mode; leave this one")
+            cls.poll_message_set("Objects can only be copied in Object Mode")
             return False
         return bpy.ops.view3d.copybuffer.poll()
 

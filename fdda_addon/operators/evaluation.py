@@ -25,25 +25,27 @@ from .playback import OnModel
 class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.evaluate"
     bl_label = "Evaluate"
-    bl_description = "Compare the bound model with the rig, on the armature's action or on random poses"
+    bl_description = "Compare the bound model with the rig, on the action of the armature or on random poses"
     bl_options = {"REGISTER"}
     verb, title = "evaluate", "Evaluation"
 
     source: bpy.props.EnumProperty(
-        name="Compare on",
-        description="The poses on which the model is compared with the rig",
+        name="Compare On",
+        description="Poses to compare the model with the rig on",
         items=(
-            ("ACTION", "Action", "The frames of an action"),
-            ("RANDOM", "Random Poses", "Random poses inside the range of motion that no recording has"),
+            ("ACTION", "Action", "All frames of an action"),
+            ("RANDOM", "Random Poses", "New random poses within the limits, which are in no recording"),
         ),
     )
     action: bpy.props.StringProperty(
-        name="Action", description="Name of the action; empty for the armature's own", options={"SKIP_SAVE"}
+        name="Action",
+        description="Action to compare on. Empty for the active action of the armature",
+        options={"SKIP_SAVE"},
     )
     poses: bpy.props.IntProperty(
         name="Poses", description="Number of random poses", default=SIDEBAR_EVALUATION_POSES, min=1
     )
-    seed: bpy.props.IntProperty(name="Seed", description="Of the random poses", default=EVALUATION_SEED, min=0)
+    seed: bpy.props.IntProperty(name="Seed", description="Random seed of the poses", default=EVALUATION_SEED, min=0)
 
     execute = JobOperator.execute
 
@@ -95,8 +97,8 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
             target = mesh_object.fdda.settings.target
             true = f"'{target}'" if target else "the rig"
             sentences.append(
-                f"FDDA{of} is {fdda.mean:.2f} mm from {true} on average and {fdda.max:.1f} mm at most; "
-                f"linear skinning {linear.mean:.2f} and {linear.max:.1f} mm."
+                f"The model{of} is {fdda.mean:.2f} mm from {true} on average and {fdda.max:.1f} mm at most; "
+                f"skinning alone {linear.mean:.2f} and {linear.max:.1f} mm."
             )
         context.window_manager.fdda_view.pose = -1
         if self._action:
@@ -120,7 +122,7 @@ class OnEvaluation(OnModel):
         if not cls.is_free(context):
             return False
         if not any_mesh_object(context, last_evaluation.get):
-            cls.poll_message_set("Nothing was evaluated since Blender was started; evaluate first")
+            cls.poll_message_set("Nothing has been compared in this session; press Evaluate first")
             return False
         return True
 
@@ -134,24 +136,24 @@ class OnEvaluation(OnModel):
         last = last_evaluation.get(scene_rig.mesh_object)
         if last is None:
             raise ModelError(
-                f"'{scene_rig.mesh_object.name}' was not evaluated since Blender was started; evaluate first."
+                f"'{scene_rig.mesh_object.name}' has not been compared in this session; press Evaluate first."
             )
         return scene_rig, last
 
 
 class FDDA_OT_paint(OnEvaluation, bpy.types.Operator):
     bl_idname = "fdda.paint"
-    bl_label = "Colour the Mesh"
-    bl_description = "Show the errors of the last evaluation, or the partitions, as colours in the viewport"
+    bl_label = "Color the Mesh"
+    bl_description = "Show errors or body parts as colors in the viewport"
     bl_options = {"REGISTER"}
 
     colors: bpy.props.EnumProperty(
-        name="Colours",
-        description="What the colours mean",
+        name="Colors",
+        description="Meaning of the colors",
         items=(
-            ("NONE", "None", "Show the mesh as Blender does"),
-            ("ERRORS", "Heat Map", "Show the errors of the last evaluation"),
-            ("PARTITIONS", "Partitions", "Show the partitions, a colour for each main joint"),
+            ("NONE", "None", "Show the mesh without colors"),
+            ("ERRORS", "Heat Map", "Show the errors of the last comparison"),
+            ("PARTITIONS", "Body Parts", "Show one color for each body part"),
         ),
         default="ERRORS",
     )
@@ -175,14 +177,13 @@ class FDDA_OT_paint(OnEvaluation, bpy.types.Operator):
         else:
             scene_rig = self.rig(context)
             heat_map.clear(scene_rig.mesh_object)
-        shown = {"ERRORS": "its errors", "PARTITIONS": "its partitions", "NONE": "no colours"}[self.colors]
-        return f"'{scene_rig.mesh_object.name}' shows {shown}."
+        return ""
 
 
 class FDDA_OT_fit_range(OnEvaluation, bpy.types.Operator):
     bl_idname = "fdda.fit_range"
     bl_label = "Fit Range"
-    bl_description = "Choose the range of the heat map so that the errors shown use all of its colours"
+    bl_description = "Fit the range of the heat map to the errors that are shown"
     bl_options = {"REGISTER"}
 
     @classmethod
@@ -195,16 +196,16 @@ class FDDA_OT_fit_range(OnEvaluation, bpy.types.Operator):
         scene_rig, _ = self.last(context)
         fitting = heat_map.fitting_range_mm(scene_rig.mesh_object)
         if not fitting:
-            raise ModelError("No errors are shown that a range could fit; choose another frame, or show the mean.")
+            raise ModelError("No errors are shown to fit the range to; choose another frame, or show the mean.")
         view = context.window_manager.fdda_view
         view.range_mm = fitting
-        return f"Red begins at {view.range_mm:.3g} mm."
+        return f"Max color: {view.range_mm:.3g} mm."
 
 
 class FDDA_OT_open_report(OnModel, bpy.types.Operator):
     bl_idname = "fdda.open_report"
-    bl_label = "Open Report"
-    bl_description = f"Open the page {REPORT_HTML} that the training wrote beside the model, in the web browser"
+    bl_label = "Open Training Report"
+    bl_description = f"Open {REPORT_HTML}, which the training wrote next to the model, in the web browser"
     bl_options = {"REGISTER"}
 
     @classmethod
@@ -214,12 +215,12 @@ class FDDA_OT_open_report(OnModel, bpy.types.Operator):
     def work(self, context: bpy.types.Context) -> str:
         path = self._page(self.bound_rig(context).mesh_object)
         if not path.is_file():
-            raise ModelError(f"There is no report '{path}'; it lies beside the model that was trained, or train again.")
+            raise ModelError(f"There is no report '{path}'; move it next to the model, or train again.")
         try:
             bpy.ops.wm.url_open(url=path.as_uri())
         except RuntimeError as error:
             raise ModelError(f"No web browser could be started; open '{path}' yourself.") from error
-        return f"{path} opens in the web browser."
+        return f"Opened {path} in the web browser."
 
     def _page(self, mesh_object: bpy.types.Object) -> Path:
         """Where the report of the bound model is."""
@@ -234,23 +235,23 @@ class FDDA_OT_open_report(OnModel, bpy.types.Operator):
 
 class FDDA_OT_compare(OnModel, bpy.types.Operator):
     bl_idname = "fdda.compare"
-    bl_label = "Side by Side"
-    bl_description = "Show the true rig together with what plays, beside it or over it as a wireframe"
+    bl_label = "Show the Rig"
+    bl_description = "Show the rig together with the model, next to it or over it as a wireframe"
     bl_options = {"REGISTER", "UNDO"}
 
     way: bpy.props.EnumProperty(
         name="Show the Rig",
-        description="Where the true rig is shown",
+        description="Where to show the rig",
         items=(
-            ("NONE", "Off", "What plays alone"),
-            ("BESIDE", "Beside", "The rig next to what plays, to its right as seen from the front"),
-            ("OVERLAY", "Overlay", "The rig as a wireframe over what plays"),
+            ("NONE", "Off", "Show the model only"),
+            ("BESIDE", "Beside", "Show the rig next to the model, on the right in front view"),
+            ("OVERLAY", "Overlay", "Show the rig as a wireframe over the model"),
         ),
         default="BESIDE",
     )
     distance: bpy.props.FloatProperty(
         name="Distance",
-        description="How far to the side along X; 0 for the width of the character and a little",
+        description="Distance along X. 0 for a little more than the width of the character",
         subtype="DISTANCE",
         options={"SKIP_SAVE"},
     )
@@ -273,8 +274,8 @@ class FDDA_OT_compare(OnModel, bpy.types.Operator):
 
 class FDDA_OT_show_bone(OnRig, bpy.types.Operator):
     bl_idname = "fdda.show_bone"
-    bl_label = "Show Bone"
-    bl_description = "Select this bone in pose mode; a bone that is clicked in the view has its partition on top here"
+    bl_label = "Select Bone"
+    bl_description = "Select this bone in Pose Mode"
     bl_options = {"REGISTER", "UNDO"}
 
     bone: bpy.props.StringProperty(name="Bone", description="Name of the bone", options={"SKIP_SAVE"})

@@ -20,7 +20,7 @@ class FDDA_OT_help(bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     section: bpy.props.StringProperty(
-        name="Section", description="Heading in the manual; empty for its beginning", options={"SKIP_SAVE"}
+        name="Section", description="Heading in the manual. Empty for its beginning", options={"SKIP_SAVE"}
     )
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
@@ -35,7 +35,7 @@ class FDDA_OT_help(bpy.types.Operator):
         except RuntimeError:
             self.report({"ERROR"}, f"No web browser could be started; open '{path}' yourself.")
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{address} opens in the web browser.")
+        self.report({"INFO"}, f"Opened {address} in the web browser.")
         return {"FINISHED"}
 
 

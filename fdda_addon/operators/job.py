@@ -63,7 +63,7 @@ class JobOperator:
 
     def cancelled(self, context: bpy.types.Context) -> str:
         """The sentence that is reported when the user has cancelled the job."""
-        return f"{self.title} cancelled."
+        return f"{self.title} canceled."
 
     def failed(self) -> None:
         """Do what remains when the job has ended with an error."""
@@ -208,13 +208,13 @@ def _is_harmless(context: bpy.types.Context, event: bpy.types.Event) -> bool:
 class FDDA_OT_cancel(bpy.types.Operator):
     bl_idname = "fdda.cancel"
     bl_label = "Cancel"
-    bl_description = "End the job that is under way; what it has kept stays"
+    bl_description = "Cancel the running job. What it has finished is kept"
     bl_options = {"INTERNAL"}
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
         if current() is None:
-            cls.poll_message_set("Nothing is under way")
+            cls.poll_message_set("No job is running")
         return current() is not None
 
     def execute(self, _context: bpy.types.Context) -> set[str]:

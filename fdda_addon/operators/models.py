@@ -18,7 +18,7 @@ class OnEntry(OnModel):
 
     index: bpy.props.IntProperty(
         name="Index",
-        description="Place in the list, from 0; -1 for the entry that is chosen",
+        description="Index of the model in the list. -1 for the active one",
         default=-1,
         min=-1,
         options={"SKIP_SAVE"},
@@ -30,7 +30,7 @@ class OnEntry(OnModel):
         if not cls.is_free(context):
             return False
         if not any_mesh_object(context, _has_models):
-            cls.poll_message_set("The list of models is empty; train one, or add a file")
+            cls.poll_message_set("The model library is empty; train a model, or add a file")
             return False
         return True
 
@@ -53,8 +53,8 @@ class OnEntry(OnModel):
 
 class FDDA_OT_add_model(OnModel, ChoosesModel, bpy.types.Operator):
     bl_idname = "fdda.add_model"
-    bl_label = "Add Model…"
-    bl_description = "Add a model's file to the list of this mesh; a model of another rig is refused"
+    bl_label = "Add Model"
+    bl_description = "Add a model file to the list of this mesh"
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
@@ -69,19 +69,17 @@ class FDDA_OT_add_model(OnModel, ChoosesModel, bpy.types.Operator):
 
         scene_rig = self.rig(context)
         if not self.filepath:
-            raise ModelError("No file was chosen; give the model's file.")
+            raise ModelError("No file was chosen; choose a model file.")
         model_list.check(scene_rig, self.path())
         model_list.adopt(scene_rig.mesh_object)
         entry = model_list.remember(scene_rig.mesh_object, self.path())
-        return f"{entry.name} is in the list of '{scene_rig.mesh_object.name}'; bind it to play it."
+        return f"Added {entry.name}; bind it to use it."
 
 
 class FDDA_OT_remove_model(OnEntry, bpy.types.Operator):
     bl_idname = "fdda.remove_model"
     bl_label = "Remove Model"
-    bl_description = (
-        "Take the model off the list, and unbind it if it is bound; its file stays, a packed model is deleted"
-    )
+    bl_description = "Remove the model from the list, and unbind it. Its file is kept; a packed model is deleted"
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
@@ -94,13 +92,13 @@ class FDDA_OT_remove_model(OnEntry, bpy.types.Operator):
         scene_rig, entry = self.entry(context)
         mesh_object = scene_rig.mesh_object
         name = model_list.forget_entry(mesh_object, list(mesh_object.fdda.models).index(entry))
-        return f"{name} is no longer in the list of '{mesh_object.name}'."
+        return f"Removed {name}."
 
 
 class FDDA_OT_pack_model(OnEntry, bpy.types.Operator):
     bl_idname = "fdda.pack_model"
     bl_label = "Pack Model"
-    bl_description = "Keep the model inside the .blend file, which then plays without any other file"
+    bl_description = "Store the model in the .blend file"
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
@@ -112,20 +110,20 @@ class FDDA_OT_pack_model(OnEntry, bpy.types.Operator):
 
         scene_rig, entry = self.entry(context)
         if entry.packed:
-            raise ModelError(f"{entry.name} is packed already.")
+            raise ModelError(f"{entry.name} is already packed.")
         size = model_list.pack_entry(scene_rig.mesh_object, entry)
-        return f"{entry.name} is inside the .blend file, {megabytes(size)}; save the file to keep it."
+        return f"Packed {entry.name}, {megabytes(size)}. Save the .blend file to keep it."
 
 
 class FDDA_OT_unpack_model(OnEntry, bpy.types.Operator):
     bl_idname = "fdda.unpack_model"
     bl_label = "Unpack Model"
-    bl_description = "Write the packed model to a file and remove it from the .blend file"
+    bl_description = "Write the packed model to a file, and remove it from the .blend file"
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(
         name="File",
-        description="Where to write it; empty for NAME.onnx beside the .blend file",
+        description="File to write. Empty for NAME.onnx next to the .blend file",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
@@ -143,17 +141,17 @@ class FDDA_OT_unpack_model(OnEntry, bpy.types.Operator):
         if not entry.packed:
             raise ModelError(f"{entry.name} is not packed.")
         if not self.filepath and not bpy.data.filepath:
-            raise ModelError("The .blend file has not been saved, so there is no place beside it; save it first.")
+            raise ModelError("Save the .blend file first: models are unpacked next to it.")
         name = bpy.path.clean_name(entry.name) + ".onnx"
         path = Path(bpy.path.abspath(self.filepath or f"//{name}"))
         model_list.unpack_entry(scene_rig.mesh_object, entry, path)
-        return f"{entry.name} is now the file {path}."
+        return f"Unpacked {entry.name} to {path}."
 
 
 class FDDA_OT_check_model(OnEntry, bpy.types.Operator):
     bl_idname = "fdda.check_model"
     bl_label = "Check Model"
-    bl_description = "Compare the rig with the one that the model was trained for, and say what has changed since"
+    bl_description = "Report what has changed in the rig since the model was trained"
     bl_options = {"REGISTER"}
 
     @classmethod
@@ -167,10 +165,7 @@ class FDDA_OT_check_model(OnEntry, bpy.types.Operator):
         found = changes_since(scene_rig, entry)
         if found.prevents:
             raise ModelError(found.sentence)
-        return (
-            found.sentence
-            or f"{entry.name} fits '{scene_rig.mesh_object.name}': nothing has changed since it was trained."
-        )
+        return found.sentence or f"{entry.name} matches '{scene_rig.mesh_object.name}'."
 
 
 CLASSES = (FDDA_OT_add_model, FDDA_OT_remove_model, FDDA_OT_pack_model, FDDA_OT_unpack_model, FDDA_OT_check_model)

@@ -18,7 +18,7 @@ class OnPose(OnRig):
             cls.poll_message_set(f"{job.title} is under way; wait for it or cancel it")
             return False
         if context.mode not in {"OBJECT", "POSE"}:
-            cls.poll_message_set("Only in object mode and pose mode")
+            cls.poll_message_set("Only available in Object Mode and Pose Mode")
             return False
         return cls.has_rig(context)
 

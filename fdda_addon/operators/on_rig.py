@@ -13,12 +13,12 @@ class OnRig:
 
     object: bpy.props.StringProperty(
         name="Object",
-        description="Name of the mesh object; empty for the active object",
+        description="Name of the mesh object. Empty for the active object",
         options={"SKIP_SAVE"},
     )
     all_meshes: bpy.props.BoolProperty(
         name="All Meshes",
-        description="Work on all meshes that follow the active armature, and not on one of them",
+        description="Apply to all meshes of the active armature",
         options={"SKIP_SAVE"},
     )
 

@@ -19,7 +19,7 @@ from .on_rig import OnRig
 
 LARGE_BYTES = 32_000_000
 """From this size on a model is not packed without being asked: every save writes it again."""
-MODE_NAMES = {"RIG": "the rig", "LINEAR": "linear skinning", "FDDA": "the model"}
+MODE_NAMES = {"RIG": "the rig", "LINEAR": "skinning alone", "FDDA": "the model"}
 
 
 def _is_bound(mesh_object: bpy.types.Object) -> bool:
@@ -89,7 +89,7 @@ class ChoosesModel:
     """Mixin for an operator that takes the path of a model, and asks for it when it is invoked without."""
 
     filepath: bpy.props.StringProperty(
-        name="Model", description="The model, an .onnx file", subtype="FILE_PATH", options={"SKIP_SAVE"}
+        name="Model", description="Model file, .onnx", subtype="FILE_PATH", options={"SKIP_SAVE"}
     )
     filter_glob: bpy.props.StringProperty(default="*.onnx", options={"HIDDEN"})
     check_existing: bpy.props.BoolProperty(default=False, options={"HIDDEN"})
@@ -159,7 +159,7 @@ def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGrou
         return ""
     size = model_list.entry_path(mesh_object, entry).stat().st_size
     if size > LARGE_BYTES and not pack_large:
-        return f" It has {megabytes(size)} and stays beside the .blend file; the section Models packs it."
+        return f" It is large ({megabytes(size)}) and was not packed; pack it in the Model Library."
     model_list.pack_entry(mesh_object, entry)
     return ""
 
@@ -167,20 +167,18 @@ def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGrou
 class FDDA_OT_bind(OnModel, ChoosesModel, bpy.types.Operator):
     bl_idname = "fdda.bind"
     bl_label = "Bind"
-    bl_description = (
-        "Let a model play in place of the rig's modifiers, the one that is chosen in the list unless a file is given"
-    )
+    bl_description = "Use a model instead of the rig's modifiers: the active one of the Model Library, or a file"
     bl_options = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(
         name="Model",
-        description="The model, an .onnx file; empty for the one chosen in the list",
+        description="Model file, .onnx. Empty for the active model of the list",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
     pack_large: bpy.props.BoolProperty(
         name="Pack into the .blend File",
-        description="Take the model into the .blend file although it is large",
+        description="Store the model in the .blend file although it is large",
         options={"SKIP_SAVE"},
     )
 
@@ -197,12 +195,12 @@ class FDDA_OT_bind(OnModel, ChoosesModel, bpy.types.Operator):
             return self.choose(context)
         self._size = self._outside_bytes(context)
         if self._size > LARGE_BYTES and packs_models() and context.window is not None:
-            return context.window_manager.invoke_props_dialog(self, title="A Large Model", confirm_text="Bind")
+            return context.window_manager.invoke_props_dialog(self, title="Large Model", confirm_text="Bind")
         return self.execute(context)
 
     def draw(self, _context: bpy.types.Context) -> None:
         if size := getattr(self, "_size", 0):
-            self.layout.label(text=f"The model has {megabytes(size)}, which every save of the file writes again.")
+            self.layout.label(text=f"The model has {megabytes(size)}. Packed, it is written with every save.")
             self.layout.prop(self, "pack_large")
 
     def _outside_bytes(self, context: bpy.types.Context) -> int:
@@ -225,7 +223,7 @@ class FDDA_OT_bind(OnModel, ChoosesModel, bpy.types.Operator):
 class FDDA_OT_unbind(OnModel, bpy.types.Operator):
     bl_idname = "fdda.unbind"
     bl_label = "Unbind"
-    bl_description = "Give the mesh back to its rig, with the modifiers as they were; the model stays in the list"
+    bl_description = "Restore the modifiers of the rig. The model stays in the Model Library"
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
@@ -243,23 +241,23 @@ class FDDA_OT_unbind(OnModel, bpy.types.Operator):
             names.append(bound_name(mesh_object))
             side_by_side.hide(mesh_object)
             unbind(mesh_object)
-        return f"The rig deforms again; {' and '.join(names)} {'is' if len(names) == 1 else 'are'} unbound."
+        return f"Unbound {' and '.join(names)}."
 
 
 class FDDA_OT_switch(OnModel, bpy.types.Operator):
     bl_idname = "fdda.switch"
     bl_label = "Switch Deformation"
-    bl_description = "Choose what deforms the mesh: the modifiers of the rig, linear skinning alone, or the model"
+    bl_description = "Deform the mesh with the modifiers of the rig, linear skinning alone, or the model"
     bl_options = {"REGISTER", "UNDO"}
 
     mode: bpy.props.EnumProperty(
         name="Mode",
         description="What deforms the mesh",
         items=(
-            ("NEXT", "Other", "The model if the rig is shown, else the rig"),
+            ("NEXT", "Toggle", "The model if the rig is shown, else the rig"),
             ("RIG", "Rig", "The modifiers of the rig"),
-            ("LINEAR", "Linear Layer", "Linear skinning alone"),
-            ("FDDA", "FDDA", "The model"),
+            ("LINEAR", "Skinning", "Linear skinning alone"),
+            ("FDDA", "Model", "The model"),
         ),
     )
 
@@ -283,8 +281,8 @@ class FDDA_OT_switch(OnModel, bpy.types.Operator):
 
 class FDDA_OT_relink(OnModel, ChoosesModel, bpy.types.Operator):
     bl_idname = "fdda.relink"
-    bl_label = "Find Model…"
-    bl_description = "Say where the file of the bound model is now, and play it"
+    bl_label = "Find Model"
+    bl_description = "Choose where the file of the bound model is now"
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
@@ -307,12 +305,14 @@ class FDDA_OT_relink(OnModel, ChoosesModel, bpy.types.Operator):
 
 class FDDA_OT_measure_model(OnModel, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.measure_model"
-    bl_label = "Measure"
-    bl_description = "Time a frame of the rig, of linear skinning and of the model, in turn"
+    bl_label = "Measure Speed of the Model"
+    bl_description = "Measure the time per frame of the rig, of linear skinning and of the model"
     bl_options = {"REGISTER"}
     verb, title = "measure_model", "Measurement"
 
-    frames: bpy.props.IntProperty(name="Frames", description="Frames to time, each way", default=50, min=5, max=10000)
+    frames: bpy.props.IntProperty(
+        name="Frames", description="Number of frames to measure", default=50, min=5, max=10000
+    )
 
     execute = JobOperator.execute
 
@@ -335,8 +335,8 @@ class FDDA_OT_measure_model(OnModel, JobOperator, bpy.types.Operator):
         times = result.frame_times(mesh_object.fdda.model)
         frame_times.store(mesh_object, times)
         return (
-            f"A frame of '{mesh_object.name}' takes {times.rig:.2f} ms with the rig and {times.fdda:.2f} ms with FDDA, "
-            f"of which Blender takes {times.floor:.2f}. {times.sentence}"
+            f"'{mesh_object.name}': {times.rig:.2f} ms per frame with the rig, {times.fdda:.2f} ms with the model "
+            f"({times.floor:.2f} ms of it in Blender). {times.sentence}"
         )
 
 

@@ -2,7 +2,6 @@
 """The poses: look at those that are recorded, and state the range of motion."""
 
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import bpy
@@ -18,51 +17,40 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 
 class FDDA_OT_preview_pose(OnPose, bpy.types.Operator):
     bl_idname = "fdda.preview_pose"
-    bl_label = "Show Random Pose"
-    bl_description = "Pose the rig as one of the random poses that are recorded"
+    bl_label = "Preview Random Pose"
+    bl_description = "Show one of the random poses that will be recorded"
     bl_options = {"REGISTER", "UNDO"}
 
     number: bpy.props.IntProperty(
-        name="Number",
-        description="Of the pose; -1 for the one that was shown last",
+        name="Index",
+        description="Index of the pose, from 0. -1 for the last one shown",
         default=-1,
         min=-1,
         options={"SKIP_SAVE"},
     )
-    step: bpy.props.IntProperty(
-        name="Step", description="Show the pose so many after the number", options={"SKIP_SAVE"}
-    )
+    step: bpy.props.IntProperty(name="Step", description="Number to add to the index", options={"SKIP_SAVE"})
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         if properties.step:
-            return f"Show the {'next' if properties.step > 0 else 'previous'} of the random poses that are recorded"
+            return f"Show the {'next' if properties.step > 0 else 'previous'} of the random poses that will be recorded"
         return cls.bl_description
 
     def change(self, context: bpy.types.Context) -> str:
-        from ..core.poses import sample_pose
-        from ..recording.plan import read_sampled_rig
-        from ..scene.armature import Poser, clear_pose
+        from ..recording.preview import show_random_pose
 
-        rig = self.rig(context)
-        settings, session = rig.mesh_object.fdda.settings, context.window_manager.fdda
-        wanted = recording_settings(rig)
-        _, channels = read_sampled_rig(rig, replace(wanted, poses=max(1, wanted.poses)))
-        start = self.number if self.number >= 0 else session.pose_number
-        number = max(0, start + self.step)
-        clear_pose(rig.armature_object)
-        Poser(rig, channels).set(sample_pose(channels, settings.seed, number, settings.spread))
-        rig.armature_object.update_tag(refresh={"DATA"})
-        session.pose_number = number
-        return f"Random pose {number} of seed {settings.seed}."
+        rig, session = self.rig(context), context.window_manager.fdda
+        start = self.number if self.number >= 0 else session.pose_index
+        index = max(0, start + self.step)
+        show_random_pose(rig, recording_settings(rig), index)
+        session.pose_index = index
+        return f"Random pose {index + 1}."
 
 
 class FDDA_OT_rest_pose(OnPose, bpy.types.Operator):
     bl_idname = "fdda.rest_pose"
     bl_label = "Rest Pose"
-    bl_description = (
-        "Bring every bone back to its rest pose, and every control that is sampled to where it does nothing"
-    )
+    bl_description = "Reset all bones to the rest pose, and all extra inputs of the random poses to their defaults"
     bl_options = {"REGISTER", "UNDO"}
 
     def change(self, context: bpy.types.Context) -> str:
@@ -115,10 +103,8 @@ class _OnRange(OnPose):
 
 class FDDA_OT_state_range(_OnRange, bpy.types.Operator):
     bl_idname = "fdda.state_range"
-    bl_label = "State Range"
-    bl_description = (
-        "Write this range of motion to the bone: as IK limits, or into its Limit Rotation constraint where it has one"
-    )
+    bl_label = "Set Limit"
+    bl_description = "Limit the rotation of the bone about this axis, in its Limit Rotation constraint or as IK limits"
     bl_options = {"REGISTER", "UNDO"}
 
     low: bpy.props.FloatProperty(
@@ -134,13 +120,13 @@ class FDDA_OT_state_range(_OnRange, bpy.types.Operator):
         bone = self.pose_bone(context)
         set_rotation_range(bone, self.axis_index, self.low, self.high)
         low, high = math.degrees(self.low), math.degrees(self.high)
-        return f"'{bone.name}' turns about {self.axis} from {low:.0f}° to {high:.0f}°."
+        return f"'{bone.name}' rotates about {self.axis} from {low:.0f}° to {high:.0f}°."
 
 
 class FDDA_OT_unstate_range(_OnRange, bpy.types.Operator):
     bl_idname = "fdda.unstate_range"
-    bl_label = "Forget Range"
-    bl_description = "Remove this range of motion from the bone; it then has the default of ±45°"
+    bl_label = "Clear Limit"
+    bl_description = "Remove the rotation limit of the bone about this axis. The default is ±45°"
     bl_options = {"REGISTER", "UNDO"}
 
     def change(self, context: bpy.types.Context) -> str:
@@ -148,21 +134,18 @@ class FDDA_OT_unstate_range(_OnRange, bpy.types.Operator):
 
         bone = self.pose_bone(context)
         clear_rotation_range(bone, self.axis_index)
-        return f"'{bone.name}' states no range about {self.axis} any more."
+        return f"Removed the limit of '{bone.name}' about {self.axis}."
 
 
 class FDDA_OT_limits_from_actions(OnPose, bpy.types.Operator):
     bl_idname = "fdda.limits_from_actions"
     bl_label = "Set Limits from Actions"
-    bl_description = (
-        "Make how far the ticked actions move each bone its range of motion. Posing stays free: what IK limits cannot "
-        "say goes into Limit constraints without influence"
-    )
+    bl_description = "Set each bone's limits to the motion in the checked actions. Bones can still be posed freely"
     bl_options = {"REGISTER", "UNDO"}
 
     margin: bpy.props.FloatProperty(
         name="Margin",
-        description="Part of the width of a range that is added at each end",
+        description="Part of each range to add at both ends",
         default=0.1,
         min=0.0,
         max=10.0,
@@ -174,15 +157,19 @@ class FDDA_OT_limits_from_actions(OnPose, bpy.types.Operator):
         rig = self.rig(context)
         names = recorded_actions(rig.armature_object)
         if not names:
-            raise RigError("No action is ticked; tick those of Actions to record as well that show how the rig moves.")
+            raise RigError(
+                "No action is checked; check the actions under Also Record Actions that show how the rig moves."
+            )
         limits = set_limits_from_actions(rig, [bpy.data.actions[name] for name in names], self.margin)
         stated = {limit.bone for limit in limits if not limit.reason_unset}
         left = [limit for limit in limits if limit.reason_unset]
-        others = f"; {len(left)} axes were left as they are ('{left[0].bone}' {left[0].reason_unset})" if left else ""
+        others = f"; {len(left)} axes were not changed ('{left[0].bone}' {left[0].reason_unset})" if left else ""
         if wide := list(dict.fromkeys(limit.bone for limit in limits if limit.near_gimbal_lock)):
-            others += f"; {len(wide)} ('{wide[0]}') rotate near gimbal lock, less far than these say: Ticked Actions,"
-            others += " above the list, samples what the actions do"
-        return f"{len(stated)} bones have the ranges of {', '.join(names)}{others}."
+            others += (
+                f"; {len(wide)} bones ('{wide[0]}') rotate near gimbal lock, so their limits are too wide: choose "
+            )
+            others += "Bones in the Checked Actions instead"
+        return f"Set the limits of {len(stated)} bones from {', '.join(names)}{others}."
 
 
 CLASSES = (

@@ -12,9 +12,9 @@ from .on_pose import OnPose
 AXES = "XYZ"
 
 
-def _counted(count: int, one: str = "has", many: str = "have") -> str:
-    """The beginning of a sentence about so many bones: "1 bone has", "4 bones have"."""
-    return f"1 bone {one}" if count == 1 else f"{count} bones {many}"
+def _counted(count: int) -> str:
+    """Return a number of bones in words: "1 bone", "4 bones"."""
+    return "1 bone" if count == 1 else f"{count} bones"
 
 
 class _OnSelected(OnPose):
@@ -30,7 +30,7 @@ class _OnSelected(OnPose):
         found = [bone for bone in armature_object.pose.bones if is_selected(bone)]
         if not found:
             raise RigError(
-                f"No bone of '{armature_object.name}' is selected; tick bones in the list, or select them in pose mode."
+                f"No bone of '{armature_object.name}' is selected; check bones in the list or select them in Pose Mode."
             )
         return found
 
@@ -51,11 +51,11 @@ def _copy(source: bpy.types.PoseBone, target: bpy.types.PoseBone, mirrored: bool
 
 class FDDA_OT_edit_ranges(_OnSelected, bpy.types.Operator):
     bl_idname = "fdda.edit_ranges"
-    bl_label = "Set Ranges of Selected"
-    bl_description = "Give the selected bones one range of motion about each axis that is ticked"
+    bl_label = "Set Limits of Selected Bones"
+    bl_description = "Give all selected bones the same rotation limits"
     bl_options = {"REGISTER", "UNDO"}
 
-    axes: bpy.props.BoolVectorProperty(name="Axes", description="Axes that are set", default=(True, True, True))
+    axes: bpy.props.BoolVectorProperty(name="Axes", description="Axes to limit", default=(True, True, True))
     low: bpy.props.FloatVectorProperty(
         name="Minimum", subtype="EULER", default=(-math.pi / 4,) * 3, min=-math.pi, max=math.pi
     )
@@ -74,7 +74,7 @@ class FDDA_OT_edit_ranges(_OnSelected, bpy.types.Operator):
         self.low, self.high = [r.low for r in ranges], [r.high for r in ranges]
         self.axes = [r.moves for r in ranges]
         return context.window_manager.invoke_props_dialog(
-            self, title="Ranges of the Selected Bones", confirm_text="Set"
+            self, title="Set Limits of Selected Bones", confirm_text="Set"
         )
 
     def draw(self, _context: bpy.types.Context) -> None:
@@ -92,21 +92,21 @@ class FDDA_OT_edit_ranges(_OnSelected, bpy.types.Operator):
         bones = self.selected(context)
         for axis in (axis for axis in range(3) if self.axes[axis]):
             if not self.low[axis] < self.high[axis]:
-                raise RigError(f"The range about {AXES[axis]} is empty; give a larger maximum.")
+                raise RigError(f"The maximum about {AXES[axis]} must be larger than the minimum.")
         for bone in bones:
             for axis in (axis for axis in range(3) if self.axes[axis]):
                 set_rotation_range(bone, axis, self.low[axis], self.high[axis])
-        return f"{_counted(len(bones))} these ranges."
+        return f"Set the limits of {_counted(len(bones))}."
 
 
 class FDDA_OT_copy_ranges(_OnSelected, bpy.types.Operator):
     bl_idname = "fdda.copy_ranges"
-    bl_label = "Copy to Selected"
-    bl_description = "Give the selected bones the range of motion of the one that is shown below the list"
+    bl_label = "Copy Limits to Selected Bones"
+    bl_description = "Copy the limits of the active bone of the list to the selected bones"
     bl_options = {"REGISTER", "UNDO"}
 
     bone: bpy.props.StringProperty(
-        name="Bone", description="Whose ranges; empty for the one that is shown", options={"SKIP_SAVE"}
+        name="Bone", description="Bone to copy from. Empty for the active bone of the list", options={"SKIP_SAVE"}
     )
 
     def change(self, context: bpy.types.Context) -> str:
@@ -118,13 +118,13 @@ class FDDA_OT_copy_ranges(_OnSelected, bpy.types.Operator):
         targets = [bone for bone in self.selected(context) if bone != source]
         for target in targets:
             _copy(source, target)
-        return f"{_counted(len(targets))} the ranges of '{source.name}'."
+        return f"Copied the limits of '{source.name}' to {_counted(len(targets))}."
 
 
 class FDDA_OT_mirror_ranges(_OnSelected, bpy.types.Operator):
     bl_idname = "fdda.mirror_ranges"
-    bl_label = "Mirror"
-    bl_description = "Give the bones of the other side the range of motion of the selected ones, mirrored"
+    bl_label = "Mirror Limits to Other Side"
+    bl_description = "Copy the limits of the selected bones, mirrored, to the bones of the other side"
     bl_options = {"REGISTER", "UNDO"}
 
     def change(self, context: bpy.types.Context) -> str:
@@ -134,27 +134,25 @@ class FDDA_OT_mirror_ranges(_OnSelected, bpy.types.Operator):
         pairs = [(bone, bones.get(flipped_name(bone.name))) for bone in self.selected(context)]
         pairs = [(bone, other) for bone, other in pairs if other is not None and other != bone]
         if not pairs:
-            raise RigError("None of the selected bones has one on the other side by its name; select arm.L or LeftArm.")
+            raise RigError(
+                "No selected bone has a bone of the same name on the other side; select bones such as arm.L or LeftArm."
+            )
         for bone, other in pairs:
             _copy(bone, other, mirrored=True)
-        return f"On the other side {_counted(len(pairs))} mirrored ranges."
+        return f"Mirrored the limits of {_counted(len(pairs))}."
 
 
 class FDDA_OT_limits_preset(OnPose, bpy.types.Operator):
     bl_idname = "fdda.limits_preset"
-    bl_label = "Human Ranges"
+    bl_label = "Human Limits"
     bl_description = (
-        "Give the bones that are named as parts of a body (arm, forearm, thigh, spine, index1 …) the range of motion "
-        "of a person; the character stands upright and looks along -Y"
+        "Give all bones that are named after body parts (arm, forearm, thigh, spine, index1 …) the rotation limits of "
+        "a person. The character must stand upright and face -Y"
     )
     bl_options = {"REGISTER", "UNDO"}
 
-    only_selected: bpy.props.BoolProperty(
-        name="Only Selected", description="Leave the bones alone that are not selected"
-    )
-    replace: bpy.props.BoolProperty(
-        name="Replace", description="Also where a bone states a range already, and not only where it states none"
-    )
+    only_selected: bpy.props.BoolProperty(name="Only Selected", description="Set the limits of selected bones only")
+    replace: bpy.props.BoolProperty(name="Replace", description="Overwrite the limits of bones that already have some")
 
     def change(self, context: bpy.types.Context) -> str:
         from ..poses.human_ranges import human_ranges
@@ -177,16 +175,16 @@ class FDDA_OT_limits_preset(OnPose, bpy.types.Operator):
             done += 1
         if not done:
             raise RigError(
-                f"No bone of '{armature_object.name}' that states no range is named as a part of a body; set the "
-                "ranges by hand, or from actions."
+                f"No bone of '{armature_object.name}' without limits has the name of a body part; set the limits by "
+                "hand, or from actions."
             )
-        return f"{_counted(done)} the range of motion of a person."
+        return f"Set human limits for {_counted(done)}."
 
 
 class FDDA_OT_forget_ranges(_OnSelected, bpy.types.Operator):
     bl_idname = "fdda.forget_ranges"
-    bl_label = "Forget Ranges of Selected"
-    bl_description = "Remove the ranges of motion that the selected bones state; they then have the default of ±45°"
+    bl_label = "Clear Limits of Selected Bones"
+    bl_description = "Remove the rotation limits of the selected bones. The default is ±45°"
     bl_options = {"REGISTER", "UNDO"}
 
     def change(self, context: bpy.types.Context) -> str:
@@ -196,7 +194,7 @@ class FDDA_OT_forget_ranges(_OnSelected, bpy.types.Operator):
         for bone in bones:
             for axis in range(3):
                 clear_rotation_range(bone, axis)
-        return f"{_counted(len(bones), 'states', 'state')} no range any more."
+        return f"Removed the limits of {_counted(len(bones))}."
 
 
 CLASSES = (

@@ -50,18 +50,18 @@ def is_recorded(path: Path) -> bool:
 class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.record"
     bl_label = "Record"
-    bl_description = "Let Blender evaluate random poses and the chosen actions, and keep them in the folder"
+    bl_description = "Evaluate random poses and the checked actions, and write the deformed mesh to the folder"
     bl_options = {"REGISTER"}
     verb, title = "record", "Recording"
 
     folder: bpy.props.StringProperty(
         name="Folder",
-        description="Folder of the recording; empty for that of the character",
+        description="Folder of the recording. Empty for the folder in the settings of the mesh",
         subtype="DIR_PATH",
         options={"SKIP_SAVE"},
     )
     resume: bpy.props.BoolProperty(
-        name="Resume", description="Continue a recording that was broken off", options={"SKIP_SAVE"}
+        name="Resume", description="Continue an interrupted recording", options={"SKIP_SAVE"}
     )
 
     @classmethod
@@ -90,19 +90,21 @@ class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
 
     def cancelled(self, _context: bpy.types.Context) -> str:
         if self.state.stage != "poses" or not self.state.done:
-            return "Recording cancelled before the first pose; nothing was kept."
-        return f"Recording cancelled; {self.state.done:,} of {self.state.total:,} poses are kept, resume goes on there."
+            return "Recording canceled before the first pose; nothing was kept."
+        return (
+            f"Recording canceled. {self.state.done:,} of {self.state.total:,} poses are kept; press Resume to continue."
+        )
 
 
 class FDDA_OT_refine(OnRig, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.refine"
-    bl_label = "Add Poses Where It Is Worst"
-    bl_description = "Compare the trained model with the rig, and add poses to the recording where it errs most"
+    bl_label = "Add Poses at Worst Errors"
+    bl_description = "Compare the trained model with the rig, and record more poses where its error is largest"
     bl_options = {"REGISTER"}
     verb, title = "refine", "Refinement"
 
     poses: bpy.props.IntProperty(
-        name="Poses", description="How many poses are added", default=REFINEMENT_POSES, min=1, options={"SKIP_SAVE"}
+        name="Poses", description="Number of poses to add", default=REFINEMENT_POSES, min=1, options={"SKIP_SAVE"}
     )
 
     @classmethod
@@ -120,19 +122,17 @@ class FDDA_OT_refine(OnRig, JobOperator, bpy.types.Operator):
             yield from refine(rig, self._path, model, wanted)
 
     def finish(self, _context: bpy.types.Context, _result: object) -> str:
-        return f"Added {self.state.total:,} poses to '{self._path.name}'; train on with them."
+        return f"Added {self.state.total:,} poses to '{self._path.name}'; press Continue Training."
 
     def cancelled(self, _context: bpy.types.Context) -> str:
         added = self.state.done if self.state.stage == "poses" else 0
-        return f"Refinement cancelled; {added:,} poses were added."
+        return f"Refinement canceled; {added:,} poses were added."
 
 
 class FDDA_OT_remove_recording(OnRig, bpy.types.Operator):
     bl_idname = "fdda.remove_recording"
-    bl_label = "Remove Recording"
-    bl_description = (
-        "Remove the recording that is in the folder, so that another can be made there. This cannot be undone"
-    )
+    bl_label = "Delete Recording"
+    bl_description = "Delete the recording in the folder. This cannot be undone"
     bl_options = {"REGISTER"}
 
     @classmethod
@@ -148,9 +148,9 @@ class FDDA_OT_remove_recording(OnRig, bpy.types.Operator):
         return context.window_manager.invoke_confirm(
             self,
             event,
-            title="Remove the Recording?",
+            title="Delete Recording?",
             message=self._what(context),
-            confirm_text="Remove",
+            confirm_text="Delete",
             icon="WARNING",
         )
 
@@ -164,7 +164,7 @@ class FDDA_OT_remove_recording(OnRig, bpy.types.Operator):
         except FDDAError as error:
             return str(error)
         size = sum(file.stat().st_size for file in path.glob("*.npy"))
-        return f"{count:,} poses, {megabytes(size)}, in '{path}'. This cannot be undone; models stay."
+        return f"{count:,} poses, {megabytes(size)}, in '{path}'. This cannot be undone. Models are kept."
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         from ..core.recording.folder import remove_recording
@@ -175,7 +175,7 @@ class FDDA_OT_remove_recording(OnRig, bpy.types.Operator):
         except FDDAError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"Removed the recording '{path.name}'.")
+        self.report({"INFO"}, f"Deleted the recording '{path.name}'.")
         return {"FINISHED"}
 
 

@@ -26,16 +26,18 @@ def cost_of(mesh_object: bpy.types.Object) -> "RigCost | None":
 class FDDA_OT_add_arm(bpy.types.Operator):
     bl_idname = "fdda.add_arm"
     bl_label = "FDDA Sample Arm"
-    bl_description = "Add an arm of 22 joints with a driven biceps, delta mush and an action, to try a first model on"
+    bl_description = (
+        "Add a rigged arm with 22 bones, a driven biceps, delta mush and an action, to train a first model on"
+    )
     bl_options = {"REGISTER", "UNDO"}
 
     density: bpy.props.EnumProperty(
         name="Density",
-        description="How many vertices the arm has",
+        description="Number of vertices",
         items=(
-            ("1", "1,476 Vertices", "Quick to record and train; so cheap that a model does not pay"),
-            ("2", "9,960 Vertices", "A model is about four times as fast as the rig, and is made in some minutes"),
-            ("3", "50,618 Vertices", "A model is about eleven times as fast as the rig; recording takes a while"),
+            ("1", "1,476 Vertices", "Quick to record and train, but too cheap for a model to be faster"),
+            ("2", "9,960 Vertices", "A model is about 4x faster than the rig, and takes some minutes to make"),
+            ("3", "50,618 Vertices", "A model is about 11x faster than the rig, but recording takes a while"),
         ),
         default="2",
     )
@@ -43,7 +45,7 @@ class FDDA_OT_add_arm(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if context.mode != "OBJECT":
-            cls.poll_message_set("Objects are added in object mode; switch to it first")
+            cls.poll_message_set("Objects can only be added in Object Mode")
             return False
         return True
 
@@ -66,7 +68,7 @@ class FDDA_OT_add_arm(bpy.types.Operator):
         context.view_layer.objects.active = mesh_object
         frame_objects([mesh_object])
         count = len(mesh_object.data.vertices)
-        others = " Blender's cube is hidden." if hidden else ""
+        others = " The default cube is hidden." if hidden else ""
         self.report(
             {"INFO"}, f"Added '{mesh_object.name}' with {count:,} vertices on '{armature_object.name}'.{others}"
         )
@@ -93,8 +95,8 @@ def _hide_startup_cube(context: bpy.types.Context) -> bool:
 
 class FDDA_OT_measure(OnRig, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.measure"
-    bl_label = "Measure"
-    bl_description = "Time some frames of this rig, and estimate what they would cost with a model in its place"
+    bl_label = "Measure Speed"
+    bl_description = "Measure the time per frame of this rig, and estimate it for a model"
     bl_options = {"REGISTER"}
     verb, title = "measure", "Measuring"
 
@@ -109,7 +111,7 @@ class FDDA_OT_measure(OnRig, JobOperator, bpy.types.Operator):
 
     def finish(self, context: bpy.types.Context, result: "RigCost") -> str:
         _costs[self.rig(context).mesh_object.session_uid] = result
-        return f"A frame of this rig takes {result.rig:.2f} ms. {result.sentence}"
+        return f"{result.rig:.2f} ms per frame with the rig. {result.sentence}"
 
 
 def _draw_add(self: bpy.types.Menu, _context: bpy.types.Context) -> None:

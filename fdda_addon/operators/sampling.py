@@ -17,7 +17,9 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 class FDDA_OT_use_selected_bones(OnPose, bpy.types.Operator):
     bl_idname = "fdda.use_selected_bones"
     bl_label = "Use Selected Bones"
-    bl_description = "Let random poses move the bones that are selected now; another selection later changes nothing"
+    bl_description = (
+        "Let random poses move the bones that are selected now. Later changes of the selection have no effect"
+    )
     bl_options = {"REGISTER", "UNDO"}
 
     def change(self, context: bpy.types.Context) -> str:
@@ -26,7 +28,7 @@ class FDDA_OT_use_selected_bones(OnPose, bpy.types.Operator):
         rig = self.rig(context)
         names = [bone.name for bone in rig.armature_object.pose.bones if is_selected(bone)]
         if not names:
-            raise RigError(f"No bone of '{rig.armature_object.name}' is selected; select bones in pose mode.")
+            raise RigError(f"No bone of '{rig.armature_object.name}' is selected; select bones in Pose Mode.")
         settings = rig.mesh_object.fdda.settings
         settings.sample = "SELECTED"
         settings.sampled_bones.clear()
@@ -39,48 +41,50 @@ class FDDA_OT_use_selected_bones(OnPose, bpy.types.Operator):
 
 class FDDA_OT_add_control(OnPose, bpy.types.Operator):
     bl_idname = "fdda.add_control"
-    bl_label = "Add Control"
-    bl_description = "Make another number an input of the model, which random poses change: a shape key, a property"
+    bl_label = "Add Extra Input"
+    bl_description = "Make a shape key or another animated number an input of the model. Random poses change it too"
     bl_options = {"REGISTER", "UNDO"}
 
     name: bpy.props.StringProperty(
-        name="Name", description="Of a shape key, or OWNER/PATH; empty to choose it later", options={"SKIP_SAVE"}
+        name="Name", description="Name of a shape key, or data path. Empty to choose it later", options={"SKIP_SAVE"}
     )
 
     def change(self, context: bpy.types.Context) -> str:
         from ..recording.plan import RecordingSettings, listed_controls
+        from ..scene.control_names import control_at
 
         rig = self.rig(context)
         settings = rig.mesh_object.fdda.settings
-        if self.name:
+        name = control_at(rig, self.name)
+        if name:
             try:
                 wanted = recording_settings(rig)
             except RigError:
                 # What random poses move has not been chosen yet.
                 wanted = RecordingSettings()
-            listed_controls(rig, replace(wanted, controls=(self.name,)))
-        if self.name and self.name in settings.controls:
-            raise RigError(f"The control '{self.name}' is in the list already.")
-        settings.controls.add().name = self.name
+            listed_controls(rig, replace(wanted, controls=(name,)))
+        if name and name in settings.controls:
+            raise RigError(f"'{name}' is already in the list.")
+        settings.controls.add().name = name
         settings.control_index = len(settings.controls) - 1
-        return f"{self.name or 'Another control'} is in the list."
+        return f"Added {name or 'an input'}."
 
 
 class FDDA_OT_remove_control(OnPose, bpy.types.Operator):
     bl_idname = "fdda.remove_control"
-    bl_label = "Remove Control"
-    bl_description = "Take this control off the list"
+    bl_label = "Remove Extra Input"
+    bl_description = "Remove the active input from the list"
     bl_options = {"REGISTER", "UNDO"}
 
     def change(self, context: bpy.types.Context) -> str:
         settings = self.rig(context).mesh_object.fdda.settings
         index = settings.control_index
         if not 0 <= index < len(settings.controls):
-            raise RigError("No control is chosen; click one of the list.")
+            raise RigError("No extra input is active; click one in the list.")
         name = settings.controls[index].name
         settings.controls.remove(index)
         settings.control_index = max(0, index - 1)
-        return f"{name or 'The control'} is no longer in the list."
+        return f"Removed {name or 'the input'}."
 
 
 CLASSES = (FDDA_OT_use_selected_bones, FDDA_OT_add_control, FDDA_OT_remove_control)

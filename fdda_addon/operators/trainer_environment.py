@@ -98,19 +98,19 @@ def begin(
             yield CheckResult("WARNING" if state.cancel_requested else "ERROR", str(error))
 
     def finish(outcome: CheckResult | None) -> str:
-        outcome = outcome or CheckResult("ERROR", f"{title} ended without a word.")
+        outcome = outcome or CheckResult("ERROR", f"{title} ended without a result.")
         keep(outcome)
         if outcome.level != "INFO":
             raise TrainerEnvironmentError(outcome.message)
         return outcome.message
 
-    return Run(state, answered(), finish, lambda: f"{title} was cancelled.", ends_itself=True)
+    return Run(state, answered(), finish, lambda: f"{title} was canceled.", ends_itself=True)
 
 
 class FDDA_OT_check_trainer(_OnEnvironment, bpy.types.Operator):
     bl_idname = "fdda.check_trainer"
-    bl_label = "Check the Trainer's Python"
-    bl_description = "Ask the Python that trains for its version, torch and the device that it would train on"
+    bl_label = "Check Training Setup"
+    bl_description = "Check whether the Python for training has PyTorch, and show which device it will train on"
 
     def steps(self) -> _Work:
         return _check(choice.chosen_python()), None
@@ -127,18 +127,18 @@ def _check(python: choice.TrainerPython) -> Iterator[Progress | CheckResult]:
 
 class FDDA_OT_create_trainer_environment(_OnEnvironment, bpy.types.Operator):
     bl_idname = "fdda.create_trainer_environment"
-    bl_label = "Create Trainer Environment"
+    bl_label = "Install Training Environment"
     bl_description = (
-        "Make a Python environment with torch in the add-on's own folder, in the background. It takes some minutes, on "
-        "Linux 3 GB to download and 6 GB of disk"
+        "Install PyTorch into the add-on's own folder, in the background. This takes some minutes. On Linux it "
+        "downloads 3 GB and uses 6 GB of disk space"
     )
 
     python: StringProperty(
-        name="Python", description="The Python to make it from; empty: one that is found", options={"SKIP_SAVE"}
+        name="Python", description="Python to create it from. Empty to search for one", options={"SKIP_SAVE"}
     )
     wheels: StringProperty(
-        name="Wheels",
-        description="Folder of wheels to install from; empty: that of the preferences, else the package index",
+        name="Offline Packages",
+        description="Folder of .whl files to install from. Empty for the folder in the preferences",
         options={"SKIP_SAVE"},
     )
 
@@ -160,15 +160,15 @@ class FDDA_OT_create_trainer_environment(_OnEnvironment, bpy.types.Operator):
         elif origin is choice.Origin.OWN:
             session.remember(outcome)
         else:
-            what = "the field Python" if origin is choice.Origin.PREFERENCES else choice.PYTHON_VARIABLE
-            text = f"The trainer environment is ready, but {what} names another Python, which is used in its place."
+            field = "Existing Python" if origin is choice.Origin.PREFERENCES else choice.PYTHON_VARIABLE
+            text = f"The training environment is ready, but {field} names another Python, which is used instead."
             session.remember(None, CheckResult("WARNING", text))
 
 
 class FDDA_OT_remove_trainer_environment(_OnEnvironment, bpy.types.Operator):
     bl_idname = "fdda.remove_trainer_environment"
-    bl_label = "Remove Trainer Environment"
-    bl_description = "Remove the Python environment that the add-on has made, some gigabytes"
+    bl_label = "Remove Training Environment"
+    bl_description = "Delete the Python environment that the add-on has installed"
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if bpy.app.background or context.window is None:
@@ -184,20 +184,22 @@ def _remove(path: Path) -> Iterator[Progress | CheckResult]:
     with folder.claimed(path):
         existed = path.exists()
         folder.remove(path)
-    yield CheckResult("INFO", "The trainer environment was removed." if existed else "There is no trainer environment.")
+    yield CheckResult(
+        "INFO", "The training environment was removed." if existed else "There is no training environment."
+    )
 
 
 class FDDA_OT_cancel_trainer_environment(bpy.types.Operator):
     bl_idname = "fdda.cancel_trainer_environment"
     bl_label = "Cancel"
-    bl_description = "End the creation of the trainer environment; nothing is left of it"
+    bl_description = "Cancel the installation of the training environment. Nothing is kept"
     bl_options = {"INTERNAL"}
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
         state = current(ENVIRONMENT)
         if state is None or not state.can_cancel:
-            cls.poll_message_set("Nothing is under way")
+            cls.poll_message_set("No installation is running")
             return False
         return True
 
@@ -209,13 +211,13 @@ class FDDA_OT_cancel_trainer_environment(bpy.types.Operator):
 class FDDA_OT_open_trainer_log(bpy.types.Operator):
     bl_idname = "fdda.open_trainer_log"
     bl_label = "Open Log"
-    bl_description = "Show what the last creation of the trainer environment printed"
+    bl_description = "Open the log of the last installation of the training environment"
     bl_options = {"INTERNAL"}
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
         log = folder.log_path()
         if not log.is_file():
-            self.report({"ERROR"}, f"There is no log '{log}' yet; it is written when the environment is created.")
+            self.report({"ERROR"}, f"There is no log '{log}' yet; it is written when the environment is installed.")
             return {"CANCELLED"}
         return bpy.ops.wm.path_open(filepath=str(log))
 

@@ -73,7 +73,7 @@ class TrainsModels(OnRig):
         settings = mesh_object.fdda.settings
         arguments = [str(recording), str(model), "--seed", str(settings.training_seed)]
         arguments += ["--tolerance-mm", f"{settings.tolerance_mm:.6g}", "--epochs", str(settings.epochs)]
-        if settings.goal_mm:
+        if settings.use_goal:
             arguments += ["--goal-mm", f"{settings.goal_mm:.6g}"]
         if warm_start:
             arguments += ["--warm-start"]
@@ -129,7 +129,7 @@ class TrainsModels(OnRig):
 class FDDA_OT_train(TrainsModels, ConfirmFirst, bpy.types.Operator):
     bl_idname = "fdda.train"
     bl_label = "Train"
-    bl_description = "Train a model on the recording, in another process; Blender can be used meanwhile, and closed"
+    bl_description = "Train a model on the recording, in the background. Training continues when Blender is closed"
     # Not UNDO: Adjust Last Operation would train once more at each change, in the foreground.
     bl_options = {"REGISTER"}
     verb, title = "train", "Training"
@@ -138,20 +138,20 @@ class FDDA_OT_train(TrainsModels, ConfirmFirst, bpy.types.Operator):
 
     recording: bpy.props.StringProperty(
         name="Recording",
-        description="Folder of the recording; empty for that of the character",
+        description="Folder of the recording. Empty for the folder in the settings of the mesh",
         subtype="DIR_PATH",
         options={"SKIP_SAVE"},
     )
     model: bpy.props.StringProperty(
         name="Model",
-        description="File to write the model to; empty for that of the character",
+        description="File to write the model to. Empty for the file in the settings of the mesh",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
     )
 
     warm_start: bpy.props.BoolProperty(
-        name="Train On",
-        description="Start from the checkpoint of the model, on a recording that has grown",
+        name="Continue Training",
+        description="Continue from the last training, on a recording with more poses",
         options={"SKIP_SAVE"},
     )
     replace: bpy.props.BoolProperty(options={"SKIP_SAVE", "HIDDEN"})
@@ -159,7 +159,9 @@ class FDDA_OT_train(TrainsModels, ConfirmFirst, bpy.types.Operator):
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         if properties.warm_start:
-            return "Go on from the model's checkpoint, on a recording that has grown: half as long as a training"
+            return (
+                "Continue from the last training, on a recording with more poses. Takes half as long as a new training"
+            )
         return cls.bl_description
 
     @classmethod
@@ -170,7 +172,7 @@ class FDDA_OT_train(TrainsModels, ConfirmFirst, bpy.types.Operator):
         if not (self.replace or bpy.app.background) and (foreign := self._foreign_models(context)):
             self._is_confirming = True
             return context.window_manager.invoke_confirm(
-                self, event, title="Replace Another Model?", message=foreign, confirm_text="Replace", icon="WARNING"
+                self, event, title="Overwrite Another Model?", message=foreign, confirm_text="Overwrite", icon="WARNING"
             )
         return ConfirmFirst.invoke(self, context, event)
 
@@ -189,7 +191,7 @@ class FDDA_OT_train(TrainsModels, ConfirmFirst, bpy.types.Operator):
                 if model.is_file() and not is_detached(model):
                     check(rig, model)
         except FDDAError as error:
-            return f"{error} Training writes over it; to keep it, name another file under Model."
+            return f"{error} Training will overwrite it; to keep it, choose another file under Model."
         return ""
 
     def _files(self, mesh_object: bpy.types.Object) -> tuple[Path, Path]:
@@ -212,7 +214,7 @@ class FDDA_OT_train(TrainsModels, ConfirmFirst, bpy.types.Operator):
 
     def cancelled(self, _context: bpy.types.Context) -> str:
         self.list_models()
-        return "Training cancelled; no model was written."
+        return "Training canceled; no model was written."
 
 
 def _check_recording(path: Path) -> None:

@@ -19,8 +19,8 @@ class _OnFolders:
 
 class FDDA_OT_add_trusted_folder(_OnFolders, bpy.types.Operator):
     bl_idname = "fdda.add_trusted_folder"
-    bl_label = "Trust a Folder…"
-    bl_description = "Choose a folder of your own whose models any .blend file may use"
+    bl_label = "Add Folder"
+    bl_description = "Choose a folder from which any .blend file may load models"
     bl_options = {"REGISTER"}
 
     directory: bpy.props.StringProperty(
@@ -35,7 +35,7 @@ class FDDA_OT_add_trusted_folder(_OnFolders, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         if not self.directory:
-            self.report({"ERROR"}, "No folder was chosen; give one.")
+            self.report({"ERROR"}, "No folder was chosen.")
             return {"CANCELLED"}
         preferences().folders.add().path = self.directory
         context.preferences.is_dirty = True
@@ -44,8 +44,8 @@ class FDDA_OT_add_trusted_folder(_OnFolders, bpy.types.Operator):
 
 class FDDA_OT_remove_trusted_folder(_OnFolders, bpy.types.Operator):
     bl_idname = "fdda.remove_trusted_folder"
-    bl_label = "Trust No More"
-    bl_description = "Take the folder off the list; what lies in it stays"
+    bl_label = "Remove Folder"
+    bl_description = "Remove the folder from the list. Its files are kept"
     bl_options = {"REGISTER"}
 
     index: bpy.props.IntProperty(name="Index", description="Place in the list, from 0", min=0, options={"SKIP_SAVE"})

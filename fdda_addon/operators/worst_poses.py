@@ -22,17 +22,19 @@ class OnWorst(OnEvaluation):
         scene_rig, last = self.last(context)
         found = last.worst(count)
         if not found:
-            raise ModelError("The model is exact in every pose that was compared; there is nothing to look at.")
+            raise ModelError("The model is exact in all compared poses; there is no worst one.")
         return scene_rig, last, found
 
 
 class FDDA_OT_mark_worst(OnWorst, bpy.types.Operator):
     bl_idname = "fdda.mark_worst"
     bl_label = "Mark Worst Frames"
-    bl_description = "Put timeline markers at the frames with the largest errors, in place of those put there before"
+    bl_description = "Add timeline markers at the frames with the largest errors, and remove those added before"
     bl_options = {"REGISTER", "UNDO"}
 
-    count: bpy.props.IntProperty(name="Markers", description="How many at most", default=MARKERS, min=1, max=50)
+    count: bpy.props.IntProperty(
+        name="Markers", description="Maximum number of markers", default=MARKERS, min=1, max=50
+    )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -44,30 +46,30 @@ class FDDA_OT_mark_worst(OnWorst, bpy.types.Operator):
             raise ModelError("Random poses have no frames to mark; evaluate the active action.")
         worst = [(last.first_frame + index, error_mm) for index, error_mm in found]
         markers.place(context.scene, worst)
-        return f"{len(worst)} frames marked; the worst is {worst[0][0]}, with {worst[0][1]:.2f} mm."
+        return f"Added {len(worst)} markers. The worst frame is {worst[0][0]}, with {worst[0][1]:.2f} mm."
 
 
 class FDDA_OT_remove_markers(OnModel, bpy.types.Operator):
     bl_idname = "fdda.remove_markers"
     bl_label = "Remove Markers"
-    bl_description = "Remove the timeline markers at the worst frames; other markers stay"
+    bl_description = "Remove the timeline markers at the worst frames. Other markers are kept"
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if not markers.find(context.scene):
-            cls.poll_message_set("No frame is marked")
+            cls.poll_message_set("There are no markers at worst frames")
             return False
         return True
 
     def work(self, context: bpy.types.Context) -> str:
-        return f"{markers.remove(context.scene)} markers removed."
+        return f"Removed {markers.remove(context.scene)} markers."
 
 
 class FDDA_OT_jump_to_worst(OnWorst, bpy.types.Operator):
     bl_idname = "fdda.jump_to_worst"
     bl_label = "Jump to Worst"
-    bl_description = "Go to the frame, or set the random pose, with the largest error"
+    bl_description = "Go to the frame, or show the random pose, with the largest error"
     bl_options = {"REGISTER", "UNDO"}
 
     rank: bpy.props.IntProperty(name="Rank", description="1 is the worst, 2 the next", default=1, min=1, max=50)
@@ -81,13 +83,13 @@ class FDDA_OT_jump_to_worst(OnWorst, bpy.types.Operator):
         index, error_mm = found[-1]
         if last.name:
             context.scene.frame_set(last.first_frame + index)
-            return f"Frame {last.first_frame + index}: at most {error_mm:.2f} mm."
+            return f"Frame {last.first_frame + index}: max error {error_mm:.2f} mm."
         from ..evaluation.run import set_held_out_pose
 
         set_held_out_pose(scene_rig, last.channels, last.seed, index)
         context.view_layer.update()
         context.window_manager.fdda_view.pose = index
-        return f"Random pose {index}: at most {error_mm:.2f} mm."
+        return f"Random pose {index}: max error {error_mm:.2f} mm."
 
 
 CLASSES = (FDDA_OT_mark_worst, FDDA_OT_remove_markers, FDDA_OT_jump_to_worst)

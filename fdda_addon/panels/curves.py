@@ -15,8 +15,8 @@ LEFT, BOTTOM = 34, 16
 LINE = 1.6
 """Half the width of a line, pixels."""
 LEGEND = {
-    "training": ("Training", "COLORSET_04_VEC", (0.25, 0.55, 1.0)),
-    "validation": ("Validation", "COLORSET_02_VEC", (1.0, 0.55, 0.2)),
+    "training": ("Seen Poses", "COLORSET_04_VEC", (0.25, 0.55, 1.0)),
+    "validation": ("Unseen Poses", "COLORSET_02_VEC", (1.0, 0.55, 0.2)),
 }
 BACKGROUND, GRID = (0.10, 0.10, 0.10, 1.0), (0.20, 0.20, 0.20, 1.0)
 INK = (0.75, 0.75, 0.75)
@@ -37,7 +37,7 @@ def draw(layout: bpy.types.UILayout, curves: dict[str, list[float]]) -> None:
     lengths = [len(curves.get(name, ())) for name in LEGEND]
     if min(lengths) < 2:
         return
-    layout.label(text="Error in mm by epoch")
+    layout.label(text="Error (mm) per Pass")
     layout.template_icon(icon_value=_icon(curves), scale=9)
     column = layout.column(align=True)
     for name, (label, icon, _) in LEGEND.items():

@@ -12,12 +12,12 @@ from .names import shown_name
 from .section import Section, draw_button, draw_job, draw_sentence, panel_rig, together
 
 FEW_PARTITIONS = 5
-FIGURES = (("Mean", "mean"), ("99.9 %", "p999"), ("Largest", "max"))
+FIGURES = (("Mean", "mean"), ("99.9 %", "p999"), ("Max", "max"))
 
 
 class FDDA_PT_evaluation(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_evaluation"
-    bl_label = "Evaluation"
+    bl_label = "Compare with Rig"
     bl_options = {"DEFAULT_CLOSED"}
     verbs = ("evaluate",)
 
@@ -33,9 +33,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
             draw_sentence(layout, context, reason, "INFO")
             return
         if not scene_rig.mesh_object.fdda.is_bound:
-            draw_sentence(
-                layout, context, "Bind a model first: what is compared with the rig is the bound model.", "INFO"
-            )
+            draw_sentence(layout, context, "Bind a model first, to compare it with the rig.", "INFO")
         else:
             _draw_side_by_side(layout, context, scene_rig)
             self._draw_start(context, scene_rig)
@@ -54,7 +52,9 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         if state is not None and state.is_running:
             draw_job(layout, context, "evaluate")
             return
-        layout.row().prop(view, "source", expand=True)
+        choice = layout.column(align=True)
+        choice.label(text="Compare On")
+        choice.row(align=True).prop(view, "source", expand=True)
         column = layout.column()
         column.use_property_split, column.use_property_decorate = True, False
         animation = scene_rig.armature_object.animation_data
@@ -98,26 +98,26 @@ def _draw_figures(
     bound = bound_name(rig.mesh_object)
     what = f"{last.poses} frames of {last.name}" if last.name else f"{last.poses} random poses"
     header, body = layout.panel("fdda_figures", default_closed=False)
-    header.label(text="Distance from the Rig, mm")
+    header.label(text="Error (mm)")
     if body is None:
         return
     draw_sentence(body, context, f"{last.model} on {what}")
     if bound != last.model:
-        draw_sentence(body, context, f"{last.model} is not what is bound now; evaluate again.", "INFO")
+        draw_sentence(body, context, f"{last.model} is no longer the bound model; evaluate again.", "INFO")
     table = body.column(align=True)
     _row(table, "", [label for label, _ in FIGURES])
-    for label, way in (("FDDA", "fdda"), ("Linear skinning", "linear")):
+    for label, way in (("Model", "fdda"), ("Skinning", "linear")):
         _row(table, label, [_millimetres(getattr(last.total[way], name)) for _, name in FIGURES])
     body.separator()
     row = body.row()
-    row.label(text="Partitions, worst first")
+    row.label(text="Body parts, worst first")
     if len(last.partitions) > FEW_PARTITIONS:
         row.prop(view, "show_partitions", text="All", toggle=True)
     active = active_bone_name(context, rig)
     chosen = [partition for partition in last.partitions if partition.joint == active]
     if context.mode == "POSE" and not chosen:
         draw_sentence(
-            body, context, "Click a bone to see its partition on top; click a name to select its bone.", "INFO"
+            body, context, "Click a bone to see its body part on top; click a name to select its bone.", "INFO"
         )
     shown = last.partitions[: None if view.show_partitions else FEW_PARTITIONS]
     column = body.column(align=True)
@@ -146,20 +146,20 @@ def _draw_colors(
     last: last_evaluation.LastEvaluation | None,
 ) -> None:
     header, body = layout.panel("fdda_colors", default_closed=False)
-    header.label(text="Colours in the Viewport")
+    header.label(text="Viewport Colors")
     if body is None:
         return
     heat_map = loaded_heat_map()
     shown = heat_map.painted(mesh_object) if heat_map else ""
     row = body.row(align=True)
-    for colors, text in (("NONE", "None"), ("ERRORS", "Heat Map"), ("PARTITIONS", "Partitions")):
+    for colors, text in (("NONE", "None"), ("ERRORS", "Heat Map"), ("PARTITIONS", "Body Parts")):
         button = row.row(align=True)
         button.enabled = colors != "ERRORS" or last is not None
         button.operator("fdda.paint", text=text, depress=shown == ("" if colors == "NONE" else colors)).colors = colors
     if last is None:
-        draw_sentence(body, context, "The heat map is there once the model was evaluated.", "INFO")
+        draw_sentence(body, context, "Press Evaluate to get the heat map.", "INFO")
     if shown and heat_map.is_hidden(mesh_object):
-        text = "The colours show outside edit mode, while no modifier changes the topology in the viewport."
+        text = "Colors are hidden in Edit Mode, and while a modifier changes the topology in the viewport."
         draw_sentence(body, context, text, "INFO")
     if shown != "ERRORS" or last is None:
         return
@@ -167,7 +167,7 @@ def _draw_colors(
     column.row(align=True).prop(view, "way", expand=True)
     column.row(align=True).prop(view, "statistic", expand=True)
     if view.statistic == "pose" and not last.name and view.pose < 0:
-        draw_sentence(body, context, "Jump to a pose below to see its errors.", "INFO")
+        draw_sentence(body, context, "Click a pose below to see its errors.", "INFO")
     elif view.statistic == "pose" and last.name and last.pose_at(context.scene.frame_current) is None:
         draw_sentence(body, context, f"Frame {context.scene.frame_current} was not compared.", "INFO")
     row = body.row(align=True)
@@ -192,7 +192,7 @@ def _draw_worst(
     body.prop(view, "graph")
     row = body.row(align=True)
     row.prop(view, "markers")
-    row.operator("fdda.mark_worst", text="Mark", icon="MARKER_HLT").count = view.markers
+    row.operator("fdda.mark_worst", text="Add Markers", icon="MARKER_HLT").count = view.markers
     if markers.find(context.scene):
         row.operator("fdda.remove_markers", text="", icon="X")
 

@@ -89,7 +89,7 @@ class FDDA_UL_models(bpy.types.UIList):
 
 class FDDA_PT_models(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_models"
-    bl_label = "Models"
+    bl_label = "Model Library"
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -102,7 +102,7 @@ class FDDA_PT_models(Section, bpy.types.Panel):
         binding = mesh_object.fdda
         if not binding.models and not binding.is_bound:
             draw_sentence(layout, context, "No model yet: train one above, or add a file.", "INFO")
-            layout.operator("fdda.add_model", icon="ADD")
+            layout.operator("fdda.add_model", text="Add Model…", icon="ADD")
             return
         row = layout.row()
         row.template_list("FDDA_UL_models", "", binding, "models", binding, "model_index", rows=3)
@@ -126,7 +126,7 @@ class FDDA_PT_models(Section, bpy.types.Panel):
             row.scale_y = 1.2
             row.operator("fdda.bind", text=f"Bind {entry.name}", icon="LINKED").filepath = ""
         if entry.packed:
-            draw_sentence(layout, context, f"Inside the .blend file, {megabytes(entry.packed_bytes)}.", "PACKAGE")
+            draw_sentence(layout, context, f"Packed, {megabytes(entry.packed_bytes)}", "PACKAGE")
             layout.operator("fdda.unpack_model", icon="EXPORT")
         else:
             draw_sentence(layout, context, str(resolve_path(entry.path)), "FILE")
@@ -136,7 +136,7 @@ class FDDA_PT_models(Section, bpy.types.Panel):
             box.alert = state[0] == "ERROR"
             draw_sentence(box, context, state[1], state[0])
         elif states is not None:
-            draw_sentence(layout, context, "It fits the rig: nothing has changed since it was trained.", "CHECKMARK")
+            draw_sentence(layout, context, "Matches this rig", "CHECKMARK")
 
 
 CLASSES = (FDDA_UL_models, FDDA_PT_models)

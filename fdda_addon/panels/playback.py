@@ -19,7 +19,7 @@ from .watch import Watch
 
 FULL_CONFIDENCE = 0.995
 MAX_SHOWN = 6
-MODES = (("RIG", "Rig"), ("LINEAR", "Linear Layer"), ("FDDA", "FDDA"))
+MODES = (("RIG", "Rig"), ("LINEAR", "Skinning"), ("FDDA", "Model"))
 
 
 @draw_cached
@@ -35,13 +35,13 @@ def mask_sentence(mesh_object: bpy.types.Object) -> str:
     name = mesh_object.fdda.mask
     if not name or name in mesh_object.vertex_groups:
         return ""
-    return f"'{mesh_object.name}' has no vertex group '{name}', so the model counts everywhere; choose another mask."
+    return f"'{mesh_object.name}' has no vertex group '{name}', so the mask has no effect; choose another."
 
 
 def _confidence(mesh_object: bpy.types.Object) -> object:
     from ..runtime.confidence import partition_confidence
 
-    return partition_confidence(mesh_object) or "This model has no confidence output."
+    return partition_confidence(mesh_object) or "This model has no confidence values."
 
 
 _confidences = Watch(_confidence, 0.2)
@@ -49,7 +49,7 @@ _confidences = Watch(_confidence, 0.2)
 
 class FDDA_PT_playback(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_playback"
-    bl_label = "Playback"
+    bl_label = "Model"
     verbs = ("measure_model", "bake")
 
     @classmethod
@@ -90,11 +90,10 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
 
     def _draw_bound(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
         layout, binding = self.layout, mesh_object.fdda
-        verb, icon = ("cannot play", "ERROR") if binding.status else ("is bound", "LINKED")
-        where = ", packed" if binding.packed else ""
-        layout.label(text=f"{bound_name(mesh_object)} {verb}{where}", icon=icon)
+        where = " (in this file)" if binding.packed else ""
+        layout.label(text=f"{bound_name(mesh_object)}{where}", icon="ERROR" if binding.status else "LINKED")
         if not binding.packed and not binding.status and lies_outside(mesh_object):
-            text = "The model is not packed and lies outside the folder of this file: opened again, it is not followed."
+            text = "The model is not packed, and not in the folder of this file: it will not load again."
             draw_sentence(layout, context, text, "ERROR")
             layout.operator("fdda.pack_model", text="Pack into the .blend File", icon="PACKAGE")
         if binding.status:
@@ -102,7 +101,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             box.alert = True
             draw_sentence(box, context, binding.status)
             row = layout.row(align=True)
-            row.operator("fdda.relink", icon="FILEBROWSER")
+            row.operator("fdda.relink", text="Find Model…", icon="FILEBROWSER")
             row.operator("fdda.switch", text="Try Again", icon="FILE_REFRESH").mode = "FDDA"
             return
         row = layout.row(align=True)
@@ -131,7 +130,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
     def _draw_times(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
         layout = self.usable_layout()
         header, body = layout.panel("fdda_frame_times", default_closed=False)
-        header.label(text="Time a Frame")
+        header.label(text="Speed")
         if body is None:
             return
         state = job.state_of("measure_model")
@@ -142,23 +141,23 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             grid = body.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
             for label, value in (
                 ("Rig", f"{times.rig:.2f} ms"),
-                ("Armature alone", f"{times.linear:.2f} ms"),
-                ("FDDA", f"{times.fdda:.2f} ms"),
-                ("… without its model", f"{times.floor:.2f} ms"),
-                ("The model alone", f"{times.inference:.2f} ms"),
-                *((("It reads", f"{times.constant_bytes / 1e6:.1f} MB"),) if times.constant_bytes else ()),
+                ("Armature Only", f"{times.linear:.2f} ms"),
+                ("Model", f"{times.fdda:.2f} ms"),
+                ("   Blender", f"{times.floor:.2f} ms"),
+                ("   Network", f"{times.inference:.2f} ms"),
+                *((("   Memory", f"{times.constant_bytes / 1e6:.1f} MB"),) if times.constant_bytes else ()),
             ):
                 grid.label(text=label)
                 number = grid.row()
                 number.alignment = "RIGHT"
                 number.label(text=value)
             draw_sentence(body, context, times.sentence, "INFO" if times.fdda < times.rig else "ERROR")
-        body.operator("fdda.measure_model", text="Measure Again" if times else "Measure", icon="TIME")
+        body.operator("fdda.measure_model", text="Measure Speed", icon="TIME")
 
     def _draw_confidence(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
         # Closed, nobody looks and the model is not asked.
         header, body = self.layout.panel("fdda_confidence", default_closed=True)
-        header.label(text="Trust in This Pose")
+        header.label(text="Confidence in This Pose")
         if body is None:
             return
         confidence = _confidences.look(mesh_object)
@@ -167,11 +166,9 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
             return
         doubtful = [(name, value) for name, value in confidence if value < FULL_CONFIDENCE]
         if not doubtful:
-            draw_sentence(body, context, "This pose lies inside what the model was trained on.", "CHECKMARK")
+            draw_sentence(body, context, "This pose is inside the trained range.", "CHECKMARK")
             return
-        draw_sentence(
-            body, context, f"{len(doubtful)} of {len(confidence)} partitions leave what the model was trained on:"
-        )
+        draw_sentence(body, context, f"{len(doubtful)} of {len(confidence)} body parts are beyond the trained range:")
         column = body.column(align=True)
         for name, value in doubtful[:MAX_SHOWN]:
             row = column.split(factor=0.5, align=True)
@@ -182,7 +179,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
 
     def _draw_bake(self, context: bpy.types.Context) -> None:
         if not draw_job(self.layout, context, "bake"):
-            self.layout.operator("fdda.bake", icon="EXPORT")
+            self.layout.operator("fdda.bake", text="Bake…", icon="EXPORT")
 
 
 CLASSES = (FDDA_PT_playback,)

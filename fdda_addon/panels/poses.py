@@ -13,7 +13,7 @@ from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks, sampled
 from .names import shown_name
-from .section import Section, draw_sentence, panel_rig
+from .section import Section, draw_advanced, draw_sentence, panel_rig
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.poses import Channel
@@ -78,7 +78,7 @@ def _line(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[str, 
     if is_moved_by_constraints(bone):
         return "CONSTRAINT_BONE", name, "constrained", False
     ranges = rotation_ranges(bone)
-    texts = [_degrees(r.low, r.high, is_wide) if r.moves else "fixed" for r in ranges]
+    texts = [_degrees(r.low, r.high, is_wide) if r.moves else "locked" for r in ranges]
     return "NONE", name, "  ".join(texts), any(r.moves and r.source != DEFAULT for r in ranges)
 
 
@@ -114,17 +114,21 @@ def _sampled_text(channels: "list[Channel]", is_wide: bool) -> str:
     turns = {channel.axis: channel for channel in channels if channel.kind in {ROTATION, ROTATION_VECTOR}}
     moves = "".join("XYZ"[channel.axis] for channel in channels if channel.kind == LOCATION)
     texts = [
-        _degrees(turns[axis].low, turns[axis].high, is_wide) if axis in turns else "fixed" for axis in range(3) if turns
+        _degrees(turns[axis].low, turns[axis].high, is_wide) if axis in turns else "locked"
+        for axis in range(3)
+        if turns
     ]
     if moves:
-        texts.append(f"+{moves}" if turns else f"moves {moves}")
+        texts.append(f"Loc {moves}")
     return "  ".join(texts)
 
 
 def _degrees(low: float, high: float, is_wide: bool) -> str:
-    """A range, or only its width where the sidebar is narrow."""
-    low, high = math.degrees(low), math.degrees(high)
-    return f"{low:.0f}…{high:.0f}°" if is_wide else f"{high - low:.0f}°"
+    """Return a range in degrees, "±45°" or "-10…140°"; in a narrow sidebar an asymmetric one as its width, "150°"."""
+    low, high = round(math.degrees(low)), round(math.degrees(high))
+    if low == -high:
+        return f"±{high}°"
+    return f"{low}…{high}°" if is_wide else f"{high - low}°"
 
 
 class FDDA_UL_actions(bpy.types.UIList):
@@ -151,7 +155,7 @@ class FDDA_UL_actions(bpy.types.UIList):
 
 class FDDA_PT_poses(Section, bpy.types.Panel):
     bl_idname = "FDDA_PT_poses"
-    bl_label = "Poses"
+    bl_label = "Training Poses"
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -161,10 +165,11 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
             return
         session, bones = context.window_manager.fdda, rig.armature_object.pose.bones
         sampled.draw_choice(layout, context, rig)
-        layout.label(text="Range of motion about X, Y and Z")
+        layout.label(text="Rotation Limits (X, Y, Z)")
         if not states_limits(rig):
-            text = "This rig states no limits: each joint turns ±45° about each axis, more than a body does or less."
+            text = "No rotation limits found. Every bone will rotate ±45°; set limits, or press Human Limits."
             draw_sentence(layout, context, text, "ERROR")
+        _draw_limit_sources(layout, rig)
         layout.template_list("FDDA_UL_joints", "", rig.armature_object.pose, "bones", session, "joint_index", rows=5)
         if 0 <= session.joint_index < len(bones):
             _draw_bone(layout, rig, bones[session.joint_index])
@@ -172,26 +177,37 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
         sampled.draw_controls(layout, rig)
         _draw_random(layout, context, rig)
         _draw_actions(layout, context, rig)
+        if (advanced := draw_advanced(layout, "fdda_poses_advanced")) is not None:
+            for name in ("seed", "spread", "margin"):
+                advanced.prop(rig.mesh_object.fdda.settings, name)
+
+
+def _draw_limit_sources(layout: bpy.types.UILayout, rig: SceneRig) -> None:
+    """Draw the buttons that set the limits of all bones."""
+    has_actions = bool(recorded_actions(rig.armature_object))
+    column = layout.column(align=True)
+    column.operator("fdda.limits_preset", text="Human Limits (All Bones)", icon="OUTLINER_OB_ARMATURE")
+    row = column.row(align=True)
+    row.enabled = has_actions
+    row.operator("fdda.limits_from_actions", icon="CON_ROTLIMIT")
+    if not has_actions:
+        layout.label(text="Check an action below first", icon="INFO")
 
 
 def _draw_many(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
     """What works on many bones: those that are ticked, which are those that are selected in the view."""
     header, body = layout.panel("fdda_many_bones", default_closed=states_limits(rig))
-    header.label(text=f"Selected Bones ({_selected(rig)})")
+    count = _selected(rig)
+    header.label(text=f"Selected Bones ({count})")
     if body is None:
         return
     column = body.column(align=True)
-    column.operator("fdda.edit_ranges", text="Set Ranges…", icon="DRIVER_ROTATIONAL_DIFFERENCE")
+    column.enabled = count > 0
+    column.operator("fdda.edit_ranges", text="Set Limits…", icon="DRIVER_ROTATIONAL_DIFFERENCE")
     row = column.row(align=True)
     row.operator("fdda.copy_ranges", text="Copy to Selected", icon="COPYDOWN")
-    row.operator("fdda.mirror_ranges", text="Mirror", icon="MOD_MIRROR")
-    column.operator("fdda.forget_ranges", text="Forget Ranges", icon="X")
-    column = body.column(align=True)
-    column.operator("fdda.limits_preset", text="Human Ranges", icon="OUTLINER_OB_ARMATURE")
-    column.operator("fdda.limits_from_actions", icon="CON_ROTLIMIT")
-    if not recorded_actions(rig.armature_object):
-        text = "It measures how far actions move the bones: give the armature one and tick it below."
-        draw_sentence(body, context, text, "INFO")
+    row.operator("fdda.mirror_ranges", text="Mirror to Other Side", icon="MOD_MIRROR")
+    column.operator("fdda.forget_ranges", text="Clear Limits", icon="X")
 
 
 @draw_cached
@@ -217,10 +233,10 @@ def _ranges_of(rig: SceneRig, bone: bpy.types.PoseBone) -> tuple[str, list, tupl
     from ..poses.motion_range import CONSTRAINT, DEFAULT, IK, location_ranges, rotation_ranges
 
     ranges = rotation_ranges(bone)
-    where = {CONSTRAINT: "Limit Rotation", IK: "IK limits", DEFAULT: "default"}
-    sources = {r.source for r in ranges if r.moves} or {DEFAULT}
+    names = {CONSTRAINT: "Limit Rotation", IK: "IK Limits"}
+    sources = {r.source for r in ranges if r.moves and r.source != DEFAULT}
     locations = () if bone.bone.use_connect else tuple(location_ranges(bone))
-    return f"{bone.name} ({', '.join(where[source] for source in sorted(sources))})", ranges, locations
+    return f"{bone.name}: {', '.join(names[source] for source in sorted(sources)) or 'no limits'}", ranges, locations
 
 
 def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
@@ -237,7 +253,7 @@ def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBon
         fields = row.row(align=True)
         fields.enabled = not bone.lock_rotation[axis]
         if r.source == DEFAULT:
-            text = "fixed (IK lock)" if r.is_locked and not bone.lock_rotation[axis] else "±45°, not stated"
+            text = "locked (IK)" if r.is_locked and not bone.lock_rotation[axis] else "±45° (default)"
             fields.label(text="locked" if bone.lock_rotation[axis] else text)
             _draw_state_button(fields, rig, bone, axis, "fdda.state_range", "ADD")
             continue
@@ -248,7 +264,7 @@ def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBon
     for axis in locations:
         row = column.row(align=True)
         limit = find_local_limit(bone, "LIMIT_LOCATION")
-        row.prop(bone, "lock_location", index=axis, text=f"Move {AXES[axis].upper()}", toggle=1)
+        row.prop(bone, "lock_location", index=axis, text=f"Location {AXES[axis].upper()}", toggle=1)
         row.prop(limit, f"min_{AXES[axis]}", text="")
         row.prop(limit, f"max_{AXES[axis]}", text="")
 
@@ -264,19 +280,13 @@ def _draw_state_button(
 
 
 def _draw_random(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    settings, number = rig.mesh_object.fdda.settings, context.window_manager.fdda.pose_number
+    settings = rig.mesh_object.fdda.settings
     column = layout.column()
     column.use_property_split = True
     column.use_property_decorate = False
     column.prop(settings, "poses", text="Random Poses")
-    column.prop(settings, "seed")
-    column.prop(settings, "spread")
-    column.prop(settings, "margin")
     row = layout.row(align=True)
-    row.operator("fdda.preview_pose", text="", icon="TRIA_LEFT").step = -1
-    row.operator("fdda.preview_pose", text=f"Show Pose {number}").step = 0
-    row.operator("fdda.preview_pose", text="", icon="TRIA_RIGHT").step = 1
-    row.separator()
+    row.prop(context.window_manager.fdda, "preview_pose")
     row.operator("fdda.rest_pose", text="Rest Pose", icon="LOOP_BACK")
 
 
@@ -289,7 +299,7 @@ def _draw_actions(layout: bpy.types.UILayout, context: bpy.types.Context, rig: S
     fitting = _fitting_actions(rig)
     if not fitting:
         return
-    layout.label(text="Actions to record as well")
+    layout.label(text="Also Record Actions")
     session = context.window_manager.fdda
     layout.template_list("FDDA_UL_actions", "", bpy.data, "actions", session, "action_index", rows=min(4, len(fitting)))
     settings = rig.mesh_object.fdda.settings
@@ -298,9 +308,7 @@ def _draw_actions(layout: bpy.types.UILayout, context: bpy.types.Context, rig: S
     row.active = any(action.fdda.record for action in fitting)
     row.prop(settings, "mirror")
     if not settings.poses and not any(action.fdda.record for action in fitting):
-        draw_sentence(
-            layout, context, "There is nothing to record: raise the number of poses, or tick an action.", "ERROR"
-        )
+        draw_sentence(layout, context, "Nothing to record: raise Random Poses, or check an action.", "ERROR")
 
 
 CLASSES = (FDDA_UL_joints, sampled.FDDA_UL_controls, FDDA_UL_actions, FDDA_PT_poses)

@@ -10,12 +10,12 @@ import bpy
 
 from ..core.errors import FDDAError
 from ..jobs import job
-from ..properties.character import recording_folder
+from ..properties.character import default_recording, recording_folder
 from ..properties.choices import recorded_actions, recording_settings
 from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks
-from .section import Section, draw_button, draw_job, draw_path, draw_sentence, panel_rig
+from .section import Section, draw_advanced, draw_button, draw_job, draw_path, draw_sentence, panel_rig
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.recording.folder import FolderContent
@@ -84,13 +84,15 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
             return
         _draw_folder(layout, context, rig)
         draw_job(layout, context, "record", ("ERROR",))
+        if (advanced := draw_advanced(layout, "fdda_recording_advanced")) is not None:
+            advanced.prop(rig.mesh_object.fdda.settings, "min_partition_vertices")
 
 
 def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
     from ..core.recording.folder import FolderState
 
     settings = rig.mesh_object.fdda.settings
-    draw_path(layout, settings, "recording")
+    draw_path(layout, settings, "recording", default_recording(rig.mesh_object))
     _draw_settings(layout, context, settings)
     found = shown_content(rig)
     if isinstance(found, str):
@@ -100,18 +102,16 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     check = checks.known(rig)
     ready = check is not None and not check.problems
     if check is not None and check.problems:
-        draw_sentence(layout, context, "The rig cannot be recorded yet; see the section Rig.", "ERROR")
+        draw_sentence(layout, context, "The rig cannot be recorded yet; see the Rig section.", "ERROR")
     if content.state is FolderState.FREE:
         draw_sentence(layout, context, f"{_plan(rig)} will go into '{path.name}'.")
         _draw_record(layout, context, "Record", ready)
     elif content.state is FolderState.INCOMPLETE:
-        text = f"'{path.name}' has {content.complete:,} of {content.poses:,} poses."
+        text = f"{content.complete:,} of {content.poses:,} poses recorded. Press Resume to continue."
         draw_sentence(layout, context, text, "INFO")
         _draw_record(layout, context, "Resume", ready, resume=True)
     elif content.state is FolderState.COMPLETE:
-        draw_sentence(
-            layout, context, f"'{path.name}' is complete: {content.poses:,} poses. Train on it next.", "CHECKMARK"
-        )
+        draw_sentence(layout, context, f"{content.poses:,} poses recorded. Next: Train", "CHECKMARK")
         for sentence in content.measured:
             draw_sentence(layout, context, sentence)
         if content.sentence:
@@ -119,7 +119,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     else:
         draw_sentence(layout, context, content.sentence, "ERROR")
     if content.is_recording:
-        layout.operator("fdda.remove_recording", text="Remove Recording", icon="TRASH").object = rig.mesh_object.name
+        layout.operator("fdda.remove_recording", text="Delete Recording…", icon="TRASH").object = rig.mesh_object.name
 
 
 def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context, settings: bpy.types.PropertyGroup) -> None:
@@ -130,7 +130,6 @@ def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context, setti
         column.prop(settings, "pre_roll")
         column.prop(settings, "max_settle_frames")
     column.prop(settings, "fit_linear")
-    column.prop(settings, "min_partition_vertices")
 
 
 def _draw_record(
@@ -152,7 +151,7 @@ def _plan(rig: SceneRig) -> str:
     if frames:
         parts.append(f"{sum(frames):,} frames of {len(frames)} {'action' if len(frames) == 1 else 'actions'}")
         if settings.mirror:
-            parts.append("as many mirrored ones")
+            parts.append("their mirrored copies")
     return " and ".join(parts)
 
 

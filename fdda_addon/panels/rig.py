@@ -68,7 +68,7 @@ def _draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
             row.label(text="", icon="LINKED")
     if len(rigs) > MAX_MESHES:
         box.label(text=f"and {len(rigs) - MAX_MESHES} more; select one to see it")
-    box.prop(context.window_manager.fdda, "all_meshes", text=f"Buttons Work on All {len(rigs)}")
+    box.prop(context.window_manager.fdda, "all_meshes", text=f"Apply to All {len(rigs)} Meshes")
 
 
 def _draw_counts(layout: bpy.types.UILayout, rig: SceneRig) -> None:
@@ -76,16 +76,14 @@ def _draw_counts(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     column = layout.column(align=True)
     column.label(text=f"{rig.mesh_object.name}: {len(rig.mesh_object.data.vertices):,} vertices", icon="MESH_DATA")
     bones = len(rig.armature_object.data.bones)
-    joints = f"{len(check.rig.joints)} joints" if check and check.rig else "…"
-    text = f"{rig.armature_object.name}: {joints}"
-    if check and check.rig and len(check.rig.joints) != bones:
-        text += f" of {bones} bones"
-    column.label(text=text, icon="ARMATURE_DATA")
+    deforming = len(check.rig.joints) if check and check.rig else bones
+    count = f"{bones} bones" if deforming == bones else f"{deforming} of {bones} bones"
+    column.label(text=f"{rig.armature_object.name}: {count}", icon="ARMATURE_DATA")
 
 
 def _draw_replaced(layout: bpy.types.UILayout, mesh_object: bpy.types.Object, replaced: tuple[str, ...]) -> None:
     column = layout.column(align=True)
-    column.label(text="A model takes the place of:")
+    column.label(text="Replaced by the Model:")
     for modifier in (mesh_object.modifiers[name] for name in replaced if name in mesh_object.modifiers):
         column.label(text=modifier.name, icon=MODIFIER_ICONS.get(modifier.type, "MODIFIER"))
     if mesh_object.data.shape_keys:
@@ -102,7 +100,7 @@ def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context) ->
         return
     row = layout.row()
     row.scale_y = 1.3
-    draw_button(row, context, "fdda.build_model", "Prepare, Train, Bind", "PLAY")
+    draw_button(row, context, "fdda.build_model", "Record, Train & Bind", "PLAY")
 
 
 def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
@@ -113,16 +111,16 @@ def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Scen
     if cost is not None:
         column = layout.column(align=True)
         for name, milliseconds in (
-            ("This rig", f"{cost.rig:.2f} ms a frame"),
-            ("Armature alone", f"{cost.linear:.2f} ms"),
-            ("With a model", f"{cost.model:.1f} ms, estimated"),
+            ("Rig", f"{cost.rig:.2f} ms per frame"),
+            ("Armature Only", f"{cost.linear:.2f} ms"),
+            ("Model (estimate)", f"{cost.model:.1f} ms"),
         ):
             row = column.split(factor=0.45)
             row.label(text=name)
             row.label(text=milliseconds)
         draw_sentence(layout, context, cost.sentence, "INFO")
     if state is None or not state.is_running:
-        layout.operator("fdda.measure", text="Measure Again" if cost else "Measure", icon="TIME")
+        layout.operator("fdda.measure", text="Measure Speed", icon="TIME")
 
 
 CLASSES = (FDDA_PT_rig,)

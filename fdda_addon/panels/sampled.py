@@ -24,29 +24,27 @@ class FDDA_UL_controls(bpy.types.UIList):
 
     def draw_item(self, _context: bpy.types.Context, layout: bpy.types.UILayout, _data, control, _icon, _active, _name):
         row = layout.row()
-        text = (
-            "All Shape Keys" if control.name == ALL_SHAPE_KEYS else control.name.rpartition("/")[2] or "not named yet"
-        )
+        text = "All Shape Keys" if control.name == ALL_SHAPE_KEYS else control.name.rpartition("/")[2] or "(unnamed)"
         row.label(text=text, icon="SHAPEKEY_DATA" if "/" not in control.name else "DRIVER")
         side = row.row()
         side.alignment = "RIGHT"
-        side.label(text=f"{control.low:g}…{control.high:g}" if control.has_range else "its range")
+        side.label(text=f"{control.low:g}…{control.high:g}" if control.has_range else "default")
 
 
 def draw_choice(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
     """Which bones random poses move."""
     settings = rig.mesh_object.fdda.settings
     column = layout.column()
-    column.label(text="Random poses move")
+    column.label(text="Bones to Pose")
     column.prop(settings, "sample", text="")
     if settings.sample == "COLLECTION":
         column.prop_search(settings, "bone_collection", rig.armature_object.data, "collections_all", text="")
     elif settings.sample == "ACTIONS" and not recorded_actions(rig.armature_object):
-        draw_sentence(column, context, "Tick the actions below that show how the rig moves.", "INFO")
+        draw_sentence(column, context, "Check the actions below that show how the rig moves.", "INFO")
     elif settings.sample == "SELECTED":
         count = len(settings.sampled_bones)
         if not count:
-            draw_sentence(column, context, "Select bones in pose mode, then press the button.", "INFO")
+            draw_sentence(column, context, "Select bones in Pose Mode, then press the button.", "INFO")
         column.operator("fdda.use_selected_bones", icon="RESTRICT_SELECT_OFF").object = rig.mesh_object.name
     check = checks.known(rig)
     if check is not None and check.channels and (settings.sample != "WEIGHTS" or check.rig.controls):
@@ -63,8 +61,8 @@ def counted(check: "RigCheck") -> str:
     if bones:
         parts.append(f"{_many(bones, 'bone')} ({_many(len(channels), 'channel')})")
     if controls:
-        parts.append(_many(controls, "control"))
-    return f"Sampled: {' and '.join(parts)}."
+        parts.append(_many(controls, "extra input"))
+    return f"Random poses will move {' and '.join(parts)}."
 
 
 def _many(count: int, noun: str) -> str:
@@ -75,9 +73,9 @@ def draw_channels(box: bpy.types.UILayout, bone: bpy.types.PoseBone, channels: "
     """How a bone is sampled that was chosen: nothing to edit, for the ranges may come from actions."""
     from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR
 
-    box.label(text=f"{bone.name}, as it is sampled", icon="BONE_DATA")
+    box.label(text=f"{bone.name} (from actions)", icon="BONE_DATA")
     column = box.column(align=True)
-    verbs = {ROTATION: "Turn", ROTATION_VECTOR: "Turn", LOCATION: "Move"}
+    verbs = {ROTATION: "Rotation", ROTATION_VECTOR: "Rotation", LOCATION: "Location"}
     for channel in channels:
         row = column.split(factor=0.4)
         row.label(text=f"{verbs.get(channel.kind, 'Scale')} {'XYZ'[channel.axis]}")
@@ -94,7 +92,7 @@ def draw_controls(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     found = check.found if check is not None else ()
     count = len(check.rig.controls) if check is not None and check.rig else len(settings.controls)
     header, body = layout.panel("fdda_controls", default_closed=True)
-    header.label(text=f"Controls ({count})" if count else "Controls")
+    header.label(text=f"Extra Inputs ({count})" if count else "Extra Inputs")
     if body is None:
         return
     row = body.row()
@@ -105,9 +103,9 @@ def draw_controls(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     if 0 <= settings.control_index < len(settings.controls):
         control = settings.controls[settings.control_index]
         column = body.column(align=True)
-        column.prop(control, "name", text="")
+        column.prop(control, "name", text="", placeholder="Shape key or data path")
         row = column.row(align=True)
-        row.prop(control, "has_range", text="Range")
+        row.prop(control, "has_range", text="Override Range")
         fields = row.row(align=True)
         fields.active = control.has_range
         fields.prop(control, "low", text="")
@@ -117,7 +115,7 @@ def draw_controls(layout: bpy.types.UILayout, rig: SceneRig) -> None:
         properties.object, properties.name = rig.mesh_object.name, ALL_SHAPE_KEYS
     if found:
         column = body.column(align=True)
-        column.label(text="Found: drivers or ticked actions use them")
+        column.label(text="Detected automatically")
         for control in found[:MAX_LINES]:
             column.label(text=f"{control.name} {control.low:g}…{control.high:g}", icon="DOT")
         if len(found) > MAX_LINES:

@@ -110,11 +110,22 @@ def _lines(text: str, width: float, points: float) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def draw_path(layout: bpy.types.UILayout, owner: bpy.types.bpy_struct, name: str) -> None:
-    """Draw a path; as a label above, so that the path has the whole width."""
+def draw_path(layout: bpy.types.UILayout, owner: bpy.types.bpy_struct, name: str, default: str) -> None:
+    """Draw a path below its label, so that it has the whole width; an empty one shows the default in gray."""
     column = layout.column(align=True)
-    column.label(text=f"{owner.bl_rna.properties[name].name} (empty: beside the file)")
-    column.prop(owner, name, text="")
+    column.label(text=owner.bl_rna.properties[name].name)
+    column.prop(owner, name, text="", placeholder=default)
+
+
+def draw_advanced(layout: bpy.types.UILayout, identifier: str) -> bpy.types.UILayout | None:
+    """Draw the header of a closed sub-panel "Advanced"; returns the column for its fields, None while it is closed."""
+    header, body = layout.panel(identifier, default_closed=True)
+    header.label(text="Advanced")
+    if body is None:
+        return None
+    column = body.column()
+    column.use_property_split, column.use_property_decorate = True, False
+    return column
 
 
 def draw_job(
@@ -150,14 +161,11 @@ def draw_job(
         draw_sentence(column, context, state.sentence, "SORTTIME")
     row = column.row(align=True)
     row.enabled = not state.cancel_requested
-    row.operator("fdda.cancel", text="Cancelling…" if state.cancel_requested else "Cancel", icon="X")
+    row.operator("fdda.cancel", text="Canceling…" if state.cancel_requested else "Cancel", icon="X")
     remaining = state.remaining_seconds
     # The line is always there: what is below would jump.
-    if state.total and state.done == state.total:
-        text = "Finishing…"
-    else:
-        text = f"About {duration(remaining)} left" if remaining is not None else "…"
-    layout.label(text=text, icon="TIME")
+    text = f"About {duration(remaining)} left" if remaining is not None else "…"
+    layout.label(text="Finishing…" if state.is_finishing else text, icon="TIME")
     return True
 
 

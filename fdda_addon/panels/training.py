@@ -9,13 +9,14 @@ import bpy
 from ..core.errors import TrainingError
 from ..core.report import Verdict, checkpoint_path, read_report, report_path
 from ..jobs import job
+from ..properties.character import default_model
 from ..properties.preferences import MODULE, preferences
 from ..scene.scene_rig import SceneRig
 from ..training.environment import choice, session
 from . import curves
 from .names import shown_name
 from .recording import shown_content
-from .section import Section, draw_button, draw_job, draw_path, draw_sentence, panel_rig
+from .section import Section, draw_advanced, draw_button, draw_job, draw_path, draw_sentence, panel_rig
 from .trained import Trained, trained
 
 SHOWN_PARTITIONS = 8
@@ -47,7 +48,7 @@ class FDDA_PT_training(Section, bpy.types.Panel):
             curves.draw(layout, running.curves)
             for warning in running.warnings:
                 draw_sentence(layout, context, warning, "INFO")
-            draw_sentence(layout, context, "You can go on working meanwhile, and close Blender.", "INFO")
+            draw_sentence(layout, context, "You can keep working, or even quit Blender: training continues.", "INFO")
             return
         if running and running.verb == "refine":
             draw_job(layout, context, "refine")
@@ -66,6 +67,9 @@ class FDDA_PT_training(Section, bpy.types.Panel):
             curves.draw(layout, ended.curves)
         if found is not None and not found.foreign:
             _draw_report(layout, context, rig, found.path)
+        if (advanced := draw_advanced(layout, "fdda_training_advanced")) is not None:
+            advanced.prop(rig.mesh_object.fdda.settings, "tolerance_mm")
+            advanced.prop(rig.mesh_object.fdda.settings, "training_seed")
 
 
 def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
@@ -80,12 +84,12 @@ def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool
     elif answer is not None:
         draw_sentence(box, context, answer.message, "ERROR" if answer.level == "ERROR" else "INFO")
     elif choice.chosen_python().origin is choice.Origin.THIS:
-        text = "Training needs a Python with PyTorch, and there is none yet; the preferences can make one."
+        text = "Training needs PyTorch, which is not installed yet; install it in the preferences."
         draw_sentence(box, context, text, "ERROR")
     else:
-        draw_sentence(box, context, f"Trains with {choice.chosen_python().path}, which was not checked yet.", "INFO")
+        draw_sentence(box, context, f"Python not checked yet: {choice.chosen_python().path}", "INFO")
     row = box.row(align=True)
-    row.operator("fdda.check_trainer", text="Check", icon="QUESTION")
+    row.operator("fdda.check_trainer", text="Check Setup", icon="VIEWZOOM")
     if preferences() is not None:
         row.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = MODULE
     return answer is None or answer.level != "ERROR"
@@ -100,37 +104,39 @@ def _draw_settings(
     column = layout.column()
     column.use_property_split = True
     column.use_property_decorate = False
-    for name in ("goal_mm", "tolerance_mm", "epochs", "training_seed"):
-        column.prop(settings, name)
-    draw_path(layout, settings, "model")
+    row = column.row(heading="Goal (mm)")
+    row.prop(settings, "use_goal", text="")
+    goal = row.row()
+    goal.active = settings.use_goal
+    goal.prop(settings, "goal_mm", text="")
+    column.prop(settings, "epochs")
+    draw_path(layout, settings, "model", default_model(rig.mesh_object))
     content = shown_content(rig)
     if isinstance(content, str):
         draw_sentence(layout, context, content, "ERROR")
         ready = False
     elif content[1].state is not FolderState.COMPLETE:
-        draw_sentence(layout, context, "There is no complete recording of this rig yet; record first.", "INFO")
+        draw_sentence(layout, context, "This rig has no complete recording yet; record first.", "INFO")
         ready = False
     if found is not None and found.foreign:
-        text = (
-            f"'{found.path.name}' is there and not of this rig: {found.foreign}. Training asks before it replaces it."
-        )
+        text = f"{found.path.name} belongs to another rig: {found.foreign}. Train will ask before it overwrites it."
         draw_sentence(layout, context, text, "ERROR")
     elif found is not None:
-        draw_sentence(layout, context, f"'{found.path.name}' is there; training again replaces it.", "CHECKMARK")
+        draw_sentence(layout, context, f"{found.path.name} exists; Train will overwrite it.", "CHECKMARK")
     row = layout.row()
     row.enabled = ready
     row.scale_y = 1.3
-    draw_button(row, context, "fdda.train", "Train", "PLAY")
+    draw_button(row, context, "fdda.train", "Train" if found is None else "Train Again", "PLAY")
     if found is None or found.foreign:
         return
     # What a better model takes, in the order of the work.
     on = layout.column(align=True)
     on.enabled = ready
-    on.operator("fdda.refine", text="Add Poses Where It Is Worst", icon="ADD")
+    on.operator("fdda.refine", text="Add Poses at Worst Errors", icon="ADD")
     if checkpoint_path(found.path).is_file():
-        on.operator("fdda.train", text="Train On", icon="FF").warm_start = True
+        on.operator("fdda.train", text="Continue Training", icon="FF").warm_start = True
     else:
-        draw_sentence(layout, context, "Its checkpoint is gone, so it cannot be trained on.", "INFO")
+        draw_sentence(layout, context, "Its checkpoint is missing, so training cannot continue from it.", "INFO")
     if not rig.mesh_object.fdda.is_bound:
         bind = layout.operator("fdda.bind", text=f"Bind '{found.path.name}'", icon="LINKED")
         bind.object, bind.filepath = rig.mesh_object.name, str(found.path)
@@ -143,18 +149,19 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     if goal := report.get("goal"):
         draw_sentence(layout, context, *_goal(goal))
     for warning in report.get("warnings", ()):
-        draw_sentence(layout, context, f"Warning: {warning['name']}; the report says what to do.", "INFO")
-    everything = report["fdda"]["held_out"]
+        draw_sentence(layout, context, f"Warning: {warning['name']}; see the training report.", "INFO")
+    model_mm, skinning_mm = (report[way]["held_out"] for way in ("fdda", "linear"))
+    text = f"Unseen poses: mean {model_mm['mean']:.2f} mm (skinning alone {skinning_mm['mean']:.2f}), max "
+    draw_sentence(layout, context, f"{text}{model_mm['max']:.1f} ({skinning_mm['max']:.1f})")
+    draw_sentence(layout, context, f"99.9 % of points within {model_mm['p999']:.2f} mm")
     header, body = layout.panel("fdda_held_out", default_closed=True)
-    header.label(text=f"Held-out mean {everything['mean']:.3f}, max {everything['max']:.2f} mm")
+    header.label(text="Error by Body Part")
     if body is None:
         return
-    body.label(text=f"99.9 % within {everything['p999']:.2f} mm")
-    body.label(text="By partition, worst first")
     partitions = sorted(report["partitions"], key=lambda p: -p["held_out"]["max"])
     shown = partitions if context.window_manager.fdda.show_all_partitions else partitions[:SHOWN_PARTITIONS]
     names, means, nearly, largest = _columns(body.box())
-    for column, text in ((names, "Partition"), (means, "Mean"), (nearly, "99.9 %"), (largest, "Max")):
+    for column, text in ((names, "Body Part"), (means, "Mean"), (nearly, "99.9 %"), (largest, "Max")):
         column.label(text=text)
     for p in shown:
         names.label(text=shown_name(rig.armature_object, p["joint"]))
@@ -162,7 +169,7 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         nearly.label(text=f"{p['held_out']['p999']:.2f}")
         largest.label(text=f"{p['held_out']['max']:.2f}")
     if len(partitions) > SHOWN_PARTITIONS:
-        text = f"Show All {len(partitions)} Partitions"
+        text = f"Show All {len(partitions)} Body Parts"
         body.prop(context.window_manager.fdda, "show_all_partitions", text=text, toggle=True)
 
 
@@ -179,10 +186,10 @@ def _columns(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
 
 def _goal(goal: dict) -> tuple[str, str]:
     """A sentence and an icon for what the report says of the accuracy goal."""
-    reached = f"99.9 % within {goal['p999']:.2f} mm, goal {goal['goal']:g} mm"
+    reached = f"99.9 % of points within {goal['p999']:.2f} mm, goal {goal['goal']:g} mm"
     return {
         Verdict.MET: (f"{reached}: met.", "CHECKMARK"),
-        Verdict.MISSED: (f"{reached}: missed. Add poses where the model is worst, and train on.", "INFO"),
+        Verdict.MISSED: (f"{reached}: missed. Add poses at the worst errors, and continue training.", "INFO"),
         Verdict.EXHAUSTED: (f"{reached}: missed, and more poses no longer help.", "INFO"),
     }[Verdict(goal["verdict"])]
 

@@ -46,7 +46,7 @@ class FDDA_PG_modifier(bpy.types.PropertyGroup):
 class FDDA_PG_model(bpy.types.PropertyGroup):
     """A model of a mesh: its file, or the text that holds it."""
 
-    name: StringProperty(name="Name", description="What the model is called", override=OVERRIDABLE)
+    name: StringProperty(name="Name", description="Name of the model", override=OVERRIDABLE)
     path: StringProperty(
         name="File",
         description="The model, an .onnx file; where it came from when it is packed",
@@ -86,8 +86,8 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
         description="What deforms the mesh",
         items=(
             ("RIG", "Rig", "The modifiers of the rig"),
-            ("LINEAR", "Linear Layer", "Linear skinning alone"),
-            ("FDDA", "FDDA", "The model"),
+            ("LINEAR", "Skinning", "Linear skinning alone"),
+            ("FDDA", "Model", "The model"),
         ),
         default="RIG",
         update=_apply,
@@ -96,7 +96,7 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
     )
     strength: FloatProperty(
         name="Strength",
-        description="0 is linear skinning, 1 the model",
+        description="Blend from linear skinning (0) to the model (1)",
         min=0,
         max=1,
         default=1,
@@ -108,26 +108,26 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
     mask: StringProperty(
         name="Mask",
         description=(
-            "The vertex group that says where the model counts: with a weight of 1 it does, with 0, and outside of the "
-            "group, there is linear skinning, in between a blend. Empty: everywhere"
+            "Vertex group that limits the model: at a weight of 1 the model is used, at 0 and outside the group linear "
+            "skinning, in between a blend. Empty to use the model everywhere"
         ),
         update=_apply_mask,
         override=OVERRIDABLE,
     )
     invert_mask: BoolProperty(
         name="Invert Mask",
-        description="The model counts where the vertex group has a weight of 0: the group is what is left out",
+        description="Use the model outside the vertex group instead of inside",
         update=_apply_mask,
         override=OVERRIDABLE,
     )
     use_in_render: BoolProperty(
         name="Use in Render",
-        description="Final renders use the model as well, not the rig",
+        description="Use the model in final renders too, instead of the rig",
         update=_apply,
         override=OVERRIDABLE,
     )
     status: StringProperty(
-        name="Status", description="Why the model was switched off, empty when all is well", override=OVERRIDABLE
+        name="Status", description="Why the model is switched off; empty when it is not", override=OVERRIDABLE
     )
 
     is_playing: BoolProperty(
@@ -136,9 +136,7 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
     modifiers: CollectionProperty(type=FDDA_PG_modifier, override=INSERTABLE)
 
     models: CollectionProperty(type=FDDA_PG_model, override=INSERTABLE)
-    model_index: IntProperty(
-        name="Model", description="The model that the buttons below are about", override=OVERRIDABLE
-    )
+    model_index: IntProperty(name="Model", description="Active model of the list", override=OVERRIDABLE)
 
     settings: PointerProperty(type=FDDA_PG_character, override=OVERRIDABLE)
 

@@ -80,16 +80,20 @@ def _sample(settings: FDDA_PG_character, actions: tuple[str, ...]) -> tuple[str,
     """What random poses move, as `poses.sampling.choose` reads it."""
     if settings.sample == "COLLECTION":
         if not settings.bone_collection:
-            raise RigError("Random poses are to move a bone collection, and none is chosen; choose it under Poses.")
+            raise RigError(
+                "Bones to Pose is set to Bone Collection, but no collection is chosen; choose one in Training Poses."
+            )
         return (f"collection:{settings.bone_collection}",)
     if settings.sample == "ACTIONS":
         if not actions:
-            raise RigError("Random poses are to move what the ticked actions key, and none is ticked; tick one.")
+            raise RigError(
+                "Bones to Pose is set to Bones in the Checked Actions, but no action is checked; check one below it."
+            )
         return tuple(f"action:{name}" for name in actions)
     if settings.sample == "SELECTED":
         if not settings.sampled_bones:
             raise RigError(
-                "Random poses are to move selected bones, and none is chosen; select them and press Use Selected Bones."
+                "Bones to Pose is set to Selected Bones, but none is chosen; select bones and press Use Selected Bones."
             )
         return tuple(f"bone:{bone.name}" for bone in settings.sampled_bones)
     return ()

@@ -18,10 +18,10 @@ MODULE = EXTENSION or __package__.partition(".")[0]
 
 ICONS = {"INFO": "CHECKMARK", "WARNING": "INFO", "ERROR": "ERROR"}
 SHORT = {
-    FolderState.MISSING: "Not created",
-    FolderState.HALF_MADE: "Half-made: its creation was interrupted; create it again, or remove it",
-    FolderState.BROKEN: "Broken: its Python is gone; create it again",
-    FolderState.OUTDATED: "Ready, with other versions than this add-on asks for; create it again when it suits",
+    FolderState.MISSING: "Not installed",
+    FolderState.HALF_MADE: "Incomplete: its installation was interrupted; reinstall it, or remove it",
+    FolderState.BROKEN: "Broken: its Python is missing; reinstall it",
+    FolderState.OUTDATED: "Ready, but this add-on expects other versions; reinstall it when convenient",
     FolderState.READY: "Ready",
 }
 
@@ -29,7 +29,9 @@ SHORT = {
 class FDDA_PG_folder(bpy.types.PropertyGroup):
     """A folder that the user trusts: .blend files may name models in it and below."""
 
-    path: StringProperty(name="Folder", description="Models in this folder and below are followed", subtype="DIR_PATH")
+    path: StringProperty(
+        name="Folder", description="Load models from this folder and its subfolders", subtype="DIR_PATH"
+    )
 
 
 class FDDA_AP_preferences(bpy.types.AddonPreferences):
@@ -38,23 +40,22 @@ class FDDA_AP_preferences(bpy.types.AddonPreferences):
     bl_idname = MODULE
 
     trainer_python: StringProperty(
-        name="Python",
-        description="A Python that has torch, or the folder of a virtual environment with it. Empty: the environment "
-        f"variable {choice.PYTHON_VARIABLE}, else the environment below",
+        name="Existing Python",
+        description="Python with PyTorch, or the folder of its virtual environment. Empty for the environment "
+        f"variable {choice.PYTHON_VARIABLE}, or else the environment above",
         subtype="FILE_PATH",
         update=lambda _preferences, _context: session.remember(None),
     )
     wheels_folder: StringProperty(
-        name="Wheels",
-        description="Install the environment from the Python packages in this folder, files that end in .whl, on a "
-        "machine that is not online. Empty: from the package index",
+        name="Offline Packages",
+        description="Folder of .whl files to install from, for a machine without internet. Empty for the package index",
         subtype="DIR_PATH",
     )
 
     pack_models: BoolProperty(
         name="Pack Models into the .blend File",
-        description="A model that is bound is kept inside the .blend file, and so is there wherever that is saved, "
-        "appended or linked. One of more than 32 MB stays outside until you press Pack",
+        description="Store models in the .blend file when they are bound, so that they are saved, appended and linked "
+        "with it. Models of more than 32 MB are only packed on request",
         default=True,
     )
     folders: CollectionProperty(type=FDDA_PG_folder)
@@ -66,25 +67,27 @@ class FDDA_AP_preferences(bpy.types.AddonPreferences):
         layout.use_property_split = True
         layout.use_property_decorate = False
         layout.label(text="Training needs PyTorch, in a Python of its own. Everything else works without it.")
-        layout.prop(self, "trainer_python", placeholder="The trainer environment below")
+        draw_own_environment(layout, self)
+        layout.separator()
+        layout.prop(
+            self, "trainer_python", text="Existing Python (optional)", placeholder="The training environment above"
+        )
         if not self.trainer_python and (named := os.environ.get(choice.PYTHON_VARIABLE)):
             draw_lines(layout, f"{choice.PYTHON_VARIABLE} is set: {named}", "INFO")
         draw_check(layout)
-        layout.separator()
-        draw_own_environment(layout, self)
 
 
 def draw_models(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -> None:
     """Where models are kept, and from which folders they are followed."""
     column = layout.column()
-    column.label(text="A .blend file follows a model that is packed into it, or lies in its folder or below.")
+    column.label(text="Models load if packed, or in the .blend file's folder")
     column.prop(own, "pack_models")
-    column.label(text="Trusted folders: models in them and below are followed from any .blend file")
+    column.label(text="Also load models from:")
     for index, folder in enumerate(own.folders):
         row = column.row(align=True)
         row.prop(folder, "path", text="")
         row.operator("fdda.remove_trusted_folder", text="", icon="REMOVE").index = index
-    column.operator("fdda.add_trusted_folder", icon="ADD")
+    column.operator("fdda.add_trusted_folder", text="Add Folder…", icon="ADD")
 
 
 def packs_models() -> bool:
@@ -114,7 +117,7 @@ def wheels_folder() -> str:
 def draw_check(layout: bpy.types.UILayout) -> None:
     """Which Python trains, a button to check it, and what the last check said. Asks nothing."""
     _, right = _split(layout)
-    right.operator("fdda.check_trainer", text="Check", icon="QUESTION")
+    right.operator("fdda.check_trainer", text="Check Setup", icon="VIEWZOOM")
     if current(ENVIRONMENT) is None:
         draw_check_result(layout, session.check_result)
 
@@ -123,9 +126,9 @@ def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -
     """The environment that the add-on makes: its state, its buttons, its progress."""
     state = session.own_state()
     left, right = _split(layout)
-    left.label(text="Trainer Environment")
+    left.label(text="Training Environment")
     right.label(text=SHORT[state], icon="ERROR" if state in (FolderState.HALF_MADE, FolderState.BROKEN) else "NONE")
-    layout.prop(own, "wheels_folder", placeholder="None: install from the network")
+    layout.prop(own, "wheels_folder", placeholder="None: install from the internet")
     if (job := current(ENVIRONMENT)) is not None:
         draw_job(layout, job)
     else:
@@ -135,7 +138,7 @@ def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -
         again = state is not FolderState.MISSING
         create = row.row()
         create.enabled = not reason
-        text = "Create Again" if again else "Create Trainer Environment"
+        text = "Reinstall" if again else "Install Training Environment (3 GB)"
         create.operator("fdda.create_trainer_environment", text=text, icon="IMPORT")
         if again:
             row.operator("fdda.remove_trainer_environment", text="", icon="TRASH")

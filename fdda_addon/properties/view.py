@@ -23,40 +23,40 @@ class FDDA_PG_view(bpy.types.PropertyGroup):
     """Settings of the evaluation and of the colours in the viewport."""
 
     source: EnumProperty(
-        name="Compare on",
-        description="The poses on which the model is compared with the rig",
+        name="Compare On",
+        description="Poses to compare the model with the rig on",
         items=(
-            ("ACTION", "Active Action", "The frames of the armature's action"),
-            ("RANDOM", "Random Poses", "Random poses inside the range of motion that no recording has"),
+            ("ACTION", "Active Action", "All frames of the armature's action"),
+            ("RANDOM", "Random Poses", "New random poses within the limits, which are in no recording"),
         ),
         default="ACTION",
     )
     poses: IntProperty(
         name="Poses", description="Number of random poses", default=SIDEBAR_EVALUATION_POSES, min=1, soft_max=1000
     )
-    seed: IntProperty(name="Seed", description="Other seeds give other random poses", default=EVALUATION_SEED, min=0)
+    seed: IntProperty(name="Seed", description="Random seed of the poses", default=EVALUATION_SEED, min=0)
     way: EnumProperty(
-        name="Of",
-        description="Whose error is shown",
+        name="Error Of",
+        description="Deformation whose error to show",
         items=(
-            ("fdda", "FDDA", "The distance of the model from the rig"),
-            ("linear", "Linear Layer", "The distance of linear skinning alone from the rig"),
+            ("fdda", "Model", "Distance between the model and the rig"),
+            ("linear", "Skinning", "Distance between linear skinning and the rig"),
         ),
         update=_redraw,
     )
     statistic: EnumProperty(
         name="Show",
-        description="Which error of a vertex is shown",
+        description="Error to show for each vertex",
         items=(
-            ("mean", "Mean", "The mean over all poses that were compared"),
-            ("max", "Largest", "The largest over all poses that were compared"),
-            ("pose", "This Frame", "That of the current frame, or of the random pose that was jumped to"),
+            ("mean", "Mean", "Mean error over all compared poses"),
+            ("max", "Max", "Largest error over all compared poses"),
+            ("pose", "This Frame", "Error in the current frame, or in the random pose that is shown"),
         ),
         update=_redraw,
     )
     range_mm: FloatProperty(
-        name="Red from (mm)",
-        description="Errors from here on are red, half of it is violet",
+        name="Max Color (mm)",
+        description="Error that is shown in red",
         default=10.0,
         min=0.001,
         soft_max=50.0,
@@ -65,16 +65,14 @@ class FDDA_PG_view(bpy.types.PropertyGroup):
         update=_redraw,
     )
     graph: BoolProperty(
-        name="Error in the Timeline",
-        description="Draw the largest error of each frame as a graph along the bottom of the timeline",
+        name="Show in Timeline",
+        description="Draw the largest error of each frame as a graph at the bottom of the timeline",
         default=True,
         update=lambda view, _context: show_graph(view.graph),
     )
-    pose: IntProperty(name="Pose", description="The random pose that was jumped to", default=-1, options={"HIDDEN"})
-    markers: IntProperty(
-        name="Markers", description="How many of the worst frames are marked", default=MARKERS, min=1, max=50
-    )
-    show_partitions: BoolProperty(name="All Partitions", description="List every partition, not the worst five alone")
+    pose: IntProperty(name="Pose", description="Random pose that is shown", default=-1, options={"HIDDEN"})
+    markers: IntProperty(name="Markers", description="Number of worst frames to mark", default=MARKERS, min=1, max=50)
+    show_partitions: BoolProperty(name="All Body Parts", description="List all body parts, not only the five worst")
 
 
 CLASSES = (FDDA_PG_view,)

@@ -110,5 +110,5 @@ def check_has_weights(scene_rig: SceneRig, rig: Rig) -> None:
         raise RigError(
             f"The vertices of '{scene_rig.mesh_object.name}' have no weights on deforming bones of "
             f"'{scene_rig.armature_object.name}', so there is no linear skinning to learn from; have one fitted "
-            "(--fit-linear smooth, or Linear Layer in the sidebar), or paint weights."
+            "(--fit-linear smooth, or Base Skinning in the sidebar), or paint weights."
         )

@@ -81,7 +81,7 @@ def allowed_path(mesh_object: bpy.types.Object, stored: str) -> Path:
     if not (in_folder or path.resolve() in _chosen_paths or is_trusted(path)):
         raise ModelError(
             f"The model '{path}' lies outside the folder of '{Path(file).name}' and is not followed; "
-            "choose it again and pack it, move it beside the file, or trust its folder in the preferences."
+            "choose it again and pack it, move it beside the file, or add its folder in the preferences."
         )
     return path
 

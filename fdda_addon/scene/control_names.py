@@ -1,11 +1,51 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Names of controls that a user may want, and the value at which a control does nothing."""
 
+import re
+
 import bpy
 
 from ..core.controls import ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS
-from .controls import custom_property_key, is_custom_property, is_driven, is_number, owner_of, parent_and_name
+from .controls import (
+    custom_property_key,
+    fcurve_target,
+    is_custom_property,
+    is_driven,
+    is_number,
+    owner_name,
+    owner_of,
+    parent_and_name,
+)
 from .scene_rig import SceneRig
+
+_FULL_DATA_PATH = re.compile(r'bpy\.data\.(?P<collection>\w+)\["(?P<name>(?:[^"\\]|\\.)*)"\]\.?(?P<path>.+)', re.DOTALL)
+_SHAPE_KEY = re.compile(r'key_blocks\["(?P<name>(?:[^"\\]|\\.)*)"\]\.value')
+
+
+def control_at(scene_rig: SceneRig, text: str) -> str:
+    """Return the name of the control at a full data path, as Copy Full Data Path of Blender gives it.
+
+    Args:
+        scene_rig: the rig.
+        text: for example `bpy.data.objects["arm"].data.shape_keys.key_blocks["smile"].value`.
+
+    Returns:
+        The name of a shape key, or OWNER/PATH; the text itself where it leads to no number of the rig.
+    """
+    match = _FULL_DATA_PATH.fullmatch(text.strip())
+    collection = getattr(bpy.data, match["collection"], None) if match else None
+    if not isinstance(collection, bpy.types.bpy_prop_collection):
+        return text
+    datablock = collection.get(bpy.utils.unescape_identifier(match["name"]))
+    if not is_number(datablock, match["path"]):
+        return text
+    struct_owner, path, _ = fcurve_target(datablock, match["path"])
+    index = parent_and_name(datablock, match["path"])[2]
+    owner = owner_name(scene_rig, struct_owner)
+    shape_key = _SHAPE_KEY.fullmatch(path) if owner == SHAPE_KEYS else None
+    if shape_key:
+        return bpy.utils.unescape_identifier(shape_key["name"])
+    return f"{owner}/{path}{'' if index is None else f'[{index}]'}" if owner else text
 
 
 def suggested_controls(scene_rig: SceneRig) -> list[str]:

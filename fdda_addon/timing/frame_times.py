@@ -37,8 +37,8 @@ class FrameTimes:
 def verdict(rig: float, fdda: float) -> str:
     """Whether a model pays that takes so many milliseconds a frame in place of the rig's."""
     if fdda >= rig:
-        return "Not worth it here: the modifiers of this rig cost less than the playback of a model."
-    return f"FDDA is {rig / fdda:.1f} times as fast as the rig: it pays."
+        return "Not worth it here: this rig is faster than the model."
+    return f"{rig / fdda:.1f}x faster than the rig."
 
 
 def store(mesh_object: bpy.types.Object, times: FrameTimes) -> None:

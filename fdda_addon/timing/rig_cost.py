@@ -45,10 +45,10 @@ class RigCost:
         """Whether a model would pay."""
         gain = self.rig / self.model
         if gain >= MIN_CLEAR_SPEEDUP:
-            return f"A model would pay: a frame is about {gain:.1f} times as fast."
+            return f"Worth it: about {gain:.1f}x faster."
         if gain >= 1 / MIN_CLEAR_SPEEDUP:
-            return "A model would make little difference to the time of a frame."
-        return "A model would not pay: this rig costs less than the playback of a model."
+            return "Little difference: a model takes about as long as this rig."
+        return "Not worth it here: this rig is faster than a model."
 
 
 def estimated_playback(vertices: int) -> float:

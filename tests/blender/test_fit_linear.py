@@ -162,7 +162,7 @@ def test_a_mesh_without_weights_is_refused_unless_they_are_fitted(refusal, tmp_p
     save_copy(tmp_path / "cloth.blend")
     assert refusal("record", tmp_path / "cloth.blend", tmp_path / "recording", "--object", ELBOW) == (
         "The vertices of 'elbow' have no weights on deforming bones of 'elbow_rig', so there is no linear skinning to "
-        "learn from; have one fitted (--fit-linear smooth, or Linear Layer in the sidebar), or paint weights."
+        "learn from; have one fitted (--fit-linear smooth, or Base Skinning in the sidebar), or paint weights."
     )
 
 

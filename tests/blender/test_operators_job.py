@@ -119,7 +119,7 @@ def test_there_is_one_job_at_a_time():
 
 
 def test_cancel_without_a_job_says_so():
-    with pytest.raises(RuntimeError, match="Nothing is under way"):
+    with pytest.raises(RuntimeError, match="No job is running"):
         bpy.ops.fdda.cancel()
 
 

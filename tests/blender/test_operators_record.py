@@ -91,7 +91,7 @@ class TestRig:
         cost = cost_of(saved.mesh_object)
         assert cost.vertices == len(saved.mesh_object.data.vertices)
         assert cost.rig > cost.linear > 0 and cost.model > cost.linear
-        assert job.state_of("measure").outcome.endswith("this rig costs less than the playback of a model.")
+        assert job.state_of("measure").outcome.endswith("Not worth it here: this rig is faster than a model.")
 
     def test_what_cannot_be_evaluated_is_not_measured(self, saved):
         saved.armature_object.data.pose_position = "REST"
@@ -142,12 +142,26 @@ class TestPoses:
         channels = sampled_channels(saved, read_rig(saved))
         assert bpy.ops.fdda.preview_pose(number=3) == {"FINISHED"}
         assert bpy.ops.fdda.preview_pose(step=1) == {"FINISHED"}
-        assert bpy.context.window_manager.fdda.pose_number == 4
+        assert bpy.context.window_manager.fdda.pose_index == 4
         bones = saved.armature_object.pose.bones
         shown = [bones[c.name].rotation_euler[c.axis] for c in channels]
         np.testing.assert_allclose(shown, sample_pose(channels, 7, 4, 0.5), atol=1e-6)
         bpy.ops.fdda.preview_pose(number=0, step=-1)
-        assert bpy.context.window_manager.fdda.pose_number == 0
+        assert bpy.context.window_manager.fdda.pose_index == 0
+
+    def test_the_number_field_shows_a_pose(self, saved):
+        session, bones = bpy.context.window_manager.fdda, saved.armature_object.pose.bones
+        bpy.ops.fdda.preview_pose(number=2)
+        shown = [tuple(bone.rotation_euler) for bone in bones]
+        assert session.preview_pose == 3
+        session.preview_pose = 1
+        assert session.pose_index == 0 and [tuple(bone.rotation_euler) for bone in bones] != shown
+        session.preview_pose = 3
+        assert [tuple(bone.rotation_euler) for bone in bones] == shown
+        for bone in bones:
+            bone.lock_rotation = (True, True, True)
+        session.preview_pose = 5
+        assert session.preview_pose == 3, "there is nothing to pose"
 
     def test_back_to_rest_and_undone(self, saved):
         bpy.ops.fdda.preview_pose(number=1)
@@ -313,19 +327,19 @@ class TestTraining:
         saved.mesh_object.fdda.settings.epochs = 10_000
         options = {"recording": str(elbow.recording), "model": str(tmp_path / "m.onnx")}
         assert bpy.ops.fdda.train(**options) == {"CANCELLED"}
-        assert job.state_of("train").outcome == "Training cancelled; no model was written."
+        assert job.state_of("train").outcome == "Training canceled; no model was written."
         assert not (tmp_path / "m.onnx").exists()
 
     def test_more_poses_where_the_model_is_worst_and_training_on(self, saved, elbow, tmp_path):
         settings = saved.mesh_object.fdda.settings
-        settings.poses, settings.epochs, settings.goal_mm = 40, 4, 0.001
+        settings.poses, settings.epochs, settings.use_goal, settings.goal_mm = 40, 4, True, 0.001
         assert bpy.ops.fdda.record() == {"FINISHED"}
         with pytest.raises(RuntimeError, match="There is no checkpoint"):
             bpy.ops.fdda.train(warm_start=True)
         assert bpy.ops.fdda.train() == {"FINISHED"}
         before = scene_state(saved)
         assert bpy.ops.fdda.refine(poses=12) == {"FINISHED"}
-        assert job.state_of("refine").outcome == "Added 12 poses to 'elbow_recording'; train on with them."
+        assert job.state_of("refine").outcome == "Added 12 poses to 'elbow_recording'; press Continue Training."
         assert_same_state(before, scene_state(saved))
         assert [s.kind for s in read_recording(recorded_folder(tmp_path)).info.sampling.sources] == [
             "random",

@@ -97,7 +97,7 @@ class TestBones:
         check = checks.check_now(arm)
         assert check.problems == () and set(sampled_by_bone(arm)) == CONTROL_BONES
         assert check.rig.joint_names == DEFORMING
-        assert counted(check) == "Sampled: 4 bones (8 channels) and 1 control."
+        assert counted(check) == "Random poses will move 4 bones (8 channels) and 1 extra input."
         recording = recorded(arm)
         assert recording.rig.joint_names == DEFORMING and sampled_bones(recording) == CONTROL_BONES
         assert [control.name for control in recording.rig.controls] == [IK]
@@ -155,7 +155,7 @@ class TestBones:
         settings.sample = "SELECTED"
         select(arm)
         assert checks.check_now(arm).problems[0].endswith("select them and press Use Selected Bones.")
-        with pytest.raises(RuntimeError, match="No bone of 'elbow_rig' is selected; select bones in pose mode"):
+        with pytest.raises(RuntimeError, match="No bone of 'elbow_rig' is selected; select bones in Pose Mode"):
             bpy.ops.fdda.use_selected_bones()
         select(arm, "ik_hand", "ik_pole")
         assert bpy.ops.fdda.use_selected_bones() == {"FINISHED"}
@@ -238,7 +238,7 @@ class TestControls:
         control.has_range, control.low, control.high = True, 0.25, 0.75
         check = checks.check_now(face)
         assert check.problems == () and check.found == ()
-        assert counted(check).endswith(" channels) and 2 controls.")
+        assert counted(check).endswith(" channels) and 2 extra inputs.")
         recording = recorded(face)
         ranges = {control.path: (control.low, control.high) for control in recording.rig.controls}
         assert ranges == {'key_blocks["flexed"].value': (0.25, 0.75), 'key_blocks["thin"].value': (-0.5, 1.0)}
@@ -247,7 +247,7 @@ class TestControls:
 
     def test_all_shape_keys(self, face):
         assert bpy.ops.fdda.add_control(name="shape_keys") == {"FINISHED"}
-        with pytest.raises(RuntimeError, match="The control 'shape_keys' is in the list already"):
+        with pytest.raises(RuntimeError, match="'shape_keys' is already in the list"):
             bpy.ops.fdda.add_control(name="shape_keys")
         recorded(face)
         index = read_index(recording_folder(face.mesh_object))
@@ -266,8 +266,35 @@ class TestControls:
         assert checks.check_now(face).problems[0].startswith("'elbow' has no control 'smile/'")
         assert bpy.ops.fdda.remove_control() == {"FINISHED"}
         assert not settings.controls and checks.check_now(face).problems == ()
-        with pytest.raises(RuntimeError, match="No control is chosen; click one of the list"):
+        with pytest.raises(RuntimeError, match="No extra input is active; click one in the list"):
             bpy.ops.fdda.remove_control()
+
+    @pytest.mark.parametrize(
+        ("path", "name"),
+        [
+            ('objects["elbow"].data.shape_keys.key_blocks["flexed"].value', "flexed"),
+            ('shape_keys["KEYS"].key_blocks["thin"].value', "thin"),
+            ('objects["elbow_rig"].pose.bones["upper"].location[1]', 'armature_object/pose.bones["upper"].location[1]'),
+            ('armatures["elbow_rig"].display_type', None),
+            ('objects["elbow"].data.shape_keys.key_blocks["gone"].value', None),
+            ("objects", None),
+        ],
+    )
+    def test_a_full_data_path(self, face, path, name):
+        keys, armature = face.mesh_object.data.shape_keys, face.armature_object.data
+        path = "bpy.data." + path.replace("KEYS", keys.name).replace(
+            'armatures["elbow_rig"]', f'armatures["{armature.name}"]'
+        )
+        control = face.mesh_object.fdda.settings.controls.add()
+        control.name = path
+        assert control.name == (name or path)
+
+    def test_a_full_data_path_is_added_by_its_short_name(self, face):
+        path = 'bpy.data.objects["elbow"].data.shape_keys.key_blocks["flexed"].value'
+        assert bpy.ops.fdda.add_control(name=path) == {"FINISHED"}
+        assert [control.name for control in face.mesh_object.fdda.settings.controls] == ["flexed"]
+        with pytest.raises(RuntimeError, match="'flexed' is already in the list"):
+            bpy.ops.fdda.add_control(name=path)
 
     def test_an_empty_range(self, face):
         bpy.ops.fdda.add_control(name="thin")

@@ -68,7 +68,7 @@ def test_a_bound_model_comes_along_with_append(rig, elbow, model, tmp_path):
 
 def test_a_large_one_stays_outside_and_is_told(rig, model, monkeypatch):
     monkeypatch.setattr(playback, "LARGE_BYTES", 1000)
-    assert playback.bind_model(rig, model_files.Path(model)).endswith("the section Models packs it.")
+    assert playback.bind_model(rig, model_files.Path(model)).endswith("pack it in the Model Library.")
     assert rig.mesh_object.fdda.is_bound and rig.mesh_object.fdda.packed is None
     bpy.ops.fdda.bind(pack_large=True)
     assert rig.mesh_object.fdda.packed is not None
@@ -98,7 +98,7 @@ def test_a_packed_model_that_is_trained_anew_is_packed_anew(rig, elbow, model):
 def test_a_trusted_folder_is_followed_and_no_other(bound, elbow, model, tmp_path, monkeypatch):
     bound.fdda.model = bound.fdda.models[0].path = str(model)
     model_files._chosen_paths.clear()
-    with pytest.raises(ModelError, match="or trust its folder in the preferences"):
+    with pytest.raises(ModelError, match="or add its folder in the preferences"):
         model_files.model_path(bound)
     monkeypatch.setattr(folder_trust, "trusted_folders", lambda: [(tmp_path / "other").resolve()])
     with pytest.raises(ModelError, match="is not followed"):

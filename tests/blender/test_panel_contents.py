@@ -210,10 +210,10 @@ class TestCost:
     @pytest.mark.parametrize(
         "vertices, rig, linear, words",
         [
-            (9_960, 5.17, 0.29, "A model would pay: a frame is about 6.5 times as fast"),
-            (50_618, 29.60, 0.98, "A model would pay: a frame is about 17.3 times as fast"),
-            (1_476, 0.71, 0.14, "A model would make little difference"),
-            (1_476, 0.40, 0.14, "A model would not pay"),
+            (9_960, 5.17, 0.29, "Worth it: about 6.5x faster"),
+            (50_618, 29.60, 0.98, "Worth it: about 17.3x faster"),
+            (1_476, 0.71, 0.14, "Little difference"),
+            (1_476, 0.40, 0.14, "Not worth it here"),
         ],
     )
     def test_the_figures_of_the_benchmark_come_out_again(self, vertices, rig, linear, words):

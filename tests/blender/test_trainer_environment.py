@@ -93,9 +93,9 @@ def test_it_is_created_from_a_folder_of_wheels(user: Path, wheels: Path):
     assert create(wheels=str(wheels)) == {"FINISHED"}
     assert session.own_state() is FolderState.READY and not junk.exists()
     assert choice.chosen_python() == (str(folder.python_in(folder.own_folder())), Origin.OWN)
-    assert session.check_result.message.endswith(f"torch {pinned('torch')}.")
-    assert session.check_result.message.startswith("Ready to train on the processor: Python 3.")
-    assert f"onnx {pinned('onnx')}" in session.check_result.details
+    assert session.answer.message.endswith(f"torch {pinned('torch')}.")
+    assert session.answer.message.startswith("Ready to train on the CPU: Python 3.")
+    assert f"onnx {pinned('onnx')}" in session.answer.details
     log = folder.log_path().read_text()
     assert "-m venv" in log and "Successfully installed" in log and "Ready to train" in log
     assert sorted(path.name for path in user.iterdir()) == ["trainer", "trainer.lock", "trainer.log"]
@@ -127,7 +127,7 @@ def test_a_wheel_that_is_missing(own: Path, wheels: Path, tmp_path: Path):
     shutil.copytree(wheels, tmp_path / "fewer")
     next((tmp_path / "fewer").glob("onnx-*")).unlink()
     text = refused(create, wheels=str(tmp_path / "fewer"))
-    assert text.startswith(f"The folder '{tmp_path}/fewer' lacks the wheels of onnx {pinned('onnx')} for Python 3.1")
+    assert text.startswith(f"The folder '{tmp_path}/fewer' lacks the packages onnx {pinned('onnx')} for Python 3.1")
     assert " -m pip download --only-binary=:all: " in folder.log_path().read_text()
     assert session.own_state() is FolderState.READY
     assert session.notice.message == text
@@ -154,7 +154,7 @@ def test_packages_that_do_not_work_are_no_environment(user: Path, wheels: Path, 
 
 
 def test_a_folder_without_wheels_leaves_what_is_there(own: Path, tmp_path: Path):
-    assert refused(create, wheels=str(tmp_path)).startswith(f"The folder '{tmp_path}' lacks the wheels of ")
+    assert refused(create, wheels=str(tmp_path)).startswith(f"The folder '{tmp_path}' lacks the packages ")
     assert refused(create, wheels="/none").startswith("'/none' is no folder; ")
     assert session.own_state() is FolderState.READY
 
@@ -162,11 +162,11 @@ def test_a_folder_without_wheels_leaves_what_is_there(own: Path, tmp_path: Path)
 def test_offline_it_asks_for_wheels(user: Path, preferences, tmp_path: Path):
     assert not bpy.app.online_access
     assert refused(create) == (
-        "Blender's online access is off: allow it in Preferences > System > Network, choose a folder of wheels, or "
-        "choose an existing Python that has torch."
+        "Blender's online access is off: allow it in Preferences > System > Network, choose a folder under Offline "
+        "Packages, or choose an existing Python that has torch."
     )
     preferences.wheels_folder = str(tmp_path)
-    assert "lacks the wheels of matplotlib" in refused(create)
+    assert "lacks the packages matplotlib" in refused(create)
 
 
 def test_a_full_disk_is_noticed_before(user: Path, own: Path, monkeypatch: pytest.MonkeyPatch):
@@ -187,7 +187,8 @@ def test_a_python_that_cannot_make_one(user: Path, wheels: Path, tmp_path: Path)
         "    sys.exit(1)",
     )
     text = refused(bpy.ops.fdda.create_trainer_environment, python=broken, wheels=str(wheels))
-    assert "can make the trainer environment" in text and "Error: no room for it" in text and "install Python 3" in text
+    assert "can create the training environment" in text and "Error: no room for it" in text
+    assert "install Python 3" in text
     assert "'/none/python' is no Python that runs; " in refused(
         bpy.ops.fdda.create_trainer_environment, python="/none/python", wheels=str(wheels)
     )
@@ -201,7 +202,7 @@ def test_a_second_blender_waits(user: Path, own: Path):
     ) as other:
         assert other.stdout.readline() == "mine\n"
         text = refused(bpy.ops.fdda.remove_trainer_environment)
-        assert text == "Another Blender is making or removing the trainer environment; wait until it is done."
+        assert text == "Another Blender is installing or removing the training environment; wait until it is done."
         assert own.is_dir()
         other.communicate()
     assert bpy.ops.fdda.remove_trainer_environment() == {"FINISHED"}
@@ -271,16 +272,16 @@ def test_an_environment_whose_python_is_gone(own: Path, elbow, tmp_path: Path, c
     assert run("train", elbow.recording, tmp_path / "m.onnx") == 1
     python = folder.python_in(own)
     assert capfd.readouterr().err.strip() == (
-        f"Error: The trainer's Python '{python}' cannot be started (No such file or directory); create the trainer "
-        "environment again, in the add-on's preferences."
+        f"Error: The trainer's Python '{python}' cannot be started (No such file or directory); reinstall the "
+        "training environment in the add-on's preferences."
     )
 
 
 def test_an_environment_whose_torch_is_gone(own: Path):
     shutil.rmtree(own / "torch")
     text = refused(bpy.ops.fdda.check_trainer)
-    assert text.endswith("lacks torch; create the trainer environment again, in the add-on's preferences.")
-    assert session.check_result.level == "ERROR" and "torch is missing" in session.check_result.details
+    assert text.endswith("lacks torch; reinstall the training environment in the add-on's preferences.")
+    assert session.answer.level == "ERROR" and "torch is missing" in session.answer.details
 
 
 def test_an_environment_of_other_versions_still_trains(own: Path):
@@ -297,5 +298,5 @@ def test_what_is_removed_is_half_made_first(own: Path, monkeypatch: pytest.Monke
 
     monkeypatch.setattr(shutil, "rmtree", full)
     text = refused(bpy.ops.fdda.remove_trainer_environment)
-    assert text.startswith("The trainer environment cannot be removed (Permission denied: ") and str(own) in text
+    assert text.startswith("The training environment cannot be removed (Permission denied: ") and str(own) in text
     assert session.own_state() is FolderState.HALF_MADE and choice.chosen_python().origin is Origin.THIS

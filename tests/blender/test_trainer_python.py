@@ -46,14 +46,14 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_it_can_train(packages: Path):
     answer = asked(sys.executable)
     version = ".".join(map(str, sys.version_info[:3]))
-    assert answer.level == "INFO" and answer.message == f"Ready to train on the processor: Python {version}, torch 9."
-    assert answer.details[0] == f"Python {version}: {sys.executable}" and answer.details[-1] == "Device: the processor"
+    assert answer.level == "INFO" and answer.message == f"Ready to train on the CPU: Python {version}, torch 9."
+    assert answer.details[0] == f"Python {version}: {sys.executable}" and answer.details[-1] == "Device: the CPU"
 
 
 def test_the_command_line_says_it_too(packages: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture):
     monkeypatch.setenv(PYTHON_VARIABLE, sys.executable)
     assert run("check-trainer") == 0
-    assert capfd.readouterr().out.splitlines()[-1].startswith("Ready to train on the processor: ")
+    assert capfd.readouterr().out.splitlines()[-1].startswith("Ready to train on the CPU: ")
     monkeypatch.setenv(PYTHON_VARIABLE, "/none/python")
     assert run("check-trainer") == 1
     assert re.fullmatch(

@@ -116,7 +116,7 @@ def append_the_characters(folder: Path) -> Iterator[float]:
 
 
 def cancel_all_in_one(folder: Path) -> Iterator[float]:
-    """Prepare, Train, Bind on a new arm: a bar counts the poses; ESC ends it, and the rig is as before."""
+    """Record, Train & Bind on a new arm: a bar counts the poses; ESC ends it, and the rig is as before."""
     own = emptied(folder / "work" / "cancelled")
     bpy.ops.wm.read_homefile(app_template="", load_ui=False)
     yield 0.5
@@ -142,7 +142,7 @@ def cancel_all_in_one(folder: Path) -> Iterator[float]:
 
 
 def trust_a_folder(folder: Path) -> Iterator[float]:
-    """In the preferences: press Trust a Folder…, choose it, and a model in it is followed from a file elsewhere."""
+    """In the preferences: press Add Folder…, choose it, and a model in it is followed from a file elsewhere."""
     preferences = bpy.context.preferences.addons[EXTENSION].preferences
     trusted = emptied(folder / "work" / "trusted")
     area = next(a for a in main_screen().areas if a.type == "VIEW_3D")

@@ -101,7 +101,7 @@ def add_the_arm(folder: Path) -> Iterator[float]:
 
 
 def measure_the_rig(_folder: Path) -> Iterator[float]:
-    """Press Measure in the section Rig."""
+    """Press Measure Speed in the section Rig."""
     yield from sidebar.open_section("rig")
     yield from sidebar.push("fdda.measure()")
     yield from job_done("measure", 40)
@@ -113,7 +113,7 @@ def show_a_random_pose(_folder: Path) -> Iterator[float]:
     """Look at a random pose."""
     rest = shape()
     yield from sidebar.open_section("poses")
-    yield from sidebar.push("fdda.preview_pose(step=1)", across=0.54)
+    yield from sidebar.push("fdda.preview_pose", across=0.45)
     yield 0.3
     shown = arm().evaluated_get(bpy.context.evaluated_depsgraph_get()).data
     moved = np.empty_like(rest)
@@ -196,7 +196,7 @@ def train(folder: Path) -> Iterator[float]:
 
 
 def bind(_folder: Path) -> Iterator[float]:
-    """Press Bind in the section Playback: the mesh moves as the rig does, without its modifiers."""
+    """Press Bind in the section Model: the mesh moves as the rig does, without its modifiers."""
     global _rig_shape, _model_shape
     _rig_shape = shape()
     yield from sidebar.open_section("playback")
@@ -210,7 +210,7 @@ def bind(_folder: Path) -> Iterator[float]:
 
 
 def switch_the_deformation(folder: Path) -> Iterator[float]:
-    """Press Rig, Linear Layer and FDDA, and compare the shapes."""
+    """Press Rig, Skinning and Model, and compare the shapes."""
     shapes = {}
     for mode, across in (("RIG", 0.15), ("LINEAR", 0.5), ("FDDA", 0.88)):
         yield from sidebar.push("fdda.mode", across)
@@ -224,7 +224,7 @@ def switch_the_deformation(folder: Path) -> Iterator[float]:
 
 
 def measure_the_model(_folder: Path) -> Iterator[float]:
-    """Press Measure in the section Playback."""
+    """Press Measure Speed in the section Model."""
     yield from sidebar.push("fdda.measure_model")
     yield from until(lambda: part("timing.frame_times").of(arm()) is not None, 60, "nothing is measured")
     times = part("timing.frame_times").of(arm())
@@ -269,7 +269,7 @@ def show_the_heat_map(folder: Path) -> Iterator[float]:
 
 
 def show_the_partitions(folder: Path) -> Iterator[float]:
-    """Press Partitions."""
+    """Press Body Parts."""
     yield from _paint("PARTITIONS", folder)
 
 
@@ -289,7 +289,7 @@ def _paint(colors: str, folder: Path) -> Iterator[float]:
 
 
 def mark_the_worst_frames(_folder: Path) -> Iterator[float]:
-    """Press Mark, then the first of the worst frames, and look at its errors alone."""
+    """Press Add Markers, then the first of the worst frames, and look at its errors alone."""
     yield from sidebar.push("fdda.mark_worst", across=0.8)
     worst = part("evaluation.last_evaluation").of(arm()).worst(5)
     found = part("evaluation.markers").find(bpy.context.scene)
@@ -310,7 +310,7 @@ def mark_the_worst_frames(_folder: Path) -> Iterator[float]:
 
 
 def unpack_and_pack_the_model(_folder: Path) -> Iterator[float]:
-    """The model was packed when it was bound. Press Unpack Model, and Pack, in the section Models."""
+    """The model was packed when it was bound. Press Unpack Model, and Pack, in the section Model Library."""
     check(arm().fdda.packed is not None, "the bound model is not packed")
     yield from sidebar.open_section("models")
     yield from sidebar.push("fdda.unpack_model")

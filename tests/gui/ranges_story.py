@@ -23,7 +23,7 @@ BODY = {
 
 
 def give_a_figure_human_ranges(folder: Path) -> Iterator[float]:
-    """A figure with limbs that states no limits, as it says; press Human Ranges."""
+    """A figure with limbs that states no limits, as it says; press Human Limits."""
     bpy.ops.wm.read_homefile(app_template="", load_ui=False)
     yield 0.5
     bpy.data.objects.remove(bpy.data.objects["Cube"])

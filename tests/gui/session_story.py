@@ -36,7 +36,7 @@ def open_the_bound_file(folder: Path) -> Iterator[float]:
 
 
 def play_with_the_tab_open(folder: Path) -> Iterator[float]:
-    """Play with the section Playback open: no panel is drawn, for nothing of theirs changes."""
+    """Play with the section Model open: no panel is drawn, for nothing of theirs changes."""
     yield from sidebar.open_section("playback")
     bpy.context.scene.frame_set(1)
     yield from rest_mouse()

@@ -56,7 +56,7 @@ def bake_asks_each_time(folder: Path) -> Iterator[float]:
 
 
 def add_model_asks_each_time(_folder: Path) -> Iterator[float]:
-    """Press + in the section Models twice, and leave the dialog each time."""
+    """Press + in the section Model Library twice, and leave the dialog each time."""
     yield from sidebar.open_section("models")
     for _ in range(2):
         yield from sidebar.push("fdda.add_model", across=0.97)

@@ -227,7 +227,7 @@ def test_a_python_without_scipy(tmp_path):
     message = Message.decode(process.stdout)
     assert message.type is MessageType.FAILED
     assert message.values["text"].startswith("Fitting skin weights needs the Python package 'scipy', which ")
-    assert "numpy, scipy and matplotlib there, create the trainer environment" in message.values["text"]
+    assert "numpy, scipy and matplotlib there, install the training environment" in message.values["text"]
 
 
 def damage() -> Iterator:

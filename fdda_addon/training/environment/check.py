@@ -96,6 +96,6 @@ def _judge(python: str, answer: dict, advice: str) -> CheckResult:
         advice = runtime_advice(reason) or advice
         return CheckResult("ERROR", f"{name} of '{python}' cannot be imported ({reason}); {advice}.", tuple(details))
     device = answer["device"]
-    details.append(f"Device: {'the processor' if device == 'cpu' else f'{device} (CUDA)'}")
-    where = "on the processor" if device == "cpu" else f"on {device}"
+    details.append(f"Device: {'the CPU' if device == 'cpu' else f'{device} (CUDA)'}")
+    where = "on the CPU" if device == "cpu" else f"on {device}"
     return CheckResult("INFO", f"Ready to train {where}: Python {version}, torch {packages['torch']}.", tuple(details))

@@ -24,9 +24,9 @@ class Origin(enum.Enum):
 
     PREFERENCES = "choose another Python in the add-on's preferences, or leave that field empty"
     VARIABLE = f"set {PYTHON_VARIABLE} to a Python that has torch"
-    OWN = "create the trainer environment again, in the add-on's preferences"
+    OWN = "reinstall the training environment in the add-on's preferences"
     THIS = (
-        f"create the trainer environment in the add-on's preferences, or set {PYTHON_VARIABLE} to a Python with torch"
+        f"install the training environment in the add-on's preferences, or set {PYTHON_VARIABLE} to a Python with torch"
     )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Makes the add-on's own trainer environment: a virtual environment with the pinned packages, and a log of it."""
+"""Makes the add-on's own training environment: a virtual environment with the pinned packages, and a log of it."""
 
 import os
 import re
@@ -67,8 +67,8 @@ class Creation:
             yield from self._steps()
         except OSError as error:
             raise TrainerEnvironmentError(
-                f"The trainer environment cannot be written ({os_error_text(error)}: "
-                f"'{error.filename or self.folder}'); make room or see to the permissions, and create it again."
+                f"The training environment cannot be written ({os_error_text(error)}: "
+                f"'{error.filename or self.folder}'); make room or check the permissions, and install it again."
             ) from error
 
     def _steps(self) -> Iterator[Progress | CheckResult]:
@@ -105,7 +105,7 @@ class Creation:
     def _check_source(self) -> None:
         if has_path_limit() and (letters := missing_letters(self.folder, Path(tempfile.gettempdir(), TEMPORARY))):
             raise TrainerEnvironmentError(
-                f"Paths in the trainer environment '{self.folder}' would be {letters} letters too long for Windows; "
+                f"Paths in the training environment '{self.folder}' would be {letters} letters too long for Windows; "
                 "allow long paths (https://pip.pypa.io/warnings/enable-long-paths), or choose an existing Python that "
                 "has torch."
             )
@@ -113,11 +113,11 @@ class Creation:
             free = shutil.disk_usage(self.folder.parent).free / 1e9
             if free < NEEDED_GB:
                 raise TrainerEnvironmentError(
-                    f"The trainer environment needs {NEEDED_GB} GB and '{self.folder.parent}' has {free:.1f} GB left; "
+                    f"The training environment needs {NEEDED_GB} GB and '{self.folder.parent}' has {free:.1f} GB left; "
                     "make room, or choose an existing Python that has torch."
                 )
         elif not self.wheels.is_dir():
-            raise TrainerEnvironmentError(f"'{self.wheels}' is no folder; choose the one that holds the wheels.")
+            raise TrainerEnvironmentError(f"'{self.wheels}' is no folder; choose the folder that holds the packages.")
 
     def _check_wheels(self, base: Interpreter, log: IO[str]) -> None:
         """Before what is there is removed: pip would find a missing wheel late, and call it a conflict of versions."""
@@ -132,7 +132,7 @@ class Creation:
             log.write(f"With Python {version} on such a machine as this, but online:\n")
             log.write(f"$ {subprocess.list2cmdline([f'python{version}', '-m', *download, *PACKAGES])}\n")
             raise TrainerEnvironmentError(
-                f"The folder '{self.wheels}' lacks the wheels of {', '.join(missing)} for Python {version}; download "
+                f"The folder '{self.wheels}' lacks the packages {', '.join(missing)} for Python {version}; download "
                 f"them on a machine that is online, '{self.log}' has the command."
             )
 
@@ -163,8 +163,8 @@ class Creation:
 
     def _no_python(self, reason: str) -> TrainerEnvironmentError:
         return TrainerEnvironmentError(
-            f"No Python of this machine can make the trainer environment ({reason}); install Python 3.13 with its venv "
-            f"module, or choose an existing Python that has torch. '{self.log}' lists what was tried."
+            f"No Python on this machine can create the training environment ({reason}); install Python 3.13 with its "
+            f"venv module, or choose an existing Python that has torch. '{self.log}' lists what was tried."
         )
 
     def _install(self, base: Interpreter, log: IO[str]) -> Iterator[Progress]:
@@ -273,7 +273,7 @@ class Creation:
     def _stop_if_cancelled(self) -> None:
         if self._cancelled:
             left = "nothing is left of it" if self._has_begun else "what was there stays"
-            raise TrainerEnvironmentError(f"The creation of the trainer environment was cancelled; {left}.")
+            raise TrainerEnvironmentError(f"The installation of the training environment was canceled; {left}.")
 
 
 @contextmanager

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where the add-on's own trainer environment lies, and what state it is in.
+"""Where the add-on's own training environment lies, and what state it is in.
 
 It is complete when its mark is there, and the mark is written last: whatever was interrupted is recognised. Blender
 leaves the folder alone when it updates the extension and removes it when it uninstalls the extension.
@@ -33,8 +33,8 @@ REQUIREMENTS = ROOT / "requirements"
 PINS = {(3, 11): "python-3.11.txt", (3, 12): "python-3.11.txt", (3, 13): "python-3.13.txt"}
 """Versions of Python that an environment can be made from, and the file of pinned versions for each."""
 OFFLINE = (
-    "Blender's online access is off: allow it in Preferences > System > Network, choose a folder of wheels, or choose "
-    "an existing Python that has torch"
+    "Blender's online access is off: allow it in Preferences > System > Network, choose a folder under Offline "
+    "Packages, or choose an existing Python that has torch"
 )
 
 
@@ -168,7 +168,7 @@ def remove(folder: Path) -> None:
             shutil.rmtree(folder)
     except OSError as error:
         raise TrainerEnvironmentError(
-            f"The trainer environment cannot be removed ({os_error_text(error)}: '{error.filename}'); end what uses "
+            f"The training environment cannot be removed ({os_error_text(error)}: '{error.filename}'); end what uses "
             f"it, a training perhaps, or remove the folder '{folder}' yourself."
         ) from error
 
@@ -194,7 +194,7 @@ def claimed(folder: Path) -> Iterator[None]:
             _lock(file.fileno())
         except OSError as error:
             raise TrainerEnvironmentError(
-                "Another Blender is making or removing the trainer environment; wait until it is done."
+                "Another Blender is installing or removing the training environment; wait until it is done."
             ) from error
         yield
 

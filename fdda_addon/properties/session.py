@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""State of the sidebar, which is not saved with the file: `WindowManager.fdda`."""
+
+from contextlib import suppress
+
+import bpy
+from bpy.props import BoolProperty, IntProperty, PointerProperty, StringProperty
+
+from ..core.errors import FDDAError
+from ..jobs.job import current
+from ..scene import undo
+from ..scene.active_rig import cached_active_rig
+from .choices import recording_settings
+from .without_keys import without_keys
+
+
+def _show_random_pose(session: "FDDA_PG_session", number: int) -> None:
+    """Show the random pose whose number, from 1, was entered in the sidebar."""
+    from ..recording.preview import show_random_pose
+
+    context, job = bpy.context, current()
+    rig = cached_active_rig(context)
+    if rig is None or context.mode not in {"OBJECT", "POSE"} or (job is not None and job.borrows_scene):
+        return
+    # The section Rig says why where there is nothing to pose.
+    with suppress(FDDAError):
+        show_random_pose(rig, recording_settings(rig), number - 1)
+        session.pose_index = number - 1
+        undo.push_undo_soon("Preview Pose")
+
+
+@without_keys
+class FDDA_PG_session(bpy.types.PropertyGroup):
+    """What the sidebar shows."""
+
+    mesh: StringProperty(name="Mesh", description="Mesh of the active armature that the sidebar shows")
+    all_meshes: BoolProperty(
+        name="All Meshes",
+        description="Make the buttons work on all meshes of this armature, not only on the one that is shown",
+        default=True,
+    )
+
+    pose_index: IntProperty(name="Pose Index", description="Index of the random pose that is shown", min=0)
+    preview_pose: IntProperty(
+        name="Preview Pose",
+        description="Show one of the random poses that will be recorded",
+        min=1,
+        default=1,
+        get=lambda session: session.pose_index + 1,
+        set=_show_random_pose,
+    )
+    joint_index: IntProperty(name="Joint")
+    action_index: IntProperty(name="Action")
+    show_all_partitions: BoolProperty(
+        name="Show All", description="List all body parts of the model, not only the worst"
+    )
+
+
+CLASSES = (FDDA_PG_session,)
+
+
+def register() -> None:
+    """Add the property of the window manager."""
+    bpy.types.WindowManager.fdda = PointerProperty(type=FDDA_PG_session)
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    undo.unregister()
+    del bpy.types.WindowManager.fdda
