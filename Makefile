@@ -10,7 +10,7 @@ OTHER_LINE = $$(.venv/bin/python -c 'import sys; print("4.5" if sys.version_info
 
 # A process for each core, of which each runs whole files: there is one Blender to a process.
 SIDE_BY_SIDE = -n auto --maxprocesses 4 --dist loadfile
-MARKS = -m "not to_single_line"
+FAST = -m "not slow"
 
 # Where torch is. Blender's Python, or a line's environment, starts this one for training.
 export FDDA_TRAINER_PYTHON ?= $(CURDIR)/.venv/bin/python
@@ -31,10 +31,13 @@ test-core: .venv  ## the tests that need no Blender and take seconds
 	.venv/bin/python -m pytest $(SIDE_BY_SIDE) tests/core tests/contract
 
 test-trainer: .venv  ## the tests of the training, export and report
-	.venv/bin/python -m pytest $(SIDE_BY_SIDE) tests/trainer
+	.venv/bin/python -m pytest $(SIDE_BY_SIDE) tests/trainer $(FAST)
 
 test-blender: .venv  ## the tests that run in Blender
-	.venv/bin/python -m pytest $(SIDE_BY_SIDE) tests/blender
+	.venv/bin/python -m pytest $(SIDE_BY_SIDE) tests/blender $(FAST)
+
+test-slow: .venv  ## the tests that make test leaves out: whole trainings, simulations, most characters, a short soak
+	.venv/bin/python -m pytest $(SIDE_BY_SIDE) -m slow tests/trainer tests/blender
 
 test-examples: .venv  ## the examples of docs/formats.md, in Python and in Chromium (CHROMIUM=/path/to/chromium)
 	.venv/bin/python -m pytest tests/examples
@@ -56,9 +59,11 @@ test-windows: .venv  ## the tests in Python for Windows under Wine, as root on D
 	.venv/bin/python setup/package.py windows-x64
 	.venv/bin/python tests/windows/run.py $(LINE)
 
-test-all: test  ## as test, and the core and Blender tiers on the other LTS line
+test-all: test test-slow test-farm test-examples test-gui soak  ## every test on both LTS lines, with a Blender with a window (1.5 hours)
 	@$(MAKE) test-line LINE=$(OTHER_LINE) MARKS=
 
+# What differs between versions of Blender; empty for all tests.
+test-line: MARKS = -m "not slow and not one_blender_version"
 test-line: .venv-line .venv  ## the core tier, and of the Blender tier what differs between versions, on LINE=4.5 or LINE=5.2
 	.venv-$(LINE)/bin/python -m pytest $(SIDE_BY_SIDE) tests/core tests/contract
 	.venv-$(LINE)/bin/python -m pytest $(SIDE_BY_SIDE) $(MARKS) tests/blender

@@ -80,9 +80,10 @@ def elbow(tmp_path_factory: pytest.TempPathFactory) -> ElbowFiles:
 
 @pytest.fixture(autouse=True)
 def _addon() -> Iterator[None]:
-    """The add-on is registered in an empty file; nothing stays for the next test."""
+    """The add-on is registered in an empty file; nothing stays for the next test but preferences."""
     fdda_addon.register()
-    bpy.ops.wm.read_factory_settings(use_empty=True)
+    # Several times as fast as `read_factory_settings`.
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     fdda_addon.register()
     yield
     fdda_addon.unregister()

@@ -19,7 +19,7 @@ VERTICES = {1: 1450, 2: 10_000, 3: 50_000}
 FINGERS = ("index", "middle", "ring", "pinky")
 
 
-@pytest.fixture(scope="module", params=[1, 2, 3])
+@pytest.fixture(scope="module", params=[1, 2, pytest.param(3, marks=pytest.mark.slow)])
 def surface(request) -> tuple[int, Surface]:
     return request.param, sculpt_arm(request.param)
 
@@ -123,6 +123,7 @@ def test_no_finger_follows_another(surface):
             assert len(points) and np.abs(side).max() < 0.016
 
 
+@pytest.mark.slow
 def test_two_builds_are_identical():
     first, second = sculpt_arm(1), sculpt_arm(1)
     for name in ("points", "faces", "joints", "biceps", "nails"):

@@ -15,7 +15,7 @@ from fdda_addon.jobs import background
 from fdda_addon.jobs.background import in_thread, look_after
 from fdda_addon.jobs.job import CHARACTER, ENVIRONMENT, JobState, Run, current, request_cancel, state_of
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 
 class Work:

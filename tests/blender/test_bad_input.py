@@ -15,7 +15,7 @@ import pytest
 from .. import systems
 from .refusals import Refusal, files, save_elbow, small_files
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 
 @pytest.fixture
@@ -113,6 +113,11 @@ def put_nan(path) -> None:
     np.save(path / "residuals.npy", array)
 
 
+def slow(damage, words: str, name: str):
+    """Return a case for `make test-slow`: each starts a trainer."""
+    return pytest.param(damage, words, id=name, marks=pytest.mark.slow)
+
+
 def set_index(**values):
     def change(path):
         index = json.loads((path / "recording.json").read_text())
@@ -124,12 +129,13 @@ def set_index(**values):
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (set_index(complete=40), "is incomplete: 40 of 150 poses; finish it with record --resume"),
-        (cut_short, "residuals.npy' cannot be used: it is truncated: "),
-        (set_index(version=2), "is a recording of version 2 and this add-on reads version 1; record again"),
-        (put_nan, "holds values that are not numbers (residuals, pose 3); record again"),
+        slow(set_index(complete=40), "is incomplete: 40 of 150 poses; finish it with record --resume", "incomplete"),
+        slow(cut_short, "residuals.npy' cannot be used: it is truncated: ", "truncated"),
+        slow(
+            set_index(version=2), "is a recording of version 2 and this add-on reads version 1; record again", "version"
+        ),
+        pytest.param(put_nan, "holds values that are not numbers (residuals, pose 3); record again", id="NaN"),
     ],
-    ids=["incomplete", "truncated", "other version", "NaN"],
 )
 def test_recordings(refusal, elbow, tmp_path, damage, words):
     path = shutil.copytree(elbow.recording, tmp_path / "recording")

@@ -18,7 +18,7 @@ from .conftest import run
 from .refusals import Refusal
 from .stand_ins import say, stand_in_trainer
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 
 @pytest.fixture
@@ -134,7 +134,7 @@ def test_a_trainer_that_crashes(train, tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="/dev/full is Linux's")
-@pytest.mark.parametrize("is_silent", [False, True])
+@pytest.mark.parametrize("is_silent", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_trainer_whose_disk_is_full(elbow, train, tmp_path, monkeypatch, is_silent):
     """It cannot say a word, or only on stderr."""
     lines = ["os.dup2(os.open('/dev/full', os.O_WRONLY), 1)", *(["os.dup2(1, 2)"] if is_silent else [])]

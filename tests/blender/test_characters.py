@@ -10,14 +10,15 @@ from pathlib import Path
 
 import pytest
 
-import fdda_addon
 from benchmarks.characters import END, START, table
 from blend_fixtures.characters import controls, skinning, stacks, targets, transforms
 from blend_fixtures.characters.comparison import compare_row, record_row
 from blend_fixtures.characters.rows import ROWS, Row
-from blend_fixtures.characters.training import SMALL, Trainings
+from blend_fixtures.characters.training import SMALL
 
-pytestmark = pytest.mark.to_single_line
+from .conftest import train
+
+pytestmark = pytest.mark.one_blender_version
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "characters.md"
@@ -27,27 +28,22 @@ NOTHING_MM = 0.01
 """Errors below this are none."""
 MOVED_MM = 10.0
 """The poses move the vertices by more, on average."""
+QUICK = {
+    "smooth_weights", "preserve_volume", "b_bones", "corrective_smooth", "geometry_nodes", "custom_property",
+    "body_and_sleeve", "parented_to_bone", "far_away", "in_millimetres", "target_alembic",
+}  # fmt: skip
+"""Rows of every topic, which `make test` learns; `make test-slow` learns the others."""
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of each row with its rig, recordings and models."""
-    path = tmp_path_factory.mktemp("characters")
-    fdda_addon.register()
-    try:
-        with Trainings() as trainings:
-            for row in ROWS:
-                (path / row.name).mkdir()
-                for recording, model in record_row(row, path / row.name):
-                    trainings.add(recording, model, "--epochs", row.epochs, *SMALL)
-    finally:
-        fdda_addon.unregister()
-    return path
+def parameter(row: Row) -> object:
+    return pytest.param(row, id=row.name, marks=() if row.name in QUICK else pytest.mark.slow)
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
-def test_a_character_is_learnt_and_played(row: Row, folder: Path):
-    results = compare_row(row, folder / row.name)
+@pytest.mark.parametrize("row", map(parameter, ROWS))
+def test_a_character_is_learnt_and_played(row: Row, tmp_path: Path):
+    for recording, model in record_row(row, tmp_path):
+        train(recording, model, "--epochs", row.epochs, *SMALL)
+    results = compare_row(row, tmp_path)
     assert tuple(result.mesh for result in results) == row.meshes
     for result in results:
         assert result.moved_mm > MOVED_MM

@@ -13,9 +13,14 @@ from fdda_addon.runtime import playback
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
 
 
+@pytest.fixture(autouse=True)
+def _clipboard(tmp_path, monkeypatch):
+    """The clipboard is a file in the folder of the test."""
+    monkeypatch.setattr(bpy.context.preferences.filepaths, "temporary_directory", str(tmp_path))
+
+
 def to_clipboard(_: bpy.types.Object, folder: Path) -> Path:
     bpy.ops.object.select_all(action="SELECT")
-    bpy.context.preferences.filepaths.temporary_directory = str(folder)
     assert bpy.ops.fdda.copy_objects() == {"FINISHED"}
     (path,) = folder.rglob("copybuffer*.blend")
     return path

@@ -16,7 +16,7 @@ from fdda_addon.runtime import model_files, registry
 from .conftest import assert_plays, evaluated, pose, run
 from .refusals import files, save_elbow
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 
 @pytest.mark.parametrize("arguments", [["--help"], *([verb, "--help"] for verb in VERBS)], ids=" ".join)

@@ -142,7 +142,9 @@ def test_a_recording_that_is_killed_resumes(elbow, tmp_path):
     assert files(path) == files(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("request_", REQUESTS)
+@pytest.mark.parametrize(
+    "request_", [REQUESTS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in REQUESTS[1:])]
+)
 def test_an_interrupted_training_leaves_neither_model_nor_trainer(elbow, tmp_path, request_):
     """Also where the request reaches the verb alone, as that of a batch system does."""
     process = start("train", elbow.recording, tmp_path / "m.onnx", "--epochs", 1_000_000)

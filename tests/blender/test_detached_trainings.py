@@ -14,7 +14,7 @@ from fdda_addon.core.messages import MessageType
 from fdda_addon.core.model import read_model_info
 from fdda_addon.training import detached_process
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 LEAVING = """
 import sys

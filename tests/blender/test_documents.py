@@ -18,7 +18,7 @@ from fdda_addon.training.process import trainer_python
 
 from .conftest import run
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -89,6 +89,7 @@ def test_evaluation_code(folder):
     assert lines[1].startswith("largest error: ")
 
 
+@pytest.mark.slow
 def test_messages_code(folder, tmp_path):
     shutil.copytree(folder / "recording", tmp_path / "recording")
     lines = run_code(chapter("Trainer messages"), tmp_path, trainer_python()).splitlines()

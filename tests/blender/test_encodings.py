@@ -12,7 +12,7 @@ import pytest
 
 from .refusals import save_elbow
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 ROOT = Path(__file__).resolve().parents[2]
 ASCII = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}

@@ -187,9 +187,9 @@ def test_another_add_on_that_poses_after_a_frame(bound, elbow):
     assert np.abs(shown[0] - shown[2]).max() > 1e-2
 
 
-def test_python_drivers_elsewhere(bound, elbow):
+def test_python_drivers_elsewhere(bound, elbow, monkeypatch):
     """Their expressions take Python's lock, on the threads that evaluate."""
-    bpy.context.preferences.filepaths.use_scripts_auto_execute = True
+    monkeypatch.setattr(bpy.context.preferences.filepaths, "use_scripts_auto_execute", True)
     for number in range(20):
         empty = bpy.data.objects.new(f"empty {number}", None)
         bpy.context.scene.collection.objects.link(empty)

@@ -25,7 +25,7 @@ from .conftest import run, train
 from .refusals import files, save_elbow
 from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 SETTINGS = RecordingSettings(poses=40, margin=2.0, influence_poses=2, actions=("elbow_wave",))
 INSIDE = 30

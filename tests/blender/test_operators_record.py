@@ -330,6 +330,7 @@ class TestTraining:
         assert job.state_of("train").outcome == "Training canceled; no model was written."
         assert not (tmp_path / "m.onnx").exists()
 
+    @pytest.mark.slow
     def test_more_poses_where_the_model_is_worst_and_training_on(self, saved, elbow, tmp_path):
         settings = saved.mesh_object.fdda.settings
         settings.poses, settings.epochs, settings.use_goal, settings.goal_mm = 40, 4, True, 0.001

@@ -14,7 +14,7 @@ from .. import systems
 from .conftest import run
 from .refusals import Refusal, files
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 IS_READ = "it is read for this; give another name, or --overwrite."
 IS_OTHER = "another file is there, which is not {}; give another name, or --overwrite."
@@ -141,6 +141,7 @@ def done(line: str) -> bool:
     return run(*line.split()) == 0
 
 
+@pytest.mark.slow
 def test_what_a_verb_wrote_before_it_writes_again(place, monkeypatch):
     monkeypatch.chdir(place)
     verbs = (
@@ -158,6 +159,7 @@ def test_what_a_verb_wrote_before_it_writes_again(place, monkeypatch):
     assert left == []
 
 
+@pytest.mark.slow
 def test_a_verb_that_is_told_to_overwrites(place, monkeypatch):
     monkeypatch.chdir(place)
     assert done("evaluate rig.blend m.onnx --json notes.txt --poses 2 --overwrite")

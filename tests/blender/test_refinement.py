@@ -24,7 +24,7 @@ from .conftest import ELBOW_RIG, run, train
 from .refusals import files
 from .scene_state import scene_state
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 
 @pytest.fixture
@@ -147,6 +147,7 @@ def test_options_that_contradict(elbow, recording, capfd, option):
     assert "--refine adds random poses to a complete recording" in capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_training_until_a_target_is_met(elbow, recording, tmp_path, capfd):
     model = tmp_path / "m.onnx"
     quick = ("--epochs", 8, "--hidden", 16, 16)

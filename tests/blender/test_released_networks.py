@@ -15,7 +15,7 @@ from fdda_addon.scene.blend_file import save_copy
 
 from .conftest import ELBOW, assert_plays
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 
 def opened(path) -> weakref.ref:

@@ -27,7 +27,7 @@ from fdda_addon.scene.scene_rig import find_rigs
 from .conftest import assert_plays, pose, run
 from .refusals import Refusal, files
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 BODY, SLEEVE = "elbow", "sleeve"
 POSES = 60

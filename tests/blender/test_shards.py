@@ -24,7 +24,7 @@ from .conftest import run
 from .figure import WAVE, add_wave, build_figure
 from .refusals import Refusal, files
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 FIST = 'armature_object/pose.bones["arm.R"]["fist"]=0:1'
 

@@ -10,7 +10,7 @@ import pytest
 
 from .conftest import run
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 ROOT = Path(__file__).resolve().parents[2]
 SEED = 77
@@ -29,6 +29,7 @@ def folder(elbow, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="The soak measures memory by /proc, which only Linux has.")
 @pytest.mark.parametrize(
     ("part", "count"),

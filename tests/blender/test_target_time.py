@@ -130,6 +130,7 @@ def test_a_simulation_that_does_not_move(refusal, tmp_path):
     assert refused(refusal, rig).startswith("The target 'flesh' does not move while 'elbow' does, by ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", SIMULATIONS)
 def test_a_settled_pose_depends_on_the_pose_alone(build, tmp_path):
     rig = built(build, tmp_path / "rig.blend")
@@ -150,6 +151,7 @@ def test_a_settled_pose_depends_on_the_pose_alone(build, tmp_path):
     assert np.array_equal(half.residuals, recording.residuals[3:])
 
 
+@pytest.mark.slow
 def test_settling_resumes_where_it_was_killed(tmp_path):
     rig, killed = built(targets.target_cloth, tmp_path / "rig.blend"), tmp_path / "killed"
     whole = recorded(rig, tmp_path / "whole", *SETTLED, "--poses", 8)
@@ -187,6 +189,7 @@ def test_poses_that_do_not_settle_are_named(tmp_path, capfd):
         assert (tmp_path / "merged" / name).read_bytes() == (tmp_path / "recording" / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_a_settled_model_is_evaluated_against_settled_poses(tmp_path, capfd):
     rig = built(targets.target_soft_body, tmp_path / "rig.blend")
     recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 40, "--repeatability-poses", 3)
@@ -207,6 +210,7 @@ def test_a_settled_model_is_evaluated_against_settled_poses(tmp_path, capfd):
     assert "two ways to the same pose" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_cloth_that_folds_one_way_or_the_other_is_named(tmp_path, capfd):
     rig = built(targets.target_cloth, tmp_path / "rig.blend")
     recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 16, "--repeatability-poses", 5)

@@ -24,7 +24,7 @@ from .conftest import run
 from .stand_ins import program
 from .tiny_wheels import pinned, write_wheel, write_wheels
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -102,6 +102,7 @@ def test_it_is_created_from_a_folder_of_wheels(user: Path, wheels: Path):
     assert not (folder.own_folder() / "temporary").exists()
 
 
+@pytest.mark.slow
 def test_the_other_pythons_come_first(own: Path, preferences, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert choice.chosen_python() == (str(folder.python_in(own)), Origin.OWN)
     monkeypatch.setenv(choice.PYTHON_VARIABLE, "/of/the/variable")
@@ -145,6 +146,7 @@ def test_a_wheel_of_a_package_that_those_need_is_missing(user: Path, wheels: Pat
     assert "No matching distribution" in folder.log_path().read_text()
 
 
+@pytest.mark.slow
 def test_packages_that_do_not_work_are_no_environment(user: Path, wheels: Path, tmp_path: Path):
     shutil.copytree(wheels, tmp_path / "broken")
     write_wheel(tmp_path / "broken", "torch", "raise OSError('libcudart.so.13 is missing')\n")

@@ -21,7 +21,7 @@ from .conftest import run
 from .stand_ins import program
 from .tiny_wheels import TORCH
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 ROOT = Path(__file__).resolve().parents[2]
 ADVICE = "do this"

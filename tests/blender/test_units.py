@@ -30,7 +30,7 @@ from fdda_addon.scene.unit import metres_per_unit
 
 from .conftest import ELBOW, run, train
 
-pytestmark = pytest.mark.to_single_line
+pytestmark = pytest.mark.one_blender_version
 
 IN_METRES, IN_CENTIMETRES, FROM_FBX = "metres", "centimetres", "FBX"
 IN_MILLIMETRES, IN_KILOMETRES, FAR_AWAY = "millimetres", "kilometres", "100 metres from its origin"

@@ -20,6 +20,8 @@ from trainer.process import run_announced
 from .chain import write_chain
 from .conftest import QUICK, REPOSITORY, start_trainer
 
+ONLY_POSIX = pytest.mark.skipif(os.name != "posix", reason="Windows has no such signals.")
+
 
 def decode(text: str) -> list[Message]:
     messages = [Message.decode(line) for line in text.splitlines()]
@@ -131,7 +133,7 @@ def test_wrong_usage_exits_with_two(capsys):
     assert exit_.value.code == 2
 
 
-@pytest.mark.parametrize("limit", [20_000, "after the model"])
+@pytest.mark.parametrize("limit", [pytest.param(20_000, marks=pytest.mark.slow), "after the model"])
 def test_a_full_disk_leaves_nothing(recording, trained, tmp_path, limit):
     if limit == "after the model":
         # The report is the last to be written, and the largest file.
@@ -158,7 +160,14 @@ def test_a_full_disk_leaves_nothing(recording, trained, tmp_path, limit):
     assert (tmp_path / "m.onnx").read_bytes() == old
 
 
-@pytest.mark.parametrize("request_", ["file", *(("SIGTERM", "SIGINT", "SIGHUP") if os.name == "posix" else ())])
+@pytest.mark.parametrize(
+    "request_",
+    [
+        "file",
+        pytest.param("SIGTERM", marks=ONLY_POSIX),
+        *(pytest.param(name, marks=[ONLY_POSIX, pytest.mark.slow]) for name in ("SIGINT", "SIGHUP")),
+    ],
+)
 def test_a_request_to_stop_leaves_nothing(recording, tmp_path, monkeypatch, request_):
     stop_file, folder = tmp_path / "stop", tmp_path / "models"
     folder.mkdir()
