@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The deformation and its files: numpy and the standard library only, no bpy and no torch.
+"""Mathematics and file formats of the deformation, with numpy and the standard library only.
 
-Shared by the add-on inside Blender and by the trainer outside it.
+Both the add-on inside Blender and the trainer outside it import this package; it needs neither bpy nor torch.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Controls: inputs of a model beside the joints. Numbers that deform the mesh and that no joint tells of."""
+"""Controls: inputs of a model beside the joints, such as values of shape keys."""
 
 from dataclasses import asdict, dataclass
 
@@ -8,17 +8,18 @@ import numpy as np
 ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS = "armature_object", "armature", "mesh_object", "shape_keys"
 OWNERS = (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS)
 OTHER_OBJECT = "object:"
-"""Begins the owner of a control of another object; its name follows."""
+"""Prefix of the owner of a control on another object; the name of the object follows."""
 MAX_TEXT_LENGTH = 1000
+"""Characters of an owner or a path in a file."""
 
 
 @dataclass(frozen=True)
 class Control:
-    """A number that can be animated.
+    """An animatable number that deforms the mesh.
 
     Attributes:
-        owner: the datablock as seen from the rig, one of `OWNERS`, or `OTHER_OBJECT` and the name of an object: a
-            character that is linked or renamed keeps its controls.
+        owner: the datablock by its role in the rig, one of `OWNERS`, or `OTHER_OBJECT` and the name of an object. So
+            a character that is linked or renamed keeps its controls.
         path: RNA path inside the owner, `key_blocks["Smile"].value`, `pose.bones["hand"]["fist"]`; one element of an
             array is `location[0]`.
         low, high: its range, in the unit of the property.
@@ -31,7 +32,7 @@ class Control:
 
     @property
     def name(self) -> str:
-        """Owner and path in one; tells controls of a rig apart."""
+        """Owner and path; unique among the controls of a rig."""
         return f"{self.owner}/{self.path}"
 
     def to_json(self) -> dict:

@@ -1,24 +1,25 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Settings that hold where nobody states others: the same in the sidebar, on the command line, in the trainer and in
-scripts. What only one of them has stands there.
+"""Default settings shared by the sidebar, the command line, the trainer and scripts.
+
+A default that only one of them uses is defined there.
 """
 
 POSES = 1000
-"""Random poses of a recording."""
+"""Number of random poses in a recording."""
 SPREAD = 1.0
-"""Standard deviation of random poses, as a part of half the range."""
+"""Standard deviation of random poses, as a ratio of half the range of motion."""
 MARGIN = 1.0
-"""How many times as wide as the range of motion the poses of its margin are; 1 for none of them."""
+"""Scale of the range of motion for poses of the margin; 1 for no margin."""
 INFLUENCE_POSES = 10
-"""How often each joint is moved alone to find the partitions that it influences."""
+"""How many times each joint is moved alone to find the partitions that it influences."""
 MIN_PARTITION_VERTICES = 8
-"""Partitions of fewer vertices are merged into others."""
+"""Partitions with fewer vertices are merged into others."""
 REFINEMENT_POSES = 250
-"""Poses that are added where a model is worst."""
+"""Number of poses that are added where a model is worst."""
 REST_THRESHOLD_MM = 0.1
-"""A target that poses are held for is at rest when no vertex moves by more from a frame to the next."""
+"""Millimetres per frame. A target is at rest when no vertex moves by more between two frames."""
 REPEATABILITY_POSES = 10
-"""Poses that are approached from another direction as well."""
+"""Number of poses that a simulated target reaches a second time, from another direction."""
 
 TOLERANCE_MM = 0.04
 """What the basis shapes may leave, over the whole mesh."""
@@ -29,8 +30,8 @@ SUGGESTED_GOAL_MM = 0.5
 """The goal that the sidebar suggests when a user turns it on."""
 
 EVALUATION_POSES, SIDEBAR_EVALUATION_POSES = 200, 100
-"""Random poses that a model is compared on; fewer where a user waits for them."""
+"""Numbers of random poses on which a model is compared; fewer in the sidebar, where the user waits."""
 EVALUATION_SEED = 1
-"""Of these poses: not that of a recording."""
+"""Seed of these poses; it differs from the default seed of a recording."""
 MARKERS = 5
-"""So many of the worst frames are marked."""
+"""Number of the worst frames that get a marker."""

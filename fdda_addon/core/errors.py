@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The errors that users read.
+"""Errors with a message for the user.
 
-Each carries one sentence: what is wrong, with names and numbers, and what to do about it. The command line prints
-it and exits with status 1, or with `TRY_AGAIN` where the machine is to blame; an operator reports it and is cancelled.
+Each message is one sentence: what is wrong, with names and numbers, and what to do. The command line prints it and
+exits with status 1, or with `TRY_AGAIN` where the machine caused the error; an operator reports it and is cancelled.
 Any other exception is a bug and propagates.
 """
 
@@ -11,7 +11,7 @@ import os
 import re
 
 TRY_AGAIN = 75
-"""Exit status of what may work when it is run again, as it is or on another machine: EX_TEMPFAIL of sysexits.h."""
+"""Exit status of a command that may succeed later or on another machine: EX_TEMPFAIL of sysexits.h."""
 MACHINE_ERRNOS = {
     getattr(errno, name)
     for name in (
@@ -21,9 +21,9 @@ MACHINE_ERRNOS = {
     )
     if hasattr(errno, name)
 }
-"""What the system says when a disk, the memory or a shared folder gave out, and not when a path is wrong."""
+"""Values of errno for failures of a disk, the memory or a shared folder, as opposed to a wrong path."""
 MACHINE_WINERRORS = {8, 14, 21, 32, 33, 39, 53, 59, 64, 112, 121, 1117, 1224, 1231, 1450, 1455}
-"""The same as Windows numbers it, and that another program has a file open; Python knows few of these by `errno`."""
+"""The same as Windows error numbers, with those of a file that another program has open; few have an `errno`."""
 _WINERROR_TEXTS = {
     **dict.fromkeys((32, 33, 1224), "another program has it open"),
     **dict.fromkeys((39, 112), os.strerror(errno.ENOSPC)),
@@ -31,12 +31,12 @@ _WINERROR_TEXTS = {
     206: os.strerror(errno.ENAMETOOLONG),
 }
 MAX_SENTENCE_LENGTH = 1000
-"""Letters of a sentence. What a file of somebody else's says is quoted in it, and may be a million letters long."""
+"""Characters. A message quotes text of files from elsewhere, which may be of any length."""
 _CONTROL_CHARACTERS = r"[\x00-\x1f\x7f-\x9f\u2028\u2029]"
 
 
 def to_single_line(text: str) -> str:
-    """A text of a readable length that a terminal shows as one line: what would steer it is written out."""
+    """Shorten a text and escape its control characters, so that a terminal shows it as one line."""
     if len(text) > MAX_SENTENCE_LENGTH:
         half = MAX_SENTENCE_LENGTH // 2
         text = f"{text[:half]} […] {text[-half:]}"
@@ -44,17 +44,17 @@ def to_single_line(text: str) -> str:
 
 
 def os_error_text(error: OSError) -> str:
-    """What the system says of an error, in English; Windows says it in its own language."""
+    """Return the system's text of an error in English; Windows itself uses its own language."""
     number = getattr(error, "winerror", None)
     if not number:
         return error.strerror or str(error)
-    # What Python has no number of its own for is EINVAL.
+    # Python reports Windows errors without an errno of their own as EINVAL.
     words = f"error {number} of Windows" if error.errno == errno.EINVAL else os.strerror(error.errno)
     return _WINERROR_TEXTS.get(number, words)
 
 
 class FDDAError(Exception):
-    """Base of every error whose text is meant for the user; `exit_status` is that of the command line."""
+    """Base of all errors whose text is for the user; `exit_status` is the status of the command line."""
 
     exit_status = 1
 
@@ -63,7 +63,7 @@ class FDDAError(Exception):
 
 
 def exit_status(error: BaseException) -> int:
-    """Exit status of the command line for an error: `TRY_AGAIN` where the machine caused it."""
+    """Return the exit status of the command line for an error: `TRY_AGAIN` where the machine caused it."""
     status = getattr(error, "exit_status", FDDAError.exit_status)
     if status != FDDAError.exit_status:
         return status
@@ -76,7 +76,7 @@ def exit_status(error: BaseException) -> int:
 
 
 def machine_fault_sentence(error: BaseException) -> str:
-    """What to say of an error that nobody foresaw where the machine caused it; empty where it may be a bug."""
+    """Return a message for an unexpected error that the machine caused; empty where it may be a bug."""
     if isinstance(error, MemoryError):
         return "The memory of this machine is used up; free some, or use a larger one."
     if isinstance(error, OSError) and _is_machine_fault(error):
@@ -90,14 +90,14 @@ def _is_machine_fault(error: OSError) -> bool:
 
 
 class WrongUsageError(FDDAError):
-    """Options that make no sense. The text may be that of the parser, several lines."""
+    """Options are wrong or contradict each other. The text of the parser may have several lines."""
 
     exit_status = 2
     __str__ = Exception.__str__
 
 
 class RigError(FDDAError):
-    """The scene holds no rig that can be recorded, bound or evaluated."""
+    """The scene has no rig that can be recorded, bound or evaluated."""
 
 
 class RecordingError(FDDAError):
@@ -105,7 +105,7 @@ class RecordingError(FDDAError):
 
 
 class BusyError(RecordingError):
-    """Another process is at it."""
+    """Another process uses the recording."""
 
     exit_status = TRY_AGAIN
 
@@ -115,17 +115,17 @@ class ModelError(FDDAError):
 
 
 class TrainingError(FDDAError):
-    """The training could not start, died, or reported a failure."""
+    """The training could not start, ended unexpectedly, or reported a failure."""
 
 
 class TrainingDiedError(TrainingError):
-    """The training was ended from outside, or lacked memory or disk."""
+    """The training was ended from outside, or memory or disk space ran out."""
 
     exit_status = TRY_AGAIN
 
 
 class TrainerEnvironmentError(FDDAError):
-    """The Python environment of the trainer cannot be made, removed or used."""
+    """The Python environment of the trainer cannot be created, removed or used."""
 
 
 class OutputError(FDDAError):
@@ -133,7 +133,7 @@ class OutputError(FDDAError):
 
 
 class DiskFullError(OutputError):
-    """The disk lacks the room."""
+    """The disk has too little free space."""
 
     exit_status = TRY_AGAIN
 

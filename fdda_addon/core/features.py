@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a network sees of a pose: the transforms of joints relative to parent and rest pose."""
+"""Joint features: the transforms of joints relative to parent and rest pose, the inputs of a network."""
 
 import numpy as np
 
@@ -11,9 +11,11 @@ FLOAT32_ROUNDING_RATIO = 2.0**-21
 
 
 def joint_features(pose_matrices: np.ndarray, rest_matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:
-    """Transform of each joint relative to its parent and to the rest pose, F_j = (B_p^-1 B_j)^-1 P_p^-1 P_j.
+    """Compute the transform of each joint relative to its parent and to the rest pose.
 
-    The identity in the rest pose. The parent of a root is mesh-object space itself.
+    F_j = (B_p^-1 B_j)^-1 P_p^-1 P_j for joint j with parent p, rest matrices B and pose matrices P.
+
+    F_j is the identity in the rest pose. The parent space of a root is mesh-object space.
 
     Args:
         pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
@@ -30,7 +32,7 @@ def joint_features(pose_matrices: np.ndarray, rest_matrices: np.ndarray, parents
 
 
 def relative_to_parent(matrices: np.ndarray, parents: np.ndarray) -> np.ndarray:
-    """(N, J, 4, 4) matrices in mesh-object space to matrices relative to the parent joint; roots stay as they are."""
+    """Convert (N, J, 4, 4) matrices from mesh-object space to the space of the parent joint; roots stay unchanged."""
     relative = matrices.copy()
     children = np.flatnonzero(parents >= 0)
     relative[:, children] = np.linalg.inv(matrices[:, parents[children]]) @ matrices[:, children]

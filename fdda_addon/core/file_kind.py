@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Kinds of the files that verbs write, told by how they begin: nothing else in their place is written over."""
+"""Kinds of output files, recognized by their signatures: a file of another kind is never overwritten."""
 
 import re
 from dataclasses import dataclass
@@ -12,18 +12,18 @@ SIGNATURE_BYTES = 4096
 
 @dataclass(frozen=True)
 class FileKind:
-    """A kind of file.
+    """A kind of output file.
 
     Attributes:
-        name: for sentences, with its article.
-        signature: what such a file begins with, a pattern.
+        name: for messages, with its article.
+        signature: regular expression of the first bytes.
     """
 
     name: str
     signature: bytes
 
     def matches(self, path: Path) -> bool:
-        """Whether a file is of this kind. An empty one is of every kind.
+        """Return whether a file is of this kind; an empty file is of every kind.
 
         Raises:
             OSError: it cannot be read.
@@ -36,7 +36,7 @@ class FileKind:
 _OBJECTS_PREFIX = rb'\s*\{\s*(?:"objects":\s*\{\s*"(?:[^"\\]|\\.)*":\s*\{\s*)?'
 
 BLEND = FileKind("a .blend file", rb"BLENDER|\x28\xb5\x2f\xfd|\x1f\x8b")
-"""Plain, or compressed by a new or an old Blender."""
+"""Uncompressed, Zstandard or gzip."""
 MODEL = FileKind("a model", rb"\x08[\x01-\x1f][\x12\x1a\x22\x3a]")
 CHECKPOINT = FileKind("the checkpoint of a training", rb"PK\x03\x04.{26}about\.npy")
 REPORT = FileKind("a training report", rb'\s*\{\s*"format":\s*"fdda-report"')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Opening files that come from elsewhere: ordinary ones only, so that none blocks, never ends, or leads away."""
+"""Opening of untrusted files: regular files only, as pipes may block, devices never end and links lead elsewhere."""
 
 import errno
 import os
@@ -9,23 +9,23 @@ from typing import BinaryIO
 
 from .open_files import open_with_retry
 
-NOT_A_REGULAR_FILE = "it is no ordinary file"
+NOT_A_REGULAR_FILE = "it is not a regular file"
 IS_A_LINK = "it is a link to another place"
-# A pipe that took the place of the file meanwhile must not block. Windows has neither flag, nor pipes in folders.
+# A pipe that replaces the file between check and open must not block. Windows has neither flags nor such pipes.
 _NONBLOCK = getattr(os, "O_NONBLOCK", 0)
 _NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 
 
 def open_input(path: Path, mode: str = "rb", follow: bool = True) -> BinaryIO:
-    """Open an ordinary file.
+    """Open a regular file.
 
     Args:
         path: the file.
-        mode: of `open`; "x+b" makes a new file where nothing is.
-        follow: whether the path itself may be a symbolic link; not inside of folders that come from elsewhere.
+        mode: as for `open`; "x+b" creates a file that must not exist.
+        follow: whether the path may be a symbolic link; pass False inside of folders that come from elsewhere.
 
     Raises:
-        OSError: it cannot be opened, or is a pipe, a device, a folder or, unless `follow`, a link; `strerror` says so.
+        OSError: it cannot be opened, or is a pipe, a device, a folder or, unless `follow`, a link; `strerror` says which.
     """
     return open_with_retry(lambda: _open(path, mode, follow))
 
@@ -44,7 +44,7 @@ def _open(path: Path, mode: str, follow: bool) -> BinaryIO:
 
 
 def read_input(path: Path, max_bytes: int, follow: bool = True) -> bytes:
-    """The bytes of an ordinary file; all else as `open_input`.
+    """Read the bytes of a regular file, as `open_input` opens it.
 
     Raises:
         OSError: as `open_input`, or it has more than `max_bytes` bytes.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where a model counts: a weight for each vertex, 1 for the model and 0 for linear skinning."""
+"""Blending of a model with linear skinning, by vertex mask and by strength."""
 
 from dataclasses import dataclass, replace
 
@@ -11,11 +11,11 @@ from .skinning import LinearSkinning
 
 @dataclass(frozen=True)
 class Mask:
-    """A weight for each vertex of a mesh.
+    """Weight of the model at each vertex of a mesh; linear skinning has the rest.
 
     Attributes:
         weights: (V,) float32, 0 to 1.
-        partial: (n,) int64, ascending: the vertices with less than 1, which are not the model's alone.
+        partial: (n,) int64, ascending indices of the vertices with a weight below 1.
     """
 
     weights: np.ndarray
@@ -23,12 +23,12 @@ class Mask:
 
     @staticmethod
     def from_weights(weights: np.ndarray) -> "Mask":
-        """The mask with these weights, (V,); what is beyond 0 and 1 is brought to them."""
+        """Make a mask of (V,) weights, clamped to 0 and 1."""
         weights = np.clip(np.asarray(weights, np.float32), 0, 1)
         return Mask(weights, np.flatnonzero(weights < 1))
 
     def blended(self, linear: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Of one pose, (V, 3) float32 each: the model's positions where it counts, linear skinning's elsewhere."""
+        """Blend (V, 3) float32 positions of one pose: `linear` where the weight is 0, `positions` where it is 1."""
         blended, weights = positions.copy(), self.weights[self.partial][:, None]
         blended[self.partial] = linear[self.partial] + weights * (positions[self.partial] - linear[self.partial])
         return blended
@@ -40,12 +40,12 @@ class Mask:
 
 
 class SkinningBlend:
-    """Blends what a model gives with linear skinning: linear + strength * weight * (model - linear)."""
+    """Blends positions of a model with linear skinning: linear + strength * weight * (model - linear)."""
 
     def __init__(self, rig: Rig, mask: Mask | None = None):
         """Args:
-        rig: with the skin weights of the model's linear skinning, and the rest pose of the model.
-        mask: of its mesh; None where the model counts everywhere.
+        rig: with the skin weights and the rest pose of the model.
+        mask: of the mesh; None for a weight of 1 everywhere.
         """
         self.mask = mask
         self._rig = rig
@@ -53,7 +53,7 @@ class SkinningBlend:
         self._partial_skinning: LinearSkinning | None = None
 
     def with_mask(self, mask: Mask | None) -> "SkinningBlend":
-        """The same with another mask."""
+        """Return a copy with another mask."""
         other = SkinningBlend(self._rig, mask)
         other._full_skinning = self._full_skinning
         return other
@@ -62,21 +62,21 @@ class SkinningBlend:
         """Blend some poses.
 
         Args:
-            positions: (N, V, 3) float32 of the model, mesh units; may be written into. Not looked at where the
-                strength is 0.
+            positions: (N, V, 3) float32 of the model, mesh-object space, mesh units; may be overwritten. Ignored
+                for poses of strength 0.
             pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
-            strengths: (N,) float32, 0 for linear skinning alone, 1 for the model where the mask lets it.
+            strengths: (N,) float32, 0 for linear skinning alone, 1 for the model with its mask.
 
         Returns:
-            (N, V, 3) float32, mesh-object space, mesh units; `positions` itself where it was written into.
+            (N, V, 3) float32, mesh-object space, mesh units; `positions` itself where it was overwritten.
         """
         if strengths.min() < 1:
             linear = self._make_full_skinning().positions(pose_matrices)
             factors = strengths.astype(np.float32)[:, None]
             if self.mask is not None:
                 factors = factors * self.mask.weights
-            shown = strengths > 0
-            linear[shown] += factors[shown][..., None] * (positions[shown] - linear[shown])
+            blended = strengths > 0
+            linear[blended] += factors[blended][..., None] * (positions[blended] - linear[blended])
             return linear
         if self.mask is not None and len(self.mask.partial):
             partial = self.mask.partial
@@ -91,7 +91,7 @@ class SkinningBlend:
         return self._full_skinning
 
     def _make_partial_skinning(self) -> LinearSkinning:
-        """Of the vertices alone that the model does not have for itself: a mask costs as much as it covers."""
+        """Return linear skinning of the partial vertices alone, so that the cost follows their count."""
         if self._partial_skinning is None:
             rig, partial = self._rig, self.mask.partial
             self._partial_skinning = LinearSkinning(

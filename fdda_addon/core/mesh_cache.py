@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How many frames the files have that a Mesh Cache modifier plays: .pc2 and .mdd, by their headers."""
+"""Number of frames in the files of a Mesh Cache modifier, .pc2 and .mdd, read from their headers."""
 
 import struct
 from pathlib import Path
@@ -9,14 +9,14 @@ from .input_file import open_input
 from .point_cache import read_point_cache
 
 _MDD_HEADER = struct.Struct(">ii")
-"""Frames and points; then float32 seconds of each frame, then x, y, z of each point, frame by frame; big-endian."""
+"""Big-endian frame and point counts. Float32 follow: seconds of each frame, then x, y, z of each point by frame."""
 
 
 def mesh_cache_frames(path: Path) -> int:
-    """Frames of a .pc2 or .mdd file.
+    """Return the number of frames in a .pc2 or .mdd file.
 
     Raises:
-        PointCacheError: it cannot be read, or its size is not what its header says.
+        PointCacheError: it cannot be read, or its size contradicts its header.
     """
     if path.suffix.lower() != ".mdd":
         return len(read_point_cache(path).positions)

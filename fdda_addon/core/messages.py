@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the trainer says while it works: one JSON object a line on its stdout.
+"""Messages of the trainer to the add-on: one JSON object per line on stdout.
 
-Direction: trainer to add-on. Every training ends with exactly one of `FINISHED`, `CANCELLED` and `FAILED`. The add-on
-asks the trainer to stop by creating the file that `STOP_FILE_VARIABLE` names: no signal does that on Windows.
+Every training ends with exactly one of `FINISHED`, `CANCELLED` and `FAILED`. The add-on asks the trainer to stop by
+creating the file that `STOP_FILE_VARIABLE` names, because Windows has no signal for it.
 """
 
 import enum
@@ -10,18 +10,18 @@ import json
 from dataclasses import dataclass, field
 
 STOP_FILE_VARIABLE = "FDDA_STOP_FILE"
-"""Environment variable of the trainer: path of a file that does not exist until the trainer is to stop."""
+"""Environment variable of the trainer: path of a file that is created to stop the trainer."""
 WARNING_LINE = "Warning ({name}): {text}"
-"""A warning for people, from its values."""
+"""Text of a warning on the command line."""
 
 
 class MessageType(enum.Enum):
-    """Types of a message, with the keys that it carries beside `type`."""
+    """Types of messages, each with its keys beside `type`."""
 
     STARTED = "started"
     """partitions: int, poses: int, vertices: int, device: str."""
     PREPARING = "preparing"
-    """done: int, total: int (partitions whose residuals have been turned into shapes)."""
+    """done: int, total: int (partitions whose principal components are computed)."""
     PROGRESS = "progress"
     """epoch: int, epochs: int, training_mm: float, validation_mm: float (mean errors of the training and the validation
     poses). Of a fit of skin weights: done: int, total: int (vertices)."""
@@ -32,7 +32,7 @@ class MessageType(enum.Enum):
     WARNING = "warning"
     """name: str, text: str: something about the recording that makes a bad model likely (`core.checks.warning`)."""
     MODEL_FINISHED = "model_finished"
-    """As `FINISHED`, of one of several models that are trained in turn: each has its own `STARTED` before it."""
+    """As `FINISHED`, for one of several models that are trained one after the other, each with its own `STARTED`."""
     FINISHED = "finished"
     """model: str (path), seconds: float, held_out_mm and held_out_p999_mm: float (mean and percentile 99.9);
     verdict: str, "met", "missed" or "exhausted", where there is a goal. Of several models: model is their folder, the
@@ -50,18 +50,18 @@ class MessageType(enum.Enum):
 
 @dataclass(frozen=True)
 class Message:
-    """A message and the values of its keys."""
+    """A message with the values of its keys."""
 
     type: MessageType
     values: dict = field(default_factory=dict)
 
     def encode(self) -> str:
-        """One line of JSON, without the line's end."""
+        """Return the message as one line of JSON, without the line end."""
         return json.dumps({"type": self.type.value, **self.values})
 
     @staticmethod
     def decode(line: str) -> "Message":
-        """Read one line.
+        """Read a message from one line.
 
         Raises:
             ValueError: the line is no message.

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Recognizes that a package cannot be imported since Windows lacks Microsoft's Visual C++ runtime."""
+"""Detection of a missing Visual C++ runtime, without which Windows cannot import some packages."""
 
 import platform
 import re
 
 _LOAD_ERROR = re.compile(r"DLL load failed|WinError 126\b|WinError 127\b", re.IGNORECASE)
-"""Python's own words and numbers; the rest of such a text is in the language of Windows."""
+"""Python's own words and error numbers; Windows writes the rest of the text in its own language."""
 
 
 def runtime_advice(error_text: str) -> str:
-    """Advise on a failed import, as the end of a sentence without its period; empty where no DLL is missing.
+    """Return advice on a failed import, as the end of a sentence without its period; empty where no DLL is missing.
 
     Args:
         error_text: of the exception that the import raised.

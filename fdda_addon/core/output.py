@@ -84,7 +84,7 @@ def check_writable(path: Path) -> None:
         raise OutputError(f"Cannot write '{path}': it is a folder; give the name of a file.")
     if os.path.exists(path) and not os.path.isfile(path):
         # A rename would put a file in the place of /dev/null.
-        raise OutputError(f"Cannot write '{path}': it is no ordinary file; give the name of a file.")
+        raise OutputError(f"Cannot write '{path}': it is not a regular file; give the name of a file.")
     if is_windows() and os.path.exists(path) and not os.access(path, os.W_OK):
         raise OutputError(f"Cannot write '{path}': it is write-protected; give another name, or let it be written.")
     if not os.path.isdir(folder):

@@ -1,13 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How far a job is: what every generator that works yields."""
+"""The progress of a job, which its generator yields."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Progress:
-    """`done` of `total` steps of the stage are done; `note` is a sentence for the user, where there is one to say, and
-    `detail` what there is to say of the last step in a few words."""
+    """Progress of one stage of a job.
+
+    Attributes:
+        stage: name of the stage.
+        done, total: steps that are complete, and all steps of the stage.
+        note: a sentence for the user; may be empty.
+        detail: a few words about the last step; may be empty.
+    """
 
     stage: str
     done: int

@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Signals that ask a process to stop. Imports little: it is used before anything else is imported."""
+"""Signals that ask a process to stop. Imports little, because it is used before all other imports."""
 
 import os
 import signal
 from collections.abc import Callable
 
 INTERRUPTED = 130
-"""Exit status of a process that was asked to stop."""
+"""Exit status of a process that a signal stopped."""
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
 """Ctrl-C, a request to end, a terminal that closes; SIGBREAK is Windows' for Ctrl-Break and a console that closes."""
 
 
 def handle_stop_signals(handler: Callable) -> dict[int, object]:
-    """Install a handler for every stop signal. One that the process was started to ignore stays so, but not Ctrl-C.
+    """Install a handler for all stop signals but those that the process inherited as ignored; Ctrl-C is always handled.
 
     Returns:
-        The handlers before, by signal, for `restore_handlers`; None for one of another language than Python.
+        The previous handlers by signal, for `restore_handlers`; None for a handler that was not installed from Python.
     """
     return {
         number: signal.signal(number, handler)
@@ -32,5 +32,5 @@ def restore_handlers(handlers: dict[int, object]) -> None:
 
 
 def exit_on_stop_signal() -> None:
-    """Let stop signals end the process at once, without a traceback: for the time before there is anything to lose."""
+    """Let stop signals end the process at once, without a traceback, before it has data to lose."""
     handle_stop_signals(lambda *_: os._exit(INTERRUPTED))

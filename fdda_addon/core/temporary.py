@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The system's temporary folder, which may take no file."""
+"""Check of the system's temporary folder."""
 
 import tempfile
 
@@ -7,10 +7,10 @@ from .errors import DiskFullError, os_error_text
 
 
 def check_temporary_folder() -> None:
-    """Fail where the system's temporary folder takes no file: packages that are imported may need one.
+    """Check that files can be written to the system's temporary folder; imported packages may need one.
 
     Raises:
-        DiskFullError: it takes none.
+        DiskFullError: no file can be written.
     """
     try:
         tempfile.gettempdir()
@@ -19,7 +19,7 @@ def check_temporary_folder() -> None:
 
 
 def temporary_folder_error(error: OSError) -> DiskFullError:
-    """The error where the system's temporary folder takes no file; Python looks for one that does."""
+    """Return the error for a temporary folder that cannot be written; Python tries several folders."""
     return DiskFullError(
         f"No temporary file can be written ({os_error_text(error)}); make room there, or name another folder in TMPDIR."
     )

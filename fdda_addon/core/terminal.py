@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a terminal or a log cannot show is written out in its place, so that no name ends a verb."""
+"""Encoding of the terminal: names that it cannot show are escaped, so that printing never fails."""
 
 import os
 import sys
 
 
 def escape_unencodable_output() -> None:
-    """Let stdout and stderr escape what their encoding lacks: `\\xc4rmel` where there is nothing but ASCII."""
+    """Let stdout and stderr escape characters that their encoding lacks: `\\xc4rmel` in ASCII."""
     for stream in (sys.stdout, sys.stderr):
-        # Whoever calls a verb may have put something else in their place.
+        # A caller may have replaced the streams.
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
 
 
 def restart_in_utf8_mode() -> None:
-    """Start this program of Python again where it takes names and paths for ASCII: those of objects are UTF-8.
+    """Restart this Python program in UTF-8 mode where it decodes names and paths as ASCII.
 
-    With LC_ALL=C Python does so by itself, unless it was told not to (PYTHONUTF8=0). Blender always does.
+    Names of objects are UTF-8. With LC_ALL=C Python chooses UTF-8 mode itself, unless PYTHONUTF8=0 is set. Blender
+    always uses UTF-8.
     """
     if sys.getfilesystemencoding() == "ascii":
         os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])

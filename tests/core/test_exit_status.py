@@ -44,7 +44,7 @@ def test_what_windows_says_is_not_quoted():
     error = PermissionError(errno.EACCES, "Zugriff verweigert")
     error.winerror = 5
     assert os_error_text(error) == "Permission denied" and exit_status(caused_by(error)) == 1
-    assert os_error_text(OSError(errno.EINVAL, "it is no ordinary file")) == "it is no ordinary file"
+    assert os_error_text(OSError(errno.EINVAL, "it is not a regular file")) == "it is not a regular file"
 
 
 @pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES, errno.EISDIR, errno.EROFS, errno.ENAMETOOLONG])

@@ -64,5 +64,5 @@ def test_what_is_of_the_kind_or_not_there_is_written(tmp_path):
 @systems.named_pipes
 def test_what_cannot_be_read_is_not_written_over(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(OutputError, match="it is no ordinary file"):
+    with pytest.raises(OutputError, match="it is not a regular file"):
         check_outputs({tmp_path / "pipe": file_kind.MODEL}, overwrite=True)

@@ -22,7 +22,7 @@ from .good_recording import good_recording
 from .limb import make_rig, partitions_of, random_poses, random_residuals, recording_info
 
 FILES = ("recording.json", "residuals.npy", "pose_matrices.npy", "rest_positions.npy", "skin_weights.npy")
-NO_FILE = "it is no ordinary file"
+NO_FILE = "it is not a regular file"
 
 
 @pytest.fixture(autouse=True)

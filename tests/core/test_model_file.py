@@ -86,7 +86,7 @@ def test_a_folder(tmp_path):
 
 @systems.devices
 def test_a_device_that_never_ends():
-    refused(Path("/dev/zero"), "cannot be read: it is no ordinary file")
+    refused(Path("/dev/zero"), "cannot be read: it is not a regular file")
 
 
 @pytest.mark.parametrize("data", [b"", b"blender", bytes(500)])

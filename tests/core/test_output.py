@@ -187,7 +187,7 @@ def test_a_folder_is_no_file(tmp_path):
 
 
 def test_a_device_is_no_file():
-    with pytest.raises(OutputError, match=f"'{os.devnull}': (it is no ordinary file|'nul' is the name of a device)"):
+    with pytest.raises(OutputError, match=f"'{os.devnull}': (it is not a regular file|'nul' is the name of a device)"):
         check_writable(Path(os.devnull))
 
 

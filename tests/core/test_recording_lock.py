@@ -178,5 +178,5 @@ def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path):
 @systems.named_pipes
 def test_a_pipe_in_place_of_the_lock_blocks_nobody(tmp_path):
     os.mkfifo(tmp_path / LOCK)
-    with pytest.raises(OutputError, match=rf"'{LOCK}' is no ordinary file"):
+    with pytest.raises(OutputError, match=rf"'{LOCK}' is not a regular file"):
         write(tmp_path)

@@ -77,7 +77,7 @@ def test_a_model_says_its_unit():
 @pytest.mark.parametrize("metres", BAD)
 def test_a_model_in_no_unit(metres):
     text = json.dumps({**json.loads(tiny_info().to_json()), "metres_per_unit": metres})
-    with pytest.raises(ValueError, match=r"'metres_per_unit' is .*, and a unit is longer than nothing"):
+    with pytest.raises(ValueError, match=r"'metres_per_unit' is .*, and must be a number above 0"):
         ModelInfo.from_json(text)
 
 

@@ -140,7 +140,7 @@ def test_pipes_block_nobody(report, tmp_path, capsys):
         assert main([str(tmp_path / name)]) == 1
     (tmp_path / "report.json").write_text(json.dumps(report))
     assert main([str(tmp_path / "report.json"), "--pictures", str(tmp_path)]) == 1
-    assert "it is no ordinary file" in capsys.readouterr().err
+    assert "it is not a regular file" in capsys.readouterr().err
 
 
 def test_the_page_takes_no_other_file_s_place(report, tmp_path, capsys):

@@ -155,7 +155,7 @@ def test_a_damaged_checkpoint_is_refused(recording, model, capsys, damage):
     before = model.read_bytes()
     text = refused(capsys, recording, model)
     if damage == "pipe":
-        assert "it is no ordinary file" in text
+        assert "it is not a regular file" in text
     elif damage == "text":
         assert "another file is there, which is not the checkpoint of a training" in text
     else:

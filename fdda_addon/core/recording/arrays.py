@@ -77,7 +77,7 @@ def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -
         rows: how many, one or more, must be there and are mapped; all of `shape` when left out.
 
     Raises:
-        RecordingError: it is missing, no ordinary file, truncated, or something else.
+        RecordingError: it is missing, not a regular file, truncated, or something else.
     """
     try:
         with open_input(path, follow=False) as file:

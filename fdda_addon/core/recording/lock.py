@@ -49,7 +49,7 @@ class RecordingLock:
             handle = os.open(self._path, _OPEN, 0o666)
             try:
                 if not stat.S_ISREG(os.fstat(handle).st_mode):
-                    raise OSError(errno.EINVAL, f"'{LOCK}' is no ordinary file")
+                    raise OSError(errno.EINVAL, f"'{LOCK}' is not a regular file")
                 if not _lock(handle):
                     raise BusyError(
                         f"{self._owner(handle)} is recording into '{self._folder}'; wait for it, or choose another "
