@@ -66,7 +66,7 @@ def read_controls(values: list) -> tuple[Control, ...]:
         KeyError, TypeError, ValueError: they are damaged, or two have one name.
     """
     if not isinstance(values, list):
-        raise TypeError("its controls are no list")
+        raise TypeError("its controls are not a list")
     controls = tuple(Control.from_json(value) for value in values)
     if len({control.name for control in controls}) != len(controls):
         raise ValueError("two of its controls have one name")

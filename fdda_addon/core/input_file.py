@@ -25,7 +25,7 @@ def open_input(path: Path, mode: str = "rb", follow: bool = True) -> BinaryIO:
         follow: whether the path may be a symbolic link; pass False inside of folders that come from elsewhere.
 
     Raises:
-        OSError: it cannot be opened, or is a pipe, a device, a folder or, unless `follow`, a link; `strerror` says which.
+        OSError: it cannot be opened, or is a pipe, a device, a folder or, unless `follow`, a link; see `strerror`.
     """
     return open_with_retry(lambda: _open(path, mode, follow))
 

@@ -152,7 +152,7 @@ class ModelInfo:
         """
         try:
             if len(text) > MAX_METADATA_LENGTH:
-                raise ValueError(f"its metadata has {len(text)} letters")
+                raise ValueError(f"its metadata has {len(text)} characters")
             return _read_info(json.loads(text))
         except json.JSONDecodeError as error:
             raise ValueError(f"its metadata is not JSON ({error})") from error

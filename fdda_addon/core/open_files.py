@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Replacing, removing and opening files that other programs may have open.
+"""Replacing, removing and opening of files that other programs may have open.
 
-Windows refuses all three while a virus scanner, an indexer or another Blender has the file open, often for a moment.
+Windows refuses all three while a virus scanner, an indexer or another Blender has the file open, often only briefly.
 """
 
 import errno
@@ -15,7 +15,7 @@ from typing import TypeVar
 
 RETRY_SECONDS = 10.0
 OPEN_RETRY_SECONDS = 1.0
-"""How long it takes until a file counts as in use. Who only reads is told sooner: the file may simply be forbidden."""
+"""How long to retry until a file counts as in use; shorter for reading, because access may simply be denied."""
 MAX_PAUSE_SECONDS = 0.1
 IN_USE_TEXT = "another program has it open"
 SHARING_WINERRORS = {5, 32, 33, 1224}
@@ -25,7 +25,7 @@ Result = TypeVar("Result")
 
 
 def replace_file(source: Path, target: Path) -> None:
-    """Rename a file to a path where another may be.
+    """Rename a file to a path, and replace a file there.
 
     Raises:
         OSError: as `os.replace`; EBUSY where another program has one of them open for longer than `RETRY_SECONDS`.
@@ -34,7 +34,7 @@ def replace_file(source: Path, target: Path) -> None:
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file, where there is one.
+    """Remove a file where it exists.
 
     Raises:
         OSError: as `os.unlink`; EBUSY where another program has it open for longer than `RETRY_SECONDS`.
@@ -42,16 +42,16 @@ def remove_file(path: Path) -> None:
     _retry_while_in_use(lambda: path.unlink(missing_ok=True), path)
 
 
-def open_with_retry(opened: Callable[[], Result]) -> Result:
-    """Call what opens a file, again for a moment where Windows refuses it.
+def open_with_retry(open_file: Callable[[], Result]) -> Result:
+    """Call a function that opens a file, and retry while Windows refuses it.
 
     Raises:
-        OSError: as `opened`.
+        OSError: as `open_file`.
     """
     end = time.monotonic() + OPEN_RETRY_SECONDS
     while True:
         try:
-            return opened()
+            return open_file()
         except PermissionError:
             # `open` does not say which error of Windows it was.
             if sys.platform != "win32" or time.monotonic() > end:
@@ -73,10 +73,10 @@ def _retry_while_in_use(action: Callable[[], None], path: Path) -> None:
 
 
 def _is_forbidden(path: Path) -> bool:
-    """Whether Windows refuses a path for what it is, and patience does not help."""
+    """Return whether Windows refuses a path permanently, because it is a folder or write-protected."""
     return os.path.isdir(path) or (os.path.lexists(path) and not os.access(path, os.W_OK))
 
 
 def _pause() -> None:
-    # Of no fixed length: who opens the file at regular times would be met every time.
+    # A random pause does not stay in step with a program that opens the file at regular times.
     time.sleep(random.uniform(0.1, 1) * MAX_PAUSE_SECONDS)

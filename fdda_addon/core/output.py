@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Writing files so that a reader finds the old one, the new one, or none; never a half."""
+"""Atomic writing of files: a reader finds the old file, the new one or none, but never an incomplete one."""
 
 import errno
 import json
@@ -20,9 +20,9 @@ from .path_limits import check_path, comparable_path, is_windows
 
 TEMPORARY_PREFIX = ".fdda-"
 KEPT_PREFIX = "new-"
-"""Begins the name of a file that could not take the place of another."""
+"""Prefix of a new file that could not replace the old one."""
 _TEMPORARY_NAME = r"\.fdda-[0-9a-f]{12}(\..*)?"
-"""Names that `atomic_write` gives."""
+"""Pattern of the temporary names of `atomic_write`."""
 
 
 def check_outputs(
@@ -30,25 +30,25 @@ def check_outputs(
     inputs: Iterable[Path] = (),
     overwrite: bool = False,
 ) -> None:
-    """Fail before the work when what a verb writes could not be written, or would take something away.
+    """Check before the work that outputs can be written and replace no other data.
 
     Args:
-        outputs: the files that it writes, and of which kind each is.
-        inputs: the files that it reads.
-        overwrite: the user said that it may write over what it reads, and over files of another kind.
+        outputs: the files to write, each with its kind.
+        inputs: the files that are read.
+        overwrite: the user permits to overwrite inputs and files of another kind.
 
     Raises:
-        OutputError: as `check_writable`; two outputs are one file; or, unless `overwrite`, one is read, or holds
-            something of another kind.
+        OutputError: as `check_writable`; two outputs are the same file; or, unless `overwrite`, one is an input or a
+            file of another kind.
     """
     outputs = list(outputs.items() if isinstance(outputs, Mapping) else outputs)
-    inputs, places = list(inputs), {}
+    inputs, kind_names = list(inputs), {}
     for path, kind in outputs:
         check_writable(path)
-        place = comparable_path(path)
-        if place in places:
-            raise OutputError(f"Cannot write '{path}': it would be {places[place]} and {kind.name}; give two names.")
-        places[place] = kind.name
+        key = comparable_path(path)
+        if key in kind_names:
+            raise OutputError(f"Cannot write '{path}': it would be {kind_names[key]} and {kind.name}; give two names.")
+        kind_names[key] = kind.name
         if overwrite or not os.path.exists(path):
             continue
         if any(os.path.exists(other) and os.path.samefile(path, other) for other in inputs):
@@ -70,34 +70,34 @@ def _has_kind(path: Path, kind: FileKind) -> bool:
 
 
 def check_writable(path: Path) -> None:
-    """Fail before the work rather than after it when a file could not be written.
+    """Check before the work that a file can be written.
 
     Raises:
         OutputError: the folder does not exist or cannot be written, the path is a folder or a device, or `check_path`
             refuses it.
     """
-    # Blender, too, writes beside the file that it is told to write, with a letter more.
+    # Blender also writes to a temporary file beside the file, whose name has one more character.
     check_path(path, path, path.parent / f"{_temporary_name(path)}@")
-    # os.path: the methods of Path raise for a folder that may not be entered.
+    # os.path, because methods of Path raise for a folder without permission.
     folder = path.parent
     if os.path.isdir(path):
         raise OutputError(f"Cannot write '{path}': it is a folder; give the name of a file.")
     if os.path.exists(path) and not os.path.isfile(path):
-        # A rename would put a file in the place of /dev/null.
+        # A rename would replace /dev/null.
         raise OutputError(f"Cannot write '{path}': it is not a regular file; give the name of a file.")
     if is_windows() and os.path.exists(path) and not os.access(path, os.W_OK):
-        raise OutputError(f"Cannot write '{path}': it is write-protected; give another name, or let it be written.")
+        raise OutputError(f"Cannot write '{path}': it is write-protected; give another name, or remove the protection.")
     if not os.path.isdir(folder):
         raise OutputError(f"Cannot write '{path}': the folder '{folder}' does not exist; create it first.")
     _check_can_create_file(path, folder)
 
 
 def check_folder_writable(path: Path, names: Iterable[str] = ()) -> None:
-    """Fail before the work rather than after it when files could not be written into a folder that may not exist yet.
+    """Check before the work that files can be written into a folder, which may not exist yet.
 
     Args:
         path: the folder.
-        names: of files that are written into it, with those of folders in it.
+        names: of the files to write, relative to the folder.
 
     Raises:
         OutputError: the folder, or the nearest one above it that exists, cannot be written, or is a file; no folder
@@ -112,7 +112,7 @@ def check_folder_writable(path: Path, names: Iterable[str] = ()) -> None:
 
 
 def nearest_existing_folder(path: Path) -> Path:
-    """Find what exists of a path: the path itself, or the nearest folder above it.
+    """Return the path itself where it exists, else its nearest existing parent.
 
     Raises:
         OutputError: nothing exists, for instance because the drive is not connected.
@@ -139,11 +139,11 @@ def _check_can_create_file(path: Path, folder: Path) -> None:
 
 @contextmanager
 def atomic_write(path: Path, keep: bool = True) -> Iterator[Path]:
-    """Give a temporary file beside `path`, and rename it to `path` when the block ends without an error.
+    """Yield a temporary file beside `path`, and rename it to `path` when the block ends without an error.
 
     Args:
         path: the file.
-        keep: where the file is written but cannot be renamed, keep it under another name beside `path`.
+        keep: keep a file that is written but cannot be renamed under another name beside `path`.
 
     Raises:
         OutputError: the file cannot be written or renamed, for instance because the disk is full.
@@ -154,7 +154,7 @@ def atomic_write(path: Path, keep: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def atomic_write_all(*paths: Path, keep: bool = True) -> Iterator[tuple[Path, ...]]:
-    """As `atomic_write`, of files that belong together: when one cannot be written or renamed, none is changed.
+    """Write several files as `atomic_write` does: when one cannot be written or renamed, none is changed.
 
     Raises:
         OutputError: one cannot be written or renamed.
@@ -179,7 +179,7 @@ def atomic_write_all(*paths: Path, keep: bool = True) -> Iterator[tuple[Path, ..
 
 
 def _commit(temporaries: list[Path], paths: tuple[Path, ...], keep: bool) -> None:
-    """Rename all files, or none."""
+    """Rename all files or none."""
     backups: dict[Path, Path | None] = {}
     replaced: list[tuple[Path, Path]] = []
     try:
@@ -207,20 +207,20 @@ def _commit(temporaries: list[Path], paths: tuple[Path, ...], keep: bool) -> Non
 
 
 def _backup(path: Path) -> Path | None:
-    """A second name for a file, which it keeps when another takes its place; None where there is no file."""
+    """Link or copy a file to a temporary name before it is replaced; None where it does not exist."""
     if not os.path.lexists(path):
         return None
     backup = path.with_name(_temporary_name(path))
     try:
         os.link(path, backup)
     except OSError:
-        # Not every disk knows second names.
+        # Not every file system has hard links.
         shutil.copy2(path, backup)
     return backup
 
 
 def _restore(temporary: Path, path: Path, backup: Path | None) -> bool:
-    """Take a file back that was renamed to `path`; returns whether that succeeded."""
+    """Undo the renaming of a file to `path`; return whether that succeeded."""
     try:
         replace_file(path, temporary)
         if backup:
@@ -231,17 +231,17 @@ def _restore(temporary: Path, path: Path, backup: Path | None) -> bool:
 
 
 def _keep_beside(temporaries: list[Path], paths: tuple[Path, ...]) -> list[Path]:
-    """Give files that could not take their place names beside it; returns the names."""
-    for number in count(1):
-        prefix = KEPT_PREFIX if number == 1 else f"{KEPT_PREFIX}{number}-"
-        places = [path.with_name(f"{prefix}{path.name}") for path in paths]
-        if not any(os.path.lexists(place) for place in places):
+    """Rename files that could not replace `paths` to names beside them; return these names."""
+    for attempt in count(1):
+        prefix = KEPT_PREFIX if attempt == 1 else f"{KEPT_PREFIX}{attempt}-"
+        new_paths = [path.with_name(f"{prefix}{path.name}") for path in paths]
+        if not any(os.path.lexists(new_path) for new_path in new_paths):
             break
     kept = []
-    for temporary, place in zip(temporaries, places, strict=True):
+    for temporary, new_path in zip(temporaries, new_paths, strict=True):
         with suppress(OSError):
-            replace_file(temporary, place)
-            kept.append(place)
+            replace_file(temporary, new_path)
+            kept.append(new_path)
     return kept
 
 
@@ -250,9 +250,9 @@ def _quoted(paths: Iterable[Path]) -> str:
 
 
 def _new_file(path: Path) -> Path:
-    """An empty file beside a path, which nobody could foresee or put a link in the place of.
+    """Create an empty file with an unpredictable name beside a path.
 
-    As `tempfile.mkstemp` makes them, but with the permissions of any other new file.
+    Unlike `tempfile.mkstemp`, the file gets the usual permissions.
     """
     temporary = path.with_name(_temporary_name(path))
     os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666))
@@ -264,12 +264,12 @@ def _temporary_name(path: Path) -> str:
 
 
 def is_temporary_name(name: str) -> bool:
-    """Whether a file of this name was left by a process that was ended while it wrote."""
+    """Return whether a name is one of `atomic_write`, left by a process that was killed while writing."""
     return re.fullmatch(_TEMPORARY_NAME, name, re.DOTALL) is not None
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace a file with text, UTF-8; parts of file names that are none are escaped.
+    """Write a text file atomically as UTF-8; invalid characters of file names are escaped.
 
     Raises:
         OutputError: as `atomic_write`.
@@ -279,7 +279,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: object) -> None:
-    """Replace a file with JSON; NaN and infinity are refused.
+    """Write a JSON file atomically; NaN and infinity raise ValueError.
 
     Raises:
         OutputError: as `atomic_write`.
@@ -288,5 +288,5 @@ def write_json(path: Path, value: object) -> None:
 
 
 def to_json_text(value: object) -> str:
-    """A value as `write_json` writes it; ValueError for NaN and infinity."""
+    """Return the text that `write_json` writes; raise ValueError for NaN and infinity."""
     return json.dumps(value, indent=1, allow_nan=False) + "\n"

@@ -14,20 +14,20 @@ DEFAULT_RANGE = (-np.pi / 4, np.pi / 4)
 """Range of a rotation axis that the rig neither limits nor locks, radians."""
 
 MAX_CHANNEL_NAME_LENGTH = 2100
-"""Letters of what a channel is called in a file: a control has an owner and a path."""
+"""Characters of a channel's name in a file; the name of a control has an owner and a path."""
 MARGIN_POSE_RATIO = 0.25
-"""Part of the random poses that lies in the margin, where there is one."""
+"""Ratio of the random poses that are drawn from the margin."""
 MAX_MARGIN = 4.0
-"""Wider is no pose of anybody."""
+"""Largest scale of the range of motion; animators need no wider poses."""
 LOCKED_AXIS_ANGLE = np.pi / 4
-"""How far a locked axis turns in the margin, radians: by this for every range that the margin adds to a range."""
+"""Rotation of a locked axis in the margin, radians per unit of the margin's factor above 1."""
 RANGE_TOLERANCE = 1e-4
-"""Radians or metres. Ranges that differ by less count as the same: Blender keeps them as float32."""
+"""Radians or metres. Largest difference of two equal ranges, which Blender stores as float32."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One number of a pose that may be sampled.
+    """A number of a pose that can be sampled.
 
     Attributes:
         name: of the bone, or of the control (`Control.name`).
@@ -46,17 +46,17 @@ class Channel:
 
     @property
     def rest(self) -> float:
-        """The value of the rest pose, or what comes nearest to it in the range."""
+        """The value of the rest pose, clamped to the range."""
         return min(max(1.0 if self.kind == SCALE else 0.0, self.low), self.high)
 
     @property
-    def changes(self) -> bool:
-        """Whether the channel ever is elsewhere than in the rest pose."""
+    def can_change(self) -> bool:
+        """Whether the range has values other than that of the rest pose."""
         rest = 1.0 if self.kind == SCALE else 0.0
         return self.high - rest > RANGE_TOLERANCE or rest - self.low > RANGE_TOLERANCE
 
     def to_json(self) -> dict:
-        """As files have it: there the name is called `bone`, also that of a control."""
+        """Return the JSON of a file, whose key for the name is `bone`, also for a control."""
         values = asdict(self)
         return {"bone": values.pop("name"), **values}
 
@@ -82,45 +82,45 @@ class Channel:
 
 
 def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: float = SPREAD) -> np.ndarray:
-    """Draw one pose: a normal distribution centred on the middle of each range, redrawn until inside.
+    """Draw one pose from normal distributions around the centers of the ranges, truncated to the ranges.
 
-    The pose depends on seed and index alone, so a recording that is resumed continues with the same poses.
+    The pose depends on seed and index alone, so a resumed recording continues with the same poses.
 
     Args:
         channels: C channels with their ranges.
         seed: of the recording.
         index: of the pose in the recording.
-        spread: standard deviation as a part of half the range; larger is closer to uniform.
+        spread: standard deviation as a ratio of half the range; larger values are closer to uniform.
 
     Returns:
         (C,) float64, radians or metres, as the channels say.
     """
     rng = np.random.default_rng([seed, index])
     low, high = np.array([(channel.low, channel.high) for channel in channels]).T
-    places = rng.standard_normal(len(channels)) * spread
-    while len(outside := np.flatnonzero(np.abs(places) > 1)):
-        places[outside] = rng.standard_normal(len(outside)) * spread
-    # Rounding must not lead out of the range.
-    return np.clip((low + high) / 2 + (high - low) / 2 * places, low, high)
+    offsets = rng.standard_normal(len(channels)) * spread
+    while len(outside := np.flatnonzero(np.abs(offsets) > 1)):
+        offsets[outside] = rng.standard_normal(len(outside)) * spread
+    # Rounding must not leave the range.
+    return np.clip((low + high) / 2 + (high - low) / 2 * offsets, low, high)
 
 
 def scale_ranges(channels: tuple[Channel, ...], factor: float) -> tuple[Channel, ...]:
-    """Channels whose ranges are `factor` times as wide, about the same middle."""
-    widened = []
+    """Scale the ranges of channels by a factor around their centers."""
+    scaled = []
     for channel in channels:
-        middle, half = (channel.low + channel.high) / 2, (channel.high - channel.low) / 2 * factor
-        widened.append(replace(channel, low=middle - half, high=middle + half))
-    return tuple(widened)
+        center, half = (channel.low + channel.high) / 2, (channel.high - channel.low) / 2 * factor
+        scaled.append(replace(channel, low=center - half, high=center + half))
+    return tuple(scaled)
 
 
 @dataclass(frozen=True)
 class Margin:
-    """Poses around the range of motion: what a model is to know of where an animator breaks the limits.
+    """Random poses outside of the range of motion, for animation that exceeds the limits.
 
     Attributes:
-        factor: how many times as wide as the range of motion they are drawn.
-        poses: how many of the random poses, the last ones.
-        channels: of these poses, with the widened ranges; those of the other poses first, then the locked axes.
+        factor: scale of the range of motion from which these poses are drawn.
+        poses: number of these poses, which are the last of the random poses.
+        channels: of these poses, with scaled ranges; first those of the other poses, then the locked axes.
     """
 
     factor: float
@@ -133,7 +133,7 @@ class Margin:
 
     @staticmethod
     def from_json(value: dict) -> "Margin":
-        """Read it from a file.
+        """Read a margin from a file.
 
         Raises:
             KeyError, TypeError, ValueError: it is damaged.
@@ -144,48 +144,48 @@ class Margin:
         if type(poses) is not int or poses < 0:
             raise ValueError(f"its margin has {poses!r} poses")
         if not isinstance(value["limits"], list):
-            raise TypeError("the limits of its margin are no list")
+            raise TypeError("the limits of its margin are not a list")
         return Margin(float(factor), poses, tuple(Channel.from_json(channel) for channel in value["limits"]))
 
 
 def make_margin(channels: tuple[Channel, ...], locked: tuple[Channel, ...], factor: float, poses: int) -> Margin | None:
-    """The margin of random poses; None where there is none.
+    """Make the margin of random poses; None for a factor of 1 or too few poses.
 
-    Controls keep their ranges, which their properties hold them to, and scales stay above zero.
+    Controls keep their ranges, because their properties clamp them, and scales stay above zero.
 
     Args:
         channels: of the poses inside the range of motion.
-        locked: axes of the same bones that do not turn there (`LOCKED_AXIS_ANGLE`), whatever their ranges say.
-        factor: how many times as wide as the range the margin is; 1 for none.
-        poses: how many random poses there are in all.
+        locked: locked rotation axes of the same bones, which the margin rotates (`LOCKED_AXIS_ANGLE`).
+        factor: scale of the range of motion; 1 for no margin.
+        poses: number of all random poses.
     """
     count = round(poses * MARGIN_POSE_RATIO)
     if factor == 1 or not count:
         return None
-    widened = []
-    for own, wide in zip(channels, scale_ranges(channels, factor), strict=True):
-        if own.kind == CONTROL:
-            wide = own
-        elif own.kind == SCALE:
-            wide = replace(wide, low=max(wide.low, min(own.low, own.low / factor)))
-        widened.append(wide)
-    turn = LOCKED_AXIS_ANGLE * (factor - 1)
-    return Margin(factor, count, (*widened, *(replace(channel, low=-turn, high=turn) for channel in locked)))
+    scaled_channels = []
+    for channel, scaled in zip(channels, scale_ranges(channels, factor), strict=True):
+        if channel.kind == CONTROL:
+            scaled = channel
+        elif channel.kind == SCALE:
+            scaled = replace(scaled, low=max(scaled.low, min(channel.low, channel.low / factor)))
+        scaled_channels.append(scaled)
+    angle = LOCKED_AXIS_ANGLE * (factor - 1)
+    return Margin(factor, count, (*scaled_channels, *(replace(axis, low=-angle, high=angle) for axis in locked)))
 
 
 def bones_with_changed_range(before: tuple[Channel, ...], after: tuple[Channel, ...]) -> list[str]:
-    """Names of the bones whose range of motion differs, in the order of `after`, those that are gone last."""
+    """List the bones whose range of motion differs, in the order of `after`, with missing bones last."""
 
     def by_bone(channels: tuple[Channel, ...]) -> dict[str, dict[tuple[str, int], tuple[float, float]]]:
-        found: dict[str, dict] = {}
+        ranges: dict[str, dict] = {}
         for channel in channels:
-            found.setdefault(channel.name, {})[channel.kind, channel.axis] = (channel.low, channel.high)
-        return found
+            ranges.setdefault(channel.name, {})[channel.kind, channel.axis] = (channel.low, channel.high)
+        return ranges
 
     old, new = by_bone(before), by_bone(after)
     return [
         bone
         for bone in {**new, **old}
         if old.get(bone, {}).keys() != new.get(bone, {}).keys()
-        or any(not np.allclose(own, new[bone][key], atol=RANGE_TOLERANCE) for key, own in old[bone].items())
+        or any(not np.allclose(old[bone][key], new[bone][key], atol=RANGE_TOLERANCE) for key in old[bone])
     ]

@@ -10,29 +10,28 @@ from .controls import Control
 from .deformation import check_deformation, deformation_differences
 
 STATIC_JOINT = ""
-"""Name of the joint that never moves; no bone has it. What follows no bone follows this one.
+"""Name of the static joint, which vertices without a bone follow; no bone has this name.
 
-Its rest and its pose matrix are the identity, its parent is -1."""
+Its rest and pose matrices are the identity, its parent is -1."""
 STATIC_JOINT_LABEL = "no bone"
-"""What people read in place of that name."""
+"""Label of the static joint in messages."""
 
 MAX_HASH_LENGTH = 128
 REST_MATRIX_TOLERANCE = 1e-4
-"""Largest difference of a rest matrix element (metres, or no unit) at which two rest poses count as the same.
+"""Largest difference of two equal rest matrices in one element; metres for translations, no unit for rotations.
 
-Blender's versions compute a bone's matrix a few float32 steps apart, so the comparison cannot be exact."""
-
+Versions of Blender compute a bone's matrix with different rounding, so the comparison cannot be exact."""
 
 MAX_NAME_LENGTH = 1000
-"""Letters of a name in a file; Blender's are at most a quarter of it."""
+"""Characters of a name in a file; names in Blender have at most a quarter of it."""
 
 
 def read_name(value: object) -> str:
-    """A name from a file; TypeError or ValueError where it is none."""
+    """Read a name from a file; raise TypeError or ValueError where it is invalid."""
     if not isinstance(value, str):
-        raise TypeError(f"{value!r} stands where a name belongs")
+        raise TypeError(f"{value!r} is not a name")
     if len(value) > MAX_NAME_LENGTH:
-        raise ValueError(f"a name has {len(value)} letters")
+        raise ValueError(f"a name has {len(value)} characters")
     return value
 
 
@@ -48,28 +47,26 @@ def read_joints(values: list) -> tuple[Joint, ...]:
     """Read the joints of a recording or model.
 
     Raises:
-        KeyError, TypeError, ValueError: they are damaged, two have one name, or one stands before its parent.
+        KeyError, TypeError, ValueError: they are damaged, two have the same name, or one comes before its parent.
     """
     if not isinstance(values, list):
-        raise TypeError("its joints are no list")
+        raise TypeError("its joints are not a list")
     joints = tuple(Joint(read_name(value["name"]), value["parent"]) for value in values)
     if not joints or len({joint.name for joint in joints}) != len(joints):
         raise ValueError("it has no joints, or two of one name")
-    for number, joint in enumerate(joints):
-        if type(joint.parent) is not int or not -1 <= joint.parent < number:
-            raise ValueError(
-                f"a joint stands before its parent: the parent of joint {joint.name!r} is {joint.parent!r}"
-            )
+    for index, joint in enumerate(joints):
+        if type(joint.parent) is not int or not -1 <= joint.parent < index:
+            raise ValueError(f"a joint comes before its parent: the parent of joint {joint.name!r} is {joint.parent!r}")
     return joints
 
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """Tells two rigs apart and says in what they differ.
+    """Fingerprint of a rig: hashes and settings that show in what two rigs differ.
 
     Attributes:
         topology, rest_positions, skin_weights: hashes.
-        deformation: what deforms the mesh besides (`core.deformation`); empty where nobody knows.
+        deformation: what deforms the mesh beside skin weights (`core.deformation`); empty where unknown.
     """
 
     topology: str
@@ -79,15 +76,15 @@ class Fingerprint:
 
     @staticmethod
     def from_json(value: dict) -> "Fingerprint":
-        """Read a fingerprint from a file; KeyError, TypeError or ValueError where it is damaged."""
-        parts = [value[name] for name in ("topology", "rest_positions", "skin_weights")]
-        if not all(isinstance(part, str) and len(part) <= MAX_HASH_LENGTH for part in parts):
-            raise ValueError("its fingerprint holds no hashes")
-        return Fingerprint(*parts, check_deformation(value.get("deformation", {})))
+        """Read a fingerprint from a file; raise KeyError, TypeError or ValueError where it is damaged."""
+        hashes = [value[name] for name in ("topology", "rest_positions", "skin_weights")]
+        if not all(isinstance(text, str) and len(text) <= MAX_HASH_LENGTH for text in hashes):
+            raise ValueError("its fingerprint has no valid hashes")
+        return Fingerprint(*hashes, check_deformation(value.get("deformation", {})))
 
     @staticmethod
     def digest(*arrays: np.ndarray) -> str:
-        """Hash arrays by dtype, shape and bytes; 16 hexadecimal digits."""
+        """Hash arrays by dtype, shape and bytes to 16 hexadecimal digits."""
         digest = hashlib.sha256()
         for array in arrays:
             array = np.ascontiguousarray(array)
@@ -97,7 +94,7 @@ class Fingerprint:
 
     @staticmethod
     def digest_text(text: str) -> str:
-        """Hash a text; 16 hexadecimal digits."""
+        """Hash a text to 16 hexadecimal digits."""
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -109,14 +106,13 @@ class Rig:
         joints: J joints, every parent before its children.
         rest_positions: (V, 3) float32, mesh-object space, mesh units (see `metres_per_unit`).
         rest_matrices: (J, 4, 4) float32, rest pose of the joints in mesh-object space, column vectors.
-        skin_joints: (V, I) int32, indices of the joints that a vertex follows; unused places hold 0.
-        skin_weights: (V, I) float32, their weights; each row sums to 1, unused places hold 0.
+        skin_joints: (V, I) int32, indices of the joints that a vertex follows; unused entries are 0.
+        skin_weights: (V, I) float32, weights of these joints; each row sums to 1, unused entries are 0.
         fingerprint: of topology, rest positions and weights.
-        face_starts: (F,) int32, where each face starts in `face_vertices`; empty when the faces are not known.
+        face_starts: (F,) int32, first corner of each face in `face_vertices`; empty where faces are unknown.
         face_vertices: (C,) int32, vertex indices of the corners, face by face.
         controls: the inputs beside the joints.
-        metres_per_unit: length of one unit of mesh-object space. What is called metres above, in recordings and in
-            models are such units; a distance in them times this is in metres.
+        metres_per_unit: length in metres of a unit of mesh-object space (a mesh unit).
     """
 
     joints: tuple[Joint, ...]
@@ -150,53 +146,53 @@ class Rig:
 
 
 def rest_matrices_match(rest_matrices: np.ndarray, rig: Rig) -> bool:
-    """Whether (J, 4, 4) rest matrices are those of a rig, to `REST_MATRIX_TOLERANCE`."""
-    apart = np.abs(rest_matrices - rig.rest_matrices)
-    apart[:, :3, 3] *= rig.metres_per_unit
-    return bool(apart.max(initial=0) <= REST_MATRIX_TOLERANCE)
+    """Return whether (J, 4, 4) rest matrices equal those of a rig within `REST_MATRIX_TOLERANCE`."""
+    difference = np.abs(rest_matrices - rig.rest_matrices)
+    difference[:, :3, 3] *= rig.metres_per_unit
+    return bool(difference.max(initial=0) <= REST_MATRIX_TOLERANCE)
 
 
 def rig_differences(
     joints: tuple[Joint, ...], rest_matrices: np.ndarray, vertex_count: int, fingerprint: Fingerprint, rig: Rig
 ) -> list[str]:
-    """Say in what a rig differs from the one that a recording or model was made of.
+    """List in what a rig differs from the rig of a recording or model.
 
     Args:
-        joints, rest_matrices, vertex_count, fingerprint: what the file says, as in `Rig`.
-        rig: the rig at hand.
+        joints, rest_matrices, vertex_count, fingerprint: of the recording or model, as in `Rig`.
+        rig: the rig to compare.
 
     Returns:
-        One clause a difference ("it has 1443 vertices, the mesh 1450"); empty when the rigs are the same.
+        One clause per difference ("it has 1443 vertices, the mesh 1450"); empty when the rigs are the same.
     """
-    found = []
+    clauses = []
     if vertex_count != rig.vertex_count:
-        found.append(f"it has {vertex_count} vertices, the mesh has {rig.vertex_count}")
-    theirs, ours = {j.name for j in joints}, set(rig.joint_names)
-    if theirs != ours:
-        if missing := sorted(theirs - ours):
-            found.append(f"the armature lacks {_names(missing)}")
-        if STATIC_JOINT in ours - theirs:
-            found.append("some vertices follow no bone")
-        if extra := sorted(ours - theirs - {STATIC_JOINT}):
-            found.append(f"it does not know {_names(extra)}")
+        clauses.append(f"it has {vertex_count} vertices, the mesh has {rig.vertex_count}")
+    file_joints, rig_joints = {j.name for j in joints}, set(rig.joint_names)
+    if file_joints != rig_joints:
+        if missing := sorted(file_joints - rig_joints):
+            clauses.append(f"the armature lacks {_listed_joints(missing)}")
+        if STATIC_JOINT in rig_joints - file_joints:
+            clauses.append("some vertices follow no bone")
+        if extra := sorted(rig_joints - file_joints - {STATIC_JOINT}):
+            clauses.append(f"it does not know {_listed_joints(extra)}")
     elif joints != rig.joints:
-        found.append("its joints have other parents")
+        clauses.append("its joints have other parents")
     elif rest_matrices.shape != rig.rest_matrices.shape or (not rest_matrices_match(rest_matrices, rig)):
-        found.append("the rest pose of the armature differs")
-    if not found:
-        for part, name in (
+        clauses.append("the rest pose of the armature differs")
+    if not clauses:
+        for attribute, name in (
             ("topology", "the topology of the mesh"),
             ("rest_positions", "the rest pose of the mesh"),
             ("skin_weights", "the skin weights"),
         ):
-            if getattr(fingerprint, part) != getattr(rig.fingerprint, part):
-                found.append(f"{name} differ" + ("s" if part != "skin_weights" else ""))
-        found += deformation_differences(fingerprint.deformation, rig.fingerprint.deformation, rig.controls)
-    return found
+            if getattr(fingerprint, attribute) != getattr(rig.fingerprint, attribute):
+                clauses.append(f"{name} differ" + ("s" if attribute != "skin_weights" else ""))
+        clauses += deformation_differences(fingerprint.deformation, rig.fingerprint.deformation, rig.controls)
+    return clauses
 
 
-def _names(names: list[str], most: int = 3) -> str:
-    shown = ", ".join(f"'{name}'" for name in names[:most])
+def _listed_joints(names: list[str], max_names: int = 3) -> str:
+    shown = ", ".join(f"'{name}'" for name in names[:max_names])
     return f"the {'joint' if len(names) == 1 else 'joints'} {shown}" + (
-        f" and {len(names) - most} more" if len(names) > most else ""
+        f" and {len(names) - max_names} more" if len(names) > max_names else ""
     )

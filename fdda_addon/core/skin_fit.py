@@ -110,7 +110,7 @@ def skin_from_text(text: str, vertex_count: int, joint_count: int) -> tuple[np.n
     """
     try:
         if len(text) > 2 * (-(-4 * vertex_count * MAX_INFLUENCES // 3) * 4) + (1 << 20):
-            raise ValueError(f"they have {len(text)} letters")
+            raise ValueError(f"they have {len(text)} characters")
         value = json.loads(text)
         influences = value["influences"]
         if type(influences) is not int or not 1 <= influences <= MAX_INFLUENCES:

@@ -15,7 +15,7 @@ from .rig import Rig
 
 
 def skin_matrices(pose_matrices: np.ndarray, rest_matrices: np.ndarray) -> np.ndarray:
-    """Skin matrices S_j = P_j B_j^-1.
+    """Compute skin matrices S_j = P_j B_j^-1.
 
     Args:
         pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
@@ -29,12 +29,11 @@ def skin_matrices(pose_matrices: np.ndarray, rest_matrices: np.ndarray) -> np.nd
 
 MIN_COLUMN_LENGTH = 1e-12
 MIN_COLUMN_VOLUME = 1e-6
-"""Of the box that three columns of length 1 span."""
+"""Smallest volume of the parallelepiped of three normalized columns."""
 
 
 def are_invertible(matrices: np.ndarray) -> np.ndarray:
-    """Which of (..., 4, 4) matrices can be inverted: their columns have a length and a volume, the last row is that of
-    an affine transform. (...,) bool."""
+    """Return which of (..., 4, 4) matrices are invertible affine transforms, as (...,) bool."""
     columns = matrices[..., :3, :3].astype(np.float64)
     lengths = np.linalg.norm(columns, axis=-2)
     unit = columns / np.maximum(lengths, MIN_COLUMN_LENGTH)[..., None, :]
@@ -44,13 +43,13 @@ def are_invertible(matrices: np.ndarray) -> np.ndarray:
 
 
 class SkinBlock:
-    """The linear skinning of one partition as one constant matrix.
+    """Linear skinning of one partition as one constant matrix.
 
-    With S the skin matrices of the joints that skin the partition side by side, `S @ weighted_rest` is linear
-    skinning of all its vertices: one product in place of a gather for each weight.
+    With S the horizontally stacked skin matrices of the partition's joints, `S @ weighted_rest` skins all vertices:
+    one matrix product in place of a gather per weight.
 
     Attributes:
-        joints: (Jp,) int32, the joints that skin the partition.
+        joints: (Jp,) int32, joints with a weight in the partition.
         weighted_rest: (4 Jp, Vp) float32, w_vj (x_v, 1), mesh units.
     """
 
@@ -69,13 +68,13 @@ class SkinBlock:
 
 
 class LinearSkinning:
-    """Linear blend skinning of a rig, and the local residuals beside it."""
+    """Linear blend skinning of a rig, and local residuals relative to it."""
 
     def __init__(self, rig: Rig, partitions: tuple[Partition, ...] | None = None):
         self.rig = rig
         self.partitions = make_partitions(rig) if partitions is None else partitions
         self._blocks = [SkinBlock(rig, partition) for partition in self.partitions]
-        # Vertices in the order of the partitions, and back: one gather of all is far cheaper than one each.
+        # Vertices sorted by partition, and the inverse: one gather of all is far cheaper than one per partition.
         self._order = np.concatenate([partition.vertices for partition in self.partitions])
         self._inverse_order = np.argsort(self._order)
 
@@ -90,22 +89,22 @@ class LinearSkinning:
         """
         skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
         ordered = np.empty((len(skin), self.rig.vertex_count, 3), np.float32)
-        for _, block, own in self._iterate_partitions(ordered):
-            own[:] = _skinned_positions(skin, block)
+        for _, block, values in self._iterate_partitions(ordered):
+            values[:] = _skinned_positions(skin, block)
         return np.take(ordered, self._inverse_order, axis=1)
 
     def local_residuals(self, pose_matrices: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Residuals in the frames of the main joints, l_v = R_m^-1 (complex_v - lin_v).
+        """Compute residuals in the space of the main joints, l_v = R_m^-1 (complex_v - lin_v).
 
         Args:
             pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
-            positions: (N, V, 3), what the rig evaluates to, mesh-object space, mesh units.
+            positions: (N, V, 3), evaluated by the rig, mesh-object space, mesh units.
 
         Returns:
-            (N, V, 3) float32, mesh units.
+            (N, V, 3) float32, axes of the main joint, mesh units.
 
         Raises:
-            RigError: a joint is without extent in some pose (a scale of zero).
+            RigError: a joint has a scale of zero in some pose.
         """
         skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
         try:
@@ -117,25 +116,30 @@ class LinearSkinning:
                 "look for a constraint or driver that sets it."
             ) from error
         ordered = np.take(np.asarray(positions, np.float32), self._order, axis=1)
-        for partition, block, own in self._iterate_partitions(ordered):
-            own -= _skinned_positions(skin, block)
-            own[:] = own @ inverse[:, partition.joint].transpose(0, 2, 1)
+        for partition, block, values in self._iterate_partitions(ordered):
+            values -= _skinned_positions(skin, block)
+            values[:] = values @ inverse[:, partition.joint].transpose(0, 2, 1)
         return np.take(ordered, self._inverse_order, axis=1)
 
     def complex_positions(self, pose_matrices: np.ndarray, local_residuals: np.ndarray) -> np.ndarray:
-        """The inverse of `local_residuals`: lin_v + R_m l_v.
+        """Invert `local_residuals`: compute lin_v + R_m l_v.
 
-        Args and returns as there: (N, J, 4, 4) and (N, V, 3) in, (N, V, 3) float32 in mesh-object space out.
+        Args:
+            pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
+            local_residuals: (N, V, 3), axes of the main joint, mesh units.
+
+        Returns:
+            (N, V, 3) float32, mesh-object space, mesh units.
         """
         skin = skin_matrices(pose_matrices, self.rig.rest_matrices)[:, :, :3, :]
         ordered = np.take(np.asarray(local_residuals, np.float32), self._order, axis=1)
-        for partition, block, own in self._iterate_partitions(ordered):
-            own[:] = own @ skin[:, partition.joint, :, :3].transpose(0, 2, 1)
-            own += _skinned_positions(skin, block)
+        for partition, block, values in self._iterate_partitions(ordered):
+            values[:] = values @ skin[:, partition.joint, :, :3].transpose(0, 2, 1)
+            values += _skinned_positions(skin, block)
         return np.take(ordered, self._inverse_order, axis=1)
 
     def _iterate_partitions(self, ordered: np.ndarray) -> Iterator[tuple[Partition, SkinBlock, np.ndarray]]:
-        """Each partition with its part of an (N, V, 3) array in the order of the partitions."""
+        """Yield each partition with its view into an (N, V, 3) array sorted by partition."""
         start = 0
         for partition, block in zip(self.partitions, self._blocks, strict=True):
             yield partition, block, ordered[:, start : start + len(partition.vertices)]
@@ -143,8 +147,8 @@ class LinearSkinning:
 
 
 def _skinned_positions(skin: np.ndarray, block: SkinBlock) -> np.ndarray:
-    """(N, J, 3, 4) skin matrices to the (N, Vp, 3) skinned vertices of a partition, mesh units."""
-    # A product for each pose: in one product of all, the last bits of a pose would depend on how many others there are,
-    # and a recording that was resumed must have the bytes of one that was not.
+    """Skin a partition with (N, J, 3, 4) skin matrices; returns (N, Vp, 3), mesh units."""
+    # One product per pose: in one product of all, the last bits would depend on the number of poses, and a resumed
+    # recording must have the same bytes as an uninterrupted one.
     rows = skin[:, block.joints].transpose(0, 2, 1, 3).reshape(len(skin), 3, -1)
     return (rows @ block.weighted_rest).transpose(0, 2, 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The surface of a mesh, and what shading shows of its errors: angles between normals, lengths of edges."""
+"""The surface of a mesh, and errors that shading shows: angles between normals, lengths of edges."""
 
 from dataclasses import dataclass
 
@@ -8,11 +8,11 @@ import numpy as np
 from .partition import Partition
 
 MIN_CORNERS = 3
-"""A face has at least this number of vertices."""
+"""Smallest number of vertices of a face."""
 
 
 def are_faces(face_starts: np.ndarray, face_vertices: np.ndarray, vertex_count: int) -> bool:
-    """Whether two arrays are the faces of a mesh of so many vertices, as in `Rig`. No faces at all are good too."""
+    """Return whether two arrays are valid faces of a mesh, as in `Rig`; no faces at all are valid."""
     if not len(face_starts):
         return not len(face_vertices)
     corners = np.diff(face_starts.astype(np.int64), append=len(face_vertices))
@@ -25,10 +25,13 @@ def are_faces(face_starts: np.ndarray, face_vertices: np.ndarray, vertex_count: 
 
 
 def adjacent_corners(face_starts: np.ndarray, face_vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The corner before and the corner after each, along its face: (C,) int64 both.
+    """Find the previous and the next corner of each corner in its face.
 
     Args:
         face_starts, face_vertices: (F,) and (C,) int32 as in `Rig`, at least one face.
+
+    Returns:
+        (C,) int64 indices of the previous and of the next corners.
     """
     after = np.arange(1, len(face_vertices) + 1)
     after[np.append(face_starts[1:], len(face_vertices)) - 1] = face_starts
@@ -38,10 +41,10 @@ def adjacent_corners(face_starts: np.ndarray, face_vertices: np.ndarray) -> tupl
 
 
 class Surface:
-    """The faces of a mesh, made ready to give the normals of one pose after another.
+    """The faces of a mesh, prepared to compute the normals of many poses.
 
     Attributes:
-        vertices: (n,) int32, the vertices that have faces, ascending; no others have normals.
+        vertices: (n,) int32, ascending indices of the vertices with faces; only these have normals.
         edges: (E, 2) int32, vertices of the edges of the faces, each edge once, the lower vertex first.
     """
 
@@ -53,16 +56,16 @@ class Surface:
         self._starts, self._corners = face_starts, face_vertices
         self._face_of_corner = np.repeat(np.arange(len(face_starts)), counts)
         self._previous, self._next = adjacent_corners(face_starts, face_vertices)
-        # Corners in the order of their vertices: the sums at a vertex are then sums of neighbours.
+        # Sorted by vertex, the corners of a vertex are adjacent, so that `np.add.reduceat` sums them.
         self._by_vertex = np.argsort(face_vertices, kind="stable")
         self.vertices, self._vertex_starts = np.unique(face_vertices[self._by_vertex], return_index=True)
         ends = np.sort(np.stack([face_vertices, face_vertices[self._next]], axis=1), axis=1)
         self.edges = np.unique(ends, axis=0)
 
     def normals(self, positions: np.ndarray) -> np.ndarray:
-        """Vertex normals as Blender computes them: normals of the faces, weighted by the angle of the corner.
+        """Compute vertex normals as Blender does: face normals weighted by the angle of the corner.
 
-        The normal of a face with more than three corners is Newell's, that of its area vector.
+        The normal of a polygon follows Newell's method.
 
         Args:
             positions: (V, 3), one pose.
@@ -70,7 +73,7 @@ class Surface:
         Returns:
             (n, 3) float64 unit vectors, of `vertices`; zero where all faces at a vertex have no area.
         """
-        # Between corners, so that it does not matter how far away from the origin the mesh is.
+        # Differences of corners keep their precision far from the origin.
         corners = positions[self._corners].astype(np.float64)
         along = corners[self._next] - corners
         from_first = corners - corners[self._starts][self._face_of_corner]
@@ -81,7 +84,7 @@ class Surface:
         return _unit(np.add.reduceat(weighted[self._by_vertex], self._vertex_starts))
 
     def edge_lengths(self, positions: np.ndarray) -> np.ndarray:
-        """(V, 3) positions of one pose to (E,) lengths of the edges, in the same unit."""
+        """Compute the (E,) edge lengths of (V, 3) positions, in their unit."""
         ends = positions[self.edges]
         return np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
 
@@ -92,8 +95,8 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def angles_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Angles between unit vectors, (n, 3) and (n, 3), as (n,) float64 degrees; 90 where one is zero, 0 where both."""
-    # The arc cosine of a dot product loses small angles: 1e-8 of it is 0.008 degrees.
+    """Compute the angles between (n, 3) unit vectors; (n,) float64 degrees, 90 where one is zero, 0 where both are."""
+    # The arc cosine is inexact for small angles: an error of 1e-8 in the dot product is 0.008 degrees.
     cross = np.linalg.norm(np.cross(first, second), axis=-1)
     dot = np.einsum("nx,nx->n", first, second)
     lost = first.any(axis=-1) != second.any(axis=-1)
@@ -102,14 +105,13 @@ def angles_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SurfaceErrors:
-    """Errors of the surface over poses.
+    """Errors of a surface over poses.
 
     Attributes:
         angles: (N, n) float32, between the normals, degrees.
-        across: (N,) float64, mean error of the lengths of the edges between two partitions, each as a part of its
-            rest length.
-        beside: (N,) float64, the same of the edges inside partitions that end at a border.
-        inside: (N,) float64, the same of all edges inside partitions.
+        across: (N,) float64, mean relative error of the lengths of edges between two partitions.
+        beside: (N,) float64, the same for edges inside of partitions that touch a border.
+        inside: (N,) float64, the same for all edges inside of partitions.
     """
 
     angles: np.ndarray
@@ -118,33 +120,33 @@ class SurfaceErrors:
     inside: np.ndarray
 
     def normals_json(self) -> dict:
-        """Angles over poses and vertices, degrees."""
+        """Return statistics of the angles over poses and vertices, degrees."""
         angles = self.angles.astype(np.float64)
         return {"mean": float(angles.mean()), "p99": float(np.percentile(angles, 99)), "max": float(angles.max())}
 
     def edges_json(self) -> dict:
-        """Errors of edge lengths as parts of the rest length; None for what there is no edge of."""
-        found = {
+        """Return mean relative errors of edge lengths; None for a kind without edges."""
+        mean_errors = {
             kind: float(errors.mean()) if np.isfinite(errors).all() else None
             for kind, errors in (("across", self.across), ("beside", self.beside), ("inside", self.inside))
         }
-        known = found["across"] is not None and found["inside"]
-        return {**found, "ratio": found["across"] / found["inside"] if known else None}
+        has_ratio = mean_errors["across"] is not None and mean_errors["inside"]
+        return {**mean_errors, "ratio": mean_errors["across"] / mean_errors["inside"] if has_ratio else None}
 
 
 def surface_json(fdda: SurfaceErrors | None, linear: SurfaceErrors | None) -> dict:
-    """`normals`, degrees, and `edges`, parts of the rest length, of both ways; None without faces."""
+    """Return `normals` (degrees) and `edges` (relative) of the model and of linear skinning; None without faces."""
     if fdda is None or linear is None:
         return {"normals": None, "edges": None}
-    ways = {"fdda": fdda, "linear": linear}
+    methods = {"fdda": fdda, "linear": linear}
     return {
-        "normals": {way: errors.normals_json() for way, errors in ways.items()},
-        "edges": {way: errors.edges_json() for way, errors in ways.items()},
+        "normals": {method: errors.normals_json() for method, errors in methods.items()},
+        "edges": {method: errors.edges_json() for method, errors in methods.items()},
     }
 
 
 class SurfaceComparison:
-    """Compares the surfaces of poses with the true ones, a pose at a time."""
+    """Compares surfaces with the surface of the rig, one pose at a time."""
 
     def __init__(self, surface: Surface, rest_positions: np.ndarray, partitions: tuple[Partition, ...]):
         """Args:
@@ -155,8 +157,8 @@ class SurfaceComparison:
         self._surface = surface
         self._rest_lengths = surface.edge_lengths(rest_positions).astype(np.float64)
         partition_of = np.empty(len(rest_positions), np.int32)
-        for number, partition in enumerate(partitions):
-            partition_of[partition.vertices] = number
+        for index, partition in enumerate(partitions):
+            partition_of[partition.vertices] = index
         measured = self._rest_lengths > 0
         crosses = np.diff(partition_of[surface.edges], axis=1)[:, 0] != 0
         at_border = np.isin(surface.edges, surface.edges[crosses]).any(axis=1)
@@ -164,14 +166,14 @@ class SurfaceComparison:
         self._kinds = [np.flatnonzero(kind & measured) for kind in kinds]
 
     def compare(self, true: np.ndarray, others: tuple[np.ndarray, ...]) -> list[tuple[np.ndarray, float, float, float]]:
-        """Compare other positions of a pose with the true ones.
+        """Compare positions of a pose with those of the rig.
 
         Args:
-            true: (V, 3), mesh units.
-            others: one or more of the same.
+            true: (V, 3) of the rig, mesh units.
+            others: one or more arrays of the same shape and unit.
 
         Returns:
-            For each of the others, the row that it adds to the arrays of `SurfaceErrors`.
+            One row of the arrays of `SurfaceErrors` for each of `others`.
         """
         surface = self._surface
         normals, lengths = surface.normals(true), surface.edge_lengths(true)
@@ -187,5 +189,5 @@ class SurfaceComparison:
 
 
 def surface_errors(rows: list[tuple[np.ndarray, float, float, float]]) -> SurfaceErrors:
-    """Put together what `SurfaceComparison.compare` returned for one way over all poses, at least one."""
+    """Collect the rows of `SurfaceComparison.compare` for one method over all poses, at least one."""
     return SurfaceErrors(*(np.array(column) for column in zip(*rows, strict=True)))

@@ -227,7 +227,7 @@ def _narrowed(bounds: tuple[float, float], limit: tuple[float, float]) -> tuple[
 
 
 def _changing(channels: Iterable[Channel]) -> list[Channel]:
-    return [channel for channel in channels if channel.changes]
+    return [channel for channel in channels if channel.can_change]
 
 
 def locked_channels(armature_object: bpy.types.Object, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:

@@ -173,15 +173,15 @@ HASHES = {"topology": "a", "rest_positions": "b", "skin_weights": "c"}
         (("spread", float("inf")), "its spread is inf"),
         *[(("sources", [{**SOURCE, key: value}]), words) for key, value, words in (
             ("kind", "stolen", "of the kind 'stolen'"), ("kind", [], "of the kind []"), ("poses", -1, "-1 poses"),
-            ("name", 5, "5 stands where a name belongs"), ("frames", [1], "has the frames (1,)"),
-            ("frames", [0, "x"], "has the frames (0, 'x')"), ("name", "n" * 5000, "a name has 5000 letters"),
+            ("name", 5, "5 is not a name"), ("frames", [1], "has the frames (1,)"),
+            ("frames", [0, "x"], "has the frames (0, 'x')"), ("name", "n" * 5000, "a name has 5000 characters"),
         )],
         *[(("margin", {**MARGIN, key: value}), words) for key, value, words in (
             ("factor", 1, "its margin is 1 times"), ("factor", 99, "its margin is 99 times"),
             ("factor", True, "True times"),
             ("factor", float("nan"), "nan times"), ("factor", "2", "'2' times"),
             ("poses", -1, "its margin has -1 poses"),
-            ("poses", 1.5, "has 1.5 poses"), ("poses", 10**6, "1000000 of its"), ("limits", {}, "margin are no list"),
+            ("poses", 1.5, "has 1.5 poses"), ("poses", 10**6, "1000000 of its"), ("limits", {}, "are not a list"),
             ("limits", [{**LIMIT, "axis": 7}], "its range of motion"),
         )],
         *[(("margin", value), "is damaged") for value in ([], None, 2, {}, {"factor": 2.0})],

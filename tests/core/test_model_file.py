@@ -154,8 +154,8 @@ PARTITION = {"joint": 0, "influencing": [], "vertices": 4, "basis": 1}
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"joints": [{"name": "a", "parent": 0}]}, "a joint stands before its parent"),
-        ({"joints": [{"name": "a", "parent": -2}]}, "a joint stands before its parent"),
+        ({"joints": [{"name": "a", "parent": 0}]}, "a joint comes before its parent"),
+        ({"joints": [{"name": "a", "parent": -2}]}, "a joint comes before its parent"),
         ({"partitions": [{**PARTITION, "joint": 3}]}, "none of its joints"),
         ({"partitions": [{**PARTITION, "influencing": [9]}]}, "none of its joints"),
         ({"vertices": 5}, "the partitions do not add up to the vertices"),

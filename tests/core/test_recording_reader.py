@@ -81,7 +81,7 @@ def test_a_key_of_another_type(recording, key, value):
         ({"partitions": [{"joint": 4, "influencing": []}]}, "a partition has joint 4 of 4"),
         ({"partitions": [{"joint": 0, "influencing": [-1]}]}, "a partition has joint -1 of 4"),
         ({"controls": [{"name": "fist"}]}, "lacks 'owner'"),
-        ({"controls": {}}, "its controls are no list"),
+        ({"controls": {}}, "its controls are not a list"),
         ({"controls": [FIST, FIST]}, "two of its controls have one name"),
         ({"controls": [{**FIST, "owner": "../scene"}]}, "a control belongs to '../scene'"),
         ({"controls": [{**FIST, "path": 3}]}, "a control is called 3"),

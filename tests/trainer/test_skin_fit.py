@@ -265,7 +265,7 @@ def damage() -> Iterator:
     yield "numbers", change("positions", with_nan), "positions holds values that are not numbers"
     yield "few", change("pose_matrices", lambda a: a[:3]), "positions has the shape (40, 300, 3)"
     yield "joints", change("skin_joints", lambda a: a + 99), "the skin weights name no joints"
-    yield "parents", change("parents", lambda a: a + 1), "a joint stands before its parent"
+    yield "parents", change("parents", lambda a: a + 1), "a joint comes before its parent"
     yield "flat", change("rest_matrices", lambda a: a * 0), "a rest matrix is singular"
 
 

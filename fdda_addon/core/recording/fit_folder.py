@@ -140,7 +140,7 @@ def read_fit_poses(folder: Path) -> FitPoses:
             raise _damaged(folder, f"{name} holds values that are not numbers")
     parents, joints, weights = arrays["parents"], arrays["skin_joints"], arrays["skin_weights"]
     if (parents < -1).any() or (parents >= np.arange(sizes["J"])).any():
-        raise _damaged(folder, "a joint stands before its parent")
+        raise _damaged(folder, "a joint comes before its parent")
     if joints.min() < 0 or joints.max() >= sizes["J"] or weights.min() < 0:
         raise _damaged(folder, "the skin weights name no joints")
     if not are_invertible(arrays["rest_matrices"]).all():

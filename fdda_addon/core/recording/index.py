@@ -147,7 +147,7 @@ def _check_index(index: dict) -> None:
             raise TypeError(f"{text!r} stands where text belongs")
     joints = len(read_joints(index["joints"]))
     if not isinstance(index["partitions"], list):
-        raise TypeError("its partitions are no list")
+        raise TypeError("its partitions are not a list")
     for partition in index["partitions"]:
         _check_numbers([partition["joint"]], "joint", joints)
         _check_numbers(partition["influencing"], "joint", joints)
@@ -168,9 +168,9 @@ def _check_index(index: dict) -> None:
 
 
 def _check_numbers(values: list, what: str, count: int, owner: str = "a partition") -> None:
-    """Fail where values are no list of different indices below a count."""
+    """Fail where values are not a list of different indices below a count."""
     if not isinstance(values, list):
-        raise TypeError(f"{owner} has {what}s that are no list")
+        raise TypeError(f"{owner} has {what}s that are not a list")
     for value in values:
         if type(value) is not int or not 0 <= value < count:
             raise ValueError(f"{owner} has {what} {value!r} of {count}")
@@ -185,7 +185,7 @@ def _sampling(value: dict) -> Sampling:
     if type(spread) not in (int, float) or not 0 < spread < math.inf:
         raise ValueError(f"its spread is {spread!r}")
     if not isinstance(value["limits"], list) or not isinstance(value["sources"], list):
-        raise TypeError("its range of motion or its sources are no list")
+        raise TypeError("its range of motion or its sources are not a list")
     sources = tuple(_source(source) for source in value["sources"])
     margin = Margin.from_json(value["margin"]) if "margin" in value else None
     random = sum(source.poses for source in sources if source.kind == RANDOM)
