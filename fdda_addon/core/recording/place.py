@@ -71,7 +71,7 @@ def is_free(path: Path) -> bool:
 def is_recording(path: Path) -> bool:
     """Whether a folder holds a recording, however damaged: its index begins as one, or the arrays of one are there."""
     try:
-        if RECORDING.is_of(path / INDEX):
+        if RECORDING.matches(path / INDEX):
             return True
     except OSError:
         return False
