@@ -13,7 +13,7 @@ import torch
 from fdda_addon.core.errors import RecordingError, TrainingError
 from fdda_addon.core.metrics import error_statistics
 from fdda_addon.core.output import atomic_write, write_json
-from fdda_addon.core.recording.reader import Recording, partitions_json, read_partitions, read_recording
+from fdda_addon.core.recording.reader import Recording, partitions_to_json, read_partitions, read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
 from trainer.confidence import measure_training_range
@@ -63,7 +63,7 @@ def cut(recording: Recording, names: tuple[str, ...]) -> Recording:
         rig.fingerprint,
         controls=rig.controls,
     )
-    partitions = read_partitions(small, partitions_json(tuple(chosen)))
+    partitions = read_partitions(small, partitions_to_json(tuple(chosen)))
     residuals = np.array(recording.residuals[:, vertices])
     return Recording(
         recording.path, recording.info, small, partitions, recording.pose_matrices, residuals, recording.controls

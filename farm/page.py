@@ -4,7 +4,7 @@
 import base64
 from html import escape
 
-from fdda_addon.core.recording.estimate import duration_in_words
+from fdda_addon.core.recording.estimate import format_duration
 
 from .tasks import KINDS
 
@@ -60,7 +60,7 @@ def _head(report: dict) -> str:
         (str(states.count("failed")), "failed", "bad" if "failed" in states else ""),
         (str(sum(_misses(own) for own in characters)), "done, and miss their goal", ""),
         (str(sum(own["ran_now"] for own in characters)), "tasks ran now, the others were up to date", ""),
-        (duration_in_words(seconds).removeprefix("about "), "of processes, one after the other", ""),
+        (format_duration(seconds).removeprefix("about "), "of processes, one after the other", ""),
         (f"{max((own['peak_mb'] for own in characters), default=0):,.0f} MB", "most memory of a process", ""),
     ]
     shown = "".join(

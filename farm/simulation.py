@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from fdda_addon.core.recording.estimate import duration_in_words
+from fdda_addon.core.recording.estimate import format_duration
 
 from .characters import Farm
 from .fingerprints import read_manifest
@@ -125,7 +125,7 @@ def print_estimate(farm: Farm, tasks: dict[str, Task], counts: Sequence[int]) ->
     runs = [simulate(tasks, seconds, count) for count in sorted(set(counts))]
     print(
         f"{len(tasks)} tasks of {len({task.character for task in tasks.values()})} characters, {measured} of them "
-        f"measured: {duration_in_words(total)} one after the other."
+        f"measured: {format_duration(total)} one after the other."
     )
     print(f"{'workers':>8} {'seconds':>10} {'times as fast':>14} {'workers busy':>13}")
     for run in runs:
@@ -149,7 +149,7 @@ def _advice(farm: Farm, tasks: dict[str, Task], seconds: dict[str, float], runs:
         else f"Even {runs[0].workers:,} workers stand idle for more than half of the time."
     ]
     lines.append(
-        f"No number of workers takes less than {duration_in_words(shortest).removeprefix('about ')}: tasks of "
+        f"No number of workers takes less than {format_duration(shortest).removeprefix('about ')}: tasks of "
         f"'{tasks[path[0]].character}' that wait for each other."
     )
     kinds = {kind: sum(seconds[name] for name in path if tasks[name].kind == kind) for kind in KINDS}

@@ -18,7 +18,7 @@ import numpy as np
 from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.input_file import open_input
 from fdda_addon.core.partition import Partition
-from fdda_addon.core.recording.arrays import HEADER_ERRORS, LARGEST
+from fdda_addon.core.recording.arrays import MAX_VALUE, NPY_HEADER_ERRORS
 from fdda_addon.core.rig import Fingerprint
 
 from .borders import partition_of, recut
@@ -30,7 +30,7 @@ from .model import Network
 VERSION = 1
 READ_ERRORS = (
     *(OSError, ValueError, KeyError, AttributeError, OverflowError, EOFError, zipfile.BadZipFile, zlib.error),
-    *(RuntimeError, IndexError, *HEADER_ERRORS),
+    *(RuntimeError, IndexError, *NPY_HEADER_ERRORS),
 )
 """What numpy and zipfile raise for a damaged file; RuntimeError where the archive is encrypted."""
 OTHER_PARTITIONS = "The checkpoint is of other partitions; train without --warm-start."
@@ -206,7 +206,7 @@ def _read_deltas(arrays: np.lib.npyio.NpzFile) -> Deltas:
             name, (3, count, corners)
         ):
             raise ValueError(CONTRADICTION)
-        if not (np.abs(array) <= LARGEST).all() or (is_index and array.min(initial=0) < 0):
+        if not (np.abs(array) <= MAX_VALUE).all() or (is_index and array.min(initial=0) < 0):
             raise ValueError(NOT_FINITE)
     if deltas.tangents.ndim != 4 or not (deltas.least > 0).all():
         raise ValueError(CONTRADICTION)
@@ -222,7 +222,7 @@ def _check_partition(partition: PartitionCheckpoint, hidden: tuple[int, ...]) ->
     network = partition.network
     arrays = [partition.feature_mean, partition.feature_scale, partition.basis_mean, partition.basis_shapes]
     for array in (*arrays, *network.weights, *network.biases):
-        if array.dtype != np.float32 or not (np.abs(array) <= LARGEST).all():
+        if array.dtype != np.float32 or not (np.abs(array) <= MAX_VALUE).all():
             raise ValueError(NOT_FINITE)
     if partition.columns.dtype != np.int64 or partition.columns.ndim != 1:
         raise ValueError(CONTRADICTION)

@@ -10,7 +10,7 @@ import numpy as np
 
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.metrics import distances
-from fdda_addon.core.recording.fit_folder import FitPoses, read_fit_poses, write_fitted
+from fdda_addon.core.recording.fit_folder import FitPoses, read_fit_poses, write_fitted_weights
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skin_fit import INFLUENCES, FitReport, SkinFit
 from fdda_addon.core.skinning import LinearSkinning
@@ -42,7 +42,7 @@ def fit_folder(
     started = time.perf_counter()
     poses = read_fit_poses(folder)
     total = poses.rig.vertex_count
-    training, held_out = poses.part(slice(0, None, 2)), poses.part(slice(1, None, 2))
+    training, held_out = poses.subset(slice(0, None, 2)), poses.subset(slice(1, None, 2))
     joints, weights = np.zeros((total, INFLUENCES), np.int32), np.zeros((total, INFLUENCES), np.float32)
     for block, *fitted in SkinSolver(training).fit(kind):
         if should_stop():
@@ -51,7 +51,7 @@ def fit_folder(
         announcer.say(MessageType.PROGRESS, done=block.stop, total=total)
     skinned = replace(poses.rig, skin_joints=joints, skin_weights=weights, metres_per_unit=metres_per_unit)
     result = SkinFit(kind, len(poses.positions), *(measure(part, skinned) for part in (held_out, training)))
-    write_fitted(folder, joints, weights)
+    write_fitted_weights(folder, joints, weights)
     announcer.say(MessageType.FINISHED, seconds=time.perf_counter() - started, fit=result.to_json())
     return result
 

@@ -16,7 +16,7 @@ from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.output import atomic_write_all
 from fdda_addon.core.partition import Partition
-from fdda_addon.core.recording.estimate import sizes_in_words
+from fdda_addon.core.recording.estimate import training_size_sentence
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.report import checkpoint_path, report_text
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
@@ -85,7 +85,7 @@ def train_model(
         vertices=recording.rig.vertex_count,
         device=str(device),
     )
-    announcer.say(MessageType.LOG, text=sizes_in_words(recording))
+    announcer.say(MessageType.LOG, text=training_size_sentence(recording))
     warnings = _check(recording, announcer, strict)
     _check_stop(should_stop)
     recording = without_needless_down(recording, split)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdda_addon.core.recording.arrays import HEADER_ERRORS
+from fdda_addon.core.recording.arrays import NPY_HEADER_ERRORS
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.runtime.network import Network
 from trainer.config import TrainingConfig
@@ -102,7 +102,7 @@ def mutate(random: np.random.Generator, recording: Path) -> str:
         return f"bytes of {path.name}"
     try:
         array = np.load(path)
-    except (ValueError, EOFError, *HEADER_ERRORS):
+    except (ValueError, EOFError, *NPY_HEADER_ERRORS):
         return f"{path.name} is none"
     if kind == 6:
         shape = list(array.shape)

@@ -129,8 +129,8 @@ def _shard(text: str) -> tuple[int, int]:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..core.checks.recording import merges_in_words
-    from ..core.checks.target import unsettled_in_words
+    from ..core.checks.recording import merges_sentence
+    from ..core.checks.target import unsettled_sentence
     from ..core.errors import WrongUsageError
     from ..core.poses import MAX_MARGIN
     from ..core.recording.index import read_index, read_info
@@ -191,7 +191,7 @@ def run(options: argparse.Namespace) -> None:
             index = read_index(recording)
             if options.fit_linear:
                 print(read_info(index).fit.sentence())
-            for line in (merges_in_words(index, options.min_partition_vertices), unsettled_in_words(index)):
+            for line in (merges_sentence(index, options.min_partition_vertices), unsettled_sentence(index)):
                 if line:
                     print(line)
             if repeatability := read_info(index).repeatability:

@@ -8,7 +8,7 @@ from ..core.errors import RecordingError
 from ..core.partition import Partition, make_merged_partitions
 from ..core.recording.index import RecordingInfo, read_index, read_info
 from ..core.recording.reader import read_partitions, read_recorded_skin
-from ..core.recording.writer import different_keys
+from ..core.recording.writer import find_different_keys
 from ..core.rig import Fingerprint, Rig, read_joints, rig_differences
 from ..core.skin_fit import SkinFit
 
@@ -81,7 +81,7 @@ def check_influences_match(path: Path, rig: Rig, info: RecordingInfo) -> None:
     )
     if found.blender != info.blender:
         different.append(f"Blender {found.blender} found them, and this is {info.blender}")
-    keys = different_keys(found.sampling.to_json(), info.sampling.to_json())
+    keys = find_different_keys(found.sampling.to_json(), info.sampling.to_json())
     if found.shard is None or info.shard is None or found.shard.total != info.shard.total:
         keys.append("poses")
     if keys:

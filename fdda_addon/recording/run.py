@@ -13,9 +13,9 @@ from ..core.errors import RecordingError
 from ..core.partition import GOLDEN_RATIO, assume_nearby_influences, make_merged_partitions
 from ..core.poses import sample_pose
 from ..core.progress import Progress
-from ..core.recording.estimate import check_room, recording_bytes
+from ..core.recording.estimate import check_disk_space, recording_bytes
+from ..core.recording.folder_check import check_recordable
 from ..core.recording.index import INDEX, RecordingInfo
-from ..core.recording.place import check_recordable
 from ..core.recording.shard import Shard, shard_poses
 from ..core.recording.target import POSE
 from ..core.recording.writer import RecordingWriter
@@ -123,7 +123,7 @@ def _plan(
     if plan.total < 1:
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
     wanted = len(_wanted(settings, plan.total))
-    check_room([(path, recording_bytes(rig, wanted)) for (_, path), (rig, _) in zip(rigs, read, strict=True)])
+    check_disk_space([(path, recording_bytes(rig, wanted)) for (_, path), (rig, _) in zip(rigs, read, strict=True)])
     known = [_known(path, settings, len(rigs) > 1) for _, path in rigs]
     planned = [
         MeshPlanned(scene_rig, rig, path, own, plan.channels_of(number), known[number], pose_setter.target)

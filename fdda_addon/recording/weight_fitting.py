@@ -12,7 +12,7 @@ import numpy as np
 from ..core.errors import RecordingError, RigError, TrainingError
 from ..core.messages import MessageType
 from ..core.progress import Progress
-from ..core.recording.fit_folder import MIN_POSES, FitPosesWriter, read_fitted
+from ..core.recording.fit_folder import MIN_POSES, FitPosesWriter, read_fitted_weights
 from ..core.rig import STATIC_JOINT, Rig
 from ..core.skin_fit import SkinFit
 from ..core.temporary import temporary_folder_error
@@ -80,7 +80,7 @@ def fit_weights(rig: Rig, kind: str, poses: Iterator[None], count: int, evaluato
                 writer.append(pose_matrices, positions)
                 yield Progress("poses to fit", number, count)
         fit = yield from _fit_folder(folder, kind, rig)
-        joints, weights = read_fitted(folder, rig)
+        joints, weights = read_fitted_weights(folder, rig)
     return replace(rig, skin_joints=joints, skin_weights=weights), fit
 
 

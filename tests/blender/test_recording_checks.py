@@ -39,7 +39,7 @@ def test_preserve_volume_flips_beyond_180_degrees(tmp_path, smooth, capsys):
     (warning,) = json.loads((tmp_path / "checks.json").read_text(encoding="utf-8"))["warnings"]
     assert warning["name"] == "flips"
     assert warning["text"].startswith("Vertices of 'upper' jump up to ")
-    assert "between poses that are alike, 'lower' on the two sides of 180 degrees (" in warning["text"]
+    assert "between similar poses, 'lower' on the two sides of 180 degrees (" in warning["text"]
     assert capsys.readouterr().out == f"Warning (flips): {warning['text']}\n"
     assert run("check-recording", recording, "--strict") == 1
     assert capsys.readouterr().err == f"Error: {warning['text'].removesuffix('.')} (flips).\n"

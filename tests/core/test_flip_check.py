@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Jumps between poses that are alike: found where there are some, and nowhere else."""
+"""Jumps between similar poses: found where there are some, and nowhere else."""
 
 import re
 
 import numpy as np
 import pytest
 
-from fdda_addon.core.checks.flips import alike_poses
+from fdda_addon.core.checks.flips import find_similar_poses
 from fdda_addon.core.recording.reader import Recording
 
 from .good_recording import BONE, JOINTS, LIMIT, good_recording, only, warned, with_partitions
@@ -28,7 +28,7 @@ def flipping(poses: int, reach: float, jump: float, seed: int = 0) -> Recording:
 def test_a_joint_that_flips(poses):
     text = only(flipping(poses, 1.1, 0.08), "flips")
     assert re.match(
-        r"Vertices of '(upper|lower)' jump up to \d\d mm between poses that are alike, 'lower' on the two sides of 180 "
+        r"Vertices of '(upper|lower)' jump up to \d\d mm between similar poses, 'lower' on the two sides of 180 "
         r"degrees \(\d+ pairs?, such as poses \d+ and \d+\); [12] more partitions? jumps? too, and no network follows "
         "a jump: keep its turn below 180 degrees",
         text,
@@ -72,7 +72,7 @@ def test_a_control_that_switches(many):
     near = np.exp(-((many.rig.rest_positions[:, 2] / BONE - 1.5) ** 2))
     many.residuals[:, :, 1] += 0.05 * (many.controls > 0.6) * near
     text = only(many, "flips")
-    assert re.search(r"jump up to \d\d mm between poses that are alike \(\d+ pairs, such as poses \d+ and \d+\)", text)
+    assert re.search(r"jump up to \d\d mm between similar poses \(\d+ pairs, such as poses \d+ and \d+\)", text)
     assert "a jump: look for what switches there, a driver or a Shrinkwrap" in text
 
 
@@ -91,13 +91,13 @@ def test_a_jump_far_from_a_half_turn(many):
 
 def test_alike_poses_are_near():
     values = np.random.default_rng(0).uniform(0, 1, (300, 1))
-    pairs = alike_poses(values, 0.2)
+    pairs = find_similar_poses(values, 0.2)
     assert len(pairs) > 300 and (pairs[:, 0] < pairs[:, 1]).all()
     assert np.abs(values[pairs[:, 0]] - values[pairs[:, 1]]).max() < 0.2 * 0.3
-    assert len(alike_poses(np.ones((300, 4)), 0.2)) == 0
+    assert len(find_similar_poses(np.ones((300, 4)), 0.2)) == 0
 
 
 def test_equal_poses_are_no_neighbours():
     values = np.repeat(np.random.default_rng(0).uniform(0, 1, (100, 1)), 3, axis=0)
-    pairs = alike_poses(values, 0.2)
+    pairs = find_similar_poses(values, 0.2)
     assert len(pairs) and (values[pairs[:, 0]] != values[pairs[:, 1]]).all()

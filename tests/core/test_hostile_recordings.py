@@ -12,7 +12,7 @@ import pytest
 
 from fdda_addon.core.errors import FDDAError, RecordingError
 from fdda_addon.core.recording.extension import RecordingExtension
-from fdda_addon.core.recording.place import check_recordable
+from fdda_addon.core.recording.folder_check import check_recordable
 from fdda_addon.core.recording.reader import check_resumable, read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 

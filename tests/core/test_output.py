@@ -22,7 +22,7 @@ from fdda_addon.core.output import (
     write_json,
     write_text,
 )
-from fdda_addon.core.recording.estimate import check_room
+from fdda_addon.core.recording.estimate import check_disk_space
 
 from .. import systems
 
@@ -211,7 +211,7 @@ def test_a_drive_that_is_not_connected():
     with pytest.raises(OutputError, match=words):
         check_folder_writable(path)
     with pytest.raises(OutputError, match=words):
-        check_room([(path, 1000)])
+        check_disk_space([(path, 1000)])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Only Linux has /proc.")

@@ -12,8 +12,8 @@ from fdda_addon.core.errors import OutputError
 from fdda_addon.core.file_kind import EVALUATION, PICTURE
 from fdda_addon.core.output import check_folder_writable, check_outputs, check_writable
 from fdda_addon.core.path_limits import windows_name_problem
+from fdda_addon.core.recording.folder_check import check_recordable
 from fdda_addon.core.recording.index import INDEX
-from fdda_addon.core.recording.place import check_recordable
 
 DEVICE, DROPPED = "is the name of a device on Windows", "ends in a dot or a blank, which Windows drops"
 PROBLEMS = {

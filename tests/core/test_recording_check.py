@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.checks import residual_scan
-from fdda_addon.core.checks.recording import NAMES, bone_lengths, check_recording, merges_in_words
-from fdda_addon.core.checks.warning import RecordingWarning, counted, length, listed
+from fdda_addon.core.checks.recording import WARNING_NAMES, check_recording, compute_bone_lengths, merges_sentence
+from fdda_addon.core.checks.warning import RecordingWarning, counted, format_length, listed
 from fdda_addon.core.controls import Control
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.poses import Channel
@@ -286,17 +286,17 @@ def test_small_partitions(good):
 def test_merges_in_words():
     joints = [{"name": name} for name in ("root", "a", "b", STATIC_JOINT, *map(str, range(20)))]
     none = {"joints": joints, "partitions": [{"joint": 0}]}
-    assert merges_in_words(none, 8) == ""
+    assert merges_sentence(none, 8) == ""
     few = {"joints": joints, "partitions": [{"joint": 0, "merged": [2, 3]}, {"joint": 1}]}
-    assert merges_in_words(few, 8) == (
+    assert merges_sentence(few, 8) == (
         "2 partitions of fewer than 8 vertices are merged: 'b' into 'root', 'no bone' into 'root'."
     )
     many = {"joints": joints, "partitions": [{"joint": 0, "merged": list(range(4, 20))}]}
-    assert merges_in_words(many, 5).endswith("'8' into 'root', '9' into 'root' and 6 more.")
+    assert merges_sentence(many, 5).endswith("'8' into 'root', '9' into 'root' and 6 more.")
 
 
 def test_the_length_of_bones(good):
-    assert bone_lengths(good.rig) == pytest.approx([BONE] * 4)
+    assert compute_bone_lengths(good.rig) == pytest.approx([BONE] * 4)
 
 
 def test_no_more_poses_are_read_than_are_needed(good, monkeypatch):
@@ -332,9 +332,9 @@ def test_lengths_are_metres_in_any_unit(good):
     words = ["0.04 mm", "87 mm", "250 mm", "1.23 m"]
     for metres in (1.0, 0.01):
         rig = with_rig(good, metres_per_unit=metres).rig
-        assert [length(rig, m / metres) for m in (0.00004, 0.0871, 0.25, 1.234)] == words
+        assert [format_length(rig, m / metres) for m in (0.00004, 0.0871, 0.25, 1.234)] == words
 
 
 def test_every_warning_is_documented():
     headings = re.findall(r"^#### `(.+)`$", CHECKS.read_text(encoding="utf-8"), re.MULTILINE)
-    assert headings == list(NAMES)
+    assert headings == list(WARNING_NAMES)

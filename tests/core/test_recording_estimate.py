@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from fdda_addon.core.errors import OutputError
-from fdda_addon.core.recording.estimate import Estimate, check_room, recording_bytes, sizes_in_words
+from fdda_addon.core.recording.estimate import Estimate, check_disk_space, recording_bytes, training_size_sentence
 from fdda_addon.core.recording.reader import read_recording
 
 from .limb import make_rig, record_limb
@@ -42,7 +42,7 @@ def test_what_a_training_takes(tmp_path):
     recording = read_recording(tmp_path / "r")
     largest = max(recording.partitions, key=lambda partition: len(partition.vertices))
     name = recording.rig.joint_names[largest.joint]
-    assert sizes_in_words(recording) == (
+    assert training_size_sentence(recording) == (
         f"50 poses of {recording.rig.vertex_count} vertices: less than 1 MB on the disk; residuals of the largest "
         f"partition, '{name}', of {len(largest.vertices)} vertices: less than 1 MB, in memory two or three times."
     )
@@ -50,11 +50,11 @@ def test_what_a_training_takes(tmp_path):
 
 def test_a_disk_without_room(tmp_path):
     free = shutil.disk_usage(tmp_path).free
-    check_room([(tmp_path / "a", 1000), (tmp_path / "b", 1000)])
+    check_disk_space([(tmp_path / "a", 1000), (tmp_path / "b", 1000)])
     with pytest.raises(
         OutputError, match=r"Cannot write the recording '.*a.b': it takes .* GB and the disk has .* left"
     ):
-        check_room([(tmp_path / "a" / "b", free), (tmp_path / "c", 10**9)])
+        check_disk_space([(tmp_path / "a" / "b", free), (tmp_path / "c", 10**9)])
 
 
 @pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="Windows reserves no room for files.")
@@ -62,6 +62,6 @@ def test_what_a_recording_has_already_needs_no_room(small_disk):
     record_limb(small_disk / "r", poses=20, complete=5)
     size = recording_bytes(make_rig(), 20)
     (small_disk / "ballast").write_bytes(b"x" * (shutil.disk_usage(small_disk).free - 8192))
-    check_room([(small_disk / "r", size)])
+    check_disk_space([(small_disk / "r", size)])
     with pytest.raises(OutputError, match="make room"):
-        check_room([(small_disk / "other", size)])
+        check_disk_space([(small_disk / "other", size)])

@@ -57,7 +57,7 @@ def test_each_pose_is_in_one_shard(count, total):
 
 @pytest.mark.parametrize("piece", [1, 3 * 4 * (40 * 3 + 4 * 16), 1 << 24])
 def test_merged_shards_are_the_recording_of_one_run(shards, tmp_path, monkeypatch, piece):
-    monkeypatch.setattr(merge, "PIECE_BYTES", piece)
+    monkeypatch.setattr(merge, "COPY_CHUNK_BYTES", piece)
     record_limb(tmp_path / "whole", POSES)
     path = merged([shards[n] for n in (3, 5, 0, 1, 4, 2)], tmp_path / "merged")
     assert contents(path) == contents(tmp_path / "whole")
@@ -65,7 +65,7 @@ def test_merged_shards_are_the_recording_of_one_run(shards, tmp_path, monkeypatc
 
 
 def test_a_merge_goes_on_and_repeats_nothing(shards, tmp_path, monkeypatch):
-    monkeypatch.setattr(merge, "PIECE_BYTES", 1)
+    monkeypatch.setattr(merge, "COPY_CHUNK_BYTES", 1)
     path, appended = tmp_path / "merged", []
     append = writer.RecordingWriter.append
     monkeypatch.setattr(
@@ -115,7 +115,7 @@ def test_shards_of_other_recordings_are_refused(shards, tmp_path):
     np.save(shards[3] / "rest_positions.npy", rest + np.float32(1e-6))
     assert "differently (rest_positions); record" in sentence(shards, path)
     record_limb(tmp_path / "whole", POSES)
-    assert "is no shard, but a recording by itself" in sentence([*shards[:3], tmp_path / "whole"], path)
+    assert "is not a shard, but a complete recording" in sentence([*shards[:3], tmp_path / "whole"], path)
 
 
 def test_a_shard_that_is_incomplete_is_refused(shards, tmp_path):
@@ -196,4 +196,4 @@ def test_memory_stays_bounded(tmp_path):
     command = [sys.executable, "-c", MEASURE, tmp_path / "merged", tmp_path / "1", tmp_path / "2"]
     result = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[2])
     assert read_index(tmp_path / "merged")["complete"] == total
-    assert int(result.stdout) * 1024 < 3 * merge.PIECE_BYTES
+    assert int(result.stdout) * 1024 < 3 * merge.COPY_CHUNK_BYTES

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from fdda_addon.core.errors import FDDAError, OutputError, RecordingError
+from fdda_addon.core.recording.folder_check import check_recordable
 from fdda_addon.core.recording.index import read_index
-from fdda_addon.core.recording.place import check_recordable
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter, array_header
 
@@ -164,21 +164,6 @@ def test_resuming_does_not_make_up_poses_that_are_gone(tmp_path, name, damage):
     with pytest.raises(RecordingError, match=rf"Cannot resume.*'{name}' does not hold the 10 poses"):
         record_limb(tmp_path / "r", POSES, resume=True)
     assert files(tmp_path / "r") == before
-
-
-def test_a_recording_from_before_there_were_faces_resumes_without_them(tmp_path, recording):
-    path = tmp_path / "old"
-    record_limb(path, POSES, 5)
-    index = json.loads((path / "recording.json").read_text())
-    (path / "recording.json").write_text(json.dumps({k: v for k, v in index.items() if k not in ("faces", "corners")}))
-    for name in ("face_starts", "face_vertices"):
-        (path / f"{name}.npy").unlink()
-    record_limb(path, POSES, resume=True)
-    expected = files(recording)
-    del expected["face_starts.npy"], expected["face_vertices.npy"], expected["recording.json"]
-    assert {name: data for name, data in files(path).items() if name != "recording.json"} == expected
-    assert not {"faces", "corners"} & set(read_index(path))
-    assert len(read_recording(path).rig.face_starts) == 0
 
 
 def test_a_mesh_without_faces(tmp_path):

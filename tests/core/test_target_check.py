@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdda_addon.core.checks.target import check_target, unsettled_in_words
+from fdda_addon.core.checks.target import check_target, unsettled_sentence
 from fdda_addon.core.recording.index import ACTION, Source
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.target import RecordedTarget, Repeatability
@@ -86,9 +86,9 @@ def test_the_same_pose_from_two_directions(swinging):
 
 
 def test_poses_that_did_not_settle_in_words():
-    assert unsettled_in_words({"complete": 9}) == ""
+    assert unsettled_sentence({"complete": 9}) == ""
     index = {"complete": 9, "unsettled": [1, 4], "target": {"max_settle_frames": 30}}
-    assert unsettled_in_words(index).startswith("2 of 9 poses did not come to rest in 30 frames: 1 and 4. A training")
+    assert unsettled_sentence(index).startswith("2 of 9 poses did not come to rest in 30 frames: 1 and 4. A training")
 
 
 def test_index_of_repeatability():

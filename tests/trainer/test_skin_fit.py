@@ -13,7 +13,7 @@ import pytest
 
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.messages import Message, MessageType
-from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fit_poses, read_fitted
+from fdda_addon.core.recording.fit_folder import FitPoses, FitPosesWriter, read_fit_poses, read_fitted_weights
 from fdda_addon.core.recording.writer import array_header
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from fdda_addon.core.skin_fit import SkinFit
@@ -199,7 +199,7 @@ def test_the_process_says_what_the_fit_brings(kind, tmp_path, capsys):
     assert (messages[-1].type, fit.kind, fit.poses) == (MessageType.FINISHED, kind, POSES)
     for gain in (fit.held_out, fit.training):
         assert gain.rms_mm["fitted"] < 0.8 * gain.rms_mm["rig"]
-    joints, weights = read_fitted(tmp_path, poses.rig)
+    joints, weights = read_fitted_weights(tmp_path, poses.rig)
     found = LinearSkinning(replace(poses.rig, skin_joints=joints, skin_weights=weights))
     # Every other pose is held out.
     for gain, part in ((fit.held_out, slice(1, None, 2)), (fit.training, slice(0, None, 2))):
@@ -292,7 +292,7 @@ def test_fitted_weights_of_another_rig_are_refused(tmp_path):
     rig = random_rig(2)
     fit_folder(write(tmp_path, posed(rig)), "hard", Silent(), lambda: False)
     with pytest.raises(RecordingError, match=r"the fitted weights have the shapes \(300, 4\) and \(300, 4\)"):
-        read_fitted(tmp_path, replace(rig, rest_positions=rig.rest_positions[1:]))
+        read_fitted_weights(tmp_path, replace(rig, rest_positions=rig.rest_positions[1:]))
     np.save(tmp_path / "fitted_weights.npy", np.full((VERTICES, 4), -0.25, np.float32))
     with pytest.raises(RecordingError, match="the fitted weights are no weights"):
-        read_fitted(tmp_path, rig)
+        read_fitted_weights(tmp_path, rig)

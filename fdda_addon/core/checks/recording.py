@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is suspicious about a recording, before a training is spent on it. docs/formats.md has causes and remedies."""
+"""Checks of a recording before training. docs/formats.md has causes and remedies."""
 
 import numpy as np
 
@@ -12,59 +12,59 @@ from .poses import check_poses
 from .residual_scan import ResidualScan, scan_residuals
 from .rest import check_rest
 from .target import check_target
-from .warning import RecordingWarning, counted, joint_name, length, listed
+from .warning import RecordingWarning, counted, format_length, joint_name, listed
 
-NAMES = (
+WARNING_NAMES = (
     *("units", "axes", "large-residuals", "duplicate-poses", "hidden-inputs", "degenerate-poses", "flips"),
     *("hysteresis", "frame-jumps", "frozen-frames", "target-place"),
     *("dead-controls", "dead-joints", "still-vertices", "small-partitions"),
 )
-"""All names that a warning may have."""
-STILL = 1e-5
-"""What moves by less than this part of the character's size, in all poses, counts as still."""
-MAX_STILL = 0.01
-"""Part of the vertices that may be still."""
-MAX_MERGES = 10
-"""Merges beyond this many are counted, not listed."""
-RELATED = 0.3
-"""Correlation from which on a joint counts as moved by another, or by a control."""
-MAX_RELATED = 500
-"""The correlation is measured over at most this number of poses."""
+"""Names of all warnings."""
+MIN_MOTION_RATIO = 1e-5
+"""Motion over all poses below this ratio of the rig's size counts as none."""
+MAX_STILL_RATIO = 0.01
+"""Ratio of the vertices that may not move."""
+MAX_LISTED_MERGES = 10
+"""Largest number of merges that are listed; further ones are counted."""
+MIN_CORRELATION = 0.3
+"""Correlation above which a joint counts as moved by another joint or by a control."""
+MAX_CORRELATED_POSES = 500
+"""Largest number of poses over which correlations are computed."""
 
 
 def check_recording(recording: Recording) -> list[RecordingWarning]:
-    """Look for mistakes of rig and poses; memory stays bounded however large the recording is.
+    """Find mistakes of rig and poses, with bounded memory for recordings of any size.
 
-    Residuals are read of at most `residual_scan.MAX_POSES` poses.
+    Reads residuals of at most `residual_scan.MAX_SCANNED_POSES` poses.
 
     Returns:
-        The warnings, in the order of `NAMES`; none for a good recording.
+        The warnings in the order of `WARNING_NAMES`; empty for a good recording.
     """
     scan = scan_residuals(recording)
-    moving = moving_joints(recording)
-    found = [
+    moving = find_moving_joints(recording)
+    warnings = [
         *check_rest(recording.rig),
-        *_check_large(recording, scan),
+        *_check_large_residuals(recording, scan),
         *check_poses(recording),
         *check_flips(recording, scan),
         *check_target(recording),
         *_check_controls(recording),
         *_check_joints(recording),
-        *_check_still(recording, scan, moving),
-        *_check_small(recording),
+        *_check_still_vertices(recording, scan, moving),
+        *_check_small_partitions(recording),
     ]
-    return sorted(found, key=lambda warning: NAMES.index(warning.name))
+    return sorted(warnings, key=lambda warning: WARNING_NAMES.index(warning.name))
 
 
-def merges_in_words(index: dict, least: int) -> str:
-    """A line about the small partitions that were merged: "1 partition of fewer than 8 vertices is merged: …".
+def merges_sentence(index: dict, min_vertices: int) -> str:
+    """Describe the merged partitions: "1 partition of fewer than 8 vertices is merged: …".
 
     Args:
         index: of the recording.
-        least: how many vertices a partition was to have.
+        min_vertices: the setting of the recording.
 
     Returns:
-        The line, empty when none were merged.
+        The sentence; empty where none were merged.
     """
     names = [joint["name"] or STATIC_JOINT_LABEL for joint in index["joints"]]
     merges = [f"'{names[j]}' into '{names[p['joint']]}'" for p in index["partitions"] for j in p.get("merged", ())]
@@ -72,47 +72,51 @@ def merges_in_words(index: dict, least: int) -> str:
         return ""
     which = "1 partition" if len(merges) == 1 else f"{len(merges)} partitions"
     verb = "is" if len(merges) == 1 else "are"
-    more = f" and {len(merges) - MAX_MERGES} more" if len(merges) > MAX_MERGES else ""
-    return f"{which} of fewer than {least} vertices {verb} merged: {', '.join(merges[:MAX_MERGES])}{more}."
+    more = f" and {len(merges) - MAX_LISTED_MERGES} more" if len(merges) > MAX_LISTED_MERGES else ""
+    return (
+        f"{which} of fewer than {min_vertices} vertices {verb} merged: {', '.join(merges[:MAX_LISTED_MERGES])}{more}."
+    )
 
 
-def bone_lengths(rig: Rig) -> np.ndarray:
-    """(J,) float64, from each joint to its nearest child, else to its parent, 0 for one that is alone; metres."""
-    places, parents = rig.rest_matrices[:, :3, 3].astype(np.float64), rig.parents
-    to_parent = np.where(parents >= 0, np.linalg.norm(places - places[parents], axis=1), 0.0)
+def compute_bone_lengths(rig: Rig) -> np.ndarray:
+    """Compute bone lengths: the distance to the nearest child, else to the parent, else 0; (J,) float64, mesh units."""
+    positions, parents = rig.rest_matrices[:, :3, 3].astype(np.float64), rig.parents
+    to_parent = np.where(parents >= 0, np.linalg.norm(positions - positions[parents], axis=1), 0.0)
     nearest = np.full(len(parents), np.inf)
     children = np.flatnonzero(parents >= 0)
     np.minimum.at(nearest, parents[children], to_parent[children])
     return np.where(np.isfinite(nearest), nearest, to_parent)
 
 
-def moving_joints(recording: Recording) -> np.ndarray:
-    """(J,) bool, the joints whose pose matrices are not the same in all poses."""
+def find_moving_joints(recording: Recording) -> np.ndarray:
+    """Find joints whose pose matrices differ between poses; (J,) bool."""
     low, high = (function(recording.pose_matrices, axis=0) for function in (np.min, np.max))
     rig, moved = recording.rig, high - low
-    least = max(STILL * max(1 / rig.metres_per_unit, rig.size), float32_rounding(recording.pose_matrices))
-    return (moved[:, :3, :3].max(axis=(1, 2)) > STILL) | (moved[:, :3, 3].max(axis=1) > least)
+    rounding = float32_rounding(recording.pose_matrices)
+    threshold = max(MIN_MOTION_RATIO * max(1 / rig.metres_per_unit, rig.size), rounding)
+    return (moved[:, :3, :3].max(axis=(1, 2)) > MIN_MOTION_RATIO) | (moved[:, :3, 3].max(axis=1) > threshold)
 
 
-def _check_large(recording: Recording, scan: ResidualScan) -> list[RecordingWarning]:
-    """Residuals are to be corrections of skinning: smaller than what they correct."""
-    rig, bones = recording.rig, bone_lengths(recording.rig)
+def _check_large_residuals(recording: Recording, scan: ResidualScan) -> list[RecordingWarning]:
+    """Warn about residuals larger than the bones, because residuals are meant as corrections of skinning."""
+    rig, bones = recording.rig, compute_bone_lengths(recording.rig)
     large = []
     for p in recording.partitions:
         extent = float(np.linalg.norm(np.ptp(rig.rest_positions[p.vertices], axis=0)))
         rms = float(np.sqrt(np.mean(scan.rms[p.vertices] ** 2)))
-        own = max(float(bones[p.joint]), extent)
-        if rms > own > 0:
-            large.append((rms / own, rms, own, joint_name(rig, p.joint)))
+        size = max(float(bones[p.joint]), extent)
+        if rms > size > 0:
+            large.append((rms / size, rms, size, joint_name(rig, p.joint)))
     advice = (
         "linear skinning is no start there; look at the skin weights and whether mesh and armature match in the rest "
         "pose, or record with --fit-linear smooth."
     )
     if large:
-        _, rms, own, name = max(large)
+        _, rms, size, name = max(large)
         text = (
             f"Residuals are larger than bones and vertices of {len(large)} of {len(recording.partitions)} partitions, "
-            f"most of '{name}', {length(rig, rms)} rms where bone and vertices are {length(rig, own)} long: {advice}"
+            f"most of '{name}', {format_length(rig, rms)} rms where bone and vertices are {format_length(rig, size)} "
+            f"long: {advice}"
         )
         return [RecordingWarning("large-residuals", text)]
     vertex = int(scan.largest.argmax())
@@ -120,8 +124,8 @@ def _check_large(recording: Recording, scan: ResidualScan) -> list[RecordingWarn
     if scan.largest[vertex] <= size:
         return []
     text = (
-        f"The residual of vertex {vertex} is {length(rig, float(scan.largest[vertex]))} in pose "
-        f"{scan.largest_pose[vertex]}, and the character is {length(rig, size)} large: {advice}"
+        f"The residual of vertex {vertex} is {format_length(rig, float(scan.largest[vertex]))} in pose "
+        f"{scan.largest_pose[vertex]}, and the character is {format_length(rig, size)} large: {advice}"
     )
     return [RecordingWarning("large-residuals", text)]
 
@@ -133,7 +137,7 @@ def _check_controls(recording: Recording) -> list[RecordingWarning]:
     idle = [c for c in range(len(controls)) if c not in used and c not in still]
     poses, features = _sampled_features(recording)
     features = features.reshape(len(poses), -1)
-    # One that moves joints, as a switch between IK and FK, has done its part.
+    # A control that moves joints, such as a switch between IK and FK, has an effect.
     idle = [c for c in idle if not _are_related(recording.controls[poses, c : c + 1], features)]
     dead = sorted([*idle, *still])
     if not dead:
@@ -148,7 +152,7 @@ def _check_controls(recording: Recording) -> list[RecordingWarning]:
 
 
 def _check_joints(recording: Recording) -> list[RecordingWarning]:
-    """Joints that are sampled, move no residual, and carry no vertex and no joint with vertices."""
+    """Warn about sampled joints that change no residual and carry no vertices, themselves or through children."""
     rig = recording.rig
     sampled = {channel.name for channel in recording.info.sampling.channels}
     skinning = np.zeros(len(rig.joints), bool)
@@ -171,7 +175,7 @@ def _check_joints(recording: Recording) -> list[RecordingWarning]:
 
 
 def _moves_others(recording: Recording, joint: int, sampled: set[str]) -> bool:
-    """Whether joints that are not sampled themselves move with this one: through constraints, not as its children."""
+    """Return whether joints that are not sampled follow this one, through constraints for example."""
     rig = recording.rig
     driven = [j for j, other in enumerate(rig.joints) if other.name not in sampled]
     poses, features = _sampled_features(recording)
@@ -179,30 +183,30 @@ def _moves_others(recording: Recording, joint: int, sampled: set[str]) -> bool:
 
 
 def _sampled_features(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) indices of evenly spaced poses, and their (n, J, 12) joint features."""
+    """Return (n,) indices of evenly spaced poses and their (n, J, 12) joint features."""
     rig, count = recording.rig, len(recording.pose_matrices)
-    poses = np.unique(np.linspace(0, count - 1, MAX_RELATED).round().astype(np.int64))
+    poses = np.unique(np.linspace(0, count - 1, MAX_CORRELATED_POSES).round().astype(np.int64))
     return poses, joint_features_in_metres(np.array(recording.pose_matrices[poses]), rig)
 
 
 def _are_related(first: np.ndarray, second: np.ndarray) -> bool:
-    """Whether any of the (n, A) values goes along with any of the (n, B) values or with how far it is from its mean."""
+    """Return whether any of (n, A) values correlates with any of (n, B) values or their absolute deviations."""
     standard = []
     for values in (first.astype(np.float64), second.astype(np.float64)):
-        values = values[:, values.std(axis=0) > STILL]
+        values = values[:, values.std(axis=0) > MIN_MOTION_RATIO]
         standard.append((values - values.mean(axis=0)) / values.std(axis=0))
     far = np.abs(standard[1])
     far = far - far.mean(axis=0)
-    columns = np.concatenate([standard[1], far / np.maximum(far.std(axis=0), STILL)], axis=1)
+    columns = np.concatenate([standard[1], far / np.maximum(far.std(axis=0), MIN_MOTION_RATIO)], axis=1)
     related = np.abs(standard[0].T @ columns) / len(first)
-    return bool(related.max(initial=0) > max(RELATED, 5 / np.sqrt(len(first))))
+    return bool(related.max(initial=0) > max(MIN_CORRELATION, 5 / np.sqrt(len(first))))
 
 
-def _check_still(recording: Recording, scan: ResidualScan, moving: np.ndarray) -> list[RecordingWarning]:
+def _check_still_vertices(recording: Recording, scan: ResidualScan, moving: np.ndarray) -> list[RecordingWarning]:
     rig = recording.rig
     carried = ((rig.skin_weights > 0) & moving[rig.skin_joints]).any(axis=1)
-    still = ~carried & (scan.change < STILL * rig.size)
-    if still.sum() <= MAX_STILL * rig.vertex_count:
+    still = ~carried & (scan.change < MIN_MOTION_RATIO * rig.size)
+    if still.sum() <= MAX_STILL_RATIO * rig.vertex_count:
         return []
     names = [joint_name(rig, p.joint) for p in recording.partitions if still[p.vertices].any()]
     text = (
@@ -212,7 +216,7 @@ def _check_still(recording: Recording, scan: ResidualScan, moving: np.ndarray) -
     return [RecordingWarning("still-vertices", text)]
 
 
-def _check_small(recording: Recording) -> list[RecordingWarning]:
+def _check_small_partitions(recording: Recording) -> list[RecordingWarning]:
     small = [p for p in recording.partitions if len(p.vertices) < MIN_PARTITION_VERTICES]
     if not small or len(recording.partitions) == 1:
         return []

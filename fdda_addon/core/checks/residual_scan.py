@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One look at the residuals of a recording, which may be larger than memory."""
+"""Statistics of the residuals of a recording, which may be larger than memory."""
 
 from dataclasses import dataclass
 
@@ -8,21 +8,21 @@ import numpy as np
 from ..partition import Partition
 from ..recording.reader import Recording
 
-MAX_POSES = 1000
-SAMPLED_VERTICES, SAMPLED_IN_PARTITION, MIN_IN_PARTITION = 8000, 48, 8
-"""How many vertices are kept pose by pose, in all and of one partition."""
+MAX_SCANNED_POSES = 1000
+MAX_KEPT_VERTICES, MAX_KEPT_IN_PARTITION, MIN_KEPT_IN_PARTITION = 8000, 48, 8
+"""Limits for the number of vertices whose residuals are kept: in total, largest and smallest of one partition."""
 
 
 @dataclass(frozen=True)
 class ResidualScan:
-    """What the poses of a recording say of its residuals; local residuals, metres.
+    """Statistics of local residuals over poses, mesh units.
 
     Attributes:
-        poses: (n,) indices of the poses that were looked at, ascending; at most `MAX_POSES`, evenly spaced.
+        poses: (n,) ascending indices of the scanned poses, at most `MAX_SCANNED_POSES`, evenly spaced.
         rms: (V,) float64, rms length over the poses.
         largest: (V,) float32, largest length.
         largest_pose: (V,) int64, index of the pose in which it is largest.
-        change: (V,) float32, farthest from the residual in the first pose.
+        change: (V,) float32, largest difference from the residual of the first pose.
         vertices: for each partition, the (S_p,) int64 vertices that were kept.
         residuals: for each partition, their (n, S_p, 3) float32 residuals.
     """
@@ -38,12 +38,12 @@ class ResidualScan:
 
 def scan_residuals(recording: Recording) -> ResidualScan:
     """Read the residuals of evenly spaced poses, one pose in memory at a time."""
-    count, rig = len(recording.residuals), recording.rig
-    poses = np.unique(np.linspace(0, count - 1, min(count, MAX_POSES)).round().astype(np.int64))
-    most = min(SAMPLED_IN_PARTITION, max(MIN_IN_PARTITION, SAMPLED_VERTICES // len(recording.partitions)))
-    vertices = tuple(_sampled(p, rig.skin_weights, most) for p in recording.partitions)
-    gathered = np.concatenate(vertices)
-    kept = np.empty((len(poses), len(gathered), 3), np.float32)
+    pose_count, rig = len(recording.residuals), recording.rig
+    poses = np.unique(np.linspace(0, pose_count - 1, min(pose_count, MAX_SCANNED_POSES)).round().astype(np.int64))
+    count = min(MAX_KEPT_IN_PARTITION, max(MIN_KEPT_IN_PARTITION, MAX_KEPT_VERTICES // len(recording.partitions)))
+    vertices = tuple(_choose_vertices(p, rig.skin_weights, count) for p in recording.partitions)
+    all_vertices = np.concatenate(vertices)
+    kept = np.empty((len(poses), len(all_vertices), 3), np.float32)
     squares = np.zeros(rig.vertex_count, np.float64)
     largest = np.full(rig.vertex_count, -1, np.float32)
     change = np.zeros(rig.vertex_count, np.float32)
@@ -51,14 +51,14 @@ def scan_residuals(recording: Recording) -> ResidualScan:
     first = np.array(recording.residuals[0])
     for row, pose in enumerate(poses):
         residuals = np.array(recording.residuals[pose])
-        kept[row] = residuals[gathered]
+        kept[row] = residuals[all_vertices]
         square = np.einsum("vc,vc->v", residuals, residuals)
         squares += square
         larger = np.flatnonzero(square > largest)
         largest[larger], largest_pose[larger] = square[larger], pose
         residuals -= first
         np.maximum(change, np.einsum("vc,vc->v", residuals, residuals), out=change)
-    ends = np.cumsum([len(own) for own in vertices])[:-1]
+    ends = np.cumsum([len(chosen) for chosen in vertices])[:-1]
     return ResidualScan(
         poses,
         np.sqrt(squares / len(poses)),
@@ -70,11 +70,11 @@ def scan_residuals(recording: Recording) -> ResidualScan:
     )
 
 
-def _sampled(partition: Partition, skin_weights: np.ndarray, most: int) -> np.ndarray:
-    """Vertices that stand for a partition: half of them the most blended ones, half spread over it."""
-    own = partition.vertices
-    if len(own) <= most:
-        return own.astype(np.int64)
-    blended = own[np.argsort(skin_weights[own].max(axis=1), kind="stable")[: most // 2]]
-    spread = own[np.linspace(0, len(own) - 1, most - most // 2).round().astype(np.int64)]
+def _choose_vertices(partition: Partition, skin_weights: np.ndarray, count: int) -> np.ndarray:
+    """Choose vertices of a partition: half of them those with the most blended weights, half evenly spaced."""
+    vertices = partition.vertices
+    if len(vertices) <= count:
+        return vertices.astype(np.int64)
+    blended = vertices[np.argsort(skin_weights[vertices].max(axis=1), kind="stable")[: count // 2]]
+    spread = vertices[np.linspace(0, len(vertices) - 1, count - count // 2).round().astype(np.int64)]
     return np.union1d(blended, spread).astype(np.int64)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Whether the joints of a rig lie in its mesh: mistakes of units and axes."""
+"""Checks of units and axes: whether the joints of a rig lie inside of its mesh."""
 
 import itertools
 
@@ -7,107 +7,113 @@ import numpy as np
 
 from ..partition import main_joints
 from ..rig import STATIC_JOINT, Rig
-from .warning import RecordingWarning, length
+from .warning import RecordingWarning, format_length
 
-SMALLEST, LARGEST = 0.005, 100.0
-"""Sizes of a mesh in metres beyond which its unit is taken for something else."""
-SCALE_RATIO = 5.0
-"""Joints and the vertices that follow them differ in size by less than this."""
-ALIKE = 0.8
-"""Correlation of the places of joints and of their vertices from which on one is an image of the other."""
-FAR = 0.1
-"""A joint is far from its vertices beyond this part of the size of the character."""
+MIN_SIZE_METRES, MAX_SIZE_METRES = 0.005, 100.0
+"""Range of the size of a mesh; outside of it the unit is probably wrong."""
+MAX_SCALE_RATIO = 5.0
+"""Largest ratio between the extents of joints and of the vertices that follow them."""
+MIN_CORRELATION = 0.8
+"""Correlation of joint positions and vertex centers above which they have the same shape."""
+MAX_DISTANCE_RATIO = 0.1
+"""Largest distance of a joint from its vertices, as a ratio of the rig's size."""
 
 
 def check_rest(rig: Rig) -> list[RecordingWarning]:
-    """Warnings "units" and "axes"."""
-    if not SMALLEST <= rig.size * rig.metres_per_unit <= LARGEST:
+    """Return the warnings "units" and "axes"."""
+    if not MIN_SIZE_METRES <= rig.size * rig.metres_per_unit <= MAX_SIZE_METRES:
         text = (
-            f"The mesh is {length(rig, rig.size)} large, so errors and tolerances in mm mean little: set the unit "
-            "scale of the scene to the unit that the character is built in (0.01 for centimetres), or scale it to its "
-            "true size, and record again."
+            f"The mesh is {format_length(rig, rig.size)} large, so errors and tolerances in mm mean little: set the "
+            "unit scale of the scene to the unit that the character is built in (0.01 for centimetres), or scale it to "
+            "its true size, and record again."
         )
         return [RecordingWarning("units", text)]
     main = main_joints(rig.skin_joints, rig.skin_weights)
     joints = np.array([j for j in np.unique(main) if rig.joints[j].name != STATIC_JOINT], np.int64)
     if len(joints) < 2:
-        # One joint may be anywhere: a door turns on its hinge.
+        # A single joint may be anywhere, such as the hinge of a door.
         return []
-    places = rig.rest_matrices[joints, :3, 3].astype(np.float64)
-    own = [rig.rest_positions[main == joint].astype(np.float64) for joint in joints]
-    middles = np.stack([vertices.mean(axis=0) for vertices in own])
-    turn, likeness, upright = _best_turn(places, middles)
-    spans = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in (places, middles)]
+    joint_positions = rig.rest_matrices[joints, :3, 3].astype(np.float64)
+    vertices_by_joint = [rig.rest_positions[main == joint].astype(np.float64) for joint in joints]
+    vertex_centers = np.stack([vertices.mean(axis=0) for vertices in vertices_by_joint])
+    rotation, correlation, unrotated_correlation = _best_rotation(joint_positions, vertex_centers)
+    spans = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in (joint_positions, vertex_centers)]
     ratio = spans[1] / max(spans[0], 1e-9)
-    if len(joints) > 2 and likeness > ALIKE and not 1 / SCALE_RATIO < ratio < SCALE_RATIO:
-        of_joints, of_vertices = (length(rig, span) for span in spans)
+    if len(joints) > 2 and correlation > MIN_CORRELATION and not 1 / MAX_SCALE_RATIO < ratio < MAX_SCALE_RATIO:
+        of_joints, of_vertices = (format_length(rig, span) for span in spans)
         text = (
             f"The {len(joints)} joints that skin the mesh lie {of_joints} apart and their vertices "
-            f"{of_vertices}, {_times(ratio)}: the scale of mesh or armature is not applied, or one was imported "
+            f"{of_vertices}, {_ratio_label(ratio)}: the scale of mesh or armature is not applied, or one was imported "
             "in another unit; give both one size in the rest pose and record again."
         )
         return [RecordingWarning("units", text)]
-    apart = np.array([np.linalg.norm(v - p, axis=1).min() for v, p in zip(own, places, strict=True)])
+    distances = np.array(
+        [
+            np.linalg.norm(vertices - position, axis=1).min()
+            for vertices, position in zip(vertices_by_joint, joint_positions, strict=True)
+        ]
+    )
     size = max(rig.size, float(np.linalg.norm(np.ptp(rig.rest_matrices[:, :3, 3], axis=0))))
-    if np.median(apart) <= FAR * size:
+    if np.median(distances) <= MAX_DISTANCE_RATIO * size:
         return []
     low, high = rig.rest_positions.min(axis=0), rig.rest_positions.max(axis=0)
-    outside = int(((places < low) | (places > high)).any(axis=1).sum())
-    seen = (
-        f"their places fit after {turn}"
-        if turn and len(joints) > 2 and likeness > max(ALIKE, upright + 0.2)
-        else f"most of it along {_direction(np.median(middles - places, axis=0))}"
+    outside = int(((joint_positions < low) | (joint_positions > high)).any(axis=1).sum())
+    hint = (
+        f"their places fit after {rotation}"
+        if rotation and len(joints) > 2 and correlation > max(MIN_CORRELATION, unrotated_correlation + 0.2)
+        else f"most of it along {_axis_label(np.median(vertex_centers - joint_positions, axis=0))}"
     )
     text = (
         f"{outside} of the {len(joints)} joints that skin the mesh lie outside its bounds, and joints lie "
-        f"{length(rig, float(np.median(apart)))} from the nearest vertex that follows them (median), {seen}: mesh and "
-        "armature do not match in the rest pose; bring them together, apply their transforms and record again."
+        f"{format_length(rig, float(np.median(distances)))} from the nearest vertex that follows them (median), "
+        f"{hint}: mesh and armature do not match in the rest pose; bring them together, apply their transforms and "
+        "record again."
     )
     return [RecordingWarning("axes", text)]
 
 
-def _best_turn(places: np.ndarray, middles: np.ndarray) -> tuple[str, float, float]:
-    """How joints have to be turned to lie like their vertices.
+def _best_rotation(joint_positions: np.ndarray, vertex_centers: np.ndarray) -> tuple[str, float, float]:
+    """Find the rotation between joints and their vertices among the 24 rotations of a cube.
 
     Args:
-        places, middles: (n, 3) joints and the middles of their vertices, metres.
+        joint_positions, vertex_centers: (n, 3) positions of joints and mean positions of their vertices, mesh units.
 
     Returns:
-        The best of the turns of a cube, in words, empty for none; the correlation with it and without any.
+        A label of the best rotation, empty for none; the correlations with it and without rotation.
     """
-    a, b = places - places.mean(axis=0), middles - middles.mean(axis=0)
+    a, b = joint_positions - joint_positions.mean(axis=0), vertex_centers - vertex_centers.mean(axis=0)
     scale = max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12)
-    upright = float((a * b).sum()) / scale
-    turns = [
-        turn
+    unrotated_correlation = float((a * b).sum()) / scale
+    rotations = [
+        rotation
         for order in itertools.permutations(range(3))
         for signs in itertools.product((1, -1), repeat=3)
-        if np.linalg.det(turn := np.eye(3)[list(order)] * np.array(signs)[:, None]) > 0
+        if np.linalg.det(rotation := np.eye(3)[list(order)] * np.array(signs)[:, None]) > 0
     ]
-    likeness = [round(float(((a @ turn.T) * b).sum()) / scale, 2) for turn in turns]
-    # Joints in a row fit after several turns: the one is meant that leaves most axes where they are.
-    best = max(range(len(turns)), key=lambda i: (likeness[i], np.trace(turns[i])))
-    return _turn_in_words(turns[best]), likeness[best], upright
+    correlation = [round(float(((a @ rotation.T) * b).sum()) / scale, 2) for rotation in rotations]
+    # Joints in a row fit after several rotations: prefer the one that keeps most axes.
+    best = max(range(len(rotations)), key=lambda i: (correlation[i], np.trace(rotations[i])))
+    return _rotation_label(rotations[best]), correlation[best], unrotated_correlation
 
 
-def _turn_in_words(turn: np.ndarray) -> str:
-    angle = round(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
-    kept = np.flatnonzero(np.diagonal(turn) == 1)
-    if len(kept) == 3:
+def _rotation_label(rotation: np.ndarray) -> str:
+    angle = round(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
+    fixed_axes = np.flatnonzero(np.diagonal(rotation) == 1)
+    if len(fixed_axes) == 3:
         return ""
-    if len(kept) != 1:
+    if len(fixed_axes) != 1:
         return "an exchange of the axes"
-    x, y = (i for i in range(3) if i != kept[0])
-    # Counter-clockwise about Y turns Z towards X.
-    positive = turn[y, x] > 0 if kept[0] != 1 else turn[x, y] > 0
+    x, y = (i for i in range(3) if i != fixed_axes[0])
+    # A counter-clockwise rotation about Y moves Z towards X.
+    positive = rotation[y, x] > 0 if fixed_axes[0] != 1 else rotation[x, y] > 0
     sign = "" if angle == 180 or positive else "-"
-    return f"a turn of {sign}{angle} degrees about {'XYZ'[kept[0]]}"
+    return f"a turn of {sign}{angle} degrees about {'XYZ'[fixed_axes[0]]}"
 
 
-def _direction(offset: np.ndarray) -> str:
+def _axis_label(offset: np.ndarray) -> str:
     axis = int(np.abs(offset).argmax())
     return f"{'-' if offset[axis] < 0 else '+'}{'XYZ'[axis]}"
 
 
-def _times(ratio: float) -> str:
+def _ratio_label(ratio: float) -> str:
     return f"{ratio:.3g} times as far" if ratio > 1 else f"only 1/{1 / ratio:.3g} of it"

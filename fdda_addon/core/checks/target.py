@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Whether what a target showed can be learnt: poses that did not settle, frames that jump or stand still, its place."""
+"""Checks of a recorded target: hysteresis, frames that jump or freeze, wrong scale or location."""
 
 from collections.abc import Iterator
 
@@ -8,35 +8,39 @@ import numpy as np
 from ..recording.index import ACTION, STRIP, Source
 from ..recording.reader import Recording
 from ..skinning import LinearSkinning
-from .warning import RecordingWarning, length, listed
+from .warning import RecordingWarning, format_length, listed
 
-MAX_APART = 0.2
-"""Two ways to one pose may be apart by this part of what linear skinning is off by; a model would learn no more."""
-JUMP, MIN_JUMP = 8.0, 0.01
-"""A frame jumps when the target moves against linear skinning by so many times the median of such moves of the action,
-and by more than this part of the character's size."""
-FROZEN, MOVES = 1e-6, 1e-3
-"""Parts of the character's size: the target stands still where it moves by less than the first from a frame to the next
-while its linear skinning moves by more than the second."""
-MAX_FRAMES = 2000
-"""Frames beyond so many are not looked at."""
-MAX_POSES = 50
-"""Of poses far apart the place and size of the target are taken."""
-MAX_SCALE, MAX_OFF = 1.5, 0.25
-"""A target that is larger or smaller by this factor, or whose middle is off by this part of the size, is elsewhere."""
+MAX_DISTANCE_RATIO = 0.2
+"""Largest distance between two approaches to a pose, as a ratio of the error of linear skinning."""
+JUMP_RATIO, MIN_JUMP_RATIO = 8.0, 0.01
+"""A frame jumps when the target moves relative to linear skinning by this multiple of the action's median, and by more
+than this ratio of the rig's size."""
+MAX_FROZEN_RATIO, MIN_MOTION_RATIO = 1e-6, 1e-3
+"""Ratios of the rig's size: a target is frozen where it moves by less than the first between two frames while linear
+skinning moves by more than the second."""
+MAX_CHECKED_FRAMES = 2000
+"""Largest number of frames of an action that are checked."""
+MAX_COMPARED_POSES = 50
+"""Number of evenly spaced poses in which location and size of the target are measured."""
+MAX_SCALE, MAX_OFFSET_RATIO = 1.5, 0.25
+"""Limits of a target relative to linear skinning: factor of scale, and offset of its center as a ratio of the size."""
 
 
 def check_target(recording: Recording) -> list[RecordingWarning]:
-    """Warnings "hysteresis", "frame-jumps", "frozen-frames" and "target-place"; none where there is no target."""
+    """Return the warnings "hysteresis", "frame-jumps", "frozen-frames" and "target-place"; empty without a target."""
     if recording.info.target is None:
         return []
     skinning = LinearSkinning(recording.rig, recording.partitions)
-    return [*_check_repeatability(recording), *_check_frames(recording, skinning), *_check_place(recording, skinning)]
+    return [
+        *_check_repeatability(recording),
+        *_check_frames(recording, skinning),
+        *_check_location(recording, skinning),
+    ]
 
 
 def _check_repeatability(recording: Recording) -> list[RecordingWarning]:
     repeatability = recording.info.repeatability
-    if repeatability is None or repeatability.distance_mm["mean"] <= MAX_APART * repeatability.linear_mm:
+    if repeatability is None or repeatability.distance_mm["mean"] <= MAX_DISTANCE_RATIO * repeatability.linear_mm:
         return []
     text = (
         f"The target is {repeatability.distance_mm['mean']:.2g} mm from itself when the same pose is reached from "
@@ -48,95 +52,100 @@ def _check_repeatability(recording: Recording) -> list[RecordingWarning]:
 
 
 def _check_frames(recording: Recording, skinning: LinearSkinning) -> list[RecordingWarning]:
-    """Frames of actions that jump, or in which the target stands still."""
+    """Warn about frames of actions in which the target jumps or is frozen."""
     jumps, frozen = [], []
     first = 0
     for source in recording.info.sampling.sources:
         if source.kind in (ACTION, STRIP) and source.poses > 2:
-            moved, linear = _moves(recording, skinning, first, min(source.poses, MAX_FRAMES))
+            moved, linear = _largest_motions(recording, skinning, first, min(source.poses, MAX_CHECKED_FRAMES))
             size = recording.rig.size
-            still = np.flatnonzero((moved[:, 0] < FROZEN * size) & (linear > MOVES * size)) + 1
-            frozen += [_frame(source, number) for number in still.tolist()]
-            # What stands still while the rig moves does not jump.
+            still = np.flatnonzero((moved[:, 0] < MAX_FROZEN_RATIO * size) & (linear > MIN_MOTION_RATIO * size)) + 1
+            frozen += [_frame_label(source, number) for number in still.tolist()]
+            # A target that is frozen while the rig moves does not jump.
             beside = moved.min(axis=1)
-            jumping = np.flatnonzero((beside > JUMP * np.median(beside)) & (beside > MIN_JUMP * size)) + 1
-            jumps += [(_frame(source, number), float(beside[number - 1])) for number in jumping.tolist()]
+            jumping = np.flatnonzero((beside > JUMP_RATIO * np.median(beside)) & (beside > MIN_JUMP_RATIO * size)) + 1
+            jumps += [(_frame_label(source, number), float(beside[number - 1])) for number in jumping.tolist()]
         first += source.poses
-    found = []
+    warnings = []
     if frozen:
         text = (
             f"The target stands still in {len(frozen)} frames in which the rig moves: {listed(frozen)}: its cache ends "
             "before, or begins after; record frames that it has."
         )
-        found.append(RecordingWarning("frozen-frames", text))
+        warnings.append(RecordingWarning("frozen-frames", text))
     if jumps:
         jumps.sort(key=lambda jump: -jump[1])
         text = (
-            f"The target jumps in {len(jumps)} frames, by up to {length(recording.rig, jumps[0][1])} from one frame to "
-            f"the next: {listed([name for name, _ in jumps])}: look at the simulation there, or leave these frames out."
+            f"The target jumps in {len(jumps)} frames, by up to {format_length(recording.rig, jumps[0][1])} from one "
+            f"frame to the next: {listed([name for name, _ in jumps])}: look at the simulation there, or leave these "
+            "frames out."
         )
-        found.append(RecordingWarning("frame-jumps", text))
-    return found
+        warnings.append(RecordingWarning("frame-jumps", text))
+    return warnings
 
 
-def _frame(source: Source, number: int) -> str:
+def _frame_label(source: Source, number: int) -> str:
     return f"{source.name} {source.frames[0] + number}"
 
 
-def _moves(recording: Recording, skinning: LinearSkinning, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """How far vertices move from each frame to the next, the farthest of each frame.
+def _largest_motions(
+    recording: Recording, skinning: LinearSkinning, first: int, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Measure the largest motion of a vertex between consecutive frames, mesh units.
 
     Returns:
-        (count - 1, 2) of the target, and of the target beside its linear skinning; (count - 1,) of linear skinning.
+        (count - 1, 2) of the target, absolute and relative to linear skinning; (count - 1,) of linear skinning.
     """
     moved, linear, before = [], [], None
-    for positions, skinned in _shown(recording, skinning, range(first, first + count)):
+    for positions, skinned in _iterate_positions(recording, skinning, range(first, first + count)):
         now = positions, skinned
         if before is not None:
             whole, rest = positions - before[0], skinned - before[1]
-            moved.append([_farthest(whole), _farthest(whole - rest)])
-            linear.append(_farthest(rest))
+            moved.append([_max_length(whole), _max_length(whole - rest)])
+            linear.append(_max_length(rest))
         before = now
     return np.array(moved), np.array(linear)
 
 
-def _shown(recording: Recording, skinning: LinearSkinning, poses: range) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """(V, 3) positions of the target and of linear skinning in some poses."""
+def _iterate_positions(
+    recording: Recording, skinning: LinearSkinning, poses: range
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield (V, 3) positions of the target and of linear skinning, mesh-object space, mesh units."""
     for pose in poses:
         matrices = np.array(recording.pose_matrices[pose])[None]
         residuals = np.array(recording.residuals[pose])[None]
         yield skinning.complex_positions(matrices, residuals)[0], skinning.positions(matrices)[0]
 
 
-def _farthest(offsets: np.ndarray) -> float:
+def _max_length(offsets: np.ndarray) -> float:
     return float(np.sqrt(np.einsum("vc,vc->v", offsets, offsets).max()))
 
 
-def _check_place(recording: Recording, skinning: LinearSkinning) -> list[RecordingWarning]:
-    poses = range(0, len(recording.pose_matrices), max(1, len(recording.pose_matrices) // MAX_POSES))
+def _check_location(recording: Recording, skinning: LinearSkinning) -> list[RecordingWarning]:
+    poses = range(0, len(recording.pose_matrices), max(1, len(recording.pose_matrices) // MAX_COMPARED_POSES))
     scales, offsets = [], []
-    for positions, skinned in _shown(recording, skinning, poses):
-        middles = positions.mean(axis=0), skinned.mean(axis=0)
-        extents = [np.sqrt(((own - middle) ** 2).sum(axis=1).mean()) for own, middle in
-                   zip((positions, skinned), middles, strict=True)]  # fmt: skip
+    for positions, skinned in _iterate_positions(recording, skinning, poses):
+        centers = positions.mean(axis=0), skinned.mean(axis=0)
+        extents = [np.sqrt(((own - center) ** 2).sum(axis=1).mean()) for own, center in
+                   zip((positions, skinned), centers, strict=True)]  # fmt: skip
         scales.append(extents[0] / max(extents[1], 1e-12))
-        offsets.append(np.linalg.norm(middles[0] - middles[1]))
-    scale, off = float(np.median(scales)), float(np.median(offsets))
-    if 1 / MAX_SCALE < scale < MAX_SCALE and off < MAX_OFF * recording.rig.size:
+        offsets.append(np.linalg.norm(centers[0] - centers[1]))
+    scale, offset = float(np.median(scales)), float(np.median(offsets))
+    if 1 / MAX_SCALE < scale < MAX_SCALE and offset < MAX_OFFSET_RATIO * recording.rig.size:
         return []
     text = (
         f"The target '{recording.info.target.object_name}' is {scale:.3g} times as large as linear skinning, and its "
-        f"middle {length(recording.rig, off)} away: it is in other units or another place; scale and move it onto the "
-        "mesh, and record again."
+        f"middle {format_length(recording.rig, offset)} away: it is in other units or another place; scale and move it "
+        "onto the mesh, and record again."
     )
     return [RecordingWarning("target-place", text)]
 
 
-def unsettled_in_words(index: dict) -> str:
-    """A sentence about the poses of a recording that did not come to rest; empty where all did.
+def unsettled_sentence(index: dict) -> str:
+    """Describe the poses of a recording that did not come to rest; empty where all did.
 
     Args:
-        index: as `read_index` gives it.
+        index: from `read_index`.
     """
     unsettled = index.get("unsettled", [])
     if not unsettled:

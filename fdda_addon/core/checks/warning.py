@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A warning about a recording, and the words that such sentences share."""
+"""Warnings about a recording, and formatting that their sentences share."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -13,11 +13,11 @@ MAX_LISTED = 3
 
 @dataclass(frozen=True)
 class RecordingWarning:
-    """Something about a recording that makes a bad model likely.
+    """A property of a recording that makes a bad model likely.
 
     Attributes:
-        name: which kind, the heading in docs/formats.md.
-        text: one sentence for the user: what was found, with names and numbers, and what to do.
+        name: of the kind, a heading in docs/formats.md.
+        text: one sentence for the user: what is wrong, with names and numbers, and what to do.
     """
 
     name: str
@@ -31,10 +31,10 @@ class RecordingWarning:
 
 
 def refuse(warnings: Sequence[RecordingWarning]) -> None:
-    """Make an error of warnings: the sentence of the first, with its name and those of the others.
+    """Raise an error with the first warning and the names of the others.
 
     Raises:
-        RecordingError: there are some.
+        RecordingError: `warnings` is not empty.
     """
     if not warnings:
         return
@@ -43,28 +43,28 @@ def refuse(warnings: Sequence[RecordingWarning]) -> None:
     raise RecordingError(f"{warnings[0].text.removesuffix('.')} ({warnings[0].name}{more}).")
 
 
-def listed(names: Sequence[object], most: int = MAX_LISTED) -> str:
-    """The first of some names or numbers: "'a', 'b', 'c' and 4 more"; texts are quoted."""
-    shown = [f"'{name}'" if isinstance(name, str) else str(name) for name in names[:most]]
-    if len(names) > most:
-        return f"{', '.join(shown)} and {len(names) - most} more"
+def listed(names: Sequence[object], max_names: int = MAX_LISTED) -> str:
+    """Format the first names or numbers of a list: "'a', 'b', 'c' and 4 more"; strings are quoted."""
+    shown = [f"'{name}'" if isinstance(name, str) else str(name) for name in names[:max_names]]
+    if len(names) > max_names:
+        return f"{', '.join(shown)} and {len(names) - max_names} more"
     return f"{', '.join(shown[:-1])} and {shown[-1]}" if len(shown) > 1 else "".join(shown)
 
 
 def counted(names: Sequence[object], noun: str, plural: str = "") -> str:
-    """How many and which: "the joint 'a'", "the 7 joints 'a', 'b', 'c' and 4 more"."""
+    """Format names with a noun: "the joint 'a'", "the 7 joints 'a', 'b', 'c' and 4 more"."""
     if len(names) == 1:
         return f"the {noun} {listed(names)}"
     return f"the {len(names)} {plural or noun + 's'} {listed(names)}"
 
 
 def joint_name(rig: Rig, joint: int) -> str:
-    """Name of a joint for people, also of the one that never moves."""
+    """Return the name of a joint for messages, or the label of the static joint."""
     return rig.joints[joint].name or STATIC_JOINT_LABEL
 
 
-def length(rig: Rig, units: float) -> str:
-    """A length in the space of a rig for people: "0.04 mm", "87 mm", "1.2 m"."""
+def format_length(rig: Rig, units: float) -> str:
+    """Format a length in mesh units: "0.04 mm", "87 mm", "1.2 m"."""
     metres = units * rig.metres_per_unit
     if metres < 1:
         return f"{metres * 1000:.2g} mm" if metres < 0.1 else f"{metres * 1000:.0f} mm"

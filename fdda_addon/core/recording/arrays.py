@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The arrays of a recording: `.npy` files that may be from anyone, mapped from disk after they have been checked."""
+"""Arrays of a recording: untrusted `.npy` files, which are checked before they are memory-mapped."""
 
 import math
 import os
@@ -13,35 +13,35 @@ from ..errors import RecordingError, os_error_text
 from ..input_file import open_input
 from ..skinning import are_invertible
 
-HEADER_ERRORS = (TypeError, SyntaxError, RecursionError, MemoryError, tokenize.TokenError)
-"""What numpy raises beside ValueError for a damaged header of an array, which is the text of a Python dictionary."""
-LARGEST = 1e12
-"""What is larger than this, whatever its unit, overflows when it is squared and summed up."""
-CHECK_BYTES = 64 << 20
-"""Recordings are searched for NaN in pieces of this size."""
+NPY_HEADER_ERRORS = (TypeError, SyntaxError, RecursionError, MemoryError, tokenize.TokenError)
+"""Errors beside ValueError that numpy raises for a damaged header of a `.npy` file."""
+MAX_VALUE = 1e12
+"""Largest absolute value of an element; sums of squares of larger values may overflow."""
+CHECK_CHUNK_BYTES = 64 << 20
+"""Size of the chunks in which arrays are checked for invalid values."""
 POSE_MATRICES = "pose_matrices"
-SHRUNK = "joints that have shrunk to nothing"
-_CHECKS = {
+SINGULAR_JOINTS = "joints that have shrunk to nothing"
+_VALUE_CHECKS = {
     "values that are not numbers": np.isfinite,
-    "values beyond all bounds": lambda values: np.abs(values) <= LARGEST,
-    SHRUNK: are_invertible,
+    "values beyond all bounds": lambda values: np.abs(values) <= MAX_VALUE,
+    SINGULAR_JOINTS: are_invertible,
 }
-"""What poses are searched for, in this order."""
+"""Checks of pose arrays, by the words of their errors."""
 
 
 def array_shapes(
     poses: int, joints: int, vertices: int, influences: int, faces: int = 0, corners: int = 0, controls: int = 0
 ) -> dict[str, tuple[tuple, type]]:
-    """Shape and dtype of each array of a recording, by name.
+    """Return shape and dtype of each array of a recording, by name.
 
     Args:
-        poses, joints, vertices: how many.
-        influences: I of the skin weights.
-        faces, corners: how many; without faces there are no arrays of them.
-        controls: how many; without any there is no array of them.
+        poses, joints, vertices: counts.
+        influences: number of skin weights of a vertex.
+        faces, corners: counts; without faces their arrays are left out.
+        controls: count; without controls their array is left out.
     """
-    of_controls = {"controls": ((poses, controls), np.float32)}
-    of_faces = {"face_starts": ((faces,), np.int32), "face_vertices": ((corners,), np.int32)}
+    control_arrays = {"controls": ((poses, controls), np.float32)}
+    face_arrays = {"face_starts": ((faces,), np.int32), "face_vertices": ((corners,), np.int32)}
     return {
         "rest_positions": ((vertices, 3), np.float32),
         "rest_matrices": ((joints, 4, 4), np.float32),
@@ -49,45 +49,45 @@ def array_shapes(
         "skin_weights": ((vertices, influences), np.float32),
         POSE_MATRICES: ((poses, joints, 4, 4), np.float32),
         "residuals": ((poses, vertices, 3), np.float32),
-        **(of_controls if controls else {}),
-        **(of_faces if faces else {}),
+        **(control_arrays if controls else {}),
+        **(face_arrays if faces else {}),
     }
 
 
 ARRAYS = tuple(array_shapes(1, 1, 1, 1, faces=1, corners=1, controls=1))
-"""Every array that a recording may have."""
+"""Names of all arrays of a recording."""
 STREAMED = (POSE_MATRICES, "residuals", "controls")
-"""The arrays that grow with the poses."""
+"""Names of the arrays with one row per pose."""
 
 
 def streamed_arrays(
     pose_matrices: np.ndarray, residuals: np.ndarray, controls: np.ndarray | None, count: int
 ) -> dict[str, np.ndarray]:
-    """The arrays that poses are added to, by name; `count` is C, without controls there is no array of them."""
-    of_controls = {"controls": controls} if count else {}
-    return {POSE_MATRICES: pose_matrices, "residuals": residuals, **of_controls}
+    """Return the arrays with one row per pose, by name; `count` is the number of controls."""
+    control_arrays = {"controls": controls} if count else {}
+    return {POSE_MATRICES: pose_matrices, "residuals": residuals, **control_arrays}
 
 
 def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -> np.ndarray:
-    """Map an array after its size has been checked against what the index says.
+    """Memory-map an array after its header and size are checked against the index.
 
     Args:
         path: the file.
-        shape, dtype: what its header must say; arrays that grow may have more rows.
-        rows: how many, one or more, must be there and are mapped; all of `shape` when left out.
+        shape, dtype: expected; arrays in `STREAMED` may have more rows.
+        rows: number of rows that must exist and are mapped, at least one; all of `shape` by default.
 
     Raises:
-        RecordingError: it is missing, not a regular file, truncated, or something else.
+        RecordingError: it is missing, not a regular file, truncated, or of another shape or dtype.
     """
     try:
         with open_input(path, follow=False) as file:
             found_shape, found_dtype = _read_header(file)
-            # More poses than the index counts are left by an extension that was interrupted.
+            # An interrupted extension may leave more poses than the index counts.
             longer = path.stem in STREAMED and found_shape[:1] > shape[:1] and found_shape[1:] == shape[1:]
             if not (found_shape == shape or longer) or found_dtype != np.dtype(dtype):
                 raise ValueError(f"it holds {found_shape} {found_dtype}, not {shape} {np.dtype(dtype)}")
             start, mapped = file.tell(), shape if rows is None else (rows, *shape[1:])
-            # math.prod: the counts may be anything, and those of numpy wrap around.
+            # math.prod, because the counts are untrusted and integers of numpy overflow.
             expected = start + math.prod(found_shape if rows is None else mapped) * np.dtype(dtype).itemsize
             size = file.seek(0, os.SEEK_END)
             if size < expected:
@@ -97,7 +97,7 @@ def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -
         raise RecordingError(f"'{path}' cannot be used: {os_error_text(error)}; record again.") from error
     except ValueError as error:
         raise RecordingError(f"'{path}' cannot be used: {error}; record again.") from error
-    except HEADER_ERRORS as error:
+    except NPY_HEADER_ERRORS as error:
         raise RecordingError(f"'{path}' cannot be used: its header is damaged; record again.") from error
 
 
@@ -110,18 +110,21 @@ def _read_header(file: BinaryIO) -> tuple[tuple, np.dtype]:
     return shape, dtype
 
 
-def bad_pose(name: str, array: np.ndarray) -> tuple[int, str] | None:
-    """Where the first of some poses is that no training can use, and what it holds, words; None where there is none.
+def find_invalid_pose(name: str, array: np.ndarray) -> tuple[int, str] | None:
+    """Find the first pose with values that cannot be trained on.
 
     Args:
         name: of the array.
         array: (n, ...) of n poses.
+
+    Returns:
+        Its index and words for the values; None where all poses are valid.
     """
-    step = max(1, CHECK_BYTES // max(1, array[:1].nbytes))
+    step = max(1, CHECK_CHUNK_BYTES // max(1, array[:1].nbytes))
     for start in range(0, len(array), step):
         part = np.asarray(array[start : start + step])
-        for words, check in _CHECKS.items():
-            if words != SHRUNK or name == POSE_MATRICES:
+        for words, check in _VALUE_CHECKS.items():
+            if words != SINGULAR_JOINTS or name == POSE_MATRICES:
                 good = check(part)
                 if not good.all():
                     return start + int(np.flatnonzero(~good.reshape(len(part), -1).all(axis=1))[0]), words

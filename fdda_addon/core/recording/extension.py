@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Appends refined poses to a complete recording, which stays complete at every moment (docs/formats.md)."""
+"""Appending of refined poses to a complete recording, which stays complete throughout (docs/formats.md)."""
 
 import math
 import os
@@ -13,23 +13,21 @@ from .arrays import STREAMED, array_shapes, streamed_arrays
 from .index import REFINED, Source, read_index
 from .lock import RecordingLock
 from .reader import Recording
-from .writer import array_header, check_finite, write_index
+from .writer import array_header, check_pose_values, write_index
 
 
 class RecordingExtension:
-    """Appends poses to a recording; use as a context manager.
+    """Context manager that appends poses to a recording.
 
-    Poses are written behind those that the recording has, then the headers of the arrays, which may say more than the
-    index, and the index last: an interruption at any moment leaves a complete recording, with the poses of every
-    `append` that ended.
+    `append` writes the rows first, then the headers of the arrays, and the index last. So an interruption leaves a
+    complete recording with the poses of every finished `append`.
     """
 
     def __init__(self, recording: Recording, name: str, added: int = 0):
         """Args:
             recording: complete.
-            name: of the model that the poses refine, its file name.
-            added: how many of the last poses of the recording were chosen for the same model, and count with those that
-                are appended now.
+            name: file name of the model that the poses refine.
+            added: number of last poses of the recording that were already added for the same model.
 
         Raises:
             RecordingError: another process writes the recording.
@@ -53,13 +51,13 @@ class RecordingExtension:
                 self._files[streamed] = open_input(self.path / f"{streamed}.npy", "r+b", follow=False)
         except OSError as error:
             self._close()
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
         except RecordingError:
             self._close()
             raise
 
     def _read_index(self) -> dict:
-        """The index as it is now that no other process can change it."""
+        """Read the index again under the lock, and check that no other process has changed it."""
         index = read_index(self.path)
         if index["poses"] != self.complete:
             raise BusyError(
@@ -69,19 +67,19 @@ class RecordingExtension:
         return index
 
     def append(self, pose_matrices: np.ndarray, residuals: np.ndarray, controls: np.ndarray | None = None) -> None:
-        """Add poses.
+        """Append poses.
 
         Args:
             pose_matrices: (n, J, 4, 4), mesh-object space, mesh units.
-            residuals: (n, V, 3), local residuals, mesh units.
+            residuals: (n, V, 3), local residuals, axes of the main joint, mesh units.
             controls: (n, C), where the rig has controls.
 
         Raises:
-            OutputError: the disk is full or went away; the poses before stay complete.
+            OutputError: the disk is full or was disconnected; earlier poses stay complete.
             RecordingError: a value is not finite.
         """
         arrays = streamed_arrays(pose_matrices, residuals, controls, len(self._index["controls"]))
-        check_finite(arrays, self.complete)
+        check_pose_values(arrays, self.complete)
         before = self.complete
         total = before + len(pose_matrices)
         try:
@@ -93,7 +91,7 @@ class RecordingExtension:
             self._write_index()
         except OSError as error:
             self.complete = before
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
 
     def _write(self, name: str, array: np.ndarray) -> None:
         shape, dtype = self._shapes[name]
@@ -125,7 +123,7 @@ class RecordingExtension:
         index = {**self._index, "poses": self.complete, "complete": self.complete, "sampling": sampling}
         write_index(self.path, index)
 
-    def _failed(self, error: OSError) -> OutputError:
+    def _write_error(self, error: OSError) -> OutputError:
         return OutputError(
             f"Cannot add poses to the recording '{self.path}': {os_error_text(error)}; it holds {self.complete} "
             "poses and can be trained on as it is."

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What `record` hands to the trainer to fit skin weights to, and what it gets back: a folder of arrays.
+"""Exchange of poses and fitted skin weights between `record` and the trainer, in a temporary folder of arrays.
 
-It lives as long as the fit. Whatever is read here is checked as if it came from elsewhere.
+All arrays are checked as untrusted input.
 """
 
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from ..input_file import open_input
 from ..rig import Fingerprint, Joint, Rig
 from ..skin_fit import INFLUENCES, are_skin_weights
 from ..skinning import are_invertible
-from .arrays import HEADER_ERRORS
-from .writer import array_header, check_finite
+from .arrays import NPY_HEADER_ERRORS
+from .writer import array_header, check_pose_values
 
 MIN_POSES = 10
-"""Fewer say too little of the weights, as half of them are held out."""
-SHAPES = {
+"""Smallest number of poses, half of which are held out."""
+ARRAY_SHAPES = {
     "pose_matrices": ("n", "J", 4, 4),
     "positions": ("n", "V", 3),
     "rest_matrices": ("J", 4, 4),
@@ -29,37 +29,37 @@ SHAPES = {
     "skin_weights": ("V", "I"),
     "parents": ("J",),
 }
-INTEGERS = ("skin_joints", "parents")
+INTEGER_ARRAYS = ("skin_joints", "parents")
 STREAMED = ("pose_matrices", "positions")
 
 
 @dataclass(frozen=True)
 class FitPoses:
-    """Poses to fit skin weights to.
+    """Poses to which skin weights are fitted.
 
     Attributes:
-        rig: with the weights of its own. Its joints have no names here.
+        rig: with its own skin weights; its joints have no names.
         pose_matrices: (n, J, 4, 4) float32, mesh-object space, mesh units.
-        positions: (n, V, 3) float32, what the rig evaluates to, mesh-object space, mesh units; may be a memory map.
+        positions: (n, V, 3) float32, evaluated by the rig, mesh-object space, mesh units; may be a memory map.
     """
 
     rig: Rig
     pose_matrices: np.ndarray
     positions: np.ndarray
 
-    def part(self, poses: slice) -> "FitPoses":
-        """Some of the poses."""
+    def subset(self, poses: slice) -> "FitPoses":
+        """Return a slice of the poses."""
         return FitPoses(self.rig, self.pose_matrices[poses], self.positions[poses])
 
 
 class FitPosesWriter:
-    """Writes poses into a folder, one by one; use as a context manager. All that were announced must be appended."""
+    """Context manager that writes a fixed number of poses into a folder, one by one."""
 
     def __init__(self, folder: Path, rig: Rig, count: int):
         """Args:
-            folder: empty.
-            rig: with the weights of its own.
-            count: number of poses.
+            folder: an empty folder.
+            rig: with its own skin weights.
+            count: number of poses that will be appended.
 
         Raises:
             OutputError: the folder cannot be written.
@@ -68,32 +68,32 @@ class FitPosesWriter:
         self._shapes = {"pose_matrices": (len(rig.joints), 4, 4), "positions": (rig.vertex_count, 3)}
         self._files = {}
         try:
-            for name in SHAPES.keys() - set(STREAMED):
+            for name in ARRAY_SHAPES.keys() - set(STREAMED):
                 np.save(folder / f"{name}.npy", getattr(rig, name).astype(_dtype(name)), allow_pickle=False)
             for name, shape in self._shapes.items():
                 self._files[name] = open(folder / f"{name}.npy", "wb")  # noqa: SIM115 - __exit__
                 self._files[name].write(array_header((count, *shape), np.float32))
         except OSError as error:
             self.close()
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
 
     def append(self, pose_matrices: np.ndarray, positions: np.ndarray) -> None:
-        """Add a pose: (J, 4, 4) and (V, 3), as in `FitPoses`.
+        """Append a pose: (J, 4, 4) and (V, 3), as in `FitPoses`.
 
         Raises:
             OutputError: the disk is full.
             RecordingError: a value is not finite.
         """
         arrays = {"pose_matrices": pose_matrices[None], "positions": positions[None]}
-        check_finite(arrays, self._done)
+        check_pose_values(arrays, self._done)
         self._done += 1
         try:
             for name, array in arrays.items():
                 self._files[name].write(np.ascontiguousarray(array, np.float32).data)
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
 
-    def _failed(self, error: OSError) -> OutputError:
+    def _write_error(self, error: OSError) -> OutputError:
         return OutputError(
             f"Cannot write the poses to fit into '{self._folder}': {os_error_text(error)}; make room there."
         )
@@ -115,46 +115,48 @@ class FitPosesWriter:
             self.close()
         except OSError as error:
             if kind is None:
-                raise self._failed(error) from error
+                raise self._write_error(error) from error
 
 
 def read_fit_poses(folder: Path) -> FitPoses:
-    """Read what `FitPosesWriter` wrote; the positions are a memory map.
+    """Read the poses that `FitPosesWriter` wrote; the positions are a memory map.
 
     Raises:
-        RecordingError: something is missing, damaged, or contradicts the rest.
+        RecordingError: an array is missing, damaged, or contradicts the others.
     """
-    arrays = {name: _read_array(folder / f"{name}.npy", len(shape), _dtype(name)) for name, shape in SHAPES.items()}
+    arrays = {
+        name: _read_array(folder / f"{name}.npy", len(shape), _dtype(name)) for name, shape in ARRAY_SHAPES.items()
+    }
     sizes: dict[str, int] = {}
-    for name, shape in SHAPES.items():
+    for name, shape in ARRAY_SHAPES.items():
         for expected, found in zip(shape, arrays[name].shape, strict=True):
-            wanted = sizes.setdefault(expected, found) if isinstance(expected, str) else expected
-            if found != wanted or not found:
-                raise _damaged(folder, f"{name} has the shape {arrays[name].shape}")
+            size = sizes.setdefault(expected, found) if isinstance(expected, str) else expected
+            if found != size or not found:
+                raise _damaged_error(folder, f"{name} has the shape {arrays[name].shape}")
     if sizes["n"] < MIN_POSES:
-        raise _damaged(folder, f"they are {sizes['n']}, and a fit takes {MIN_POSES}")
-    for name in SHAPES.keys() - {"positions"}:
+        raise _damaged_error(folder, f"they are {sizes['n']}, and a fit takes {MIN_POSES}")
+    for name in ARRAY_SHAPES.keys() - {"positions"}:
         arrays[name] = np.array(arrays[name])
     for name, array in arrays.items():
         if not all(np.isfinite(row).all() for row in array):
-            raise _damaged(folder, f"{name} holds values that are not numbers")
+            raise _damaged_error(folder, f"{name} holds values that are not numbers")
     parents, joints, weights = arrays["parents"], arrays["skin_joints"], arrays["skin_weights"]
     if (parents < -1).any() or (parents >= np.arange(sizes["J"])).any():
-        raise _damaged(folder, "a joint comes before its parent")
+        raise _damaged_error(folder, "a joint comes before its parent")
     if joints.min() < 0 or joints.max() >= sizes["J"] or weights.min() < 0:
-        raise _damaged(folder, "the skin weights name no joints")
+        raise _damaged_error(folder, "the skin weights name no joints")
     if not are_invertible(arrays["rest_matrices"]).all():
-        raise _damaged(folder, "a rest matrix is singular")
+        raise _damaged_error(folder, "a rest matrix is singular")
     rig = Rig(
-        tuple(Joint(str(number), int(parent)) for number, parent in enumerate(parents)),
+        tuple(Joint(str(index), int(parent)) for index, parent in enumerate(parents)),
         *(arrays[name] for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights")),
         Fingerprint("", "", ""),
     )
     return FitPoses(rig, arrays["pose_matrices"], arrays["positions"])
 
 
-def write_fitted(folder: Path, joints: np.ndarray, weights: np.ndarray) -> None:
-    """Put fitted weights in the place of the rig's own: (V, 4) int32 joints and (V, 4) float32 weights.
+def write_fitted_weights(folder: Path, joints: np.ndarray, weights: np.ndarray) -> None:
+    """Write fitted skin weights: (V, 4) int32 joints and (V, 4) float32 weights.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -166,8 +168,8 @@ def write_fitted(folder: Path, joints: np.ndarray, weights: np.ndarray) -> None:
         raise OutputError(f"Cannot write the fitted weights into '{folder}': {os_error_text(error)}.") from error
 
 
-def read_fitted(folder: Path, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """The fitted weights: (V, 4) int32 joints and (V, 4) float32 weights, each row summing to 1.
+def read_fitted_weights(folder: Path, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+    """Read fitted skin weights: (V, 4) int32 joints and (V, 4) float32 weights, each row summing to 1.
 
     Raises:
         RecordingError: they are missing, damaged, or not of this rig.
@@ -177,31 +179,31 @@ def read_fitted(folder: Path, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
         for name, dtype in (("joints", np.int32), ("weights", np.float32))
     )
     if not joints.shape == weights.shape == (rig.vertex_count, INFLUENCES):
-        raise _damaged(folder, f"the fitted weights have the shapes {joints.shape} and {weights.shape}")
+        raise _damaged_error(folder, f"the fitted weights have the shapes {joints.shape} and {weights.shape}")
     if not are_skin_weights(joints, weights, len(rig.joints)):
-        raise _damaged(folder, "the fitted weights are no weights")
+        raise _damaged_error(folder, "the fitted weights are no weights")
     return joints, weights
 
 
 def _dtype(name: str) -> type:
-    return np.int32 if name in INTEGERS else np.float32
+    return np.int32 if name in INTEGER_ARRAYS else np.float32
 
 
 def _read_array(path: Path, dimensions: int, dtype: type) -> np.ndarray:
-    """Map an array; numpy checks the file's size against its header."""
+    """Memory-map an array; numpy checks the file's size against its header."""
     try:
-        # A pipe in its place would block.
+        # A pipe would block.
         open_input(path, follow=False).close()
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except OSError as error:
-        raise _damaged(path.parent, f"'{path.name}' cannot be read ({os_error_text(error)})") from error
-    except (ValueError, *HEADER_ERRORS) as error:
-        raise _damaged(path.parent, f"'{path.name}' is no array, or truncated") from error
-    # A zip file of arrays is none either.
+        raise _damaged_error(path.parent, f"'{path.name}' cannot be read ({os_error_text(error)})") from error
+    except (ValueError, *NPY_HEADER_ERRORS) as error:
+        raise _damaged_error(path.parent, f"'{path.name}' is no array, or truncated") from error
+    # np.load also reads zip files of arrays.
     if not isinstance(array, np.ndarray) or array.ndim != dimensions or array.dtype != dtype:
-        raise _damaged(path.parent, f"'{path.name}' holds something else")
+        raise _damaged_error(path.parent, f"'{path.name}' holds something else")
     return array
 
 
-def _damaged(folder: Path, what: str) -> RecordingError:
-    return RecordingError(f"The poses in '{folder}' cannot be fitted: {what}; record again.")
+def _damaged_error(folder: Path, reason: str) -> RecordingError:
+    return RecordingError(f"The poses in '{folder}' cannot be fitted: {reason}; record again.")

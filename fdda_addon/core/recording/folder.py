@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is in the folder of a recording: said before anything is recorded, and removed on request."""
+"""State of the folder of a recording, and removal of a recording."""
 
 import enum
 import os
@@ -9,40 +9,40 @@ from pathlib import Path
 
 from ..errors import OutputError, RecordingError, os_error_text
 from ..rig import Fingerprint, Rig, read_joints, rig_differences
+from .folder_check import is_available, is_recording, remove_recording_files
 from .index import INDEX, REFINED, read_index, read_info
 from .lock import RecordingLock
-from .place import is_free, is_recording, remove_files
-from .writer import different_keys
+from .writer import find_different_keys
 
-SETTINGS = {"limits": "range of motion", "sources": "number of poses or actions", "fit": "linear skinning"}
-"""What people call the keys of a sampling."""
+SETTING_LABELS = {"limits": "range of motion", "sources": "number of poses or actions", "fit": "linear skinning"}
+"""Labels of sampling keys in messages."""
 
 
 class FolderState(enum.Enum):
-    """What a folder holds."""
+    """State of a recording folder."""
 
     FREE = "free"
-    """Nothing: it can be recorded into."""
+    """Empty or missing: it can be recorded into."""
     INCOMPLETE = "incomplete"
-    """A recording of this rig with these settings that was broken off."""
+    """An interrupted recording of this rig with these settings."""
     COMPLETE = "complete"
     """A recording of this rig."""
     OTHER = "other"
     """A recording of another rig, or an incomplete one with other settings."""
     FOREIGN = "foreign"
-    """Something else, or a recording that cannot be read."""
+    """Other files, or a recording that cannot be read."""
 
 
 @dataclass(frozen=True)
 class FolderContent:
-    """What a folder holds.
+    """Content of a recording folder.
 
     Attributes:
-        state: in short.
-        complete, poses: of the recording in it, how many there are and how many there will be.
-        sentence: where it is not as it should be.
-        measured: sentences of what was measured with the poses: the gain of fitted weights, two ways to the same pose.
-        is_recording: there is a recording in it, however damaged, that can be removed.
+        state: of the folder.
+        complete, poses: number of complete poses and of all poses of the recording.
+        sentence: describes a problem; may be empty.
+        measured: sentences about fitted weights and about the repeatability of the target.
+        is_recording: the folder has a recording, possibly damaged, that can be removed.
     """
 
     state: FolderState
@@ -59,18 +59,18 @@ def read_folder(
     """Look into the folder of a recording.
 
     Args:
-        path: the folder, which need not exist.
-        rig: the rig at hand; None leaves the comparison out.
-        sampling: `Sampling.to_json` of what would be recorded; None leaves the comparison out.
-        fit_linear: kind of the skin weights that would be fitted, empty for the rig's own; None leaves it out.
+        path: the folder, which may be missing.
+        rig: the rig to compare with; None skips the comparison.
+        sampling: `Sampling.to_json` to compare with; None skips the comparison.
+        fit_linear: kind of fitted skin weights, empty for the rig's own; None skips the comparison.
     """
-    content = _content(path, rig, sampling, fit_linear)
+    content = _read_content(path, rig, sampling, fit_linear)
     return replace(content, is_recording=content.state is not FolderState.FREE and is_recording(path))
 
 
-def _content(path: Path, rig: Rig | None, sampling: dict | None, fit_linear: str | None) -> FolderContent:
+def _read_content(path: Path, rig: Rig | None, sampling: dict | None, fit_linear: str | None) -> FolderContent:
     if not os.path.exists(path / INDEX):
-        if not is_free(path):
+        if not is_available(path):
             return FolderContent(FolderState.FOREIGN, sentence=f"'{path.name}' is not an empty folder; choose another.")
         return FolderContent(FolderState.FREE)
     try:
@@ -84,12 +84,12 @@ def _content(path: Path, rig: Rig | None, sampling: dict | None, fit_linear: str
             *counts,
             f"'{path.name}' holds a recording of another rig: {'; '.join(found)}. Choose another folder, or remove it.",
         )
-    found = different_keys(_as_recorded_first(index["sampling"]), sampling) if sampling is not None else []
+    found = find_different_keys(_without_refined(index["sampling"]), sampling) if sampling is not None else []
     info = read_info(index)
     fit = info.fit
     if fit_linear is not None and fit_linear != (fit.kind if fit else ""):
         found.append("fit")
-    names = ", ".join(sorted({SETTINGS.get(key.partition(".")[0], key) for key in found}))
+    names = ", ".join(sorted({SETTING_LABELS.get(key.partition(".")[0], key) for key in found}))
     if counts[0] == counts[1]:
         sentence = f"It was recorded with other settings than those above: {names}." if found else ""
         measured = tuple(part.sentence() for part in (fit, info.repeatability) if part)
@@ -105,26 +105,26 @@ def _content(path: Path, rig: Rig | None, sampling: dict | None, fit_linear: str
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """The recordings that lie in a folder, each in a folder of its own; none where the folder is a recording itself."""
+    """List the recordings in the subfolders of a folder; empty where the folder is a recording itself."""
     if os.path.exists(folder / INDEX) or not os.path.isdir(folder):
         return []
     return sorted(path for path in folder.iterdir() if os.path.isfile(path / INDEX))
 
 
-def _as_recorded_first(sampling: dict) -> dict:
-    """A sampling without the poses that were added where a model was worst."""
+def _without_refined(sampling: dict) -> dict:
+    """Return a sampling without refined poses."""
     return {**sampling, "sources": [source for source in sampling["sources"] if source["kind"] != REFINED]}
 
 
 def _differences(index: dict, rig: Rig) -> list[str]:
     joints = read_joints(index["joints"])
     fingerprint = Fingerprint.from_json(index["rig"]["fingerprint"])
-    # The rest pose of the joints is in an array; what differs there is found when the recording is used.
+    # The rest matrices are in an array and are compared when the recording is used.
     return rig_differences(joints, rig.rest_matrices, index["vertices"], fingerprint, rig)
 
 
 def remove_recording(path: Path) -> None:
-    """Remove the files of a recording, and its folder when nothing else is in it.
+    """Remove the files of a recording, and its folder where it is empty then.
 
     Raises:
         RecordingError: there is no recording, or another process writes it.
@@ -135,9 +135,9 @@ def remove_recording(path: Path) -> None:
     lock = RecordingLock(path)
     try:
         lock.acquire()
-        remove_files(path)
+        remove_recording_files(path)
         lock.release()
-        # It stays where something is in it, or another program has it open.
+        # The folder stays where it has other files, or another program has it open.
         with suppress(OSError):
             path.rmdir()
     except OSError as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The index of a recording, `recording.json`: what it says beside the arrays, read and checked."""
+"""The index of a recording, `recording.json`."""
 
 import json
 import math
@@ -22,22 +22,22 @@ VERSION = 1
 INDEX = "recording.json"
 MAX_INDEX_BYTES = 16 << 20
 MAX_INFLUENCES = 1000
-"""Places for skin weights of a vertex."""
+"""Largest number of skin weights of a vertex."""
 RANDOM, ACTION, STRIP, MIRRORED = "random", "action", "strip", "mirrored"
-"""Kinds of the poses that a recording is made of: drawn at random, frames of an action, frames of a strip of the NLA,
-and the frames of the source before, left and right exchanged."""
+"""Kinds of sources of poses: random poses, frames of an action, frames of an NLA strip, and the mirrored frames of the
+previous source."""
 REFINED = "refined"
-"""Kind of the poses that were added where a model was worst: no sample of the range of motion, so never held out."""
+"""Kind of poses added where a model was worst. They do not represent the range of motion and are never held out."""
 KINDS = (RANDOM, ACTION, STRIP, MIRRORED, REFINED)
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where poses of a recording came from.
+    """A source of consecutive poses of a recording.
 
     Attributes:
         kind: `RANDOM`, `ACTION`, `STRIP`, `MIRRORED` or `REFINED`.
-        poses: how many.
+        poses: number of poses.
         name: of the action or strip, mirrored or not; file name of the model that refined poses were chosen for; empty
             for random poses.
         frames: first frame of the action or strip and the step between poses, (0, 0) for other poses.
@@ -51,7 +51,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Sampling:
-    """How the poses were chosen; `margin` is of random poses around the range of motion, where there are any."""
+    """How poses are chosen; `margin` describes random poses outside of the range of motion and may be None."""
 
     seed: int
     spread: float
@@ -71,12 +71,19 @@ class Sampling:
 
 @dataclass(frozen=True)
 class RecordingInfo:
-    """What `recording.json` says beside the arrays.
+    """Counts and origin of a recording, from `recording.json`.
 
-    `fit` is there where the skin weights are not the rig's own, `shard` where the poses are a part of those of a plan:
-    `sampling` is that of the whole plan then. `target` is there where the surface is another object's; `unsettled` are
-    numbers of poses, ascending, in which it did not come to rest, and `repeatability` is there where poses were
-    approached from two directions.
+    Attributes:
+        poses, complete: number of all poses and of complete ones.
+        rig_file, object_name: names of the .blend file and of the mesh object.
+        blender: version of Blender.
+        sampling: of the poses; of a shard, the sampling of all shards together.
+        fit: of the skin weights; None where they are the rig's own.
+        shard: which poses the recording has; None for all.
+        target: whose surface was recorded; None for the rig itself.
+        unsettled: ascending indices of the poses in which the target did not come to rest.
+        repeatability: of the target; None where it was not measured.
+
     """
 
     poses: int
@@ -100,7 +107,7 @@ def read_index(path: Path) -> dict:
     """
     index_path = path / INDEX
     try:
-        # JSON has no infinity, but Python reads it.
+        # Python reads NaN and infinity, which JSON does not have.
         constants: list[str] = []
         data = read_input(index_path, MAX_INDEX_BYTES, follow=False)
         index = json.loads(data, parse_constant=lambda name: constants.append(name) or float(name.lower()))
@@ -144,15 +151,15 @@ def _check_index(index: dict) -> None:
     controls = read_controls(index["controls"])
     for text in (index["blender"], index["rig"]["file"], index["rig"]["object"]):
         if not isinstance(text, str):
-            raise TypeError(f"{text!r} stands where text belongs")
+            raise TypeError(f"{text!r} is not a string")
     joints = len(read_joints(index["joints"]))
     if not isinstance(index["partitions"], list):
         raise TypeError("its partitions are not a list")
     for partition in index["partitions"]:
-        _check_numbers([partition["joint"]], "joint", joints)
-        _check_numbers(partition["influencing"], "joint", joints)
-        _check_numbers(partition.get("merged", []), "joint", joints)
-        _check_numbers(partition.get("controls", []), "control", len(controls))
+        _check_indices([partition["joint"]], "joint", joints)
+        _check_indices(partition["influencing"], "joint", joints)
+        _check_indices(partition.get("merged", []), "joint", joints)
+        _check_indices(partition.get("controls", []), "control", len(controls))
     Fingerprint.from_json(index["rig"]["fingerprint"])
     read_unit(index)
     if "fit" in index:
@@ -163,22 +170,22 @@ def _check_index(index: dict) -> None:
         RecordedTarget.from_json(index["target"])
     if "repeatability" in index:
         Repeatability.from_json(index["repeatability"], index["complete"])
-    _check_numbers(index.get("unsettled", []), "unsettled pose", index["complete"], "it")
-    _sampling(index["sampling"])
+    _check_indices(index.get("unsettled", []), "unsettled pose", index["complete"], "it")
+    _read_sampling(index["sampling"])
 
 
-def _check_numbers(values: list, what: str, count: int, owner: str = "a partition") -> None:
-    """Fail where values are not a list of different indices below a count."""
+def _check_indices(values: list, noun: str, count: int, owner: str = "a partition") -> None:
+    """Raise TypeError or ValueError where values are not a list of different indices below a count."""
     if not isinstance(values, list):
-        raise TypeError(f"{owner} has {what}s that are not a list")
+        raise TypeError(f"{owner} has {noun}s that are not a list")
     for value in values:
         if type(value) is not int or not 0 <= value < count:
-            raise ValueError(f"{owner} has {what} {value!r} of {count}")
+            raise ValueError(f"{owner} has {noun} {value!r} of {count}")
     if len(set(values)) != len(values):
-        raise ValueError(f"{owner} has the same {what} twice")
+        raise ValueError(f"{owner} has the same {noun} twice")
 
 
-def _sampling(value: dict) -> Sampling:
+def _read_sampling(value: dict) -> Sampling:
     seed, spread = value["seed"], value["spread"]
     if type(seed) is not int or seed < 0:
         raise ValueError(f"its seed is {seed!r}")
@@ -186,7 +193,7 @@ def _sampling(value: dict) -> Sampling:
         raise ValueError(f"its spread is {spread!r}")
     if not isinstance(value["limits"], list) or not isinstance(value["sources"], list):
         raise TypeError("its range of motion or its sources are not a list")
-    sources = tuple(_source(source) for source in value["sources"])
+    sources = tuple(_read_source(source) for source in value["sources"])
     margin = Margin.from_json(value["margin"]) if "margin" in value else None
     random = sum(source.poses for source in sources if source.kind == RANDOM)
     if margin and margin.poses > random:
@@ -195,7 +202,7 @@ def _sampling(value: dict) -> Sampling:
     return Sampling(seed, float(spread), channels, sources, margin)
 
 
-def _source(value: dict) -> Source:
+def _read_source(value: dict) -> Source:
     source = Source(value["kind"], value["poses"], read_name(value["name"]), tuple(value["frames"]))
     if source.kind not in KINDS:
         raise ValueError(f"a source is of the kind {source.kind!r}")
@@ -207,14 +214,14 @@ def _source(value: dict) -> Source:
 
 
 def read_info(index: dict) -> RecordingInfo:
-    """What an index says beside the arrays."""
+    """Return the counts and the origin of a recording from its index."""
     return RecordingInfo(
         index["poses"],
         index["complete"],
         index["rig"]["file"],
         index["rig"]["object"],
         index["blender"],
-        _sampling(index["sampling"]),
+        _read_sampling(index["sampling"]),
         SkinFit.from_json(index["fit"]) if "fit" in index else None,
         Shard.from_json(index["shard"], index["poses"]) if "shard" in index else None,
         RecordedTarget.from_json(index["target"]) if "target" in index else None,

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One writer at a time for a recording: a file in its folder that the writer has locked.
+"""Lock file of a recording folder, which permits one writer at a time.
 
-The operating system keeps the lock, as for the locks of the package `filelock`: it ends with the process however that
-ends, and nothing depends on what the file says. That is only for the sentence that the other process is told.
+The operating system holds the lock, as in the package `filelock`, and releases it when the process ends. The content
+of the file only names the owner in messages.
 """
 
 import contextlib
@@ -17,17 +17,17 @@ from pathlib import Path
 from ..errors import BusyError
 
 LOCK = "recording.lock"
-MAX_BYTES = 1000
-_FLAGS = (getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
-_OPEN = os.O_RDWR | os.O_CREAT | sum(_FLAGS)
+MAX_OWNER_BYTES = 1000
+_OPTIONAL_FLAGS = (getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
+_OPEN_FLAGS = os.O_RDWR | os.O_CREAT | sum(_OPTIONAL_FLAGS)
 LOCKED_BYTE = 1 << 30
-"""Windows lets nobody read what is locked: a byte that no file has."""
+"""Windows denies reading of locked bytes, so a byte past the end of the file is locked."""
 
-_held: set[Path] = set()
+_held_locks: set[Path] = set()
 
 
 class RecordingLock:
-    """The right to write into a folder, from `acquire` to `release`."""
+    """Lock of a folder for writing, from `acquire` to `release`."""
 
     def __init__(self, folder: Path):
         self._folder = folder
@@ -39,14 +39,14 @@ class RecordingLock:
         return self._handle >= 0
 
     def acquire(self) -> None:
-        """Take the lock; a file that a process has left behind which is gone is no lock.
+        """Acquire the lock; a file left by a process that has ended does not count.
 
         Raises:
-            BusyError: another process has it.
-            OSError: the folder cannot be written, or its disk knows no locks.
+            BusyError: another process holds the lock.
+            OSError: the folder cannot be written, or its file system has no locks.
         """
         while True:
-            handle = os.open(self._path, _OPEN, 0o666)
+            handle = os.open(self._path, _OPEN_FLAGS, 0o666)
             try:
                 if not stat.S_ISREG(os.fstat(handle).st_mode):
                     raise OSError(errno.EINVAL, f"'{LOCK}' is not a regular file")
@@ -55,26 +55,26 @@ class RecordingLock:
                         f"{self._owner(handle)} is recording into '{self._folder}'; wait for it, or choose another "
                         "folder."
                     )
-                if self._is_in_place(handle):
+                if self._is_current_file(handle):
                     break
             except BaseException:
                 os.close(handle)
                 raise
-            # Whoever had it has removed the file meanwhile.
+            # The previous owner has removed the file in the meantime.
             os.close(handle)
         self._handle = handle
-        _held.add(self._path)
-        # On a full disk the lock holds too.
+        _held_locks.add(self._path)
+        # The lock does not depend on the content, which a full disk may refuse.
         with contextlib.suppress(OSError):
             os.ftruncate(handle, 0)
             os.write(handle, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
 
     def release(self) -> None:
-        """Give the lock back, if this has it."""
+        """Release the lock, if it is held."""
         if not self.is_held:
             return
-        _held.discard(self._path)
-        # While it is locked: nobody else's file can be there. Windows removes no open file.
+        _held_locks.discard(self._path)
+        # While the lock is held, the file is this one. Windows does not remove open files.
         with contextlib.suppress(OSError):
             self._path.unlink()
         os.close(self._handle)
@@ -83,19 +83,19 @@ class RecordingLock:
             with contextlib.suppress(OSError):
                 self._path.unlink()
 
-    def _is_in_place(self, handle: int) -> bool:
+    def _is_current_file(self, handle: int) -> bool:
         try:
             return os.path.samestat(os.fstat(handle), os.lstat(self._path))
         except FileNotFoundError:
             return False
 
     def _owner(self, handle: int) -> str:
-        """Who has the lock, for a sentence."""
-        if self._path in _held:
+        """Return words for the owner of the lock."""
+        if self._path in _held_locks:
             return "This Blender"
         try:
             os.lseek(handle, 0, os.SEEK_SET)
-            owner = json.loads(os.read(handle, MAX_BYTES))
+            owner = json.loads(os.read(handle, MAX_OWNER_BYTES))
             pid, host = int(owner["pid"]), str(owner["host"])[:80]
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             return "Another process"
@@ -103,7 +103,7 @@ class RecordingLock:
 
 
 def _lock(handle: int) -> bool:
-    """Lock an open file; False when somebody else has."""
+    """Lock an open file; return False where another process holds the lock."""
     if sys.platform == "win32":
         import msvcrt
 

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The recording: a folder of poses and local residuals. docs/formats.md describes the format.
+"""Reading of a recording, a folder of poses and local residuals. docs/formats.md describes the format.
 
-`recording.json` says how many poses are complete: an array file may be longer than that, and what lies behind it is
-never read. `writer` writes it.
+`recording.json` has the number of complete poses; an array file may have more rows, which are never read.
 """
 
 from dataclasses import dataclass
@@ -18,24 +17,24 @@ from ..skin_fit import are_skin_weights
 from ..skinning import are_invertible
 from ..surface import are_faces
 from ..unit import read_unit
-from .arrays import LARGEST, STREAMED, array_shapes, bad_pose, open_array
+from .arrays import MAX_VALUE, STREAMED, array_shapes, find_invalid_pose, open_array
 from .index import RecordingInfo, read_index, read_info
 
-BLOCK_VERTICES = 1 << 16
-"""Skin weights are checked so many vertices at a time, before they take memory."""
+CHECK_BLOCK_VERTICES = 1 << 16
+"""Number of vertices whose skin weights are checked at once, to bound the memory."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A complete recording, its large arrays mapped from disk.
+    """A complete recording with memory-mapped arrays.
 
     Attributes:
         path: the folder.
-        info: counts and where it came from.
-        rig: the rig it was made of.
+        info: counts and origin.
+        rig: the recorded rig.
         partitions: with their influencing joints.
         pose_matrices: (N, J, 4, 4) float32, mesh-object space, mesh units.
-        residuals: (N, V, 3) float32, local residuals, mesh units.
+        residuals: (N, V, 3) float32, local residuals, axes of the main joint, mesh units.
         controls: (N, C) float32, values of the controls of the rig, each in the unit of its property.
     """
 
@@ -59,11 +58,11 @@ def read_recording(path: Path) -> Recording:
     poses, shard = recording.info.poses, recording.info.shard
     if shard:
         raise RecordingError(
-            f"'{path}' is a shard of a recording ({shard.in_words(poses)}); give all shards to merge-recordings, and "
-            "go on with the recording that it makes."
+            f"'{path}' is a shard of a recording ({shard.format_range(poses)}); give all shards to merge-recordings, "
+            "and go on with the recording that it makes."
         )
     if not poses:
-        raise _incomplete(path, 0, 0)
+        raise _incomplete_error(path, 0, 0)
     for name in STREAMED:
         check_poses(path, name, getattr(recording, name))
     if sum(source.poses for source in recording.info.sampling.sources) != poses:
@@ -74,15 +73,15 @@ def read_recording(path: Path) -> Recording:
 
 
 def open_recording(path: Path) -> Recording:
-    """As `read_recording`, also of a shard, and one without poses; the large arrays are not read.
+    """Open a recording or shard, possibly without poses, without reading its large arrays.
 
     Raises:
-        RecordingError: as `read_recording`, except that poses may be none that can be trained on.
+        RecordingError: as `read_recording`, but values of poses are not checked.
     """
     index = read_index(path)
     if index["complete"] < index["poses"]:
-        raise _incomplete(path, index["complete"], index["poses"])
-    arrays = {name: open_array(path / f"{name}.npy", *what) for name, what in _shapes(index).items()}
+        raise _incomplete_error(path, index["complete"], index["poses"])
+    arrays = {name: open_array(path / f"{name}.npy", *what) for name, what in _array_shapes(index).items()}
     joints = read_joints(index["joints"])
     _check_rest(path, arrays, len(joints))
     rig = Rig(
@@ -102,14 +101,14 @@ def open_recording(path: Path) -> Recording:
     return Recording(path, read_info(index), rig, partitions, *(arrays[name] for name in STREAMED))
 
 
-def _incomplete(path: Path, complete: int, poses: int) -> RecordingError:
+def _incomplete_error(path: Path, complete: int, poses: int) -> RecordingError:
     return RecordingError(
         f"The recording '{path}' is incomplete: {complete} of {poses} poses; finish it with record --resume."
     )
 
 
 def read_recorded_skin(path: Path, index: dict) -> tuple[np.ndarray, np.ndarray]:
-    """The skin weights of a recording, complete or not; `index` is what `read_index` gave.
+    """Read the skin weights of a recording, complete or not; `index` is from `read_index`.
 
     Returns:
         (V, I) int32 joints and (V, I) float32 weights.
@@ -127,8 +126,8 @@ def read_recorded_skin(path: Path, index: dict) -> tuple[np.ndarray, np.ndarray]
     return joints, weights
 
 
-def partitions_json(partitions: tuple[Partition, ...]) -> list[dict]:
-    """Partitions as `recording.json` has them."""
+def partitions_to_json(partitions: tuple[Partition, ...]) -> list[dict]:
+    """Return the JSON of partitions for `recording.json`."""
     return [
         {
             "joint": partition.joint,
@@ -141,7 +140,7 @@ def partitions_json(partitions: tuple[Partition, ...]) -> list[dict]:
 
 
 def read_partitions(rig: Rig, values: list[dict]) -> tuple[Partition, ...]:
-    """The partitions of a rig with what `partitions_json` says of them."""
+    """Make the partitions of a rig from their JSON (`partitions_to_json`)."""
     return make_partitions(
         rig,
         {value["joint"]: tuple(value["influencing"]) for value in values},
@@ -151,33 +150,33 @@ def read_partitions(rig: Rig, values: list[dict]) -> tuple[Partition, ...]:
 
 
 def check_poses(path: Path, name: str, array: np.ndarray) -> None:
-    """Fail where poses of a recording cannot be trained on; `name` and `array` as for `bad_pose`.
+    """Check poses of a recording with `find_invalid_pose`, which describes `name` and `array`.
 
     Raises:
-        RecordingError: names the first of them.
+        RecordingError: a pose has invalid values.
     """
-    if (bad := bad_pose(name, array)) is not None:
+    if (bad := find_invalid_pose(name, array)) is not None:
         pose, words = bad
         raise RecordingError(f"The recording '{path}' holds {words} ({name}, pose {pose}); record again.")
 
 
 def check_resumable(path: Path) -> None:
-    """Fail before the work where a recording cannot be gone on with, complete or not.
+    """Check before the work that a recording, complete or not, can be resumed.
 
     Raises:
-        RecordingError: as `read_recording`, of what is complete of it.
+        RecordingError: as `read_recording`, for the complete poses.
     """
     index = read_index(path)
     if not index["complete"]:
         return
-    for name, (shape, dtype) in _shapes(index).items():
+    for name, (shape, dtype) in _array_shapes(index).items():
         if name in STREAMED:
             check_poses(path, name, open_array(path / f"{name}.npy", shape, dtype, index["complete"]))
         else:
             open_array(path / f"{name}.npy", shape, dtype)
 
 
-def _shapes(index: dict) -> dict[str, tuple[tuple, type]]:
+def _array_shapes(index: dict) -> dict[str, tuple[tuple, type]]:
     return array_shapes(
         *(index["poses"], len(index["joints"]), index["vertices"], index["influences"]),
         *(index.get(key, 0) for key in ("faces", "corners")),
@@ -186,12 +185,12 @@ def _shapes(index: dict) -> dict[str, tuple[tuple, type]]:
 
 
 def _check_rest(path: Path, arrays: dict[str, np.ndarray], joints: int) -> None:
-    """Fail where rest pose and skin weights are none."""
+    """Raise RecordingError where rest pose or skin weights are invalid."""
     rest, positions = arrays["rest_matrices"], arrays["rest_positions"]
-    good = bool((np.abs(rest) <= LARGEST).all()) and bool(are_invertible(rest).all())
-    for start in range(0, len(positions), BLOCK_VERTICES):
-        block = slice(start, start + BLOCK_VERTICES)
-        good = good and bool((np.abs(positions[block]) <= LARGEST).all())
-        good = good and are_skin_weights(arrays["skin_joints"][block], arrays["skin_weights"][block], joints)
-    if not good:
+    is_valid = bool((np.abs(rest) <= MAX_VALUE).all()) and bool(are_invertible(rest).all())
+    for start in range(0, len(positions), CHECK_BLOCK_VERTICES):
+        block = slice(start, start + CHECK_BLOCK_VERTICES)
+        is_valid = is_valid and bool((np.abs(positions[block]) <= MAX_VALUE).all())
+        is_valid = is_valid and are_skin_weights(arrays["skin_joints"][block], arrays["skin_weights"][block], joints)
+    if not is_valid:
         raise RecordingError(f"The rest pose or skin weights of '{path}' are damaged; record again.")

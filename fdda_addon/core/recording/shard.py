@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A part of a recording: some of the poses of its plan, so that machines can record them at the same time."""
+"""Shards of a recording: ranges of its poses, which several machines can record at the same time."""
 
 from dataclasses import dataclass
 
@@ -8,11 +8,11 @@ MAX_SHARDS = 100_000
 
 @dataclass(frozen=True)
 class Shard:
-    """Which poses of a plan a recording has: `first` and those that follow, as many as its index says.
+    """Range of poses that a shard has; its length is the number of poses in the index.
 
     Attributes:
-        first: number of the first pose.
-        total: how many poses the plan has.
+        first: index of the first pose.
+        total: number of poses of all shards together.
     """
 
     first: int
@@ -20,7 +20,7 @@ class Shard:
 
     @staticmethod
     def from_json(value: dict, poses: int) -> "Shard":
-        """What `to_json` gave, of a recording of some poses.
+        """Read the JSON of `to_json` for a shard of `poses` poses.
 
         Raises:
             ValueError: the counts contradict each other.
@@ -34,19 +34,19 @@ class Shard:
     def to_json(self) -> dict:
         return {"first": self.first, "of": self.total}
 
-    def in_words(self, poses: int) -> str:
-        """ "poses 250 to 499 of 1,000", and what a shard without poses is there for."""
+    def format_range(self, poses: int) -> str:
+        """Format the range: "poses 250 to 499 of 1,000"; a shard without poses has influences only."""
         if not poses:
             return f"influences for {self.total:,} poses, and none of these"
         return f"poses {self.first:,} to {self.first + poses - 1:,} of {self.total:,}"
 
 
 def shard_poses(number: int, count: int, total: int) -> range:
-    """Numbers of the poses that belong to a shard; all shards together have each pose once.
+    """Return the indices of the poses of a shard; the shards together have each pose once.
 
     Args:
         number: of the shard, 1 to `count`.
-        count: how many shards there are.
-        total: how many poses.
+        count: number of shards.
+        total: number of poses.
     """
     return range((number - 1) * total // count, number * total // count)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What `recording.json` says of a target: the object whose surface was recorded in place of the rig's own."""
+"""Targets in `recording.json`: objects whose surface is recorded in place of the rig's own."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from ..rig import read_name
 
 STATISTICS = ("mean", "rms", "p99", "p999", "max")
 POSE, FRAMES, SIMULATION = "pose", "frames", "simulation"
-"""What a target follows: the pose at once; the frame, as caches do; or the pose and what was before it."""
+"""What a target depends on: the pose; the frame, as a cache does; or the pose and its history, as a simulation does."""
 FOLLOWS = (POSE, FRAMES, SIMULATION)
 
 
@@ -20,7 +20,7 @@ class RecordedTarget:
         object_name: of the target.
         follows: `POSE`, `FRAMES` or `SIMULATION`.
         pre_roll: frames in which the rig went from the rest pose to the first frame of an action.
-        max_settle_frames: frames that a random pose was held for at most, 0 where poses were not held.
+        max_settle_frames: most frames for which a random pose was held; 0 where poses were not held.
         rest_threshold_mm: the target is at rest when no vertex moves by more from a frame to the next, mm.
     """
 
@@ -40,7 +40,7 @@ class RecordedTarget:
 
     @staticmethod
     def from_json(value: dict) -> "RecordedTarget":
-        """ValueError, TypeError or KeyError where it is damaged."""
+        """Read a target from a file; raise ValueError, TypeError or KeyError where it is damaged."""
         target = RecordedTarget(
             read_name(value["object"]),
             value["follows"],
@@ -60,11 +60,11 @@ class RecordedTarget:
 
 @dataclass(frozen=True)
 class Repeatability:
-    """Poses that were approached from two directions: no model can be closer to a target than these are apart.
+    """Distance of a target from itself in poses reached from two directions, a lower bound of a model's error.
 
     Attributes:
-        poses: their numbers.
-        distance_mm: distance of the vertices between the two, mm: mean, rms, percentiles 99 and 99.9, and largest.
+        poses: indices of the poses.
+        distance_mm: distance of the vertices by name of a statistic: mean, rms, p99, p999 (99.9 %) and max, mm.
         linear_mm: mean distance of the target from linear skinning in these poses, mm.
     """
 
@@ -77,19 +77,24 @@ class Repeatability:
 
     @staticmethod
     def from_json(value: dict, poses: int) -> "Repeatability":
-        """ValueError, TypeError or KeyError where it is damaged; `poses` is how many there are."""
-        found = Repeatability(
+        """Read it from a file; raise ValueError, TypeError or KeyError where it is damaged.
+
+        Args:
+            value: the JSON.
+            poses: number of poses of the recording.
+        """
+        repeatability = Repeatability(
             tuple(value["poses"]), {name: value["distance_mm"][name] for name in STATISTICS}, value["linear_mm"]
         )
-        if not found.poses or not all(type(pose) is int and 0 <= pose < poses for pose in found.poses):
+        if not repeatability.poses or not all(type(pose) is int and 0 <= pose < poses for pose in repeatability.poses):
             raise ValueError("its repeated poses are none of its poses")
-        for number in (*found.distance_mm.values(), found.linear_mm):
+        for number in (*repeatability.distance_mm.values(), repeatability.linear_mm):
             if type(number) not in (int, float) or not 0 <= number < math.inf:
                 raise ValueError(f"repeated poses are {number!r} mm apart")
-        return found
+        return repeatability
 
     def sentence(self) -> str:
-        """What it comes to, for people."""
+        """Describe it for the user."""
         count = "1 pose" if len(self.poses) == 1 else f"{len(self.poses)} poses"
         return (
             f"The same pose from two directions: {self.distance_mm['mean']:.3g} mm apart on average, "

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The folder that a recording is written into: what may be in it before, and what is removed from it."""
+"""Checks of the folder that a recording is written into, and removal of its files."""
 
 import os
 from pathlib import Path
@@ -13,24 +13,24 @@ from .index import INDEX
 from .lock import LOCK, RecordingLock
 from .reader import check_resumable
 
-FILES = tuple(f"{name}.npy" for name in sorted(ARRAYS, key=STREAMED.__contains__, reverse=True))
-"""The arrays of a recording. First those that a training has open, which Windows does not remove meanwhile."""
+RECORDING_FILES = tuple(f"{name}.npy" for name in sorted(ARRAYS, key=STREAMED.__contains__, reverse=True))
+"""File names of the arrays; first those that a training has open, which Windows refuses to remove."""
 
 
 def check_recordable(path: Path, resume: bool, overwrite: bool = False) -> None:
-    """Fail before the work where a recording cannot be begun, or what is to be resumed is damaged.
+    """Check before the work that a recording can be started or resumed.
 
     Args:
         path: the folder.
-        resume: go on with the recording in it.
-        overwrite: replace the recording in it.
+        resume: continue the recording in the folder.
+        overwrite: replace the recording in the folder.
 
     Raises:
-        OutputError: the folder holds something else, or cannot be written.
+        OutputError: the folder has other files, or cannot be written.
         RecordingError: there is a recording and neither is set, it is damaged, or another process writes it.
     """
-    check_folder_writable(path, (*FILES, INDEX))
-    check_place(path, resume, overwrite)
+    check_folder_writable(path, (*RECORDING_FILES, INDEX))
+    check_folder(path, resume, overwrite)
     if os.path.lexists(path / LOCK):
         lock = RecordingLock(path)
         try:
@@ -42,15 +42,15 @@ def check_recordable(path: Path, resume: bool, overwrite: bool = False) -> None:
         check_resumable(path)
 
 
-def check_place(path: Path, resume: bool, overwrite: bool = False) -> None:
-    """As `check_recordable`, without a look into the files.
+def check_folder(path: Path, resume: bool, overwrite: bool = False) -> None:
+    """Check a folder as `check_recordable` does, but without its arrays.
 
     Raises:
-        OutputError: the folder holds something else.
+        OutputError: the folder has other files.
         RecordingError: there is a recording, and neither `resume` nor `overwrite` is set.
     """
     if not os.path.exists(path / INDEX):
-        if not is_free(path):
+        if not is_available(path):
             raise OutputError(f"Cannot record into '{path}': it is not an empty folder; choose another.")
     elif overwrite and not is_recording(path):
         raise OutputError(f"Cannot record into '{path}': its '{INDEX}' is of something else; choose another folder.")
@@ -61,15 +61,15 @@ def check_place(path: Path, resume: bool, overwrite: bool = False) -> None:
         )
 
 
-def is_free(path: Path) -> bool:
-    """Whether a folder can be recorded into: it is not there, or holds nothing but what an interruption has left."""
+def is_available(path: Path) -> bool:
+    """Return whether a folder is missing, empty, or has only temporary files of an interruption."""
     if not os.path.exists(path):
         return True
     return os.path.isdir(path) and all(name == LOCK or is_temporary_name(name) for name in os.listdir(path))
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a folder holds a recording, however damaged: its index begins as one, or the arrays of one are there."""
+    """Return whether a folder has a recording, possibly damaged, by the signature of its index or by its arrays."""
     try:
         if RECORDING.matches(path / INDEX):
             return True
@@ -78,8 +78,8 @@ def is_recording(path: Path) -> bool:
     return all(os.path.isfile(path / f"{name}.npy") for name in STREAMED[:2])
 
 
-def remove_left_over(path: Path) -> None:
-    """Remove what a process has left that was ended while it wrote the index.
+def remove_temporary_files(path: Path) -> None:
+    """Remove temporary files of a process that was killed while writing the index.
 
     Raises:
         OSError: a file cannot be removed.
@@ -89,14 +89,14 @@ def remove_left_over(path: Path) -> None:
             remove_file(path / name)
 
 
-def remove_files(path: Path) -> None:
-    """Remove the files of a recording; whoever calls it has locked the folder.
+def remove_recording_files(path: Path) -> None:
+    """Remove the files of a recording; the caller holds the lock.
 
     Raises:
         OSError: a file cannot be removed.
     """
-    for name in FILES:
+    for name in RECORDING_FILES:
         remove_file(path / name)
-    remove_left_over(path)
-    # The index last: what is left of an interruption is still seen to be a recording.
+    remove_temporary_files(path)
+    # The index last, so that an interrupted removal still leaves a recognizable recording.
     remove_file(path / INDEX)
