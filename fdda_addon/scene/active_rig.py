@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The rig that the user works on: the active mesh and its armature, or the other way round."""
+"""Finds the rig that the user works on: the active mesh with its armature, or the active armature with its mesh."""
 
 from collections.abc import Callable
 
@@ -12,17 +12,17 @@ from .scene_rig import SceneRig, armature_of, find_rig, parenting_message
 
 
 def active_rig(context: bpy.types.Context, name: str = "") -> SceneRig:
-    """The rig of a mesh object, or of the active object: a mesh that an armature deforms, or its armature.
+    """Find the rig of a mesh object or of the active object, without evaluating anything.
 
-    Of several meshes that follow the active armature, the one that is selected is meant, else the one that was chosen
-    in the sidebar, else the one that has a model, else the first. Nothing is evaluated.
+    The active object is a mesh that an armature deforms, or its armature. Of several meshes of the armature, the
+    selected one is taken, else the one that was chosen in the sidebar, else the bound one, else the first.
 
     Args:
-        context: where the active object is.
-        name: of the mesh object, empty for the active object.
+        context: the context with the active object.
+        name: name of the mesh object; empty for the active object.
 
     Raises:
-        RigError: there is none.
+        RigError: there is no rig.
     """
     if name:
         return find_rig(name)
@@ -41,13 +41,15 @@ def active_rig(context: bpy.types.Context, name: str = "") -> SceneRig:
 
 
 def cached_active_rig(context: bpy.types.Context) -> SceneRig | None:
-    """As `active_rig` for what is drawn again and again: None where there is none."""
+    """Find the active rig, cached for drawing; return None if there is none."""
     active = context.view_layer.objects.active
-    return None if active is None else _shown_rig(context, active, context.scene)
+    return None if active is None else _cached_active_rig(context, active, context.scene)
 
 
 @draw_cached
-def _shown_rig(context: bpy.types.Context, _active: bpy.types.Object, _scene: bpy.types.Scene) -> SceneRig | None:
+def _cached_active_rig(
+    context: bpy.types.Context, _active: bpy.types.Object, _scene: bpy.types.Scene
+) -> SceneRig | None:
     try:
         return active_rig(context)
     except RigError:
@@ -55,29 +57,34 @@ def _shown_rig(context: bpy.types.Context, _active: bpy.types.Object, _scene: bp
 
 
 def cached_rigs_of_active_armature(context: bpy.types.Context) -> tuple[SceneRig, ...]:
-    """As `rigs_of_active_armature` for what is drawn again and again."""
-    return _shown_together(context, context.view_layer.objects.active, context.scene)
+    """Find the rigs of the active armature, cached for drawing."""
+    return _cached_rigs(context, context.view_layer.objects.active, context.scene)
 
 
 @draw_cached
-def _shown_together(
+def _cached_rigs(
     context: bpy.types.Context, _active: bpy.types.Object, _scene: bpy.types.Scene
 ) -> tuple[SceneRig, ...]:
     return tuple(rigs_of_active_armature(context))
 
 
-def any_mesh_object(context: bpy.types.Context, fact: Callable[[bpy.types.Object], object]) -> bool:
-    """Whether something is true of a mesh object of the scene; for polls, with a function that is defined once."""
-    return _any_mesh(context.scene, fact) is True
+def any_mesh_object(context: bpy.types.Context, predicate: Callable[[bpy.types.Object], object]) -> bool:
+    """Return whether a predicate holds for any mesh object of the scene, cached for drawing.
+
+    Args:
+        context: the context with the scene.
+        predicate: a function of a module: a lambda would be another key of the cache in each call.
+    """
+    return _any_mesh_object(context.scene, predicate) is True
 
 
 @draw_cached
-def _any_mesh(scene: bpy.types.Scene, fact: Callable[[bpy.types.Object], object]) -> bool | None:
-    return any(o.type == "MESH" and fact(o) for o in scene.objects) or None
+def _any_mesh_object(scene: bpy.types.Scene, predicate: Callable[[bpy.types.Object], object]) -> bool | None:
+    return any(o.type == "MESH" and predicate(o) for o in scene.objects) or None
 
 
 def rigs_of_active_armature(context: bpy.types.Context) -> list[SceneRig]:
-    """The rigs of all meshes that follow the active armature, where it is active and there are several; else none."""
+    """Find the rigs of all meshes of the active armature; empty if no armature is active or it has a single mesh."""
     active = context.view_layer.objects.active
     if active is None or active.type != "ARMATURE":
         return []
@@ -98,10 +105,10 @@ def _mesh_of(context: bpy.types.Context, armature_object: bpy.types.Object) -> b
                 raise RigError(sentence)
         raise RigError(f"No mesh follows the armature '{armature_object.name}'; give one an Armature modifier.")
     name = context.window_manager.fdda.mesh
-    ways = (lambda o: o.select_get(), lambda o: o.name == name, lambda o: o.fdda.is_bound)
-    for found in ([o for o in meshes if way(o)] for way in ways):
-        if len(found) == 1:
-            return found[0]
+    predicates = (lambda o: o.select_get(), lambda o: o.name == name, lambda o: o.fdda.is_bound)
+    for matches in ([o for o in meshes if predicate(o)] for predicate in predicates):
+        if len(matches) == 1:
+            return matches[0]
     return meshes[0]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which F-curves animate a datablock now, and whether they change it."""
+"""Finds the F-curves that animate a datablock, and whether they change its properties."""
 
 from collections.abc import Iterable, Iterator
 
@@ -10,11 +10,11 @@ from .arrays import KEYFRAME, read
 from .compatibility import curves_of, curves_of_slot
 
 MIN_CHANGE = 1e-6
-"""Keys whose values lie no farther apart hold one value."""
+"""Keyframes whose values differ by no more than this hold one value."""
 
 
 def active_curves(datablock: bpy.types.ID) -> list[bpy.types.FCurve]:
-    """The F-curves that animate a datablock now: those of its action and of its NLA that are not muted."""
+    """Find the F-curves that animate a datablock: those of its action and of its NLA that are not muted."""
     animation = datablock.animation_data
     if animation is None:
         return []
@@ -23,8 +23,8 @@ def active_curves(datablock: bpy.types.ID) -> list[bpy.types.FCurve]:
         tracks = [track for track in animation.nla_tracks if track.is_solo] or animation.nla_tracks
         owners += [strip for track in tracks if not track.mute for strip in _flat_strips(track.strips)]
     pairs = [(owner.action, owner.action_slot) for owner in owners]
-    found = [curve for action, slot in pairs if action and slot for curve in curves_of_slot(action, slot)]
-    return [curve for curve in found if not curve.mute]
+    curves = [curve for action, slot in pairs if action and slot for curve in curves_of_slot(action, slot)]
+    return [curve for curve in curves if not curve.mute]
 
 
 def _flat_strips(strips: Iterable[bpy.types.NlaStrip]) -> Iterator[bpy.types.NlaStrip]:
@@ -35,12 +35,12 @@ def _flat_strips(strips: Iterable[bpy.types.NlaStrip]) -> Iterator[bpy.types.Nla
 
 
 def curves_with_actions(datablock: bpy.types.ID, actions: Iterable[bpy.types.Action]) -> list[bpy.types.FCurve]:
-    """The F-curves that animate a datablock now, or would if these actions were played."""
+    """Find the F-curves that animate a datablock, and those that would if these actions were assigned to it."""
     return [*active_curves(datablock), *(curve for action in actions for curve in curves_of(action, datablock))]
 
 
 def changes_value(curve: bpy.types.FCurve) -> bool:
-    """Whether an F-curve changes what it animates, as far as its keys tell."""
+    """Return whether the values of an F-curve differ, as far as its keyframes tell."""
     if any(not modifier.mute for modifier in curve.modifiers) or len(curve.sampled_points):
         return True
     points = curve.keyframe_points
@@ -51,7 +51,7 @@ def changes_value(curve: bpy.types.FCurve) -> bool:
 
 
 def value_range(curve: bpy.types.FCurve) -> tuple[float, float]:
-    """Lowest and highest value of an F-curve over its whole frames."""
+    """Return the lowest and highest value of an F-curve at its whole frames."""
     first, last = curve.range()
     values = [curve.evaluate(frame) for frame in range(int(first), int(last) + 1)]
     return min(values), max(values)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Armatures in and out: rest pose, pose matrices, posing."""
+"""Reads rest poses and pose matrices of armatures, and sets poses."""
 
 import bpy
 import numpy as np
@@ -13,50 +13,60 @@ from .scene_rig import SceneRig
 
 
 def rest_matrices(armature: bpy.types.Armature, names: tuple[str, ...]) -> np.ndarray:
-    """Rest matrices of bones, (J, 4, 4) float64, armature space, its units; the identity for the unmoved joint."""
+    """Read the rest matrices of bones.
+
+    Returns:
+        (J, 4, 4) float64, armature space, armature units; the identity for the static joint.
+    """
     identity = np.eye(4)
     matrices = [identity if name == STATIC_JOINT else armature.bones[name].matrix_local for name in names]
     return np.array(matrices, np.float64).reshape(-1, 4, 4)
 
 
 _REST_POSE = ((0, 0, 0), (0, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0), (1, 1, 1))
-"""Values of `POSE_CHANNELS`."""
+"""The values of `POSE_CHANNELS` in the rest pose."""
 
 
 class PoseMatrixReader:
-    """Reads the pose matrices of some bones of an armature, again and again."""
+    """Reads the pose matrices of bones into the same memory each time."""
 
     def __init__(self, armature_object: bpy.types.Object, names: tuple[str, ...]):
-        """Args:
-        armature_object: whose bones are meant.
-        names: J bones. KeyError for a name that is not there.
+        """Prepare to read bones.
+
+        Args:
+            armature_object: the armature object.
+            names: names of J bones.
+
+        Raises:
+            KeyError: the armature lacks a bone.
         """
-        index = {bone.name: number for number, bone in enumerate(armature_object.pose.bones)}
+        index = {bone.name: bone_index for bone_index, bone in enumerate(armature_object.pose.bones)}
         self._count = len(index)
-        # Behind the bones there is an identity, for the joint that never moves.
+        # An identity follows the bones, for the static joint.
         order = np.array([index[name] if name != STATIC_JOINT else self._count for name in names], np.int32)
-        in_a_row = np.array_equal(order, np.arange(len(order)))
-        self._order = slice(0, len(order)) if in_a_row else order
+        is_consecutive = np.array_equal(order, np.arange(len(order)))
+        self._order = slice(0, len(order)) if is_consecutive else order
         self._matrices = np.empty((self._count + 1, 4, 4), np.float32)
         self._matrices[-1] = np.eye(4)
-        self._of_bones = Reader(POSE_MATRIX, self._matrices[:-1])
+        self._bone_reader = Reader(POSE_MATRIX, self._matrices[:-1])
 
     def fits(self, armature_object: bpy.types.Object) -> bool:
-        """Whether the armature still has as many bones."""
+        """Return whether the armature still has the same number of bones."""
         return len(armature_object.pose.bones) == self._count
 
     def read(self, armature_object: bpy.types.Object) -> np.ndarray:
-        """Pose matrices of an evaluated armature object, (J, 4, 4) float32, armature space, its units.
+        """Read the pose matrices of an evaluated armature object, whose number of bones must not have changed (`fits`).
 
-        A view of memory that the next call writes into. Bones must not have come or gone (`fits`).
+        Returns:
+            (J, 4, 4) float32, armature space, armature units. The next call overwrites the memory.
         """
-        self._of_bones.read(armature_object.pose.bones)
-        # Blender keeps matrices column by column.
+        self._bone_reader.read(armature_object.pose.bones)
+        # Blender stores matrices in column-major order.
         return self._matrices[self._order].transpose(0, 2, 1)
 
 
 def clear_pose(armature_object: bpy.types.Object) -> None:
-    """Bring every bone to its rest pose."""
+    """Set every bone to its rest pose."""
     bones = armature_object.pose.bones
     for channel, values in zip(POSE_CHANNELS, _REST_POSE, strict=True):
         write(bones, channel, np.tile(np.float32(values), (len(bones), 1)))
@@ -64,41 +74,46 @@ def clear_pose(armature_object: bpy.types.Object) -> None:
 
 
 class Poser:
-    """Sets poses given as values of channels. Bones must be at rest where no channel reaches (`clear_pose`)."""
+    """Sets poses that are given as values of channels. Everything else must be in the rest pose (`clear_pose`)."""
 
     def __init__(self, scene_rig: SceneRig, channels: tuple[Channel, ...]):
         self._scene_rig = scene_rig
-        self._places: dict[str, dict[str, list[tuple[int, int]]]] = {}
-        for place, channel in enumerate(channels):
-            self._places.setdefault(channel.kind, {}).setdefault(channel.name, []).append((place, channel.axis))
+        self._channels: dict[str, dict[str, list[tuple[int, int]]]] = {}
+        """By kind and name: the index and the axis of each channel."""
+        for index, channel in enumerate(channels):
+            self._channels.setdefault(channel.kind, {}).setdefault(channel.name, []).append((index, channel.axis))
 
     def set(self, values: np.ndarray) -> None:
-        """Pose the rig: (C,) values in the order of the channels, each in its unit. The graph is not evaluated."""
+        """Set a pose without evaluating it.
+
+        Args:
+            values: (C,) values in the order of the channels, each in its unit.
+        """
         bones = self._scene_rig.armature_object.pose.bones
-        for name, places in self._places.get(ROTATION, {}).items():
+        for name, channels in self._channels.get(ROTATION, {}).items():
             angles = [0.0, 0.0, 0.0]
-            for place, axis in places:
-                angles[axis] = values[place]
+            for index, axis in channels:
+                angles[axis] = values[index]
             if bones[name].rotation_mode in {"QUATERNION", "AXIS_ANGLE"}:
                 _rotate(bones[name], Euler(angles).to_quaternion())
             else:
                 bones[name].rotation_euler = angles
-        for name, places in self._places.get(ROTATION_VECTOR, {}).items():
+        for name, channels in self._channels.get(ROTATION_VECTOR, {}).items():
             vector = [0.0, 0.0, 0.0]
-            for place, axis in places:
-                vector[axis] = values[place]
+            for index, axis in channels:
+                vector[axis] = values[index]
             _rotate(bones[name], Quaternion(vector))
         for kind in (LOCATION, SCALE):
-            for name, places in self._places.get(kind, {}).items():
-                values_of_bone = getattr(bones[name], kind)
-                for place, axis in places:
-                    values_of_bone[axis] = values[place]
-        for name, places in self._places.get(CONTROL, {}).items():
-            set_control(self._scene_rig, name, float(values[places[0][0]]))
+            for name, channels in self._channels.get(kind, {}).items():
+                bone_values = getattr(bones[name], kind)
+                for index, axis in channels:
+                    bone_values[axis] = values[index]
+        for name, channels in self._channels.get(CONTROL, {}).items():
+            set_control(self._scene_rig, name, float(values[channels[0][0]]))
 
 
 def _rotate(bone: bpy.types.PoseBone, rotation: Quaternion) -> None:
-    """Rotate a bone relative to its rest pose, in whichever mode it rotates."""
+    """Set the rotation of a bone relative to its rest pose, in its rotation mode."""
     if bone.rotation_mode == "QUATERNION":
         bone.rotation_quaternion = rotation
     elif bone.rotation_mode == "AXIS_ANGLE":

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The one border between numpy arrays and RNA collections: what Blender keeps for each element, in and out.
+"""Reads and writes properties of RNA collections as numpy arrays.
 
-Blender itself takes an array of another type, only a hundred times slower, and in places one that is too long; here
-both are errors.
+`foreach_get` and `foreach_set` also accept an array of another type, a hundred times slower, and in some cases one that
+is too long. Here both are errors.
 """
 
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ class Element:
     """A property of the elements of a collection.
 
     Attributes:
-        name: of the RNA property.
-        dtype: that Blender keeps it in, so that it is copied as it is.
-        shape: of one element's values; () for one number.
+        name: name of the RNA property.
+        dtype: type in which Blender stores it, so that it is copied without conversion.
+        shape: shape of the values of one element; () for a single number.
     """
 
     name: str
@@ -26,16 +26,16 @@ class Element:
     shape: tuple[int, ...] = ()
 
     def empty(self, count: int) -> np.ndarray:
-        """Memory for (count, *shape) values of dtype."""
+        """Allocate an uninitialized array (count, *shape) of dtype."""
         return np.empty((count, *self.shape), self.dtype)
 
 
 COORDINATE = Element("co", np.float32, (3,))
-"""Of vertices and of the points of shape keys; the object's space."""
+"""Of vertices and of the points of shape keys; object space."""
 VECTOR = Element("vector", np.float32, (3,))
-"""Of an attribute of vectors, and of vertex normals."""
+"""Of vector attributes and of vertex normals."""
 COLOR = Element("color", np.float32, (4,))
-"""Of a colour attribute: linear red, green and blue, and alpha."""
+"""Of color attributes: linear RGBA."""
 MUTE = Element("mute", np.bool_)
 """Of shape keys."""
 LOOP_START = Element("loop_start", np.int32)
@@ -44,9 +44,9 @@ MATERIAL_INDEX = Element("material_index", np.int32)
 TRIANGLE = Element("vertices", np.int32, (3,))
 """Of loop triangles."""
 POSE_MATRIX = Element("matrix", np.float32, (4, 4))
-"""Of pose bones: armature space, column by column."""
+"""Of pose bones: armature space, column-major."""
 REST_MATRIX = Element("matrix_local", np.float32, (4, 4))
-"""Of bones: armature space, column by column."""
+"""Of bones: armature space, column-major."""
 POSE_CHANNELS = (
     Element("location", np.float32, (3,)),
     Element("rotation_euler", np.float32, (3,)),
@@ -54,7 +54,7 @@ POSE_CHANNELS = (
     Element("rotation_axis_angle", np.float32, (4,)),
     Element("scale", np.float32, (3,)),
 )
-"""Of pose bones: all that a pose sets; angles in radians."""
+"""Of pose bones: all properties that define a pose; angles in radians."""
 KEYFRAME = (
     Element("co", np.float32, (2,)),
     Element("handle_left", np.float32, (2,)),
@@ -65,11 +65,11 @@ KEYFRAME = (
     Element("back", np.float32),
     Element("period", np.float32),
 )
-"""Of keyframe points: all that the values of a curve follow from."""
+"""Of keyframe points: all properties that define the values of an F-curve."""
 
 
 def read(collection: bpy.types.bpy_prop_collection, element: Element) -> np.ndarray:
-    """Values of all elements of a collection, (n, *element.shape) element.dtype."""
+    """Read the values of all elements of a collection, (n, *element.shape) of element.dtype."""
     values = element.empty(len(collection))
     collection.foreach_get(element.name, values.reshape(-1))
     return values
@@ -79,12 +79,12 @@ def write(collection: bpy.types.bpy_prop_collection, element: Element, values: n
     """Set the values of all elements of a collection.
 
     Args:
-        collection: of n elements.
-        element: what is set.
-        values: (n, *element.shape) element.dtype, contiguous.
+        collection: n elements.
+        element: the property to set.
+        values: (n, *element.shape) of element.dtype, contiguous.
 
     Raises:
-        ValueError: they are not that.
+        ValueError: the array has another shape or type, or is not contiguous.
     """
     if not _holds(values, element) or len(values) != len(collection):
         raise _mismatch(collection, element, values)
@@ -92,30 +92,31 @@ def write(collection: bpy.types.bpy_prop_collection, element: Element, values: n
 
 
 class Reader:
-    """Reads a collection again and again into the same memory.
+    """Reads a property of a collection into the same memory each time.
 
     Attributes:
-        element: what is read.
-        values: (n, *element.shape) element.dtype, what was read last.
+        element: the property.
+        values: (n, *element.shape) of element.dtype, as they were read last.
     """
 
     def __init__(self, element: Element, values: np.ndarray):
-        """Args:
-        element: what is read.
-        values: the memory, (n, *element.shape) element.dtype, contiguous.
+        """Prepare to read a property.
+
+        Args:
+            element: the property.
+            values: memory to read into, (n, *element.shape) of element.dtype, contiguous.
 
         Raises:
-            ValueError: it is not that.
+            ValueError: the array has another shape or type, or is not contiguous.
         """
         if not _holds(values, element):
             raise _mismatch("the memory to read into", element, values)
         self.element, self.values, self._flat = element, values, values.reshape(-1)
 
     def read(self, collection: bpy.types.bpy_prop_collection) -> None:
-        """Bring `values` up to date.
+        """Read the values of a collection into `values`.
 
-        They are not counted, for Blender takes as long to count bones as to read them: a collection that may have
-        become smaller has to be counted by whoever knows when.
+        A collection with fewer than n elements is not noticed: counting bones takes Blender as long as reading them.
 
         Raises:
             ValueError: the collection has more than n elements.
@@ -127,14 +128,14 @@ class Reader:
 
 
 def write_pixels(preview: bpy.types.ImagePreview, pixels: np.ndarray) -> None:
-    """Paint a preview.
+    """Write the pixels of a preview image.
 
     Args:
-        preview: of the size that the pixels have.
-        pixels: (height, width, 4) float32, rows from the bottom; linear red, green and blue, and alpha.
+        preview: the preview, of the size of the pixels.
+        pixels: (height, width, 4) float32, linear RGBA, rows from the bottom.
 
     Raises:
-        ValueError: they are not that.
+        ValueError: the array has another shape or type.
     """
     width, height = preview.image_size
     if pixels.shape != (height, width, 4) or pixels.dtype != np.float32:
@@ -149,6 +150,7 @@ def _holds(values: np.ndarray, element: Element) -> bool:
 
 
 def _mismatch(collection: object, element: Element, values: np.ndarray) -> ValueError:
-    has = f"{element.shape} {np.dtype(element.dtype)} each"
+    expected = f"{element.shape} {np.dtype(element.dtype)} each"
     order = "" if values.flags.c_contiguous else ", not contiguous"
-    return ValueError(f"'{element.name}' of {collection} is {has}, the array is {values.shape} {values.dtype}{order}.")
+    actual = f"{values.shape} {values.dtype}{order}"
+    return ValueError(f"'{element.name}' of {collection} is {expected}, the array is {actual}.")

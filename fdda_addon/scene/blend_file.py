@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Saving the open .blend file elsewhere, wholly or not at all, with sentences in place of Blender's reports."""
+"""Saves copies of the open .blend file atomically, and turns Blender's reports into error messages."""
 
 import contextlib
 import os
@@ -15,18 +15,18 @@ from ..core.output import atomic_write, check_writable
 from ..core.path_limits import path_length_problem
 
 SEEK_TABLE_END = bytes.fromhex("b1ea928f")
-"""Last bytes of a compressed .blend file, which is one of Zstandard's seekable format."""
+"""Last bytes of a compressed .blend file, which is in Zstandard's seekable format."""
 
 
 def save_copy(path: Path) -> None:
-    """Save the open file to a path, wholly or not at all; relative paths inside are kept right.
+    """Save a copy of the open file, completely or not at all; Blender remaps relative paths in it.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the copy cannot be written.
     """
     check_writable(path)
     with atomic_write(path) as temporary:
-        # Blender keeps a second copy of a file that it saves over.
+        # Blender keeps a backup of a file that it overwrites.
         remove_file(temporary)
         try:
             with silenced_stdout():
@@ -35,16 +35,16 @@ def save_copy(path: Path) -> None:
                 )
         except RuntimeError as error:
             raise OSError(report_message(error)) from error
-        # Blender 4.5 saves half a compressed file to a full disk and calls it finished.
+        # On a full disk Blender 4.5 saves half of a compressed file and reports success.
         if temporary.read_bytes()[-len(SEEK_TABLE_END) :] != SEEK_TABLE_END:
             raise OSError("Blender wrote only a part of it, the disk may be full")
 
 
 def blender_path(path: Path) -> str:
-    """A path as it is handed to Blender, which cuts one that is too long, and reads or writes another file then.
+    """Return a path for Blender, which would truncate one that is too long and use another file.
 
     Raises:
-        FDDAError: it is too long.
+        FDDAError: the path is too long.
     """
     absolute = path.absolute()
     if limit := path_length_problem(absolute):
@@ -53,21 +53,21 @@ def blender_path(path: Path) -> str:
 
 
 def report_message(error: RuntimeError) -> str:
-    """The first of the reports that an operator failed with."""
+    """Return the first report of an operator that failed."""
     return str(error).strip().removeprefix("Error: ").partition("\n")[0]
 
 
 @contextlib.contextmanager
 def silenced_stdout() -> Iterator[None]:
-    """Keep Blender's own lines ("Read blend: …") off stdout, where a verb prints its results."""
+    """Discard Blender's own output ("Read blend: …"), so that stdout has only the results of a verb."""
     sys.stdout.flush()
-    saved = os.dup(1)
+    stdout_copy = os.dup(1)
     try:
         with open(os.devnull, "w") as sink:
             os.dup2(sink.fileno(), 1)
-            # Blender prints the reports of a failed operator through Python, all else through C.
+            # Blender prints the reports of a failed operator through Python, everything else through C.
             with contextlib.redirect_stdout(sink):
                 yield
     finally:
-        os.dup2(saved, 1)
-        os.close(saved)
+        os.dup2(stdout_copy, 1)
+        os.close(stdout_copy)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Copies of characters that stand beside them to be compared with: how they are told from characters."""
+"""Identifies comparison objects: copies of a character's mesh that show its rig beside or over it."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -7,22 +7,22 @@ from contextlib import ExitStack, contextmanager
 import bpy
 
 COMPARISON_KEY = "fdda_compared"
-"""Custom property of a copy: the mesh object that it is compared with."""
+"""Custom property of a comparison object: the mesh object that it is compared with."""
 
 
 def is_comparison(scene_object: bpy.types.Object) -> bool:
-    """Whether an object is such a copy, and no character of the user's."""
+    """Return whether an object is a comparison object."""
     return scene_object.is_runtime_data and COMPARISON_KEY in scene_object
 
 
 def comparisons() -> list[bpy.types.Object]:
-    """All such copies in the open file."""
+    """Return all comparison objects of the open file."""
     return [o for o in bpy.data.objects if is_comparison(o)]
 
 
 @contextmanager
 def hidden_comparisons() -> Iterator[None]:
-    """Spare Blender their evaluation for a while."""
+    """Hide all comparison objects, so that Blender does not evaluate them."""
     from .temporary_state import temporary_attributes  # Blender starts without numpy.
 
     with ExitStack() as stack:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What differs between Blender's versions, in one place. The rest of the code is written to the API of 4.5."""
+"""Hides the differences between Blender's versions. All other code uses the API of 4.5."""
 
 import bpy
 
 
 def animation_curves(action: bpy.types.Action) -> list[bpy.types.FCurve]:
-    """All F-curves of an action, of all its slots (4.4 and later have layers and slots)."""
+    """Return the F-curves of all slots of an action (4.4 and later have layers and slots)."""
     if getattr(action, "layers", None):
         strips = (strip for layer in action.layers for strip in layer.strips)
         return [curve for strip in strips for bag in strip.channelbags for curve in bag.fcurves]
@@ -13,24 +13,24 @@ def animation_curves(action: bpy.types.Action) -> list[bpy.types.FCurve]:
 
 
 def slot_of(action: bpy.types.Action, datablock: bpy.types.ID) -> "bpy.types.ActionSlot | None":
-    """The slot with which an action animates a datablock, None when there is none (4.4 and later have slots).
+    """Choose the slot with which an action animates a datablock; None if there is none (4.4 and later have slots).
 
-    The one of its name, else the only one. An armature object takes any other that animates bones: it plays actions
-    that were made for another character. Which slot it had last does not count, for the answer must not depend on what
-    was played before.
+    It is the slot with the datablock's name, else the only slot. An armature object also takes another slot that
+    animates bones, so that it plays actions of other characters. The slot that it used last is ignored: the choice must
+    not depend on what was played before.
     """
-    known = getattr(action, "slots", ())
-    slots = [slot for slot in known if slot.target_id_type in {datablock.id_type, "UNSPECIFIED"}]
-    chosen = [slot for slot in slots if slot.name_display == datablock.name]
-    if len(known) == 1:
-        chosen += slots
-    if not chosen and getattr(datablock, "type", "") == "ARMATURE":
-        chosen = [s for s in slots if any(c.data_path.startswith("pose.bones[") for c in curves_of_slot(action, s))]
-    return chosen[0] if chosen else None
+    all_slots = getattr(action, "slots", ())
+    slots = [slot for slot in all_slots if slot.target_id_type in {datablock.id_type, "UNSPECIFIED"}]
+    candidates = [slot for slot in slots if slot.name_display == datablock.name]
+    if len(all_slots) == 1:
+        candidates += slots
+    if not candidates and getattr(datablock, "type", "") == "ARMATURE":
+        candidates = [s for s in slots if any(c.data_path.startswith("pose.bones[") for c in curves_of_slot(action, s))]
+    return candidates[0] if candidates else None
 
 
 def curves_of(action: bpy.types.Action, datablock: bpy.types.ID) -> list[bpy.types.FCurve]:
-    """The F-curves with which an action animates a datablock."""
+    """Return the F-curves with which an action animates a datablock."""
     if not hasattr(action, "slots"):
         return list(action.fcurves) if action.id_root == datablock.id_type else []
     slot = slot_of(action, datablock)
@@ -38,7 +38,7 @@ def curves_of(action: bpy.types.Action, datablock: bpy.types.ID) -> list[bpy.typ
 
 
 def curves_of_slot(action: bpy.types.Action, slot: "bpy.types.ActionSlot") -> list[bpy.types.FCurve]:
-    """The F-curves of a slot of an action."""
+    """Return the F-curves of a slot of an action."""
     bags = (strip.channelbag(slot) for layer in action.layers for strip in layer.strips)
     return [curve for bag in bags if bag is not None for curve in bag.fcurves]
 
@@ -52,29 +52,29 @@ def set_node_input(modifier: bpy.types.NodesModifier, identifier: str, value: ob
 
 
 def node_input(modifier: bpy.types.NodesModifier, identifier: str) -> object:
-    """The value of an input of a Geometry Nodes modifier, None when it has no such input."""
+    """Return the value of an input of a Geometry Nodes modifier; None if it has no such input."""
     if hasattr(modifier, "properties") and hasattr(modifier.properties, "inputs"):
         return getattr(getattr(modifier.properties.inputs, identifier, None), "value", None)
     return modifier.get(identifier)
 
 
 def is_selected(bone: bpy.types.PoseBone) -> bool:
-    """Whether a bone is selected (5.0 and later keep that with the pose)."""
+    """Return whether a bone is selected (5.0 and later store that in the pose bone)."""
     return selection_owner(bone).select
 
 
 def select_bone(bone: bpy.types.PoseBone, selected: bool) -> None:
-    """Select a bone, or not."""
+    """Select or deselect a bone."""
     selection_owner(bone).select = selected
 
 
 def selection_owner(bone: bpy.types.PoseBone) -> "bpy.types.PoseBone | bpy.types.Bone":
-    """What has the property `select` of a bone."""
+    """Return the struct that has the property `select` of a bone."""
     return bone if hasattr(bone, "select") else bone.bone
 
 
 def is_bone_hidden(bone: bpy.types.PoseBone) -> bool:
-    """Whether a bone is hidden in pose mode, by itself or with its collections (5.0 and later: by its pose)."""
+    """Return whether a bone is hidden in pose mode, by itself or by its collections."""
     return (bone.hide if hasattr(bone, "hide") else bone.bone.hide) or (
         not any(collection.is_visible_effectively for collection in bone.bone.collections)
         and bool(bone.bone.collections)

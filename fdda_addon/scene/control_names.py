@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Names of controls that a user may want, and the value at which a control does nothing."""
+"""Suggests controls of a rig, and reads their default values."""
 
 import re
 
@@ -49,36 +49,36 @@ def control_at(scene_rig: SceneRig, text: str) -> str:
 
 
 def suggested_controls(scene_rig: SceneRig) -> list[str]:
-    """Shape keys and custom properties that no driver sets, as `parse_controls` reads them; all shape keys first."""
+    """Suggest the shape keys and custom properties that no driver sets, in the form that `parse_controls` reads."""
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
-    found = []
+    names = []
     if keys := mesh_object.data.shape_keys:
         blocks = [block for block in keys.key_blocks if block != keys.reference_key]
-        free = [block.name for block in blocks if not is_driven(keys, block.path_from_id("value"))]
-        found += [SHAPE_KEYS, *free] if free else []
+        undriven = [block.name for block in blocks if not is_driven(keys, block.path_from_id("value"))]
+        names += [SHAPE_KEYS, *undriven] if undriven else []
     for owner, datablock in ((ARMATURE_OBJECT, armature_object), (MESH_OBJECT, mesh_object)):
-        found += [f"{owner}/{path}" for path in _custom_numbers(datablock, "")]
+        names += [f"{owner}/{path}" for path in _custom_properties(datablock, "")]
     for bone in armature_object.pose.bones:
-        found += [f"{ARMATURE_OBJECT}/{path}" for path in _custom_numbers(armature_object, bone.path_from_id())]
-    return found
+        names += [f"{ARMATURE_OBJECT}/{path}" for path in _custom_properties(armature_object, bone.path_from_id())]
+    return names
 
 
-def _custom_numbers(datablock: bpy.types.ID, path: str) -> list[str]:
-    """Paths of the custom properties of a datablock, or of what is at a path of it, that are numbers."""
-    struct = datablock.path_resolve(path) if path else datablock
-    paths = [f'{path}["{bpy.utils.escape_identifier(name)}"]' for name, _ in struct.items()]
-    return [one for one in paths if is_number(datablock, one) and not is_driven(datablock, one)]
+def _custom_properties(datablock: bpy.types.ID, owner_path: str) -> list[str]:
+    """Return the paths of the undriven numeric custom properties of a datablock, or of a struct in it."""
+    struct = datablock.path_resolve(owner_path) if owner_path else datablock
+    paths = [f'{owner_path}["{bpy.utils.escape_identifier(name)}"]' for name, _ in struct.items()]
+    return [path for path in paths if is_number(datablock, path) and not is_driven(datablock, path)]
 
 
 def control_default(scene_rig: SceneRig, name: str) -> float:
-    """The value that a control has by default; 0 for a shape key."""
+    """Return the default value of a control; 0 for a shape key."""
     owner, _, path = name.partition("/")
     struct, attribute, index = parent_and_name(owner_of(scene_rig, owner), path)
     if isinstance(struct, bpy.types.ShapeKey):
         return 0.0
     if is_custom_property(attribute):
-        own = custom_property_key(attribute)
-        default = False if isinstance(struct[own], bool) else struct.id_properties_ui(own).as_dict()["default"]
+        key = custom_property_key(attribute)
+        default = False if isinstance(struct[key], bool) else struct.id_properties_ui(key).as_dict()["default"]
         return float(default[index] if hasattr(default, "__len__") else default)
     prop = struct.bl_rna.properties[attribute]
     return float(prop.default if index is None else prop.default_array[index])
