@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Controls in and out: which numbers there are, their ranges, their values."""
+"""Finds, reads and sets controls: numbers of a rig that are inputs of a model besides its joints."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,15 +14,15 @@ from ..core.errors import RigError
 from .scene_rig import SceneRig
 
 MAX_RANGE_WIDTH = 1e4
-"""A property whose range is wider than this states none."""
+"""A property with a wider range counts as one without a range."""
 
-_STATED = re.compile(r"(?P<name>.+?)(?:=(?P<low>[-+.\deE]+):(?P<high>[-+.\deE]+))?", re.DOTALL)
+_CONTROL_TEXT = re.compile(r"(?P<name>.+?)(?:=(?P<low>[-+.\deE]+):(?P<high>[-+.\deE]+))?", re.DOTALL)
 _CUSTOM = re.compile(r'(?P<owner>.*)\["(?P<name>(?:[^"\\]|\\.)*)"\]')
 _ELEMENT = re.compile(r"(?P<array>.+)\[(?P<index>\d+)\]")
 
 
 def owner_of(scene_rig: SceneRig, owner: str) -> bpy.types.ID | None:
-    """The datablock that `Control.owner` means for a rig, None when there is none."""
+    """Return the datablock that `Control.owner` names for a rig; None if it does not exist."""
     mesh_object = scene_rig.mesh_object
     if owner.startswith(OTHER_OBJECT):
         return bpy.data.objects.get(owner.removeprefix(OTHER_OBJECT))
@@ -35,7 +35,7 @@ def owner_of(scene_rig: SceneRig, owner: str) -> bpy.types.ID | None:
 
 
 def owner_name(scene_rig: SceneRig, datablock: bpy.types.ID) -> str:
-    """The inverse of `owner_of`; empty for a datablock that no control can belong to."""
+    """Return the inverse of `owner_of`; empty for a datablock that cannot have controls."""
     for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
         if owner_of(scene_rig, owner) == datablock:
             return owner
@@ -46,19 +46,20 @@ def make_control(
     scene_rig: SceneRig,
     owner: str,
     path: str,
-    stated: tuple[float, float] | None = None,
-    sampled: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+    bounds: tuple[float, float] | None = None,
+    sampled_ranges: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> Control:
-    """A control of a rig, with the range that its property states.
+    """Make a control of a rig.
 
     Args:
         scene_rig: the rig.
-        owner, path: as of `Control`.
-        stated: its range, in place of what the property states.
-        sampled: by the names of controls the ranges of numbers that random poses move anyway.
+        owner, path: as in `Control`.
+        bounds: the range of the control; None for the range of its property.
+        sampled_ranges: ranges of numbers that random poses set anyway, by the names of controls. They take precedence
+            over the ranges of properties.
 
     Raises:
-        RigError: there is no such number, or nobody states its range.
+        RigError: there is no such number, or it has no range.
     """
     name = f"{owner}/{path}"
     datablock = owner_of(scene_rig, owner)
@@ -67,42 +68,43 @@ def make_control(
             f"'{scene_rig.mesh_object.name}' has no control '{name}'; give the name of a shape key, or OWNER/PATH of a "
             f"number, with OWNER one of {', '.join(OWNERS)} and {OTHER_OBJECT}NAME."
         )
-    low, high = stated or sampled.get(name) or _property_range(datablock, path)
+    low, high = bounds or sampled_ranges.get(name) or _property_range(datablock, path)
     if not low < high or high - low > MAX_RANGE_WIDTH:
         raise RigError(f"The control '{name}' states no range; give one: '{name}=LOW:HIGH'.")
     return Control(owner, path, float(low), float(high))
 
 
 def parse_controls(
-    scene_rig: SceneRig, texts: Iterable[str], sampled: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    scene_rig: SceneRig, texts: Iterable[str], sampled_ranges: Mapping[str, tuple[float, float]] = MappingProxyType({})
 ) -> tuple[Control, ...]:
-    """Controls as a user lists them.
+    """Parse controls as a user lists them.
 
     Args:
         scene_rig: the rig.
-        texts: each OWNER/PATH, or the name of a shape key, and after it =LOW:HIGH where the property's range is not
-            meant; `shape_keys` means every shape key that no driver moves.
-        sampled: as for `make_control`.
+        texts: each is OWNER/PATH or the name of a shape key, with an optional =LOW:HIGH that overrides the range of the
+            property; `shape_keys` stands for all shape keys without drivers.
+        sampled_ranges: as for `make_control`.
 
     Raises:
         RigError: as `make_control`.
     """
-    found: dict[str, Control] = {}
+    controls: dict[str, Control] = {}
     for text in texts:
-        match = _STATED.fullmatch(text)
-        name, stated = match["name"], None
+        match = _CONTROL_TEXT.fullmatch(text)
+        name, bounds = match["name"], None
         if match["low"]:
             try:
-                stated = float(match["low"]), float(match["high"])
+                bounds = float(match["low"]), float(match["high"])
             except ValueError as error:
                 raise RigError(f"'{text}' states no range; write it as NAME=LOW:HIGH, with two numbers.") from error
-        for owner, path in _meant(scene_rig, name):
-            control = make_control(scene_rig, owner, path, stated, sampled)
-            found[control.name] = control
-    return tuple(found.values())
+        for owner, path in _resolve_name(scene_rig, name):
+            control = make_control(scene_rig, owner, path, bounds, sampled_ranges)
+            controls[control.name] = control
+    return tuple(controls.values())
 
 
-def _meant(scene_rig: SceneRig, name: str) -> list[tuple[str, str]]:
+def _resolve_name(scene_rig: SceneRig, name: str) -> list[tuple[str, str]]:
+    """Return the owners and paths that a name stands for."""
     keys = scene_rig.mesh_object.data.shape_keys
     blocks = [b for b in keys.key_blocks if b != keys.reference_key] if keys else []
     if name == SHAPE_KEYS:
@@ -115,7 +117,7 @@ def _meant(scene_rig: SceneRig, name: str) -> list[tuple[str, str]]:
 
 
 def is_driven(datablock: bpy.types.ID, path: str) -> bool:
-    """Whether a driver sets a number."""
+    """Return whether a driver sets a number."""
     owner, array, index = fcurve_target(datablock, path)
     animation = owner.animation_data
     return animation is not None and any(
@@ -124,18 +126,22 @@ def is_driven(datablock: bpy.types.ID, path: str) -> bool:
 
 
 def is_number(datablock: bpy.types.ID | None, path: str) -> bool:
-    """Whether there is a number at a path of a datablock."""
+    """Return whether a path of a datablock leads to a number."""
     return datablock is not None and _value(datablock, path) is not None
 
 
-def _element(path: str) -> tuple[str, int | None]:
+def _split_index(path: str) -> tuple[str, int | None]:
+    """Split a path into that of an array and the index in it; the index is None if there is none."""
     match = _ELEMENT.fullmatch(path)
     return (match["array"], int(match["index"])) if match else (path, None)
 
 
 def parent_and_name(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.bpy_struct, str, int | None]:
-    """What has the property at a path, the property's name (of a custom one, `["NAME"]`) and the place in an array."""
-    array, index = _element(path)
+    """Return the struct that has the property at a path, the property's name, and the index in an array or None.
+
+    The name of a custom property is `["NAME"]`.
+    """
+    array, index = _split_index(path)
     if match := _CUSTOM.fullmatch(array):
         owner, name = match["owner"], array[len(match["owner"]) :]
     else:
@@ -144,34 +150,34 @@ def parent_and_name(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.bpy_s
 
 
 def fcurve_target(datablock: bpy.types.ID, path: str) -> tuple[bpy.types.ID, str, int]:
-    """A number as F-curves name it: the datablock that has it, the path there, the place in an array, else 0.
+    """Return what an F-curve of a number refers to: the datablock that has it, its path there, and its array index.
 
-    A path may lead to another datablock: from a lattice object to the shape keys of its data.
+    A path may lead to another datablock, such as from a lattice object to the shape keys of its data.
     """
-    array, place = _element(path)
+    array, index = _split_index(path)
     try:
         struct, name, _ = parent_and_name(datablock, path)
         prefix = "" if struct == struct.id_data else struct.path_from_id()
     except ValueError:
-        return datablock, array, place or 0
-    return struct.id_data, prefix + name if is_custom_property(name) or not prefix else f"{prefix}.{name}", place or 0
+        return datablock, array, index or 0
+    return struct.id_data, prefix + name if is_custom_property(name) or not prefix else f"{prefix}.{name}", index or 0
 
 
 def is_custom_property(name: str) -> bool:
-    """Whether a name of `parent_and_name` is that of a custom property."""
+    """Return whether a name of `parent_and_name` is that of a custom property."""
     return name.startswith('["')
 
 
 def custom_property_key(name: str) -> str:
-    """The key of a custom property by such a name."""
+    """Return the key of a custom property from such a name."""
     return bpy.utils.unescape_identifier(name[2:-2])
 
 
 def write_value(datablock: bpy.types.ID, path: str, value: object) -> None:
-    """Set what `path_resolve` reads; the graph is not told of custom properties."""
+    """Set the value that `path_resolve` reads; a custom property does not tag its datablock."""
     struct, name, index = parent_and_name(datablock, path)
     if index is not None:
-        datablock.path_resolve(_element(path)[0])[index] = value
+        datablock.path_resolve(_split_index(path)[0])[index] = value
     elif is_custom_property(name):
         struct[custom_property_key(name)] = value
     else:
@@ -179,7 +185,7 @@ def write_value(datablock: bpy.types.ID, path: str, value: object) -> None:
 
 
 def _value(datablock: bpy.types.ID, path: str) -> float | None:
-    """The number at a path, None when there is none."""
+    """Return the number at a path; None if there is none."""
     try:
         value = datablock.path_resolve(path)
     except ValueError:
@@ -194,7 +200,7 @@ def _property_range(datablock: bpy.types.ID, path: str) -> tuple[float, float]:
         if isinstance(struct[key], bool):
             return 0.0, 1.0
         settings = struct.id_properties_ui(key).as_dict()
-        return _narrower(*((settings[f"{kind}min"], settings[f"{kind}max"]) for kind in ("soft_", "")))
+        return _narrower(*((settings[f"{prefix}min"], settings[f"{prefix}max"]) for prefix in ("soft_", "")))
     if isinstance(struct, bpy.types.ShapeKey) and name == "value":
         return struct.slider_min, struct.slider_max
     prop = struct.bl_rna.properties[name]
@@ -208,24 +214,26 @@ def _narrower(soft: tuple[float, float], hard: tuple[float, float]) -> tuple[flo
 
 
 class ControlReader:
-    """Reads the values of some controls of a rig, again and again."""
+    """Reads the values of controls of a rig."""
 
     def __init__(self, scene_rig: SceneRig, controls: tuple[Control, ...]):
-        """Args:
+        """Prepare to read controls.
+
+        Args:
             scene_rig: the rig.
-            controls: C of them.
+            controls: C controls.
 
         Raises:
-            RigError: the rig lacks one.
+            RigError: the rig lacks a control.
         """
         self._controls, self._mesh_name = controls, scene_rig.mesh_object.name
         self.values([owner_of(scene_rig, control.owner) for control in controls])
 
     def read(self, scene_rig: SceneRig, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
-        """Read the controls as a dependency graph has evaluated them.
+        """Read the evaluated values of the controls.
 
         Returns:
-            (C,) float32 values, each in the unit of its property.
+            (C,) float32, each in the unit of its property.
 
         Raises:
             RigError: a control was removed or renamed.
@@ -234,47 +242,47 @@ class ControlReader:
         return self.values([owner and owner.evaluated_get(depsgraph) for owner in owners])
 
     def values(self, owners: Sequence[bpy.types.ID | None]) -> np.ndarray:
-        """As `read`, of the evaluated owner of each control."""
+        """Read the values as `read` does, from the evaluated owner of each control."""
         values = np.zeros(len(self._controls), np.float32)
-        for place, (owner, control) in enumerate(zip(owners, self._controls, strict=True)):
+        for index, (owner, control) in enumerate(zip(owners, self._controls, strict=True)):
             value = None if owner is None else _value(owner, control.path)
             if value is None:
                 raise RigError(
                     f"'{self._mesh_name}' lacks the control '{control.name}', or it is not a number; name it as "
                     "before, or record and train this rig."
                 )
-            values[place] = value
+            values[index] = value
         return values
 
 
 def set_control(scene_rig: SceneRig, name: str, value: float) -> None:
-    """Set a control by its name; a number that counts is rounded. The graph is not evaluated."""
+    """Set a control by its name without evaluating it; integers and booleans are rounded."""
     owner, _, path = name.partition("/")
     datablock = owner_of(scene_rig, owner)
-    old = datablock.path_resolve(path)
-    write_value(datablock, path, type(old)(round(value)) if isinstance(old, bool | int) else value)
-    # Custom properties do not tell the graph by themselves.
+    current = datablock.path_resolve(path)
+    write_value(datablock, path, type(current)(round(value)) if isinstance(current, bool | int) else value)
+    # Custom properties do not tag their datablock.
     datablock.update_tag()
 
 
 @contextmanager
 def temporary_controls(scene_rig: SceneRig, names: Iterable[str]) -> Iterator[None]:
-    """Give back the values of controls, by name, and what animates them. Inside, nothing animates them.
+    """Remove the animation of controls, given by name; restore it and their values afterwards.
 
-    What animates the armature object is not touched: `temporary_state.temporary_pose` takes care of it.
+    `temporary_state.temporary_pose` does the same for the animation of the armature object.
     """
     names = list(names)
-    places = [(owner_of(scene_rig, owner), path) for owner, _, path in (name.partition("/") for name in names)]
-    owners = {fcurve_target(*place)[0] for place in places} - {scene_rig.armature_object}
+    paths = [(owner_of(scene_rig, owner), path) for owner, _, path in (name.partition("/") for name in names)]
+    owners = {fcurve_target(*owner_and_path)[0] for owner_and_path in paths} - {scene_rig.armature_object}
     animations = [a for a in (owner.animation_data for owner in owners) if a is not None]
-    kept = [(a, a.action, getattr(a, "action_slot", None), a.use_nla) for a in animations]
+    previous = [(a, a.action, getattr(a, "action_slot", None), a.use_nla) for a in animations]
     values = {name: owner_of(scene_rig, name.partition("/")[0]).path_resolve(name.partition("/")[2]) for name in names}
     for animation in animations:
         animation.use_nla, animation.action = False, None
     try:
         yield
     finally:
-        for animation, action, slot, use_nla in kept:
+        for animation, action, slot, use_nla in previous:
             animation.action = action
             if action is not None and slot is not None:
                 animation.action_slot = slot

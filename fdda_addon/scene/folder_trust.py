@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From which folders a .blend file may name a model, besides its own: those that the user trusts in the preferences.
+"""Knows the folders that the user trusts in the preferences: a .blend file may refer to models in these and in its own.
 
-A file of somebody else can so have no other file read than a model, and that from places that the user has named.
+So a file from somebody else can only make the add-on read a model, and only from folders that the user chose.
 """
 
 from collections.abc import Callable
 from pathlib import Path
 
 trusted_folders: Callable[[], list[Path]] = list
-"""The trusted folders, absolute and without links; the preferences set it."""
+"""Returns the trusted folders, absolute and without links. The preferences replace this function."""
 
 
 def is_trusted(path: Path) -> bool:
-    """Whether a path lies in a trusted folder or below; links are followed first."""
+    """Return whether a path, with its links resolved, is in a trusted folder or below."""
     resolved = path.resolve()
     return any(resolved.is_relative_to(folder) for folder in trusted_folders())

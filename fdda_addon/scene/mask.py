@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The vertex group that says where a model counts, as its mesh object keeps it (`Object.fdda`)."""
+"""Reads the mask of a bound object: the vertex group that limits the model to a part of the mesh (`Object.fdda`)."""
 
 import bpy
 import numpy as np
@@ -8,19 +8,19 @@ from ..core.mask import Mask
 
 
 def mask_key(mesh_object: bpy.types.Object) -> tuple[int, bool]:
-    """What a mask is read by: the index of its vertex group, -1 where there is none, and whether it is inverted.
+    """Return the index of the mask's vertex group, -1 for none, and whether the mask is inverted.
 
-    A group that is gone counts as none, as it does for Blender's own modifiers.
+    A group that was removed counts as none, as for Blender's own modifiers.
     """
     binding = mesh_object.fdda
     return (mesh_object.vertex_groups.find(binding.mask) if binding.mask else -1), binding.invert_mask
 
 
 def read_mask(mesh_object: bpy.types.Object) -> Mask | None:
-    """The mask of a mesh object; None where the model counts everywhere.
+    """Read the mask of a mesh object; return None if the model applies to the whole mesh.
 
     Args:
-        mesh_object: original, not evaluated. In edit mode the weights are those from before.
+        mesh_object: the original object, not an evaluated one. In edit mode the weights are those before the edit.
     """
     group, is_inverted = mask_key(mesh_object)
     if group < 0:

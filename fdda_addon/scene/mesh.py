@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Meshes in and out: rest positions, topology, evaluated positions."""
+"""Reads rest positions, topology and evaluated positions of meshes, and writes positions."""
 
 import bpy
 import numpy as np
@@ -9,7 +9,7 @@ from .arrays import COORDINATE, LOOP_START, VECTOR, VERTEX_INDEX, read, write
 
 
 def rest_positions(mesh: bpy.types.Mesh) -> np.ndarray:
-    """Positions before anything deforms the mesh: the reference shape key where there are keys.
+    """Read the positions of a mesh before any deformation: those of the reference shape key, if there are keys.
 
     Returns:
         (V, 3) float32, mesh-object space, mesh units.
@@ -19,23 +19,23 @@ def rest_positions(mesh: bpy.types.Mesh) -> np.ndarray:
 
 
 def topology(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Faces of a mesh.
+    """Read the faces of a mesh.
 
     Returns:
-        loop_starts: (F,) int32, where each face starts in `loop_vertices`.
+        loop_starts: (F,) int32, index of the first element of each face in `loop_vertices`.
         loop_vertices: (L,) int32, vertex indices, face by face.
     """
     return read(mesh.polygons, LOOP_START), read(mesh.loops, VERTEX_INDEX)
 
 
 def evaluated_positions(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
-    """What the dependency graph evaluates the mesh to.
+    """Read the evaluated positions of a mesh object.
 
     Returns:
         (V, 3) float32, mesh-object space, mesh units.
 
     Raises:
-        RigError: it has other vertices than the mesh object's own mesh.
+        RigError: the evaluated mesh has another number of vertices.
     """
     mesh, count = mesh_object.evaluated_get(depsgraph).data, len(mesh_object.data.vertices)
     if len(mesh.vertices) != count:
@@ -47,18 +47,27 @@ def evaluated_positions(mesh_object: bpy.types.Object, depsgraph: bpy.types.Deps
 
 
 def mesh_positions(mesh: bpy.types.Mesh) -> np.ndarray:
-    """Positions of the vertices of a mesh, original or evaluated: (V, 3) float32, its object's space, metres."""
-    # Through the attribute: reading or writing the vertices themselves is some hundred times slower.
+    """Read the vertex positions of an original or evaluated mesh.
+
+    Returns:
+        (V, 3) float32, object space, mesh units.
+    """
+    # Reading or writing `vertices` instead of the attribute is about a hundred times slower.
     positions = mesh.attributes.get("position")
     if positions is None:
-        # In edit mode a mesh has no attributes; its vertices are where they were before.
+        # In edit mode a mesh has no attributes; its vertices are those before the edit.
         return read(mesh.vertices, COORDINATE)
     return read(positions.data, VECTOR)
 
 
 def set_mesh_positions(mesh: bpy.types.Mesh, positions: np.ndarray) -> None:
-    """Move the vertices of a mesh: (V, 3) float32, its object's space, metres. Nothing is tagged."""
+    """Write the vertex positions of a mesh without tagging it.
+
+    Args:
+        mesh: an original or evaluated mesh.
+        positions: (V, 3) float32, object space, mesh units.
+    """
     if not len(positions):
-        # A mesh without vertices has no positions.
+        # A mesh without vertices has no such attribute.
         return
     write(mesh.attributes["position"].data, VECTOR, positions)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a group of Geometry Nodes does to a mesh, as far as its nodes say. Nothing is evaluated."""
+"""Analyzes the nodes of Geometry Nodes groups, without evaluating them, for their effect on a mesh."""
 
 from collections.abc import Iterator
 from enum import Enum, auto
@@ -12,6 +12,7 @@ ATTRIBUTE_NODES = {
     "GeometryNodeSetMeshNormal", "GeometryNodeSetShadeSmooth", "GeometryNodeStoreNamedAttribute",
     "GeometryNodeViewer", "NodeGroupInput", "NodeReroute",
 }  # fmt: skip
+"""Nodes that keep the vertices and their positions."""
 POSITION_NODE = "GeometryNodeSetPosition"
 SIMULATION_NODES = {"GeometryNodeSimulationInput", "GeometryNodeSimulationOutput"}
 TIME_NODES = {"GeometryNodeInputSceneTime", *SIMULATION_NODES}
@@ -19,40 +20,40 @@ UNLINKED = "unlinked"
 
 
 class GeometryEffect(Enum):
-    """What the nodes between the geometry that comes in and the one that goes out can do to a mesh."""
+    """The possible effect of the nodes between the input geometry and the output geometry of a group."""
 
     ATTRIBUTES = auto()
-    """Materials, shading, attributes: vertices stay where they are."""
+    """They change materials, shading or attributes, and move no vertices."""
     POSITIONS = auto()
-    """Vertices move; there are as many as before, in the same order."""
+    """They move vertices, and keep their number and order."""
     ANY = auto()
-    """More than the nodes alone tell."""
+    """Their effect cannot be told without an evaluation."""
 
 
 def geometry_effect(tree: bpy.types.NodeTree | None) -> GeometryEffect:
-    """What a node group can do to a mesh. A modifier without a group does nothing."""
+    """Return the possible effect of a node group on a mesh. A modifier without a group has none."""
     if tree is None:
         return GeometryEffect.ATTRIBUTES
-    kinds = set(_on_the_way(tree))
-    if kinds <= ATTRIBUTE_NODES:
+    node_types = set(_geometry_node_types(tree))
+    if node_types <= ATTRIBUTE_NODES:
         return GeometryEffect.ATTRIBUTES
-    return GeometryEffect.POSITIONS if kinds <= ATTRIBUTE_NODES | {POSITION_NODE} else GeometryEffect.ANY
+    return GeometryEffect.POSITIONS if node_types <= ATTRIBUTE_NODES | {POSITION_NODE} else GeometryEffect.ANY
 
 
 def find_time_node(tree: bpy.types.NodeTree | None) -> bpy.types.Node | None:
-    """A node, in the group or in groups that it uses, whose result depends on time; None when there is none."""
+    """Find a node whose result depends on time, in the group or in nested groups; return None if there is none."""
     for node in tree.nodes if tree is not None else ():
         if node.mute:
             continue
         if node.bl_idname in TIME_NODES:
             return node
-        if node.type == "GROUP" and (found := find_time_node(node.node_tree)):
-            return found
+        if node.type == "GROUP" and (nested_node := find_time_node(node.node_tree)):
+            return nested_node
     return None
 
 
-def _on_the_way(tree: bpy.types.NodeTree) -> Iterator[str]:
-    """Kinds of the nodes that geometry passes on its way out, those of nested groups included."""
+def _geometry_node_types(tree: bpy.types.NodeTree) -> Iterator[str]:
+    """Yield the types of the nodes that the output geometry passes, including those of nested groups."""
     open_nodes = [n for n in tree.nodes if n.bl_idname == "NodeGroupOutput" and n.is_active_output]
     if not open_nodes:
         yield UNLINKED
@@ -60,7 +61,7 @@ def _on_the_way(tree: bpy.types.NodeTree) -> Iterator[str]:
     while open_nodes:
         node = open_nodes.pop()
         if node.bl_idname != "NodeGroupOutput" and not node.mute:
-            yield from _kinds(node)
+            yield from _node_types(node)
         for socket in node.inputs:
             if socket.type != "GEOMETRY" or not socket.enabled:
                 continue
@@ -72,9 +73,9 @@ def _on_the_way(tree: bpy.types.NodeTree) -> Iterator[str]:
             seen.update(sources)
 
 
-def _kinds(node: bpy.types.Node) -> Iterator[str]:
+def _node_types(node: bpy.types.Node) -> Iterator[str]:
     if node.type == "GROUP" and node.node_tree is not None:
-        yield from _on_the_way(node.node_tree)
+        yield from _geometry_node_types(node.node_tree)
     elif node.bl_idname == "GeometryNodeStoreNamedAttribute" and _may_store_positions(node):
         yield POSITION_NODE
     else:

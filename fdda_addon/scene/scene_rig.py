@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds the rig in a scene, or says why there is none. Nothing here is evaluated and numpy is not needed."""
+"""Finds the rigs of a scene, without evaluating anything and without numpy."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,15 +10,15 @@ from ..core.errors import RigError
 from .comparison import is_comparison
 
 MODIFIER_NAME = "FDDA"
-"""Name of the Geometry Nodes modifier that plays a model; it is never part of the rig."""
+"""Name of the Geometry Nodes modifier that shows a model's positions; it is never part of the rig."""
 
 MIN_VOLUME = 1e-15
-"""An object whose scales multiply to less is flat: no position could be brought into its space."""
+"""An object whose matrix has a smaller determinant is flat: the inverse that positions need does not exist."""
 
 
 @dataclass(frozen=True)
 class SceneRig:
-    """A mesh object and the armature object that deforms it. Holds RNA references: not to be kept."""
+    """A mesh object and the armature object that deforms it. Holds RNA references, so do not store it."""
 
     mesh_object: bpy.types.Object
     armature_object: bpy.types.Object
@@ -28,10 +28,10 @@ def find_rig(name: str = "") -> SceneRig:
     """Find the rig of the current scene.
 
     Args:
-        name: of the mesh object; may be left out when one mesh of the scene has an Armature modifier.
+        name: name of the mesh object; optional if only one mesh of the scene has an Armature modifier.
 
     Raises:
-        RigError: there is none, or more than one.
+        RigError: there is no rig, or more than one.
     """
     meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and not is_comparison(o)]
     if name:
@@ -60,7 +60,7 @@ def find_rigs() -> list[SceneRig]:
     """Find all rigs of the current scene: the meshes with an Armature modifier, in the order of the scene.
 
     Raises:
-        RigError: there is none.
+        RigError: there is no rig.
     """
     meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and not is_comparison(o)]
     rigged = [o for o in meshes if armature_modifier(o) is not None]
@@ -68,12 +68,12 @@ def find_rigs() -> list[SceneRig]:
 
 
 def is_flat(scene_object: bpy.types.Object) -> bool:
-    """Whether an object has a scale of zero along an axis, its own or its parents'."""
+    """Return whether an object or one of its parents has a scale of zero along an axis."""
     return abs(scene_object.matrix_world.to_3x3().determinant()) < MIN_VOLUME
 
 
 def armature_modifier(mesh_object: bpy.types.Object) -> bpy.types.ArmatureModifier | None:
-    """The first Armature modifier that has an armature, None when there is none."""
+    """Return the first Armature modifier that has an armature; None if there is none."""
     for modifier in mesh_object.modifiers:
         if modifier.type == "ARMATURE" and modifier.object is not None:
             return modifier
@@ -81,7 +81,7 @@ def armature_modifier(mesh_object: bpy.types.Object) -> bpy.types.ArmatureModifi
 
 
 def parenting_message(mesh_object: bpy.types.Object) -> str:
-    """Why a mesh that no modifier ties to an armature is no rig though it is parented to one; empty when it is not."""
+    """Explain why a mesh that is parented to an armature, without a modifier, is no rig; empty if it is not parented."""
     parent = mesh_object.parent
     if parent is None or parent.type != "ARMATURE":
         return ""
@@ -102,34 +102,33 @@ def parenting_message(mesh_object: bpy.types.Object) -> str:
 
 
 def armature_of(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
-    """The armature object that deforms a mesh, None when there is none.
+    """Find the armature object that deforms a mesh; return None if there is none.
 
-    That of its first Armature modifier; else the first that is reached through the objects that its modifiers read: a
-    cage or a lattice that has an Armature modifier itself, an empty that is the child of a bone.
+    It is the armature of the first Armature modifier. Without one, it is the first armature that the objects that the
+    modifiers read depend on: a cage or a lattice may have an Armature modifier, an empty may be the child of a bone.
     """
     modifier = armature_modifier(mesh_object)
     if modifier is not None:
         return modifier.object
-    seen = {mesh_object}
-    waiting = list(objects_read_by_modifiers(mesh_object))
-    while waiting:
-        found = waiting.pop(0)
-        if found.type == "ARMATURE":
-            return found
-        if found not in seen:
-            seen.add(found)
-            targets = [getattr(constraint, "target", None) for constraint in found.constraints if not constraint.mute]
-            waiting += [
-                other for other in (*objects_read_by_modifiers(found), found.parent, *targets) if other is not None
-            ]
+    visited = {mesh_object}
+    queue = list(objects_read_by_modifiers(mesh_object))
+    while queue:
+        candidate = queue.pop(0)
+        if candidate.type == "ARMATURE":
+            return candidate
+        if candidate not in visited:
+            visited.add(candidate)
+            targets = [getattr(c, "target", None) for c in candidate.constraints if not c.mute]
+            inputs = (*objects_read_by_modifiers(candidate), candidate.parent, *targets)
+            queue += [scene_object for scene_object in inputs if scene_object is not None]
     return None
 
 
 def objects_read_by_modifiers(owner: bpy.types.Object) -> Iterator[bpy.types.Object]:
-    """The objects that the modifiers of an object read."""
+    """Yield the objects that the modifiers of an object read."""
     for modifier in owner.modifiers:
         for prop in modifier.bl_rna.properties:
             if prop.type == "POINTER" and prop.fixed_type.identifier == "Object":
-                found = getattr(modifier, prop.identifier)
-                if found is not None:
-                    yield found
+                scene_object = getattr(modifier, prop.identifier)
+                if scene_object is not None:
+                    yield scene_object

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How long a unit of an object's space is: of the scene's unit scale and the object's own."""
+"""Computes the length of a unit of an object's space from the scales of scene and object."""
 
 import bpy
 import numpy as np
 
 
 def metres_per_unit(scene_object: bpy.types.Object) -> float:
-    """The length of a unit of an object's space as scene and object are scaled now, metres.
+    """Compute the length of a unit of an object's space, in metres, with the current scales of scene and object.
 
-    An object that is scaled by other factors along each axis counts as scaled by their geometric mean.
+    For an object with different scales along its axes, it uses their geometric mean.
 
     Returns:
-        Six digits: what Blender's single precision is good for, so that a metre is exactly 1.
+        The length, rounded to six digits, which is Blender's single precision, so that a metre is exactly 1.
     """
     settings = bpy.context.scene.unit_settings
     scale = settings.scale_length if settings.system != "NONE" else 1.0

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The 3D viewports of all windows."""
+"""Redraws and frames the 3D viewports."""
 
 from collections.abc import Iterable
 
 import bpy
 from mathutils import Vector
 
-DISTANCE = 2.0
-"""Of the viewer, in radii of what is looked at: it fills most of the view with Blender's own lens of 50 mm."""
+VIEW_DISTANCE_RADII = 2.0
+"""Distance of the viewer in radii of the framed objects: these fill most of the view with Blender's default lens."""
+DEFAULT_LENS_MM = 50
 
 
 def redraw_views() -> None:
-    """Draw the 3D viewports again."""
+    """Redraw all 3D viewports."""
     for window in getattr(bpy.context.window_manager, "windows", ()):
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
@@ -19,7 +20,7 @@ def redraw_views() -> None:
 
 
 def frame_objects(objects: Iterable[bpy.types.Object]) -> None:
-    """Have all 3D viewports of the file look at objects, from where they look now; works without a window."""
+    """Frame objects in all 3D viewports of the file, without changing the view direction; works without a window."""
     corners = [o.matrix_world @ Vector(corner) for o in objects for corner in o.bound_box]
     if not corners:
         return
@@ -30,5 +31,5 @@ def frame_objects(objects: Iterable[bpy.types.Object]) -> None:
             if space.region_3d.view_perspective == "CAMERA":
                 space.region_3d.view_perspective = "PERSP"
             space.region_3d.view_location = (low + high) / 2
-            space.region_3d.view_distance = DISTANCE * radius * max(1.0, space.lens / 50)
+            space.region_3d.view_distance = VIEW_DISTANCE_RADII * radius * max(1.0, space.lens / DEFAULT_LENS_MM)
             space.clip_start = min(space.clip_start, radius / 10)
