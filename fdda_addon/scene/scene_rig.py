@@ -81,7 +81,7 @@ def armature_modifier(mesh_object: bpy.types.Object) -> bpy.types.ArmatureModifi
 
 
 def parenting_message(mesh_object: bpy.types.Object) -> str:
-    """Explain why a mesh that is parented to an armature, without a modifier, is no rig; empty if it is not parented."""
+    """Explain why a mesh with an armature as its parent, but no modifier, is no rig; empty if it has no such parent."""
     parent = mesh_object.parent
     if parent is None or parent.type != "ARMATURE":
         return ""

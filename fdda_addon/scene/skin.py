@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Skin weights as Blender's Armature modifier takes them.
+"""Computes the skin weights that Blender's Armature modifier uses.
 
-The rules of the modifier (Blender's manual, Armature Modifier; blenkernel/intern/armature_deform.cc): weights of the
-vertex groups of deforming bones, times the bone's envelope where it multiplies; the envelopes of all deforming bones
-for a vertex that is in none of these groups, where the modifier uses envelopes; divided by their sum; a sum of nearly
-nothing leaves the vertex where it is. So does the modifier's own vertex group, by its weight.
+The rules of the modifier (Blender's manual, Armature Modifier; blenkernel/intern/armature_deform.cc): It takes the
+weights of the vertex groups of deforming bones, times the bone's envelope where that multiplies. If it uses envelopes,
+a vertex in none of these groups gets the envelopes of all deforming bones. It divides the weights by their sum, and
+does not move a vertex whose sum is nearly zero. Its own vertex group scales the deformation.
 """
 
 from dataclasses import dataclass
@@ -17,30 +17,33 @@ from .mesh import rest_positions
 
 MIN_INFLUENCES = 4
 """Skin weights have at least this many places a vertex (docs/formats.md)."""
-MIN_SUM = 1e-4
-"""A vertex whose weights sum to less is not moved by the modifier."""
+MIN_WEIGHT_SUM = 1e-4
+"""The modifier does not move a vertex whose weights have a smaller sum."""
 
 
 @dataclass(frozen=True)
 class Skin:
-    """Weights of a mesh, one entry for each vertex and bone with a weight.
+    """Skin weights of a mesh, one entry for each pair of a vertex and a bone with a weight.
 
     Attributes:
-        bones: names of the bones that have weights, `STATIC_JOINT` where something follows no bone.
+        bones: names of the bones that have weights; `STATIC_JOINT` if something follows no bone.
         vertices: (n,) int64, ascending.
-        places: (n,) int64 indices into `bones`.
+        bone_indices: (n,) int64 indices into `bones`.
         weights: (n,) float32; those of a vertex sum to 1.
-        vertex_count: of the mesh.
+        vertex_count: number of vertices of the mesh.
     """
 
     bones: tuple[str, ...]
     vertices: np.ndarray
-    places: np.ndarray
+    bone_indices: np.ndarray
     weights: np.ndarray
     vertex_count: int
 
     def arrays(self, joints: dict[str, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Dense arrays for joint indices by name.
+        """Convert the weights to dense arrays.
+
+        Args:
+            joints: joint indices by name.
 
         Returns:
             skin_joints (V, I) int32 and skin_weights (V, I) float32, rows of weights sum to 1; I is 4 or more.
@@ -52,7 +55,7 @@ class Skin:
         shape = (self.vertex_count, max(MIN_INFLUENCES, int(counts.max(initial=0))))
         skin_joints, skin_weights = np.zeros(shape, np.int32), np.zeros(shape, np.float32)
         slots = np.arange(len(self.vertices)) - np.repeat(np.cumsum(counts) - counts, counts)
-        skin_joints[self.vertices, slots] = np.array([joints[name] for name in self.bones], np.int32)[self.places]
+        skin_joints[self.vertices, slots] = np.array([joints[name] for name in self.bones], np.int32)[self.bone_indices]
         skin_weights[self.vertices, slots] = self.weights
         return skin_joints, skin_weights
 
@@ -60,113 +63,118 @@ class Skin:
 def read_skin(
     mesh_object: bpy.types.Object, armature_object: bpy.types.Object, modifier: bpy.types.ArmatureModifier | None
 ) -> Skin:
-    """Read the weights of a mesh.
+    """Read the skin weights of a mesh.
 
     Args:
         mesh_object: the mesh object.
-        armature_object: whose bones deform it.
-        modifier: the Armature modifier; None where there is none, and nothing follows a bone.
+        armature_object: the armature object that deforms it.
+        modifier: the Armature modifier; None if there is none, so that nothing follows a bone.
     """
     count = len(mesh_object.data.vertices)
     bones = [bone for bone in armature_object.data.bones if bone.use_deform]
     entries = _Entries(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32))
     if modifier is not None:
-        grouped = np.zeros(count, bool)
+        has_group = np.zeros(count, bool)
         if modifier.use_vertex_groups:
-            entries, grouped = _of_groups(mesh_object, armature_object, bones)
-        if modifier.use_bone_envelopes and not grouped.all():
-            entries = entries.joined(_of_envelopes(mesh_object, armature_object, bones, np.flatnonzero(~grouped)))
-    kept = _moved_parts(mesh_object, modifier, count)
+            entries, has_group = _group_weights(mesh_object, armature_object, bones)
+        if modifier.use_bone_envelopes and not has_group.all():
+            ungrouped = np.flatnonzero(~has_group)
+            entries = entries.concatenated(_envelope_weights(mesh_object, armature_object, bones, ungrouped))
+    factors = _modifier_factors(mesh_object, modifier, count)
     sums = np.bincount(entries.vertices, entries.weights, count)
-    kept[sums <= MIN_SUM] = 0
-    entries = entries.chosen((entries.weights > 0) & (kept[entries.vertices] > 0))
+    factors[sums <= MIN_WEIGHT_SUM] = 0
+    entries = entries.selected((entries.weights > 0) & (factors[entries.vertices] > 0))
     weights = (
         entries.weights / np.bincount(entries.vertices, entries.weights, count).astype(np.float32)[entries.vertices]
     )
-    entries = _Entries(entries.vertices, entries.places, weights * kept[entries.vertices].astype(np.float32))
-    unmoved = np.flatnonzero(kept < 1)
-    here = np.full(len(unmoved), len(bones))
-    entries = entries.joined(_Entries(unmoved, here, (1 - kept[unmoved]).astype(np.float32))).sorted()
+    entries = _Entries(entries.vertices, entries.bone_indices, weights * factors[entries.vertices].astype(np.float32))
+    static = np.flatnonzero(factors < 1)
+    static_joint = np.full(len(static), len(bones))
+    entries = entries.concatenated(_Entries(static, static_joint, (1 - factors[static]).astype(np.float32))).sorted()
     names = np.array([*(bone.name for bone in bones), STATIC_JOINT], object)
-    used, places = np.unique(entries.places, return_inverse=True)
-    return Skin(tuple(names[used]), entries.vertices, places, entries.weights, count)
+    used, bone_indices = np.unique(entries.bone_indices, return_inverse=True)
+    return Skin(tuple(names[used]), entries.vertices, bone_indices, entries.weights, count)
 
 
 @dataclass(frozen=True)
 class _Entries:
-    """As in `Skin`, with indices into all deforming bones; weights not yet divided by their sum."""
+    """Weights as in `Skin`, with indices into all deforming bones, not yet divided by their sum."""
 
     vertices: np.ndarray
-    places: np.ndarray
+    bone_indices: np.ndarray
     weights: np.ndarray
 
-    def joined(self, other: "_Entries") -> "_Entries":
-        pairs = ((getattr(own, name) for own in (self, other)) for name in ("vertices", "places", "weights"))
-        return _Entries(*(np.concatenate(list(pair)) for pair in pairs))
+    def concatenated(self, other: "_Entries") -> "_Entries":
+        fields = ("vertices", "bone_indices", "weights")
+        return _Entries(*(np.concatenate([getattr(self, field), getattr(other, field)]) for field in fields))
 
-    def chosen(self, mask: np.ndarray) -> "_Entries":
-        return _Entries(self.vertices[mask], self.places[mask], self.weights[mask])
+    def selected(self, mask: np.ndarray) -> "_Entries":
+        return _Entries(self.vertices[mask], self.bone_indices[mask], self.weights[mask])
 
     def sorted(self) -> "_Entries":
-        return self.chosen(np.argsort(self.vertices, kind="stable"))
+        return self.selected(np.argsort(self.vertices, kind="stable"))
 
 
-def _of_groups(
+def _group_weights(
     mesh_object: bpy.types.Object, armature_object: bpy.types.Object, bones: list[bpy.types.Bone]
 ) -> tuple[_Entries, np.ndarray]:
-    """Weights of vertex groups, and (V,) whether a vertex is in a group of a deforming bone, whatever its weight."""
-    place_of_bone = {bone.name: place for place, bone in enumerate(bones)}
-    place_of_group = {
-        group.index: place_of_bone[group.name] for group in mesh_object.vertex_groups if group.name in place_of_bone
+    """Read the weights of vertex groups.
+
+    Returns:
+        The weights, and (V,) bool whether a vertex is in a group of a deforming bone, with any weight.
+    """
+    bone_indices = {bone.name: index for index, bone in enumerate(bones)}
+    group_bones = {
+        group.index: bone_indices[group.name] for group in mesh_object.vertex_groups if group.name in bone_indices
     }
     rows = [
-        (vertex.index, place_of_group[g.group], g.weight)
+        (vertex.index, group_bones[g.group], g.weight)
         for vertex in mesh_object.data.vertices
         for g in vertex.groups
-        if g.group in place_of_group
+        if g.group in group_bones
     ]
-    vertices, places, weights = zip(*rows, strict=True) if rows else ((), (), ())
-    entries = _Entries(np.array(vertices, np.int64), np.array(places, np.int64), np.array(weights, np.float32))
-    grouped = np.zeros(len(mesh_object.data.vertices), bool)
-    grouped[entries.vertices] = True
+    vertices, indices, weights = zip(*rows, strict=True) if rows else ((), (), ())
+    entries = _Entries(np.array(vertices, np.int64), np.array(indices, np.int64), np.array(weights, np.float32))
+    has_group = np.zeros(len(mesh_object.data.vertices), bool)
+    has_group[entries.vertices] = True
     if any(bone.use_envelope_multiply for bone in bones):
-        entries = _multiplied(mesh_object, armature_object, bones, entries)
-    return entries, grouped
+        entries = _multiply_envelopes(mesh_object, armature_object, bones, entries)
+    return entries, has_group
 
 
-def _multiplied(
+def _multiply_envelopes(
     mesh_object: bpy.types.Object, armature_object: bpy.types.Object, bones: list[bpy.types.Bone], entries: _Entries
 ) -> _Entries:
-    """Weights times the envelopes of the bones that are set to multiply."""
+    """Multiply the weights by the envelopes of the bones that are set to multiply."""
     weights = entries.weights.copy()
     points = _rest_points(mesh_object, armature_object, np.arange(len(mesh_object.data.vertices)))
-    for place, bone in enumerate(bones):
+    for bone_index, bone in enumerate(bones):
         if bone.use_envelope_multiply:
-            own = np.flatnonzero(entries.places == place)
-            weights[own] *= _envelope(bone, points[entries.vertices[own]])
-    return _Entries(entries.vertices, entries.places, weights)
+            rows = np.flatnonzero(entries.bone_indices == bone_index)
+            weights[rows] *= _envelope(bone, points[entries.vertices[rows]])
+    return _Entries(entries.vertices, entries.bone_indices, weights)
 
 
-def _of_envelopes(
+def _envelope_weights(
     mesh_object: bpy.types.Object, armature_object: bpy.types.Object, bones: list[bpy.types.Bone], vertices: np.ndarray
 ) -> _Entries:
-    """Weights of the envelopes of all bones on some vertices."""
+    """Compute the weights of the envelopes of all bones for some vertices, given by their (n,) int64 indices."""
     points = _rest_points(mesh_object, armature_object, vertices)
-    factors = [_envelope(bone, points) * bone.envelope_weight for bone in bones]
-    found = [np.flatnonzero(own > 0) for own in factors]
+    bone_weights = [_envelope(bone, points) * bone.envelope_weight for bone in bones]
+    inside = [np.flatnonzero(weights > 0) for weights in bone_weights]
+    positive = [weights[rows] for weights, rows in zip(bone_weights, inside, strict=True)]
     return _Entries(
-        np.concatenate([np.zeros(0, np.int64), *(vertices[own] for own in found)]),
-        np.repeat(np.arange(len(bones)), [len(own) for own in found]),
-        np.concatenate([np.zeros(0), *(own[chosen] for own, chosen in zip(factors, found, strict=True))]).astype(
-            np.float32
-        ),
+        np.concatenate([np.zeros(0, np.int64), *(vertices[rows] for rows in inside)]),
+        np.repeat(np.arange(len(bones)), [len(rows) for rows in inside]),
+        np.concatenate([np.zeros(0), *positive]).astype(np.float32),
     )
 
 
 def _envelope(bone: bpy.types.Bone, points: np.ndarray) -> np.ndarray:
-    """How much a bone's envelope holds points: 1 inside its radius, falling to 0 over its distance.
+    """Evaluate a bone's envelope at points: 1 inside its radius, decreasing to 0 over its distance.
 
-    `Bone.evaluate_envelope` for many points, without the weight that it takes in where the envelope multiplies.
+    This is `Bone.evaluate_envelope` for many points, without the envelope weight that it includes for multiplying
+    envelopes.
 
     Args:
         bone: the bone.
@@ -175,24 +183,26 @@ def _envelope(bone: bpy.types.Bone, points: np.ndarray) -> np.ndarray:
     Returns:
         (n,) float64, 0 to 1.
     """
-    head, along = np.array(bone.head_local), np.array(bone.tail_local) - np.array(bone.head_local)
-    place = np.clip((points - head) @ along / max(along @ along, 1e-30), 0, 1)
-    radius = bone.head_radius + place * (bone.tail_radius - bone.head_radius)
-    beyond = np.linalg.norm(points - head - place[:, None] * along, axis=1) - radius
+    head, axis = np.array(bone.head_local), np.array(bone.tail_local) - np.array(bone.head_local)
+    fraction = np.clip((points - head) @ axis / max(axis @ axis, 1e-30), 0, 1)
+    radius = bone.head_radius + fraction * (bone.tail_radius - bone.head_radius)
+    distance = np.linalg.norm(points - head - fraction[:, None] * axis, axis=1) - radius
     if bone.envelope_distance == 0:
-        return (beyond < 0).astype(np.float64)
-    return 1 - np.clip(beyond / bone.envelope_distance, 0, 1) ** 2
+        return (distance < 0).astype(np.float64)
+    return 1 - np.clip(distance / bone.envelope_distance, 0, 1) ** 2
 
 
 def _rest_points(mesh_object: bpy.types.Object, armature_object: bpy.types.Object, vertices: np.ndarray) -> np.ndarray:
-    """(n, 3) float64 rest positions of some vertices in armature space, its units."""
+    """Return the rest positions of some vertices, (n, 3) float64, armature space, armature units."""
     to_armature = np.array(armature_object.matrix_world.inverted_safe() @ mesh_object.matrix_world, np.float64)
     points = rest_positions(mesh_object.data)[vertices].astype(np.float64)
     return points @ to_armature[:3, :3].T + to_armature[:3, 3]
 
 
-def _moved_parts(mesh_object: bpy.types.Object, modifier: bpy.types.ArmatureModifier | None, count: int) -> np.ndarray:
-    """(V,) float64 how far the modifier moves each vertex, by its vertex group."""
+def _modifier_factors(
+    mesh_object: bpy.types.Object, modifier: bpy.types.ArmatureModifier | None, count: int
+) -> np.ndarray:
+    """Return the factor by which the modifier's vertex group scales the deformation of each vertex, (V,) float64."""
     if modifier is None:
         return np.zeros(count)
     group = mesh_object.vertex_groups.get(modifier.vertex_group) if modifier.vertex_group else None
