@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reads what deforms a mesh beside its skin weights (`core.deformation`), as a model will stand in for it."""
+"""Reads what deforms a mesh besides its skin weights, and what its model therefore replaces (`core.deformation`)."""
 
 import json
 from collections.abc import Iterator
@@ -14,49 +14,50 @@ from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import animated_paths
 from .modifier_stack import BIND_PROPERTIES, is_fdda_modifier, recorded_modifiers
 
-_OF_ALL = frozenset(bpy.types.Modifier.bl_rna.properties.keys())
-"""Properties that every modifier has; none of them says what it does to a mesh."""
-_OF_SHAPE_KEY = ("value", "mute", "vertex_group", "interpolation")
-_NOT_SHAPE = {"bbone_x", "bbone_z"}
-"""How thick B-Bones are drawn."""
-_DIGITS = 6
+_COMMON_PROPERTIES = frozenset(bpy.types.Modifier.bl_rna.properties.keys())
+"""Properties that all modifiers have; none of them changes the effect on the mesh."""
+_SHAPE_KEY_PROPERTIES = ("value", "mute", "vertex_group", "interpolation")
+_DISPLAY_PROPERTIES = {"bbone_x", "bbone_z"}
+"""Display size of B-Bones."""
+_SIGNIFICANT_DIGITS = 6
 
 
 def read_deformation(scene_rig: SceneRig) -> dict:
-    """Read what deforms the mesh of a rig.
+    """Read what deforms the mesh of a rig besides its skin weights, as JSON values.
 
     Raises:
         RigError: as `recorded_modifiers`.
     """
     mesh_object = scene_rig.mesh_object
-    found = {
-        "modifiers": [_modifier(scene_rig, modifier) for modifier in recorded_modifiers(mesh_object)],
-        "shape_keys": _shape_keys(mesh_object),
+    deformation = {
+        "modifiers": [_read_modifier(scene_rig, modifier) for modifier in recorded_modifiers(mesh_object)],
+        "shape_keys": _read_shape_keys(mesh_object),
         "b_bones": read_b_bones(scene_rig.armature_object.data),
-        "drivers": _drivers(scene_rig),
+        "drivers": _drivers_digest(scene_rig),
     }
-    return {key: value for key, value in found.items() if value or key == "modifiers"}
+    return {key: value for key, value in deformation.items() if value or key == "modifiers"}
 
 
 def read_b_bones(armature: bpy.types.Armature) -> dict:
-    """Settings of the deforming bones that have B-Bone segments, by name."""
-    known = [prop.identifier for prop in bpy.types.Bone.bl_rna.properties]
-    names = [name for name in known if name.startswith("bbone_") and name not in _NOT_SHAPE]
+    """Read the settings of the deforming bones that have B-Bone segments, by the names of the bones."""
+    properties = [prop.identifier for prop in bpy.types.Bone.bl_rna.properties]
+    names = [name for name in properties if name.startswith("bbone_") and name not in _DISPLAY_PROPERTIES]
     return {
-        bone.name: {name.removeprefix("bbone_"): _value(None, bone, name) for name in names}
+        bone.name: {name.removeprefix("bbone_"): _json_property(None, bone, name) for name in names}
         for bone in armature.bones
         if bone.use_deform and bone.bbone_segments > 1
     }
 
 
-def _modifier(scene_rig: SceneRig, modifier: bpy.types.Modifier) -> dict:
+def _read_modifier(scene_rig: SceneRig, modifier: bpy.types.Modifier) -> dict:
+    """Read name, type and settings of a modifier; animated settings are None."""
     if modifier.type == "NODES":
         settings = _node_inputs(modifier)
     else:
-        properties = [p for p in modifier.bl_rna.properties if p.identifier not in _OF_ALL]
-        bound = BIND_PROPERTIES.get(modifier.type)
-        names = [p.identifier for p in properties if not p.is_readonly or p.identifier == bound]
-        settings = {name: _value(scene_rig, modifier, name) for name in names if _is_setting(modifier, name)}
+        properties = [p for p in modifier.bl_rna.properties if p.identifier not in _COMMON_PROPERTIES]
+        bind_property = BIND_PROPERTIES.get(modifier.type)
+        names = [p.identifier for p in properties if not p.is_readonly or p.identifier == bind_property]
+        settings = {name: _json_property(scene_rig, modifier, name) for name in names if _is_setting(modifier, name)}
     animated = animated_paths(modifier.id_data)
     for name in settings:
         if f"{modifier.path_from_id()}.{name}" in animated:
@@ -76,67 +77,70 @@ def _node_inputs(modifier: bpy.types.NodesModifier) -> dict:
     items = [] if group is None else group.interface.items_tree
     sockets = [i.identifier for i in items if i.item_type == "SOCKET" and i.in_out == "INPUT"]
     values = {socket: node_input(modifier, socket) for socket in sockets}
-    return {socket: _plain(None, value) for socket, value in values.items() if value is not None}
+    return {socket: _json_value(None, value) for socket, value in values.items() if value is not None}
 
 
-def _shape_keys(mesh_object: bpy.types.Object) -> dict:
-    """Settings of the shape keys that move vertices, by name."""
+def _read_shape_keys(mesh_object: bpy.types.Object) -> dict:
+    """Read the settings of the shape keys that move vertices, by name; animated settings are None."""
     keys = mesh_object.data.shape_keys
     if keys is None:
         return {}
-    animated, relatives, found = animated_paths(keys), {}, {}
+    animated, relatives, shape_keys = animated_paths(keys), {}, {}
     for block in keys.key_blocks:
         if block == keys.reference_key:
             continue
-        shape = read(block.data, COORDINATE)
+        positions = read(block.data, COORDINATE)
         relative = block.relative_key
         if relative.name not in relatives:
             relatives[relative.name] = read(relative.data, COORDINATE)
-        if (shape == relatives[relative.name]).all():
-            # It moves nothing.
+        if (positions == relatives[relative.name]).all():
+            # It moves no vertex.
             continue
-        settings = {name: _value(None, block, name) for name in _OF_SHAPE_KEY}
+        settings = {name: _json_property(None, block, name) for name in _SHAPE_KEY_PROPERTIES}
         for name in settings:
             if f"{block.path_from_id()}.{name}" in animated:
                 settings[name] = None
         if mesh_object.show_only_shape_key:
             settings["value"] = float(block == mesh_object.active_shape_key)
-        found[block.name] = settings | {"shape": Fingerprint.digest(shape)}
-    return found
+        shape_keys[block.name] = settings | {"shape": Fingerprint.digest(positions)}
+    return shape_keys
 
 
-def _drivers(scene_rig: SceneRig) -> str:
-    """A hash of the drivers of the mesh, its shape keys and its modifiers; empty when there are none."""
+def _drivers_digest(scene_rig: SceneRig) -> str:
+    """Compute a digest of the drivers of the mesh, its shape keys and its modifiers; empty if there are none."""
     mesh_object = scene_rig.mesh_object
-    found = []
+    drivers = []
     for owner in (mesh_object, mesh_object.data, mesh_object.data.shape_keys):
         for curve in owner.animation_data.drivers if owner is not None and owner.animation_data else ():
-            if owner is not mesh_object or _is_of_deformation(mesh_object, curve.data_path):
-                found.append(_driver(scene_rig, curve))
-    return Fingerprint.digest_text(json.dumps(sorted(found))) if found else ""
+            if owner is not mesh_object or _is_rig_modifier_path(mesh_object, curve.data_path):
+                drivers.append(_read_driver(scene_rig, curve))
+    return Fingerprint.digest_text(json.dumps(sorted(drivers))) if drivers else ""
 
 
-def _is_of_deformation(mesh_object: bpy.types.Object, path: str) -> bool:
-    playback = [modifier.path_from_id() for modifier in mesh_object.modifiers if is_fdda_modifier(modifier)]
-    return path.startswith("modifiers[") and not any(path.startswith(f"{own}.") for own in playback)
+def _is_rig_modifier_path(mesh_object: bpy.types.Object, path: str) -> bool:
+    """Return whether a path of a mesh object leads into a modifier of its rig, not into the FDDA modifier."""
+    fdda_paths = [modifier.path_from_id() for modifier in mesh_object.modifiers if is_fdda_modifier(modifier)]
+    return path.startswith("modifiers[") and not any(path.startswith(f"{fdda_path}.") for fdda_path in fdda_paths)
 
 
-def _driver(scene_rig: SceneRig, curve: bpy.types.FCurve) -> list:
+def _read_driver(scene_rig: SceneRig, curve: bpy.types.FCurve) -> list:
     driver = curve.driver
     return [
         *(curve.data_path, curve.array_index, curve.mute, driver.type),
         driver.expression if driver.type == "SCRIPTED" else "",
-        [[_rounded(part) for part in point.co] for point in curve.keyframe_points],
+        [[_rounded(coordinate) for coordinate in point.co] for point in curve.keyframe_points],
         [list(map(_rounded, m.coefficients)) for m in curve.modifiers if m.type == "GENERATOR"],
         [
-            [variable.name, variable.type, *(list(_target(scene_rig, variable, t)) for t in variable.targets)]
+            [variable.name, variable.type, *(list(_read_target(scene_rig, variable, t)) for t in variable.targets)]
             for variable in driver.variables
         ],
     ]
 
 
-def _target(scene_rig: SceneRig, variable: bpy.types.DriverVariable, target: bpy.types.DriverTarget) -> Iterator[str]:
-    # Names of other objects are not compared: a character that is duplicated has others.
+def _read_target(
+    scene_rig: SceneRig, variable: bpy.types.DriverVariable, target: bpy.types.DriverTarget
+) -> Iterator[str]:
+    # Without the names of other objects, which differ in a duplicate of the character.
     owner = "" if target.id is None else owner_name(scene_rig, target.id)
     yield owner.partition(":")[0]
     if variable.type == "SINGLE_PROP":
@@ -145,12 +149,12 @@ def _target(scene_rig: SceneRig, variable: bpy.types.DriverVariable, target: bpy
         yield from (target.bone_target, target.transform_type, target.transform_space, target.rotation_mode)
 
 
-def _value(scene_rig: SceneRig | None, struct: bpy.types.bpy_struct, name: str) -> object:
-    return _plain(scene_rig, getattr(struct, name))
+def _json_property(scene_rig: SceneRig | None, struct: bpy.types.bpy_struct, name: str) -> object:
+    return _json_value(scene_rig, getattr(struct, name))
 
 
-def _plain(scene_rig: SceneRig | None, value: object) -> object:
-    """A value of a property as JSON has it. Of a datablock, which may have another name, only what it is."""
+def _json_value(scene_rig: SceneRig | None, value: object) -> object:
+    """Convert the value of a property to JSON; of a datablock only its type, because its name may change."""
     if value is None:
         return ""
     if isinstance(value, bool | int | str):
@@ -165,8 +169,8 @@ def _plain(scene_rig: SceneRig | None, value: object) -> object:
         return getattr(value, "name", "")
     if isinstance(value, set):
         return sorted(value)
-    return [_plain(None, part) for part in value]
+    return [_json_value(None, item) for item in value]
 
 
 def _rounded(value: float) -> float:
-    return float(f"{value:.{_DIGITS}g}")
+    return float(f"{value:.{_SIGNIFICANT_DIGITS}g}")

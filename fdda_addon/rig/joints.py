@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which bones of an armature are the joints of a rig, and which joint is the parent of which."""
+"""Chooses which bones of an armature are the joints of a rig, and finds the parent of each joint."""
 
 from collections.abc import Iterable
 
@@ -11,74 +11,84 @@ from ..poses.sampling import default_channels
 from ..scene.scene_rig import SceneRig
 from .dependencies import read_dependencies
 
-COINCIDENT = 1e-5
-"""Bones whose ends lie no farther apart at rest coincide, as a part of their length."""
+COINCIDENCE_TOLERANCE = 1e-5
+"""Largest distance between the ends of two bones that coincide at rest, as a fraction of their length."""
 
 
 def choose_joints(
     scene_rig: SceneRig, skinning: Iterable[str], extra_joints: Iterable[str] | None = None
 ) -> tuple[Joint, ...]:
-    """The joints of a rig, every parent before its children.
+    """Choose the joints of a rig; every parent comes before its children.
 
-    The parent of a joint is the nearest bone above it that is a joint or lies where a joint lies: in a control rig the
-    deforming bones are children of bones that others pose, each in the place of a deforming one.
+    The parent of a joint is its nearest ancestor that is a joint or that coincides with a joint: in a control rig the
+    deforming bones are children of other bones, each of which coincides with a deforming bone.
 
     Args:
         scene_rig: the rig.
-        skinning: names of the bones that have weights; all deforming bones when there are none. `STATIC_JOINT` counts.
+        skinning: names of the bones that have weights, `STATIC_JOINT` among them; if empty, all deforming bones.
         extra_joints: names of further joints; names that the armature lacks are ignored. If they include all joints,
             they define the order. None for the bones that have a range of motion, those that the mesh depends on in
             other ways, and all parents of joints.
     """
     armature_object = scene_rig.armature_object
     bones = armature_object.data.bones
-    wanted = set(skinning)
+    names = set(skinning)
     extra_joints = None if extra_joints is None else list(extra_joints)
-    if not wanted - {STATIC_JOINT}:
-        wanted |= {bone.name for bone in bones if bone.use_deform}
+    if not names - {STATIC_JOINT}:
+        names |= {bone.name for bone in bones if bone.use_deform}
     if extra_joints is not None:
-        wanted |= {name for name in extra_joints if name in bones or name == STATIC_JOINT}
+        names |= {name for name in extra_joints if name in bones or name == STATIC_JOINT}
     else:
-        wanted |= {channel.name for channel in default_channels(armature_object, set())}
-        wanted |= read_dependencies(scene_rig).bones
-        wanted |= {above.name for name in wanted - {STATIC_JOINT} for above in bones[name].parent_recursive}
-    own = [bone for bone in bones if bone.name in wanted]
-    parents = _parents(own)
-    depths = {bone.name: _depth(bone.name, parents) for bone in own}
-    ordered = sorted((bone.name for bone in own), key=depths.__getitem__)
-    given = [name for name in extra_joints or () if name != STATIC_JOINT]
-    if set(given) == set(ordered):
-        places = {name: place for place, name in enumerate(given)}
-        if all(places.get(parents[name], -1) < places[name] for name in given):
-            ordered = given
-    index = {name: number for number, name in enumerate(ordered)}
-    joints = [Joint(name, index[parents[name]] if parents[name] else -1) for name in ordered]
-    return (*joints, *([Joint(STATIC_JOINT, -1)] if STATIC_JOINT in wanted else []))
+        names |= {channel.name for channel in default_channels(armature_object, set())}
+        names |= read_dependencies(scene_rig).bones
+        names |= {ancestor.name for name in names - {STATIC_JOINT} for ancestor in bones[name].parent_recursive}
+    joint_bones = [bone for bone in bones if bone.name in names]
+    parents = _parents(joint_bones)
+    depths = {bone.name: _depth(bone.name, parents) for bone in joint_bones}
+    ordered = sorted((bone.name for bone in joint_bones), key=depths.__getitem__)
+    given_order = [name for name in extra_joints or () if name != STATIC_JOINT]
+    if set(given_order) == set(ordered):
+        # The order of an armature's bones changes when other bones are added.
+        indices = {name: index for index, name in enumerate(given_order)}
+        if all(indices.get(parents[name], -1) < indices[name] for name in given_order):
+            ordered = given_order
+    indices = {name: index for index, name in enumerate(ordered)}
+    joints = [Joint(name, indices[parents[name]] if parents[name] else -1) for name in ordered]
+    return (*joints, *([Joint(STATIC_JOINT, -1)] if STATIC_JOINT in names else []))
 
 
-def _parents(own: list[bpy.types.Bone]) -> dict[str, str]:
-    """The parent joint of each joint by name, empty for a root."""
-    names = {bone.name for bone in own}
-    ends = np.array([[*bone.head_local, *bone.tail_local] for bone in own]).reshape(-1, 6)
-    parents = {bone.name: _above(bone, names, own, ends) for bone in own}
-    # Bones that lie in each other's place may each find the other: then only real ancestors count.
-    if any(_depth(name, parents) > len(own) for name in parents):
-        parents = {bone.name: _above(bone, names, [], ends[:0]) for bone in own}
+def _parents(joint_bones: list[bpy.types.Bone]) -> dict[str, str]:
+    """Find the parent joint of each joint, by name; empty for a root."""
+    names = {bone.name for bone in joint_bones}
+    ends = np.array([[*bone.head_local, *bone.tail_local] for bone in joint_bones]).reshape(-1, 6)
+    parents = {bone.name: _parent(bone, names, joint_bones, ends) for bone in joint_bones}
+    # Coincident bones may each find the other one as parent: then only real ancestors count.
+    if any(_depth(name, parents) > len(joint_bones) for name in parents):
+        parents = {bone.name: _parent(bone, names, [], ends[:0]) for bone in joint_bones}
     return parents
 
 
-def _above(bone: bpy.types.Bone, names: set[str], own: list[bpy.types.Bone], ends: np.ndarray) -> str:
-    for above in bone.parent_recursive:
-        if above.name in names:
-            return above.name
-        apart = np.abs(ends - [*above.head_local, *above.tail_local]).max(axis=1, initial=0)
-        for place in np.flatnonzero(apart <= COINCIDENT * above.length):
-            if own[place] != bone:
-                return own[place].name
+def _parent(bone: bpy.types.Bone, names: set[str], joint_bones: list[bpy.types.Bone], ends: np.ndarray) -> str:
+    """Find the parent joint of a joint.
+
+    Args:
+        bone: the bone of the joint.
+        names: names of all joints.
+        joint_bones: bones of the joints that an ancestor may coincide with.
+        ends: (n, 6) float64, head and tail of these bones, armature space.
+    """
+    for ancestor in bone.parent_recursive:
+        if ancestor.name in names:
+            return ancestor.name
+        distances = np.abs(ends - [*ancestor.head_local, *ancestor.tail_local]).max(axis=1, initial=0)
+        for index in np.flatnonzero(distances <= COINCIDENCE_TOLERANCE * ancestor.length):
+            if joint_bones[index] != bone:
+                return joint_bones[index].name
     return ""
 
 
 def _depth(name: str, parents: dict[str, str]) -> int:
+    """Count the ancestors of a joint; more than all joints for a cycle."""
     depth = 0
     while (name := parents[name]) and depth <= len(parents):
         depth += 1

@@ -60,7 +60,7 @@ class Sources:
         self.numbers: dict[tuple[bpy.types.ID, str], None] = {}
         self.scene_reads: list[tuple[Curve, bpy.types.ID, str]] = []
         self._waiting: list[bpy.types.Object] = []
-        self._add_object(root, with_shape=True)
+        self._add_object(root, uses_geometry=True)
         while self._waiting:
             self._follow(self._waiting.pop(0))
 
@@ -69,7 +69,7 @@ class Sources:
         """Names of bones of the rig's own armature."""
         return self.bones.get(self._rig.armature_object, set())
 
-    def moves(self, datablock: bpy.types.ID, path: str) -> bool:
+    def affects_surface(self, datablock: bpy.types.ID, path: str) -> bool:
         """Whether what is at a path of one of these can move the surface; custom properties do not by themselves."""
         if path.startswith('["'):
             return False
@@ -87,7 +87,7 @@ class Sources:
             return bone in self.bones.get(datablock, ()) and not rest.startswith('["')
         return datablock != self._root and path.startswith(_TRANSFORM)
 
-    def name_of(self, datablock: bpy.types.ID, path: str) -> str:
+    def control_name(self, datablock: bpy.types.ID, path: str) -> str:
         """The name of the control that a path of a datablock would be; empty where no control can belong to it."""
         if datablock in self.datablocks:
             return f"{self.datablocks[datablock]}{path}"
@@ -101,11 +101,11 @@ class Sources:
             return False
         return modifier.show_viewport and self.objects.get(scene_object, False)
 
-    def _add_object(self, found: bpy.types.Object | None, with_shape: bool) -> None:
+    def _add_object(self, found: bpy.types.Object | None, uses_geometry: bool) -> None:
         if found is None or found in self._carriers or (found != self._root and found == self._rig.mesh_object):
             return
-        if found not in self.objects or (with_shape and not self.objects[found]):
-            self.objects[found] = with_shape
+        if found not in self.objects or (uses_geometry and not self.objects[found]):
+            self.objects[found] = uses_geometry
             self._waiting.append(found)
 
     def _add_bones(self, armature_object: bpy.types.Object, names: Iterable[str], deforming: bool = False) -> None:
@@ -119,7 +119,7 @@ class Sources:
             return
         new |= {above.name for name in new for above in armature_object.data.bones[name].parent_recursive} - known
         known |= new
-        self._add_object(armature_object, with_shape=False)
+        self._add_object(armature_object, uses_geometry=False)
         for bone in (armature_object.pose.bones[name] for name in sorted(new)):
             self._follow_constraints(bone.constraints)
         self._follow_drivers(armature_object)
@@ -137,7 +137,7 @@ class Sources:
             elif parent.type == "ARMATURE" and found.parent_type == "ARMATURE":
                 self._add_bones(parent, _deforming(found, parent), deforming=True)
             else:
-                self._add_object(parent, with_shape=found.parent_type not in {"OBJECT", "BONE"})
+                self._add_object(parent, uses_geometry=found.parent_type not in {"OBJECT", "BONE"})
         self._follow_constraints(found.constraints)
         self._follow_drivers(found)
         if not self.objects[found]:
@@ -153,7 +153,7 @@ class Sources:
             keys = getattr(data, "shape_keys", None)
             self._add_datablock(keys, "shape_keys/" if found == self._rig.mesh_object else f"{owner}/data.shape_keys.")
             for name in ("bevel_object", "taper_object"):
-                self._add_object(getattr(data, name, None), with_shape=True)
+                self._add_object(getattr(data, name, None), uses_geometry=True)
 
     def _follow_modifier(self, found: bpy.types.Object, modifier: bpy.types.Modifier, path: str) -> None:
         is_of_rig = found == self._rig.mesh_object and getattr(modifier, "object", None) == self._rig.armature_object
@@ -167,7 +167,7 @@ class Sources:
                 elif read.type == "ARMATURE" and subtarget:
                     self._add_bones(read, [subtarget])
                 else:
-                    self._add_object(read, with_shape=modifier.type not in _TRANSFORM_MODIFIERS)
+                    self._add_object(read, uses_geometry=modifier.type not in _TRANSFORM_MODIFIERS)
             elif isinstance(read, bpy.types.Collection):
                 self._follow_values([read])
             elif isinstance(read, bpy.types.NodeTree):
@@ -192,10 +192,10 @@ class Sources:
     def _follow_values(self, values: Iterable[object]) -> None:
         for value in values:
             if isinstance(value, bpy.types.Object):
-                self._add_object(value, with_shape=True)
+                self._add_object(value, uses_geometry=True)
             elif isinstance(value, bpy.types.Collection):
                 for found in value.all_objects:
-                    self._add_object(found, with_shape=True)
+                    self._add_object(found, uses_geometry=True)
 
     def _follow_constraints(self, constraints: Iterable[bpy.types.Constraint]) -> None:
         for constraint in constraints:
@@ -205,15 +205,15 @@ class Sources:
                 if target.type == "ARMATURE" and subtarget:
                     self._add_bones(target, [subtarget])
                 else:
-                    with_shape = constraint.type in _SHAPE_CONSTRAINTS or bool(subtarget)
-                    self._add_object(target, with_shape=with_shape)
+                    uses_geometry = constraint.type in _SHAPE_CONSTRAINTS or bool(subtarget)
+                    self._add_object(target, uses_geometry=uses_geometry)
 
     def _follow_drivers(self, datablock: bpy.types.ID) -> None:
         animation = datablock.animation_data
         for curve in animation.drivers if animation else ():
             # Of another armature only what its bones need; of all else, what is not asked for may be on later.
             is_any = not self._only_active and getattr(datablock, "type", "") != "ARMATURE"
-            if is_any or (not curve.mute and self.moves(datablock, curve.data_path)):
+            if is_any or (not curve.mute and self.affects_surface(datablock, curve.data_path)):
                 self._add_driver(datablock, curve)
 
     def _add_driver(self, datablock: bpy.types.ID, curve: bpy.types.FCurve) -> None:
@@ -251,7 +251,7 @@ class Sources:
         if target.id.type == "ARMATURE" and target.bone_target:
             self._add_bones(target.id, [target.bone_target])
         elif target.id != self._rig.armature_object:
-            self._add_object(target.id, with_shape=False)
+            self._add_object(target.id, uses_geometry=False)
             if variable.type == "TRANSFORMS" and (path := _CHANNELS.get(target.transform_type)):
                 self.numbers[target.id, path] = None
 

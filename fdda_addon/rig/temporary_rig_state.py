@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""All of a rig that posing it changes, borrowed at once; or of several that follow one armature."""
+"""Prepares one or several rigs of an armature for posing, and restores everything that posing changes."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -16,14 +16,14 @@ from ..scene.temporary_state import temporary_pose
 from .modifier_stack import downstream_disabled
 
 Posed = tuple[SceneRig, Rig, tuple[Channel, ...]]
-"""A rig, and the channels of the random poses that it will be brought to."""
+"""A rig, and the channels of the random poses that will be set."""
 
 
 @contextmanager
 def temporary_rig_state(
     scene_rig: SceneRig, rig: Rig, channels: tuple[Channel, ...] = (), clips: tuple[Clip, ...] = ()
 ) -> Iterator[ClipPlayer]:
-    """As `temporary_rig_states`, of one rig."""
+    """Prepare one rig for posing, as `temporary_rig_states` does."""
     with temporary_rig_states([(scene_rig, rig, channels)], clips) as player:
         yield player
 
@@ -32,15 +32,18 @@ def temporary_rig_state(
 def temporary_rig_states(
     rigs: Sequence[Posed], clips: tuple[Clip, ...] = (), beside: Sequence[Posed] = ()
 ) -> Iterator[ClipPlayer]:
-    """Give back the modifiers, the pose, the controls, the animation and the frame. Inside, the rigs are at rest.
+    """Set rigs to the rest pose, without animation; restore modifiers, pose, controls, animation and frame afterwards.
 
     Args:
-        rigs: of one armature object.
-        clips: that they will be posed by, with the player that is yielded.
-        beside: rigs that the poses move too, whose modifiers stay as they are.
+        rigs: rigs of one armature object.
+        clips: the clips that the yielded player will show.
+        beside: other rigs that the poses move, whose modifiers stay as they are.
+
+    Yields:
+        The player of the clips.
 
     Raises:
-        RigError: a clip is to be mirrored, and a rig is not the same on both sides.
+        RigError: a clip is mirrored, and a rig is not symmetric.
     """
     armature_object = rigs[0][0].armature_object
     controlled = [(scene_rig, control_names(rig, channels)) for scene_rig, rig, channels in (*rigs, *beside)]
@@ -57,6 +60,6 @@ def temporary_rig_states(
 
 
 def control_names(rig: Rig, channels: tuple[Channel, ...]) -> list[str]:
-    """Names of the controls that a rig has or that are sampled."""
+    """Return the names of the controls that a rig has, and of those that are sampled."""
     sampled = [channel.name for channel in channels if channel.kind == CONTROL]
     return list(dict.fromkeys([*(control.name for control in rig.controls), *sampled]))

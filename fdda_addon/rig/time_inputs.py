@@ -84,7 +84,7 @@ def time_inputs(
     for datablock in (*sources.objects, *sources.datablocks):
         for curve in curves_with_actions(datablock, actions):
             place = (datablock, curve.data_path, curve.array_index)
-            if place not in controls and sources.moves(datablock, curve.data_path) and changes_value(curve):
+            if place not in controls and sources.affects_surface(datablock, curve.data_path) and changes_value(curve):
                 yield _keyed(sources, datablock, curve)
     numbers = [*sources.numbers, *((scene, path) for _, scene, path in sources.scene_reads)]
     for place in dict.fromkeys(fcurve_target(*number) for number in numbers):
@@ -113,8 +113,8 @@ def time_inputs(
 
 def _modifiers_in_time(sources: Sources) -> Iterator[TimeInput]:
     """Of the objects that a mesh reads: a cage that is cloth, a lattice that waves."""
-    for scene_object, with_shape in list(sources.objects.items())[1:]:
-        for modifier in scene_object.modifiers if with_shape else ():
+    for scene_object, uses_geometry in list(sources.objects.items())[1:]:
+        for modifier in scene_object.modifiers if uses_geometry else ():
             if modifier.show_viewport and (what := time_dependence(modifier)):
                 words = f"the modifier '{modifier.name}' of '{scene_object.name}', which {what}"
                 yield TimeInput(words, "switch it off in the viewport, or remove it")
@@ -122,7 +122,7 @@ def _modifiers_in_time(sources: Sources) -> Iterator[TimeInput]:
 
 def _keyed(sources: Sources, datablock: bpy.types.ID, curve: bpy.types.FCurve) -> TimeInput:
     words = f"the keys of '{curve.data_path}' of '{datablock.name}'"
-    name = sources.name_of(datablock, curve.data_path)
+    name = sources.control_name(datablock, curve.data_path)
     if not name:
         return TimeInput(words, "remove them")
     try:

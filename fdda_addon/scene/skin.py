@@ -16,7 +16,7 @@ from ..core.rig import STATIC_JOINT
 from .mesh import rest_positions
 
 MIN_INFLUENCES = 4
-"""Skin weights have at least this many places a vertex (docs/formats.md)."""
+"""Least number of columns of skin weight arrays (docs/formats.md)."""
 MIN_WEIGHT_SUM = 1e-4
 """The modifier does not move a vertex whose weights have a smaller sum."""
 
