@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The modifiers of a rig: which of them a model replaces, which stay live, which are refused. numpy is not needed.
+"""Sorts the modifiers of a rig: those that a model replaces, those that stay on, and those that are refused.
 
-Up to the last modifier that moves vertices, a model stands in for all. What comes after and makes new vertices, a
-subdivision for example, is live: it works on what the rig gives, and in the same way on what the model gives.
+A model replaces all modifiers up to the last one that moves vertices. The modifiers after it that are on, such as a
+subdivision, are downstream: they work on the output of the rig, and in the same way on that of the model. numpy is not
+needed.
 """
 
 from collections.abc import Iterable, Iterator
@@ -17,7 +18,7 @@ from ..scene.node_groups import GeometryEffect, find_time_node, geometry_effect
 from ..scene.scene_rig import MODIFIER_NAME, SceneRig, armature_modifier
 
 PLAYBACK_KEY = "fdda_playback"
-"""Custom property of the node group that plays a model."""
+"""Custom property of the node group of FDDA modifiers."""
 
 DEFORMING = {
     "ARMATURE", "CAST", "CLOTH", "CORRECTIVE_SMOOTH", "CURVE", "DISPLACE", "HOOK", "LAPLACIANDEFORM",
@@ -38,20 +39,22 @@ BIND_PROPERTIES = {
     "CORRECTIVE_SMOOTH": "is_bind", "LAPLACIANDEFORM": "is_bind", "MESH_DEFORM": "is_bound",
     "SURFACE_DEFORM": "is_bound",
 }  # fmt: skip
-"""Modifiers that remember the rest pose, and the property that says whether they do."""
+"""Modifiers that must be bound to a rest pose, and the property that tells whether they are."""
 INDIRECT = {
     "DATA_TRANSFER", "TRIANGULATE", "VERTEX_WEIGHT_EDIT", "VERTEX_WEIGHT_MIX", "VERTEX_WEIGHT_PROXIMITY",
 }  # fmt: skip
-"""Modifiers that move no vertices, and change what those after them do: weights, edges."""
+"""Modifiers that move no vertices, but change the effect of later modifiers: they edit weights or edges."""
 NEEDS_ORIGINAL_MESH = {"MULTIRES", "SOFT_BODY"}
-"""Blender lets no modifier that makes a mesh, as the one that plays a model does, stand before these, on or off."""
+"""Modifiers before which Blender allows no modifier that creates a mesh, such as the FDDA modifier, on or off."""
 
 
 class _Kind(Enum):
     NEUTRAL = auto()
-    """Neither moves vertices nor changes them: UV maps, weights, normals, particles that are only emitted."""
+    """Keeps the vertices and their positions: it changes UV maps, weights or normals, or emits particles."""
     DEFORMS = auto()
+    """Moves vertices."""
     GENERATES = auto()
+    """Changes the topology."""
     UNSURE = auto()
     """Only an evaluation tells whether it deforms or generates."""
 
@@ -61,11 +64,11 @@ class ModifierStack:
     """The modifiers of a rig, by name, in their order.
 
     Attributes:
-        replaced: those that move vertices, switched on or not, up to the last of them that is on, and what a model
-            cannot stand before. Of a bound object, up to the modifier that plays its model.
-        misplaced: those that are on and change the topology before the last of `replaced`.
-        downstream: those that are on after it. They change the topology or, after the FDDA modifier, deform.
-        insert_index: index after the last of `replaced`, the modifier that plays a model not counted.
+        replaced: modifiers that move vertices, on or off, up to the last one that is on, and those that need the
+            original mesh. For a bound object, all of these before the FDDA modifier.
+        misplaced: modifiers that are on and change the topology before the last of `replaced`.
+        downstream: modifiers that are on after it. They change the topology or, after the FDDA modifier, deform.
+        insert_index: index after the last of `replaced`, not counting the FDDA modifier.
     """
 
     replaced: tuple[str, ...]
@@ -75,96 +78,93 @@ class ModifierStack:
 
 
 def is_fdda_modifier(modifier: bpy.types.Modifier) -> bool:
-    """Whether a modifier plays a model: it is never part of the rig."""
+    """Return whether a modifier is an FDDA modifier, which is never part of the rig."""
     if modifier.type != "NODES":
         return False
     return modifier.name == MODIFIER_NAME if modifier.node_group is None else PLAYBACK_KEY in modifier.node_group
 
 
 def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
-    """Sort the modifiers of a mesh object that its rig deforms, not a model.
+    """Sort the modifiers of a mesh object while no model plays.
 
-    Geometry Nodes that could do either are evaluated, to see whether they keep the vertices and faces of the mesh.
+    Geometry Nodes that may deform or generate are evaluated, to see whether they keep the topology of the mesh.
 
     Raises:
-        RigError: they would have to be evaluated, and the object is hidden.
+        RigError: Geometry Nodes have to be evaluated, and the object is hidden.
     """
     modifiers = [m for m in mesh_object.modifiers if not is_fdda_modifier(m)]
     kinds = [_kind(m) for m in modifiers]
-    moving = {_Kind.DEFORMS, _Kind.UNSURE}
     unsure = [i for i, m in enumerate(modifiers) if kinds[i] is _Kind.UNSURE and m.show_viewport]
     generating = [m for m, kind in zip(modifiers, kinds, strict=True) if kind in {_Kind.GENERATES, _Kind.UNSURE}]
     for i in unsure:
         with _switched_off(mesh_object, [m for m in generating if m != modifiers[i]]):
             kinds[i] = _Kind.DEFORMS if _keeps_topology(mesh_object) else _Kind.GENERATES
-    deforming = [i for i, kind in enumerate(kinds) if kind in moving]
-    original = [i for i, m in enumerate(modifiers) if m.type in NEEDS_ORIGINAL_MESH]
-    # Where all are off, the last of all: what the user switches on later is replaced.
-    shown = [i for i in deforming if modifiers[i].show_viewport] or deforming
-    last = max(shown + original, default=-1)
-    bound = _playback_place(mesh_object)
-    if bound is not None and any(i < bound for i in deforming):
-        last = bound - 1
+    deforming = [i for i, kind in enumerate(kinds) if kind in {_Kind.DEFORMS, _Kind.UNSURE}]
+    need_original = [i for i, m in enumerate(modifiers) if m.type in NEEDS_ORIGINAL_MESH]
+    # If all are off, all count, because the user may switch them on later.
+    visible = [i for i in deforming if modifiers[i].show_viewport] or deforming
+    last = max(visible + need_original, default=-1)
+    fdda_index = _fdda_modifier_index(mesh_object)
+    if fdda_index is not None and any(i < fdda_index for i in deforming):
+        last = fdda_index - 1
     generating = [i for i, kind in enumerate(kinds) if kind is _Kind.GENERATES and modifiers[i].show_viewport]
-    behind = sorted({*generating, *shown})
+    candidates = sorted({*generating, *visible})
     return ModifierStack(
-        replaced=tuple(m.name for i, m in enumerate(modifiers[: last + 1]) if i in deforming + original),
+        replaced=tuple(m.name for i, m in enumerate(modifiers[: last + 1]) if i in deforming + need_original),
         misplaced=tuple(modifiers[i].name for i in generating if i <= last),
-        downstream=tuple(modifiers[i].name for i in behind if i > last and modifiers[i].show_viewport),
+        downstream=tuple(modifiers[i].name for i in candidates if i > last and modifiers[i].show_viewport),
         insert_index=last + 1,
     )
 
 
 def deforming_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier]:
-    """What a model replaces, in its order, switched on or not.
+    """Return the modifiers that a model replaces, in their order, on or off.
 
-    Of a bound object it is what stands before the modifier that plays the model, and nothing is evaluated: whatever
-    stands after it works on what the model gives.
+    For a bound object these are the modifiers before the FDDA modifier, and nothing is evaluated.
 
     Raises:
         RigError: as `read_stack`.
     """
-    place = _playback_place(mesh_object)
-    if place is not None:
-        return [m for m in mesh_object.modifiers[:place] if _kind(m) is not _Kind.NEUTRAL]
+    fdda_index = _fdda_modifier_index(mesh_object)
+    if fdda_index is not None:
+        return [m for m in mesh_object.modifiers[:fdda_index] if _kind(m) is not _Kind.NEUTRAL]
     return [mesh_object.modifiers[name] for name in read_stack(mesh_object).replaced]
 
 
 def recorded_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier]:
-    """The modifiers whose work a model stands in for, in their order: those that are on, or will be with the rig.
+    """Return the modifiers whose effect a model includes, in their order: those that are on while the rig is shown.
 
     Raises:
         RigError: as `read_stack`.
     """
-    place = _playback_place(mesh_object)
-    if place is None:
-        place = read_stack(mesh_object).insert_index
-    candidates = [m for m in mesh_object.modifiers[:place] if _kind(m) is not _Kind.NEUTRAL or m.type in INDIRECT]
+    index = _fdda_modifier_index(mesh_object)
+    if index is None:
+        index = read_stack(mesh_object).insert_index
+    candidates = [m for m in mesh_object.modifiers[:index] if _kind(m) is not _Kind.NEUTRAL or m.type in INDIRECT]
     binding = getattr(mesh_object, "fdda", None)
     if binding is None or not binding.is_playing:
         return [m for m in candidates if m.show_viewport]
     stored = {saved.uid: saved for saved in binding.modifiers}
-    found = []
+    recorded = []
     for modifier in candidates:
-        shown = stored.get(modifier.persistent_uid, modifier)
-        # One that a render shows makes other vertices there, before the model could give them positions.
-        generates = _kind(modifier) is _Kind.GENERATES and binding.use_in_render and shown.show_render
-        if shown.show_viewport or generates:
-            found.append(modifier)
-    return found
+        visibility = stored.get(modifier.persistent_uid, modifier)
+        # One that is on in renders only changes the topology there, before the FDDA modifier.
+        generates = _kind(modifier) is _Kind.GENERATES and binding.use_in_render and visibility.show_render
+        if visibility.show_viewport or generates:
+            recorded.append(modifier)
+    return recorded
 
 
-def _playback_place(mesh_object: bpy.types.Object) -> int | None:
-    """Where the modifier that plays a model stands, None when there is none."""
-    return next((place for place, modifier in enumerate(mesh_object.modifiers) if is_fdda_modifier(modifier)), None)
+def _fdda_modifier_index(mesh_object: bpy.types.Object) -> int | None:
+    """Return the index of the FDDA modifier; None if there is none."""
+    return next((index for index, modifier in enumerate(mesh_object.modifiers) if is_fdda_modifier(modifier)), None)
 
 
 def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
-    """Fail when a modifier that is on does what no model can stand in for.
+    """Sort the modifiers of a mesh object, and check that a model can replace those that are on.
 
     Raises:
-        RigError: names a modifier that depends on time, that is not bound, or that changes the topology before
-            another deforms the mesh.
+        RigError: a modifier depends on time, is not bound, or changes the topology before another one deforms.
     """
     stack = read_stack(mesh_object)
     for name in (m.name for m in mesh_object.modifiers if m.show_viewport):
@@ -192,11 +192,11 @@ def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
 
 
 def check_evaluable(scene_rig: SceneRig) -> ModifierStack:
-    """Fail when what the graph evaluates the mesh to could not be compared with the mesh; gives its modifiers.
+    """Sort the modifiers of a rig, and check that its evaluated mesh can be compared with a model.
 
     Raises:
-        RigError: edit mode, the NLA's tweak mode, a hidden object, an Armature modifier that is off, or a modifier
-            that no model can stand in for.
+        RigError: the rig is in edit mode or in the NLA's tweak mode, the object is hidden, the Armature modifier is
+            off, or a model cannot replace a modifier.
     """
     mesh_object = scene_rig.mesh_object
     if mesh_object.mode == "EDIT" or scene_rig.armature_object.mode == "EDIT":
@@ -218,10 +218,10 @@ def check_evaluable(scene_rig: SceneRig) -> ModifierStack:
 
 @contextmanager
 def downstream_disabled(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """Switch the live modifiers off: inside, the mesh is evaluated to its own vertices, as the rig deforms them.
+    """Switch the downstream modifiers off, so that the evaluated mesh has the vertices of the original one.
 
     Raises:
-        RigError: it still has other vertices.
+        RigError: the evaluated mesh still has another number of vertices.
     """
     stack = read_stack(mesh_object)
     with _switched_off(mesh_object, [mesh_object.modifiers[name] for name in stack.downstream]):
@@ -231,7 +231,7 @@ def downstream_disabled(mesh_object: bpy.types.Object) -> Iterator[None]:
 
 @contextmanager
 def downstream_disabled_unchecked(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """As `downstream_disabled`, whatever vertices are left."""
+    """Switch the downstream modifiers off, without checking the number of vertices."""
     stack = read_stack(mesh_object)
     with _switched_off(mesh_object, [mesh_object.modifiers[name] for name in stack.downstream]):
         yield
@@ -239,7 +239,7 @@ def downstream_disabled_unchecked(mesh_object: bpy.types.Object) -> Iterator[Non
 
 @contextmanager
 def _switched_off(mesh_object: bpy.types.Object, modifiers: Iterable[bpy.types.Modifier]) -> Iterator[None]:
-    # By identifier: while a job runs in the window, the modifiers may be added to.
+    # By identifier, because the user may add modifiers while a job runs.
     uids = {m.persistent_uid for m in modifiers if m.show_viewport}
     for modifier in mesh_object.modifiers:
         if modifier.persistent_uid in uids:
@@ -275,7 +275,7 @@ def _kind(modifier: bpy.types.Modifier) -> _Kind:
 
 
 def time_dependence(modifier: bpy.types.Modifier) -> str:
-    """Say what a modifier does that depends on time, empty when it does not."""
+    """Describe how a modifier depends on time, as a verb phrase; empty if it does not."""
     if modifier.type == "NODES":
         node = find_time_node(modifier.node_group)
         return f"changes with time (node '{node.name}' of '{node.id_data.name}')" if node else ""
@@ -303,10 +303,10 @@ def _keeps_topology(mesh_object: bpy.types.Object) -> bool:
     # Blender starts without numpy.
     from ..scene.mesh import topology
 
-    before, after = mesh_object.data, _evaluated(mesh_object).data
-    if any(len(getattr(before, name)) != len(getattr(after, name)) for name in ("vertices", "edges", "loops")):
+    original, evaluated = mesh_object.data, _evaluated(mesh_object).data
+    if any(len(getattr(original, name)) != len(getattr(evaluated, name)) for name in ("vertices", "edges", "loops")):
         return False
-    return all((a == b).all() for a, b in zip(topology(before), topology(after), strict=True))
+    return all((a == b).all() for a, b in zip(topology(original), topology(evaluated), strict=True))
 
 
 def _check_count(mesh_object: bpy.types.Object, stack: ModifierStack) -> None:

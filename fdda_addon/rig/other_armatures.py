@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bones of other armatures that deform a mesh: which of their channels are controls, and which would have to be."""
+"""Checks the bones of other armatures that deform a mesh: their free channels have to be controls of the model."""
 
 from collections.abc import Iterable, Iterator
 
@@ -13,18 +13,18 @@ from ..scene.controls import fcurve_target, make_control
 from ..scene.scene_rig import SceneRig
 from .sources import Sources, is_transform_channel, split_bone_path
 
-_COPIES = {"COPY_LOCATION": LOCATION, "COPY_ROTATION": ROTATION, "COPY_SCALE": SCALE}
-_FOUR_NUMBERS = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
+_COPY_CONSTRAINTS = {"COPY_LOCATION": LOCATION, "COPY_ROTATION": ROTATION, "COPY_SCALE": SCALE}
+_FOUR_COMPONENT_MODES = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
 _VERBS = {ROTATION: "turn", LOCATION: "move", SCALE: "scale"}
 
 Ranges = dict[int, tuple[float, float] | None]
-"""Range by axis of what is free to move; None where a bone states none."""
+"""Ranges of free channels by axis; None for a channel without a range."""
 
 
 def controls_of_other_armatures(scene_rig: SceneRig, sources: Sources) -> Iterator[Control]:
-    """Channels of the bones of other armatures that deform a mesh, in their ranges of motion.
+    """Yield the channels of bones of other armatures that deform a mesh, as controls with their ranges of motion.
 
-    Rotations are Euler angles: the four numbers of a quaternion have no ranges, and two quaternions are one rotation.
+    Rotations are Euler angles: the four components of a quaternion have no ranges, and q and -q are the same rotation.
     """
     for armature_object, bone in _bones(scene_rig, sources):
         for _, channel, ranges in _free_channels(bone):
@@ -41,32 +41,34 @@ def controls_of_other_armatures(scene_rig: SceneRig, sources: Sources) -> Iterat
 def check_other_armatures(
     scene_rig: SceneRig, sources: Sources, controls: Iterable[tuple[bpy.types.ID, str, int]]
 ) -> None:
-    """Fail where bones of other armatures can deform a mesh by channels that are no controls.
+    """Check that bones of other armatures deform a mesh only by channels that are controls or driven.
 
     Args:
         scene_rig: the rig.
-        sources: of its mesh object.
-        controls: as `scene.controls.fcurve_target` gives them.
+        sources: what its mesh depends on.
+        controls: the controls of the model as `scene.controls.fcurve_target` returns them.
 
     Raises:
         RigError: names a bone and its armature.
     """
-    told = {*controls, *sources.drivers}
+    inputs = {*controls, *sources.drivers}
     for armature_object, bone in _bones(scene_rig, sources):
         path = bone.path_from_id()
-        untold = [
+        free_kinds = [
             kind
             for kind, channel, ranges in _free_channels(bone)
-            if any((armature_object, f"{path}.{channel}", axis) not in told for axis in ranges if _varies(ranges[axis]))
+            if any(
+                (armature_object, f"{path}.{channel}", axis) not in inputs for axis in ranges if _varies(ranges[axis])
+            )
         ]
-        if untold:
+        if free_kinds:
             raise RigError(
                 f"'{scene_rig.mesh_object.name}' follows the bone '{bone.name}' of a second armature, "
-                f"'{armature_object.name}', which can {' and '.join(_VERBS[kind] for kind in untold)} without the "
-                f"model being told; {' and '.join(_remedies(bone, untold))}, or join the armatures."
+                f"'{armature_object.name}', which can {' and '.join(_VERBS[kind] for kind in free_kinds)} without the "
+                f"model being told; {' and '.join(_remedies(bone, free_kinds))}, or join the armatures."
             )
     for armature_object, _, path in _channels_read(scene_rig, sources):
-        if fcurve_target(armature_object, path) not in told:
+        if fcurve_target(armature_object, path) not in inputs:
             raise RigError(
                 f"A driver of '{scene_rig.mesh_object.name}' reads '{path}' of a second armature, "
                 f"'{armature_object.name}', without the model being told; name it as a control with a range "
@@ -74,11 +76,11 @@ def check_other_armatures(
             )
 
 
-def _remedies(bone: bpy.types.PoseBone, untold: list[str]) -> Iterator[str]:
-    if ROTATION in untold:
-        four = bone.rotation_mode in _FOUR_NUMBERS
-        yield "set its rotation mode to XYZ Euler" if four else "name its rotation as controls"
-    if others := [kind for kind in untold if kind != ROTATION]:
+def _remedies(bone: bpy.types.PoseBone, free_kinds: list[str]) -> Iterator[str]:
+    if ROTATION in free_kinds:
+        has_four = bone.rotation_mode in _FOUR_COMPONENT_MODES
+        yield "set its rotation mode to XYZ Euler" if has_four else "name its rotation as controls"
+    if others := [kind for kind in free_kinds if kind != ROTATION]:
         limits = " and ".join(f"Limit {kind.title()}" for kind in others)
         yield f"lock its {' and '.join(others)} (or add {limits} in local space)"
 
@@ -90,7 +92,7 @@ def _bones(scene_rig: SceneRig, sources: Sources) -> Iterator[tuple[bpy.types.Ob
 
 
 def _channels_read(scene_rig: SceneRig, sources: Sources) -> Iterator[tuple[bpy.types.Object, bpy.types.PoseBone, str]]:
-    """Channels of bones of other armatures that drivers read by their paths and that are not locked."""
+    """Yield the unlocked channels of bones of other armatures that drivers read by path."""
     for datablock, path in sources.numbers:
         name, rest = split_bone_path(path)
         if name and datablock != scene_rig.armature_object and is_transform_channel(rest):
@@ -100,15 +102,15 @@ def _channels_read(scene_rig: SceneRig, sources: Sources) -> Iterator[tuple[bpy.
 
 
 def _bounds_of(bone: bpy.types.PoseBone, path: str) -> tuple[float, float] | None:
-    """The range of one number of a channel, whether or not it moves the bone; the empty range where it is locked."""
+    """Return the range of one component of a channel, None if it has none; an empty range if it is locked."""
     channel, axis = path.rpartition(".")[2][:-3], int(path[-2])
     if channel == LOCATION:
         return (0.0, 0.0) if bone.lock_location[axis] else location_ranges(bone).get(axis)
     if channel == SCALE:
         return (0.0, 0.0) if bone.lock_scale[axis] else scale_ranges(bone).get(axis)
-    if channel == "rotation_euler" and bone.rotation_mode not in _FOUR_NUMBERS:
-        stated = rotation_ranges(bone)[axis]
-        return (stated.low, stated.high) if stated.moves else (0.0, 0.0)
+    if channel == "rotation_euler" and bone.rotation_mode not in _FOUR_COMPONENT_MODES:
+        rotation_range = rotation_ranges(bone)[axis]
+        return (rotation_range.low, rotation_range.high) if rotation_range.moves else (0.0, 0.0)
     return (0.0, 0.0) if all(bone.lock_rotation) else None
 
 
@@ -117,10 +119,10 @@ def _varies(bounds: tuple[float, float] | None) -> bool:
 
 
 def _free_channels(bone: bpy.types.PoseBone) -> Iterator[tuple[str, str, Ranges]]:
-    """What is free to move a bone: kind, property and ranges."""
-    if bone.rotation_mode in _FOUR_NUMBERS:
+    """Yield kind, property and ranges of the channels that are free to move a bone."""
+    if bone.rotation_mode in _FOUR_COMPONENT_MODES:
         if not all(bone.lock_rotation) and not _is_replaced(bone, ROTATION):
-            yield ROTATION, _FOUR_NUMBERS[bone.rotation_mode], dict.fromkeys(range(4))
+            yield ROTATION, _FOUR_COMPONENT_MODES[bone.rotation_mode], dict.fromkeys(range(4))
     elif not _is_replaced(bone, ROTATION):
         yield (
             ROTATION,
@@ -130,15 +132,16 @@ def _free_channels(bone: bpy.types.PoseBone) -> Iterator[tuple[str, str, Ranges]
     others = [(SCALE, bone.lock_scale, scale_ranges(bone))]
     if not (bone.parent and bone.bone.use_connect):
         others.insert(0, (LOCATION, bone.lock_location, location_ranges(bone)))
-    for kind, locks, stated in others:
+    for kind, locks, ranges in others:
         if not _is_replaced(bone, kind):
-            yield kind, kind, {axis: stated.get(axis) for axis in range(3) if not locks[axis]}
+            yield kind, kind, {axis: ranges.get(axis) for axis in range(3) if not locks[axis]}
 
 
 def _is_replaced(bone: bpy.types.PoseBone, kind: str) -> bool:
-    """Whether a constraint sets what these channels would set."""
+    """Return whether a constraint overrides the channels of a kind."""
     return any(
-        constraint.type == "COPY_TRANSFORMS" or (_COPIES.get(constraint.type) == kind and _copies_all(constraint))
+        constraint.type == "COPY_TRANSFORMS"
+        or (_COPY_CONSTRAINTS.get(constraint.type) == kind and _copies_all(constraint))
         for constraint in bone.constraints
         if not constraint.mute and constraint.influence == 1 and getattr(constraint, "mix_mode", "REPLACE") == "REPLACE"
     )

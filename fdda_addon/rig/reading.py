@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks the rig of a scene and reads it into arrays."""
+"""Reads the rig of a scene and its poses into arrays."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -33,11 +33,11 @@ from .modifier_stack import check_evaluable, deforming_modifiers
 from .target import Target
 
 IDENTITY_TOLERANCE = 1e-6
-"""Mesh and armature count as unmoved, one against the other, when no matrix element differs by more."""
+"""Largest difference of a matrix element from the identity at which the matrix counts as the identity."""
 
 
 def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, include_static_joint: bool = False) -> Rig:
-    """Read a rig.
+    """Read a rig into arrays.
 
     Args:
         scene_rig: the rig.
@@ -46,11 +46,11 @@ def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, inc
         include_static_joint: add the joint that never moves, which tells the networks the direction of gravity.
 
     Raises:
-        RigError: there is no vertex, all lie at one point, an object or a bone has a scale of zero, or a rest position
-            or a transform is not finite.
+        RigError: there is no vertex, all vertices are at one point, an object or a bone has a scale of zero, or a rest
+            position or a transform is not finite.
     """
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
-    # The armature first: the mesh may be its child.
+    # The armature first, because the mesh may be its child.
     for scene_object in (armature_object, mesh_object):
         if not np.isfinite(scene_object.matrix_world).all():
             raise RigError(
@@ -64,9 +64,9 @@ def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, inc
     skin = read_skin(mesh_object, armature_object, armature_modifier(mesh_object))
     joints = choose_joints(scene_rig, (*skin.bones, STATIC_JOINT) if include_static_joint else skin.bones, extra_joints)
     names = tuple(joint.name for joint in joints)
-    skin_joints, skin_weights = skin.arrays({name: number for number, name in enumerate(names)})
-    rest = joint_rest_matrices(scene_rig, names)
-    _check_rest_matrices(names, rest)
+    skin_joints, skin_weights = skin.arrays({name: index for index, name in enumerate(names)})
+    rest_matrices = joint_rest_matrices(scene_rig, names)
+    _check_rest_matrices(names, rest_matrices)
     faces = mesh_io.topology(mesh_object.data)
     fingerprint = Fingerprint(
         Fingerprint.digest(*faces),
@@ -77,7 +77,7 @@ def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, inc
     return Rig(
         joints,
         rest_positions,
-        rest.astype(np.float32),
+        rest_matrices.astype(np.float32),
         skin_joints,
         skin_weights,
         fingerprint,
@@ -87,15 +87,15 @@ def read_rig(scene_rig: SceneRig, extra_joints: Iterable[str] | None = None, inc
 
 
 def _check_rest_positions(mesh_object: bpy.types.Object, rest_positions: np.ndarray) -> None:
-    """Raise a RigError where (V, 3) rest positions have no size."""
+    """Raise a RigError if rest positions, (V, 3), are not finite or have no extent."""
     name, count = mesh_object.name, len(rest_positions)
     if not count:
         raise RigError(f"The mesh of '{name}' has no vertices; choose another object.")
-    finite = np.isfinite(rest_positions).all(axis=1)
-    if not finite.all():
+    is_finite = np.isfinite(rest_positions).all(axis=1)
+    if not is_finite.all():
         raise RigError(
-            f"{count - finite.sum():,} of {count:,} vertices of '{name}' have coordinates that are not finite, the "
-            f"first is vertex {finite.argmin()}; delete them, or give them others in edit mode."
+            f"{count - is_finite.sum():,} of {count:,} vertices of '{name}' have coordinates that are not finite, the "
+            f"first is vertex {is_finite.argmin()}; delete them, or give them others in edit mode."
         )
     if count == 1:
         raise RigError(f"The mesh of '{name}' has one vertex, and no surface to learn; choose another object.")
@@ -106,9 +106,9 @@ def _check_rest_positions(mesh_object: bpy.types.Object, rest_positions: np.ndar
         )
 
 
-def _check_rest_matrices(names: tuple[str, ...], rest: np.ndarray) -> None:
-    """Raise a RigError where (J, 4, 4) rest matrices have no inverse."""
-    for name, matrix in zip(names, rest, strict=True):
+def _check_rest_matrices(names: tuple[str, ...], rest_matrices: np.ndarray) -> None:
+    """Raise a RigError if a rest matrix, (J, 4, 4), has no inverse."""
+    for name, matrix in zip(names, rest_matrices, strict=True):
         if not np.isfinite(matrix).all() or np.abs(np.linalg.det(matrix[:3, :3])) < MIN_VOLUME:
             raise RigError(
                 f"The bone '{name}' has no length or no finite place in the rest pose; give its head and its tail "
@@ -117,7 +117,7 @@ def _check_rest_matrices(names: tuple[str, ...], rest: np.ndarray) -> None:
 
 
 def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
-    """Read a rig with joints, controls and unit of a model; `core.model.check_rig` says in what they differ.
+    """Read a rig with the joints, controls and unit of a model; `core.model.check_rig` finds the differences.
 
     Raises:
         RigError: as `read_rig`.
@@ -127,15 +127,19 @@ def read_model_rig(scene_rig: SceneRig, info: ModelInfo) -> Rig:
 
 
 def joint_rest_matrices(scene_rig: SceneRig, names: tuple[str, ...]) -> np.ndarray:
-    """(J, 4, 4) float64 rest pose of joints, mesh-object space, mesh units; the identity for the unmoved joint."""
-    rest = armature_io.rest_matrices(scene_rig.armature_object.data, names)
-    moved = np.array([name != STATIC_JOINT for name in names], bool)
-    rest[moved] = armature_to_mesh_matrix(scene_rig.mesh_object, scene_rig.armature_object) @ rest[moved]
-    return rest
+    """Read the rest matrices of joints.
+
+    Returns:
+        (J, 4, 4) float64, mesh-object space, mesh units; the identity for the static joint.
+    """
+    matrices = armature_io.rest_matrices(scene_rig.armature_object.data, names)
+    is_bone = np.array([name != STATIC_JOINT for name in names], bool)
+    matrices[is_bone] = armature_to_mesh_matrix(scene_rig.mesh_object, scene_rig.armature_object) @ matrices[is_bone]
+    return matrices
 
 
 def armature_to_mesh_matrix(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
-    """(4, 4) float64, armature space to mesh-object space. Pass evaluated objects for an evaluated answer."""
+    """Return the matrix from armature space to mesh-object space, (4, 4) float64, of original or evaluated objects."""
     return np.array(_relation(mesh_object, armature_object), np.float64)
 
 
@@ -144,32 +148,40 @@ def _relation(mesh_object: bpy.types.Object, armature_object: bpy.types.Object) 
 
 
 class PoseReader:
-    """Reads the pose of a rig as a recording and a model want it.
+    """Reads the pose matrices of a rig for recordings and models.
 
-    A pose matrix is P_j = S_j B_j with S_j the skin matrix as Blender's Armature modifier computes it: the same as
-    the pose matrix in mesh-object space as long as mesh and armature keep the relation of the rest pose, and still
-    right when either object is moved on its own.
+    A pose matrix is P_j = S_j B_j, with B_j the rest matrix and S_j the skin matrix of Blender's Armature modifier.
+    It is the bone's pose matrix in mesh-object space if mesh and armature have the same relative transform as in the
+    rest pose, and it stays correct if one of the objects moves on its own.
     """
 
     def __init__(self, scene_rig: SceneRig, names: tuple[str, ...], rest_matrices: np.ndarray):
-        """Args:
-        scene_rig: the rig.
-        names: J joints. KeyError when the armature lacks one.
-        rest_matrices: (J, 4, 4), the joints' rest pose in mesh-object space.
+        """Prepare to read joints.
+
+        Args:
+            scene_rig: the rig.
+            names: names of J joints.
+            rest_matrices: (J, 4, 4), rest matrices of the joints, mesh-object space.
+
+        Raises:
+            KeyError: the armature lacks a joint.
         """
-        self._matrices = armature_io.PoseMatrixReader(scene_rig.armature_object, names)
-        self._rest = rest_matrices.astype(np.float64)
-        self._from_bone_rest = np.linalg.inv(armature_io.rest_matrices(scene_rig.armature_object.data, names))
+        self._matrix_reader = armature_io.PoseMatrixReader(scene_rig.armature_object, names)
+        self._rest_matrices = rest_matrices.astype(np.float64)
+        self._inverse_bone_rest = np.linalg.inv(armature_io.rest_matrices(scene_rig.armature_object.data, names))
         self._relation: Matrix | None = None
         self._left: np.ndarray | None = None
         self._right: np.ndarray | None = None
 
     def fits(self, armature_object: bpy.types.Object) -> bool:
-        """Whether the armature still has as many bones as when this reader was made."""
-        return self._matrices.fits(armature_object)
+        """Return whether the armature still has the same number of bones."""
+        return self._matrix_reader.fits(armature_object)
 
     def read(self, mesh_object: bpy.types.Object, armature_object: bpy.types.Object) -> np.ndarray:
-        """Pose matrices of evaluated objects: (J, 4, 4) float32, mesh-object space, mesh units.
+        """Read the pose matrices of evaluated objects.
+
+        Returns:
+            (J, 4, 4) float32, mesh-object space, mesh units.
 
         Raises:
             RigError: an object has a scale of zero.
@@ -180,31 +192,34 @@ class PoseReader:
                 if is_flat(scene_object):
                     raise RigError(f"'{scene_object.name}' has a scale of zero in some pose; give it another there.")
             self._set_relation(relation)
-        pose = self._matrices.read(armature_object)
+        matrices = self._matrix_reader.read(armature_object)
         if self._left is not None:
-            pose = self._left @ pose
+            matrices = self._left @ matrices
         if self._right is not None:
-            pose = pose @ self._right
-        return np.array(pose, np.float32, order="C")
+            matrices = matrices @ self._right
+        return np.array(matrices, np.float32, order="C")
 
     def _set_relation(self, relation: Matrix) -> None:
-        """Prepare P = T pose inv(T bone_rest) rest; a factor that is the identity is None."""
+        """Prepare the factors of P = T pose inv(T bone_rest) rest, with T the relation; None for an identity."""
         self._relation = relation
         left = np.array(relation, np.float64)
-        # One inverse a frame, not one a joint: where an animated parent moves both, rounding changes T each time.
-        right = self._from_bone_rest @ (np.linalg.inv(left) @ self._rest)
+        # One inverse in a frame instead of one for each joint: if an animated parent moves both objects, rounding
+        # changes T in each frame.
+        right = self._inverse_bone_rest @ (np.linalg.inv(left) @ self._rest_matrices)
         self._left, self._right = (
             None if np.abs(factor - np.eye(4)).max() < IDENTITY_TOLERANCE else factor for factor in (left, right)
         )
 
 
 class PoseEvaluator:
-    """Evaluates the scene as it is posed and reads pose matrices, positions and controls."""
+    """Evaluates the current pose of a scene and reads pose matrices, positions and controls."""
 
     def __init__(self, scene_rig: SceneRig, rig: Rig, target: Target | None = None):
-        """Args:
+        """Prepare to read a rig.
+
+        Args:
             scene_rig, rig: the rig.
-            target: whose positions are read in place of the rig's own.
+            target: the target whose positions replace those of the rig.
 
         Raises:
             RigError: the rig lacks one of its controls.
@@ -214,11 +229,11 @@ class PoseEvaluator:
         self._controls = ControlReader(scene_rig, rig.controls)
 
     def evaluate(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Evaluate the pose that is set now.
+        """Evaluate the current pose.
 
         Returns:
             pose_matrices (J, 4, 4) and positions (V, 3), both float32, mesh-object space, mesh units, and the values of
-            the controls (C,) float32.
+            the controls, (C,) float32.
         """
         depsgraph = bpy.context.evaluated_depsgraph_get()
         mesh_object = self._scene_rig.mesh_object.evaluated_get(depsgraph)
