@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 import pytest
 
-from blend_fixtures.elbow import LOWER_RANGE, UPPER_RANGE, build_elbow, elbow_surface
+from blend_fixtures.elbow import build_elbow
 from fdda_addon.arm.joints import JOINT_INDEX, JOINT_NAMES, JOINTS, LOCKED, joint
 from fdda_addon.arm.rig import build_arm
 from fdda_addon.arm.sculpt import arm_field
@@ -273,41 +273,6 @@ def test_building_leaves_the_preferences_alone():
         assert edit.keyframe_new_interpolation_type == "CONSTANT"
     finally:
         edit.keyframe_new_interpolation_type = "BEZIER"
-
-
-def test_elbow_is_a_small_closed_tube():
-    points, faces = elbow_surface()
-    assert 250 <= len(points) <= 400
-    assert_closed(points, faces)
-
-
-def test_elbow_keeps_its_range_in_constraints():
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    mesh_object, rig = build_elbow()
-    assert (mesh_object.name, rig.name) == ("elbow", "elbow_rig")
-    assert {bone.name: bone.parent and bone.parent.name for bone in rig.data.bones} == {"upper": None, "lower": "upper"}
-    for name, ranges in (("upper", UPPER_RANGE), ("lower", LOWER_RANGE)):
-        (limit,) = rig.pose.bones[name].constraints
-        assert (limit.type, limit.owner_space) == ("LIMIT_ROTATION", "LOCAL")
-        for axis, (low, high) in zip("xyz", ranges, strict=True):
-            assert getattr(limit, f"use_limit_{axis}")
-            assert math.degrees(getattr(limit, f"min_{axis}")) == pytest.approx(low, abs=1e-4)
-            assert math.degrees(getattr(limit, f"max_{axis}")) == pytest.approx(high, abs=1e-4)
-    sums = [sum(group.weight for group in vertex.groups) for vertex in mesh_object.data.vertices]
-    assert np.allclose(sums, 1.0, atol=1e-6)
-    assert sum(len(vertex.groups) == 2 for vertex in mesh_object.data.vertices) >= 24
-
-
-def test_elbow_waves():
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    mesh_object, rig = build_elbow()
-    assert rig.animation_data.action.name == "elbow_wave"
-    scene = bpy.context.scene
-    assert (scene.frame_start, scene.frame_end) == (1, 30)
-    still = evaluated(mesh_object)
-    scene.frame_set(10)
-    tip = rest(mesh_object)[:, 0].argmax()
-    assert np.linalg.norm(evaluated(mesh_object)[tip] - still[tip]) > 0.2
 
 
 @pytest.mark.parametrize(("name", "build"), [("arm", build_arm), ("elbow", build_elbow)])

@@ -10,7 +10,7 @@ from fdda_addon.runtime import playback_modifier
 from fdda_addon.scene.scene_rig import armature_modifier
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, predicted, rig_positions
-from .test_evaluations import handler, shown_in
+from .test_evaluations import handler
 from .test_player_batch import crowd_of
 from .test_renders import FRAME, animation, set_camera
 
@@ -62,92 +62,6 @@ def test_without_its_modifier_the_rig_is_back_at_once(bound, is_applied, capsys)
     pose(angle=0.3)
     assert np.abs(evaluated(bound) - first).max() > 1e-2
     assert capsys.readouterr().out.count("switched off") == 1
-
-
-def key_mode(mesh_object: bpy.types.Object, modes: dict[int, str]) -> None:
-    for frame, mode in modes.items():
-        mesh_object.fdda.mode = mode
-        mesh_object.keyframe_insert("fdda.mode", frame=frame)
-
-
-def test_a_mode_that_is_keyed(bound, elbow):
-    key_mode(bound, {1: "FDDA", 8: "LINEAR", 12: "RIG", 16: "FDDA", 20: "RIG", 24: "LINEAR"})
-    shown = {}
-    for frame in (3, 9, 13, 17, 21, 25, 13, 3):
-        bpy.context.scene.frame_set(frame)
-        # What is drawn, without another evaluation.
-        shown[frame] = shown_in(bpy.context.view_layer.depsgraph, bound)
-        assert np.array_equal(evaluated(bound), shown[frame])
-        if bound.fdda.mode == "FDDA":
-            assert_plays(bound, elbow.model)
-    bound.animation_data_clear()
-    for frame, mode in ((3, "FDDA"), (9, "LINEAR"), (13, "RIG"), (17, "FDDA"), (21, "RIG"), (25, "LINEAR")):
-        bpy.context.scene.frame_set(frame)
-        bound.fdda.mode = mode
-        bpy.context.view_layer.update()
-        assert np.abs(evaluated(bound) - shown[frame]).max() < 1e-6, frame
-    assert not bound.fdda.status
-
-
-def test_a_mode_that_is_set_shows_at_once(bound, elbow):
-    pose(angle=1.1)
-    graph = bpy.context.view_layer.depsgraph
-    for mode in ("RIG", "FDDA", "LINEAR", "RIG", "LINEAR", "FDDA"):
-        bound.fdda.mode = mode
-        bpy.context.view_layer.update()
-        drawn = shown_in(graph, bound)
-        assert np.array_equal(drawn, evaluated(bound)), mode
-    assert_plays(bound, elbow.model)
-
-
-def test_renders_of_a_mode_that_is_keyed(bound, elbow, tmp_path):
-    bound.fdda.use_in_render = True
-    set_camera()
-    bound.fdda.mode = "RIG"
-    rig = animation(tmp_path / "rig")
-    bound.fdda.mode = "FDDA"
-    model = animation(tmp_path / "model")
-    key_mode(bound, {FRAME - 1: "FDDA", FRAME: "RIG", FRAME + 1: "FDDA"})
-    for curve in curves(bound):
-        for point in curve.keyframe_points:
-            point.interpolation = "CONSTANT"
-    mixed = animation(tmp_path / "mixed")
-    for frame, source in ((FRAME - 1, model), (FRAME, rig), (FRAME + 1, model)):
-        assert np.array_equal(mixed[frame], source[frame]), frame
-    assert not np.array_equal(rig[FRAME - 1], model[FRAME - 1])
-
-
-def curves(mesh_object: bpy.types.Object) -> list[bpy.types.FCurve]:
-    from fdda_addon.scene.compatibility import curves_of
-
-    return curves_of(mesh_object.animation_data.action, mesh_object)
-
-
-@pytest.mark.parametrize("is_driven", [False, True], ids=["keyed", "driven"])
-def test_a_strength_that_is_animated(bound, elbow, is_driven):
-    if is_driven:
-        curve = bound.driver_add("fdda.strength")
-        curve.driver.expression = "min(1, frame / 20)"
-    else:
-        for frame, strength in ((0, 0.0), (20, 1.0)):
-            bound.fdda.strength = strength
-            bound.keyframe_insert("fdda.strength", frame=frame)
-        for found in curves(bound):
-            for point in found.keyframe_points:
-                point.interpolation = "LINEAR"
-    shown = {}
-    for frame in (5, 10, 20):
-        bpy.context.scene.frame_set(frame)
-        shown[frame] = evaluated(bound)
-    assert_plays(bound, elbow.model)
-    bound.animation_data_clear()
-    for frame, positions in shown.items():
-        bpy.context.scene.frame_set(frame)
-        bound.fdda.strength = 1
-        playing = assert_plays(bound, elbow.model)
-        bound.fdda.strength = 0
-        linear, strength = evaluated(bound), min(1, frame / 20)
-        assert np.abs(positions - (linear + strength * (playing - linear))).max() < 1e-6
 
 
 def test_duplicates_and_deletions_leave_nothing(bound, tmp_path):
