@@ -59,19 +59,19 @@ def test_every_name_that_a_page_places_in_a_file_is_there(page: Path):
     assert wrong == []
 
 
-def test_the_way_of_a_pose_is_named_by_functions():
-    assert len(re.findall(rf"`{PATH}\.py`\s+\(`", chapter("The way of a pose"))) > 25
+def test_the_path_of_a_pose_is_named_by_functions():
+    assert len(re.findall(rf"`{PATH}\.py`\s+\(`", chapter("The path of a pose"))) > 25
 
 
 def test_every_room_is_on_the_page_and_in_the_picture():
     rooms = [room for floor in FLOORS for room in floor]
-    assert [room for room in rooms if f"`{room}`" not in chapter("The floors")] == []
+    assert [room for room in rooms if f"`{room}`" not in chapter("Layers")] == []
     drawn = re.findall(r"<!-- (.+?) -->", MAP)
     assert [room for room in rooms if room not in drawn] == [], "draw it again: make map"
 
 
 def test_every_room_that_the_page_names_is_on_a_floor():
-    named = re.findall(r"`([\w.]+)`", "".join(re.findall(r"^\| (`[^|]+) \|", chapter("The floors"), re.MULTILINE)))
+    named = re.findall(r"`([\w.]+)`", "".join(re.findall(r"^\| (`[^|]+) \|", chapter("Layers"), re.MULTILINE)))
     assert [name for name in named if room_of(name) != name] == []
 
 
