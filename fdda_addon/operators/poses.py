@@ -68,10 +68,10 @@ class FDDA_OT_rest_pose(OnPose, bpy.types.Operator):
 
 def _sampled_controls(rig: SceneRig) -> "tuple[Control, ...]":
     """The controls that random poses change; none while the choice is not complete, which the section Rig says."""
-    from ..recording.plan import read_sampling_choice
+    from ..recording.plan import read_sample_selection
 
     try:
-        return read_sampling_choice(rig, recording_settings(rig))[0].controls
+        return read_sample_selection(rig, recording_settings(rig))[0].controls
     except RigError:
         return ()
 

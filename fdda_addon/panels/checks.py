@@ -52,7 +52,7 @@ def check_now(scene_rig: SceneRig) -> "RigCheck":
     uid, counters = scene_rig.mesh_object.session_uid, _counters(scene_rig)
     stored = _checks.get(uid)
     same_rest = stored is not None and stored[1][0] == counters[0] and not _is_rest_changed(scene_rig)
-    result = stored[0].checked_again(scene_rig, settings) if same_rest else check(scene_rig, settings)
+    result = stored[0].recheck(scene_rig, settings) if same_rest else check(scene_rig, settings)
     result = replace(result, problems=result.problems + problems)
     _outdated.discard(uid)
     _rest_changed.discard(scene_rig.mesh_object.data.name)
@@ -78,7 +78,7 @@ def _check_wanted() -> None:
 def _shown() -> dict[int, tuple]:
     """What panels draw of the checks."""
     return {
-        uid: (id(check.rig), check.problems, check.channels, check.replaced, check.found)
+        uid: (id(check.rig), check.problems, check.channels, check.replaced_modifiers, check.automatic_controls)
         for uid, (check, _) in _checks.items()
     }
 

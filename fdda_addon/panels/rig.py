@@ -46,7 +46,7 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
         for problem in check.problems if check else ():
             draw_sentence(layout.box(), context, problem, "ERROR")
         if check:
-            _draw_replaced(layout, rig.mesh_object, check.replaced)
+            _draw_replaced(layout, rig.mesh_object, check.replaced_modifiers)
         _draw_cost(layout, context, rig)
 
 

@@ -89,7 +89,7 @@ def draw_channels(box: bpy.types.UILayout, bone: bpy.types.PoseBone, channels: "
 def draw_controls(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     """The controls that are listed, and those that were found."""
     settings, check = rig.mesh_object.fdda.settings, checks.known(rig)
-    found = check.found if check is not None else ()
+    found = check.automatic_controls if check is not None else ()
     count = len(check.rig.controls) if check is not None and check.rig else len(settings.controls)
     header, body = layout.panel("fdda_controls", default_closed=True)
     header.label(text=f"Extra Inputs ({count})" if count else "Extra Inputs")

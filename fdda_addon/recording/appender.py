@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Evaluates poses and appends them to a recording in batches; while one is written, Blender evaluates the next."""
+"""Appending of evaluated poses to a recording in batches, in a thread while Blender evaluates the next poses."""
 
 import contextlib
 from collections.abc import Iterator
@@ -16,15 +16,15 @@ from ..rig.reading import PoseEvaluator
 
 BATCH_BYTES = 6 << 20
 BATCH_POSES = 250
-"""Poses go to the disk in batches of at most this size, so that an interruption loses little."""
+"""Largest size of a batch; small batches lose little in an interruption."""
 
 
-class Appender:
-    """Appends the poses of one mesh to its recording; use as a context manager.
+class PoseAppender:
+    """Context manager that appends the poses of one mesh to its recording.
 
     Attributes:
-        done: how many poses were evaluated, those that the recording had before included. They are in the recording
-            when the block has ended, also when it ends because a generator is closed.
+        pose_count: number of evaluated poses, with those that the recording had before. All of them are in the
+            recording when the block has ended, also when a generator was closed.
     """
 
     def __init__(
@@ -35,23 +35,23 @@ class Appender:
         pose_setter: PoseSetter = DIRECT_POSE_SETTER,
     ) -> None:
         self._pose_setter = pose_setter
-        self.done = writer.complete
+        self.pose_count = writer.complete
         self._evaluator, self._skinning, self._writer = evaluator, skinning, writer
-        self._size = max(1, min(BATCH_POSES, BATCH_BYTES // (skinning.rig.vertex_count * 12)))
+        self._batch_size = max(1, min(BATCH_POSES, BATCH_BYTES // (skinning.rig.vertex_count * 12)))
         self._pool = ThreadPoolExecutor(max_workers=1)
         self._previous: Future | None = None
         self._batch: list[tuple] = []
 
-    def add(self) -> None:
-        """Evaluate the pose that is set now, and append it with its batch.
+    def append_current_pose(self) -> None:
+        """Evaluate the current pose, and append it with its batch.
 
         Raises:
-            FDDAError: a pose before it could not be appended.
+            FDDAError: an earlier pose could not be appended.
         """
         self._batch.append((*self._evaluator.evaluate(), self._pose_setter.is_at_rest))
-        self.done += 1
-        # What took seconds to settle is not lost.
-        if len(self._batch) == self._size or self._pose_setter.settler:
+        self.pose_count += 1
+        # A pose that took seconds to settle is written at once.
+        if len(self._batch) == self._batch_size or self._pose_setter.settler:
             self._wait()
             self._previous = self._pool.submit(self._append, self._batch)
             self._batch = []
@@ -79,22 +79,22 @@ class Appender:
             self._pool.shutdown()
 
 
-def append_poses(poses: Iterator[object], appenders: list[Appender]) -> Iterator[int]:
-    """Add the pose that each iteration sets to the recordings that lack it; yields how many all of them have.
+def append_poses(poses: Iterator[object], appenders: list[PoseAppender]) -> Iterator[int]:
+    """Append the pose of each iteration to the recordings that lack it; yield the number of poses of all recordings.
 
-    When it is closed, the poses that were evaluated are appended.
+    When the generator is closed, all evaluated poses are appended.
 
     Args:
-        poses: sets the poses from the one of number `done` of the appender that has fewest on, one an iteration.
-        appenders: of the meshes that follow the poses.
+        poses: sets one pose per iteration, starting after the smallest `pose_count` of the appenders.
+        appenders: of the meshes.
     """
     with contextlib.ExitStack() as stack:
         for appender in appenders:
             stack.enter_context(appender)
-        number = min(appender.done for appender in appenders)
+        number = min(appender.pose_count for appender in appenders)
         for _ in poses:
             for appender in appenders:
-                if appender.done == number:
-                    appender.add()
+                if appender.pose_count == number:
+                    appender.append_current_pose()
             number += 1
             yield number

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Several meshes on one armature: whether, and how, they can be recorded together."""
+"""Recording of several meshes on one armature together."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,10 +14,10 @@ from .plan import RecordingSettings, listed_controls
 
 
 def common_armature(rigs: Sequence[SceneRig]) -> bpy.types.Object:
-    """The armature object of all meshes.
+    """Return the armature object of all meshes.
 
     Raises:
-        RigError: they follow different ones.
+        RigError: the meshes follow different armatures.
     """
     armature_object = rigs[0].armature_object
     for other in rigs:
@@ -30,33 +30,33 @@ def common_armature(rigs: Sequence[SceneRig]) -> bpy.types.Object:
     return armature_object
 
 
-def controls_of_each(rigs: Sequence[SceneRig], settings: RecordingSettings) -> list[tuple[str, ...]]:
-    """Which of the controls that settings list each mesh has.
+def split_controls(rigs: Sequence[SceneRig], settings: RecordingSettings) -> list[tuple[str, ...]]:
+    """Return the controls of the settings that each mesh has.
 
     Raises:
-        RigError: none of them has one.
+        RigError: no mesh has a control.
     """
-    found: list[list[str]] = [[] for _ in rigs]
+    controls_by_mesh: list[list[str]] = [[] for _ in rigs]
     for text in settings.controls:
         errors = []
-        for scene_rig, own in zip(rigs, found, strict=True):
+        for scene_rig, mesh_controls in zip(rigs, controls_by_mesh, strict=True):
             try:
                 listed_controls(scene_rig, replace(settings, controls=(text,)))
-                own.append(text)
+                mesh_controls.append(text)
             except RigError as error:
                 errors.append(error)
         if len(errors) == len(rigs):
             raise errors[0]
-    return [tuple(own) for own in found]
+    return [tuple(mesh_controls) for mesh_controls in controls_by_mesh]
 
 
-def in_passes(rigs: Sequence[SceneRig]) -> list[list[int]]:
-    """Which meshes can be evaluated together, by their numbers.
+def group_into_passes(rigs: Sequence[SceneRig]) -> list[list[int]]:
+    """Group the indices of meshes that can be evaluated together.
 
-    Modifiers that stay live are off while their mesh is evaluated. Where another mesh reads it with them, as a sleeve
-    that clings to a subdivided body, it is evaluated in a pass of its own.
+    Modifiers after the last deforming one are disabled while their mesh is evaluated. A mesh that another mesh reads
+    with these modifiers, such as a subdivided body under a shrinkwrapped sleeve, gets a pass of its own.
     """
     read = {mesh_object for scene_rig in rigs for mesh_object in deforming_mesh_objects(scene_rig)}
-    alone = [n for n, rig in enumerate(rigs) if rig.mesh_object in read and read_stack(rig.mesh_object).downstream]
-    together = [n for n in range(len(rigs)) if n not in alone]
-    return [numbers for numbers in (together, *([n] for n in alone)) if numbers]
+    separate = [n for n, rig in enumerate(rigs) if rig.mesh_object in read and read_stack(rig.mesh_object).downstream]
+    together = [n for n in range(len(rigs)) if n not in separate]
+    return [numbers for numbers in (together, *([n] for n in separate)) if numbers]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is known of one mesh after each phase of its recording: planned, then fitted, then found, then recorded.
+"""State of a mesh after each phase of its recording: planned, weights fitted, influences ready.
 
-Each phase takes the value of the one before, so that none can be left out or come too early.
+Each phase takes the state of the previous one, so that no phase can be skipped.
 """
 
 import time
@@ -23,7 +23,7 @@ from ..scene.scene_rig import SceneRig
 
 
 class TimedEvaluator:
-    """Evaluates poses, and knows how long that takes."""
+    """Evaluates poses and measures the time."""
 
     def __init__(self, evaluator: PoseEvaluator):
         self._evaluator = evaluator
@@ -38,8 +38,8 @@ class TimedEvaluator:
         return evaluated
 
     @property
-    def seconds_a_pose(self) -> float | None:
-        """Mean so far, None before the first pose."""
+    def seconds_per_pose(self) -> float | None:
+        """Mean time of a pose in seconds; None before the first one."""
         return self._seconds / self._count if self._count else None
 
 
@@ -48,12 +48,12 @@ class MeshPlanned:
     """A mesh whose recording is planned.
 
     Attributes:
-        scene_rig, rig: the rig, with the weights of its own.
+        scene_rig, rig: the rig, with its own skin weights.
         path: folder of the recording.
-        channels: that move it.
-        limits: channels of its recording: those that move the meshes which share its poses included.
-        known: folder that may know weights and influences already.
-        target: whose surface is recorded; None for that of the rig.
+        channels: of the mesh.
+        limits: channels of the recording, with those of meshes that share its poses.
+        previous_path: folder of a recording with weights and influences; None where there is none.
+        target: whose surface is recorded; None for the rig itself.
     """
 
     scene_rig: SceneRig
@@ -61,7 +61,7 @@ class MeshPlanned:
     path: Path
     channels: tuple[Channel, ...]
     limits: tuple[Channel, ...]
-    known: Path | None = None
+    previous_path: Path | None = None
     target: Target | None = None
 
     @property
@@ -70,22 +70,22 @@ class MeshPlanned:
         return self.scene_rig.mesh_object.name
 
     def evaluator(self, rig: Rig) -> PoseEvaluator:
-        """Evaluates the poses of the mesh, its weights those of `rig`."""
+        """Make the evaluator of the poses of the mesh, with the skin weights of `rig`."""
         return PoseEvaluator(self.scene_rig, rig, self.target)
 
     @property
     def posed(self) -> Posed:
-        """The mesh as `temporary_rig_states` takes it."""
+        """The argument for `temporary_rig_states`."""
         return self.scene_rig, self.rig, self.channels
 
 
 @dataclass(frozen=True)
 class WeightsFitted:
-    """A mesh that has the weights of its linear skinning.
+    """A mesh with the skin weights of its linear skinning.
 
     Attributes:
-        planned: the mesh as it was planned.
-        rig: with the weights of linear skinning.
+        planned: the state before.
+        rig: with the skin weights of linear skinning.
         fit: of the weights; None where they are the rig's own.
     """
 
@@ -101,12 +101,12 @@ class WeightsFitted:
 
 @dataclass(frozen=True)
 class InfluencesReady:
-    """A mesh whose influences are found: its poses can be recorded.
+    """A mesh with influences, whose poses can be recorded.
 
     Attributes:
-        fitted: the mesh with the weights of its linear skinning.
-        partitions: with what influences them.
-        evaluator: of the poses, which knows by now what one takes.
+        fitted: the state before.
+        partitions: with their influencing joints and controls.
+        evaluator: of the poses, which has measured the time of a pose.
     """
 
     fitted: WeightsFitted
@@ -114,20 +114,22 @@ class InfluencesReady:
     evaluator: TimedEvaluator
 
 
-def estimate(meshes: Sequence[InfluencesReady], poses: int, left: int, seconds_a_pose: float | None = None) -> str:
-    """A sentence about what poses of some meshes will take; empty without poses.
+def describe_estimate(
+    meshes: Sequence[InfluencesReady], poses: int, remaining: int, seconds_per_pose: float | None = None
+) -> str:
+    """Describe the remaining work of recordings; empty without remaining poses.
 
     Args:
-        meshes: which are evaluated together.
-        poses: of the complete recordings.
-        left: how many of them are still to be recorded.
-        seconds_a_pose: what one takes, where more than its evaluation does; of the evaluators where it is left out.
+        meshes: that are evaluated together.
+        poses: number of poses of a complete recording.
+        remaining: number of poses still to be recorded.
+        seconds_per_pose: time of a pose; measured by the evaluators by default.
     """
-    if not left:
+    if not remaining:
         return ""
-    rigs = [found.fitted.rig for found in meshes]
-    # Whatever is read of it, all of the scene is evaluated each time.
-    times = [seconds_a_pose or found.evaluator.seconds_a_pose for found in meshes]
-    seconds = None if None in times else max(times) * left
+    rigs = [mesh.fitted.rig for mesh in meshes]
+    # The whole scene is evaluated for each pose, so the times of meshes do not add up.
+    times = [seconds_per_pose or mesh.evaluator.seconds_per_pose for mesh in meshes]
+    seconds = None if None in times else max(times) * remaining
     size = sum(recording_bytes(rig, poses) for rig in rigs)
-    return Estimate(left, sum(rig.vertex_count for rig in rigs), size, seconds).sentence()
+    return Estimate(remaining, sum(rig.vertex_count for rig in rigs), size, seconds).sentence()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a recording will hold, before a pose is evaluated: the settings, and what they come to for a rig."""
+"""Settings of a recording, and what follows from them for a rig before a pose is evaluated."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -27,28 +27,27 @@ from ..scene.scene_rig import SceneRig
 
 @dataclass(frozen=True)
 class RecordingSettings:
-    """What to record.
+    """Settings of a recording.
 
     Attributes:
         poses: number of random poses.
         seed: of the random poses.
-        spread: standard deviation of the random poses as a part of half the range of motion.
-        margin: how many times as wide as the range of motion some of the random poses are (`core.poses.make_margin`); 1
-            for none of them.
+        spread: standard deviation of the random poses as a ratio of half the range of motion.
+        margin: scale of the range of motion for some of the random poses (`core.poses.make_margin`); 1 for none.
         actions, strips: names of actions, and of strips of the NLA, whose frames are recorded after the random poses.
         mirror: record each of these frames a second time, mirrored.
-        influence_poses: how often each joint is moved alone to find the partitions that it influences.
-        influence_tolerance: part of the character's size by which a joint moves the residuals that it influences.
-        resume: continue a recording that was interrupted.
-        overwrite: replace a recording that is in the folder.
+        influence_poses: how many times each joint is moved alone to find the partitions that it influences.
+        influence_tolerance: a joint influences a residual that it changes by more than this ratio of the rig's size.
+        resume: continue an interrupted recording.
+        overwrite: replace a recording in the folder.
         sample: which control bones the random poses move, as `sampling.choose` reads it; empty for those of the rig.
         fit_linear: kind of the skin weights that are fitted (`core.skin_fit.KINDS`); empty for those of the rig.
-        controls: which numbers are inputs and are sampled beside those that are found, as `parse_controls` reads it.
-        min_partition_vertices: partitions of fewer vertices are merged into others; 0 merges none.
-        shard: record this part of the poses, its number from 1 and how many parts there are; None for all.
-        detect_influences: find what a recording needs before its first pose, and record none.
-        influences: folder with what `detect_influences` found, of the same rig and settings; found anew when left out.
-            Where several meshes are recorded, it has a folder of the same name for each.
+        controls: listed properties that are inputs beside the automatic ones, in the syntax of `parse_controls`.
+        min_partition_vertices: partitions with fewer vertices are merged into others; 0 merges none.
+        shard: number, from 1, and count of the shards, to record one of them; None for all poses.
+        detect_influences: detect the influences of all shards, and record no poses.
+        influences: folder of a recording that was made with `detect_influences` and the same settings; None detects
+            them again. For several meshes it has a subfolder for each.
         target: whose surface is recorded.
     """
 
@@ -74,19 +73,19 @@ class RecordingSettings:
 
 
 def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Rig, tuple[Channel, ...]]:
-    """The rig with its controls, and the channels of its random poses, as these settings record it.
+    """Read the rig with the controls and the channels of these settings.
 
     Raises:
-        RigError: the rig cannot be read, or nothing may be sampled.
+        RigError: the rig cannot be read, or has nothing to sample.
     """
-    choice, extra_joints = read_sampling_choice(scene_rig, settings)
+    choice, extra_joints = read_sample_selection(scene_rig, settings)
     rig = read_rig(scene_rig, extra_joints, depends_on_time(scene_rig, settings))
     channels = sampled_channels(scene_rig, rig, choice) if settings.poses else ()
     return replace(rig, controls=choice.controls), channels
 
 
 def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings) -> bool:
-    """Whether these settings have a target that does not follow from the pose at once: what sags, for example.
+    """Return whether the target of the settings depends on more than the pose, as a simulation does.
 
     Raises:
         RigError: as `find_target`.
@@ -94,13 +93,13 @@ def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings) -> bool:
     return bool(settings.target.name) and find_target(scene_rig, settings.target.name).follows != POSE
 
 
-def read_sampling_choice(
+def read_sample_selection(
     scene_rig: SceneRig, settings: RecordingSettings
 ) -> tuple[SampleSelection, frozenset[str] | None]:
-    """What these settings sample, and which joints the rig has beside the bones that have weights (`read_rig`).
+    """Read what the settings sample, and the joints of the rig beside the bones with weights (`read_rig`).
 
-    The joints of a rig whose control bones are sampled are the bones that have weights, and those that the mesh depends
-    on otherwise: what animators pose is no input of a model, what follows from it is.
+    Where control bones are sampled, the joints are the bones with weights and other bones on which the mesh depends.
+    Control bones are no inputs of a model, only the bones that follow them.
 
     Raises:
         RigError: the rig lacks what the settings name.
@@ -116,22 +115,22 @@ def read_sampling_choice(
 
 
 def listed_controls(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Control, ...]:
-    """The controls that these settings list.
+    """Return the controls that are listed in the settings.
 
     Raises:
-        RigError: the rig lacks one, or nobody states its range.
+        RigError: the rig lacks a control, or its range is unknown.
     """
     sampled = sampled_numbers(scene_rig, select_bones(scene_rig, settings.sample)) if settings.controls else {}
     return parse_controls(scene_rig, settings.controls, sampled)
 
 
 def find_actions(settings: RecordingSettings) -> tuple[bpy.types.Action, ...]:
-    """The actions whose frames these settings record, as far as the file has them."""
+    """Return the actions of the settings that exist in the file."""
     return tuple(bpy.data.actions[name] for name in settings.actions if name in bpy.data.actions)
 
 
 def make_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]) -> Sampling:
-    """How the poses of a recording with these settings are chosen.
+    """Make the sampling of a recording with these settings.
 
     Raises:
         RigError: there is no action or strip of a name that the settings have.
@@ -139,14 +138,14 @@ def make_sampling(scene_rig: SceneRig, settings: RecordingSettings, channels: tu
     sources = [Source(RANDOM, settings.poses)] if settings.poses else []
     clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips, settings.mirror)
     sources += [clip.source for clip in clips]
-    own = channels if settings.poses else ()
-    margin = make_recording_margin(scene_rig, settings, own)
-    return Sampling(settings.seed, settings.spread, own, tuple(sources), margin)
+    sampled = channels if settings.poses else ()
+    margin = make_recording_margin(scene_rig, settings, sampled)
+    return Sampling(settings.seed, settings.spread, sampled, tuple(sources), margin)
 
 
 def make_recording_margin(
     scene_rig: SceneRig, settings: RecordingSettings, channels: tuple[Channel, ...]
 ) -> Margin | None:
-    """The margin of the random poses of a recording, of which `channels` are sampled inside the range of motion."""
+    """Make the margin of the random poses, whose `channels` are sampled inside the range of motion."""
     locked = locked_channels(scene_rig.armature_object, channels)
     return make_margin(channels, locked, settings.margin, settings.poses if channels else 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The poses of a recording, or of several that share them: random ones, then the frames of clips."""
+"""The poses of one or several recordings: random poses, then the frames of clips."""
 
 from collections.abc import Callable, Collection, Container, Iterator, Sequence
 
@@ -15,16 +15,16 @@ from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
 from .plan import RecordingSettings, make_recording_margin
 
-REPEAT_INDEX = 1 << 36
-"""Poses that are passed through are drawn from indices that neither a recording nor an evaluation reaches."""
+REPEATABILITY_INDEX_OFFSET = 1 << 36
+"""Offset of the indices of intermediate poses, larger than those of any recording or evaluation."""
 
 
 class PosePlan:
-    """Poses that meshes on one armature have in common; each mesh has the numbers of its own object to itself.
+    """Poses that the meshes on one armature share; channels of a mesh object belong to that mesh alone.
 
     Attributes:
         total: number of poses.
-        inside: how many random poses are within the range of motion, the first; those of a margin follow.
+        in_range_count: number of random poses inside the range of motion; those of the margin follow.
     """
 
     def __init__(
@@ -35,117 +35,120 @@ class PosePlan:
         pose_setter: PoseSetter = DIRECT_POSE_SETTER,
     ):
         """Args:
-        meshes: each with the channels that move it.
+        meshes: each with its channels.
         settings: of the recording.
-        clips: whose frames follow.
-        pose_setter: how a target that depends on time is brought to the poses.
+        clips: whose frames follow the random poses.
+        pose_setter: sets poses, and brings a target that depends on time to them.
         """
         self._rigs = [scene_rig for scene_rig, _ in meshes]
         self._settings, self._clips = settings, clips
         self.pose_setter = pose_setter
         self.total = settings.poses + sum(len(clip.frames) for clip in clips)
-        # The first mesh moves what all have in common.
-        found: dict[tuple, tuple[int, Channel]] = {}
-        for number, (_, channels) in enumerate(meshes):
+        # The first mesh owns the shared channels.
+        unique: dict[tuple, tuple[int, Channel]] = {}
+        for mesh_index, (_, channels) in enumerate(meshes):
             for channel in channels:
-                own = number if _is_of_mesh(channel) else -1
-                found.setdefault((own, channel.name, channel.kind, channel.axis), (own, channel))
-        self._owners = np.array([own for own, _ in found.values()], np.int64)
-        self._channels = tuple(channel for _, channel in found.values())
+                owner = mesh_index if _belongs_to_mesh(channel) else -1
+                unique.setdefault((owner, channel.name, channel.kind, channel.axis), (owner, channel))
+        self._owners = np.array([owner for owner, _ in unique.values()], np.int64)
+        self._channels = tuple(channel for _, channel in unique.values())
         self._margin = make_recording_margin(self._rigs[0], settings, self._channels)
-        self.inside = settings.poses - (self._margin.poses if self._margin else 0)
+        self.in_range_count = settings.poses - (self._margin.poses if self._margin else 0)
 
-    def channels_of(self, number: int) -> tuple[Channel, ...]:
-        """The channels of the poses as the recording of a mesh has them: without those of other meshes."""
-        own = np.isin(self._owners, (-1, number))
-        return tuple(channel for channel, is_own in zip(self._channels, own, strict=True) if is_own)
+    def channels_of_mesh(self, mesh_index: int) -> tuple[Channel, ...]:
+        """Return the channels of the recording of one mesh: the shared channels and its own."""
+        belongs = np.isin(self._owners, (-1, mesh_index))
+        return tuple(channel for channel, keep in zip(self._channels, belongs, strict=True) if keep)
 
-    def poses(self, player: ClipPlayer, wanted: Container[int]) -> Iterator[int]:
-        """Pose the rigs, one pose an iteration, in the poses that are wanted, by their numbers; yields the number.
+    def show_poses(self, player: ClipPlayer, pose_indices: Container[int]) -> Iterator[int]:
+        """Set the poses with the given indices, one per iteration; yield the index.
 
-        Limit constraints that would hold a pose of the margin are off while it is shown.
+        Limit constraints are disabled while a pose of the margin is set.
         """
-        poses, margin = self._settings.poses, self._margin
+        random_count, margin = self._settings.poses, self._margin
         with self.pose_setter.prepared():
-            set_pose = self._setter(self._channels)
-            for index in range(self.inside):
-                if index in wanted:
-                    self.pose_setter.set_pose(self._way_to(self._channels, index, set_pose))
+            set_pose = self._make_setter(self._channels)
+            for index in range(self.in_range_count):
+                if index in pose_indices:
+                    self.pose_setter.set_pose(self._make_transition(self._channels, index, set_pose))
                     yield index
             if margin:
-                set_pose = self._setter(margin.channels)
+                set_pose = self._make_setter(margin.channels)
                 with SuspendedLimits(self._rigs[0].armature_object, margin.channels) as limits:
 
                     def set_beyond(values: np.ndarray) -> None:
                         set_pose(values)
                         limits.suspend(values)
 
-                    for index in range(self.inside, poses):
-                        if index in wanted:
-                            self.pose_setter.set_pose(self._way_to(margin.channels, index, set_beyond))
+                    for index in range(self.in_range_count, random_count):
+                        if index in pose_indices:
+                            self.pose_setter.set_pose(self._make_transition(margin.channels, index, set_beyond))
                             yield index
-        first = poses
+        first = random_count
         for clip in self._clips:
-            own = [number for number in range(len(clip.frames)) if first + number in wanted]
-            for number in self.pose_setter.show_frames(player, clip, own):
-                yield first + number
+            frame_indices = [index for index in range(len(clip.frames)) if first + index in pose_indices]
+            for index in self.pose_setter.show_frames(player, clip, frame_indices):
+                yield first + index
             first += len(clip.frames)
 
     @property
-    def repeatable(self) -> list[int]:
-        """Numbers of the poses that `poses_again` may reach, ascending; those of a margin are not among them."""
+    def repeatable_poses(self) -> list[int]:
+        """Ascending indices of the poses that `show_poses_again` can set; without those of the margin."""
         if not self.pose_setter.depends_on_history:
             return []
         if self.pose_setter.settler:
-            # There are no frames of clips (`make_pose_setter`).
-            return list(range(self.inside))
+            # `make_pose_setter` refuses clips with a settler.
+            return list(range(self.in_range_count))
         first, numbers = self._settings.poses, []
         for clip in self._clips:
             numbers += [first + number for number in reversible_frames(clip)]
             first += len(clip.frames)
         return numbers
 
-    def poses_again(self, player: ClipPlayer, wanted: Collection[int]) -> Iterator[int]:
-        """As `poses`, over another way: random poses over one that no recording of this plan has, and frames of clips
-        from those that follow them."""
+    def show_poses_again(self, player: ClipPlayer, pose_indices: Collection[int]) -> Iterator[int]:
+        """Set poses again from another direction; yield the index.
+
+        Random poses are reached through another random pose, frames of clips by playing the clip backwards."""
         if self.pose_setter.settler:
-            set_pose = self._setter(self._channels)
+            set_pose = self._make_setter(self._channels)
             with self.pose_setter.prepared():
-                for index in sorted(wanted):
-                    numbers = (index, REPEAT_INDEX + index)
-                    self.pose_setter.settler.settle(*(self._way_to(self._channels, n, set_pose) for n in numbers))
+                for index in sorted(pose_indices):
+                    numbers = (index, REPEATABILITY_INDEX_OFFSET + index)
+                    self.pose_setter.settler.settle(
+                        *(self._make_transition(self._channels, n, set_pose) for n in numbers)
+                    )
                     yield index
             return
         first = self._settings.poses
         for clip in self._clips:
-            if own := {number - first for number in wanted if 0 <= number - first < len(clip.frames)}:
-                for number in self.pose_setter.show_frames_reversed(player, clip, own):
-                    yield first + number
+            if frame_indices := {index - first for index in pose_indices if 0 <= index - first < len(clip.frames)}:
+                for index in self.pose_setter.show_frames_reversed(player, clip, frame_indices):
+                    yield first + index
             first += len(clip.frames)
 
-    def _way_to(
+    def _make_transition(
         self, channels: tuple[Channel, ...], index: int, set_pose: Callable[[np.ndarray], None]
     ) -> Callable[[float], None]:
-        """Sets what part of the way from the rest pose to a random pose is done, 0 to 1."""
+        """Return a function that blends from the rest pose to a random pose by a factor of 0 to 1."""
         values = sample_pose(channels, self._settings.seed, index, self._settings.spread)
         return blend_from_rest(set_pose, np.array([channel.rest for channel in channels]), values)
 
-    def _setter(self, channels: tuple[Channel, ...]) -> Callable[[np.ndarray], None]:
-        """What poses the rigs, of channels that begin with those of the plan; what follows is of the armature."""
+    def _make_setter(self, channels: tuple[Channel, ...]) -> Callable[[np.ndarray], None]:
+        """Return a function that sets channel values; channels beyond those of the plan belong to the armature."""
         owners = np.append(self._owners, np.full(len(channels) - len(self._owners), -1))
         posers = [
-            (Poser(self._rigs[max(own, 0)], tuple(channels[place] for place in places)), places)
-            for own in np.unique(owners).tolist()
-            for places in [np.flatnonzero(owners == own)]
+            (Poser(self._rigs[max(owner, 0)], tuple(channels[index] for index in indices)), indices)
+            for owner in np.unique(owners).tolist()
+            for indices in [np.flatnonzero(owners == owner)]
         ]
 
         def set_pose(values: np.ndarray) -> None:
-            for poser, places in posers:
-                poser.set(values[places])
+            for poser, indices in posers:
+                poser.set(values[indices])
 
         return set_pose
 
 
-def _is_of_mesh(channel: Channel) -> bool:
-    """Whether a channel is a number of the mesh object or of its shape keys, which have one name for every mesh."""
+def _belongs_to_mesh(channel: Channel) -> bool:
+    """Return whether a channel is a property of the mesh object or of its shape keys."""
     return channel.kind == CONTROL and channel.name.partition("/")[0] in {MESH_OBJECT, SHAPE_KEYS}

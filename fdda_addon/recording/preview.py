@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Shows one of the random poses that a recording will have."""
+"""Preview of the random poses of a recording."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING

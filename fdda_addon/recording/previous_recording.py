@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a folder already knows of a rig: weights and influences, of a recording that goes on or that was made for it."""
+"""Weights and influences of a previous recording, which a resumed recording or a shard reuses."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,37 +14,37 @@ from ..core.skin_fit import SkinFit
 
 
 def read_previous_weights(path: Path, rig: Rig, kind: str) -> tuple[Rig, SkinFit | None]:
-    """The rig with the weights of linear skinning that a recording has, complete or not.
+    """Return the rig with the skin weights of a recording, complete or not.
 
     Args:
         path: folder of the recording.
-        rig: with the weights of its own.
-        kind: of the weights that are asked for, empty for those of the rig.
+        rig: with its own skin weights.
+        kind: requested kind of fitted weights, empty for the rig's own.
 
     Raises:
         RecordingError: there is no recording, or its weights are of another kind, or damaged.
     """
     index = read_index(path)
     fit = read_info(index).fit
-    recorded = fit.kind if fit else ""
-    if recorded != kind:
-        option = f"--fit-linear {recorded}" if recorded else "the rig's own weights"
+    recorded_kind = fit.kind if fit else ""
+    if recorded_kind != kind:
+        option = f"--fit-linear {recorded_kind}" if recorded_kind else "the rig's own weights"
         raise RecordingError(
             f"Cannot resume '{path}': it was recorded with {option}; give that, or record into another folder."
         )
     if fit is None or (index["vertices"], len(index["joints"])) != (rig.vertex_count, len(rig.joints)):
-        # Of another rig: whoever writes into it refuses, and says in what they differ.
+        # Of another rig: the writer raises an error that names the differences.
         return rig, fit
     joints, weights = read_recorded_skin(path, index)
     return replace(rig, skin_joints=joints, skin_weights=weights), fit
 
 
 def read_previous_partitions(path: Path, rig: Rig, min_partition_vertices: int) -> tuple[Partition, ...] | None:
-    """The partitions of a rig with the influences that a recording of it has; None where it has none for this rig.
+    """Return the partitions of a rig with the influences of a recording; None where they are of another rig.
 
     Args:
         path: folder of the recording.
-        rig: with the weights of linear skinning.
+        rig: with the skin weights of linear skinning.
         min_partition_vertices: as in `RecordingSettings`.
 
     Raises:
@@ -55,39 +55,39 @@ def read_previous_partitions(path: Path, rig: Rig, min_partition_vertices: int) 
     controls = [control.to_json() for control in rig.controls]
     if joints != rig.joints or index["controls"] != controls or index["vertices"] != rig.vertex_count:
         return None
-    cut = make_merged_partitions(rig, min_partition_vertices)
-    own = [(partition.joint, list(partition.merged)) for partition in cut]
-    if own != [(value["joint"], value.get("merged", [])) for value in index["partitions"]]:
+    current_partitions = make_merged_partitions(rig, min_partition_vertices)
+    current_joints = [(partition.joint, list(partition.merged)) for partition in current_partitions]
+    if current_joints != [(value["joint"], value.get("merged", [])) for value in index["partitions"]]:
         return None
     return read_partitions(rig, index["partitions"])
 
 
 def check_influences_match(path: Path, rig: Rig, info: RecordingInfo) -> None:
-    """Fail when the influences in a folder were found for other poses, or for another rig.
+    """Check that the influences of a recording were found for this rig and these poses.
 
     Args:
         path: folder with the influences.
-        rig: the rig at hand.
-        info: of the recording that is to take them.
+        rig: the rig to compare.
+        info: of the recording that reuses them.
 
     Raises:
-        RecordingError: says in what they differ.
+        RecordingError: they differ.
     """
     index = read_index(path)
-    found = read_info(index)
+    previous_info = read_info(index)
     joints = read_joints(index["joints"])
-    different = rig_differences(
+    clauses = rig_differences(
         joints, rig.rest_matrices, index["vertices"], Fingerprint.from_json(index["rig"]["fingerprint"]), rig
     )
-    if found.blender != info.blender:
-        different.append(f"Blender {found.blender} found them, and this is {info.blender}")
-    keys = find_different_keys(found.sampling.to_json(), info.sampling.to_json())
-    if found.shard is None or info.shard is None or found.shard.total != info.shard.total:
+    if previous_info.blender != info.blender:
+        clauses.append(f"Blender {previous_info.blender} found them, and this is {info.blender}")
+    keys = find_different_keys(previous_info.sampling.to_json(), info.sampling.to_json())
+    if previous_info.shard is None or info.shard is None or previous_info.shard.total != info.shard.total:
         keys.append("poses")
     if keys:
-        different.append(f"they were found with other settings ({', '.join(keys)})")
-    if different:
+        clauses.append(f"they were found with other settings ({', '.join(keys)})")
+    if clauses:
         raise RecordingError(
-            f"The influences in '{path}' are not those of this recording: {'; '.join(different)}. Find them with the "
+            f"The influences in '{path}' are not those of this recording: {'; '.join(clauses)}. Find them with the "
             "same rig and options (record --detect-influences)."
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Adds poses to a recording where a model that was trained on it is worst."""
+"""Refinement: adds poses to a recording where a model trained on it has its largest errors."""
 
 import contextlib
 from collections.abc import Iterator
@@ -29,23 +29,23 @@ from ..rig.time_inputs import check_time_inputs
 from ..runtime.opened_model import open_model
 from ..scene.armature import Poser
 from ..scene.scene_rig import SceneRig
-from .appender import Appender, append_poses
+from .appender import PoseAppender, append_poses
 
 PROBE_INDEX, BASE_INDEX = 1 << 34, 1 << 35
-"""Poses are drawn from indices that neither a recording nor an evaluation reaches."""
+"""Indices of random poses, larger than those of any recording or evaluation."""
 MIN_PROBES = 200
 WIDE_SPREAD = 10.0
-"""Every other probe is drawn almost evenly: the corners of the range are rare in a recording, not in an animation."""
+"""Spread of every second probe, almost uniform: animations reach the ends of the range more often than a recording."""
 
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """What to add.
+    """Settings of a refinement.
 
     Attributes:
-        poses: how many.
-        seed: of the choices; others with every recording that is longer.
-        resume: count the poses that were added since the model was trained; add what is missing of `poses`.
+        poses: number of poses to add.
+        seed: of the random choices, which also depend on the length of the recording.
+        resume: count the poses added since the model was trained, and add only the missing ones.
     """
 
     poses: int = REFINEMENT_POSES
@@ -54,15 +54,15 @@ class RefinementSettings:
 
 
 def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSettings) -> Iterator[Progress]:
-    """Add poses to a complete recording; a generator that does the work while it is iterated.
+    """Add poses to a complete recording while the generator is iterated.
 
-    The scene is as before when the generator ends, is closed, or raises; the recording is complete at every moment.
+    The scene is restored when the generator ends, is closed, or raises; the recording stays complete throughout.
 
     Args:
         scene_rig: the rig that was recorded.
         path: folder of the recording.
-        model: trained on it.
-        settings: what to add.
+        model: file of a model trained on the recording.
+        settings: of the refinement.
 
     Yields:
         Progress of the stages "probes" and "poses".
@@ -85,7 +85,7 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
     check_time_inputs(scene_rig, rig.controls, stack)
     channels = model_channels(scene_rig, rig, network.info)
     _check_recording(scene_rig, recording, rig, channels)
-    added = _added_since(recording, model, network.info) if settings.resume else 0
+    added = _count_added_poses(recording, model, network.info) if settings.resume else 0
     if settings.resume and added >= settings.poses:
         yield Progress("poses", settings.poses, settings.poses)
         return
@@ -93,36 +93,40 @@ def refine(scene_rig: SceneRig, path: Path, model: Path, settings: RefinementSet
     with temporary_rig_state(scene_rig, rig, channels):
         evaluator, poser = PoseEvaluator(scene_rig, rig), Poser(scene_rig, channels)
         count = max(MIN_PROBES, settings.poses)
-        values = np.stack([_probe(channels, settings.seed, PROBE_INDEX + first + i) for i in range(count)])
+        values = np.stack([_draw_probe_pose(channels, settings.seed, PROBE_INDEX + first + i) for i in range(count)])
         matrices, errors = [], []
         for number, pose in enumerate(values):
             poser.set(pose)
             pose_matrices, true, controls = evaluator.evaluate()
-            moved = distances(network.positions(pose_matrices[None], controls[None])[0], true)
+            vertex_errors = distances(network.positions(pose_matrices[None], controls[None])[0], true)
             matrices.append(pose_matrices)
-            errors.append([moved[partition.vertices].max() for partition in recording.partitions])
+            errors.append([vertex_errors[partition.vertices].max() for partition in recording.partitions])
             yield Progress("probes", number + 1, count)
-        probes = Probes(values, np.array(errors), _thinness(recording, first, np.stack(matrices)))
+        probes = Probes(values, np.array(errors), _distances_to_recording(recording, first, np.stack(matrices)))
         base = np.stack([sample_pose(channels, settings.seed, BASE_INDEX + first + i) for i in range(settings.poses)])
         rng = np.random.default_rng([settings.seed, first])
-        chosen = choose_poses(probes, channels, _owned(recording, channels), base, rng)
+        chosen = choose_poses(probes, channels, _channels_by_partition(recording, channels), base, rng)
         with RecordingExtension(recording, model.name, added) as extension:
             posed = (poser.set(pose) for pose in chosen[added:])
             skinning = LinearSkinning(recording.rig, recording.partitions)
-            with contextlib.closing(append_poses(posed, [Appender(evaluator, skinning, extension)])) as steps:
+            with contextlib.closing(append_poses(posed, [PoseAppender(evaluator, skinning, extension)])) as steps:
                 for done in steps:
                     yield Progress("poses", done - first, settings.poses)
 
 
-def _probe(channels: tuple[Channel, ...], seed: int, index: int) -> np.ndarray:
+def _draw_probe_pose(channels: tuple[Channel, ...], seed: int, index: int) -> np.ndarray:
     return sample_pose(channels, seed, index, WIDE_SPREAD if index % 2 else SPREAD)
 
 
 def _check_recording(scene_rig: SceneRig, recording: Recording, rig: Rig, channels: tuple[Channel, ...]) -> None:
-    own = recording.rig
-    found = rig_differences(own.joints, own.rest_matrices, own.vertex_count, own.fingerprint, rig)
-    if found:
-        raise RecordingError(f"'{recording.path}' is a recording of another rig: {'; '.join(found)}. Record this rig.")
+    recorded_rig = recording.rig
+    clauses = rig_differences(
+        recorded_rig.joints, recorded_rig.rest_matrices, recorded_rig.vertex_count, recorded_rig.fingerprint, rig
+    )
+    if clauses:
+        raise RecordingError(
+            f"'{recording.path}' is a recording of another rig: {'; '.join(clauses)}. Record this rig."
+        )
     if not recording.info.sampling.channels:
         raise RecordingError(
             f"'{recording.path}' has no random poses, so there is no range of motion to choose from; record with "
@@ -135,11 +139,11 @@ def _check_recording(scene_rig: SceneRig, recording: Recording, rig: Rig, channe
         )
 
 
-def _added_since(recording: Recording, model: Path, info: ModelInfo) -> int:
-    """How many poses a recording got since a model was trained on it.
+def _count_added_poses(recording: Recording, model: Path, info: ModelInfo) -> int:
+    """Count the poses added to a recording since a model was trained on it.
 
     Raises:
-        RecordingError: they were not chosen for this model.
+        RecordingError: the poses were not chosen for this model.
     """
     more = len(recording.pose_matrices) - info.trained_poses
     last = recording.info.sampling.sources[-1]
@@ -151,8 +155,8 @@ def _added_since(recording: Recording, model: Path, info: ModelInfo) -> int:
     )
 
 
-def _thinness(recording: Recording, first: int, pose_matrices: np.ndarray) -> np.ndarray:
-    """(M, P) how far each pose is from the first recorded ones, as the joints that influence each partition go."""
+def _distances_to_recording(recording: Recording, first: int, pose_matrices: np.ndarray) -> np.ndarray:
+    """Compute distances of (M, J, 4, 4) poses to the first recorded poses in the inputs of each partition; (M, P)."""
     rig = recording.rig
     probes, recorded = (
         joint_features(matrices, rig.rest_matrices, rig.parents)
@@ -167,11 +171,14 @@ def _thinness(recording: Recording, first: int, pose_matrices: np.ndarray) -> np
     )
 
 
-def _owned(recording: Recording, channels: tuple[Channel, ...]) -> list[np.ndarray]:
-    """For each partition the channels of the joints that influence it."""
+def _channels_by_partition(recording: Recording, channels: tuple[Channel, ...]) -> list[np.ndarray]:
+    """Return the indices of the channels that influence each partition."""
     names, controls = recording.rig.joint_names, recording.rig.controls
     influencing = [
         {names[joint] for joint in partition.influencing} | {controls[control].name for control in partition.controls}
         for partition in recording.partitions
     ]
-    return [np.array([i for i, c in enumerate(channels) if c.name in own], int) for own in influencing]
+    return [
+        np.array([i for i, c in enumerate(channels) if c.name in names_of_partition], int)
+        for names_of_partition in influencing
+    ]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks a rig as a recording would, and says all that is wrong at once."""
+"""Check of a rig before a recording, which reports all problems at once."""
 
 from dataclasses import dataclass, replace
 
@@ -12,43 +12,44 @@ from ..rig.modifier_stack import check_evaluable, deforming_modifiers
 from ..rig.reading import read_rig
 from ..rig.time_inputs import check_time_inputs
 from ..scene.scene_rig import SceneRig
-from .plan import RecordingSettings, depends_on_time, find_actions, listed_controls, read_sampling_choice
+from .plan import RecordingSettings, depends_on_time, find_actions, listed_controls, read_sample_selection
 
-DEFAULTS = RecordingSettings()
+DEFAULT_SETTINGS = RecordingSettings()
 
 
 @dataclass(frozen=True)
 class RigCheck:
-    """What is known about a rig.
+    """Result of the check of a rig.
 
     Attributes:
-        problems: why it cannot be recorded, a sentence each; empty when it can.
-        rig: its arrays, None when they cannot be read.
-        channels: what a random pose may move, empty when nothing.
-        replaced: names of the modifiers that a model takes the place of.
-        found: the controls that nobody listed: drivers of the mesh read them, or the actions that are sampled key them.
-        extra_joints, include_static_joint: what the rig was read with (`read_rig`).
+        problems: one sentence for each reason why the rig cannot be recorded.
+        rig: its arrays; None where they cannot be read.
+        channels: of random poses; may be empty.
+        replaced_modifiers: names of the modifiers that a model replaces.
+        automatic_controls: controls that are not listed in the settings, but read by drivers of the mesh or keyed by
+            sampled actions.
+        extra_joints, include_static_joint: arguments of `read_rig`.
     """
 
     problems: tuple[str, ...]
     rig: Rig | None
     channels: tuple[Channel, ...]
-    replaced: tuple[str, ...] = ()
-    found: tuple[Control, ...] = ()
+    replaced_modifiers: tuple[str, ...] = ()
+    automatic_controls: tuple[Control, ...] = ()
     extra_joints: frozenset[str] | None = None
     include_static_joint: bool = False
 
-    def checked_again(self, scene_rig: SceneRig, settings: RecordingSettings = DEFAULTS) -> "RigCheck":
-        """The check without reading the mesh again: for changes of modifiers, modes, ranges of motion and choices."""
+    def recheck(self, scene_rig: SceneRig, settings: RecordingSettings = DEFAULT_SETTINGS) -> "RigCheck":
+        """Check again without reading the mesh, after changes of modifiers, modes, ranges of motion and settings."""
         return _check(scene_rig, settings, self)
 
 
-def check(scene_rig: SceneRig, settings: RecordingSettings = DEFAULTS) -> RigCheck:
-    """Check a rig. While a model plays, the modifiers of the rig are off, so what they evaluate to is not checked."""
+def check(scene_rig: SceneRig, settings: RecordingSettings = DEFAULT_SETTINGS) -> RigCheck:
+    """Check a rig; while a model plays, the rig's modifiers are disabled and not checked."""
     return _check(scene_rig, settings, None)
 
 
-def _check(scene_rig: SceneRig, settings: RecordingSettings, before: RigCheck | None) -> RigCheck:
+def _check(scene_rig: SceneRig, settings: RecordingSettings, previous: RigCheck | None) -> RigCheck:
     result = RigCheck((), None, ())
     problems: list[str] = []
     stack = None
@@ -58,33 +59,37 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, before: RigCheck | 
         except RigError as error:
             problems.append(str(error))
     try:
-        result = replace(result, replaced=tuple(m.name for m in deforming_modifiers(scene_rig.mesh_object)))
-        choice, extra_joints = read_sampling_choice(scene_rig, settings)
+        result = replace(result, replaced_modifiers=tuple(m.name for m in deforming_modifiers(scene_rig.mesh_object)))
+        choice, extra_joints = read_sample_selection(scene_rig, settings)
         if stack is not None and not settings.target.name:
             try:
                 check_time_inputs(scene_rig, choice.controls, stack, find_actions(settings))
             except RigError as error:
                 problems.append(str(error))
         include_static_joint = depends_on_time(scene_rig, settings)
-        read_with = extra_joints, include_static_joint
+        read_options = extra_joints, include_static_joint
         if (
-            before is not None
-            and before.rig is not None
-            and (before.extra_joints, before.include_static_joint) == read_with
+            previous is not None
+            and previous.rig is not None
+            and (previous.extra_joints, previous.include_static_joint) == read_options
         ):
-            rig = before.rig
+            rig = previous.rig
         else:
-            rig = read_rig(scene_rig, *read_with)
+            rig = read_rig(scene_rig, *read_options)
         if rig.controls != choice.controls:
             rig = replace(rig, controls=choice.controls)
         listed = listed_controls(scene_rig, settings)
-        found = tuple(control for control in choice.controls if control not in listed)
+        automatic_controls = tuple(control for control in choice.controls if control not in listed)
         result = replace(
-            result, rig=rig, found=found, extra_joints=extra_joints, include_static_joint=include_static_joint
+            result,
+            rig=rig,
+            automatic_controls=automatic_controls,
+            extra_joints=extra_joints,
+            include_static_joint=include_static_joint,
         )
         result = replace(result, channels=sampled_channels(scene_rig, rig, choice))
     except RigError as error:
-        # A rig of which nothing may be sampled is recorded by its actions alone.
+        # A rig without channels to sample can still be recorded from actions alone.
         if str(error) not in problems and (result.rig is None or settings.poses):
             problems.append(str(error))
     return replace(result, problems=tuple(problems))

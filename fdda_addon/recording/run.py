@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Records a rig: the phases of a recording, one after the other."""
+"""Recording of a rig: runs the phases of a recording."""
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, nullcontext
@@ -27,50 +27,50 @@ from ..rig.pose_setter import make_pose_setter
 from ..rig.temporary_rig_state import temporary_rig_states
 from ..rig.time_inputs import check_time_inputs
 from ..scene.scene_rig import SceneRig
-from .appender import Appender, append_poses
-from .influences import Search, find_influences
-from .mesh_group import common_armature, controls_of_each, in_passes
-from .phases import InfluencesReady, MeshPlanned, TimedEvaluator, WeightsFitted, estimate
+from .appender import PoseAppender, append_poses
+from .influences import InfluenceSearch, detect_influences
+from .mesh_group import common_armature, group_into_passes, split_controls
+from .phases import InfluencesReady, MeshPlanned, TimedEvaluator, WeightsFitted, describe_estimate
 from .plan import RecordingSettings, find_actions, make_sampling, read_sampled_rig
 from .pose_plan import PosePlan
 from .previous_recording import check_influences_match, read_previous_partitions, read_previous_weights
 from .repeatability import measure_repeatability
-from .target_check import check_moves
+from .target_check import check_target_moves
 from .time_check import check_follows_pose
-from .weight_fitting import check_has_weights, fit_weights, poses_to_fit
+from .weight_fitting import check_has_weights, choose_fit_poses, fit_weights
 
 Before, After = TypeVar("Before", MeshPlanned, WeightsFitted), TypeVar("After")
 INFLUENCE_SEED_OFFSET = 1 << 32
-"""Poses of the influence detection are drawn from indices that no pose of a recording reaches."""
+"""Offset of the indices of poses for the detection of influences, larger than those of any recording."""
 
 
 def record(scene_rig: SceneRig, path: Path, settings: RecordingSettings) -> Iterator[Progress]:
-    """Record a rig; a generator that does the work while it is iterated.
+    """Record a rig while the generator is iterated.
 
-    The scene is as before when the generator ends, is closed, or raises.
+    The scene is restored when the generator ends, is closed, or raises.
 
     Args:
         scene_rig: the rig.
         path: folder of the recording.
-        settings: what to record.
+        settings: of the recording.
 
     Yields:
         Progress of the stages "influences" and "poses", before them "poses to fit" and "fit" where weights are fitted.
-        The first of the poses has a note of what they will take.
+        The first progress of "poses" has a note with the estimated time and disk space.
 
     Raises:
         RigError: the rig cannot be recorded.
-        TrainingError: weights are to be fitted, and the trainer's Python cannot.
-        RecordingError: there is a recording already, or the one to resume is of something else.
-        OutputError: the folder cannot be written, or the disk lacks the room.
+        TrainingError: weights cannot be fitted in the trainer's Python.
+        RecordingError: there is a recording already, or the recording to resume differs.
+        OutputError: the folder cannot be written, or the disk has too little space.
     """
     return record_meshes([(scene_rig, path)], settings)
 
 
 def record_meshes(rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSettings) -> Iterator[Progress]:
-    """As `record`, of several meshes on one armature, each into a folder of its own.
+    """Record several meshes on one armature, each into its own folder, as `record` does.
 
-    They share the poses, and each pose is evaluated once for all meshes that can be evaluated together (`in_passes`).
+    The meshes share the poses, and each pose is evaluated once for all meshes of a pass (`group_into_passes`).
 
     Raises:
         RigError: as `record`, or the meshes follow different armatures.
@@ -88,52 +88,54 @@ def _record_planned(
 ) -> Iterator[Progress]:
     meshes, posed = [mesh.scene_rig for mesh in planned], [mesh.posed for mesh in planned]
     with temporary_rig_states(posed, clips) if settings.fit_linear else nullcontext() as player:
-        fitted = yield from _in_turn(planned, lambda mesh: _fit(mesh, settings, plan, player))
-    for numbers in in_passes(meshes):
-        together = [fitted[number] for number in numbers]
-        others = [own for number, own in enumerate(posed) if number not in numbers]
-        with temporary_rig_states([posed[number] for number in numbers], clips, others) as player:
+        fitted = yield from _run_phase(planned, lambda mesh: _fit_mesh_weights(mesh, settings, plan, player))
+    for mesh_indices in group_into_passes(meshes):
+        meshes_in_pass = [fitted[index] for index in mesh_indices]
+        others = [mesh for index, mesh in enumerate(posed) if index not in mesh_indices]
+        with temporary_rig_states([posed[index] for index in mesh_indices], clips, others) as player:
             if plan.pose_setter.target:
-                yield from check_moves(together[0], plan, player)
-            check_follows_pose(together, plan, player)
-            found = yield from _in_turn(together, lambda mesh: _find_influences(mesh, settings, clips, player))
-            yield from _record_poses(found, settings, plan, player)
+                yield from check_target_moves(meshes_in_pass[0], plan, player)
+            check_follows_pose(meshes_in_pass, plan, player)
+            ready = yield from _run_phase(meshes_in_pass, lambda mesh: _find_influences(mesh, settings, clips, player))
+            yield from _record_poses(ready, settings, plan, player)
 
 
 def _plan(
     rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSettings, clips: tuple[Clip, ...]
 ) -> tuple[list[MeshPlanned], PosePlan]:
-    """The meshes with what moves them, and the poses that they share; all that can be refused is refused here."""
+    """Plan the recordings of meshes and their shared poses, and raise all errors that can be known in advance."""
     if settings.mirror and not clips:
         raise RecordingError("There is nothing to mirror: no action and no strip; give --action or --strip.")
     meshes = [scene_rig for scene_rig, _ in rigs]
-    controls = [settings.controls] if len(rigs) == 1 else controls_of_each(meshes, settings)
+    controls = [settings.controls] if len(rigs) == 1 else split_controls(meshes, settings)
     if settings.target.name and len(rigs) > 1:
-        raise RecordingError("A target is one of one mesh; record the meshes one by one, each with its target.")
+        raise RecordingError("A target belongs to one mesh; record the meshes one by one, each with its target.")
     read = []
-    for (scene_rig, path), own in zip(rigs, controls, strict=True):
+    for (scene_rig, path), mesh_controls in zip(rigs, controls, strict=True):
         stack = check_evaluable(scene_rig)
-        read.append(read_sampled_rig(scene_rig, replace(settings, controls=own)))
+        read.append(read_sampled_rig(scene_rig, replace(settings, controls=mesh_controls)))
         if not settings.target.name:
             check_time_inputs(scene_rig, read[-1][0].controls, stack, find_actions(settings))
         check_recordable(path, settings.resume, settings.overwrite)
-    channels = [(scene_rig, own) for scene_rig, (_, own) in zip(meshes, read, strict=True)]
+    meshes_with_channels = [(scene_rig, channels) for scene_rig, (_, channels) in zip(meshes, read, strict=True)]
     pose_setter = make_pose_setter(meshes[0], settings.target, clips, settings.poses)
-    plan = PosePlan(channels, settings, clips, pose_setter)
+    plan = PosePlan(meshes_with_channels, settings, clips, pose_setter)
     if plan.total < 1:
         raise RecordingError("There is nothing to record: 0 poses and no action; give --poses or --action.")
-    wanted = len(_wanted(settings, plan.total))
-    check_disk_space([(path, recording_bytes(rig, wanted)) for (_, path), (rig, _) in zip(rigs, read, strict=True)])
-    known = [_known(path, settings, len(rigs) > 1) for _, path in rigs]
+    pose_count = len(_pose_indices(settings, plan.total))
+    check_disk_space([(path, recording_bytes(rig, pose_count)) for (_, path), (rig, _) in zip(rigs, read, strict=True)])
+    previous_paths = [_previous_recording(path, settings, len(rigs) > 1) for _, path in rigs]
     planned = [
-        MeshPlanned(scene_rig, rig, path, own, plan.channels_of(number), known[number], pose_setter.target)
-        for number, ((scene_rig, path), (rig, own)) in enumerate(zip(rigs, read, strict=True))
+        MeshPlanned(
+            scene_rig, rig, path, channels, plan.channels_of_mesh(index), previous_paths[index], pose_setter.target
+        )
+        for index, ((scene_rig, path), (rig, channels)) in enumerate(zip(rigs, read, strict=True))
     ]
     return planned, plan
 
 
-def _known(path: Path, settings: RecordingSettings, is_one_of_several: bool) -> Path | None:
-    """Where the weights and influences of the recording at `path` are known already, if they are."""
+def _previous_recording(path: Path, settings: RecordingSettings, is_one_of_several: bool) -> Path | None:
+    """Return the recording that has weights and influences for the one at `path`; None where there is none."""
     if settings.resume and (path / INDEX).exists():
         return path
     if settings.influences is None:
@@ -141,119 +143,128 @@ def _known(path: Path, settings: RecordingSettings, is_one_of_several: bool) -> 
     return settings.influences / path.name if is_one_of_several else settings.influences
 
 
-def _wanted(settings: RecordingSettings, total: int) -> range:
-    """Numbers of the poses to record."""
+def _pose_indices(settings: RecordingSettings, total: int) -> range:
+    """Return the indices of the poses to record."""
     if settings.detect_influences:
         return range(0)
     return shard_poses(*settings.shard, total) if settings.shard else range(total)
 
 
-def _in_turn(
+def _run_phase(
     meshes: Sequence[Before], phase: Callable[[Before], Generator[Progress, None, After]]
 ) -> Generator[Progress, None, list[After]]:
-    """A phase of each mesh; where there are several, the stages say of which. Returns what the phases give."""
+    """Run a phase for each mesh, and return the results; stages name the mesh where there are several."""
     results = []
 
-    def keep(mesh: Before) -> Iterator[Progress]:
+    def collect_result(mesh: Before) -> Iterator[Progress]:
         results.append((yield from phase(mesh)))
 
     for mesh in meshes:
-        with closing(keep(mesh)) as steps:
+        with closing(collect_result(mesh)) as steps:
             for step in steps:
                 yield step if len(meshes) == 1 else replace(step, stage=f"{step.stage} of '{mesh.name}'")
     return results
 
 
-def _fit(
+def _fit_mesh_weights(
     mesh: MeshPlanned, settings: RecordingSettings, plan: PosePlan, player: ClipPlayer | None
 ) -> Generator[Progress, None, WeightsFitted]:
-    """Give a mesh the weights that its linear skinning is to have."""
-    if mesh.known:
-        return WeightsFitted(mesh, *read_previous_weights(mesh.known, mesh.rig, settings.fit_linear))
+    """Read, fit or keep the skin weights of a mesh."""
+    if mesh.previous_path:
+        return WeightsFitted(mesh, *read_previous_weights(mesh.previous_path, mesh.rig, settings.fit_linear))
     if not settings.fit_linear:
         check_has_weights(mesh.scene_rig, mesh.rig)
         return WeightsFitted(mesh, mesh.rig, None)
-    numbers = poses_to_fit(plan.total, mesh.rig.vertex_count)
-    posed = plan.poses(player, frozenset(numbers))
+    fit_poses = choose_fit_poses(plan.total, mesh.rig.vertex_count)
+    posed = plan.show_poses(player, frozenset(fit_poses))
     evaluator = mesh.evaluator(mesh.rig)
-    fitted = yield from fit_weights(mesh.rig, settings.fit_linear, posed, len(numbers), evaluator)
+    fitted = yield from fit_weights(mesh.rig, settings.fit_linear, posed, len(fit_poses), evaluator)
     return WeightsFitted(mesh, *fitted)
 
 
 def _find_influences(
     mesh: WeightsFitted, settings: RecordingSettings, clips: tuple[Clip, ...], player: ClipPlayer
 ) -> Generator[Progress, None, InfluencesReady]:
-    """Find what influences the partitions of a mesh; what moves it alone is moved, not what moves others."""
+    """Detect or read the influences on the partitions of a mesh, with the channels of this mesh alone."""
     scene_rig, channels = mesh.planned.scene_rig, mesh.planned.channels
-    search = Search(
+    search = InfluenceSearch(
         channels,
-        lambda number: sample_pose(channels, settings.seed, INFLUENCE_SEED_OFFSET + number, settings.spread),
-        lambda number: _show_frame(player, clips, number),
+        lambda index: sample_pose(channels, settings.seed, INFLUENCE_SEED_OFFSET + index, settings.spread),
+        lambda index: _show_frame(player, clips, index),
         player.stop,
         settings.influence_poses,
         settings.influence_tolerance,
         mesh.planned.target is not None,
     )
     evaluator = TimedEvaluator(mesh.planned.evaluator(mesh.rig))
-    known = mesh.planned.known
-    if known and (partitions := read_previous_partitions(known, mesh.rig, settings.min_partition_vertices)):
+    previous_path = mesh.planned.previous_path
+    if previous_path and (
+        partitions := read_previous_partitions(previous_path, mesh.rig, settings.min_partition_vertices)
+    ):
         return InfluencesReady(mesh, partitions, evaluator)
-    if known and known != mesh.planned.path:
+    if previous_path and previous_path != mesh.planned.path:
         raise RecordingError(
-            f"The influences in '{known}' are of other partitions than those of '{mesh.name}'; find them with the same "
-            "rig and options (record --detect-influences)."
+            f"The influences in '{previous_path}' are of other partitions than those of '{mesh.name}'; find them with "
+            "the same rig and options (record --detect-influences)."
         )
-    cut = make_merged_partitions(mesh.rig, settings.min_partition_vertices)
+    partitions_without_influences = make_merged_partitions(mesh.rig, settings.min_partition_vertices)
     target = mesh.planned.target
     if target and target.follows != POSE:
-        # What depends on time does not answer when a joint is moved.
-        return InfluencesReady(mesh, assume_nearby_influences(mesh.rig, cut), evaluator)
-    partitions = yield from find_influences(scene_rig, mesh.rig, cut, evaluator, search)
+        # A target that depends on time does not follow a joint at once.
+        return InfluencesReady(mesh, assume_nearby_influences(mesh.rig, partitions_without_influences), evaluator)
+    partitions = yield from detect_influences(scene_rig, mesh.rig, partitions_without_influences, evaluator, search)
     return InfluencesReady(mesh, partitions, evaluator)
 
 
 def _record_poses(
     meshes: list[InfluencesReady], settings: RecordingSettings, plan: PosePlan, player: ClipPlayer
 ) -> Iterator[Progress]:
-    wanted = _wanted(settings, plan.total)
+    pose_indices = _pose_indices(settings, plan.total)
     with ExitStack() as stack:
         appenders = []
         for mesh in meshes:
-            info = replace(_info(mesh, settings, plan, wanted), target=plan.pose_setter.recorded)
+            info = replace(_make_info(mesh, settings, plan, pose_indices), target=plan.pose_setter.recorded)
             writer = RecordingWriter(
                 mesh.fitted.planned.path,
                 *(mesh.fitted.rig, mesh.partitions, info),
                 *(settings.resume, settings.overwrite),
             )
             skinning = LinearSkinning(mesh.fitted.rig, mesh.partitions)
-            appenders.append(Appender(mesh.evaluator, skinning, stack.enter_context(writer), plan.pose_setter))
-        first, settler = min(appender.done for appender in appenders), plan.pose_setter.settler
+            appenders.append(PoseAppender(mesh.evaluator, skinning, stack.enter_context(writer), plan.pose_setter))
+        first, settler = min(appender.pose_count for appender in appenders), plan.pose_setter.settler
         seconds = settler.last.seconds if settler and settler.last else None
-        yield Progress("poses", first, len(wanted), estimate(meshes, len(wanted), len(wanted) - first, seconds))
-        left = plan.poses(player, wanted[first:])
-        # Closed before the writers: what was evaluated is kept when the recording is broken off.
-        with closing(left), closing(append_poses(left, appenders)) as steps:
+        yield Progress(
+            "poses",
+            first,
+            len(pose_indices),
+            describe_estimate(meshes, len(pose_indices), len(pose_indices) - first, seconds),
+        )
+        remaining_poses = plan.show_poses(player, pose_indices[first:])
+        # Closed before the writers, so that evaluated poses are kept when the recording is interrupted.
+        with closing(remaining_poses), closing(append_poses(remaining_poses, appenders)) as steps:
             for done in steps:
-                yield Progress("poses", done, len(wanted), detail=str(settler.last) if settler else "")
-        if plan.repeatable and settings.target.repeatability_poses and len(wanted) == plan.total:
+                yield Progress("poses", done, len(pose_indices), detail=str(settler.last) if settler else "")
+        if plan.repeatable_poses and settings.target.repeatability_poses and len(pose_indices) == plan.total:
             yield from measure_repeatability(meshes[0], plan, player, writer, settings.target.repeatability_poses)
-            yield Progress("poses", len(wanted), len(wanted))
+            yield Progress("poses", len(pose_indices), len(pose_indices))
 
 
-def _info(mesh: InfluencesReady, settings: RecordingSettings, plan: PosePlan, wanted: range) -> RecordingInfo:
-    """What the recording of a mesh will say of itself."""
+def _make_info(
+    mesh: InfluencesReady, settings: RecordingSettings, plan: PosePlan, pose_indices: range
+) -> RecordingInfo:
+    """Make the info of the recording of a mesh."""
     planned = mesh.fitted.planned
     sampling = make_sampling(planned.scene_rig, settings, planned.limits)
     file, version = Path(bpy.data.filepath).name, bpy.app.version_string
-    is_part = settings.shard is not None or settings.detect_influences
-    shard = Shard(wanted.start, plan.total) if is_part else None
-    info = RecordingInfo(len(wanted), 0, file, planned.name, version, sampling, mesh.fitted.fit, shard)
-    if planned.known and planned.known != planned.path:
-        check_influences_match(planned.known, mesh.fitted.rig, info)
+    is_shard = settings.shard is not None or settings.detect_influences
+    shard = Shard(pose_indices.start, plan.total) if is_shard else None
+    info = RecordingInfo(len(pose_indices), 0, file, planned.name, version, sampling, mesh.fitted.fit, shard)
+    if planned.previous_path and planned.previous_path != planned.path:
+        check_influences_match(planned.previous_path, mesh.fitted.rig, info)
     return info
 
 
-def _show_frame(player: ClipPlayer, clips: tuple[Clip, ...], number: int) -> None:
-    """Pose the rig as on one of the frames of some clips, far apart for numbers that follow each other."""
+def _show_frame(player: ClipPlayer, clips: tuple[Clip, ...], index: int) -> None:
+    """Show a frame of the clips; consecutive indices give frames that are far apart."""
     frames = [(clip, frame) for clip in clips for frame in clip.frames]
-    player.show(*frames[int(number * GOLDEN_RATIO * len(frames)) % len(frames)])
+    player.show(*frames[int(index * GOLDEN_RATIO * len(frames)) % len(frames)])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Whether surfaces follow from the pose: the same pose, held in several frames, has to show the same surface."""
+"""Check that the surface depends on the pose alone: in several frames the same pose must show the same surface."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -17,22 +17,22 @@ from .phases import WeightsFitted
 from .pose_plan import PosePlan
 
 POSE_TOLERANCE = 1e-5
-"""Matrices and controls that differ by less are those of one pose (no unit, or mesh units)."""
+"""Largest difference of matrices and controls of equal poses (no unit, or mesh units)."""
 
 
 def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: ClipPlayer) -> None:
-    """Fail where a mesh shows other surfaces in other frames while its pose and its controls are the same.
+    """Check that the surfaces of meshes do not change between frames while pose and controls are the same.
 
-    Two poses of the plan are held at the ends and in the middle of the scene. Targets that depend on time are left out.
-    Where the pose itself changes with the frame, nothing can be compared.
+    Two poses of the plan are held in the first, middle and last frame of the scene. Targets that depend on time are
+    skipped, and so are poses that change with the frame.
 
     Args:
-        meshes: that are evaluated together, borrowed.
+        meshes: that are evaluated together, inside of `temporary_rig_states`.
         plan: of the poses.
         player: plays its clips.
 
     Raises:
-        RigError: says by how much, and between which frames.
+        RigError: a surface differs between frames.
     """
     target = plan.pose_setter.target
     if target and target.follows != POSE:
@@ -43,7 +43,7 @@ def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: 
     evaluators = [mesh.planned.evaluator(mesh.rig) for mesh in meshes]
     try:
         for number in {plan.total // 3, plan.total - 1}:
-            with closing(plan.poses(player, {number})) as poses:
+            with closing(plan.show_poses(player, {number})) as poses:
                 next(poses)
                 shown = player.shown
                 player.put(shown, frame)
@@ -51,7 +51,7 @@ def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: 
                 for other in sorted(others):
                     player.put(shown, other)
                     for mesh, evaluator, before in zip(meshes, evaluators, first, strict=True):
-                        _compare(mesh, (frame, other), before, evaluator.evaluate())
+                        _compare_surfaces(mesh, (frame, other), before, evaluator.evaluate())
     finally:
         player.stop()
         clear_pose(meshes[0].planned.scene_rig.armature_object)
@@ -59,7 +59,7 @@ def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: 
         scene.frame_set(frame, subframe=subframe)
 
 
-def _compare(
+def _compare_surfaces(
     mesh: WeightsFitted, frames: tuple[int, int], before: Sequence[np.ndarray], after: Sequence[np.ndarray]
 ) -> None:
     (pose, positions, controls), (other_pose, other_positions, other_controls) = before, after
@@ -68,13 +68,13 @@ def _compare(
         for pair in ((pose, other_pose), (controls, other_controls))
     ):
         return
-    apart = float(np.linalg.norm(positions - other_positions, axis=1).max())
+    largest_difference = float(np.linalg.norm(positions - other_positions, axis=1).max())
     mesh_object = mesh.planned.scene_rig.mesh_object
     extent = max(float(np.abs(mesh.rig.rest_positions).max()), *map(abs, mesh_object.matrix_world.translation))
-    if apart > max(INFLUENCE_TOLERANCE * mesh.rig.size, 4 * FLOAT32_ROUNDING_RATIO * extent):
+    if largest_difference > max(INFLUENCE_TOLERANCE * mesh.rig.size, 4 * FLOAT32_ROUNDING_RATIO * extent):
         raise RigError(
-            f"The surface of '{mesh.name}' differs by {apart * mesh.rig.metres_per_unit * 1000:.2g} mm between frames "
-            f"{frames[0]} and {frames[1]} in the same pose, so it does not follow from the pose; look for what reads "
-            "the frame (keys, drivers, Geometry Nodes, what a constraint follows), and make it a control or switch it "
-            "off."
+            f"The surface of '{mesh.name}' differs by {largest_difference * mesh.rig.metres_per_unit * 1000:.2g} mm "
+            f"between frames {frames[0]} and {frames[1]} in the same pose, so it does not follow from the pose; look "
+            "for what reads the frame (keys, drivers, Geometry Nodes, what a constraint follows), and make it a "
+            "control or switch it off."
         )

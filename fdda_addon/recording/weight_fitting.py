@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fits the skin weights of linear skinning to poses of a rig, in the trainer's Python."""
+"""Fitting of skin weights to poses of a rig, in the trainer's Python."""
 
 import tempfile
 import time
@@ -20,33 +20,33 @@ from ..rig.reading import PoseEvaluator
 from ..scene.scene_rig import SceneRig
 from ..training.process import TrainerProcess
 
-MAX_POSES = 300
-MAX_BYTES = 256 << 20
-"""Weights are fitted to at most this number of poses, and to at most this many bytes of positions."""
+MAX_FIT_POSES = 300
+MAX_FIT_BYTES = 256 << 20
+"""Largest number of poses to which weights are fitted, and largest size of their positions."""
 WAIT_SECONDS = 0.02
-"""How long a step waits for the process: a job of the sidebar goes on drawing meanwhile."""
+"""Pause while waiting for the process, during which the sidebar stays responsive."""
 
 
 class SkinFitting(TrainerProcess):
-    """A fit of skin weights in a process of its own; its arguments are those of `trainer.skin_fit`."""
+    """Process that fits skin weights; takes the arguments of `trainer.skin_fit`."""
 
     module = "trainer.skin_fit"
     failed = "The skin weights could not be fitted."
     lost = "no skin weights were fitted, record again"
 
 
-def poses_to_fit(total: int, vertices: int) -> list[int]:
-    """Which of the `total` poses of a recording weights are fitted to: spread over all of them.
+def choose_fit_poses(total: int, vertices: int) -> list[int]:
+    """Choose evenly spaced poses of a recording to which weights are fitted.
 
     Raises:
-        RecordingError: there are too few.
+        RecordingError: there are too few poses.
     """
     if total < MIN_POSES:
         raise RecordingError(
             f"Skin weights are fitted to at least {MIN_POSES} poses, and these are {total}; record more, or leave "
             "--fit-linear out."
         )
-    count = min(total, MAX_POSES, max(MIN_POSES, MAX_BYTES // (12 * vertices)))
+    count = min(total, MAX_FIT_POSES, max(MIN_POSES, MAX_FIT_BYTES // (12 * vertices)))
     return np.linspace(0, total - 1, count).round().astype(int).tolist()
 
 
@@ -54,21 +54,21 @@ def fit_weights(rig: Rig, kind: str, poses: Iterator[None], count: int, evaluato
     """Fit the weights of a rig to poses.
 
     Args:
-        rig: with the weights of its own.
+        rig: with its own skin weights.
         kind: one of `core.skin_fit.KINDS`.
-        poses: poses the scene, one pose an iteration.
+        poses: sets one pose per iteration.
         count: number of poses.
         evaluator: of the scene.
 
     Returns:
-        The rig with the fitted weights, its fingerprint as before; and the SkinFit.
+        The rig with fitted weights and its old fingerprint; and the SkinFit.
 
     Raises:
         TrainingError: the trainer's Python cannot fit.
-        OutputError: there is no room for the poses.
+        OutputError: the poses cannot be written.
     """
     try:
-        # On Windows a virus scanner may still read what is to be removed.
+        # On Windows a virus scanner may still have a file open.
         temporary = tempfile.TemporaryDirectory(prefix="fdda-fit-", ignore_cleanup_errors=True)
     except OSError as error:
         raise temporary_folder_error(error) from error
@@ -79,13 +79,13 @@ def fit_weights(rig: Rig, kind: str, poses: Iterator[None], count: int, evaluato
                 pose_matrices, positions, *_ = evaluator.evaluate()
                 writer.append(pose_matrices, positions)
                 yield Progress("poses to fit", number, count)
-        fit = yield from _fit_folder(folder, kind, rig)
+        fit = yield from _run_fit(folder, kind, rig)
         joints, weights = read_fitted_weights(folder, rig)
     return replace(rig, skin_joints=joints, skin_weights=weights), fit
 
 
-def _fit_folder(folder: Path, kind: str, rig: Rig) -> Iterator[Progress]:
-    """Yields progress, returns the SkinFit."""
+def _run_fit(folder: Path, kind: str, rig: Rig) -> Iterator[Progress]:
+    """Run the process; yield progress and return the SkinFit."""
     progress, vertices = Progress("fit", 0, rig.vertex_count), rig.vertex_count
     with SkinFitting([str(folder), kind, "--metres-per-unit", repr(rig.metres_per_unit)]) as fitting:
         for message in fitting.messages(wait=False):
@@ -100,7 +100,7 @@ def _fit_folder(folder: Path, kind: str, rig: Rig) -> Iterator[Progress]:
 
 
 def check_has_weights(scene_rig: SceneRig, rig: Rig) -> None:
-    """Fail where linear skinning with the rig's own weights would never move.
+    """Check that vertices of the rig have weights on deforming bones.
 
     Raises:
         RigError: no vertex follows a bone.

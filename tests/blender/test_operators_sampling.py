@@ -117,7 +117,7 @@ class TestBones:
             bpy.ops.fdda.record()
         action = wave(arm)
         check = checks.check_now(arm)
-        assert check.problems == () and [control.name for control in check.found] == [IK]
+        assert check.problems == () and [control.name for control in check.automatic_controls] == [IK]
         (turn,) = sampled_by_bone(arm)["fk_lower"]
         assert (turn.kind, turn.axis) == (ROTATION, 0)
         recording = recorded(arm)
@@ -237,7 +237,7 @@ class TestControls:
         control = face.mesh_object.fdda.settings.controls["flexed"]
         control.has_range, control.low, control.high = True, 0.25, 0.75
         check = checks.check_now(face)
-        assert check.problems == () and check.found == ()
+        assert check.problems == () and check.automatic_controls == ()
         assert counted(check).endswith(" channels) and 2 extra inputs.")
         recording = recorded(face)
         ranges = {control.path: (control.low, control.high) for control in recording.rig.controls}
@@ -307,7 +307,7 @@ class TestControls:
         controls.custom_property()
         rig = saved(tmp_path)
         check = checks.check_now(rig)
-        assert [control.name for control in check.found] == ['armature_object/["flex"]']
+        assert [control.name for control in check.automatic_controls] == ['armature_object/["flex"]']
         _, channels = read_sampled_rig(rig, recording_settings(rig))
         assert channels == check.channels
 

@@ -129,7 +129,7 @@ def test_what_is_resumed_repeats_nothing(tmp_path, monkeypatch, shard):
     def again(*_: object) -> None:
         raise AssertionError("the influences are known")
 
-    monkeypatch.setattr(recording_run, "find_influences", again)
+    monkeypatch.setattr(recording_run, "detect_influences", again)
     resumed = replace(settings, resume=True)
     done = [step.done for step in record(opened(rig), tmp_path / "part", resumed)]
     assert done[0] >= 7 and done == list(range(done[0], done[-1] + 1))

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Override of joints: sets each joint alone, with constraints and drivers of bones muted."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ..core.errors import RigError
+from ..core.rig import STATIC_JOINT, Joint
+from ..scene.armature import PoseMatrixReader, rest_matrices
+from ..scene.scene_rig import MIN_VOLUME, SceneRig, is_flat
+
+_TRANSFORM_PATH = re.compile(r'pose\.bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]\.(?:location|rotation_\w+|scale)')
+_CHAIN_CONSTRAINTS = {"IK", "SPLINE_IK"}
+"""Constraints that also move ancestors of their bone."""
+
+
+class JointOverride:
+    """Reads joints of evaluated poses, and sets each joint alone.
+
+    Attributes:
+        rest: (J, 4, 4) float64, rest matrix of each joint relative to its parent joint, mesh units.
+    """
+
+    def __init__(self, scene_rig: SceneRig, joints: tuple[Joint, ...]):
+        """Args:
+        scene_rig: the rig.
+        joints: J joints, every parent before its children.
+        """
+        self._armature_object = scene_rig.armature_object
+        self._joints = joints
+        names = tuple(joint.name for joint in joints)
+        self._matrices = PoseMatrixReader(scene_rig.armature_object, names)
+        self.rest = self._relative(rest_matrices(scene_rig.armature_object.data, names))
+
+    def read(self) -> np.ndarray:
+        """Read the evaluated matrix of each joint relative to its parent joint; (J, 4, 4) float64, mesh units.
+
+        Raises:
+            RigError: the armature, or a bone, has a scale of zero.
+        """
+        armature_object = self._armature_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        matrices = self._matrices.read(armature_object).astype(np.float64)
+        is_singular = np.abs(np.linalg.det(matrices[:, :3, :3])) < MIN_VOLUME
+        if is_flat(armature_object) or is_singular.any():
+            name = armature_object.name if is_flat(armature_object) else self._joints[int(is_singular.argmax())].name
+            raise RigError(f"'{name}' has a scale of zero in some pose; look for a constraint or driver that sets it.")
+        return self._relative(matrices)
+
+    def _relative(self, matrices: np.ndarray) -> np.ndarray:
+        parents = [joint.parent for joint in self._joints]
+        return np.array(
+            [np.linalg.solve(matrices[p], m) if p >= 0 else m for p, m in zip(parents, matrices, strict=True)]
+        )
+
+    def set(self, relative: np.ndarray) -> None:
+        """Set the joints to (J, 4, 4) matrices as of `read`, inside of `override_joints`, without an evaluation."""
+        target_matrices: dict[str, Matrix] = {}
+        for joint, matrix in zip(self._joints, relative, strict=True):
+            parent_matrix = target_matrices[self._joints[joint.parent].name] if joint.parent >= 0 else Matrix()
+            target_matrices[joint.name] = parent_matrix @ Matrix(matrix)
+        target_matrices.pop(STATIC_JOINT, None)
+        pose_matrices: dict[str, Matrix] = {}
+        for bone in self._armature_object.pose.bones:
+            bone_data = bone.bone
+            parent = bone_data.parent
+            parent_matrices = (
+                {"parent_matrix": pose_matrices[parent.name], "parent_matrix_local": parent.matrix_local}
+                if parent
+                else {}
+            )
+            if bone_data.name in target_matrices:
+                pose_matrices[bone_data.name] = target_matrices[bone_data.name]
+                bone.matrix_basis = bone_data.convert_local_to_pose(
+                    target_matrices[bone_data.name], bone_data.matrix_local, invert=True, **parent_matrices
+                )
+            else:
+                pose_matrices[bone_data.name] = bone_data.convert_local_to_pose(
+                    Matrix(), bone_data.matrix_local, **parent_matrices
+                )
+
+
+@contextmanager
+def override_joints(
+    scene_rig: SceneRig, joints: tuple[Joint, ...], others_follow: bool = False
+) -> Iterator[JointOverride]:
+    """Mute constraints and drivers of bones, so that only their channels move them; restore both afterwards.
+
+    The pose must be at rest before (`armature.clear_pose`), and keeps its last values afterwards.
+
+    Args:
+        scene_rig: the rig.
+        joints: as for `JointOverride`.
+        others_follow: do not mute constraints and drivers of bones that neither are joints nor ancestors of joints.
+    """
+    armature_object = scene_rig.armature_object
+    animation = armature_object.animation_data
+    names = {joint.name for joint in joints}
+    bones = [bone for bone in armature_object.pose.bones if bone.name in names]
+    ancestors_and_self = {parent_matrix.name for bone in bones for parent_matrix in (bone, *bone.parent_recursive)}
+
+    def is_overridden(name: str) -> bool:
+        return not others_follow or name in ancestors_and_self
+
+    constraints = [
+        constraint
+        for bone in armature_object.pose.bones
+        for constraint in bone.constraints
+        if not constraint.mute and (is_overridden(bone.name) or constraint.type in _CHAIN_CONSTRAINTS)
+    ]
+    drivers = [
+        curve
+        for curve in (animation.drivers if animation else ())
+        if (match := _TRANSFORM_PATH.fullmatch(curve.data_path))
+        and is_overridden(bpy.utils.unescape_identifier(match["bone"]))
+        and not curve.mute
+    ]
+    override = JointOverride(scene_rig, joints)
+    for item in (*constraints, *drivers):
+        item.mute = True
+    try:
+        yield override
+    finally:
+        for item in (*constraints, *drivers):
+            item.mute = False
+        bpy.context.view_layer.update()
