@@ -27,7 +27,7 @@ UNITS = {
     "fit": "vertices fitted",
     "probes": "poses compared with the rig",
     "epochs": "training passes",
-    "repeats": "poses repeated",
+    "repeatability": "poses repeated",
     "evaluation": "poses compared",
     "benchmark": "measurements",
 }
