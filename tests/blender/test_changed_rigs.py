@@ -270,7 +270,7 @@ def test_playback_and_posing_read_no_rig(bound, elbow, monkeypatch):
     pose(angle=0.2)
     pose(angle=0.3)
     monkeypatch.setattr(rig_check, "read_model_rig", None)
-    monkeypatch.setattr(rig_check, "rest_of", None)
+    monkeypatch.setattr(rig_check, "rest_digest", None)
     for step in range(5):
         bpy.context.scene.frame_set(step)
         pose(angle=0.1 * step)
