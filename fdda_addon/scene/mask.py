@@ -31,4 +31,4 @@ def read_mask(mesh_object: bpy.types.Object) -> Mask | None:
             if element.group == group:
                 weights[vertex.index] = element.weight
                 break
-    return Mask.of(1 - weights if is_inverted else weights)
+    return Mask.from_weights(1 - weights if is_inverted else weights)

@@ -25,7 +25,7 @@ def test_python_knows_the_threads_that_evaluate(bound, elbow, monkeypatch):
         own.calls = getattr(own, "calls", 0) + 1
         remembered[threading.get_ident()] = own.calls
 
-    monkeypatch.setattr(playback, "play", counted)
+    monkeypatch.setattr(playback, "on_evaluate", counted)
     main = threading.get_ident()
     for number in range(MOST_POSES):
         pose(angle=number / MOST_POSES)
@@ -38,7 +38,7 @@ def test_python_knows_the_threads_that_evaluate(bound, elbow, monkeypatch):
 
 
 def test_states_of_threads_that_end_are_few(monkeypatch):
-    monkeypatch.setattr(evaluation_threads, "_kept", {threading.get_ident()})
+    monkeypatch.setattr(evaluation_threads, "_threads_with_state", {threading.get_ident()})
     count, ended = evaluation_threads.MAX_KEPT_STATES + 5, []
     # Threads that are there at once are told apart; the next one has the name of one that has ended.
     all_there = threading.Barrier(count)

@@ -93,9 +93,9 @@ def test_it_is_created_from_a_folder_of_wheels(user: Path, wheels: Path):
     assert create(wheels=str(wheels)) == {"FINISHED"}
     assert session.own_state() is FolderState.READY and not junk.exists()
     assert choice.chosen_python() == (str(folder.python_in(folder.own_folder())), Origin.OWN)
-    assert session.answer.message.endswith(f"torch {pinned('torch')}.")
-    assert session.answer.message.startswith("Ready to train on the CPU: Python 3.")
-    assert f"onnx {pinned('onnx')}" in session.answer.details
+    assert session.check_result.message.endswith(f"torch {pinned('torch')}.")
+    assert session.check_result.message.startswith("Ready to train on the CPU: Python 3.")
+    assert f"onnx {pinned('onnx')}" in session.check_result.details
     log = folder.log_path().read_text()
     assert "-m venv" in log and "Successfully installed" in log and "Ready to train" in log
     assert sorted(path.name for path in user.iterdir()) == ["trainer", "trainer.lock", "trainer.log"]
@@ -283,7 +283,7 @@ def test_an_environment_whose_torch_is_gone(own: Path):
     shutil.rmtree(own / "torch")
     text = refused(bpy.ops.fdda.check_trainer)
     assert text.endswith("lacks torch; reinstall the training environment in the add-on's preferences.")
-    assert session.answer.level == "ERROR" and "torch is missing" in session.answer.details
+    assert session.check_result.level == "ERROR" and "torch is missing" in session.check_result.details
 
 
 def test_an_environment_of_other_versions_still_trains(own: Path):

@@ -300,8 +300,8 @@ def test_the_length_of_bones(good):
 
 
 def test_no_more_poses_are_read_than_are_needed(good, monkeypatch):
-    monkeypatch.setattr(residual_scan, "MAX_POSES", 50)
-    monkeypatch.setattr(residual_scan, "SAMPLED_VERTICES", 40)
+    monkeypatch.setattr(residual_scan, "MAX_SCANNED_POSES", 50)
+    monkeypatch.setattr(residual_scan, "MAX_KEPT_VERTICES", 40)
     scan = residual_scan.scan_residuals(good)
     assert len(scan.poses) == 50 and (scan.poses[0], scan.poses[-1]) == (0, 199)
     assert all(len(r) == 50 and 8 <= r.shape[1] <= 10 for r in scan.residuals)
