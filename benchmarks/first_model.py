@@ -65,8 +65,8 @@ def way() -> Iterator[float]:
     done("opened, Rig read")
     yield from sidebar.open_section("poses")
     yield from picture(OUT / "2_poses.png")
-    if not part("panels.poses").states_limits(part("scene.active_rig").cached_active_rig(bpy.context)):
-        yield from sidebar.push("fdda.limits_preset(")
+    if not part("panels.poses").has_any_limits(part("scene.active_rig").cached_active_rig(bpy.context)):
+        yield from sidebar.push("fdda.human_limits(")
         yield 0.5
     yield from sidebar.push("fdda.preview_pose", across=0.45)
     yield 0.5

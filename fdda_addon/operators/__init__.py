@@ -8,7 +8,7 @@ MODULES: tuple[str, ...] = (
     "rig",
     "sampling",
     "poses",
-    "ranges",
+    "limits",
     "recording",
     "training",
     "playback",

@@ -8,10 +8,10 @@ import bpy
 
 from ..core.errors import FDDAError, OutputError
 from .confirm import ConfirmFirst
-from .playback import OnModel
+from .playback import ModelOperator
 
 
-class FDDA_OT_bake(OnModel, ConfirmFirst, bpy.types.Operator):
+class FDDA_OT_bake(ModelOperator, ConfirmFirst, bpy.types.Operator):
     bl_idname = "fdda.bake"
     bl_label = "Bake"
     bl_description = (
@@ -39,7 +39,7 @@ class FDDA_OT_bake(OnModel, ConfirmFirst, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_bound(context)
+        return cls.is_idle() and cls.has_bound_model(context)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if self.filepath:

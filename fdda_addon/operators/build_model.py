@@ -10,10 +10,10 @@ from ..properties.character import model_file, recording_folder
 from .job import JobOperator
 from .playback import bind_model
 from .recording import is_recorded, record_rigs
-from .training import TrainsModels
+from .training import TrainingOperator
 
 
-class FDDA_OT_build_model(TrainsModels, JobOperator, bpy.types.Operator):
+class FDDA_OT_build_model(TrainingOperator, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.build_model"
     bl_label = "Record, Train & Bind"
     bl_description = (
@@ -53,16 +53,16 @@ class FDDA_OT_build_model(TrainsModels, JobOperator, bpy.types.Operator):
     def finish(self, _context: bpy.types.Context, result: float) -> str:
         from ..scene.scene_rig import SceneRig, armature_of
 
-        self.list_models()
+        self.add_trained_models_to_list()
         sentences = []
-        for uid, model in self.trained:
+        for uid, model in self.trained_models:
             mesh_object = next((o for o in bpy.data.objects if o.session_uid == uid), None)
             if mesh_object is not None and (armature_object := armature_of(mesh_object)) is not None:
                 sentences.append(bind_model(SceneRig(mesh_object, armature_object), model))
         return f"Trained in {result:.0f} s. {' '.join(sentences)}"
 
-    def cancelled(self, _context: bpy.types.Context) -> str:
-        self.list_models()
+    def cancel_message(self, _context: bpy.types.Context) -> str:
+        self.add_trained_models_to_list()
         return "Canceled. What was recorded is kept, and the next run continues from there."
 
 

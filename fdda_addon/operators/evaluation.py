@@ -14,15 +14,15 @@ from ..core.report import REPORT_HTML, page_path
 from ..evaluation import last_evaluation, side_by_side
 from ..evaluation.loaded_heat_map import loaded_heat_map
 from ..models.entries import bound_entry, bound_name
-from ..properties.choices import target_settings
+from ..properties.recording_options import target_settings
 from ..properties.view import show_graph
 from ..scene.active_rig import any_mesh_object
 from .job import JobOperator
-from .on_rig import OnRig
-from .playback import OnModel
+from .playback import ModelOperator
+from .rig_operator import RigOperator
 
 
-class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
+class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.evaluate"
     bl_label = "Evaluate"
     bl_description = "Compare the bound model with the rig, on the action of the armature or on random poses"
@@ -51,7 +51,7 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_bound(context)
+        return cls.is_idle() and cls.has_bound_model(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         from ..evaluation.run import EvaluationSettings, evaluate, evaluate_action
@@ -113,20 +113,20 @@ class FDDA_OT_evaluate(OnModel, JobOperator, bpy.types.Operator):
         return self.action or animation.action.name
 
 
-class OnEvaluation(OnModel):
+class EvaluationOperator(ModelOperator):
     """Mixin for an operator that shows the last evaluation."""
 
     @classmethod
     def has_evaluation(cls, context: bpy.types.Context) -> bool:
         """Whether a mesh of the scene was evaluated; sets the poll message otherwise. For `poll`."""
-        if not cls.is_free(context):
+        if not cls.can_change_scene(context):
             return False
         if not any_mesh_object(context, last_evaluation.get):
             cls.poll_message_set("Nothing has been compared in this session; press Evaluate first")
             return False
         return True
 
-    def last(self, context: bpy.types.Context) -> tuple[object, object]:
+    def last_evaluation(self, context: bpy.types.Context) -> tuple[object, object]:
         """The rig and its last evaluation.
 
         Raises:
@@ -141,8 +141,8 @@ class OnEvaluation(OnModel):
         return scene_rig, last
 
 
-class FDDA_OT_paint(OnEvaluation, bpy.types.Operator):
-    bl_idname = "fdda.paint"
+class FDDA_OT_color_mesh(EvaluationOperator, bpy.types.Operator):
+    bl_idname = "fdda.color_mesh"
     bl_label = "Color the Mesh"
     bl_description = "Show errors or body parts as colors in the viewport"
     bl_options = {"REGISTER"}
@@ -160,13 +160,13 @@ class FDDA_OT_paint(OnEvaluation, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_free(context)
+        return cls.can_change_scene(context)
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..evaluation import heat_map
 
         if self.colors == "ERRORS":
-            scene_rig, _ = self.last(context)
+            scene_rig, _ = self.last_evaluation(context)
             heat_map.paint_errors(scene_rig.mesh_object)
             view = context.window_manager.fdda_view
             if not view.is_property_set("range_mm"):
@@ -180,8 +180,8 @@ class FDDA_OT_paint(OnEvaluation, bpy.types.Operator):
         return ""
 
 
-class FDDA_OT_fit_range(OnEvaluation, bpy.types.Operator):
-    bl_idname = "fdda.fit_range"
+class FDDA_OT_fit_color_range(EvaluationOperator, bpy.types.Operator):
+    bl_idname = "fdda.fit_color_range"
     bl_label = "Fit Range"
     bl_description = "Fit the range of the heat map to the errors that are shown"
     bl_options = {"REGISTER"}
@@ -190,10 +190,10 @@ class FDDA_OT_fit_range(OnEvaluation, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.has_evaluation(context)
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..evaluation import heat_map
 
-        scene_rig, _ = self.last(context)
+        scene_rig, _ = self.last_evaluation(context)
         fitting = heat_map.fitting_range_mm(scene_rig.mesh_object)
         if not fitting:
             raise ModelError("No errors are shown to fit the range to; choose another frame, or show the mean.")
@@ -202,7 +202,7 @@ class FDDA_OT_fit_range(OnEvaluation, bpy.types.Operator):
         return f"Max color: {view.range_mm:.3g} mm."
 
 
-class FDDA_OT_open_report(OnModel, bpy.types.Operator):
+class FDDA_OT_open_report(ModelOperator, bpy.types.Operator):
     bl_idname = "fdda.open_report"
     bl_label = "Open Training Report"
     bl_description = f"Open {REPORT_HTML}, which the training wrote next to the model, in the web browser"
@@ -210,10 +210,10 @@ class FDDA_OT_open_report(OnModel, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_bound(context)
+        return cls.has_bound_model(context)
 
-    def work(self, context: bpy.types.Context) -> str:
-        path = self._page(self.bound_rig(context).mesh_object)
+    def apply(self, context: bpy.types.Context) -> str:
+        path = self._report_page(self.bound_rig(context).mesh_object)
         if not path.is_file():
             raise ModelError(f"There is no report '{path}'; move it next to the model, or train again.")
         try:
@@ -222,7 +222,7 @@ class FDDA_OT_open_report(OnModel, bpy.types.Operator):
             raise ModelError(f"No web browser could be started; open '{path}' yourself.") from error
         return f"Opened {path} in the web browser."
 
-    def _page(self, mesh_object: bpy.types.Object) -> Path:
+    def _report_page(self, mesh_object: bpy.types.Object) -> Path:
         """Where the report of the bound model is."""
         from ..models import model_list
 
@@ -233,8 +233,8 @@ class FDDA_OT_open_report(OnModel, bpy.types.Operator):
         return page_path(model_list.entry_path(mesh_object, entry).resolve())
 
 
-class FDDA_OT_compare(OnModel, bpy.types.Operator):
-    bl_idname = "fdda.compare"
+class FDDA_OT_show_rig(ModelOperator, bpy.types.Operator):
+    bl_idname = "fdda.show_rig"
     bl_label = "Show the Rig"
     bl_description = "Show the rig together with the model, next to it or over it as a wireframe"
     bl_options = {"REGISTER", "UNDO"}
@@ -258,9 +258,9 @@ class FDDA_OT_compare(OnModel, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_bound(context)
+        return cls.has_bound_model(context)
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         rigs = self.bound_rigs(context)
         for scene_rig in rigs:
             if scene_rig.mesh_object.mode == "EDIT":
@@ -272,7 +272,7 @@ class FDDA_OT_compare(OnModel, bpy.types.Operator):
         return f"{names} {where[self.way]}."
 
 
-class FDDA_OT_show_bone(OnRig, bpy.types.Operator):
+class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):
     bl_idname = "fdda.show_bone"
     bl_label = "Select Bone"
     bl_description = "Select this bone in Pose Mode"
@@ -307,10 +307,10 @@ class FDDA_OT_show_bone(OnRig, bpy.types.Operator):
 
 CLASSES = (
     FDDA_OT_evaluate,
-    FDDA_OT_compare,
+    FDDA_OT_show_rig,
     FDDA_OT_show_bone,
-    FDDA_OT_paint,
-    FDDA_OT_fit_range,
+    FDDA_OT_color_mesh,
+    FDDA_OT_fit_color_range,
     FDDA_OT_open_report,
 )
 

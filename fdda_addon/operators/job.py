@@ -21,11 +21,11 @@ long as that took, or nearly all the time would go into pictures.
 """
 TICK_SECONDS, IDLE_TICK_SECONDS = 0.01, 0.1
 """Between the ticks of a job that works in Blender, and of one that waits for another process."""
-BLOCKING_SECONDS = 0.05
+BACKGROUND_STEP_SECONDS = 0.05
 REDRAW_SECONDS = 0.1
-TAB_STRIP = 24
+TAB_STRIP_WIDTH = 24
 
-LOOKING = {"MOUSEMOVE", "INBETWEEN_MOUSEMOVE", "MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "WINDOW_DEACTIVATE"}
+VIEW_EVENTS = {"MOUSEMOVE", "INBETWEEN_MOUSEMOVE", "MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "WINDOW_DEACTIVATE"}
 """Events that are passed on while a job borrows the scene: looking is allowed, changing is not."""
 
 
@@ -61,11 +61,11 @@ class JobOperator:
         """What remains to do with the last result of `steps`; returns the sentence that is reported."""
         raise NotImplementedError
 
-    def cancelled(self, context: bpy.types.Context) -> str:
+    def cancel_message(self, context: bpy.types.Context) -> str:
         """The sentence that is reported when the user has cancelled the job."""
         return f"{self.title} canceled."
 
-    def failed(self) -> None:
+    def on_failure(self) -> None:
         """Do what remains when the job has ended with an error."""
 
     @classmethod
@@ -84,9 +84,9 @@ class JobOperator:
     def execute(self, context: bpy.types.Context) -> set[str]:
         if not self._begin(context):
             return {"CANCELLED"}
-        while not self._run.work(BLOCKING_SECONDS):
+        while not self._run.work(BACKGROUND_STEP_SECONDS):
             if self._run.is_waiting:
-                time.sleep(BLOCKING_SECONDS)
+                time.sleep(BACKGROUND_STEP_SECONDS)
         return self._end()
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
@@ -105,7 +105,7 @@ class JobOperator:
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if not self._run.state.is_running:
             # Ended by an undo or by another file.
-            self._leave(context)
+            self._end_modal(context)
             return {"CANCELLED"}
         if event.type == "ESC" and self.borrows_scene:
             request_cancel()
@@ -113,7 +113,7 @@ class JobOperator:
             result = self._tick(context)
             if result is not None:
                 return result
-        if event.type == "TIMER" or not self.borrows_scene or _is_harmless(context, event):
+        if event.type == "TIMER" or not self.borrows_scene or _is_view_event(context, event):
             # Not with RUNNING_MODAL: Blender would then not notice which region the mouse is in, and no button works.
             return {"PASS_THROUGH"}
         return {"RUNNING_MODAL"}
@@ -122,7 +122,7 @@ class JobOperator:
         """Blender ends the operator: its window is closed, or Blender."""
         if self._run.state.is_running:
             stop(f"{self.title} ended with its window.")
-        self._leave(context)
+        self._end_modal(context)
 
     def _begin(self, context: bpy.types.Context) -> bool:
         if (job := current()) is not None:
@@ -133,12 +133,13 @@ class JobOperator:
         except FDDAError as error:
             self.report({"ERROR"}, str(error))
             return False
-        self._timer, self._said, self._shown, self._redrawn, self._worked = None, None, None, 0.0, time.monotonic()
+        self._timer, self._status_text, self._drawn_progress = None, None, None
+        self._last_redraw, self._last_work = 0.0, time.monotonic()
         self._run = Run(
             state,
             self.steps(context),
             lambda result: self.finish(bpy.context, result),
-            lambda: self.cancelled(bpy.context),
+            lambda: self.cancel_message(bpy.context),
             self.ends_itself,
         )
         return True
@@ -147,21 +148,22 @@ class JobOperator:
         """Work a little; returns the operator's result once the job has ended."""
         budget = TICK_BUDGET
         if self.borrows_scene:
-            budget = min(max(budget, time.monotonic() - self._worked), MAX_BUDGET)
+            budget = min(max(budget, time.monotonic() - self._last_work), MAX_BUDGET)
         try:
             has_ended = self._run.work(budget)
         except BaseException:
-            self._leave(context)
+            self._end_modal(context)
             raise
-        self._worked = time.monotonic()
+        self._last_work = time.monotonic()
         if has_ended:
-            self._leave(context)
+            self._end_modal(context)
             return self._end()
         state, now = self._run.state, time.monotonic()
         shown = (state.stage, state.done, len(state.log) + len(state.warnings), state.cancel_requested)
-        if shown != self._shown and now - self._redrawn >= REDRAW_SECONDS:
-            self._shown, self._redrawn = shown, now
-            self._say(context, f"{self.title}: {state.sentence} (ESC: cancel)" if self.borrows_scene else None)
+        if shown != self._drawn_progress and now - self._last_redraw >= REDRAW_SECONDS:
+            self._drawn_progress, self._last_redraw = shown, now
+            text = f"{self.title}: {state.sentence} (ESC: cancel)" if self.borrows_scene else None
+            self._set_status_text(context, text)
             redraw()
         return None
 
@@ -169,31 +171,31 @@ class JobOperator:
         """Report how the job ended; returns the operator's result."""
         state = self._run.state
         if state.outcome_level == "ERROR":
-            self.failed()
+            self.on_failure()
         if self.changes_file:
             bpy.ops.ed.undo_push(message=self.title)
         self.report({state.outcome_level}, state.outcome)
         return {"FINISHED"} if state.outcome_level == "INFO" else {"CANCELLED"}
 
-    def _say(self, context: bpy.types.Context, text: str | None) -> None:
+    def _set_status_text(self, context: bpy.types.Context, text: str | None) -> None:
         """Show a text in the status bar, or Blender's own again where one was shown."""
-        if text != self._said and context.workspace is not None:
+        if text != self._status_text and context.workspace is not None:
             context.workspace.status_text_set(text)
-            self._said = text
+            self._status_text = text
 
-    def _leave(self, context: bpy.types.Context) -> None:
+    def _end_modal(self, context: bpy.types.Context) -> None:
         if self._timer is not None:
             context.window_manager.event_timer_remove(self._timer)
             self._timer = None
-            self._say(context, None)
+            self._set_status_text(context, None)
 
 
-def _is_harmless(context: bpy.types.Context, event: bpy.types.Event) -> bool:
+def _is_view_event(context: bpy.types.Context, event: bpy.types.Event) -> bool:
     """Whether an event may reach the rest of Blender while the scene is borrowed: to look, and to press Cancel."""
-    if event.type in LOOKING:
+    if event.type in VIEW_EVENTS:
         return True
     # Not the strip of tabs at either side: on another tab there would be no way back.
-    strip = TAB_STRIP * context.preferences.system.ui_scale
+    strip = TAB_STRIP_WIDTH * context.preferences.system.ui_scale
     return event.type == "LEFTMOUSE" and any(
         region.type == "UI"
         and region.active_panel_category == "FDDA"

@@ -9,18 +9,18 @@ import bpy
 from ..core.errors import RigError
 from ..jobs.job import redraw
 from ..scene.active_rig import cached_active_rig, cached_rigs_of_active_armature, rigs_of_active_armature
-from .on_rig import OnRig
+from .rig_operator import RigOperator
 
-BUTTONS = (
-    ("fdda.add_arm", "fdda.build_model"),
+MENU_OPERATORS = (
+    ("fdda.add_sample_arm", "fdda.build_model"),
     ("fdda.measure",),
     ("fdda.preview_pose", "fdda.rest_pose", "fdda.use_selected_bones", "fdda.limits_from_actions"),
-    ("fdda.limits_preset", "fdda.copy_ranges", "fdda.mirror_ranges", "fdda.edit_ranges", "fdda.forget_ranges"),
+    ("fdda.human_limits", "fdda.copy_limits", "fdda.mirror_limits", "fdda.set_limits", "fdda.clear_limits"),
     ("fdda.add_control", "fdda.remove_control"),
-    ("fdda.record", "fdda.remove_recording"),
+    ("fdda.record", "fdda.delete_recording"),
     ("fdda.check_trainer", "fdda.train", "fdda.refine", "fdda.create_trainer_environment"),
-    ("fdda.bind", "fdda.switch", "fdda.measure_model", "fdda.bake", "fdda.relink", "fdda.unbind"),
-    ("fdda.evaluate", "fdda.paint", "fdda.fit_range", "fdda.mark_worst", "fdda.jump_to_worst"),
+    ("fdda.bind", "fdda.set_mode", "fdda.measure_model", "fdda.bake", "fdda.relink", "fdda.unbind"),
+    ("fdda.evaluate", "fdda.color_mesh", "fdda.fit_color_range", "fdda.add_worst_markers", "fdda.jump_to_worst"),
     ("fdda.remove_markers", "fdda.open_report"),
     ("fdda.add_model", "fdda.remove_model", "fdda.pack_model", "fdda.unpack_model", "fdda.check_model"),
     ("fdda.help",),
@@ -28,8 +28,8 @@ BUTTONS = (
 """The operators of the menu, in groups."""
 
 
-class FDDA_OT_choose_mesh(OnRig, bpy.types.Operator):
-    bl_idname = "fdda.choose_mesh"
+class FDDA_OT_show_mesh(RigOperator, bpy.types.Operator):
+    bl_idname = "fdda.show_mesh"
     bl_label = "Show Mesh"
     bl_description = "Show this mesh of the armature in the sidebar"
     bl_options = {"INTERNAL"}
@@ -53,13 +53,13 @@ class FDDA_OT_choose_mesh(OnRig, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class FDDA_MT_all(bpy.types.Menu):
-    bl_idname = "FDDA_MT_all"
+class FDDA_MT_main(bpy.types.Menu):
+    bl_idname = "FDDA_MT_main"
     bl_label = "FDDA"
 
     def draw(self, context: bpy.types.Context) -> None:
         together = context.window_manager.fdda.all_meshes and bool(cached_rigs_of_active_armature(context))
-        for number, group in enumerate(BUTTONS):
+        for number, group in enumerate(MENU_OPERATORS):
             if number:
                 self.layout.separator()
             for name in group:
@@ -71,10 +71,10 @@ class FDDA_MT_all(bpy.types.Menu):
 def _draw_menu(self: bpy.types.Menu, context: bpy.types.Context) -> None:
     if cached_active_rig(context) is not None or context.mode == "OBJECT":
         self.layout.separator()
-        self.layout.menu(FDDA_MT_all.bl_idname)
+        self.layout.menu(FDDA_MT_main.bl_idname)
 
 
-CLASSES = (FDDA_OT_choose_mesh, FDDA_MT_all)
+CLASSES = (FDDA_OT_show_mesh, FDDA_MT_main)
 MENUS = ("VIEW3D_MT_object", "VIEW3D_MT_pose")
 
 

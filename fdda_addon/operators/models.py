@@ -6,14 +6,14 @@ import bpy
 from ..core.errors import ModelError
 from ..models.entries import megabytes
 from ..scene.active_rig import any_mesh_object
-from .playback import ChoosesModel, OnModel
+from .playback import ModelFileOperator, ModelOperator
 
 
 def _has_models(mesh_object: bpy.types.Object) -> bool:
     return bool(mesh_object.fdda.models) or mesh_object.fdda.is_bound
 
 
-class OnEntry(OnModel):
+class ModelListOperator(ModelOperator):
     """Mixin for an operator on an entry of the list of models."""
 
     index: bpy.props.IntProperty(
@@ -25,16 +25,16 @@ class OnEntry(OnModel):
     )
 
     @classmethod
-    def has_entry(cls, context: bpy.types.Context) -> bool:
+    def has_models(cls, context: bpy.types.Context) -> bool:
         """Whether a mesh of the scene has models; sets the poll message otherwise. For `poll`."""
-        if not cls.is_free(context):
+        if not cls.can_change_scene(context):
             return False
         if not any_mesh_object(context, _has_models):
             cls.poll_message_set("The model library is empty; train a model, or add a file")
             return False
         return True
 
-    def entry(self, context: bpy.types.Context) -> tuple[object, object]:
+    def active_entry(self, context: bpy.types.Context) -> tuple[object, object]:
         """The rig and the entry that is meant.
 
         Raises:
@@ -51,7 +51,7 @@ class OnEntry(OnModel):
         return scene_rig, model_list.chosen(mesh_object) if self.index < 0 else mesh_object.fdda.models[self.index]
 
 
-class FDDA_OT_add_model(OnModel, ChoosesModel, bpy.types.Operator):
+class FDDA_OT_add_model(ModelOperator, ModelFileOperator, bpy.types.Operator):
     bl_idname = "fdda.add_model"
     bl_label = "Add Model"
     bl_description = "Add a model file to the list of this mesh"
@@ -59,24 +59,24 @@ class FDDA_OT_add_model(OnModel, ChoosesModel, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_free(context)
+        return cls.can_change_scene(context)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        return self.execute(context) if self.filepath else self.choose(context)
+        return self.execute(context) if self.filepath else self.open_file_browser(context)
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..models import model_list
 
         scene_rig = self.rig(context)
         if not self.filepath:
             raise ModelError("No file was chosen; choose a model file.")
-        model_list.check(scene_rig, self.path())
+        model_list.check(scene_rig, self.chosen_path())
         model_list.adopt(scene_rig.mesh_object)
-        entry = model_list.remember(scene_rig.mesh_object, self.path())
+        entry = model_list.remember(scene_rig.mesh_object, self.chosen_path())
         return f"Added {entry.name}; bind it to use it."
 
 
-class FDDA_OT_remove_model(OnEntry, bpy.types.Operator):
+class FDDA_OT_remove_model(ModelListOperator, bpy.types.Operator):
     bl_idname = "fdda.remove_model"
     bl_label = "Remove Model"
     bl_description = "Remove the model from the list, and unbind it. Its file is kept; a packed model is deleted"
@@ -84,18 +84,18 @@ class FDDA_OT_remove_model(OnEntry, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_entry(context)
+        return cls.has_models(context)
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..models import model_list
 
-        scene_rig, entry = self.entry(context)
+        scene_rig, entry = self.active_entry(context)
         mesh_object = scene_rig.mesh_object
         name = model_list.forget_entry(mesh_object, list(mesh_object.fdda.models).index(entry))
         return f"Removed {name}."
 
 
-class FDDA_OT_pack_model(OnEntry, bpy.types.Operator):
+class FDDA_OT_pack_model(ModelListOperator, bpy.types.Operator):
     bl_idname = "fdda.pack_model"
     bl_label = "Pack Model"
     bl_description = "Store the model in the .blend file"
@@ -103,19 +103,19 @@ class FDDA_OT_pack_model(OnEntry, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_entry(context)
+        return cls.has_models(context)
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..models import model_list
 
-        scene_rig, entry = self.entry(context)
+        scene_rig, entry = self.active_entry(context)
         if entry.packed:
             raise ModelError(f"{entry.name} is already packed.")
         size = model_list.pack_entry(scene_rig.mesh_object, entry)
         return f"Packed {entry.name}, {megabytes(size)}. Save the .blend file to keep it."
 
 
-class FDDA_OT_unpack_model(OnEntry, bpy.types.Operator):
+class FDDA_OT_unpack_model(ModelListOperator, bpy.types.Operator):
     bl_idname = "fdda.unpack_model"
     bl_label = "Unpack Model"
     bl_description = "Write the packed model to a file, and remove it from the .blend file"
@@ -130,14 +130,14 @@ class FDDA_OT_unpack_model(OnEntry, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_entry(context)
+        return cls.has_models(context)
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from pathlib import Path
 
         from ..models import model_list
 
-        scene_rig, entry = self.entry(context)
+        scene_rig, entry = self.active_entry(context)
         if not entry.packed:
             raise ModelError(f"{entry.name} is not packed.")
         if not self.filepath and not bpy.data.filepath:
@@ -148,7 +148,7 @@ class FDDA_OT_unpack_model(OnEntry, bpy.types.Operator):
         return f"Unpacked {entry.name} to {path}."
 
 
-class FDDA_OT_check_model(OnEntry, bpy.types.Operator):
+class FDDA_OT_check_model(ModelListOperator, bpy.types.Operator):
     bl_idname = "fdda.check_model"
     bl_label = "Check Model"
     bl_description = "Report what has changed in the rig since the model was trained"
@@ -156,12 +156,12 @@ class FDDA_OT_check_model(OnEntry, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_entry(context)
+        return cls.has_models(context)
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..models.changes import changes_since
 
-        scene_rig, entry = self.entry(context)
+        scene_rig, entry = self.active_entry(context)
         found = changes_since(scene_rig, entry)
         if found.prevents:
             raise ModelError(found.sentence)

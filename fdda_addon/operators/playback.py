@@ -15,9 +15,9 @@ from ..properties.preferences import packs_models
 from ..scene.active_rig import any_mesh_object
 from ..scene.scene_rig import SceneRig
 from .job import JobOperator
-from .on_rig import OnRig
+from .rig_operator import RigOperator
 
-LARGE_BYTES = 32_000_000
+LARGE_MODEL_BYTES = 32_000_000
 """From this size on a model is not packed without being asked: every save writes it again."""
 MODE_NAMES = {"RIG": "the rig", "LINEAR": "skinning alone", "FDDA": "the model"}
 
@@ -26,11 +26,11 @@ def _is_bound(mesh_object: bpy.types.Object) -> bool:
     return mesh_object.fdda.is_bound
 
 
-class OnModel(OnRig):
+class ModelOperator(RigOperator):
     """Mixin for an operator that works on the model of a rig, as long as no job changes the scene."""
 
     @classmethod
-    def is_free(cls, context: bpy.types.Context) -> bool:
+    def can_change_scene(cls, context: bpy.types.Context) -> bool:
         """Whether there is a rig and no job borrows the scene; sets the poll message otherwise. For `poll`."""
         job = current()
         if job is not None and job.borrows_scene:
@@ -39,9 +39,9 @@ class OnModel(OnRig):
         return cls.has_rig(context)
 
     @classmethod
-    def has_bound(cls, context: bpy.types.Context) -> bool:
-        """As `is_free`, and the active rig, or some other, has a model that is bound."""
-        if not cls.is_free(context):
+    def has_bound_model(cls, context: bpy.types.Context) -> bool:
+        """As `can_change_scene`, and the active rig, or some other, has a model that is bound."""
+        if not cls.can_change_scene(context):
             return False
         if not any_mesh_object(context, _is_bound):
             cls.poll_message_set("No model is bound; bind one first")
@@ -70,13 +70,13 @@ class OnModel(OnRig):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
-            self.report({"INFO"}, self.work(context))
+            self.report({"INFO"}, self.apply(context))
         except FDDAError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return {"FINISHED"}
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         """Do it; returns the sentence that is reported.
 
         Raises:
@@ -85,7 +85,7 @@ class OnModel(OnRig):
         raise NotImplementedError
 
 
-class ChoosesModel:
+class ModelFileOperator:
     """Mixin for an operator that takes the path of a model, and asks for it when it is invoked without."""
 
     filepath: bpy.props.StringProperty(
@@ -94,7 +94,7 @@ class ChoosesModel:
     filter_glob: bpy.props.StringProperty(default="*.onnx", options={"HIDDEN"})
     check_existing: bpy.props.BoolProperty(default=False, options={"HIDDEN"})
 
-    def choose(self, context: bpy.types.Context) -> set[str]:
+    def open_file_browser(self, context: bpy.types.Context) -> set[str]:
         """Open the file browser in the folder of the .blend file; `execute` follows."""
         self.filepath = bpy.path.abspath("//")
         context.window_manager.fileselect_add(self)
@@ -104,12 +104,12 @@ class ChoosesModel:
         # The file browser would list the properties.
         pass
 
-    def path(self) -> Path:
+    def chosen_path(self) -> Path:
         """The path that was chosen."""
         return Path(bpy.path.abspath(self.filepath))
 
 
-def _model_of(mesh_object: bpy.types.Object) -> bool:
+def _has_model(mesh_object: bpy.types.Object) -> bool:
     """Whether there is a model to bind: in the list, or where the training writes it."""
     return chosen_entry(mesh_object) is not None or trained_file(mesh_object) is not None
 
@@ -158,13 +158,13 @@ def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGrou
     if entry.packed or not packs_models():
         return ""
     size = model_list.entry_path(mesh_object, entry).stat().st_size
-    if size > LARGE_BYTES and not pack_large:
+    if size > LARGE_MODEL_BYTES and not pack_large:
         return f" It is large ({megabytes(size)}) and was not packed; pack it in the Model Library."
     model_list.pack_entry(mesh_object, entry)
     return ""
 
 
-class FDDA_OT_bind(OnModel, ChoosesModel, bpy.types.Operator):
+class FDDA_OT_bind(ModelOperator, ModelFileOperator, bpy.types.Operator):
     bl_idname = "fdda.bind"
     bl_label = "Bind"
     bl_description = "Use a model instead of the rig's modifiers: the active one of the Model Library, or a file"
@@ -184,17 +184,17 @@ class FDDA_OT_bind(OnModel, ChoosesModel, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_free(context)
+        return cls.can_change_scene(context)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         try:
-            known = any(_model_of(rig.mesh_object) for rig in self.rigs(context))
+            known = any(_has_model(rig.mesh_object) for rig in self.rigs(context))
         except FDDAError:
             known = None
         if not (self.filepath or known):
-            return self.choose(context)
-        self._size = self._outside_bytes(context)
-        if self._size > LARGE_BYTES and packs_models() and context.window is not None:
+            return self.open_file_browser(context)
+        self._size = self._largest_unpacked_bytes(context)
+        if self._size > LARGE_MODEL_BYTES and packs_models() and context.window is not None:
             return context.window_manager.invoke_props_dialog(self, title="Large Model", confirm_text="Bind")
         return self.execute(context)
 
@@ -203,24 +203,24 @@ class FDDA_OT_bind(OnModel, ChoosesModel, bpy.types.Operator):
             self.layout.label(text=f"The model has {megabytes(size)}. Packed, it is written with every save.")
             self.layout.prop(self, "pack_large")
 
-    def _outside_bytes(self, context: bpy.types.Context) -> int:
+    def _largest_unpacked_bytes(self, context: bpy.types.Context) -> int:
         """Size of the largest model that would be bound and is not packed; 0 where that cannot be said."""
         try:
             rigs = self.rigs(context)
         except FDDAError:
             return 0
-        paths = [self.path() if self.filepath else _unpacked_file(rig.mesh_object) for rig in rigs]
+        paths = [self.chosen_path() if self.filepath else _unpacked_file(rig.mesh_object) for rig in rigs]
         return max((path.stat().st_size for path in paths if path is not None and path.is_file()), default=0)
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         rigs = self.rigs(context)
         if len(rigs) > 1:
-            rigs = [rig for rig in rigs if _model_of(rig.mesh_object)] or rigs[:1]
-        path = self.path() if self.filepath else None
+            rigs = [rig for rig in rigs if _has_model(rig.mesh_object)] or rigs[:1]
+        path = self.chosen_path() if self.filepath else None
         return " ".join(bind_model(rig, path, self.pack_large) for rig in rigs)
 
 
-class FDDA_OT_unbind(OnModel, bpy.types.Operator):
+class FDDA_OT_unbind(ModelOperator, bpy.types.Operator):
     bl_idname = "fdda.unbind"
     bl_label = "Unbind"
     bl_description = "Restore the modifiers of the rig. The model stays in the Model Library"
@@ -228,9 +228,9 @@ class FDDA_OT_unbind(OnModel, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_bound(context)
+        return cls.has_bound_model(context)
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..models import model_list
         from ..runtime.binding import unbind
 
@@ -244,8 +244,8 @@ class FDDA_OT_unbind(OnModel, bpy.types.Operator):
         return f"Unbound {' and '.join(names)}."
 
 
-class FDDA_OT_switch(OnModel, bpy.types.Operator):
-    bl_idname = "fdda.switch"
+class FDDA_OT_set_mode(ModelOperator, bpy.types.Operator):
+    bl_idname = "fdda.set_mode"
     bl_label = "Switch Deformation"
     bl_description = "Deform the mesh with the modifiers of the rig, linear skinning alone, or the model"
     bl_options = {"REGISTER", "UNDO"}
@@ -263,9 +263,9 @@ class FDDA_OT_switch(OnModel, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_bound(context)
+        return cls.has_bound_model(context)
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         rigs = self.bound_rigs(context)
         bindings = [rig.mesh_object.fdda for rig in rigs]
         mode = self.mode if self.mode != "NEXT" else ("FDDA" if bindings[0].mode == "RIG" else "RIG")
@@ -279,7 +279,7 @@ class FDDA_OT_switch(OnModel, bpy.types.Operator):
         return f"{names} {'is' if len(rigs) == 1 else 'are'} deformed by {MODE_NAMES[mode]}."
 
 
-class FDDA_OT_relink(OnModel, ChoosesModel, bpy.types.Operator):
+class FDDA_OT_relink(ModelOperator, ModelFileOperator, bpy.types.Operator):
     bl_idname = "fdda.relink"
     bl_label = "Find Model"
     bl_description = "Choose where the file of the bound model is now"
@@ -287,23 +287,23 @@ class FDDA_OT_relink(OnModel, ChoosesModel, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.has_bound(context)
+        return cls.has_bound_model(context)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        return self.execute(context) if self.filepath else self.choose(context)
+        return self.execute(context) if self.filepath else self.open_file_browser(context)
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..models import model_list
 
         scene_rig = self.bound_rig(context)
         if not self.filepath:
             raise ModelError("No file was chosen; give the model's file.")
-        model_list.relink(scene_rig, self.path())
-        said = pack_by_default(scene_rig.mesh_object, chosen_entry(scene_rig.mesh_object))
-        return f"'{scene_rig.mesh_object.name}' plays {self.path()}.{said}"
+        model_list.relink(scene_rig, self.chosen_path())
+        message = pack_by_default(scene_rig.mesh_object, chosen_entry(scene_rig.mesh_object))
+        return f"'{scene_rig.mesh_object.name}' plays {self.chosen_path()}.{message}"
 
 
-class FDDA_OT_measure_model(OnModel, JobOperator, bpy.types.Operator):
+class FDDA_OT_measure_model(ModelOperator, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.measure_model"
     bl_label = "Measure Speed of the Model"
     bl_description = "Measure the time per frame of the rig, of linear skinning and of the model"
@@ -318,7 +318,7 @@ class FDDA_OT_measure_model(OnModel, JobOperator, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return cls.is_idle() and cls.has_bound(context)
+        return cls.is_idle() and cls.has_bound_model(context)
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         from ..runtime.binding import model_disabled
@@ -340,4 +340,4 @@ class FDDA_OT_measure_model(OnModel, JobOperator, bpy.types.Operator):
         )
 
 
-CLASSES = (FDDA_OT_bind, FDDA_OT_unbind, FDDA_OT_switch, FDDA_OT_relink, FDDA_OT_measure_model)
+CLASSES = (FDDA_OT_bind, FDDA_OT_unbind, FDDA_OT_set_mode, FDDA_OT_relink, FDDA_OT_measure_model)

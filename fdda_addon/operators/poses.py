@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..core.errors import RigError
-from ..properties.choices import recorded_actions, recording_settings
+from ..properties.recording_options import recorded_actions, recording_settings
 from ..scene.scene_rig import SceneRig
-from .on_pose import OnPose
+from .pose_operator import PoseOperator
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.controls import Control
 
 
-class FDDA_OT_preview_pose(OnPose, bpy.types.Operator):
+class FDDA_OT_preview_pose(PoseOperator, bpy.types.Operator):
     bl_idname = "fdda.preview_pose"
     bl_label = "Preview Random Pose"
     bl_description = "Show one of the random poses that will be recorded"
@@ -36,7 +36,7 @@ class FDDA_OT_preview_pose(OnPose, bpy.types.Operator):
             return f"Show the {'next' if properties.step > 0 else 'previous'} of the random poses that will be recorded"
         return cls.bl_description
 
-    def change(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..recording.preview import show_random_pose
 
         rig, session = self.rig(context), context.window_manager.fdda
@@ -47,13 +47,13 @@ class FDDA_OT_preview_pose(OnPose, bpy.types.Operator):
         return f"Random pose {index + 1}."
 
 
-class FDDA_OT_rest_pose(OnPose, bpy.types.Operator):
+class FDDA_OT_rest_pose(PoseOperator, bpy.types.Operator):
     bl_idname = "fdda.rest_pose"
     bl_label = "Rest Pose"
     bl_description = "Reset all bones to the rest pose, and all extra inputs of the random poses to their defaults"
     bl_options = {"REGISTER", "UNDO"}
 
-    def change(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..scene.armature import clear_pose
         from ..scene.control_names import control_default
         from ..scene.controls import is_driven, owner_of, set_control
@@ -76,7 +76,7 @@ def _sampled_controls(rig: SceneRig) -> "tuple[Control, ...]":
         return ()
 
 
-class _OnRange(OnPose):
+class _LimitOperator(PoseOperator):
     """Mixin for an operator that changes the range of one rotation axis."""
 
     bone: bpy.props.StringProperty(name="Bone", description="Name of the bone", options={"SKIP_SAVE"})
@@ -101,8 +101,8 @@ class _OnRange(OnPose):
         return "XYZ".index(self.axis)
 
 
-class FDDA_OT_state_range(_OnRange, bpy.types.Operator):
-    bl_idname = "fdda.state_range"
+class FDDA_OT_set_limit(_LimitOperator, bpy.types.Operator):
+    bl_idname = "fdda.set_limit"
     bl_label = "Set Limit"
     bl_description = "Limit the rotation of the bone about this axis, in its Limit Rotation constraint or as IK limits"
     bl_options = {"REGISTER", "UNDO"}
@@ -114,7 +114,7 @@ class FDDA_OT_state_range(_OnRange, bpy.types.Operator):
         name="Maximum", subtype="ANGLE", default=math.pi / 4, min=-math.pi, max=math.pi, description="Highest angle"
     )
 
-    def change(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..poses.motion_range import set_rotation_range
 
         bone = self.pose_bone(context)
@@ -123,13 +123,13 @@ class FDDA_OT_state_range(_OnRange, bpy.types.Operator):
         return f"'{bone.name}' rotates about {self.axis} from {low:.0f}° to {high:.0f}°."
 
 
-class FDDA_OT_unstate_range(_OnRange, bpy.types.Operator):
-    bl_idname = "fdda.unstate_range"
+class FDDA_OT_clear_limit(_LimitOperator, bpy.types.Operator):
+    bl_idname = "fdda.clear_limit"
     bl_label = "Clear Limit"
     bl_description = "Remove the rotation limit of the bone about this axis. The default is ±45°"
     bl_options = {"REGISTER", "UNDO"}
 
-    def change(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..poses.motion_range import clear_rotation_range
 
         bone = self.pose_bone(context)
@@ -137,7 +137,7 @@ class FDDA_OT_unstate_range(_OnRange, bpy.types.Operator):
         return f"Removed the limit of '{bone.name}' about {self.axis}."
 
 
-class FDDA_OT_limits_from_actions(OnPose, bpy.types.Operator):
+class FDDA_OT_limits_from_actions(PoseOperator, bpy.types.Operator):
     bl_idname = "fdda.limits_from_actions"
     bl_label = "Set Limits from Actions"
     bl_description = "Set each bone's limits to the motion in the checked actions. Bones can still be posed freely"
@@ -151,7 +151,7 @@ class FDDA_OT_limits_from_actions(OnPose, bpy.types.Operator):
         max=10.0,
     )
 
-    def change(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..poses.measured_limits import set_limits_from_actions
 
         rig = self.rig(context)
@@ -175,7 +175,7 @@ class FDDA_OT_limits_from_actions(OnPose, bpy.types.Operator):
 CLASSES = (
     FDDA_OT_preview_pose,
     FDDA_OT_rest_pose,
-    FDDA_OT_state_range,
-    FDDA_OT_unstate_range,
+    FDDA_OT_set_limit,
+    FDDA_OT_clear_limit,
     FDDA_OT_limits_from_actions,
 )

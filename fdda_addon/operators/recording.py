@@ -12,10 +12,10 @@ from ..core.errors import FDDAError
 from ..jobs.job import current
 from ..models.entries import megabytes
 from ..properties.character import model_file, recording_folder
-from ..properties.choices import recording_settings, take_over_sampling
+from ..properties.recording_options import copy_sampling_settings, recording_settings
 from ..scene.scene_rig import SceneRig
 from .job import JobOperator
-from .on_rig import OnRig
+from .rig_operator import RigOperator
 
 
 def record_rigs(shown: SceneRig, rigs: list[tuple[SceneRig, Path]], resume: bool = False) -> Iterator[object]:
@@ -31,7 +31,7 @@ def record_rigs(shown: SceneRig, rigs: list[tuple[SceneRig, Path]], resume: bool
         for rig, _ in rigs:
             borrowed.enter_context(model_disabled(rig.mesh_object))
             if rig.mesh_object != shown.mesh_object:
-                take_over_sampling(rig.mesh_object.fdda.settings, shown.mesh_object.fdda.settings)
+                copy_sampling_settings(rig.mesh_object.fdda.settings, shown.mesh_object.fdda.settings)
         # The one that is shown may be recorded already, and its settings still count.
         yield from record_meshes(rigs, recording_settings(shown, resume))
 
@@ -47,7 +47,7 @@ def is_recorded(path: Path) -> bool:
     return index["complete"] >= index["poses"]
 
 
-class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
+class FDDA_OT_record(RigOperator, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.record"
     bl_label = "Record"
     bl_description = "Evaluate random poses and the checked actions, and write the deformed mesh to the folder"
@@ -88,7 +88,7 @@ class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
         names = " and ".join(f"'{path.name}'" for path in self._paths)
         return f"Recorded {self.state.total:,} poses into {names}."
 
-    def cancelled(self, _context: bpy.types.Context) -> str:
+    def cancel_message(self, _context: bpy.types.Context) -> str:
         if self.state.stage != "poses" or not self.state.done:
             return "Recording canceled before the first pose; nothing was kept."
         return (
@@ -96,7 +96,7 @@ class FDDA_OT_record(OnRig, JobOperator, bpy.types.Operator):
         )
 
 
-class FDDA_OT_refine(OnRig, JobOperator, bpy.types.Operator):
+class FDDA_OT_refine(RigOperator, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.refine"
     bl_label = "Add Poses at Worst Errors"
     bl_description = "Compare the trained model with the rig, and record more poses where its error is largest"
@@ -124,13 +124,13 @@ class FDDA_OT_refine(OnRig, JobOperator, bpy.types.Operator):
     def finish(self, _context: bpy.types.Context, _result: object) -> str:
         return f"Added {self.state.total:,} poses to '{self._path.name}'; press Continue Training."
 
-    def cancelled(self, _context: bpy.types.Context) -> str:
+    def cancel_message(self, _context: bpy.types.Context) -> str:
         added = self.state.done if self.state.stage == "poses" else 0
         return f"Refinement canceled; {added:,} poses were added."
 
 
-class FDDA_OT_remove_recording(OnRig, bpy.types.Operator):
-    bl_idname = "fdda.remove_recording"
+class FDDA_OT_delete_recording(RigOperator, bpy.types.Operator):
+    bl_idname = "fdda.delete_recording"
     bl_label = "Delete Recording"
     bl_description = "Delete the recording in the folder. This cannot be undone"
     bl_options = {"REGISTER"}
@@ -149,12 +149,12 @@ class FDDA_OT_remove_recording(OnRig, bpy.types.Operator):
             self,
             event,
             title="Delete Recording?",
-            message=self._what(context),
+            message=self._deletion_message(context),
             confirm_text="Delete",
             icon="WARNING",
         )
 
-    def _what(self, context: bpy.types.Context) -> str:
+    def _deletion_message(self, context: bpy.types.Context) -> str:
         """What would be removed, a sentence."""
         from ..core.recording.index import read_index
 
@@ -179,4 +179,4 @@ class FDDA_OT_remove_recording(OnRig, bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (FDDA_OT_record, FDDA_OT_refine, FDDA_OT_remove_recording)
+CLASSES = (FDDA_OT_record, FDDA_OT_refine, FDDA_OT_delete_recording)

@@ -8,23 +8,23 @@ import bpy
 from mathutils import Matrix
 
 from .job import JobOperator
-from .on_rig import OnRig
+from .rig_operator import RigOperator
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..timing.rig_cost import RigCost
 
-_costs: "dict[int, RigCost]" = {}
+_measured_costs: "dict[int, RigCost]" = {}
 """What was measured in this session, by session_uid of the mesh object."""
 
 
-def cost_of(mesh_object: bpy.types.Object) -> "RigCost | None":
+def measured_cost(mesh_object: bpy.types.Object) -> "RigCost | None":
     """What a frame of a rig costs, None when that was not measured, or for another number of vertices."""
-    cost = _costs.get(mesh_object.session_uid)
+    cost = _measured_costs.get(mesh_object.session_uid)
     return cost if cost is not None and cost.vertices == len(mesh_object.data.vertices) else None
 
 
-class FDDA_OT_add_arm(bpy.types.Operator):
-    bl_idname = "fdda.add_arm"
+class FDDA_OT_add_sample_arm(bpy.types.Operator):
+    bl_idname = "fdda.add_sample_arm"
     bl_label = "FDDA Sample Arm"
     bl_description = (
         "Add a rigged arm with 22 bones, a driven biceps, delta mush and an action, to train a first model on"
@@ -93,7 +93,7 @@ def _hide_startup_cube(context: bpy.types.Context) -> bool:
     return is_untouched
 
 
-class FDDA_OT_measure(OnRig, JobOperator, bpy.types.Operator):
+class FDDA_OT_measure(RigOperator, JobOperator, bpy.types.Operator):
     bl_idname = "fdda.measure"
     bl_label = "Measure Speed"
     bl_description = "Measure the time per frame of this rig, and estimate it for a model"
@@ -110,23 +110,23 @@ class FDDA_OT_measure(OnRig, JobOperator, bpy.types.Operator):
         yield from measure(self.rig(context))
 
     def finish(self, context: bpy.types.Context, result: "RigCost") -> str:
-        _costs[self.rig(context).mesh_object.session_uid] = result
+        _measured_costs[self.rig(context).mesh_object.session_uid] = result
         return f"{result.rig:.2f} ms per frame with the rig. {result.sentence}"
 
 
-def _draw_add(self: bpy.types.Menu, _context: bpy.types.Context) -> None:
-    self.layout.operator("fdda.add_arm", icon="OUTLINER_OB_ARMATURE")
+def _draw_add_menu(self: bpy.types.Menu, _context: bpy.types.Context) -> None:
+    self.layout.operator("fdda.add_sample_arm", icon="OUTLINER_OB_ARMATURE")
 
 
-CLASSES = (FDDA_OT_add_arm, FDDA_OT_measure)
+CLASSES = (FDDA_OT_add_sample_arm, FDDA_OT_measure)
 
 
 def register() -> None:
     """Put the arm into the menu Add > Armature."""
-    bpy.types.VIEW3D_MT_armature_add.append(_draw_add)
+    bpy.types.VIEW3D_MT_armature_add.append(_draw_add_menu)
 
 
 def unregister() -> None:
     """Undo `register`."""
-    bpy.types.VIEW3D_MT_armature_add.remove(_draw_add)
-    _costs.clear()
+    bpy.types.VIEW3D_MT_armature_add.remove(_draw_add_menu)
+    _measured_costs.clear()

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..core.errors import RigError
-from ..properties.choices import recording_settings
-from .on_pose import OnPose
+from ..properties.recording_options import recording_settings
+from .pose_operator import PoseOperator
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     pass
 
 
-class FDDA_OT_use_selected_bones(OnPose, bpy.types.Operator):
+class FDDA_OT_use_selected_bones(PoseOperator, bpy.types.Operator):
     bl_idname = "fdda.use_selected_bones"
     bl_label = "Use Selected Bones"
     bl_description = (
@@ -22,7 +22,7 @@ class FDDA_OT_use_selected_bones(OnPose, bpy.types.Operator):
     )
     bl_options = {"REGISTER", "UNDO"}
 
-    def change(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..scene.compatibility import is_selected
 
         rig = self.rig(context)
@@ -39,7 +39,7 @@ class FDDA_OT_use_selected_bones(OnPose, bpy.types.Operator):
         )
 
 
-class FDDA_OT_add_control(OnPose, bpy.types.Operator):
+class FDDA_OT_add_control(PoseOperator, bpy.types.Operator):
     bl_idname = "fdda.add_control"
     bl_label = "Add Extra Input"
     bl_description = "Make a shape key or another animated number an input of the model. Random poses change it too"
@@ -49,7 +49,7 @@ class FDDA_OT_add_control(OnPose, bpy.types.Operator):
         name="Name", description="Name of a shape key, or data path. Empty to choose it later", options={"SKIP_SAVE"}
     )
 
-    def change(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..recording.plan import RecordingSettings, listed_controls
         from ..scene.control_names import control_at
 
@@ -70,13 +70,13 @@ class FDDA_OT_add_control(OnPose, bpy.types.Operator):
         return f"Added {name or 'an input'}."
 
 
-class FDDA_OT_remove_control(OnPose, bpy.types.Operator):
+class FDDA_OT_remove_control(PoseOperator, bpy.types.Operator):
     bl_idname = "fdda.remove_control"
     bl_label = "Remove Extra Input"
     bl_description = "Remove the active input from the list"
     bl_options = {"REGISTER", "UNDO"}
 
-    def change(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         settings = self.rig(context).mesh_object.fdda.settings
         index = settings.control_index
         if not 0 <= index < len(settings.controls):

@@ -20,11 +20,11 @@ from ..training.environment import choice, folder, session
 from ..training.environment.check_result import CheckResult
 
 WAIT_SECONDS = 0.05
-_Work = tuple[Iterator[Progress | CheckResult], Callable[[], None] | None]
+_EnvironmentJob = tuple[Iterator[Progress | CheckResult], Callable[[], None] | None]
 """The steps, and what has them end soon."""
 
 
-class _OnEnvironment:
+class _EnvironmentOperator:
     """Mixin: a job on the trainer's environment, in a thread; a timer looks after it where there is a window."""
 
     @classmethod
@@ -34,12 +34,12 @@ class _OnEnvironment:
             return False
         return True
 
-    def steps(self) -> _Work:
+    def steps(self) -> _EnvironmentJob:
         """The work. FDDAError: it cannot begin."""
         raise NotImplementedError
 
     @staticmethod
-    def keep(outcome: CheckResult) -> None:
+    def store_result(outcome: CheckResult) -> None:
         """Have the outcome shown."""
         session.remember(None, outcome)
 
@@ -67,19 +67,19 @@ class _OnEnvironment:
             steps, cancel = self.steps()
         except FDDAError as error:
             steps, cancel = iter([CheckResult("ERROR", str(error))]), None
-        return begin(self.bl_idname.partition("_OT_")[2], self.bl_label, steps, cancel, type(self).keep)
+        return start_job(self.bl_idname.partition("_OT_")[2], self.bl_label, steps, cancel, type(self).store_result)
 
     def _end(self, state: JobState) -> set[str]:
         self.report({state.outcome_level}, state.outcome)
         return {"FINISHED"} if state.outcome_level == "INFO" else {"CANCELLED"}
 
 
-def begin(
+def start_job(
     verb: str,
     title: str,
     steps: Iterator[Progress | CheckResult],
     cancel: Callable[[], None] | None,
-    keep: Callable[[CheckResult], None],
+    store_result: Callable[[CheckResult], None],
 ) -> Run:
     """Begin a job on the trainer's environment.
 
@@ -87,11 +87,11 @@ def begin(
         verb, title: of its `JobState`.
         steps: yields how far it is, and last its outcome; iterated in a thread.
         cancel: has `steps` end soon, called from another thread; None where that is not possible.
-        keep: takes the outcome, in the main thread.
+        store_result: takes the outcome, in the main thread.
     """
     state = JobState(verb, title, works_on=ENVIRONMENT, can_cancel=cancel is not None)
 
-    def answered() -> Iterator[object]:
+    def check_results() -> Iterator[object]:
         try:
             yield from in_thread(steps, state, cancel)
         except FDDAError as error:
@@ -99,24 +99,24 @@ def begin(
 
     def finish(outcome: CheckResult | None) -> str:
         outcome = outcome or CheckResult("ERROR", f"{title} ended without a result.")
-        keep(outcome)
+        store_result(outcome)
         if outcome.level != "INFO":
             raise TrainerEnvironmentError(outcome.message)
         return outcome.message
 
-    return Run(state, answered(), finish, lambda: f"{title} was canceled.", ends_itself=True)
+    return Run(state, check_results(), finish, lambda: f"{title} was canceled.", ends_itself=True)
 
 
-class FDDA_OT_check_trainer(_OnEnvironment, bpy.types.Operator):
+class FDDA_OT_check_trainer(_EnvironmentOperator, bpy.types.Operator):
     bl_idname = "fdda.check_trainer"
     bl_label = "Check Training Setup"
     bl_description = "Check whether the Python for training has PyTorch, and show which device it will train on"
 
-    def steps(self) -> _Work:
+    def steps(self) -> _EnvironmentJob:
         return _check(choice.chosen_python()), None
 
     @staticmethod
-    def keep(outcome: CheckResult) -> None:
+    def store_result(outcome: CheckResult) -> None:
         session.remember(outcome)
 
 
@@ -125,7 +125,7 @@ def _check(python: choice.TrainerPython) -> Iterator[Progress | CheckResult]:
     yield choice.ping(python)
 
 
-class FDDA_OT_create_trainer_environment(_OnEnvironment, bpy.types.Operator):
+class FDDA_OT_create_trainer_environment(_EnvironmentOperator, bpy.types.Operator):
     bl_idname = "fdda.create_trainer_environment"
     bl_label = "Install Training Environment"
     bl_description = (
@@ -142,7 +142,7 @@ class FDDA_OT_create_trainer_environment(_OnEnvironment, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
 
-    def steps(self) -> _Work:
+    def steps(self) -> _EnvironmentJob:
         from ..training.environment.creation import Creation
 
         wheels = self.wheels or wheels_folder()
@@ -153,7 +153,7 @@ class FDDA_OT_create_trainer_environment(_OnEnvironment, bpy.types.Operator):
         return creation.steps(), creation.cancel
 
     @staticmethod
-    def keep(outcome: CheckResult) -> None:
+    def store_result(outcome: CheckResult) -> None:
         origin = choice.chosen_python().origin
         if outcome.level != "INFO":
             session.remember(None, outcome)
@@ -165,7 +165,7 @@ class FDDA_OT_create_trainer_environment(_OnEnvironment, bpy.types.Operator):
             session.remember(None, CheckResult("WARNING", text))
 
 
-class FDDA_OT_remove_trainer_environment(_OnEnvironment, bpy.types.Operator):
+class FDDA_OT_remove_trainer_environment(_EnvironmentOperator, bpy.types.Operator):
     bl_idname = "fdda.remove_trainer_environment"
     bl_label = "Remove Training Environment"
     bl_description = "Delete the Python environment that the add-on has installed"
@@ -175,7 +175,7 @@ class FDDA_OT_remove_trainer_environment(_OnEnvironment, bpy.types.Operator):
             return self.execute(context)
         return context.window_manager.invoke_confirm(self, event)
 
-    def steps(self) -> _Work:
+    def steps(self) -> _EnvironmentJob:
         return _remove(folder.own_folder()), None
 
 
@@ -230,4 +230,4 @@ CLASSES = (
     FDDA_OT_open_trainer_log,
 )
 
-__all__ = ["CLASSES", "begin", "unregister"]
+__all__ = ["CLASSES", "start_job", "unregister"]

@@ -15,13 +15,13 @@ from ..jobs.job import current
 from ..properties.character import model_file, recording_folder
 from ..scene.scene_rig import armature_of
 from .confirm import ConfirmFirst
-from .on_rig import OnRig
+from .rig_operator import RigOperator
 
-STARTING = "starting"
-LOOK_SECONDS = 0.5
+STARTING_STAGE = "starting"
+FOLLOW_DELAY_SECONDS = 0.5
 
 
-class TrainsModels(OnRig):
+class TrainingOperator(RigOperator):
     """Mixin for the operator of a job that trains.
 
     A training goes on when Blender is closed (`training.detached_process`).
@@ -49,12 +49,12 @@ class TrainsModels(OnRig):
                     if message is not None:
                         if message.type is MessageType.FINISHED:
                             # Perhaps after Cancel: what is being written is written to its end.
-                            self.trained.append((uid, model))
-                        yield self._note(message)
+                            self.trained_models.append((uid, model))
+                        yield self._to_progress(message)
                         continue
                     if not state.total:
                         # It says nothing for some seconds: that it works is all that can be shown.
-                        yield Progress(STARTING, int(time.monotonic() - began), 0)
+                        yield Progress(STARTING_STAGE, int(time.monotonic() - began), 0)
                     yield None
             except GeneratorExit:
                 if not bpy.app.background:
@@ -79,7 +79,7 @@ class TrainsModels(OnRig):
             arguments += ["--warm-start"]
         return Training(arguments) if bpy.app.background else DetachedTraining(arguments, model)
 
-    def _note(self, message: object) -> object:
+    def _to_progress(self, message: object) -> object:
         """What a message of the trainer is to a job: progress, a line of its log, or the result."""
         from ..core.messages import WARNING_LINE, MessageType
 
@@ -103,30 +103,30 @@ class TrainsModels(OnRig):
             return float(values["seconds"])
         return None
 
-    def list_models(self) -> None:
+    def add_trained_models_to_list(self) -> None:
         """Put what was trained into the lists of the meshes, as far as these are there still."""
         from ..models.model_list import remember
 
-        self.changes_file = bool(self.trained)
-        for uid, model in self.trained:
+        self.changes_file = bool(self.trained_models)
+        for uid, model in self.trained_models:
             mesh_object = next((o for o in bpy.data.objects if o.session_uid == uid), None)
             if mesh_object is not None:
                 remember(mesh_object, model)
 
-    def failed(self) -> None:
+    def on_failure(self) -> None:
         # What was trained before the mesh that failed is on the disk, and a packed model would stay the old one.
         with suppress(FDDAError):
-            self.list_models()
+            self.add_trained_models_to_list()
 
     @property
-    def trained(self) -> list[tuple[int, Path]]:
+    def trained_models(self) -> list[tuple[int, Path]]:
         """session_uid of the mesh and file of the model of each training that is done."""
-        if not hasattr(self, "_trained"):
-            self._trained: list[tuple[int, Path]] = []
-        return self._trained
+        if not hasattr(self, "_trained_models"):
+            self._trained_models: list[tuple[int, Path]] = []
+        return self._trained_models
 
 
-class FDDA_OT_train(TrainsModels, ConfirmFirst, bpy.types.Operator):
+class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
     bl_idname = "fdda.train"
     bl_label = "Train"
     bl_description = "Train a model on the recording, in the background. Training continues when Blender is closed"
@@ -169,7 +169,7 @@ class FDDA_OT_train(TrainsModels, ConfirmFirst, bpy.types.Operator):
         return cls.is_idle() and cls.has_rig(context)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if not (self.replace or bpy.app.background) and (foreign := self._foreign_models(context)):
+        if not (self.replace or bpy.app.background) and (foreign := self._models_of_other_rigs(context)):
             self._is_confirming = True
             return context.window_manager.invoke_confirm(
                 self, event, title="Overwrite Another Model?", message=foreign, confirm_text="Overwrite", icon="WARNING"
@@ -180,7 +180,7 @@ class FDDA_OT_train(TrainsModels, ConfirmFirst, bpy.types.Operator):
         given = {name: getattr(self, name) for name in ("object", "all_meshes", "recording", "model", "warm_start")}
         return {**given, "replace": True}
 
-    def _foreign_models(self, context: bpy.types.Context) -> str:
+    def _models_of_other_rigs(self, context: bpy.types.Context) -> str:
         """Which models a training would replace that are of another rig: a sentence, empty for none."""
         from ..models.model_list import check
         from ..training.detached_process import is_detached
@@ -208,12 +208,12 @@ class FDDA_OT_train(TrainsModels, ConfirmFirst, bpy.types.Operator):
                 return
 
     def finish(self, _context: bpy.types.Context, result: float) -> str:
-        self.list_models()
-        names = " and ".join(f"'{model.name}'" for _, model in self.trained)
+        self.add_trained_models_to_list()
+        names = " and ".join(f"'{model.name}'" for _, model in self.trained_models)
         return f"Trained {names} in {result:.0f} s."
 
-    def cancelled(self, _context: bpy.types.Context) -> str:
-        self.list_models()
+    def cancel_message(self, _context: bpy.types.Context) -> str:
+        self.add_trained_models_to_list()
         return "Training canceled; no model was written."
 
 
@@ -237,7 +237,7 @@ def _make_folder(model: Path) -> None:
         ) from error
 
 
-def _follow_left_training() -> None:
+def _follow_detached_training() -> None:
     """Follow a training of the open file that was left when Blender was closed or another file opened."""
     from ..training.detached_process import is_detached
 
@@ -258,23 +258,23 @@ def _follow_left_training() -> None:
 
 
 @persistent
-def _on_loaded(*_: object) -> None:
-    if not bpy.app.background and not bpy.app.timers.is_registered(_follow_left_training):
-        bpy.app.timers.register(_follow_left_training, first_interval=LOOK_SECONDS)
+def _on_load(*_: object) -> None:
+    if not bpy.app.background and not bpy.app.timers.is_registered(_follow_detached_training):
+        bpy.app.timers.register(_follow_detached_training, first_interval=FOLLOW_DELAY_SECONDS)
 
 
 CLASSES = (FDDA_OT_train,)
 
 
-HANDLERS = {"load_post": _on_loaded}
+HANDLERS = {"load_post": _on_load}
 
 
 def register() -> None:
     """Follow what was left of a file that is open already."""
-    _on_loaded()
+    _on_load()
 
 
 def unregister() -> None:
     """Undo `register`."""
-    if bpy.app.timers.is_registered(_follow_left_training):
-        bpy.app.timers.unregister(_follow_left_training)
+    if bpy.app.timers.is_registered(_follow_detached_training):
+        bpy.app.timers.unregister(_follow_detached_training)

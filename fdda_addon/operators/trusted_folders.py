@@ -6,7 +6,7 @@ import bpy
 from ..properties.preferences import preferences
 
 
-class _OnFolders:
+class _FolderOperator:
     """Mixin for an operator on the folders in the preferences."""
 
     @classmethod
@@ -17,7 +17,7 @@ class _OnFolders:
         return True
 
 
-class FDDA_OT_add_trusted_folder(_OnFolders, bpy.types.Operator):
+class FDDA_OT_add_trusted_folder(_FolderOperator, bpy.types.Operator):
     bl_idname = "fdda.add_trusted_folder"
     bl_label = "Add Folder"
     bl_description = "Choose a folder from which any .blend file may load models"
@@ -42,7 +42,7 @@ class FDDA_OT_add_trusted_folder(_OnFolders, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class FDDA_OT_remove_trusted_folder(_OnFolders, bpy.types.Operator):
+class FDDA_OT_remove_trusted_folder(_FolderOperator, bpy.types.Operator):
     bl_idname = "fdda.remove_trusted_folder"
     bl_label = "Remove Folder"
     bl_description = "Remove the folder from the list. Its files are kept"

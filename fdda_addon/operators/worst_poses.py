@@ -6,28 +6,28 @@ import bpy
 from ..core.defaults import MARKERS
 from ..core.errors import ModelError
 from ..evaluation import markers
-from .evaluation import OnEvaluation
-from .playback import OnModel
+from .evaluation import EvaluationOperator
+from .playback import ModelOperator
 
 
-class OnWorst(OnEvaluation):
+class WorstPosesOperator(EvaluationOperator):
     """Mixin for an operator on the poses with the largest errors."""
 
-    def worst(self, context: bpy.types.Context, count: int) -> tuple[object, object, list[tuple[int, float]]]:
+    def worst_poses(self, context: bpy.types.Context, count: int) -> tuple[object, object, list[tuple[int, float]]]:
         """The rig, its last evaluation and the worst of its poses: index and largest error in mm.
 
         Raises:
             FDDAError: there is no evaluation, or no pose of it has an error.
         """
-        scene_rig, last = self.last(context)
+        scene_rig, last = self.last_evaluation(context)
         found = last.worst(count)
         if not found:
             raise ModelError("The model is exact in all compared poses; there is no worst one.")
         return scene_rig, last, found
 
 
-class FDDA_OT_mark_worst(OnWorst, bpy.types.Operator):
-    bl_idname = "fdda.mark_worst"
+class FDDA_OT_add_worst_markers(WorstPosesOperator, bpy.types.Operator):
+    bl_idname = "fdda.add_worst_markers"
     bl_label = "Mark Worst Frames"
     bl_description = "Add timeline markers at the frames with the largest errors, and remove those added before"
     bl_options = {"REGISTER", "UNDO"}
@@ -40,8 +40,8 @@ class FDDA_OT_mark_worst(OnWorst, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.has_evaluation(context)
 
-    def work(self, context: bpy.types.Context) -> str:
-        _, last, found = self.worst(context, self.count)
+    def apply(self, context: bpy.types.Context) -> str:
+        _, last, found = self.worst_poses(context, self.count)
         if not last.name:
             raise ModelError("Random poses have no frames to mark; evaluate the active action.")
         worst = [(last.first_frame + index, error_mm) for index, error_mm in found]
@@ -49,7 +49,7 @@ class FDDA_OT_mark_worst(OnWorst, bpy.types.Operator):
         return f"Added {len(worst)} markers. The worst frame is {worst[0][0]}, with {worst[0][1]:.2f} mm."
 
 
-class FDDA_OT_remove_markers(OnModel, bpy.types.Operator):
+class FDDA_OT_remove_markers(ModelOperator, bpy.types.Operator):
     bl_idname = "fdda.remove_markers"
     bl_label = "Remove Markers"
     bl_description = "Remove the timeline markers at the worst frames. Other markers are kept"
@@ -62,11 +62,11 @@ class FDDA_OT_remove_markers(OnModel, bpy.types.Operator):
             return False
         return True
 
-    def work(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         return f"Removed {markers.remove(context.scene)} markers."
 
 
-class FDDA_OT_jump_to_worst(OnWorst, bpy.types.Operator):
+class FDDA_OT_jump_to_worst(WorstPosesOperator, bpy.types.Operator):
     bl_idname = "fdda.jump_to_worst"
     bl_label = "Jump to Worst"
     bl_description = "Go to the frame, or show the random pose, with the largest error"
@@ -78,8 +78,8 @@ class FDDA_OT_jump_to_worst(OnWorst, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return cls.has_evaluation(context)
 
-    def work(self, context: bpy.types.Context) -> str:
-        scene_rig, last, found = self.worst(context, self.rank)
+    def apply(self, context: bpy.types.Context) -> str:
+        scene_rig, last, found = self.worst_poses(context, self.rank)
         index, error_mm = found[-1]
         if last.name:
             context.scene.frame_set(last.first_frame + index)
@@ -92,4 +92,4 @@ class FDDA_OT_jump_to_worst(OnWorst, bpy.types.Operator):
         return f"Random pose {index}: max error {error_mm:.2f} mm."
 
 
-CLASSES = (FDDA_OT_mark_worst, FDDA_OT_remove_markers, FDDA_OT_jump_to_worst)
+CLASSES = (FDDA_OT_add_worst_markers, FDDA_OT_remove_markers, FDDA_OT_jump_to_worst)

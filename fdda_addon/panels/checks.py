@@ -9,34 +9,34 @@ from bpy.app.handlers import persistent
 
 from ..core.errors import RigError
 from ..jobs import job
-from ..properties.choices import recording_settings
+from ..properties.recording_options import recording_settings
 from ..scene import draw_cache
 from ..scene.scene_rig import SceneRig, armature_of
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..recording.rig_check import RigCheck
 
-PAUSE_SECONDS = 0.3
+CHECK_INTERVAL_SECONDS = 0.3
 """While something changes all the time, a rig is checked this often."""
 
 _checks: dict[int, "tuple[RigCheck, tuple]"] = {}
-"""By session_uid of the mesh object: the last check and `_counters` at that time."""
-_wanted: set[int] = set()
+"""By session_uid of the mesh object: the last check and `_change_signature` at that time."""
+_requested: set[int] = set()
 _outdated: set[int] = set()
-"""Meshes whose pose, modifiers or limits may have changed since their check; what `_counters` shows is not in here."""
-_rest_changed: set[str] = set()
+"""Meshes whose pose, modifiers or limits may have changed since their check, beside what `_change_signature` has."""
+_changed_meshes: set[str] = set()
 """Names of meshes whose data has changed."""
 
 
 @draw_cache.draw_cached
-def known(scene_rig: SceneRig) -> "RigCheck | None":
+def last_check(scene_rig: SceneRig) -> "RigCheck | None":
     """The last check of a rig, None before the first. When something has changed since, another is on its way."""
     uid = scene_rig.mesh_object.session_uid
     stored = _checks.get(uid)
-    if stored is None or uid in _outdated or stored[1] != _counters(scene_rig) or _is_rest_changed(scene_rig):
-        _wanted.add(uid)
-        if not bpy.app.timers.is_registered(_check_wanted):
-            bpy.app.timers.register(_check_wanted, first_interval=PAUSE_SECONDS if stored else 0.0)
+    if stored is None or uid in _outdated or stored[1] != _change_signature(scene_rig) or _is_mesh_changed(scene_rig):
+        _requested.add(uid)
+        if not bpy.app.timers.is_registered(_run_requested_checks):
+            bpy.app.timers.register(_run_requested_checks, first_interval=CHECK_INTERVAL_SECONDS if stored else 0.0)
     return stored[0] if stored else None
 
 
@@ -49,33 +49,33 @@ def check_now(scene_rig: SceneRig) -> "RigCheck":
         settings, problems = recording_settings(scene_rig), ()
     except RigError as error:
         settings, problems = RecordingSettings(poses=0), (str(error),)
-    uid, counters = scene_rig.mesh_object.session_uid, _counters(scene_rig)
+    uid, counters = scene_rig.mesh_object.session_uid, _change_signature(scene_rig)
     stored = _checks.get(uid)
-    same_rest = stored is not None and stored[1][0] == counters[0] and not _is_rest_changed(scene_rig)
+    same_rest = stored is not None and stored[1][0] == counters[0] and not _is_mesh_changed(scene_rig)
     result = stored[0].recheck(scene_rig, settings) if same_rest else check(scene_rig, settings)
     result = replace(result, problems=result.problems + problems)
     _outdated.discard(uid)
-    _rest_changed.discard(scene_rig.mesh_object.data.name)
+    _changed_meshes.discard(scene_rig.mesh_object.data.name)
     _checks[uid] = (result, counters)
     return result
 
 
-def _check_wanted() -> None:
+def _run_requested_checks() -> None:
     running = job.current()
-    before = _shown()
+    before = _drawn_values()
     meshes = {o.session_uid: o for o in bpy.data.objects if o.type == "MESH"}
-    for uid in list(_wanted):
-        _wanted.discard(uid)
+    for uid in list(_requested):
+        _requested.discard(uid)
         mesh_object = meshes.get(uid)
         armature_object = mesh_object and armature_of(mesh_object)
         # While a job borrows the scene, nothing is as the user left it.
         if armature_object and not (running and running.borrows_scene):
             check_now(SceneRig(mesh_object, armature_object))
-    if _shown() != before:
+    if _drawn_values() != before:
         job.redraw()
 
 
-def _shown() -> dict[int, tuple]:
+def _drawn_values() -> dict[int, tuple]:
     """What panels draw of the checks."""
     return {
         uid: (id(check.rig), check.problems, check.channels, check.replaced_modifiers, check.automatic_controls)
@@ -83,7 +83,7 @@ def _shown() -> dict[int, tuple]:
     }
 
 
-def _counters(scene_rig: SceneRig) -> tuple:
+def _change_signature(scene_rig: SceneRig) -> tuple:
     """What is cheap to read and changes when a check may come out differently: (rest pose, the rest)."""
     from ..scene.arrays import REST_MATRIX, read
 
@@ -101,10 +101,10 @@ def _counters(scene_rig: SceneRig) -> tuple:
     )
     modifiers = tuple((m.name, m.type, m.show_viewport) for m in mesh_object.modifiers)
     state = (mesh_object.mode, armature_object.mode, mesh_object.visible_get(), armature_object.data.pose_position)
-    return rest, modifiers, state, mesh_object.fdda.is_playing, _choices(scene_rig)
+    return rest, modifiers, state, mesh_object.fdda.is_playing, _sampling_settings(scene_rig)
 
 
-def _choices(scene_rig: SceneRig) -> tuple:
+def _sampling_settings(scene_rig: SceneRig) -> tuple:
     """What the user has chosen to sample."""
     try:
         settings = recording_settings(scene_rig)
@@ -113,12 +113,12 @@ def _choices(scene_rig: SceneRig) -> tuple:
     return settings.poses > 0, settings.sample, settings.controls
 
 
-def _is_rest_changed(scene_rig: SceneRig) -> bool:
+def _is_mesh_changed(scene_rig: SceneRig) -> bool:
     mesh_object = scene_rig.mesh_object
     # Reading a large mesh takes a moment: not at each stroke of a brush.
-    if mesh_object.mode not in {"OBJECT", "POSE"} or not _rest_changed:
+    if mesh_object.mode not in {"OBJECT", "POSE"} or not _changed_meshes:
         return False
-    return mesh_object.data.name in _rest_changed
+    return mesh_object.data.name in _changed_meshes
 
 
 @persistent
@@ -130,21 +130,21 @@ def _on_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
     for update in depsgraph.updates:
         # Not the armatures: Blender counts them as changed with every pose.
         if isinstance(update.id, bpy.types.Mesh):
-            _rest_changed.add(update.id.name)
+            _changed_meshes.add(update.id.name)
 
 
 @persistent
 def _on_undone(*_: object) -> None:
     draw_cache.clear()
     _outdated.update(_checks)
-    _rest_changed.update(mesh.name for mesh in bpy.data.meshes)
+    _changed_meshes.update(mesh.name for mesh in bpy.data.meshes)
 
 
 @persistent
 def _on_loaded(*_: object) -> None:
     draw_cache.clear()
-    for known_things in (_checks, _wanted, _outdated, _rest_changed):
-        known_things.clear()
+    for state in (_checks, _requested, _outdated, _changed_meshes):
+        state.clear()
 
 
 HANDLERS = {
@@ -157,6 +157,6 @@ HANDLERS = {
 
 def unregister() -> None:
     """Forget all checks."""
-    if bpy.app.timers.is_registered(_check_wanted):
-        bpy.app.timers.unregister(_check_wanted)
+    if bpy.app.timers.is_registered(_run_requested_checks):
+        bpy.app.timers.unregister(_run_requested_checks)
     _on_loaded()

@@ -8,11 +8,11 @@ from ..evaluation.loaded_heat_map import loaded_heat_map
 from ..jobs import job
 from ..models.entries import bound_name
 from ..scene.scene_rig import SceneRig
-from .names import shown_name
-from .section import Section, draw_button, draw_job, draw_sentence, panel_rig, together
+from .bone_names import short_bone_name
+from .section import Section, draw_button, draw_job, draw_wrapped, mesh_count, panel_rig
 
-FEW_PARTITIONS = 5
-FIGURES = (("Mean", "mean"), ("99.9 %", "p999"), ("Max", "max"))
+SHOWN_PARTITIONS = 5
+STATISTICS = (("Mean", "mean"), ("99.9 %", "p999"), ("Max", "max"))
 
 
 class FDDA_PT_evaluation(Section, bpy.types.Panel):
@@ -27,16 +27,16 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         return rig is not None and last_evaluation.get(rig.mesh_object) is not None
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, view = self.usable_layout(), context.window_manager.fdda_view
+        layout, view = self.enabled_layout(), context.window_manager.fdda_view
         scene_rig, reason = panel_rig(context)
         if scene_rig is None:
-            draw_sentence(layout, context, reason, "INFO")
+            draw_wrapped(layout, context, reason, "INFO")
             return
         if not scene_rig.mesh_object.fdda.is_bound:
-            draw_sentence(layout, context, "Bind a model first, to compare it with the rig.", "INFO")
+            draw_wrapped(layout, context, "Bind a model first, to compare it with the rig.", "INFO")
         else:
             _draw_side_by_side(layout, context, scene_rig)
-            self._draw_start(context, scene_rig)
+            self._draw_evaluate(context, scene_rig)
         last = last_evaluation.get(scene_rig.mesh_object)
         if last is not None:
             _draw_figures(layout, context, view, last, scene_rig)
@@ -46,8 +46,8 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         if scene_rig.mesh_object.fdda.is_bound:
             layout.operator("fdda.open_report", icon="URL")
 
-    def _draw_start(self, context: bpy.types.Context, scene_rig: object) -> None:
-        layout, view = self.usable_layout(), context.window_manager.fdda_view
+    def _draw_evaluate(self, context: bpy.types.Context, scene_rig: object) -> None:
+        layout, view = self.enabled_layout(), context.window_manager.fdda_view
         state = job.state_of("evaluate")
         if state is not None and state.is_running:
             draw_job(layout, context, "evaluate")
@@ -63,7 +63,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
             column.prop(view, "poses")
             column.prop(view, "seed")
         elif action is None:
-            draw_sentence(layout, context, f"'{scene_rig.armature_object.name}' has no action.", "ERROR")
+            draw_wrapped(layout, context, f"'{scene_rig.armature_object.name}' has no action.", "ERROR")
         else:
             first, last = (round(frame) for frame in action.frame_range)
             layout.label(text=f"{action.name}, frames {first} to {last}", icon="ACTION")
@@ -82,9 +82,9 @@ def _draw_side_by_side(layout: bpy.types.UILayout, context: bpy.types.Context, s
     row = column.row(align=True)
     shown = side_by_side.display_mode(scene_rig.mesh_object)
     for way, text in (("NONE", "Off"), ("BESIDE", "Beside"), ("OVERLAY", "Overlay")):
-        button = row.operator("fdda.compare", text=text, depress=shown == way)
+        button = row.operator("fdda.show_rig", text=text, depress=shown == way)
         button.way = way
-        if together(context):
+        if mesh_count(context):
             button.all_meshes = True
 
 
@@ -101,35 +101,35 @@ def _draw_figures(
     header.label(text="Error (mm)")
     if body is None:
         return
-    draw_sentence(body, context, f"{last.model} on {what}")
+    draw_wrapped(body, context, f"{last.model} on {what}")
     if bound != last.model:
-        draw_sentence(body, context, f"{last.model} is no longer the bound model; evaluate again.", "INFO")
+        draw_wrapped(body, context, f"{last.model} is no longer the bound model; evaluate again.", "INFO")
     table = body.column(align=True)
-    _row(table, "", [label for label, _ in FIGURES])
+    _draw_table_row(table, "", [label for label, _ in STATISTICS])
     for label, way in (("Model", "fdda"), ("Skinning", "linear")):
-        _row(table, label, [_millimetres(getattr(last.total[way], name)) for _, name in FIGURES])
+        _draw_table_row(table, label, [_format_mm(getattr(last.total[way], name)) for _, name in STATISTICS])
     body.separator()
     row = body.row()
     row.label(text="Body parts, worst first")
-    if len(last.partitions) > FEW_PARTITIONS:
+    if len(last.partitions) > SHOWN_PARTITIONS:
         row.prop(view, "show_partitions", text="All", toggle=True)
     active = active_bone_name(context, rig)
     chosen = [partition for partition in last.partitions if partition.joint == active]
     if context.mode == "POSE" and not chosen:
-        draw_sentence(
+        draw_wrapped(
             body, context, "Click a bone to see its body part on top; click a name to select its bone.", "INFO"
         )
-    shown = last.partitions[: None if view.show_partitions else FEW_PARTITIONS]
+    shown = last.partitions[: None if view.show_partitions else SHOWN_PARTITIONS]
     column = body.column(align=True)
     for partition in (*chosen, *(p for p in shown if p not in chosen)):
         row = column.split(factor=0.4, align=True)
         name = row.row(align=True)
         name.alignment = "LEFT"
-        text = shown_name(rig.armature_object, partition.joint)
+        text = short_bone_name(rig.armature_object, partition.joint)
         icon = "BONE_DATA" if partition.joint == active else "NONE"
         name.operator("fdda.show_bone", text=text, icon=icon, emboss=False).bone = partition.joint
-        for _, figure in FIGURES:
-            row.label(text=_millimetres(getattr(partition.fdda, figure)))
+        for _, figure in STATISTICS:
+            row.label(text=_format_mm(getattr(partition.fdda, figure)))
 
 
 def active_bone_name(context: bpy.types.Context, rig: SceneRig) -> str:
@@ -155,24 +155,26 @@ def _draw_colors(
     for colors, text in (("NONE", "None"), ("ERRORS", "Heat Map"), ("PARTITIONS", "Body Parts")):
         button = row.row(align=True)
         button.enabled = colors != "ERRORS" or last is not None
-        button.operator("fdda.paint", text=text, depress=shown == ("" if colors == "NONE" else colors)).colors = colors
+        button.operator(
+            "fdda.color_mesh", text=text, depress=shown == ("" if colors == "NONE" else colors)
+        ).colors = colors
     if last is None:
-        draw_sentence(body, context, "Press Evaluate to get the heat map.", "INFO")
+        draw_wrapped(body, context, "Press Evaluate to get the heat map.", "INFO")
     if shown and heat_map.is_hidden(mesh_object):
         text = "Colors are hidden in Edit Mode, and while a modifier changes the topology in the viewport."
-        draw_sentence(body, context, text, "INFO")
+        draw_wrapped(body, context, text, "INFO")
     if shown != "ERRORS" or last is None:
         return
     column = body.column(align=True)
     column.row(align=True).prop(view, "way", expand=True)
     column.row(align=True).prop(view, "statistic", expand=True)
     if view.statistic == "pose" and not last.name and view.pose < 0:
-        draw_sentence(body, context, "Click a pose below to see its errors.", "INFO")
+        draw_wrapped(body, context, "Click a pose below to see its errors.", "INFO")
     elif view.statistic == "pose" and last.name and last.pose_at(context.scene.frame_current) is None:
-        draw_sentence(body, context, f"Frame {context.scene.frame_current} was not compared.", "INFO")
+        draw_wrapped(body, context, f"Frame {context.scene.frame_current} was not compared.", "INFO")
     row = body.row(align=True)
     row.prop(view, "range_mm")
-    row.operator("fdda.fit_range", text="", icon="FULLSCREEN_EXIT")
+    row.operator("fdda.fit_color_range", text="", icon="FULLSCREEN_EXIT")
 
 
 def _draw_worst(
@@ -183,7 +185,7 @@ def _draw_worst(
     if body is None:
         return
     column = body.column(align=True)
-    for rank, (index, error_mm) in enumerate(_worst(last, view.markers), 1):
+    for rank, (index, error_mm) in enumerate(_worst_poses(last, view.markers), 1):
         place = f"Frame {last.first_frame + index}" if last.name else f"Pose {index}"
         button = column.operator("fdda.jump_to_worst", text=f"{place}: {error_mm:.2f} mm")
         button.rank = rank
@@ -192,23 +194,23 @@ def _draw_worst(
     body.prop(view, "graph")
     row = body.row(align=True)
     row.prop(view, "markers")
-    row.operator("fdda.mark_worst", text="Add Markers", icon="MARKER_HLT").count = view.markers
+    row.operator("fdda.add_worst_markers", text="Add Markers", icon="MARKER_HLT").count = view.markers
     if markers.find(context.scene):
         row.operator("fdda.remove_markers", text="", icon="X")
 
 
-_worst_of: dict[int, tuple[object, int, list[tuple[int, float]]]] = {}
+_worst_cache: dict[int, tuple[object, int, list[tuple[int, float]]]] = {}
 
 
-def _worst(last: last_evaluation.LastEvaluation, count: int) -> list[tuple[int, float]]:
+def _worst_poses(last: last_evaluation.LastEvaluation, count: int) -> list[tuple[int, float]]:
     """The worst poses, found once for an evaluation: drawing computes nothing twice."""
-    kept = _worst_of.get(0)
+    kept = _worst_cache.get(0)
     if kept is None or kept[0] is not last or kept[1] != count:
-        _worst_of[0] = (last, count, last.worst(count))
-    return _worst_of[0][2]
+        _worst_cache[0] = (last, count, last.worst(count))
+    return _worst_cache[0][2]
 
 
-def _row(layout: bpy.types.UILayout, label: str, figures: list[str]) -> None:
+def _draw_table_row(layout: bpy.types.UILayout, label: str, figures: list[str]) -> None:
     row = layout.split(factor=0.4, align=True)
     row.label(text=label)
     for figure in figures:
@@ -217,7 +219,7 @@ def _row(layout: bpy.types.UILayout, label: str, figures: list[str]) -> None:
         cell.label(text=figure)
 
 
-def _millimetres(value: float) -> str:
+def _format_mm(value: float) -> str:
     return f"{value:.2f}" if value < 10 else f"{value:.1f}"
 
 
@@ -226,4 +228,4 @@ CLASSES = (FDDA_PT_evaluation,)
 
 def unregister() -> None:
     """Let go of the last evaluation."""
-    _worst_of.clear()
+    _worst_cache.clear()

@@ -9,14 +9,14 @@ from ..core.errors import FDDAError
 from ..models.entries import chosen_entry, is_bound, megabytes
 from ..scene.stored_paths import resolve_path
 from . import checks
-from .section import Section, draw_sentence, panel_rig
-from .watch import Watch
+from .section import Section, draw_wrapped, panel_rig
+from .timed_value import TimedValue
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.model import ModelInfo
     from ..core.poses import Channel
 
-_rigs: dict[tuple, object] = {}
+_rig_cache: dict[tuple, object] = {}
 
 
 def rig_of_model(scene_rig: object, rig: object, info: object) -> object:
@@ -26,14 +26,14 @@ def rig_of_model(scene_rig: object, rig: object, info: object) -> object:
     if set(rig.joint_names) == set(info.joint_names):
         return rig
     key = (id(rig), info.joint_names)
-    if key not in _rigs:
-        _rigs.clear()
+    if key not in _rig_cache:
+        _rig_cache.clear()
         # The checked rig stands beside what was read, so that its identifier is no other's.
-        _rigs[key] = (rig, read_model_rig(scene_rig, info))
-    return _rigs[key][1]
+        _rig_cache[key] = (rig, read_model_rig(scene_rig, info))
+    return _rig_cache[key][1]
 
 
-def _states(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
+def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
     """What is wrong with the models of a mesh: icon and sentence by path and name; all is well with those left out."""
     from ..models.changes import changes
     from ..models.model_list import info_of
@@ -41,7 +41,7 @@ def _states(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
 
     armature_object = armature_of(mesh_object)
     scene_rig = SceneRig(mesh_object, armature_object)
-    check = checks.known(scene_rig) if armature_object else None
+    check = checks.last_check(scene_rig) if armature_object else None
     found = {}
     for entry in mesh_object.fdda.models:
         try:
@@ -50,9 +50,9 @@ def _states(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
                 rig = rig_of_model(scene_rig, check.rig, info)
                 changed = changes(entry.name, info, rig, _compared_channels(mesh_object, check.channels, info))
                 if changed.sentence:
-                    found[_key(entry)] = ("ERROR" if changed.prevents else "INFO", changed.sentence)
+                    found[_entry_key(entry)] = ("ERROR" if changed.prevents else "INFO", changed.sentence)
         except FDDAError as error:
-            found[_key(entry)] = ("ERROR", str(error))
+            found[_entry_key(entry)] = ("ERROR", str(error))
     return found
 
 
@@ -67,11 +67,11 @@ def _compared_channels(
     return tuple(channel for channel in channels if channel.kind != CONTROL)
 
 
-def _key(entry: bpy.types.PropertyGroup) -> str:
+def _entry_key(entry: bpy.types.PropertyGroup) -> str:
     return f"{entry.name}\n{entry.path}\n{entry.packed_bytes}"
 
 
-_models = Watch(_states, 0.5)
+_problems = TimedValue(_find_problems, 0.5)
 
 
 class FDDA_UL_models(bpy.types.UIList):
@@ -83,7 +83,7 @@ class FDDA_UL_models(bpy.types.UIList):
         row.prop(item, "name", text="", emboss=False, icon="LINKED" if is_bound(mesh_object, item) else "BLANK1")
         if item.packed:
             row.label(text=megabytes(item.packed_bytes), icon="PACKAGE")
-        if (state := (_models.look(mesh_object) or {}).get(_key(item))) is not None:
+        if (state := (_problems.get(mesh_object) or {}).get(_entry_key(item))) is not None:
             row.label(icon=state[0])
 
 
@@ -93,15 +93,15 @@ class FDDA_PT_models(Section, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.usable_layout()
+        layout = self.enabled_layout()
         scene_rig, reason = panel_rig(context)
         if scene_rig is None:
-            draw_sentence(layout, context, reason, "INFO")
+            draw_wrapped(layout, context, reason, "INFO")
             return
         mesh_object = scene_rig.mesh_object
         binding = mesh_object.fdda
         if not binding.models and not binding.is_bound:
-            draw_sentence(layout, context, "No model yet: train one above, or add a file.", "INFO")
+            draw_wrapped(layout, context, "No model yet: train one above, or add a file.", "INFO")
             layout.operator("fdda.add_model", text="Add Model…", icon="ADD")
             return
         row = layout.row()
@@ -116,9 +116,9 @@ class FDDA_PT_models(Section, bpy.types.Panel):
     def _draw_entry(
         self, context: bpy.types.Context, mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup
     ) -> None:
-        layout = self.usable_layout()
-        states = _models.look(mesh_object)
-        state = (states or {}).get(_key(entry))
+        layout = self.enabled_layout()
+        states = _problems.get(mesh_object)
+        state = (states or {}).get(_entry_key(entry))
         if is_bound(mesh_object, entry):
             layout.operator("fdda.unbind", icon="UNLINKED")
         else:
@@ -126,17 +126,17 @@ class FDDA_PT_models(Section, bpy.types.Panel):
             row.scale_y = 1.2
             row.operator("fdda.bind", text=f"Bind {entry.name}", icon="LINKED").filepath = ""
         if entry.packed:
-            draw_sentence(layout, context, f"Packed, {megabytes(entry.packed_bytes)}", "PACKAGE")
+            draw_wrapped(layout, context, f"Packed, {megabytes(entry.packed_bytes)}", "PACKAGE")
             layout.operator("fdda.unpack_model", icon="EXPORT")
         else:
-            draw_sentence(layout, context, str(resolve_path(entry.path)), "FILE")
+            draw_wrapped(layout, context, str(resolve_path(entry.path)), "FILE")
             layout.operator("fdda.pack_model", text="Pack into the .blend File", icon="PACKAGE")
         if state is not None:
             box = layout.box()
             box.alert = state[0] == "ERROR"
-            draw_sentence(box, context, state[1], state[0])
+            draw_wrapped(box, context, state[1], state[0])
         elif states is not None:
-            draw_sentence(layout, context, "Matches this rig", "CHECKMARK")
+            draw_wrapped(layout, context, "Matches this rig", "CHECKMARK")
 
 
 CLASSES = (FDDA_UL_models, FDDA_PT_models)
@@ -144,4 +144,4 @@ CLASSES = (FDDA_UL_models, FDDA_PT_models)
 
 def unregister() -> None:
     """Work nothing out any more."""
-    _models.stop()
+    _problems.stop()

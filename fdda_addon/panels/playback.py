@@ -12,25 +12,25 @@ from ..scene.folder_trust import is_trusted
 from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import resolve_path
 from ..timing import frame_times
-from .names import shown_name
-from .section import Section, draw_button, draw_job, draw_sentence, panel_rig, together
-from .trained import trained
-from .watch import Watch
+from .bone_names import short_bone_name
+from .section import Section, draw_button, draw_job, draw_wrapped, mesh_count, panel_rig
+from .timed_value import TimedValue
+from .trained_file import find_trained_file
 
 FULL_CONFIDENCE = 0.995
-MAX_SHOWN = 6
+MAX_SHOWN_PARTITIONS = 6
 MODES = (("RIG", "Rig"), ("LINEAR", "Skinning"), ("FDDA", "Model"))
 
 
 @draw_cached
-def lies_outside(mesh_object: bpy.types.Object) -> bool:
+def is_outside_model_folders(mesh_object: bpy.types.Object) -> bool:
     """Whether the bound model plays in this session only, as its file may not be followed from this one."""
     path = resolve_path(mesh_object.fdda.model, mesh_object.library).resolve()
     file = Path(bpy.data.filepath).resolve()
     return bool(bpy.data.filepath) and not path.is_relative_to(file.parent) and not is_trusted(path)
 
 
-def mask_sentence(mesh_object: bpy.types.Object) -> str:
+def mask_problem(mesh_object: bpy.types.Object) -> str:
     """What is wrong with the mask of a mesh; empty when nothing is, or there is none."""
     name = mesh_object.fdda.mask
     if not name or name in mesh_object.vertex_groups:
@@ -38,13 +38,13 @@ def mask_sentence(mesh_object: bpy.types.Object) -> str:
     return f"'{mesh_object.name}' has no vertex group '{name}', so the mask has no effect; choose another."
 
 
-def _confidence(mesh_object: bpy.types.Object) -> object:
+def _read_confidence(mesh_object: bpy.types.Object) -> object:
     from ..runtime.confidence import partition_confidence
 
     return partition_confidence(mesh_object) or "This model has no confidence values."
 
 
-_confidences = Watch(_confidence, 0.2)
+_confidence_value = TimedValue(_read_confidence, 0.2)
 
 
 class FDDA_PT_playback(Section, bpy.types.Panel):
@@ -58,10 +58,10 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         return rig is not None and rig.mesh_object.fdda.is_bound and not rig.mesh_object.fdda.status
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.usable_layout()
+        layout = self.enabled_layout()
         scene_rig, reason = panel_rig(context)
         if scene_rig is None:
-            draw_sentence(layout, context, reason, "INFO")
+            draw_wrapped(layout, context, reason, "INFO")
             return
         mesh_object = scene_rig.mesh_object
         if not mesh_object.fdda.is_bound:
@@ -76,11 +76,11 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
 
     def _draw_unbound(self, context: bpy.types.Context, rig: SceneRig) -> None:
         mesh_object = rig.mesh_object
-        layout, entry, found = self.layout, chosen_entry(mesh_object), trained(rig)
+        layout, entry, found = self.layout, chosen_entry(mesh_object), find_trained_file(rig)
         if mesh_object.fdda.status:
-            draw_sentence(layout, context, mesh_object.fdda.status, "ERROR")
-        if entry is None and (found is None or found.foreign):
-            draw_sentence(layout, context, "No model yet: train one above, or choose a file.", "INFO")
+            draw_wrapped(layout, context, mesh_object.fdda.status, "ERROR")
+        if entry is None and (found is None or found.mismatch):
+            draw_wrapped(layout, context, "No model yet: train one above, or choose a file.", "INFO")
             layout.operator("fdda.bind", text="Choose Model and Bind…", icon="FILEBROWSER")
             return
         column = layout.column()
@@ -92,23 +92,23 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         layout, binding = self.layout, mesh_object.fdda
         where = " (in this file)" if binding.packed else ""
         layout.label(text=f"{bound_name(mesh_object)}{where}", icon="ERROR" if binding.status else "LINKED")
-        if not binding.packed and not binding.status and lies_outside(mesh_object):
+        if not binding.packed and not binding.status and is_outside_model_folders(mesh_object):
             text = "The model is not packed, and not in the folder of this file: it will not load again."
-            draw_sentence(layout, context, text, "ERROR")
+            draw_wrapped(layout, context, text, "ERROR")
             layout.operator("fdda.pack_model", text="Pack into the .blend File", icon="PACKAGE")
         if binding.status:
             box = layout.box()
             box.alert = True
-            draw_sentence(box, context, binding.status)
+            draw_wrapped(box, context, binding.status)
             row = layout.row(align=True)
             row.operator("fdda.relink", text="Find Model…", icon="FILEBROWSER")
-            row.operator("fdda.switch", text="Try Again", icon="FILE_REFRESH").mode = "FDDA"
+            row.operator("fdda.set_mode", text="Try Again", icon="FILE_REFRESH").mode = "FDDA"
             return
         row = layout.row(align=True)
         row.scale_y = 1.4
-        if together(context):
+        if mesh_count(context):
             for mode, text in MODES:
-                properties = row.operator("fdda.switch", text=text, depress=binding.mode == mode)
+                properties = row.operator("fdda.set_mode", text=text, depress=binding.mode == mode)
                 properties.mode, properties.all_meshes = mode, True
         else:
             row.prop(binding, "mode", expand=True)
@@ -123,12 +123,12 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         invert = mask.row(align=True)
         invert.active = bool(binding.mask)
         invert.prop(binding, "invert_mask", text="", icon="ARROW_LEFTRIGHT")
-        if text := mask_sentence(mesh_object):
-            draw_sentence(layout, context, text, "ERROR")
+        if text := mask_problem(mesh_object):
+            draw_wrapped(layout, context, text, "ERROR")
         column.prop(binding, "use_in_render")
 
     def _draw_times(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
-        layout = self.usable_layout()
+        layout = self.enabled_layout()
         header, body = layout.panel("fdda_frame_times", default_closed=False)
         header.label(text="Speed")
         if body is None:
@@ -151,7 +151,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
                 number = grid.row()
                 number.alignment = "RIGHT"
                 number.label(text=value)
-            draw_sentence(body, context, times.sentence, "INFO" if times.fdda < times.rig else "ERROR")
+            draw_wrapped(body, context, times.sentence, "INFO" if times.fdda < times.rig else "ERROR")
         body.operator("fdda.measure_model", text="Measure Speed", icon="TIME")
 
     def _draw_confidence(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
@@ -160,22 +160,22 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         header.label(text="Confidence in This Pose")
         if body is None:
             return
-        confidence = _confidences.look(mesh_object)
+        confidence = _confidence_value.get(mesh_object)
         if confidence is None or isinstance(confidence, str):
-            draw_sentence(body, context, confidence or "…")
+            draw_wrapped(body, context, confidence or "…")
             return
         doubtful = [(name, value) for name, value in confidence if value < FULL_CONFIDENCE]
         if not doubtful:
-            draw_sentence(body, context, "This pose is inside the trained range.", "CHECKMARK")
+            draw_wrapped(body, context, "This pose is inside the trained range.", "CHECKMARK")
             return
-        draw_sentence(body, context, f"{len(doubtful)} of {len(confidence)} body parts are beyond the trained range:")
+        draw_wrapped(body, context, f"{len(doubtful)} of {len(confidence)} body parts are beyond the trained range:")
         column = body.column(align=True)
-        for name, value in doubtful[:MAX_SHOWN]:
+        for name, value in doubtful[:MAX_SHOWN_PARTITIONS]:
             row = column.split(factor=0.5, align=True)
-            row.label(text=shown_name(armature_of(mesh_object), name))
+            row.label(text=short_bone_name(armature_of(mesh_object), name))
             row.progress(factor=value, text=f"{100 * value:.0f} %")
-        if len(doubtful) > MAX_SHOWN:
-            column.label(text=f"and {len(doubtful) - MAX_SHOWN} more")
+        if len(doubtful) > MAX_SHOWN_PARTITIONS:
+            column.label(text=f"and {len(doubtful) - MAX_SHOWN_PARTITIONS} more")
 
     def _draw_bake(self, context: bpy.types.Context) -> None:
         if not draw_job(self.layout, context, "bake"):
@@ -187,4 +187,4 @@ CLASSES = (FDDA_PT_playback,)
 
 def unregister() -> None:
     """Work nothing out any more."""
-    _confidences.stop()
+    _confidence_value.stop()

@@ -6,58 +6,58 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ..operators.poses import FDDA_OT_state_range
-from ..properties.choices import moves_a_bone, recorded_actions
+from ..operators.poses import FDDA_OT_set_limit
+from ..properties.recording_options import action_moves_bones, recorded_actions
 from ..scene.compatibility import is_selected, selection_owner
 from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
-from . import checks, sampled
-from .names import shown_name
-from .section import Section, draw_advanced, draw_sentence, panel_rig
+from . import checks, sampling
+from .bone_names import short_bone_name
+from .section import Section, draw_advanced, draw_wrapped, panel_rig
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.poses import Channel
 
 AXES = "xyz"
-WIDE = 380
+WIDE_SIDEBAR_PIXELS = 380
 """From this width of the sidebar on the table has both ends of a range, pixels at a scale of 1."""
 
 
-class FDDA_UL_joints(bpy.types.UIList):
+class FDDA_UL_bones(bpy.types.UIList):
     """The joints of the rig, or the control bones that were chosen, with their range about each axis."""
 
     def filter_items(self, context: bpy.types.Context, data: object, name: str) -> tuple[list[int], list[int]]:
         rig = panel_rig(context)[0]
-        return (list(_flags(rig, self.filter_name.lower(), self.bitflag_filter_item)) if rig else []), []
+        return (list(_visible_bone_flags(rig, self.filter_name.lower(), self.bitflag_filter_item)) if rig else []), []
 
     def draw_item(self, context: bpy.types.Context, layout: bpy.types.UILayout, _data, bone, _icon, _active, _name):
         rig = panel_rig(context)[0]
         if rig is None:
             return
         region = context.region
-        is_wide = region is not None and region.width >= WIDE * _scale(context.preferences)
-        icon, name, ranges, is_stated = _line(rig, bone, is_wide)
+        is_wide = region is not None and region.width >= WIDE_SIDEBAR_PIXELS * _ui_scale(context.preferences)
+        icon, name, ranges, has_limits = _bone_row(rig, bone, is_wide)
         row = layout.split(factor=0.5)
         left = row.row(align=True)
         # The selection in the view: who ticks a box here selects the bone there.
         box = "CHECKBOX_HLT" if is_selected(bone) else "CHECKBOX_DEHLT"
         left.prop(selection_owner(bone), "select", text="", icon=box, emboss=False)
         left.label(text=name, icon=icon)
-        if not is_stated:
+        if not has_limits:
             row = row.row()
             row.active = False
         row.label(text=ranges)
 
 
 @draw_cached
-def _scale(preferences: bpy.types.Preferences) -> float:
+def _ui_scale(preferences: bpy.types.Preferences) -> float:
     return preferences.system.ui_scale
 
 
 @draw_cached
-def _flags(rig: SceneRig, text: str, flag: int) -> tuple[int, ...]:
+def _visible_bone_flags(rig: SceneRig, text: str, flag: int) -> tuple[int, ...]:
     """Which bones the list shows: the joints of the mesh, or those that were chosen, as far as they are looked for."""
-    check, channels = checks.known(rig), sampled_by_bone(rig)
+    check, channels = checks.last_check(rig), sampled_channels_by_bone(rig)
     listed = set(check.rig.joint_names) if check and check.rig else set()
     if channels is not None:
         listed = set(channels)
@@ -66,24 +66,24 @@ def _flags(rig: SceneRig, text: str, flag: int) -> tuple[int, ...]:
 
 
 @draw_cached
-def _line(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[str, str, str, bool]:
+def _bone_row(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[str, str, str, bool]:
     """Icon, name and ranges of a bone in the list, and whether it states any of them."""
     from ..poses.motion_range import DEFAULT, rotation_ranges
     from ..poses.sampling import is_moved_by_constraints
 
-    name = shown_name(rig.armature_object, bone.name)
-    channels = sampled_by_bone(rig)
+    name = short_bone_name(rig.armature_object, bone.name)
+    channels = sampled_channels_by_bone(rig)
     if channels is not None:
-        return "NONE", name, _sampled_text(channels.get(bone.name, ()), is_wide), True
+        return "NONE", name, _format_channels(channels.get(bone.name, ()), is_wide), True
     if is_moved_by_constraints(bone):
         return "CONSTRAINT_BONE", name, "constrained", False
     ranges = rotation_ranges(bone)
-    texts = [_degrees(r.low, r.high, is_wide) if r.moves else "locked" for r in ranges]
+    texts = [_format_range(r.low, r.high, is_wide) if r.moves else "locked" for r in ranges]
     return "NONE", name, "  ".join(texts), any(r.moves and r.source != DEFAULT for r in ranges)
 
 
 @draw_cached
-def states_limits(rig: SceneRig) -> bool:
+def has_any_limits(rig: SceneRig) -> bool:
     """Whether any bone of the armature states a range of motion, or locks an axis."""
     from ..poses.motion_range import DEFAULT, rotation_ranges
 
@@ -92,9 +92,9 @@ def states_limits(rig: SceneRig) -> bool:
 
 
 @draw_cached
-def sampled_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None":
+def sampled_channels_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None":
     """Channels of the bones that a user has chosen to sample, by bone; None where none were chosen, or not known."""
-    check = checks.known(rig)
+    check = checks.last_check(rig)
     if rig.mesh_object.fdda.settings.sample == "WEIGHTS" or check is None or not check.channels:
         return None
     from ..core.poses import CONTROL
@@ -106,7 +106,7 @@ def sampled_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None":
     return found
 
 
-def _sampled_text(channels: "list[Channel]", is_wide: bool) -> str:
+def _format_channels(channels: "list[Channel]", is_wide: bool) -> str:
     """The ranges about the axes, and by which other channels the bone is moved."""
     from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR
 
@@ -114,7 +114,7 @@ def _sampled_text(channels: "list[Channel]", is_wide: bool) -> str:
     turns = {channel.axis: channel for channel in channels if channel.kind in {ROTATION, ROTATION_VECTOR}}
     moves = "".join("XYZ"[channel.axis] for channel in channels if channel.kind == LOCATION)
     texts = [
-        _degrees(turns[axis].low, turns[axis].high, is_wide) if axis in turns else "locked"
+        _format_range(turns[axis].low, turns[axis].high, is_wide) if axis in turns else "locked"
         for axis in range(3)
         if turns
     ]
@@ -123,7 +123,7 @@ def _sampled_text(channels: "list[Channel]", is_wide: bool) -> str:
     return "  ".join(texts)
 
 
-def _degrees(low: float, high: float, is_wide: bool) -> str:
+def _format_range(low: float, high: float, is_wide: bool) -> str:
     """Return a range in degrees, "±45°" or "-10…140°"; in a narrow sidebar an asymmetric one as its width, "150°"."""
     low, high = round(math.degrees(low)), round(math.degrees(high))
     if low == -high:
@@ -138,7 +138,7 @@ class FDDA_UL_actions(bpy.types.UIList):
         rig = panel_rig(context)[0]
         text = self.filter_name.lower()
         flags = [
-            self.bitflag_filter_item if rig and text in action.name.lower() and action in _fitting_actions(rig) else 0
+            self.bitflag_filter_item if rig and text in action.name.lower() and action in _actions_of_rig(rig) else 0
             for action in getattr(data, name)
         ]
         return flags, []
@@ -159,22 +159,22 @@ class FDDA_PT_poses(Section, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.usable_layout()
+        layout = self.enabled_layout()
         rig = panel_rig(context)[0]
         if rig is None:
             return
         session, bones = context.window_manager.fdda, rig.armature_object.pose.bones
-        sampled.draw_choice(layout, context, rig)
+        sampling.draw_bones_to_pose(layout, context, rig)
         layout.label(text="Rotation Limits (X, Y, Z)")
-        if not states_limits(rig):
+        if not has_any_limits(rig):
             text = "No rotation limits found. Every bone will rotate ±45°; set limits, or press Human Limits."
-            draw_sentence(layout, context, text, "ERROR")
+            draw_wrapped(layout, context, text, "ERROR")
         _draw_limit_sources(layout, rig)
-        layout.template_list("FDDA_UL_joints", "", rig.armature_object.pose, "bones", session, "joint_index", rows=5)
-        if 0 <= session.joint_index < len(bones):
-            _draw_bone(layout, rig, bones[session.joint_index])
-        _draw_many(layout, context, rig)
-        sampled.draw_controls(layout, rig)
+        layout.template_list("FDDA_UL_bones", "", rig.armature_object.pose, "bones", session, "bone_index", rows=5)
+        if 0 <= session.bone_index < len(bones):
+            _draw_bone(layout, rig, bones[session.bone_index])
+        _draw_selected_bones(layout, context, rig)
+        sampling.draw_extra_inputs(layout, rig)
         _draw_random(layout, context, rig)
         _draw_actions(layout, context, rig)
         if (advanced := draw_advanced(layout, "fdda_poses_advanced")) is not None:
@@ -186,7 +186,7 @@ def _draw_limit_sources(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     """Draw the buttons that set the limits of all bones."""
     has_actions = bool(recorded_actions(rig.armature_object))
     column = layout.column(align=True)
-    column.operator("fdda.limits_preset", text="Human Limits (All Bones)", icon="OUTLINER_OB_ARMATURE")
+    column.operator("fdda.human_limits", text="Human Limits (All Bones)", icon="OUTLINER_OB_ARMATURE")
     row = column.row(align=True)
     row.enabled = has_actions
     row.operator("fdda.limits_from_actions", icon="CON_ROTLIMIT")
@@ -194,41 +194,41 @@ def _draw_limit_sources(layout: bpy.types.UILayout, rig: SceneRig) -> None:
         layout.label(text="Check an action below first", icon="INFO")
 
 
-def _draw_many(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
+def _draw_selected_bones(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
     """What works on many bones: those that are ticked, which are those that are selected in the view."""
-    header, body = layout.panel("fdda_many_bones", default_closed=states_limits(rig))
-    count = _selected(rig)
+    header, body = layout.panel("fdda_many_bones", default_closed=has_any_limits(rig))
+    count = _count_selected(rig)
     header.label(text=f"Selected Bones ({count})")
     if body is None:
         return
     column = body.column(align=True)
     column.enabled = count > 0
-    column.operator("fdda.edit_ranges", text="Set Limits…", icon="DRIVER_ROTATIONAL_DIFFERENCE")
+    column.operator("fdda.set_limits", text="Set Limits…", icon="DRIVER_ROTATIONAL_DIFFERENCE")
     row = column.row(align=True)
-    row.operator("fdda.copy_ranges", text="Copy to Selected", icon="COPYDOWN")
-    row.operator("fdda.mirror_ranges", text="Mirror to Other Side", icon="MOD_MIRROR")
-    column.operator("fdda.forget_ranges", text="Clear Limits", icon="X")
+    row.operator("fdda.copy_limits", text="Copy to Selected", icon="COPYDOWN")
+    row.operator("fdda.mirror_limits", text="Mirror to Other Side", icon="MOD_MIRROR")
+    column.operator("fdda.clear_limits", text="Clear Limits", icon="X")
 
 
 @draw_cached
-def _selected(rig: SceneRig) -> int:
+def _count_selected(rig: SceneRig) -> int:
     return sum(map(is_selected, rig.armature_object.pose.bones))
 
 
 def _draw_bone(layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
     """The active bone; where others are chosen than those that are listed, none."""
-    channels = sampled_by_bone(rig)
+    channels = sampled_channels_by_bone(rig)
     if channels is None:
-        _draw_ranges(layout.box(), rig, bone)
+        _draw_limits(layout.box(), rig, bone)
     elif bone.name in channels:
         if rig.mesh_object.fdda.settings.sample == "ACTIONS":
-            sampled.draw_channels(layout.box(), bone, channels[bone.name])
+            sampling.draw_channels(layout.box(), bone, channels[bone.name])
         else:
-            _draw_ranges(layout.box(), rig, bone)
+            _draw_limits(layout.box(), rig, bone)
 
 
 @draw_cached
-def _ranges_of(rig: SceneRig, bone: bpy.types.PoseBone) -> tuple[str, list, tuple[int, ...]]:
+def _read_limits(rig: SceneRig, bone: bpy.types.PoseBone) -> tuple[str, list, tuple[int, ...]]:
     """Name of a bone and where its ranges come from, its ranges about the axes, and the axes that it is moved along."""
     from ..poses.motion_range import CONSTRAINT, DEFAULT, IK, location_ranges, rotation_ranges
 
@@ -239,11 +239,11 @@ def _ranges_of(rig: SceneRig, bone: bpy.types.PoseBone) -> tuple[str, list, tupl
     return f"{bone.name}: {', '.join(names[source] for source in sorted(sources)) or 'no limits'}", ranges, locations
 
 
-def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
+def _draw_limits(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
     """The ranges of a bone as the fields in which Blender keeps them."""
     from ..poses.motion_range import CONSTRAINT, DEFAULT, find_local_limit
 
-    text, ranges, locations = _ranges_of(rig, bone)
+    text, ranges, locations = _read_limits(rig, bone)
     box.label(text=text, icon="BONE_DATA")
     column = box.column(align=True)
     for axis, r in enumerate(ranges):
@@ -255,12 +255,12 @@ def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBon
         if r.source == DEFAULT:
             text = "locked (IK)" if r.is_locked and not bone.lock_rotation[axis] else "±45° (default)"
             fields.label(text="locked" if bone.lock_rotation[axis] else text)
-            _draw_state_button(fields, rig, bone, axis, "fdda.state_range", "ADD")
+            _draw_limit_button(fields, rig, bone, axis, "fdda.set_limit", "ADD")
             continue
         owner, prefix = (find_local_limit(bone, "LIMIT_ROTATION"), "") if r.source == CONSTRAINT else (bone, "ik_")
         fields.prop(owner, f"{prefix}min_{AXES[axis]}", text="")
         fields.prop(owner, f"{prefix}max_{AXES[axis]}", text="")
-        _draw_state_button(fields, rig, bone, axis, "fdda.unstate_range", "X")
+        _draw_limit_button(fields, rig, bone, axis, "fdda.clear_limit", "X")
     for axis in locations:
         row = column.row(align=True)
         limit = find_local_limit(bone, "LIMIT_LOCATION")
@@ -269,12 +269,12 @@ def _draw_ranges(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBon
         row.prop(limit, f"max_{AXES[axis]}", text="")
 
 
-def _draw_state_button(
+def _draw_limit_button(
     layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone, axis: int, operator: str, icon: str
 ) -> None:
     properties = layout.operator(operator, text="", icon=icon)
     properties.object, properties.bone, properties.axis = rig.mesh_object.name, bone.name, AXES[axis].upper()
-    if operator == FDDA_OT_state_range.bl_idname:
+    if operator == FDDA_OT_set_limit.bl_idname:
         # Blender would take what was stated last.
         properties.low, properties.high = -math.pi / 4, math.pi / 4
 
@@ -291,12 +291,12 @@ def _draw_random(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 
 
 @draw_cached
-def _fitting_actions(rig: SceneRig) -> "tuple[bpy.types.Action, ...]":
-    return tuple(action for action in bpy.data.actions if moves_a_bone(action, rig.armature_object))
+def _actions_of_rig(rig: SceneRig) -> "tuple[bpy.types.Action, ...]":
+    return tuple(action for action in bpy.data.actions if action_moves_bones(action, rig.armature_object))
 
 
 def _draw_actions(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    fitting = _fitting_actions(rig)
+    fitting = _actions_of_rig(rig)
     if not fitting:
         return
     layout.label(text="Also Record Actions")
@@ -308,7 +308,7 @@ def _draw_actions(layout: bpy.types.UILayout, context: bpy.types.Context, rig: S
     row.active = any(action.fdda.record for action in fitting)
     row.prop(settings, "mirror")
     if not settings.poses and not any(action.fdda.record for action in fitting):
-        draw_sentence(layout, context, "Nothing to record: raise Random Poses, or check an action.", "ERROR")
+        draw_wrapped(layout, context, "Nothing to record: raise Random Poses, or check an action.", "ERROR")
 
 
-CLASSES = (FDDA_UL_joints, sampled.FDDA_UL_controls, FDDA_UL_actions, FDDA_PT_poses)
+CLASSES = (FDDA_UL_bones, sampling.FDDA_UL_controls, FDDA_UL_actions, FDDA_PT_poses)

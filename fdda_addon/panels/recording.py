@@ -11,48 +11,48 @@ import bpy
 from ..core.errors import FDDAError
 from ..jobs import job
 from ..properties.character import default_recording, recording_folder
-from ..properties.choices import recorded_actions, recording_settings
+from ..properties.recording_options import recorded_actions, recording_settings
 from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks
-from .section import Section, draw_advanced, draw_button, draw_job, draw_path, draw_sentence, panel_rig
+from .section import Section, draw_advanced, draw_button, draw_job, draw_path, draw_wrapped, panel_rig
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.recording.folder import FolderContent
 
-_contents: "dict[int, tuple[tuple, FolderContent]]" = {}
+_content_cache: "dict[int, tuple[tuple, FolderContent]]" = {}
 """What was found in the folder of a character, by session_uid of its mesh object, and for which question."""
 
 
 @draw_cached
-def shown_content(rig: SceneRig) -> "tuple[Path, FolderContent] | str":
+def read_content(rig: SceneRig) -> "tuple[Path, FolderContent] | str":
     """The folder of a character and what is in it; a sentence where that cannot be said."""
     try:
         path = recording_folder(rig.mesh_object)
-        return path, content_of(rig, path)
+        return path, cached_content(rig, path)
     except FDDAError as error:
         return str(error)
 
 
-def content_of(rig: SceneRig, path: Path) -> "FolderContent":
+def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
     """What is in the folder of a recording; it is read again when it, the rig or the settings have changed."""
     from ..core.recording.folder import read_folder
     from ..core.recording.index import INDEX
     from ..recording.plan import make_sampling
 
-    check, wanted = checks.known(rig), recording_settings(rig)
+    check, wanted = checks.last_check(rig), recording_settings(rig)
     try:
         stamp = os.stat(path / INDEX).st_mtime_ns
     except OSError:
         stamp = -1 if path.exists() else 0
     uid = rig.mesh_object.session_uid
     question = (path, stamp, id(check), wanted)
-    if uid not in _contents or _contents[uid][0] != question:
+    if uid not in _content_cache or _content_cache[uid][0] != question:
         own, sampling = None, None
         if check is not None and check.rig is not None:
             own, sampling = check.rig, json.loads(json.dumps(make_sampling(rig, wanted, check.channels).to_json()))
-        _contents[uid] = (question, read_folder(path, own, sampling, wanted.fit_linear))
-    return _contents[uid][1]
+        _content_cache[uid] = (question, read_folder(path, own, sampling, wanted.fit_linear))
+    return _content_cache[uid][1]
 
 
 class FDDA_PT_recording(Section, bpy.types.Panel):
@@ -69,15 +69,15 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
         running = job.current()
         if rig is None or (running and running.verb == "record"):
             return False
-        found = shown_content(rig)
+        found = read_content(rig)
         return not isinstance(found, str) and found[1].state is FolderState.COMPLETE
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.usable_layout()
+        layout = self.enabled_layout()
         running = job.current()
         if running and running.verb == "record":
             draw_job(layout, context, "record")
-            draw_sentence(layout, context, "ESC cancels as well; what is recorded is kept.", "INFO")
+            draw_wrapped(layout, context, "ESC cancels as well; what is recorded is kept.", "INFO")
             return
         rig = panel_rig(context)[0]
         if rig is None:
@@ -94,32 +94,32 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     settings = rig.mesh_object.fdda.settings
     draw_path(layout, settings, "recording", default_recording(rig.mesh_object))
     _draw_settings(layout, context, settings)
-    found = shown_content(rig)
+    found = read_content(rig)
     if isinstance(found, str):
-        draw_sentence(layout, context, found, "ERROR")
+        draw_wrapped(layout, context, found, "ERROR")
         return
     path, content = found
-    check = checks.known(rig)
+    check = checks.last_check(rig)
     ready = check is not None and not check.problems
     if check is not None and check.problems:
-        draw_sentence(layout, context, "The rig cannot be recorded yet; see the Rig section.", "ERROR")
+        draw_wrapped(layout, context, "The rig cannot be recorded yet; see the Rig section.", "ERROR")
     if content.state is FolderState.FREE:
-        draw_sentence(layout, context, f"{_plan(rig)} will go into '{path.name}'.")
+        draw_wrapped(layout, context, f"{_describe_poses(rig)} will go into '{path.name}'.")
         _draw_record(layout, context, "Record", ready)
     elif content.state is FolderState.INCOMPLETE:
         text = f"{content.complete:,} of {content.poses:,} poses recorded. Press Resume to continue."
-        draw_sentence(layout, context, text, "INFO")
+        draw_wrapped(layout, context, text, "INFO")
         _draw_record(layout, context, "Resume", ready, resume=True)
     elif content.state is FolderState.COMPLETE:
-        draw_sentence(layout, context, f"{content.poses:,} poses recorded. Next: Train", "CHECKMARK")
+        draw_wrapped(layout, context, f"{content.poses:,} poses recorded. Next: Train", "CHECKMARK")
         for sentence in content.measured:
-            draw_sentence(layout, context, sentence)
+            draw_wrapped(layout, context, sentence)
         if content.sentence:
-            draw_sentence(layout, context, content.sentence, "INFO")
+            draw_wrapped(layout, context, content.sentence, "INFO")
     else:
-        draw_sentence(layout, context, content.sentence, "ERROR")
+        draw_wrapped(layout, context, content.sentence, "ERROR")
     if content.is_recording:
-        layout.operator("fdda.remove_recording", text="Delete Recording…", icon="TRASH").object = rig.mesh_object.name
+        layout.operator("fdda.delete_recording", text="Delete Recording…", icon="TRASH").object = rig.mesh_object.name
 
 
 def _draw_settings(layout: bpy.types.UILayout, context: bpy.types.Context, settings: bpy.types.PropertyGroup) -> None:
@@ -142,7 +142,7 @@ def _draw_record(
 
 
 @draw_cached
-def _plan(rig: SceneRig) -> str:
+def _describe_poses(rig: SceneRig) -> str:
     from ..poses.action_range import action_frames
 
     settings = rig.mesh_object.fdda.settings

@@ -4,11 +4,11 @@
 import bpy
 
 from ..jobs import job
-from ..operators.rig import cost_of
+from ..operators.rig import measured_cost
 from ..scene.active_rig import cached_rigs_of_active_armature
 from ..scene.scene_rig import SceneRig
 from . import checks, curves
-from .section import Section, draw_button, draw_job, draw_sentence, panel_rig
+from .section import Section, draw_button, draw_job, draw_wrapped, panel_rig
 
 MAX_MESHES = 8
 MODIFIER_ICONS = {
@@ -29,22 +29,22 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
     @classmethod
     def is_done(cls, context: bpy.types.Context) -> bool:
         rig = panel_rig(context)[0]
-        check = checks.known(rig) if rig else None
+        check = checks.last_check(rig) if rig else None
         return check is not None and not check.problems
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.usable_layout()
+        layout = self.enabled_layout()
         rig, sentence = panel_rig(context)
         if rig is None:
-            draw_sentence(layout, context, sentence, "INFO")
-            layout.operator("fdda.add_arm", text="Add Sample Arm", icon="ADD")
+            draw_wrapped(layout, context, sentence, "INFO")
+            layout.operator("fdda.add_sample_arm", text="Add Sample Arm", icon="ADD")
             return
         _draw_build_model(layout, context)
         _draw_meshes(layout, context, rig)
         _draw_counts(layout, rig)
-        check = checks.known(rig)
+        check = checks.last_check(rig)
         for problem in check.problems if check else ():
-            draw_sentence(layout.box(), context, problem, "ERROR")
+            draw_wrapped(layout.box(), context, problem, "ERROR")
         if check:
             _draw_replaced(layout, rig.mesh_object, check.replaced_modifiers)
         _draw_cost(layout, context, rig)
@@ -62,7 +62,7 @@ def _draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         row = box.row(align=True)
         row.alignment = "LEFT"
         icon = "RADIOBUT_ON" if is_shown else "RADIOBUT_OFF"
-        button = row.operator("fdda.choose_mesh", text=other.mesh_object.name, icon=icon, emboss=False)
+        button = row.operator("fdda.show_mesh", text=other.mesh_object.name, icon=icon, emboss=False)
         button.object = other.mesh_object.name
         if other.mesh_object.fdda.is_bound:
             row.label(text="", icon="LINKED")
@@ -72,7 +72,7 @@ def _draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 
 
 def _draw_counts(layout: bpy.types.UILayout, rig: SceneRig) -> None:
-    check = checks.known(rig)
+    check = checks.last_check(rig)
     column = layout.column(align=True)
     column.label(text=f"{rig.mesh_object.name}: {len(rig.mesh_object.data.vertices):,} vertices", icon="MESH_DATA")
     bones = len(rig.armature_object.data.bones)
@@ -104,7 +104,7 @@ def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context) ->
 
 
 def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    cost = cost_of(rig.mesh_object)
+    cost = measured_cost(rig.mesh_object)
     state = job.state_of("measure")
     if state is not None and (state.is_running or state.outcome_level != "INFO"):
         draw_job(layout, context, "measure")
@@ -118,7 +118,7 @@ def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Scen
             row = column.split(factor=0.45)
             row.label(text=name)
             row.label(text=milliseconds)
-        draw_sentence(layout, context, cost.sentence, "INFO")
+        draw_wrapped(layout, context, cost.sentence, "INFO")
     if state is None or not state.is_running:
         layout.operator("fdda.measure", text="Measure Speed", icon="TIME")
 

@@ -12,9 +12,9 @@ from ..scene.active_rig import active_rig, cached_active_rig, cached_rigs_of_act
 from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 
-MARGIN, ICON = 74, 22
+TEXT_MARGIN, ICON_WIDTH = 74, 22
 """Width of what is left and right of text in a box, and of an icon, pixels at a scale of 1."""
-MIN_WIDTH = 60
+MIN_TEXT_WIDTH = 60
 OUTCOME_ICONS = {"INFO": "CHECKMARK", "WARNING": "INFO", "ERROR": "ERROR"}
 
 
@@ -32,7 +32,7 @@ class Section:
         running = job.current()
         return cached_active_rig(context) is not None or (running is not None and running.verb in cls.verbs)
 
-    def usable_layout(self) -> bpy.types.UILayout:
+    def enabled_layout(self) -> bpy.types.UILayout:
         """The layout of the panel; nothing in it can be changed while the job of another section borrows the scene."""
         running = job.current()
         self.layout.enabled = running is None or not running.borrows_scene or running.verb in self.verbs
@@ -59,7 +59,7 @@ def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
         return None, str(error)
 
 
-def together(context: bpy.types.Context) -> int:
+def mesh_count(context: bpy.types.Context) -> int:
     """How many meshes the buttons work on at once; 0 where they work on the one that is shown."""
     rigs = cached_rigs_of_active_armature(context)
     return len(rigs) if rigs and context.window_manager.fdda.all_meshes else 0
@@ -69,18 +69,18 @@ def draw_button(
     layout: bpy.types.UILayout, context: bpy.types.Context, name: str, text: str, icon: str
 ) -> bpy.types.OperatorProperties:
     """Draw the button of an operator that may work on all meshes of an armature; it says of how many."""
-    count = together(context)
+    count = mesh_count(context)
     properties = layout.operator(name, text=f"{text} ({count} Meshes)" if count else text, icon=icon)
     if count:
         properties.all_meshes = True
     return properties
 
 
-def draw_sentence(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
+def draw_wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
     """Draw text in as many lines as the width of the sidebar takes."""
     scale, points = _text_size(context.preferences)
-    width = context.region.width - (MARGIN + (ICON if icon != "NONE" else 0)) * scale
-    lines = _lines(text, max(width, MIN_WIDTH * scale), points)
+    width = context.region.width - (TEXT_MARGIN + (ICON_WIDTH if icon != "NONE" else 0)) * scale
+    lines = _wrap(text, max(width, MIN_TEXT_WIDTH * scale), points)
     if len(lines) == 1:
         layout.label(text=text, icon=icon)
         return
@@ -98,7 +98,7 @@ def _text_size(preferences: bpy.types.Preferences) -> tuple[float, float]:
 
 
 @functools.lru_cache(maxsize=256)
-def _lines(text: str, width: float, points: float) -> tuple[str, ...]:
+def _wrap(text: str, width: float, points: float) -> tuple[str, ...]:
     """Text in lines of a width in pixels, as the interface's font has it; only a word that is longer goes beyond."""
     blf.size(0, points)
     lines: list[str] = []
@@ -151,25 +151,25 @@ def draw_job(
         rig = panel_rig(context)[0]
         is_own = not state.subject or (rig is not None and rig.mesh_object.session_uid == state.subject)
         if is_own and state.outcome_level in levels:
-            draw_sentence(layout, context, state.outcome, OUTCOME_ICONS[state.outcome_level])
+            draw_wrapped(layout, context, state.outcome, OUTCOME_ICONS[state.outcome_level])
         return False
     column = layout.column(align=True)
     if state.total:
         column.progress(factor=state.fraction, text=state.sentence)
     else:
         # A bar that stands still would look as if nothing happened.
-        draw_sentence(column, context, state.sentence, "SORTTIME")
+        draw_wrapped(column, context, state.sentence, "SORTTIME")
     row = column.row(align=True)
     row.enabled = not state.cancel_requested
     row.operator("fdda.cancel", text="Canceling…" if state.cancel_requested else "Cancel", icon="X")
     remaining = state.remaining_seconds
     # The line is always there: what is below would jump.
-    text = f"About {duration(remaining)} left" if remaining is not None else "…"
+    text = f"About {format_duration(remaining)} left" if remaining is not None else "…"
     layout.label(text="Finishing…" if state.is_finishing else text, icon="TIME")
     return True
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """A time for people: "40 s", "5 min", "2 h 10 min"."""
     if seconds < 90:
         return f"{max(1, round(seconds))} s"

@@ -14,14 +14,14 @@ from ..properties.preferences import MODULE, preferences
 from ..scene.scene_rig import SceneRig
 from ..training.environment import choice, session
 from . import curves
-from .names import shown_name
-from .recording import shown_content
-from .section import Section, draw_advanced, draw_button, draw_job, draw_path, draw_sentence, panel_rig
-from .trained import Trained, trained
+from .bone_names import short_bone_name
+from .recording import read_content
+from .section import Section, draw_advanced, draw_button, draw_job, draw_path, draw_wrapped, panel_rig
+from .trained_file import TrainedFile, find_trained_file
 
 SHOWN_PARTITIONS = 8
 
-_reports: dict[Path, tuple[int, dict | None]] = {}
+_report_cache: dict[Path, tuple[int, dict | None]] = {}
 """Reports that were read, by path, with the time of their change."""
 
 
@@ -37,35 +37,35 @@ class FDDA_PT_training(Section, bpy.types.Panel):
         running = job.current()
         if rig is None or (running and running.verb == "train"):
             return False
-        found = trained(rig)
-        return found is not None and not found.foreign
+        found = find_trained_file(rig)
+        return found is not None and not found.mismatch
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.usable_layout()
+        layout = self.enabled_layout()
         running = job.current()
         if running and running.verb == "train":
             draw_job(layout, context, "train")
             curves.draw(layout, running.curves)
             for warning in running.warnings:
-                draw_sentence(layout, context, warning, "INFO")
-            draw_sentence(layout, context, "You can keep working, or even quit Blender: training continues.", "INFO")
+                draw_wrapped(layout, context, warning, "INFO")
+            draw_wrapped(layout, context, "You can keep working, or even quit Blender: training continues.", "INFO")
             return
         if running and running.verb == "refine":
             draw_job(layout, context, "refine")
-            draw_sentence(layout, context, "ESC cancels as well; the poses that were added are kept.", "INFO")
+            draw_wrapped(layout, context, "ESC cancels as well; the poses that were added are kept.", "INFO")
             return
         rig = panel_rig(context)[0]
         if rig is None:
             return
         ready = _draw_python(layout, context)
-        found = trained(rig)
+        found = find_trained_file(rig)
         _draw_settings(layout, context, rig, found, ready)
         draw_job(layout, context, "refine")
         draw_job(layout, context, "train")
         ended = job.state_of("train")
         if ended is not None and ended.subject == rig.mesh_object.session_uid:
             curves.draw(layout, ended.curves)
-        if found is not None and not found.foreign:
+        if found is not None and not found.mismatch:
             _draw_report(layout, context, rig, found.path)
         if (advanced := draw_advanced(layout, "fdda_training_advanced")) is not None:
             advanced.prop(rig.mesh_object.fdda.settings, "tolerance_mm")
@@ -76,18 +76,18 @@ def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool
     """Which Python trains and what is known of it; returns whether it may be tried."""
     answer = session.check_result
     if answer is not None and answer.level == "INFO":
-        draw_sentence(layout, context, answer.message, "CHECKMARK")
+        draw_wrapped(layout, context, answer.message, "CHECKMARK")
         return True
     box = layout.box()
     if (checking := job.current(job.ENVIRONMENT)) is not None:
-        draw_sentence(box, context, f"{checking.title}: {checking.stage}", "SORTTIME")
+        draw_wrapped(box, context, f"{checking.title}: {checking.stage}", "SORTTIME")
     elif answer is not None:
-        draw_sentence(box, context, answer.message, "ERROR" if answer.level == "ERROR" else "INFO")
+        draw_wrapped(box, context, answer.message, "ERROR" if answer.level == "ERROR" else "INFO")
     elif choice.chosen_python().origin is choice.Origin.THIS:
         text = "Training needs PyTorch, which is not installed yet; install it in the preferences."
-        draw_sentence(box, context, text, "ERROR")
+        draw_wrapped(box, context, text, "ERROR")
     else:
-        draw_sentence(box, context, f"Python not checked yet: {choice.chosen_python().path}", "INFO")
+        draw_wrapped(box, context, f"Python not checked yet: {choice.chosen_python().path}", "INFO")
     row = box.row(align=True)
     row.operator("fdda.check_trainer", text="Check Setup", icon="VIEWZOOM")
     if preferences() is not None:
@@ -96,7 +96,7 @@ def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool
 
 
 def _draw_settings(
-    layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, found: Trained | None, ready: bool
+    layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, found: TrainedFile | None, ready: bool
 ) -> None:
     from ..core.recording.folder import FolderState
 
@@ -111,23 +111,23 @@ def _draw_settings(
     goal.prop(settings, "goal_mm", text="")
     column.prop(settings, "epochs")
     draw_path(layout, settings, "model", default_model(rig.mesh_object))
-    content = shown_content(rig)
+    content = read_content(rig)
     if isinstance(content, str):
-        draw_sentence(layout, context, content, "ERROR")
+        draw_wrapped(layout, context, content, "ERROR")
         ready = False
     elif content[1].state is not FolderState.COMPLETE:
-        draw_sentence(layout, context, "This rig has no complete recording yet; record first.", "INFO")
+        draw_wrapped(layout, context, "This rig has no complete recording yet; record first.", "INFO")
         ready = False
-    if found is not None and found.foreign:
-        text = f"{found.path.name} belongs to another rig: {found.foreign}. Train will ask before it overwrites it."
-        draw_sentence(layout, context, text, "ERROR")
+    if found is not None and found.mismatch:
+        text = f"{found.path.name} belongs to another rig: {found.mismatch}. Train will ask before it overwrites it."
+        draw_wrapped(layout, context, text, "ERROR")
     elif found is not None:
-        draw_sentence(layout, context, f"{found.path.name} exists; Train will overwrite it.", "CHECKMARK")
+        draw_wrapped(layout, context, f"{found.path.name} exists; Train will overwrite it.", "CHECKMARK")
     row = layout.row()
     row.enabled = ready
     row.scale_y = 1.3
     draw_button(row, context, "fdda.train", "Train" if found is None else "Train Again", "PLAY")
-    if found is None or found.foreign:
+    if found is None or found.mismatch:
         return
     # What a better model takes, in the order of the work.
     on = layout.column(align=True)
@@ -136,35 +136,35 @@ def _draw_settings(
     if checkpoint_path(found.path).is_file():
         on.operator("fdda.train", text="Continue Training", icon="FF").warm_start = True
     else:
-        draw_sentence(layout, context, "Its checkpoint is missing, so training cannot continue from it.", "INFO")
+        draw_wrapped(layout, context, "Its checkpoint is missing, so training cannot continue from it.", "INFO")
     if not rig.mesh_object.fdda.is_bound:
         bind = layout.operator("fdda.bind", text=f"Bind '{found.path.name}'", icon="LINKED")
         bind.object, bind.filepath = rig.mesh_object.name, str(found.path)
 
 
 def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, model: Path) -> None:
-    report = _report(report_path(model))
+    report = _read_report(report_path(model))
     if report is None or report["model"] != model.name:
         return
     if goal := report.get("goal"):
-        draw_sentence(layout, context, *_goal(goal))
+        draw_wrapped(layout, context, *_describe_goal(goal))
     for warning in report.get("warnings", ()):
-        draw_sentence(layout, context, f"Warning: {warning['name']}; see the training report.", "INFO")
+        draw_wrapped(layout, context, f"Warning: {warning['name']}; see the training report.", "INFO")
     model_mm, skinning_mm = (report[way]["held_out"] for way in ("fdda", "linear"))
     text = f"Unseen poses: mean {model_mm['mean']:.2f} mm (skinning alone {skinning_mm['mean']:.2f}), max "
-    draw_sentence(layout, context, f"{text}{model_mm['max']:.1f} ({skinning_mm['max']:.1f})")
-    draw_sentence(layout, context, f"99.9 % of points within {model_mm['p999']:.2f} mm")
+    draw_wrapped(layout, context, f"{text}{model_mm['max']:.1f} ({skinning_mm['max']:.1f})")
+    draw_wrapped(layout, context, f"99.9 % of points within {model_mm['p999']:.2f} mm")
     header, body = layout.panel("fdda_held_out", default_closed=True)
     header.label(text="Error by Body Part")
     if body is None:
         return
     partitions = sorted(report["partitions"], key=lambda p: -p["held_out"]["max"])
     shown = partitions if context.window_manager.fdda.show_all_partitions else partitions[:SHOWN_PARTITIONS]
-    names, means, nearly, largest = _columns(body.box())
+    names, means, nearly, largest = _table_columns(body.box())
     for column, text in ((names, "Body Part"), (means, "Mean"), (nearly, "99.9 %"), (largest, "Max")):
         column.label(text=text)
     for p in shown:
-        names.label(text=shown_name(rig.armature_object, p["joint"]))
+        names.label(text=short_bone_name(rig.armature_object, p["joint"]))
         means.label(text=f"{p['held_out']['mean']:.3f}")
         nearly.label(text=f"{p['held_out']['p999']:.2f}")
         largest.label(text=f"{p['held_out']['max']:.2f}")
@@ -173,7 +173,7 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         body.prop(context.window_manager.fdda, "show_all_partitions", text=text, toggle=True)
 
 
-def _columns(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
+def _table_columns(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
     """A column for names, and three for numbers at the right."""
     left = layout.split(factor=0.4)
     columns = [left.column(align=True)]
@@ -184,7 +184,7 @@ def _columns(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
     return columns
 
 
-def _goal(goal: dict) -> tuple[str, str]:
+def _describe_goal(goal: dict) -> tuple[str, str]:
     """A sentence and an icon for what the report says of the accuracy goal."""
     reached = f"99.9 % of points within {goal['p999']:.2f} mm, goal {goal['goal']:g} mm"
     return {
@@ -194,19 +194,19 @@ def _goal(goal: dict) -> tuple[str, str]:
     }[Verdict(goal["verdict"])]
 
 
-def _report(path: Path) -> dict | None:
+def _read_report(path: Path) -> dict | None:
     """The report beside a model, read again when it has changed; None when there is none that can be drawn."""
     try:
         stamp = os.stat(path).st_mtime_ns
     except OSError:
         return None
-    if path not in _reports or _reports[path][0] != stamp:
+    if path not in _report_cache or _report_cache[path][0] != stamp:
         try:
             report = read_report(path)
         except TrainingError:
             report = None
-        _reports[path] = (stamp, report)
-    return _reports[path][1]
+        _report_cache[path] = (stamp, report)
+    return _report_cache[path][1]
 
 
 CLASSES = (FDDA_PT_training,)

@@ -13,7 +13,7 @@ from bpy.props import (
 )
 
 from .character import FDDA_PG_character
-from .without_keys import without_keys
+from .not_animatable import not_animatable
 
 OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}
 """A linked character keeps in the shot what is set there: Blender resets everything else of a library override."""
@@ -33,7 +33,7 @@ def _apply_mask(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None
     on_mask_update(binding.id_data)
 
 
-@without_keys
+@not_animatable
 class FDDA_PG_modifier(bpy.types.PropertyGroup):
     """A modifier of the rig and how it was shown before a model took its place."""
 
@@ -42,7 +42,7 @@ class FDDA_PG_modifier(bpy.types.PropertyGroup):
     show_render: BoolProperty(override=OVERRIDABLE)
 
 
-@without_keys
+@not_animatable
 class FDDA_PG_model(bpy.types.PropertyGroup):
     """A model of a mesh: its file, or the text that holds it."""
 
@@ -63,7 +63,7 @@ class FDDA_PG_model(bpy.types.PropertyGroup):
     packed_bytes: IntProperty(name="Size", description="Size of the packed model in bytes", override=OVERRIDABLE)
 
 
-@without_keys
+@not_animatable
 class FDDA_PG_binding(bpy.types.PropertyGroup):
     """A model bound to a mesh object."""
 

@@ -21,10 +21,10 @@ from ..core.defaults import EPOCHS, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREA
 from ..core.errors import OutputError
 from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import resolve_path
-from .without_keys import without_keys
+from .not_animatable import not_animatable
 
 
-@without_keys
+@not_animatable
 class FDDA_PG_bone(bpy.types.PropertyGroup):
     """A bone that random poses move."""
 
@@ -51,7 +51,7 @@ def _shorten_data_path(control: "FDDA_PG_control", _context: bpy.types.Context) 
         control.name = name
 
 
-@without_keys
+@not_animatable
 class FDDA_PG_control(bpy.types.PropertyGroup):
     """A number that is an input of the model, as `scene.controls.parse_controls` reads it."""
 
@@ -69,7 +69,7 @@ class FDDA_PG_control(bpy.types.PropertyGroup):
     high: FloatProperty(name="Maximum", description="Highest value in random poses", default=1.0)
 
 
-@without_keys
+@not_animatable
 class FDDA_PG_character(bpy.types.PropertyGroup):
     """How a character is sampled, recorded and trained; saved with its mesh object."""
 
@@ -202,12 +202,12 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
     training_seed: IntProperty(name="Seed", description="Random seed of the training", min=0)
 
 
-def wanted_fit(settings: FDDA_PG_character) -> str:
+def fit_kind(settings: FDDA_PG_character) -> str:
     """Kind of the skin weights that are fitted (`core.skin_fit.KINDS`); empty for those of the rig."""
     return "" if settings.fit_linear == "RIG" else settings.fit_linear.lower()
 
 
-@without_keys
+@not_animatable
 class FDDA_PG_action(bpy.types.PropertyGroup):
     """What an action is used for; saved with it."""
 

@@ -16,8 +16,8 @@ from ..training.environment.folder import EXTENSION, FolderState, obstacle, own_
 MODULE = EXTENSION or __package__.partition(".")[0]
 """Under which Blender keeps the preferences. Imported without being installed, the add-on has none."""
 
-ICONS = {"INFO": "CHECKMARK", "WARNING": "INFO", "ERROR": "ERROR"}
-SHORT = {
+LEVEL_ICONS = {"INFO": "CHECKMARK", "WARNING": "INFO", "ERROR": "ERROR"}
+STATE_LABELS = {
     FolderState.MISSING: "Not installed",
     FolderState.HALF_MADE: "Incomplete: its installation was interrupted; reinstall it, or remove it",
     FolderState.BROKEN: "Broken: its Python is missing; reinstall it",
@@ -116,7 +116,7 @@ def wheels_folder() -> str:
 
 def draw_check(layout: bpy.types.UILayout) -> None:
     """Which Python trains, a button to check it, and what the last check said. Asks nothing."""
-    _, right = _split(layout)
+    _, right = _split_row(layout)
     right.operator("fdda.check_trainer", text="Check Setup", icon="VIEWZOOM")
     if current(ENVIRONMENT) is None:
         draw_check_result(layout, session.check_result)
@@ -125,14 +125,16 @@ def draw_check(layout: bpy.types.UILayout) -> None:
 def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -> None:
     """The environment that the add-on makes: its state, its buttons, its progress."""
     state = session.own_state()
-    left, right = _split(layout)
+    left, right = _split_row(layout)
     left.label(text="Training Environment")
-    right.label(text=SHORT[state], icon="ERROR" if state in (FolderState.HALF_MADE, FolderState.BROKEN) else "NONE")
+    right.label(
+        text=STATE_LABELS[state], icon="ERROR" if state in (FolderState.HALF_MADE, FolderState.BROKEN) else "NONE"
+    )
     layout.prop(own, "wheels_folder", placeholder="None: install from the internet")
     if (job := current(ENVIRONMENT)) is not None:
         draw_job(layout, job)
     else:
-        _, row = _split(layout)
+        _, row = _split_row(layout)
         row = row.row(align=True)
         reason = obstacle(own.wheels_folder)
         again = state is not FolderState.MISSING
@@ -149,7 +151,7 @@ def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -
     draw_lines(layout, f"Folder: {own_folder()}")
 
 
-def _split(layout: bpy.types.UILayout) -> tuple[bpy.types.UILayout, bpy.types.UILayout]:
+def _split_row(layout: bpy.types.UILayout) -> tuple[bpy.types.UILayout, bpy.types.UILayout]:
     """A row as Blender splits those of properties: names on the left, values on the right."""
     split = layout.split(factor=0.4)
     left, right = split.row(), split.row()
@@ -174,7 +176,7 @@ def draw_check_result(layout: bpy.types.UILayout, answer: CheckResult | None) ->
     if answer is None:
         return
     box = layout.box()
-    draw_lines(box, answer.message, ICONS[answer.level], alert=answer.level == "ERROR")
+    draw_lines(box, answer.message, LEVEL_ICONS[answer.level], alert=answer.level == "ERROR")
     column = box.column(align=True)
     column.active = False
     for line in answer.details:

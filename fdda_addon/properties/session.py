@@ -10,8 +10,8 @@ from ..core.errors import FDDAError
 from ..jobs.job import current
 from ..scene import undo
 from ..scene.active_rig import cached_active_rig
-from .choices import recording_settings
-from .without_keys import without_keys
+from .not_animatable import not_animatable
+from .recording_options import recording_settings
 
 
 def _show_random_pose(session: "FDDA_PG_session", number: int) -> None:
@@ -29,7 +29,7 @@ def _show_random_pose(session: "FDDA_PG_session", number: int) -> None:
         undo.push_undo_soon("Preview Pose")
 
 
-@without_keys
+@not_animatable
 class FDDA_PG_session(bpy.types.PropertyGroup):
     """What the sidebar shows."""
 
@@ -49,7 +49,7 @@ class FDDA_PG_session(bpy.types.PropertyGroup):
         get=lambda session: session.pose_index + 1,
         set=_show_random_pose,
     )
-    joint_index: IntProperty(name="Joint")
+    bone_index: IntProperty(name="Joint")
     action_index: IntProperty(name="Action")
     show_all_partitions: BoolProperty(
         name="Show All", description="List all body parts of the model, not only the worst"

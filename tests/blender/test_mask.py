@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.evaluation import last_evaluation
-from fdda_addon.panels.playback import mask_sentence
+from fdda_addon.panels.playback import mask_problem
 from fdda_addon.rig.reading import read_model_rig
 from fdda_addon.runtime import registry
 from fdda_addon.runtime.network import Network
@@ -110,7 +110,7 @@ def test_without_the_group_the_model_counts_everywhere(masked, elbow, what):
     assert_plays(masked, elbow.model)
     name = masked.fdda.mask
     said = f"'elbow' has no vertex group '{name}', so the model counts everywhere; choose another mask."
-    assert mask_sentence(masked) == (said if name else "")
+    assert mask_problem(masked) == (said if name else "")
 
 
 def test_a_group_that_is_not_a_bones_changes_nothing_of_the_rig(masked, elbow):

@@ -37,12 +37,12 @@ def test_recorded_trained_bound_switched_and_evaluated_in_one_go(two, tmp_path):
     assert job.state_of("train").outcome.startswith("Trained 'two_elbow.onnx' and 'two_elbow_001.onnx' in")
     assert bpy.ops.fdda.bind(all_meshes=True) == {"FINISHED"}
     for mode in ("RIG", "LINEAR", "FDDA"):
-        bpy.ops.fdda.switch(mode=mode, all_meshes=True)
+        bpy.ops.fdda.set_mode(mode=mode, all_meshes=True)
         assert [mesh_object.fdda.mode for mesh_object in two] == [mode, mode]
     bpy.ops.fdda.evaluate(source="RANDOM", poses=3, all_meshes=True)
     assert all(last_evaluation.get(mesh_object).poses == 3 for mesh_object in two)
     assert "of 'elbow.001'" in job.state_of("evaluate").outcome
-    bpy.ops.fdda.switch(mode="RIG")
+    bpy.ops.fdda.set_mode(mode="RIG")
     assert [mesh_object.fdda.mode for mesh_object in two] == ["RIG", "FDDA"]
     assert bpy.ops.fdda.unbind(all_meshes=True) == {"FINISHED"}
     assert not any(mesh_object.fdda.is_bound for mesh_object in two)
@@ -53,7 +53,7 @@ def test_one_button_records_trains_and_binds(two):
     assert bpy.ops.fdda.build_model() == {"FINISHED"}
     assert bpy.data.is_dirty, "Blender asks before it closes the file"
     assert two[0].fdda.mode == "FDDA" and two[0].fdda.packed is not None and not two[1].fdda.is_bound
-    # Recorded already: it is trained again, and the new model plays.
+    # Recorded already: it is find_trained_file again, and the new model plays.
     before = two[0].fdda.packed.session_uid
     two[0].fdda.settings.training_seed = 5
     assert bpy.ops.fdda.build_model() == {"FINISHED"}
@@ -74,8 +74,9 @@ def test_all_meshes_is_nothing_where_a_mesh_is_active(two):
 
 
 def test_a_model_that_an_undo_takes_off_the_list_is_known(two):
+    from fdda_addon.panels.find_trained_file import find_trained_file
+
     from fdda_addon.panels import checks
-    from fdda_addon.panels.trained import trained
     from fdda_addon.scene.scene_rig import SceneRig
 
     bpy.context.view_layer.objects.active = two[0]
@@ -83,18 +84,21 @@ def test_a_model_that_an_undo_takes_off_the_list_is_known(two):
     bpy.context.view_layer.objects.active = bpy.data.objects[ELBOW_RIG]
     with pytest.raises(RuntimeError, match="two_elbow_001_recording' is not a recording"):
         bpy.ops.fdda.train(all_meshes=True)
-    assert [entry.name for entry in two[0].fdda.models] == ["two_elbow"], "it was trained before the other failed"
+    assert [entry.name for entry in two[0].fdda.models] == ["two_elbow"], (
+        "it was find_trained_file before the other failed"
+    )
     bpy.context.view_layer.objects.active = two[0]
     two[0].fdda.models.clear()
     rig = SceneRig(two[0], bpy.data.objects[ELBOW_RIG])
     checks.check_now(rig)
-    assert trained(rig).path.name == "two_elbow.onnx" and not trained(rig).foreign
+    assert find_trained_file(rig).path.name == "two_elbow.onnx" and not find_trained_file(rig).mismatch
     assert bpy.ops.fdda.bind() == {"FINISHED"} and two[0].fdda.is_bound
 
 
 def test_a_model_of_another_mesh_of_the_name_is_told(two):
+    from fdda_addon.panels.find_trained_file import find_trained_file
+
     from fdda_addon.panels import checks
-    from fdda_addon.panels.trained import trained
     from fdda_addon.scene.scene_rig import SceneRig
 
     bpy.context.view_layer.objects.active = two[0]
@@ -105,4 +109,4 @@ def test_a_model_of_another_mesh_of_the_name_is_told(two):
     bpy.context.view_layer.update()
     rig = SceneRig(two[0], bpy.data.objects[ELBOW_RIG])
     checks.check_now(rig)
-    assert "the rest pose of the mesh differs" in trained(rig).foreign
+    assert "the rest pose of the mesh differs" in find_trained_file(rig).mismatch

@@ -69,29 +69,29 @@ def test_what_cannot_be_evaluated_says_why(active):
     refused(bpy.ops.fdda.evaluate, "'elbow_rig' has no action; give it one, or compare on random poses.")
     for name in ("fit_range", "mark_worst", "jump_to_worst"):
         refused(getattr(bpy.ops.fdda, name), "Nothing was evaluated since Blender was started; evaluate first")
-    refused(lambda: bpy.ops.fdda.paint(colors="ERRORS"), "'elbow' was not evaluated since Blender was started")
+    refused(lambda: bpy.ops.fdda.color_mesh(colors="ERRORS"), "'elbow' was not evaluated since Blender was started")
     assert last_evaluation.get(active) is None and active.fdda.mode == "FDDA"
 
 
 def test_colours_are_those_of_the_report(active, evaluated_action, view):
-    bpy.ops.fdda.paint()
+    bpy.ops.fdda.color_mesh()
     assert heat_map.painted(active) == "ERRORS"
     errors = evaluated_action.errors
     assert view.range_mm == pytest.approx(np.percentile(errors["fdda"].mean(axis=0), 99.5) * 1000, rel=0.06)
     view.range_mm = 10.0
-    bpy.ops.fdda.paint()
+    bpy.ops.fdda.color_mesh()
     np.testing.assert_array_equal(heat_map.colors_of(active), heat_colors(errors["fdda"].mean(axis=0)))
     view.way, view.statistic, view.range_mm = "linear", "max", 2.0
     np.testing.assert_array_equal(heat_map.colors_of(active), heat_colors(errors["linear"].max(axis=0), 0.002))
-    assert bpy.ops.fdda.fit_range() == {"FINISHED"}
+    assert bpy.ops.fdda.fit_color_range() == {"FINISHED"}
     expected = np.percentile(errors["linear"].max(axis=0), 99.5) * 1000
     assert view.range_mm == pytest.approx(expected, rel=0.06)
-    bpy.ops.fdda.paint(colors="NONE")
+    bpy.ops.fdda.color_mesh(colors="NONE")
     assert heat_map.colors_of(active) is None and heat_map.painted(active) == ""
 
 
 def test_colours_follow_the_timeline(active, evaluated_action, view):
-    bpy.ops.fdda.paint()
+    bpy.ops.fdda.color_mesh()
     view.statistic = "pose"
     for frame in (evaluated_action.first_frame, 12):
         bpy.context.scene.frame_set(frame)
@@ -100,11 +100,11 @@ def test_colours_follow_the_timeline(active, evaluated_action, view):
         np.testing.assert_array_equal(heat_map.colors_of(active), expected)
     bpy.context.scene.frame_set(evaluated_action.first_frame + evaluated_action.poses)
     assert heat_map.colors_of(active) is None
-    refused(bpy.ops.fdda.fit_range, "choose another frame, or show the mean")
+    refused(bpy.ops.fdda.fit_color_range, "choose another frame, or show the mean")
 
 
 def test_partitions_in_colour(active):
-    bpy.ops.fdda.paint(colors="PARTITIONS")
+    bpy.ops.fdda.color_mesh(colors="PARTITIONS")
     colors, partitions = heat_map.colors_of(active), make_partitions(read_rig(find_rig()))
     assert [len(np.unique(colors[p.vertices], axis=0)) for p in partitions] == [1, 1]
     assert not np.array_equal(*(colors[p.vertices[0]] for p in partitions))
@@ -118,7 +118,7 @@ def test_nothing_of_the_file_is_touched_by_colours(active, evaluated_action):
 
     before = datablocks()
     for colors in ("ERRORS", "PARTITIONS"):
-        bpy.ops.fdda.paint(colors=colors)
+        bpy.ops.fdda.color_mesh(colors=colors)
         assert datablocks() == before
 
 
@@ -127,12 +127,12 @@ def test_worst_frames_are_marked_and_jumped_to(active, evaluated_action):
     own = scene.timeline_markers.new("FDDA notes", frame=3)
     largest = evaluated_action.errors["fdda"].max(axis=1)
     worst = evaluated_action.first_frame + int(largest.argmax())
-    assert bpy.ops.fdda.mark_worst(count=3) == {"FINISHED"}
+    assert bpy.ops.fdda.add_worst_markers(count=3) == {"FINISHED"}
     found = markers.find(scene)
     assert found[0].frame == worst and found[0].name == f"FDDA 1: {largest.max() * 1000:.2f} mm"
     frames = sorted(marker.frame for marker in found)
     assert 1 < len(found) <= 3 and min(np.diff(frames)) >= last_evaluation.FRAMES_APART
-    bpy.ops.fdda.mark_worst(count=1)
+    bpy.ops.fdda.add_worst_markers(count=1)
     assert [marker.frame for marker in markers.find(scene)] == [worst]
     bpy.ops.fdda.jump_to_worst()
     assert scene.frame_current == worst
@@ -147,7 +147,7 @@ def test_the_worst_random_pose_is_set(active, view):
     bpy.ops.fdda.evaluate(source="RANDOM", poses=9)
     last = last_evaluation.get(active)
     worst = int(last.errors["fdda"].max(axis=1).argmax())
-    refused(bpy.ops.fdda.mark_worst, "Random poses have no frames to mark")
+    refused(bpy.ops.fdda.add_worst_markers, "Random poses have no frames to mark")
     pose(angle=0.0)
     bpy.data.objects[ELBOW_RIG].animation_data.action = None
     assert bpy.ops.fdda.jump_to_worst() == {"FINISHED"}

@@ -58,7 +58,7 @@ class FDDA_OT_count(JobOperator, bpy.types.Operator):  # noqa: N801 - Blender wa
             bpy.context.scene["counted"], self.changes_file = result, True
         return f"Counted to {result}."
 
-    def cancelled(self, _context: bpy.types.Context) -> str:
+    def cancel_message(self, _context: bpy.types.Context) -> str:
         return f"Counting cancelled at {self.state.done}."
 
 

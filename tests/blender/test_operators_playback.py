@@ -102,21 +102,21 @@ def test_switch(bound, elbow):
     pose(angle=1.3)
     playing = assert_plays(bound, elbow.model)
     for mode in ("RIG", "LINEAR"):
-        assert bpy.ops.fdda.switch(mode=mode) == {"FINISHED"}
+        assert bpy.ops.fdda.set_mode(mode=mode) == {"FINISHED"}
         assert bound.fdda.mode == mode
         assert np.abs(evaluated(bound) - playing).max() > 5e-5
-    bpy.ops.fdda.switch(mode="RIG")
-    bpy.ops.fdda.switch()
+    bpy.ops.fdda.set_mode(mode="RIG")
+    bpy.ops.fdda.set_mode()
     assert bound.fdda.mode == "FDDA"
-    bpy.ops.fdda.switch()
+    bpy.ops.fdda.set_mode()
     assert bound.fdda.mode == "RIG"
 
 
 def test_switch_says_why_a_model_cannot_play(bound):
     bpy.context.view_layer.objects.active = bound
-    bpy.ops.fdda.switch(mode="RIG")
+    bpy.ops.fdda.set_mode(mode="RIG")
     bound.modifiers.remove(playback_modifier.find_modifier(bound))
-    refused(lambda: bpy.ops.fdda.switch(mode="FDDA"), "was removed; bind the model again")
+    refused(lambda: bpy.ops.fdda.set_mode(mode="FDDA"), "was removed; bind the model again")
 
 
 def test_measure(bound):

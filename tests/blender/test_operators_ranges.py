@@ -57,39 +57,39 @@ def degrees(pose_bone: bpy.types.PoseBone) -> list[tuple[float, float]]:
 def test_many_bones_at_once(armature_object):
     select(armature_object, "LeftArm", "tail")
     low, high = (math.radians(-10), 0, math.radians(-30)), (math.radians(20), 1, math.radians(5))
-    assert bpy.ops.fdda.edit_ranges(axes=(True, False, True), low=low, high=high) == {"FINISHED"}
+    assert bpy.ops.fdda.set_limits(axes=(True, False, True), low=low, high=high) == {"FINISHED"}
     for name in ("LeftArm", "tail"):
         assert degrees(bone(armature_object, name)) == [(-10, 20), (-45, 45), (-30, 5)]
     assert all(r.source == DEFAULT for r in rotation_ranges(bone(armature_object, "Hips")))
     with pytest.raises(RuntimeError, match="The maximum about X must be larger than the minimum"):
-        bpy.ops.fdda.edit_ranges(low=high, high=low)
+        bpy.ops.fdda.set_limits(low=high, high=low)
 
 
 def test_copy_and_mirror(armature_object):
     select(armature_object, "LeftArm")
     low, high = ([math.radians(v) for v in values] for values in ((-10, -20, -30), (1, 2, 3)))
-    bpy.ops.fdda.edit_ranges(low=low, high=high)
-    assert bpy.ops.fdda.mirror_ranges() == {"FINISHED"}
+    bpy.ops.fdda.set_limits(low=low, high=high)
+    assert bpy.ops.fdda.mirror_limits() == {"FINISHED"}
     assert degrees(bone(armature_object, "RightArm")) == [(-10, 1), (-2, 20), (-3, 30)]
     select(armature_object, "tail", "Hips")
-    assert bpy.ops.fdda.copy_ranges(bone="mixamorig:LeftArm") == {"FINISHED"}
+    assert bpy.ops.fdda.copy_limits(bone="mixamorig:LeftArm") == {"FINISHED"}
     assert degrees(bone(armature_object, "tail")) == degrees(bone(armature_object, "LeftArm"))
-    assert bpy.ops.fdda.forget_ranges() == {"FINISHED"}
+    assert bpy.ops.fdda.clear_limits() == {"FINISHED"}
     assert all(r.source == DEFAULT for r in rotation_ranges(bone(armature_object, "tail")))
     select(armature_object, "tail")
     with pytest.raises(RuntimeError, match="No selected bone has a bone of the same name on the other side"):
-        bpy.ops.fdda.mirror_ranges()
+        bpy.ops.fdda.mirror_limits()
 
 
 def test_nothing_selected(armature_object):
     select(armature_object)
-    for operator in (bpy.ops.fdda.edit_ranges, bpy.ops.fdda.mirror_ranges, bpy.ops.fdda.forget_ranges):
+    for operator in (bpy.ops.fdda.set_limits, bpy.ops.fdda.mirror_limits, bpy.ops.fdda.clear_limits):
         with pytest.raises(RuntimeError, match="No bone of 'person' is selected; check bones in the list"):
             operator()
 
 
 def test_a_person(armature_object):
-    assert bpy.ops.fdda.limits_preset() == {"FINISHED"}
+    assert bpy.ops.fdda.human_limits() == {"FINISHED"}
     assert all(r.source == DEFAULT for r in rotation_ranges(bone(armature_object, "tail")))
     # Arms hang from a T pose by a turn about Y of the body; forearms fold by one about Z.
     for side, sign in (("Left", 1), ("Right", -1)):
@@ -100,8 +100,8 @@ def test_a_person(armature_object):
         low, high = (round(math.degrees(v)) for v in found[folding])
         assert {low, high} == {0, 120 if turned > 0 else -120} or {low, high} == {0, -120 if turned < 0 else 120}
     with pytest.raises(RuntimeError, match="No bone of 'person' without limits has the name of a body part"):
-        bpy.ops.fdda.limits_preset()
-    assert bpy.ops.fdda.limits_preset(replace=True) == {"FINISHED"}
+        bpy.ops.fdda.human_limits()
+    assert bpy.ops.fdda.human_limits(replace=True) == {"FINISHED"}
 
 
 @pytest.mark.parametrize(

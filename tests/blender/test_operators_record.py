@@ -18,7 +18,7 @@ from fdda_addon.core.recording.lock import LOCK
 from fdda_addon.core.recording.lock import _lock as lock_file
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.jobs import job
-from fdda_addon.operators.rig import cost_of
+from fdda_addon.operators.rig import measured_cost
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.properties.character import model_file
 from fdda_addon.rig.reading import read_rig
@@ -43,7 +43,7 @@ def recorded_folder(tmp_path: Path) -> Path:
 class TestRig:
     def test_the_cube_of_a_new_file_is_out_of_the_way_and_the_arm_in_view(self):
         bpy.ops.wm.read_factory_settings()
-        assert bpy.ops.fdda.add_arm(density="1") == {"FINISHED"}
+        assert bpy.ops.fdda.add_sample_arm(density="1") == {"FINISHED"}
         assert not bpy.data.objects["Cube"].visible_get() and bpy.data.objects["Cube"].hide_render
         views = [a.spaces.active.region_3d for s in bpy.data.screens for a in s.areas if a.type == "VIEW_3D"]
         assert views
@@ -55,7 +55,7 @@ class TestRig:
         cube = bpy.context.active_object
         cube.location.x = 3
         bpy.context.view_layer.update()
-        assert bpy.ops.fdda.add_arm() == {"FINISHED"}
+        assert bpy.ops.fdda.add_sample_arm() == {"FINISHED"}
         arm = bpy.context.active_object
         assert arm.name == "arm" and len(arm.data.vertices) == 9960 and arm.select_get()
         assert cube.visible_get(), "somebody has moved it"
@@ -63,9 +63,9 @@ class TestRig:
         assert bpy.context.scene.frame_end == 250
 
     def test_a_second_arm_has_a_rig_of_its_own(self):
-        bpy.ops.fdda.add_arm(density="1")
+        bpy.ops.fdda.add_sample_arm(density="1")
         bpy.context.scene.frame_end = 77
-        bpy.ops.fdda.add_arm(density="1")
+        bpy.ops.fdda.add_sample_arm(density="1")
         second = bpy.context.active_object
         assert second.name == "arm.001" and second.modifiers["Armature"].object.name == "arm_rig.001"
         driver = second.data.shape_keys.animation_data.drivers[0].driver
@@ -74,7 +74,7 @@ class TestRig:
 
     def test_adding_the_arm_can_be_undone(self):
         bpy.ops.ed.undo_push()
-        bpy.ops.fdda.add_arm(density="1")
+        bpy.ops.fdda.add_sample_arm(density="1")
         bpy.ops.ed.undo_push()
         bpy.ops.ed.undo()
         assert "arm" not in bpy.data.objects and "arm_rig" not in bpy.data.objects
@@ -82,13 +82,13 @@ class TestRig:
     def test_not_in_edit_mode(self, saved):
         bpy.ops.object.mode_set(mode="EDIT")
         with pytest.raises(RuntimeError, match="Objects are added in object mode; switch to it first"):
-            bpy.ops.fdda.add_arm(density="1")
+            bpy.ops.fdda.add_sample_arm(density="1")
 
     def test_measuring_gives_back_the_scene_and_keeps_the_cost(self, saved):
         before = scene_state(saved)
         assert bpy.ops.fdda.measure() == {"FINISHED"}
         assert_same_state(before, scene_state(saved))
-        cost = cost_of(saved.mesh_object)
+        cost = measured_cost(saved.mesh_object)
         assert cost.vertices == len(saved.mesh_object.data.vertices)
         assert cost.rig > cost.linear > 0 and cost.model > cost.linear
         assert job.state_of("measure").outcome.endswith("Not worth it here: this rig is faster than a model.")
@@ -188,7 +188,7 @@ class TestPoses:
 
     def test_a_range_is_written_where_the_bone_has_it(self, saved):
         bone = saved.armature_object.pose.bones["upper"]
-        result = bpy.ops.fdda.state_range(bone="upper", axis="Y", low=math.radians(10), high=math.radians(60))
+        result = bpy.ops.fdda.set_limit(bone="upper", axis="Y", low=math.radians(10), high=math.radians(60))
         assert result == {"FINISHED"} and self.ranges(saved)["upper Y"] == (10, 60)
         assert math.degrees(bone.constraints[0].min_y) == pytest.approx(10)
         assert not bone.use_ik_limit_y
@@ -197,21 +197,21 @@ class TestPoses:
         bone = saved.armature_object.pose.bones["upper"]
         bone.constraints.remove(bone.constraints[0])
         bone.lock_rotation[2] = True
-        bpy.ops.fdda.state_range(bone="upper", axis="Z", low=-1, high=0.5)
+        bpy.ops.fdda.set_limit(bone="upper", axis="Z", low=-1, high=0.5)
         assert self.ranges(saved)["upper Z"] == (-57, 29) and self.ranges(saved)["upper X"] == (-45, 45)
         assert bone.use_ik_limit_z and not bone.constraints
         with pytest.raises(RuntimeError, match="IK limits, which hold the rest pose; begin at 0 or below"):
-            bpy.ops.fdda.state_range(bone="upper", axis="X", low=0.5, high=1)
-        bpy.ops.fdda.unstate_range(bone="upper", axis="Z")
+            bpy.ops.fdda.set_limit(bone="upper", axis="X", low=0.5, high=1)
+        bpy.ops.fdda.clear_limit(bone="upper", axis="Z")
         assert self.ranges(saved)["upper Z"] == (-45, 45)
-        bpy.ops.fdda.state_range(bone="upper", axis="X", low=0.5, high=1)
+        bpy.ops.fdda.set_limit(bone="upper", axis="X", low=0.5, high=1)
         assert self.ranges(saved)["upper X"] == (29, 57) and len(bone.constraints) == 1
 
     def test_an_empty_range_and_an_unknown_bone(self, saved):
         with pytest.raises(RuntimeError, match="The range of 'upper' about Y is empty; give a larger maximum"):
-            bpy.ops.fdda.state_range(bone="upper", axis="Y", low=1, high=0)
+            bpy.ops.fdda.set_limit(bone="upper", axis="Y", low=1, high=0)
         with pytest.raises(RuntimeError, match="'elbow_rig' has no bone 'tail'; give the name of one"):
-            bpy.ops.fdda.unstate_range(bone="tail", axis="Y")
+            bpy.ops.fdda.clear_limit(bone="tail", axis="Y")
 
 
 class TestRecording:
@@ -236,7 +236,7 @@ class TestRecording:
         assert job.state_of("record").outcome == "Recorded 50 poses into 'elbow_recording'."
 
     def test_an_unsaved_file_has_no_place_for_it(self):
-        bpy.ops.fdda.add_arm(density="1")
+        bpy.ops.fdda.add_sample_arm(density="1")
         with pytest.raises(RuntimeError, match=r"The \.blend file has not been saved, so there is no place beside it"):
             bpy.ops.fdda.record()
 
@@ -281,10 +281,10 @@ class TestRecording:
 
     def test_removing_a_recording(self, saved, tmp_path):
         with pytest.raises(RuntimeError, match="holds no recording; there is nothing to remove"):
-            bpy.ops.fdda.remove_recording()
+            bpy.ops.fdda.delete_recording()
         self.record(saved)
         (recorded_folder(tmp_path) / "notes.txt").write_text("mine")
-        assert bpy.ops.fdda.remove_recording() == {"FINISHED"}
+        assert bpy.ops.fdda.delete_recording() == {"FINISHED"}
         assert [path.name for path in recorded_folder(tmp_path).iterdir()] == ["notes.txt"]
 
     def test_a_bound_rig_is_recorded_as_the_true_rig(self, bound, elbow, tmp_path):

@@ -12,11 +12,11 @@ from fdda_addon.core.poses import CONTROL, LOCATION, ROTATION
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.panels import checks
-from fdda_addon.panels.poses import sampled_by_bone
-from fdda_addon.panels.recording import content_of
-from fdda_addon.panels.sampled import counted
+from fdda_addon.panels.poses import sampled_channels_by_bone
+from fdda_addon.panels.recording import cached_content
+from fdda_addon.panels.sampling import describe_channels
 from fdda_addon.properties.character import recording_folder
-from fdda_addon.properties.choices import recording_settings
+from fdda_addon.properties.recording_options import recording_settings
 from fdda_addon.recording.plan import read_sampled_rig
 from fdda_addon.scene.compatibility import curves_of
 from fdda_addon.scene.control_names import control_default, suggested_controls
@@ -82,7 +82,7 @@ class TestBones:
     def test_those_with_weights_where_nothing_is_chosen(self, arm):
         assert recording_settings(arm).sample == ()
         assert checks.check_now(arm).problems == ()
-        assert sampled_by_bone(arm) is None, "the list has the joints"
+        assert sampled_channels_by_bone(arm) is None, "the list has the joints"
 
     def test_a_bone_collection(self, arm):
         settings = arm.mesh_object.fdda.settings
@@ -95,9 +95,9 @@ class TestBones:
         settings.bone_collection = control_rigs.CONTROLS
         bpy.ops.fdda.add_control(name=IK)
         check = checks.check_now(arm)
-        assert check.problems == () and set(sampled_by_bone(arm)) == CONTROL_BONES
+        assert check.problems == () and set(sampled_channels_by_bone(arm)) == CONTROL_BONES
         assert check.rig.joint_names == DEFORMING
-        assert counted(check) == "Random poses will move 4 bones (8 channels) and 1 extra input."
+        assert describe_channels(check) == "Random poses will move 4 bones (8 channels) and 1 extra input."
         recording = recorded(arm)
         assert recording.rig.joint_names == DEFORMING and sampled_bones(recording) == CONTROL_BONES
         assert [control.name for control in recording.rig.controls] == [IK]
@@ -118,7 +118,7 @@ class TestBones:
         action = wave(arm)
         check = checks.check_now(arm)
         assert check.problems == () and [control.name for control in check.automatic_controls] == [IK]
-        (turn,) = sampled_by_bone(arm)["fk_lower"]
+        (turn,) = sampled_channels_by_bone(arm)["fk_lower"]
         assert (turn.kind, turn.axis) == (ROTATION, 0)
         recording = recorded(arm)
         assert sampled_bones(recording) == {"fk_lower"}
@@ -174,11 +174,11 @@ class TestBones:
         settings.sample, settings.bone_collection = "COLLECTION", control_rigs.CONTROLS
         recorded(arm)
         checks.check_now(arm)
-        assert content_of(arm, recording_folder(arm.mesh_object)).sentence == ""
+        assert cached_content(arm, recording_folder(arm.mesh_object)).sentence == ""
         select(arm, "fk_upper")
         bpy.ops.fdda.use_selected_bones()
         checks.check_now(arm)
-        sentence = content_of(arm, recording_folder(arm.mesh_object)).sentence
+        sentence = cached_content(arm, recording_folder(arm.mesh_object)).sentence
         assert sentence == "It was recorded with other settings than those above: range of motion."
 
     def test_the_mesh_is_not_read_again_for_another_choice_of_control_bones(self, arm):
@@ -193,7 +193,7 @@ class TestBones:
 
 def sampled_by_bone_now(rig: SceneRig) -> dict:
     checks.check_now(rig)
-    return sampled_by_bone(rig)
+    return sampled_channels_by_bone(rig)
 
 
 class TestPreview:
@@ -238,7 +238,7 @@ class TestControls:
         control.has_range, control.low, control.high = True, 0.25, 0.75
         check = checks.check_now(face)
         assert check.problems == () and check.automatic_controls == ()
-        assert counted(check).endswith(" channels) and 2 extra inputs.")
+        assert describe_channels(check).endswith(" channels) and 2 extra inputs.")
         recording = recorded(face)
         ranges = {control.path: (control.low, control.high) for control in recording.rig.controls}
         assert ranges == {'key_blocks["flexed"].value': (0.25, 0.75), 'key_blocks["thin"].value': (-0.5, 1.0)}

@@ -67,7 +67,7 @@ def test_a_bound_model_comes_along_with_append(rig, elbow, model, tmp_path):
 
 
 def test_a_large_one_stays_outside_and_is_told(rig, model, monkeypatch):
-    monkeypatch.setattr(playback, "LARGE_BYTES", 1000)
+    monkeypatch.setattr(playback, "LARGE_MODEL_BYTES", 1000)
     assert playback.bind_model(rig, model_files.Path(model)).endswith("pack it in the Model Library.")
     assert rig.mesh_object.fdda.is_bound and rig.mesh_object.fdda.packed is None
     bpy.ops.fdda.bind(pack_large=True)

@@ -12,9 +12,9 @@ from fdda_addon.core.recording.folder import FolderState
 from fdda_addon.jobs import job
 from fdda_addon.jobs.job import JobState, Run
 from fdda_addon.panels import checks, curves
-from fdda_addon.panels.recording import content_of
-from fdda_addon.panels.section import duration, panel_rig
-from fdda_addon.panels.training import _report
+from fdda_addon.panels.recording import cached_content
+from fdda_addon.panels.section import format_duration, panel_rig
+from fdda_addon.panels.training import _read_report
 from fdda_addon.properties.character import model_file, recording_folder
 from fdda_addon.scene.scene_rig import SceneRig
 from fdda_addon.timing.rig_cost import PLAYBACK_MS, RigCost, estimated_playback
@@ -32,10 +32,10 @@ def fresh() -> SceneRig:
 
 class TestChecks:
     def test_a_rig_that_is_well(self, fresh):
-        assert checks.known(fresh) is None, "nothing is checked while drawing"
+        assert checks.last_check(fresh) is None, "nothing is checked while drawing"
         check = checks.check_now(fresh)
         assert check.problems == () and check.rig.joint_names == ("upper", "lower") and len(check.channels) == 4
-        assert checks.known(fresh) is check
+        assert checks.last_check(fresh) is check
 
     def test_all_problems_at_once_in_the_sentences_of_the_command_line(self, fresh):
         fresh.armature_object.data.pose_position = "REST"
@@ -102,25 +102,25 @@ class TestFolder:
 
     def look(self, rig: SceneRig) -> FolderState:
         checks.check_now(rig)
-        return content_of(rig, recording_folder(rig.mesh_object)).state
+        return cached_content(rig, recording_folder(rig.mesh_object)).state
 
     def test_what_the_section_says_follows_folder_settings_and_rig(self, saved):
-        assert self.look(saved) is FolderState.FREE
+        assert self.get(saved) is FolderState.FREE
         bpy.ops.fdda.record()
-        assert self.look(saved) is FolderState.COMPLETE
+        assert self.get(saved) is FolderState.COMPLETE
         index = recording_folder(saved.mesh_object) / "recording.json"
         values = json.loads(index.read_text())
         index.write_text(json.dumps(values | {"complete": 3}))
-        assert self.look(saved) is FolderState.INCOMPLETE
+        assert self.get(saved) is FolderState.INCOMPLETE
         saved.mesh_object.fdda.settings.seed = 1
-        assert self.look(saved) is FolderState.OTHER
+        assert self.get(saved) is FolderState.OTHER
         saved.mesh_object.fdda.settings.seed = 0
         bpy.data.actions["elbow_wave"].fdda.record = True
-        assert self.look(saved) is FolderState.OTHER
+        assert self.get(saved) is FolderState.OTHER
         bpy.data.actions["elbow_wave"].fdda.record = False
-        assert self.look(saved) is FolderState.INCOMPLETE
-        bpy.ops.fdda.state_range(bone="upper", axis="X", low=-1, high=1)
-        assert self.look(saved) is FolderState.OTHER
+        assert self.get(saved) is FolderState.INCOMPLETE
+        bpy.ops.fdda.set_limit(bone="upper", axis="X", low=-1, high=1)
+        assert self.get(saved) is FolderState.OTHER
 
     def test_the_settings_belong_to_the_character_and_are_saved(self, saved, tmp_path):
         settings = saved.mesh_object.fdda.settings
@@ -149,9 +149,9 @@ class TestTraining:
         assert pixels.shape == (curves.HEIGHT, curves.WIDTH, 4) and pixels.dtype == np.float32
         assert pixels.min() >= 0 and pixels.max() <= 1
         heights = {}
-        pixels = pixels[curves.BOTTOM :, curves.LEFT :]
-        for name, (_, _, colour) in curves.LEGEND.items():
-            distance = np.abs(pixels[..., :3] - np.float32(colour)).sum(axis=-1)
+        pixels = pixels[curves.MARGIN_BOTTOM :, curves.MARGIN_LEFT :]
+        for name, (_, _, color) in curves.LEGEND.items():
+            distance = np.abs(pixels[..., :3] - np.float32(color)).sum(axis=-1)
             heights[name] = distance.argmin(axis=0)
             assert distance.min(axis=0).max() < 0.05, "a line without gaps"
         for falls in heights.values():
@@ -163,18 +163,18 @@ class TestTraining:
         assert np.isfinite(curves.paint({"training": values, "validation": values})).all()
 
     def test_a_report_is_read_and_a_damaged_one_passed_over(self, elbow, tmp_path):
-        report = _report(elbow.model.with_name("report.json"))
+        report = _read_report(elbow.model.with_name("report.json"))
         assert report["model"] == "elbow.onnx" and {p["joint"] for p in report["partitions"]} == {"upper", "lower"}
         for number, text in enumerate(("{", "[]", '{"model": 1, "fdda": {}, "partitions": []}')):
             path = tmp_path / f"{number}.json"
             path.write_text(text)
-            assert _report(path) is None
-        assert _report(tmp_path / "none.json") is None
+            assert _read_report(path) is None
+        assert _read_report(tmp_path / "none.json") is None
         cases = (([{"name": "flips", "text": "…"}], True), ([{"text": "…"}], False), (7, False))
         for number, (warnings, passed) in enumerate(cases):
             path = tmp_path / f"warned_{number}.json"
             path.write_text(json.dumps({**report, "warnings": warnings}))
-            assert (_report(path) is not None) is passed
+            assert (_read_report(path) is not None) is passed
 
     def test_its_trainer_ends_with_the_file(self, rig, elbow, tmp_path):
         from fdda_addon.training.process import Training
@@ -224,16 +224,16 @@ class TestCost:
     "seconds, text", [(0.2, "1 s"), (89, "89 s"), (90, "2 min"), (3600, "60 min"), (7800, "2 h 10 min")]
 )
 def test_durations(seconds, text):
-    assert duration(seconds) == text
+    assert format_duration(seconds) == text
 
 
 def test_the_worst_frames_are_those_of_the_last_of_several_evaluations():
     from fdda_addon.evaluation.last_evaluation import LastEvaluation
-    from fdda_addon.panels.evaluation import _worst
+    from fdda_addon.panels.evaluation import _worst_poses
 
     def evaluation(worst: int) -> LastEvaluation:
         errors = np.zeros((3, 4), np.float32)
         errors[worst] = 0.001
         return LastEvaluation("", "m", 0, 0, {"fdda": errors, "linear": errors}, {}, (), ())
 
-    assert [_worst(evaluation(worst), 2)[0][0] for worst in (1, 2, 0)] == [1, 2, 0]
+    assert [_worst_poses(evaluation(worst), 2)[0][0] for worst in (1, 2, 0)] == [1, 2, 0]

@@ -9,7 +9,7 @@ import pytest
 from mathutils import Euler, Quaternion
 
 from fdda_addon.core.poses import CONTROL, ROTATION_VECTOR, Channel, sample_pose
-from fdda_addon.panels.poses import _sampled_text
+from fdda_addon.panels.poses import _format_channels
 from fdda_addon.poses.action_range import measured_ranges
 from fdda_addon.poses.measured_limits import WIDE_NOTE, describe_limits, set_limits_from_actions
 from fdda_addon.poses.sample_selection import select_bones
@@ -90,7 +90,7 @@ def test_what_stands_still_beside_the_rest_pose_stays_there(figure):
         "spine: turns X 43.0 to 43.0° (stands still away from rest, has no range), turns Y -11.5 to 11.5°"
     ]
     channels = sampled(figure)
-    assert _sampled_text(list(channels), True) == "fixed  -11…11°  fixed"
+    assert _format_channels(list(channels), True) == "fixed  -11…11°  fixed"
     assert ranges(channels, "spine") == {
         ("rotation", 0): (0.75, 0.75),
         ("rotation", 1): pytest.approx((-0.2, 0.2)),

@@ -3,7 +3,7 @@
 
 import pytest
 
-from fdda_addon.panels.names import common_prefix
+from fdda_addon.panels.bone_names import common_prefix
 
 
 @pytest.mark.parametrize(

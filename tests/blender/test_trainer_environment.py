@@ -14,7 +14,7 @@ import pytest
 
 from fdda_addon.core.errors import TrainerEnvironmentError
 from fdda_addon.jobs.job import ENVIRONMENT, Run, current, state_of, stop
-from fdda_addon.operators.trainer_environment import FDDA_OT_create_trainer_environment, begin
+from fdda_addon.operators.trainer_environment import FDDA_OT_create_trainer_environment, start_job
 from fdda_addon.training.environment import choice, creation, folder, session
 from fdda_addon.training.environment.choice import Origin
 from fdda_addon.training.environment.creation import Creation
@@ -220,8 +220,8 @@ def wait_for(condition, seconds: float = 60.0) -> None:
 
 def begin_creation(job: Creation) -> Run:
     """As the button does in a window."""
-    return begin(
-        "create_trainer_environment", "Create", job.steps(), job.cancel, FDDA_OT_create_trainer_environment.keep
+    return start_job(
+        "create_trainer_environment", "Create", job.steps(), job.cancel, FDDA_OT_create_trainer_environment.store_result
     )
 
 
@@ -261,7 +261,7 @@ def test_unregistering_ends_what_is_under_way(user: Path, wheels: Path):
 def test_a_check_in_the_background_is_kept(own: Path):
     python = choice.chosen_python()
     steps = (choice.ping(python) for _ in range(1))
-    run = begin("check_trainer", "Check", steps, None, session.remember)
+    run = start_job("check_trainer", "Check", steps, None, session.remember)
     assert not run.work(0) and not run.state.can_cancel and not bpy.ops.fdda.cancel_trainer_environment.poll()
     wait_for(lambda: run.work(0))
     assert state_of("check_trainer").outcome == session.check_result.message

@@ -120,7 +120,7 @@ def cancel_all_in_one(folder: Path) -> Iterator[float]:
     own = emptied(folder / "work" / "cancelled")
     bpy.ops.wm.read_homefile(app_template="", load_ui=False)
     yield 0.5
-    bpy.ops.fdda.add_arm(density="1")
+    bpy.ops.fdda.add_sample_arm(density="1")
     # ESC cancels while the scene is borrowed: so many that it still is when the picture is taken.
     arm().fdda.settings.poses = 10_000
     bpy.ops.wm.save_as_mainfile(filepath=str(own / BLEND))

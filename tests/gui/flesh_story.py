@@ -22,7 +22,7 @@ def give_the_arm_flesh(folder: Path) -> Iterator[float]:
     bpy.ops.wm.read_homefile(app_template="", load_ui=False)
     yield 0.5
     bpy.data.objects.remove(bpy.data.objects["Cube"])
-    bpy.ops.fdda.add_arm(density="1")
+    bpy.ops.fdda.add_sample_arm(density="1")
     make_soft_body(add_flesh(arm()), FLESHY)
     # Both are in one place.
     arm().display_type = "WIRE"

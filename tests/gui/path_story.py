@@ -79,7 +79,7 @@ def add_the_arm(folder: Path) -> Iterator[float]:
     cube.select_set(False)
     bpy.context.view_layer.objects.active = None
     yield from redraw()
-    yield from sidebar.push("fdda.add_arm")
+    yield from sidebar.push("fdda.add_sample_arm")
     yield from until(lambda: "arm" in bpy.data.objects, 20, "no arm is added")
     check(not cube.visible_get(), "Blender's cube stands in the arm")
     check(len(arm().data.vertices) == PAYING, f"the arm has {len(arm().data.vertices)} vertices")
@@ -88,7 +88,7 @@ def add_the_arm(folder: Path) -> Iterator[float]:
     # The small one is quicker for what follows.
     bpy.ops.ed.undo()
     yield 0.5
-    bpy.ops.fdda.add_arm(density="1")
+    bpy.ops.fdda.add_sample_arm(density="1")
     bpy.ops.ed.undo_push(message="arm")
     check(bpy.context.view_layer.objects.active == arm(), "the arm is not the active object")
     check(len(arm().data.vertices) == VERTICES, f"the arm has {len(arm().data.vertices)} vertices")
@@ -105,7 +105,7 @@ def measure_the_rig(_folder: Path) -> Iterator[float]:
     yield from sidebar.open_section("rig")
     yield from sidebar.push("fdda.measure()")
     yield from job_done("measure", 40)
-    cost = part("operators.rig").cost_of(arm())
+    cost = part("operators.rig").measured_cost(arm())
     check(0 < cost.linear < cost.rig, f"the armature alone takes {cost.linear} ms and the whole rig {cost.rig}")
 
 
@@ -275,7 +275,7 @@ def show_the_partitions(folder: Path) -> Iterator[float]:
 
 def _paint(colors: str, folder: Path) -> Iterator[float]:
     across = {"ERRORS": 0.5, "PARTITIONS": 0.85}[colors]
-    yield from sidebar.push(f"fdda.paint(colors='{colors}')", across)
+    yield from sidebar.push(f"fdda.color_mesh(colors='{colors}')", across)
     yield from until(
         lambda: part("evaluation.heat_map").painted(arm()) == colors, 5, f"the button does not show {colors}"
     )
@@ -290,7 +290,7 @@ def _paint(colors: str, folder: Path) -> Iterator[float]:
 
 def mark_the_worst_frames(_folder: Path) -> Iterator[float]:
     """Press Add Markers, then the first of the worst frames, and look at its errors alone."""
-    yield from sidebar.push("fdda.mark_worst", across=0.8)
+    yield from sidebar.push("fdda.add_worst_markers", across=0.8)
     worst = part("evaluation.last_evaluation").of(arm()).worst(5)
     found = part("evaluation.markers").find(bpy.context.scene)
     check(
@@ -305,7 +305,7 @@ def mark_the_worst_frames(_folder: Path) -> Iterator[float]:
     yield from sidebar.push("fdda_view.statistic", across=0.85)
     yield from until(lambda: view.statistic == "pose", 5, f"the button shows '{view.statistic}', not this frame")
     before = view.range_mm
-    yield from sidebar.push("fdda.fit_range", across=0.98)
+    yield from sidebar.push("fdda.fit_color_range", across=0.98)
     yield from until(lambda: view.range_mm > before, 5, f"red begins at {view.range_mm} mm as before")
 
 

@@ -33,7 +33,7 @@ def give_a_figure_human_ranges(folder: Path) -> Iterator[float]:
     yield 1.0
     yield from sidebar.open_section("poses")
     yield from picture(folder / "no_limits.png")
-    yield from sidebar.push("fdda.limits_preset(")
+    yield from sidebar.push("fdda.human_limits(")
     bones, ranges = bpy.data.objects["figure_rig"].pose.bones, part("poses.motion_range")
 
     def stated(name: str) -> bool:
@@ -95,15 +95,15 @@ def mirror_and_copy_ranges(folder: Path) -> Iterator[float]:
     ranges.set_rotation_range(left, 0, -0.25, 0.5)
     for bone in bones:
         compatibility.select_bone(bone, bone == left)
-    session.joint_index = bones.find(left.name)
+    session.bone_index = bones.find(left.name)
     yield from redraw()
     yield from sidebar.open_section("poses")
-    yield from sidebar.push("fdda.mirror_ranges(", across=0.8)
+    yield from sidebar.push("fdda.mirror_limits(", across=0.8)
     yield from until(lambda: abs(_width(right, ranges) - 0.75) < 0.01, 5, "the other forearm has not the range")
     compatibility.select_bone(upper, True)
     yield from redraw()
     yield from picture(folder / "ranges.png")
-    yield from sidebar.push("fdda.copy_ranges(", across=0.25)
+    yield from sidebar.push("fdda.copy_limits(", across=0.25)
     yield from until(lambda: abs(_width(upper, ranges) - 0.75) < 0.01, 5, "the upper arm has not the range")
 
 
@@ -120,7 +120,7 @@ def read_names_with_a_prefix(folder: Path) -> Iterator[float]:
     yield 1.0
     yield from redraw()
     yield from picture(folder / "names.png")
-    shown = part("panels.names").shown_name(armature, "mixamorig:upper_arm.L")
+    shown = part("panels.bone_names").short_bone_name(armature, "mixamorig:upper_arm.L")
     check(shown == "upper_arm.L", f"the bone is shown as '{shown}'")
 
 

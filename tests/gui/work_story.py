@@ -91,7 +91,7 @@ def select_bones_in_the_list(folder: Path) -> Iterator[float]:
     compatibility.select_bone(bones["forearm"] if "forearm" in bones else bones[3], True)
     yield from redraw()
     with over("UI"):
-        bpy.ops.fdda.edit_ranges("INVOKE_DEFAULT")
+        bpy.ops.fdda.set_limits("INVOKE_DEFAULT")
     yield 0.5
     yield from picture(folder / "ranges_dialog.png")
     yield from press("Return")
@@ -116,11 +116,11 @@ def switch_all_meshes_in_pose_mode(folder: Path) -> Iterator[float]:
     yield from sidebar.open_section("playback")
     both = (arm().fdda, bpy.data.objects["sleeve"].fdda)
     for mode, across in (("RIG", 0.15), ("LINEAR", 0.5), ("FDDA", 0.88)):
-        yield from sidebar.push(f"fdda.switch(all_meshes=True, mode='{mode}')", across)
+        yield from sidebar.push(f"fdda.set_mode(all_meshes=True, mode='{mode}')", across)
         yield from until(lambda mode=mode: all(b.mode == mode for b in both), 5, f"not both meshes switch to {mode}")
     yield from picture(folder / "all_meshes.png")
     yield from sidebar.open_section("rig")
-    yield from sidebar.push('fdda.choose_mesh(object="sleeve")', across=0.2)
+    yield from sidebar.push('fdda.show_mesh(object="sleeve")', across=0.2)
     check(bpy.context.window_manager.fdda.mesh == "sleeve", "the click does not show the other mesh")
     yield from picture(folder / "meshes.png")
 
@@ -143,7 +143,7 @@ def pick_a_partition(folder: Path) -> Iterator[float]:
     yield from sidebar.push("fdda.show_bone", across=0.1)
     active = armature().data.bones.active
     check(active is not None and bpy.context.mode == "POSE", "no bone is selected")
-    yield from sidebar.push("fdda.paint(colors='ERRORS')", 0.5)
+    yield from sidebar.push("fdda.color_mesh(colors='ERRORS')", 0.5)
     yield 0.3
     yield from picture(folder / "bones_over_colors.png")
     part("evaluation.heat_map").clear_all()
@@ -226,7 +226,7 @@ def make_a_model_in_one_go(folder: Path) -> Iterator[float]:
     own = emptied(folder / "work" / "build_model")
     bpy.ops.wm.read_homefile(app_template="", load_ui=False)
     yield 0.5
-    bpy.ops.fdda.add_arm(density="1")
+    bpy.ops.fdda.add_sample_arm(density="1")
     settings = arm().fdda.settings
     settings.poses, settings.epochs = 60, 20
     bpy.ops.wm.save_as_mainfile(filepath=str(own / BLEND))

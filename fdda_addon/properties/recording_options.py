@@ -7,7 +7,7 @@ import bpy
 
 from ..core.errors import RigError
 from ..scene.scene_rig import SceneRig
-from .character import FDDA_PG_character, wanted_fit
+from .character import FDDA_PG_character, fit_kind
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..recording.plan import RecordingSettings
@@ -35,9 +35,9 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
         margin=round(settings.margin, 6),
         actions=actions,
         resume=resume,
-        sample=_sample(settings, actions),
-        controls=_controls(settings),
-        fit_linear=wanted_fit(settings),
+        sample=_sample_options(settings, actions),
+        controls=_control_options(settings),
+        fit_linear=fit_kind(settings),
         min_partition_vertices=settings.min_partition_vertices,
         mirror=settings.mirror and bool(actions),
         target=target_settings(settings),
@@ -53,7 +53,7 @@ def target_settings(settings: FDDA_PG_character) -> "TargetSettings":
     return TargetSettings(settings.target, settings.pre_roll, settings.max_settle_frames)
 
 
-def take_over_sampling(settings: FDDA_PG_character, other: FDDA_PG_character) -> None:
+def copy_sampling_settings(settings: FDDA_PG_character, other: FDDA_PG_character) -> None:
     """Give a mesh what another on the same armature is recorded with; its files and its training stay its own."""
     for name in (
         "poses",
@@ -76,7 +76,7 @@ def take_over_sampling(settings: FDDA_PG_character, other: FDDA_PG_character) ->
                 setattr(new, value, getattr(entry, value))
 
 
-def _sample(settings: FDDA_PG_character, actions: tuple[str, ...]) -> tuple[str, ...]:
+def _sample_options(settings: FDDA_PG_character, actions: tuple[str, ...]) -> tuple[str, ...]:
     """What random poses move, as `poses.sampling.choose` reads it."""
     if settings.sample == "COLLECTION":
         if not settings.bone_collection:
@@ -99,7 +99,7 @@ def _sample(settings: FDDA_PG_character, actions: tuple[str, ...]) -> tuple[str,
     return ()
 
 
-def _controls(settings: FDDA_PG_character) -> tuple[str, ...]:
+def _control_options(settings: FDDA_PG_character) -> tuple[str, ...]:
     """The listed controls as `scene.controls.parse_controls` reads them; those without a name yet are left out."""
     return tuple(
         f"{control.name}={control.low!r}:{control.high!r}" if control.has_range else control.name
@@ -111,11 +111,11 @@ def _controls(settings: FDDA_PG_character) -> tuple[str, ...]:
 def recorded_actions(armature_object: bpy.types.Object) -> tuple[str, ...]:
     """Names of the actions that the user has chosen for recording and that move a bone of this armature."""
     return tuple(
-        action.name for action in bpy.data.actions if action.fdda.record and moves_a_bone(action, armature_object)
+        action.name for action in bpy.data.actions if action.fdda.record and action_moves_bones(action, armature_object)
     )
 
 
-def moves_a_bone(action: bpy.types.Action, armature_object: bpy.types.Object) -> bool:
+def action_moves_bones(action: bpy.types.Action, armature_object: bpy.types.Object) -> bool:
     """Whether an action moves a bone of this armature."""
     from ..scene.compatibility import animation_curves
 

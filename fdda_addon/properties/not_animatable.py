@@ -4,7 +4,7 @@
 import bpy
 
 
-def without_keys(group: type[bpy.types.PropertyGroup]) -> type[bpy.types.PropertyGroup]:
+def not_animatable(group: type[bpy.types.PropertyGroup]) -> type[bpy.types.PropertyGroup]:
     """Decorate a property group: keys and drivers are refused for its properties that do not state their options."""
     collections = (bpy.props.CollectionProperty, bpy.props.PointerProperty)
     for declared in group.__annotations__.values():

@@ -8,7 +8,7 @@ from ..scene.active_rig import active_rig, any_mesh_object, cached_active_rig, r
 from ..scene.scene_rig import SceneRig, armature_of
 
 
-class OnRig:
+class RigOperator:
     """Mixin for an operator that works on a rig."""
 
     object: bpy.props.StringProperty(

@@ -5,10 +5,10 @@ import bpy
 
 from ..core.errors import FDDAError
 from ..jobs.job import current
-from .on_rig import OnRig
+from .rig_operator import RigOperator
 
 
-class OnPose(OnRig):
+class PoseOperator(RigOperator):
     """Mixin for an operator that changes the armature of a rig."""
 
     @classmethod
@@ -24,7 +24,7 @@ class OnPose(OnRig):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
-            sentence = self.change(context)
+            sentence = self.apply(context)
         except FDDAError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

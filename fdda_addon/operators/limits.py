@@ -7,20 +7,20 @@ import bpy
 
 from ..core.errors import RigError
 from ..scene.compatibility import is_selected
-from .on_pose import OnPose
+from .pose_operator import PoseOperator
 
 AXES = "XYZ"
 
 
-def _counted(count: int) -> str:
+def _count_bones(count: int) -> str:
     """Return a number of bones in words: "1 bone", "4 bones"."""
     return "1 bone" if count == 1 else f"{count} bones"
 
 
-class _OnSelected(OnPose):
+class _SelectedBonesOperator(PoseOperator):
     """Mixin for an operator on the ranges of the selected bones."""
 
-    def selected(self, context: bpy.types.Context) -> list[bpy.types.PoseBone]:
+    def selected_bones(self, context: bpy.types.Context) -> list[bpy.types.PoseBone]:
         """The selected bones.
 
         Raises:
@@ -35,7 +35,7 @@ class _OnSelected(OnPose):
         return found
 
 
-def _copy(source: bpy.types.PoseBone, target: bpy.types.PoseBone, mirrored: bool = False) -> None:
+def _copy_limits(source: bpy.types.PoseBone, target: bpy.types.PoseBone, mirrored: bool = False) -> None:
     """State the ranges of one bone for another; those of one on the other side turn round about Y and Z."""
     from ..poses.motion_range import DEFAULT, clear_rotation_range, rotation_ranges, set_rotation_range
 
@@ -49,8 +49,8 @@ def _copy(source: bpy.types.PoseBone, target: bpy.types.PoseBone, mirrored: bool
         target.lock_rotation[axis] = found.is_locked or low >= high
 
 
-class FDDA_OT_edit_ranges(_OnSelected, bpy.types.Operator):
-    bl_idname = "fdda.edit_ranges"
+class FDDA_OT_set_limits(_SelectedBonesOperator, bpy.types.Operator):
+    bl_idname = "fdda.set_limits"
     bl_label = "Set Limits of Selected Bones"
     bl_description = "Give all selected bones the same rotation limits"
     bl_options = {"REGISTER", "UNDO"}
@@ -67,7 +67,7 @@ class FDDA_OT_edit_ranges(_OnSelected, bpy.types.Operator):
         from ..poses.motion_range import rotation_ranges
 
         try:
-            ranges = rotation_ranges(self.selected(context)[0])
+            ranges = rotation_ranges(self.selected_bones(context)[0])
         except RigError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -86,21 +86,21 @@ class FDDA_OT_edit_ranges(_OnSelected, bpy.types.Operator):
             fields.prop(self, "low", index=axis, text="")
             fields.prop(self, "high", index=axis, text="")
 
-    def change(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..poses.motion_range import set_rotation_range
 
-        bones = self.selected(context)
+        bones = self.selected_bones(context)
         for axis in (axis for axis in range(3) if self.axes[axis]):
             if not self.low[axis] < self.high[axis]:
                 raise RigError(f"The maximum about {AXES[axis]} must be larger than the minimum.")
         for bone in bones:
             for axis in (axis for axis in range(3) if self.axes[axis]):
                 set_rotation_range(bone, axis, self.low[axis], self.high[axis])
-        return f"Set the limits of {_counted(len(bones))}."
+        return f"Set the limits of {_count_bones(len(bones))}."
 
 
-class FDDA_OT_copy_ranges(_OnSelected, bpy.types.Operator):
-    bl_idname = "fdda.copy_ranges"
+class FDDA_OT_copy_limits(_SelectedBonesOperator, bpy.types.Operator):
+    bl_idname = "fdda.copy_limits"
     bl_label = "Copy Limits to Selected Bones"
     bl_description = "Copy the limits of the active bone of the list to the selected bones"
     bl_options = {"REGISTER", "UNDO"}
@@ -109,41 +109,41 @@ class FDDA_OT_copy_ranges(_OnSelected, bpy.types.Operator):
         name="Bone", description="Bone to copy from. Empty for the active bone of the list", options={"SKIP_SAVE"}
     )
 
-    def change(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         bones = self.rig(context).armature_object.pose.bones
-        index = context.window_manager.fdda.joint_index
+        index = context.window_manager.fdda.bone_index
         source = bones.get(self.bone) if self.bone else (bones[index] if 0 <= index < len(bones) else None)
         if source is None:
             raise RigError(f"There is no bone '{self.bone}' to copy from; click one in the list.")
-        targets = [bone for bone in self.selected(context) if bone != source]
+        targets = [bone for bone in self.selected_bones(context) if bone != source]
         for target in targets:
-            _copy(source, target)
-        return f"Copied the limits of '{source.name}' to {_counted(len(targets))}."
+            _copy_limits(source, target)
+        return f"Copied the limits of '{source.name}' to {_count_bones(len(targets))}."
 
 
-class FDDA_OT_mirror_ranges(_OnSelected, bpy.types.Operator):
-    bl_idname = "fdda.mirror_ranges"
+class FDDA_OT_mirror_limits(_SelectedBonesOperator, bpy.types.Operator):
+    bl_idname = "fdda.mirror_limits"
     bl_label = "Mirror Limits to Other Side"
     bl_description = "Copy the limits of the selected bones, mirrored, to the bones of the other side"
     bl_options = {"REGISTER", "UNDO"}
 
-    def change(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..poses.mirror import flipped_name
 
         bones = self.rig(context).armature_object.pose.bones
-        pairs = [(bone, bones.get(flipped_name(bone.name))) for bone in self.selected(context)]
+        pairs = [(bone, bones.get(flipped_name(bone.name))) for bone in self.selected_bones(context)]
         pairs = [(bone, other) for bone, other in pairs if other is not None and other != bone]
         if not pairs:
             raise RigError(
                 "No selected bone has a bone of the same name on the other side; select bones such as arm.L or LeftArm."
             )
         for bone, other in pairs:
-            _copy(bone, other, mirrored=True)
-        return f"Mirrored the limits of {_counted(len(pairs))}."
+            _copy_limits(bone, other, mirrored=True)
+        return f"Mirrored the limits of {_count_bones(len(pairs))}."
 
 
-class FDDA_OT_limits_preset(OnPose, bpy.types.Operator):
-    bl_idname = "fdda.limits_preset"
+class FDDA_OT_human_limits(PoseOperator, bpy.types.Operator):
+    bl_idname = "fdda.human_limits"
     bl_label = "Human Limits"
     bl_description = (
         "Give all bones that are named after body parts (arm, forearm, thigh, spine, index1 …) the rotation limits of "
@@ -154,7 +154,7 @@ class FDDA_OT_limits_preset(OnPose, bpy.types.Operator):
     only_selected: bpy.props.BoolProperty(name="Only Selected", description="Set the limits of selected bones only")
     replace: bpy.props.BoolProperty(name="Replace", description="Overwrite the limits of bones that already have some")
 
-    def change(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..poses.human_ranges import human_ranges
         from ..poses.motion_range import DEFAULT, rotation_ranges, set_rotation_range
 
@@ -178,29 +178,29 @@ class FDDA_OT_limits_preset(OnPose, bpy.types.Operator):
                 f"No bone of '{armature_object.name}' without limits has the name of a body part; set the limits by "
                 "hand, or from actions."
             )
-        return f"Set human limits for {_counted(done)}."
+        return f"Set human limits for {_count_bones(done)}."
 
 
-class FDDA_OT_forget_ranges(_OnSelected, bpy.types.Operator):
-    bl_idname = "fdda.forget_ranges"
+class FDDA_OT_clear_limits(_SelectedBonesOperator, bpy.types.Operator):
+    bl_idname = "fdda.clear_limits"
     bl_label = "Clear Limits of Selected Bones"
     bl_description = "Remove the rotation limits of the selected bones. The default is ±45°"
     bl_options = {"REGISTER", "UNDO"}
 
-    def change(self, context: bpy.types.Context) -> str:
+    def apply(self, context: bpy.types.Context) -> str:
         from ..poses.motion_range import clear_rotation_range
 
-        bones = self.selected(context)
+        bones = self.selected_bones(context)
         for bone in bones:
             for axis in range(3):
                 clear_rotation_range(bone, axis)
-        return f"Removed the limits of {_counted(len(bones))}."
+        return f"Removed the limits of {_count_bones(len(bones))}."
 
 
 CLASSES = (
-    FDDA_OT_edit_ranges,
-    FDDA_OT_copy_ranges,
-    FDDA_OT_mirror_ranges,
-    FDDA_OT_limits_preset,
-    FDDA_OT_forget_ranges,
+    FDDA_OT_set_limits,
+    FDDA_OT_copy_limits,
+    FDDA_OT_mirror_limits,
+    FDDA_OT_human_limits,
+    FDDA_OT_clear_limits,
 )

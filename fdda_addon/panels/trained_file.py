@@ -11,41 +11,41 @@ from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 from . import checks
 
-_checked: dict[tuple, str] = {}
+_mismatch_cache: dict[tuple, str] = {}
 """Why models do not fit, by file, its time and size, and the check of the rig; empty for those that fit."""
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainedFile:
     """A model where the training of a character writes it: its file, and why it is not of this rig, empty if it is."""
 
     path: Path
-    foreign: str = ""
+    mismatch: str = ""
 
 
-def trained(rig: SceneRig) -> Trained | None:
+def find_trained_file(rig: SceneRig) -> TrainedFile | None:
     """The model that a training of this rig has written, also where an undo has taken it off the list."""
-    return _trained(rig)[0]
+    return _find_trained_file(rig)[0]
 
 
 @draw_cached
-def _trained(rig: SceneRig) -> tuple[Trained | None]:
-    """As `trained`; in a tuple, for that there is none is kept as well."""
+def _find_trained_file(rig: SceneRig) -> tuple[TrainedFile | None]:
+    """As `find_trained_file`; in a tuple, for that there is none is kept as well."""
     path = trained_file(rig.mesh_object)
-    check = checks.known(rig)
+    check = checks.last_check(rig)
     if path is None:
         return (None,)
     if check is None or check.rig is None:
-        return (Trained(path),)
+        return (TrainedFile(path),)
     status = os.stat(path)
     key = (path, status.st_mtime_ns, status.st_size, id(check.rig))
-    if key not in _checked:
-        _checked.clear()
-        _checked[key] = _foreign(rig, check.rig, path)
-    return (Trained(path, _checked[key]),)
+    if key not in _mismatch_cache:
+        _mismatch_cache.clear()
+        _mismatch_cache[key] = _describe_mismatch(rig, check.rig, path)
+    return (TrainedFile(path, _mismatch_cache[key]),)
 
 
-def _foreign(scene_rig: SceneRig, rig: object, path: Path) -> str:
+def _describe_mismatch(scene_rig: SceneRig, rig: object, path: Path) -> str:
     from ..core.model import read_model_info
     from ..core.rig import rig_differences
     from .models import rig_of_model

@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ..properties.choices import ALL_SHAPE_KEYS, recorded_actions
+from ..properties.recording_options import ALL_SHAPE_KEYS, recorded_actions
 from ..scene.scene_rig import SceneRig
 from . import checks
-from .section import draw_sentence
+from .section import draw_wrapped
 
 if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.poses import Channel
     from ..recording.rig_check import RigCheck
 
-MAX_LINES = 8
+MAX_SHOWN_CONTROLS = 8
 """The panel lists at most this number of the controls that were found."""
 
 
@@ -31,7 +31,7 @@ class FDDA_UL_controls(bpy.types.UIList):
         side.label(text=f"{control.low:g}…{control.high:g}" if control.has_range else "default")
 
 
-def draw_choice(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
+def draw_bones_to_pose(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
     """Which bones random poses move."""
     settings = rig.mesh_object.fdda.settings
     column = layout.column()
@@ -40,18 +40,18 @@ def draw_choice(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sce
     if settings.sample == "COLLECTION":
         column.prop_search(settings, "bone_collection", rig.armature_object.data, "collections_all", text="")
     elif settings.sample == "ACTIONS" and not recorded_actions(rig.armature_object):
-        draw_sentence(column, context, "Check the actions below that show how the rig moves.", "INFO")
+        draw_wrapped(column, context, "Check the actions below that show how the rig moves.", "INFO")
     elif settings.sample == "SELECTED":
         count = len(settings.sampled_bones)
         if not count:
-            draw_sentence(column, context, "Select bones in Pose Mode, then press the button.", "INFO")
+            draw_wrapped(column, context, "Select bones in Pose Mode, then press the button.", "INFO")
         column.operator("fdda.use_selected_bones", icon="RESTRICT_SELECT_OFF").object = rig.mesh_object.name
-    check = checks.known(rig)
+    check = checks.last_check(rig)
     if check is not None and check.channels and (settings.sample != "WEIGHTS" or check.rig.controls):
-        draw_sentence(layout, context, counted(check))
+        draw_wrapped(layout, context, describe_channels(check))
 
 
-def counted(check: "RigCheck") -> str:
+def describe_channels(check: "RigCheck") -> str:
     """How much random poses move, a sentence."""
     from ..core.poses import CONTROL
 
@@ -59,13 +59,13 @@ def counted(check: "RigCheck") -> str:
     bones, controls = len({channel.name for channel in channels}), len(check.channels) - len(channels)
     parts = []
     if bones:
-        parts.append(f"{_many(bones, 'bone')} ({_many(len(channels), 'channel')})")
+        parts.append(f"{_count(bones, 'bone')} ({_count(len(channels), 'channel')})")
     if controls:
-        parts.append(_many(controls, "extra input"))
+        parts.append(_count(controls, "extra input"))
     return f"Random poses will move {' and '.join(parts)}."
 
 
-def _many(count: int, noun: str) -> str:
+def _count(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
@@ -86,9 +86,9 @@ def draw_channels(box: bpy.types.UILayout, bone: bpy.types.PoseBone, channels: "
             row.label(text=f"{low:.3g}…{high:.3g}")
 
 
-def draw_controls(layout: bpy.types.UILayout, rig: SceneRig) -> None:
+def draw_extra_inputs(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     """The controls that are listed, and those that were found."""
-    settings, check = rig.mesh_object.fdda.settings, checks.known(rig)
+    settings, check = rig.mesh_object.fdda.settings, checks.last_check(rig)
     found = check.automatic_controls if check is not None else ()
     count = len(check.rig.controls) if check is not None and check.rig else len(settings.controls)
     header, body = layout.panel("fdda_controls", default_closed=True)
@@ -116,7 +116,7 @@ def draw_controls(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     if found:
         column = body.column(align=True)
         column.label(text="Detected automatically")
-        for control in found[:MAX_LINES]:
+        for control in found[:MAX_SHOWN_CONTROLS]:
             column.label(text=f"{control.name} {control.low:g}…{control.high:g}", icon="DOT")
-        if len(found) > MAX_LINES:
-            column.label(text=f"and {len(found) - MAX_LINES} more", icon="BLANK1")
+        if len(found) > MAX_SHOWN_CONTROLS:
+            column.label(text=f"and {len(found) - MAX_SHOWN_CONTROLS} more", icon="BLANK1")
