@@ -65,7 +65,7 @@ def _tube(topic: str, build: Callable[[], object], text: str, **settings: object
 def _frames(build: Callable[[], object], text: str) -> Row:
     """A target that shows the frames of an action, and is compared on them."""
     settings = _recording(poses=0, actions=(ACTION,), target=TargetSettings(targets.TARGET))
-    return _tube(TARGETS, build, f"{text}; learnt from an action, and compared on it", recording=settings)
+    return _tube(TARGETS, build, f"{text}; learned from an action and compared on it", recording=settings)
 
 
 def _settled(build: Callable[[], object], text: str) -> Row:
@@ -165,12 +165,12 @@ ROWS: tuple[Row, ...] = (
     _tube(MESHES, transforms.parented_to_armature, "mesh parented to a turned and scaled armature"),
     _tube(MESHES, transforms.parented_to_empty, "armature parented to a moving empty"),
     _tube(MESHES, transforms.parented_to_bone, "mesh parented to a bone and skinned besides"),
-    _tube(MESHES, transforms.in_centimetres, "a scene in centimetres"),
-    _tube(MESHES, transforms.in_millimetres, "a scene in millimetres"),
-    _tube(MESHES, transforms.in_kilometres, "a scene in kilometres"),
+    _tube(MESHES, transforms.in_centimetres, "a scene in centimeters"),
+    _tube(MESHES, transforms.in_millimetres, "a scene in millimeters"),
+    _tube(MESHES, transforms.in_kilometres, "a scene in kilometers"),
     _tube(MESHES, transforms.far_from_its_origin, "vertices 100 m from the origin of their object"),
-    _tube(MESHES, transforms.scaled_armature, "an armature in centimetres, scaled by 0.01"),
-    _tube(MESHES, transforms.scaled_character, "mesh and armature in centimetres, scaled by 0.01"),
+    _tube(MESHES, transforms.scaled_armature, "an armature in centimeters, scaled by 0.01"),
+    _tube(MESHES, transforms.scaled_character, "mesh and armature in centimeters, scaled by 0.01"),
     _tube(MESHES, transforms.far_away, "hundreds of metres from the origin"),
     Row(
         "linked", MESHES, "a linked character, overridden twice in two poses", stacks.corrective_smooth, is_linked=True

@@ -21,8 +21,6 @@ MANUAL = {
     "manual_play": ("09_train", "12_measure_the_model", "14_evaluate"),
 }
 """Pictures of sections beside each other, and the steps that they come from."""
-BESIDE = {"sidebar_poses": "04_show_a_random_pose", "sidebar_training": "training"}
-"""Pictures of a section with a part of the view."""
 WHOLE = {
     "sidebar_evaluation": "17_mark_the_worst_frames",
     "manual_heat_map": "16_show_the_heat_map",
@@ -66,8 +64,5 @@ if __name__ == "__main__":
 
     for name, steps in MANUAL.items():
         write(beside([sections(step(each)) for each in steps]), name)
-    for name, each in BESIDE.items():
-        shown = step(each)
-        write(shown.crop((380, VIEW[1], VIEW[2], SIDEBAR[1] + height_of_sections(shown))), name)
     for name, each in WHOLE.items():
         write(step(each).crop(VIEW), name)
