@@ -53,7 +53,7 @@ def test_one_button_records_trains_and_binds(two):
     assert bpy.ops.fdda.build_model() == {"FINISHED"}
     assert bpy.data.is_dirty, "Blender asks before it closes the file"
     assert two[0].fdda.mode == "FDDA" and two[0].fdda.packed is not None and not two[1].fdda.is_bound
-    # Recorded already: it is find_trained_file again, and the new model plays.
+    # Recorded already: it is trained again, and the new model plays.
     before = two[0].fdda.packed.session_uid
     two[0].fdda.settings.training_seed = 5
     assert bpy.ops.fdda.build_model() == {"FINISHED"}
@@ -74,9 +74,8 @@ def test_all_meshes_is_nothing_where_a_mesh_is_active(two):
 
 
 def test_a_model_that_an_undo_takes_off_the_list_is_known(two):
-    from fdda_addon.panels.find_trained_file import find_trained_file
-
     from fdda_addon.panels import checks
+    from fdda_addon.panels.trained_file import find_trained_file
     from fdda_addon.scene.scene_rig import SceneRig
 
     bpy.context.view_layer.objects.active = two[0]
@@ -84,9 +83,7 @@ def test_a_model_that_an_undo_takes_off_the_list_is_known(two):
     bpy.context.view_layer.objects.active = bpy.data.objects[ELBOW_RIG]
     with pytest.raises(RuntimeError, match="two_elbow_001_recording' is not a recording"):
         bpy.ops.fdda.train(all_meshes=True)
-    assert [entry.name for entry in two[0].fdda.models] == ["two_elbow"], (
-        "it was find_trained_file before the other failed"
-    )
+    assert [entry.name for entry in two[0].fdda.models] == ["two_elbow"], "it was trained before the other failed"
     bpy.context.view_layer.objects.active = two[0]
     two[0].fdda.models.clear()
     rig = SceneRig(two[0], bpy.data.objects[ELBOW_RIG])
@@ -96,9 +93,8 @@ def test_a_model_that_an_undo_takes_off_the_list_is_known(two):
 
 
 def test_a_model_of_another_mesh_of_the_name_is_told(two):
-    from fdda_addon.panels.find_trained_file import find_trained_file
-
     from fdda_addon.panels import checks
+    from fdda_addon.panels.trained_file import find_trained_file
     from fdda_addon.scene.scene_rig import SceneRig
 
     bpy.context.view_layer.objects.active = two[0]
