@@ -110,6 +110,22 @@ def with_deformation(model: Path, deformation: dict) -> Path:
 
 
 @pytest.fixture
+def refusal(tmp_path: Path, capfd: pytest.CaptureFixture):
+    """What runs a verb that refuses (`refusals.Refusal`), and returns its sentence."""
+    from .refusals import Refusal
+
+    return Refusal(tmp_path, capfd)
+
+
+@pytest.fixture
+def refusal_on_a_full_disk(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """As `refusal`; what is caught stays in memory, for it could not be written to a file either."""
+    from .refusals import Refusal
+
+    return Refusal(tmp_path, capsys)
+
+
+@pytest.fixture
 def loose_model(elbow: ElbowFiles) -> Path:
     """The elbow's model for characters with other modifiers."""
     return without_deformation(elbow.model)

@@ -13,20 +13,9 @@ import numpy as np
 import pytest
 
 from .. import systems
-from .refusals import Refusal, files, save_elbow, small_files
+from .refusals import files, save_elbow, small_files
 
 pytestmark = pytest.mark.one_blender_version
-
-
-@pytest.fixture
-def refusal(tmp_path, capfd) -> Refusal:
-    return Refusal(tmp_path, capfd)
-
-
-@pytest.fixture
-def refusal_on_a_full_disk(tmp_path, capsys) -> Refusal:
-    """As `refusal`; what is caught stays in memory, for it could not be written to a file either."""
-    return Refusal(tmp_path, capsys)
 
 
 @pytest.fixture(params=["record", "bind", "evaluate", "benchmark"])

@@ -17,12 +17,7 @@ from fdda_addon.scene.scene_rig import find_rig
 
 from .. import systems
 from .conftest import run
-from .refusals import Refusal, save_elbow
-
-
-@pytest.fixture
-def refusal(tmp_path, capfd) -> Refusal:
-    return Refusal(tmp_path, capfd)
+from .refusals import save_elbow
 
 
 @pytest.fixture(params=["bind", "evaluate", "benchmark"])

@@ -15,15 +15,9 @@ from fdda_addon.core.messages import Message, MessageType
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 
 from .conftest import run
-from .refusals import Refusal
 from .stand_ins import say, stand_in_trainer
 
 pytestmark = pytest.mark.one_blender_version
-
-
-@pytest.fixture
-def refusal(tmp_path, capfd) -> Refusal:
-    return Refusal(tmp_path, capfd)
 
 
 @pytest.fixture

@@ -9,18 +9,10 @@ import numpy as np
 import pytest
 
 from .conftest import run
-from .refusals import Refusal, files, save_elbow, small_files
+from .refusals import files, save_elbow, small_files
 
 
 class TestRefusals:
-    @pytest.fixture
-    def refusal(self, tmp_path, capfd) -> Refusal:
-        return Refusal(tmp_path, capfd)
-
-    @pytest.fixture
-    def refusal_on_a_full_disk(self, tmp_path, capsys) -> Refusal:
-        return Refusal(tmp_path, capsys)
-
     def test_no_such_action(self, refusal, elbow, tmp_path):
         text = refusal("bake", elbow.rig, elbow.model, tmp_path / "a.pc2", "--action", "jump")
         assert text == "The file has no action 'jump'; its actions: 'elbow_wave'."

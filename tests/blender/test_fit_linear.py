@@ -29,7 +29,7 @@ from fdda_addon.scene.scene_rig import SceneRig, find_rig
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 
 from .conftest import ELBOW, assert_plays, evaluated, pose, run, train
-from .refusals import Refusal, save_elbow
+from .refusals import save_elbow
 from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
 pytestmark = pytest.mark.one_blender_version
@@ -150,11 +150,6 @@ def test_the_fitted_linear_skinning_is_what_plays(kind, build, fitted, capfd):
     np.testing.assert_allclose(linear, LinearSkinning(recording.rig).positions(matrices[None])[0], atol=1e-5)
     errors = [np.linalg.norm(positions - true, axis=1).mean() for positions in (shown, linear)]
     assert errors[0] < errors[1] < 0.01
-
-
-@pytest.fixture
-def refusal(tmp_path, capfd) -> Refusal:
-    return Refusal(tmp_path, capfd)
 
 
 def test_a_mesh_without_weights_is_refused_unless_they_are_fitted(refusal, tmp_path):

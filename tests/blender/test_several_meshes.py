@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Two meshes on one armature, one command each: recorded in the same poses, trained, bound, compared and timed."""
 
-import io
 import json
 import shutil
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +22,7 @@ from fdda_addon.recording.run import record_meshes
 from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import find_rigs
 
+from .command_output import CommandOutput, output_of
 from .conftest import assert_plays, pose, run
 from .refusals import Refusal, files
 
@@ -43,36 +42,24 @@ class Files:
     bound: Path
 
 
-@dataclass(frozen=True)
-class Said:
-    """What a command printed, a list of lines each."""
-
-    out: list[str]
-    err: list[str]
-
-
-def said(*arguments: object) -> Said:
-    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
-        assert run(*arguments) == 0
-    return Said(out.getvalue().splitlines(), err.getvalue().splitlines())
-
-
 @pytest.fixture(scope="module")
-def commands() -> dict[str, Said]:
+def commands() -> dict[str, CommandOutput]:
     """What `record` and `train` said."""
     return {}
 
 
 @pytest.fixture(scope="module")
-def two(tmp_path_factory: pytest.TempPathFactory, commands: dict[str, Said]) -> Files:
+def two(tmp_path_factory: pytest.TempPathFactory, commands: dict[str, CommandOutput]) -> Files:
     folder = tmp_path_factory.mktemp("several")
     made = Files(*(folder / name for name in ("rig.blend", "recordings", "models", "bound.blend")))
     fdda_addon.register()
     bpy.ops.wm.read_factory_settings(use_empty=True)
     body_and_sleeve()
     save_copy(made.rig)
-    commands["record"] = said("record", made.rig, made.recordings, "--all", "--poses", POSES, "--action", "elbow_wave")
-    commands["train"] = said("train", made.recordings, made.models, "--epochs", 8, "--hidden", 16)
+    commands["record"] = output_of(
+        "record", made.rig, made.recordings, "--all", "--poses", POSES, "--action", "elbow_wave"
+    )
+    commands["train"] = output_of("train", made.recordings, made.models, "--epochs", 8, "--hidden", 16)
     assert run("bind", made.rig, made.models, made.bound) == 0
     fdda_addon.unregister()
     return made

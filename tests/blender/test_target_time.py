@@ -22,18 +22,13 @@ from fdda_addon.scene.scene_rig import find_rig
 
 from .. import systems
 from .conftest import evaluated, run, train
-from .refusals import Refusal
 from .scene_state import assert_same_state, drain, scene_state
-from .test_targets import built, complex_positions, of_flesh, recorded, refused
+from .test_target_refusals import refused
+from .test_targets import built, complex_positions, of_flesh, recorded
 
 SIMULATIONS = (targets.target_soft_body, targets.target_cloth, targets.target_geometry_nodes)
 ROOT = Path(__file__).resolve().parents[2]
 SETTLED = ("--target", "flesh", "--max-settle-frames", 80)
-
-
-@pytest.fixture
-def refusal(tmp_path, capfd) -> Refusal:
-    return Refusal(tmp_path, capfd)
 
 
 def played(rig: Path) -> np.ndarray:

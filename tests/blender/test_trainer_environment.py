@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 import time
-import tomllib
 from pathlib import Path
 
 import bpy
@@ -78,12 +77,6 @@ def refused(operator, **options: str) -> str:
     with pytest.raises(RuntimeError) as caught:
         operator(**options)
     return str(caught.value).removeprefix("Error: ").strip()
-
-
-def test_the_packages_are_what_the_trainer_asks_for():
-    groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
-    assert sorted(folder.PACKAGES) == sorted(requirement.partition("==")[0] for requirement in groups["trainer"])
-    assert all(path.is_file() for path in map(folder.pins, folder.PINS))
 
 
 def test_it_is_created_from_a_folder_of_wheels(user: Path, wheels: Path):

@@ -6,12 +6,13 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from fdda_addon.core.errors import TrainerEnvironmentError
-from fdda_addon.training.environment import check, creation, interpreters
+from fdda_addon.training.environment import check, creation, folder, interpreters
 from fdda_addon.training.environment.check_result import CheckResult
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 from fdda_addon.training.environment.folder import MARK, PACKAGES, missing_letters, python_in
@@ -264,3 +265,9 @@ def test_paths_that_are_too_long_for_windows_are_noticed_before(tmp_path: Path, 
     with pytest.raises(TrainerEnvironmentError, match=r"would be 7 letters too long for Windows; allow long paths \("):
         list(creation.Creation(tmp_path / "trainer", tmp_path / "log").steps())
     assert not (tmp_path / "trainer").exists()
+
+
+def test_the_packages_are_what_the_trainer_asks_for():
+    groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
+    assert sorted(folder.PACKAGES) == sorted(requirement.partition("==")[0] for requirement in groups["trainer"])
+    assert all(path.is_file() for path in map(folder.pins, folder.PINS))

@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from fdda_addon.core.recording.reader import Recording
+
+from .good_recording import good_recording
 from .limb import record_limb
 
 SMALL_DISK = 64 << 10
@@ -27,6 +30,12 @@ def _recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def recording(_recorded: Path, tmp_path: Path) -> Path:
     """Folder of a complete recording of the limb, to be damaged."""
     return shutil.copytree(_recorded, tmp_path / "recording")
+
+
+@pytest.fixture
+def good() -> Recording:
+    """A recording without a warning."""
+    return good_recording()
 
 
 @pytest.fixture
