@@ -187,5 +187,5 @@ def test_settling_and_pre_roll_of_what_is_no_simulation(refusal, tmp_path):
 def test_one_target_is_of_one_mesh(refusal, tmp_path):
     rig = built(targets.target_copy, tmp_path / "rig.blend")
     assert refusal("record", rig, tmp_path / "out", "--all", "--target", "flesh").startswith(
-        "A target is one of one mesh; record the meshes one by one"
+        "A target belongs to one mesh; record the meshes one by one"
     )

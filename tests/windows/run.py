@@ -67,10 +67,10 @@ runpy.run_path("setup/environment.py", run_name="__main__")
 """
 
 # What fails because of Wine, with the reason. On Windows these should pass.
-_NO_CTRL_BREAK = "Wine does not send Ctrl-Break to the group of another process."
+_CTRL_BREAK = "Wine does not send Ctrl-Break to the group of another process."
 OF_WINE: dict[str, str] = {
-    "tests/blender/test_command_process.py::test_an_interrupted_recording_resumes": _NO_CTRL_BREAK,
-    "tests/blender/test_command_process.py::test_an_interrupted_training_leaves_neither_model_nor_trainer": _NO_CTRL_BREAK,
+    "tests/blender/test_command_process.py::test_an_interrupted_recording_resumes": _CTRL_BREAK,
+    "tests/blender/test_command_process.py::test_an_interrupted_training_leaves_neither_model_nor_trainer": _CTRL_BREAK,
 }
 
 
