@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operators: a button each. Poll, gather, call, report; the work is done by the modules below."""
+"""The operators. Each gathers its settings, calls a function of a lower package, and reports."""
 
 MODULES: tuple[str, ...] = (
     "job",
@@ -21,4 +21,4 @@ MODULES: tuple[str, ...] = (
     "meshes",
     "clipboard",
 )
-"""The modules of this package; each lists its classes in `CLASSES`."""
+"""The modules of this package. Each lists its classes in `CLASSES`."""

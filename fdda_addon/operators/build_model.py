@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""All steps from the rig to a model that plays, with one button: record, train, bind."""
+"""The operator that records, trains and binds."""
 
 from collections.abc import Iterator
 
@@ -36,7 +36,7 @@ class FDDA_OT_build_model(TrainingOperator, JobOperator, bpy.types.Operator):
         files = [(rig, recording_folder(rig.mesh_object), model_file(rig.mesh_object)) for rig in rigs]
         missing = [(rig, recording) for rig, recording, _ in files if not is_recorded(recording)]
         if missing:
-            # One that was broken off is resumed.
+            # An interrupted recording is resumed.
             resume = any((recording / "recording.json").exists() for _, recording in missing)
             for step in record_rigs(self.rig(context), missing, resume):
                 yield step

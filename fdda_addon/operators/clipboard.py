@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Copy Objects of Blender, for characters that play: what lands on the clipboard is the true rig.
+"""Blender's Copy Objects for characters that play a model: it copies their rigs.
 
-Blender calls nobody before it writes the clipboard. So the key that copies objects in the 3D View comes here first, and
-is passed on where no model plays. The entry of the menu Object cannot be had that way.
+Blender has no handler that runs before the clipboard is written. So this operator takes the shortcut in the 3D View,
+and passes it on while no model plays. It cannot replace the entry in the Object menu.
 """
 
 import bpy
@@ -39,7 +39,7 @@ CLASSES = (FDDA_OT_copy_objects,)
 
 
 def register() -> None:
-    """Take the key of Blender's own operator; a Blender without a window has no keys."""
+    """Add the shortcut. In the background Blender has no key configuration."""
     configuration = bpy.context.window_manager.keyconfigs.addon
     if configuration is not None:
         keymap = configuration.keymaps.new("3D View", space_type="VIEW_3D")

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Jobs that ask before they begin, with a file browser or a dialog.
+"""Jobs that first show a file browser or a dialog.
 
-Blender executes an operator when its question is answered, and an operator that is executed works to its end at once:
-the answer therefore invokes the operator a second time.
+Blender calls `execute` after the dialog, where a job would run to its end at once. So it invokes the operator again.
 """
 
 import bpy
@@ -11,12 +10,12 @@ from .job import JobOperator
 
 
 class ConfirmFirst(JobOperator):
-    """Mixin for an operator of a job that may ask first; `invoke` does, with `_is_confirming` set."""
+    """Mixin for a job operator with a dialog. Its `invoke` shows it and sets `_is_confirming`."""
 
     _is_confirming = False
 
     def confirmed_properties(self) -> dict[str, object]:
-        """The properties that it is invoked with once the question was answered."""
+        """Return the properties for the second invocation."""
         return {}
 
     def execute(self, context: bpy.types.Context) -> set[str]:

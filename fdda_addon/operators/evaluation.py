@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators of the section Evaluation: compare, colour the mesh, open the report."""
+"""Operators of the section "Compare with Rig": evaluate, color the mesh, show the rig, open the report."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -114,11 +114,11 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
 
 
 class EvaluationOperator(ModelOperator):
-    """Mixin for an operator that shows the last evaluation."""
+    """Mixin for an operator on the last evaluation."""
 
     @classmethod
     def has_evaluation(cls, context: bpy.types.Context) -> bool:
-        """Whether a mesh of the scene was evaluated; sets the poll message otherwise. For `poll`."""
+        """Return whether any mesh of the scene has an evaluation, else set the poll message. For `poll`."""
         if not cls.can_change_scene(context):
             return False
         if not any_mesh_object(context, last_evaluation.get):
@@ -127,7 +127,7 @@ class EvaluationOperator(ModelOperator):
         return True
 
     def last_evaluation(self, context: bpy.types.Context) -> tuple[object, object]:
-        """The rig and its last evaluation.
+        """Return the rig and its last evaluation.
 
         Raises:
             FDDAError: there is none.
@@ -223,7 +223,7 @@ class FDDA_OT_open_report(ModelOperator, bpy.types.Operator):
         return f"Opened {path} in the web browser."
 
     def _report_page(self, mesh_object: bpy.types.Object) -> Path:
-        """Where the report of the bound model is."""
+        """Return the path of the report of the bound model."""
         from ..models import model_list
 
         entry = bound_entry(mesh_object)
@@ -316,8 +316,8 @@ CLASSES = (
 
 
 def unregister() -> None:
-    """Paint nothing and compare nothing any more."""
-    # No data is there while Blender starts or ends.
+    """Remove all colors, copies of rigs and graphs."""
+    # Blender has no data while it starts or quits.
     if hasattr(bpy.data, "objects"):
         side_by_side.hide_all()
     show_graph(False)

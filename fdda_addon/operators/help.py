@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The manual, opened in the web browser at the section of a button. It comes with the add-on: no network is needed."""
+"""The operator that opens the manual in the web browser. The manual is part of the add-on."""
 
 import tempfile
 from pathlib import Path
@@ -40,7 +40,7 @@ class FDDA_OT_help(bpy.types.Operator):
 
 
 def manual_file() -> Path:
-    """The manual as a page for browsers, written anew; its pictures are those of the add-on.
+    """Write the manual as an HTML page and return its path. The pictures stay in the add-on.
 
     Raises:
         OSError, OutputError: it cannot be read or written.

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators whose work takes more than a moment.
+"""Base of operators that take longer than a moment.
 
-In a window a job advances a little at each tick of a timer; in the background, or when the operator is executed rather
-than invoked, it runs to its end.
+Invoked in a window, the job advances at each tick of a timer. In the background, or executed, it runs to its end.
 """
 
 import time
@@ -14,19 +13,19 @@ from ..core.errors import FDDAError
 from ..jobs.job import JobState, Run, current, redraw, request_cancel, stop, unregister
 
 TICK_BUDGET, MAX_BUDGET = 0.03, 0.2
-"""Seconds that a job may work at a tick; a step that is begun is finished, so steps must be short.
+"""Seconds that a job may work in one tick. A step is always finished, so steps must be short.
 
-A job that borrows the scene has each of its poses drawn. Where drawing takes longer than the budget, it may work as
-long as that took, or nearly all the time would go into pictures.
+Blender draws each pose of a job that borrows the scene. Where drawing takes longer than the budget, the job may work as
+long as the drawing took, or nearly all the time would go into drawing.
 """
 TICK_SECONDS, IDLE_TICK_SECONDS = 0.01, 0.1
-"""Between the ticks of a job that works in Blender, and of one that waits for another process."""
+"""Seconds between ticks of a job that works in Blender, and of one that waits for another process."""
 BACKGROUND_STEP_SECONDS = 0.05
 REDRAW_SECONDS = 0.1
 TAB_STRIP_WIDTH = 24
 
 VIEW_EVENTS = {"MOUSEMOVE", "INBETWEEN_MOUSEMOVE", "MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "WINDOW_DEACTIVATE"}
-"""Events that are passed on while a job borrows the scene: looking is allowed, changing is not."""
+"""Events that a job passes on to Blender while it borrows the scene: navigation of the view."""
 
 
 class JobOperator:
@@ -39,38 +38,37 @@ class JobOperator:
     verb = ""
     title = ""
     borrows_scene = True
-    """The job changes the scene and gives it back: meanwhile the user may look, but not touch, and ESC cancels."""
+    """Whether the job changes the scene and restores it. Meanwhile only the view can be navigated; ESC cancels."""
     changes_file = False
-    """The job has changed what the .blend file keeps. Its end is then a step of Blender's undo, and marks the file as
-    changed, so that Blender asks before it closes the file."""
+    """Whether the job changes data of the .blend file. Its end then adds an undo step and marks the file as changed."""
     ends_itself = False
-    """`steps` watches `state.cancel_requested` and ends soon: for a process that takes its time to stop."""
+    """Whether `steps` watches `state.cancel_requested` and ends by itself, as a process needs time to stop."""
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        """The work: yields `Progress`, None when there is nothing to do before the next tick, or a result.
+        """Do the work: yield `Progress`, None while there is nothing to do, or a result.
 
         Closing the generator cancels the job. No step may take longer than a tick (`TICK_BUDGET`).
         """
         raise NotImplementedError
 
     def subject(self, context: bpy.types.Context) -> int:
-        """session_uid of the object that the job is about."""
+        """Return the session_uid of the object that the job works on."""
         return 0
 
     def finish(self, context: bpy.types.Context, result: object) -> str:
-        """What remains to do with the last result of `steps`; returns the sentence that is reported."""
+        """Use the last result of `steps`, and return the message to report."""
         raise NotImplementedError
 
     def cancel_message(self, context: bpy.types.Context) -> str:
-        """The sentence that is reported when the user has cancelled the job."""
+        """Return the message to report when the user has canceled the job."""
         return f"{self.title} canceled."
 
     def on_failure(self) -> None:
-        """Do what remains when the job has ended with an error."""
+        """Clean up after an error."""
 
     @classmethod
     def is_idle(cls) -> bool:
-        """Whether no job runs; sets the poll message otherwise. For `poll`."""
+        """Return whether no job runs, else set the poll message. For `poll`."""
         job = current()
         if job is not None:
             cls.poll_message_set(f"{job.title} is under way; wait for it or cancel it")
@@ -78,7 +76,7 @@ class JobOperator:
 
     @property
     def state(self) -> JobState:
-        """The state of this operator's job, for its log and curves."""
+        """Return the state of the job, for its log and curves."""
         return self._run.state
 
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -104,7 +102,7 @@ class JobOperator:
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if not self._run.state.is_running:
-            # Ended by an undo or by another file.
+            # An undo or another file has ended the job.
             self._end_modal(context)
             return {"CANCELLED"}
         if event.type == "ESC" and self.borrows_scene:
@@ -114,12 +112,12 @@ class JobOperator:
             if result is not None:
                 return result
         if event.type == "TIMER" or not self.borrows_scene or _is_view_event(context, event):
-            # Not with RUNNING_MODAL: Blender would then not notice which region the mouse is in, and no button works.
+            # With RUNNING_MODAL Blender would not track the region below the mouse, and no button would work.
             return {"PASS_THROUGH"}
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """Blender ends the operator: its window is closed, or Blender."""
+        """Stop the job: its window or Blender is closed."""
         if self._run.state.is_running:
             stop(f"{self.title} ended with its window.")
         self._end_modal(context)
@@ -145,7 +143,7 @@ class JobOperator:
         return True
 
     def _tick(self, context: bpy.types.Context) -> set[str] | None:
-        """Work a little; returns the operator's result once the job has ended."""
+        """Work for one tick; return the result of the operator once the job has ended."""
         budget = TICK_BUDGET
         if self.borrows_scene:
             budget = min(max(budget, time.monotonic() - self._last_work), MAX_BUDGET)
@@ -168,7 +166,7 @@ class JobOperator:
         return None
 
     def _end(self) -> set[str]:
-        """Report how the job ended; returns the operator's result."""
+        """Report the outcome of the job, and return the result of the operator."""
         state = self._run.state
         if state.outcome_level == "ERROR":
             self.on_failure()
@@ -178,7 +176,7 @@ class JobOperator:
         return {"FINISHED"} if state.outcome_level == "INFO" else {"CANCELLED"}
 
     def _set_status_text(self, context: bpy.types.Context, text: str | None) -> None:
-        """Show a text in the status bar, or Blender's own again where one was shown."""
+        """Show a text in the status bar; None restores Blender's own."""
         if text != self._status_text and context.workspace is not None:
             context.workspace.status_text_set(text)
             self._status_text = text
@@ -191,10 +189,10 @@ class JobOperator:
 
 
 def _is_view_event(context: bpy.types.Context, event: bpy.types.Event) -> bool:
-    """Whether an event may reach the rest of Blender while the scene is borrowed: to look, and to press Cancel."""
+    """Return whether an event only navigates the view or presses a button of the sidebar, such as Cancel."""
     if event.type in VIEW_EVENTS:
         return True
-    # Not the strip of tabs at either side: on another tab there would be no way back.
+    # Without the strip of tabs: there would be no way back from another tab.
     strip = TAB_STRIP_WIDTH * context.preferences.system.ui_scale
     return event.type == "LEFTMOUSE" and any(
         region.type == "UI"

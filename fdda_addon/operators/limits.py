@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The range of motion of many bones at once: those that are selected, in the list and in the view alike."""
+"""Operators on the rotation limits of the selected bones."""
 
 import math
 
@@ -18,10 +18,10 @@ def _count_bones(count: int) -> str:
 
 
 class _SelectedBonesOperator(PoseOperator):
-    """Mixin for an operator on the ranges of the selected bones."""
+    """Mixin for an operator on the limits of the selected bones."""
 
     def selected_bones(self, context: bpy.types.Context) -> list[bpy.types.PoseBone]:
-        """The selected bones.
+        """Return the selected bones.
 
         Raises:
             RigError: there is none.
@@ -36,7 +36,7 @@ class _SelectedBonesOperator(PoseOperator):
 
 
 def _copy_limits(source: bpy.types.PoseBone, target: bpy.types.PoseBone, mirrored: bool = False) -> None:
-    """State the ranges of one bone for another; those of one on the other side turn round about Y and Z."""
+    """Copy the limits of one bone to another; mirrored limits change sign about Y and Z."""
     from ..poses.motion_range import DEFAULT, clear_rotation_range, rotation_ranges, set_rotation_range
 
     for axis, found in enumerate(rotation_ranges(source)):

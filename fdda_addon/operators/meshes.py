@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The meshes of one armature: which of them the sidebar shows, and Blender's menus with all buttons of the add-on.
+"""Chooses the mesh of an armature that the sidebar shows, and adds a menu with all operators to Blender's menus.
 
 Blender's search (F3) finds what is in a menu, so all of them are.
 """
@@ -25,7 +25,7 @@ MENU_OPERATORS = (
     ("fdda.add_model", "fdda.remove_model", "fdda.pack_model", "fdda.unpack_model", "fdda.check_model"),
     ("fdda.help",),
 )
-"""The operators of the menu, in groups."""
+"""Operators of the menu, in groups."""
 
 
 class FDDA_OT_show_mesh(RigOperator, bpy.types.Operator):
@@ -45,7 +45,7 @@ class FDDA_OT_show_mesh(RigOperator, bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         context.window_manager.fdda.mesh = shown.name
-        # A mesh that is selected beside the armature would be shown in its place.
+        # The sidebar prefers a mesh that is selected together with the armature.
         for rig in rigs_of_active_armature(context):
             if rig.mesh_object.select_get():
                 rig.mesh_object.select_set(False)
@@ -79,7 +79,7 @@ MENUS = ("VIEW3D_MT_object", "VIEW3D_MT_pose")
 
 
 def register() -> None:
-    """Put the menu into those of object mode and pose mode."""
+    """Add the menu to the menus Object and Pose."""
     for name in MENUS:
         getattr(bpy.types, name).append(_draw_menu)
 

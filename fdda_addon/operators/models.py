@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators of the section Models: the list of a mesh, packing into the .blend file, and checking against the rig."""
+"""Operators of the section "Model Library": add, remove, pack and check models."""
 
 import bpy
 
@@ -14,7 +14,7 @@ def _has_models(mesh_object: bpy.types.Object) -> bool:
 
 
 class ModelListOperator(ModelOperator):
-    """Mixin for an operator on an entry of the list of models."""
+    """Mixin for an operator on a model of the Model Library."""
 
     index: bpy.props.IntProperty(
         name="Index",
@@ -26,7 +26,7 @@ class ModelListOperator(ModelOperator):
 
     @classmethod
     def has_models(cls, context: bpy.types.Context) -> bool:
-        """Whether a mesh of the scene has models; sets the poll message otherwise. For `poll`."""
+        """Return whether any mesh of the scene has models, else set the poll message. For `poll`."""
         if not cls.can_change_scene(context):
             return False
         if not any_mesh_object(context, _has_models):
@@ -35,7 +35,7 @@ class ModelListOperator(ModelOperator):
         return True
 
     def active_entry(self, context: bpy.types.Context) -> tuple[object, object]:
-        """The rig and the entry that is meant.
+        """Return the rig, and the entry at `index` or the active one.
 
         Raises:
             FDDAError: there is none.

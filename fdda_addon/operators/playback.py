@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators of the section Playback: bind, switch, measure, relink, unbind."""
+"""Operators of the section "Model": bind, set the mode, measure, relink, unbind."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +18,7 @@ from .job import JobOperator
 from .rig_operator import RigOperator
 
 LARGE_MODEL_BYTES = 32_000_000
-"""From this size on a model is not packed without being asked: every save writes it again."""
+"""Models above this size are packed on request only: every save writes them again."""
 MODE_NAMES = {"RIG": "the rig", "LINEAR": "skinning alone", "FDDA": "the model"}
 
 
@@ -27,11 +27,11 @@ def _is_bound(mesh_object: bpy.types.Object) -> bool:
 
 
 class ModelOperator(RigOperator):
-    """Mixin for an operator that works on the model of a rig, as long as no job changes the scene."""
+    """Mixin for an operator on the model of a rig."""
 
     @classmethod
     def can_change_scene(cls, context: bpy.types.Context) -> bool:
-        """Whether there is a rig and no job borrows the scene; sets the poll message otherwise. For `poll`."""
+        """Return whether there is a rig and no job borrows the scene, else set the poll message. For `poll`."""
         job = current()
         if job is not None and job.borrows_scene:
             cls.poll_message_set(f"{job.title} is under way; wait for it or cancel it")
@@ -40,7 +40,7 @@ class ModelOperator(RigOperator):
 
     @classmethod
     def has_bound_model(cls, context: bpy.types.Context) -> bool:
-        """As `can_change_scene`, and the active rig, or some other, has a model that is bound."""
+        """As `can_change_scene`, and a mesh of the scene has a bound model."""
         if not cls.can_change_scene(context):
             return False
         if not any_mesh_object(context, _is_bound):
@@ -49,7 +49,7 @@ class ModelOperator(RigOperator):
         return True
 
     def bound_rig(self, context: bpy.types.Context) -> object:
-        """The rig that is meant, which has a model.
+        """Return the rig to apply the operator to; it has a bound model.
 
         Raises:
             FDDAError: there is no rig, or no model is bound to it.
@@ -60,10 +60,10 @@ class ModelOperator(RigOperator):
         return scene_rig
 
     def bound_rigs(self, context: bpy.types.Context) -> list[SceneRig]:
-        """The rigs that are meant and have a model.
+        """Return the rigs with a bound model to apply the operator to.
 
         Raises:
-            FDDAError: none has.
+            FDDAError: none has a bound model.
         """
         bound = [rig for rig in self.rigs(context) if rig.mesh_object.fdda.is_bound]
         return bound or [self.bound_rig(context)]
@@ -77,16 +77,16 @@ class ModelOperator(RigOperator):
         return {"FINISHED"}
 
     def apply(self, context: bpy.types.Context) -> str:
-        """Do it; returns the sentence that is reported.
+        """Do the work of the operator and return the message to report; empty for none.
 
         Raises:
-            FDDAError: its text is reported, and the operator is cancelled.
+            FDDAError: its text is reported, and the operator is canceled.
         """
         raise NotImplementedError
 
 
 class ModelFileOperator:
-    """Mixin for an operator that takes the path of a model, and asks for it when it is invoked without."""
+    """Mixin for an operator on a model file; without one, `invoke` opens the file browser."""
 
     filepath: bpy.props.StringProperty(
         name="Model", description="Model file, .onnx", subtype="FILE_PATH", options={"SKIP_SAVE"}
@@ -95,27 +95,27 @@ class ModelFileOperator:
     check_existing: bpy.props.BoolProperty(default=False, options={"HIDDEN"})
 
     def open_file_browser(self, context: bpy.types.Context) -> set[str]:
-        """Open the file browser in the folder of the .blend file; `execute` follows."""
+        """Open the file browser in the folder of the .blend file. Blender then calls `execute`."""
         self.filepath = bpy.path.abspath("//")
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
     def draw(self, _context: bpy.types.Context) -> None:
-        # The file browser would list the properties.
+        # Without this the file browser would list the properties.
         pass
 
     def chosen_path(self) -> Path:
-        """The path that was chosen."""
+        """Return the absolute path of the chosen file."""
         return Path(bpy.path.abspath(self.filepath))
 
 
 def _has_model(mesh_object: bpy.types.Object) -> bool:
-    """Whether there is a model to bind: in the list, or where the training writes it."""
+    """Return whether there is a model to bind: in the Model Library, or from a training."""
     return chosen_entry(mesh_object) is not None or trained_file(mesh_object) is not None
 
 
 def _unpacked_file(mesh_object: bpy.types.Object) -> Path | None:
-    """The file of the model that would be bound, None for one that is packed."""
+    """Return the file of the model that would be bound, None if it is packed."""
     from ..models import model_list
 
     entry = chosen_entry(mesh_object)
@@ -125,15 +125,15 @@ def _unpacked_file(mesh_object: bpy.types.Object) -> Path | None:
 
 
 def bind_model(scene_rig: SceneRig, path: Path | None = None, pack_large: bool = False) -> str:
-    """Bind a model and pack it, as the preferences say; returns the sentence that says so.
+    """Bind a model, pack it unless the preferences disagree, and return the message to report.
 
     Args:
         scene_rig: the rig.
-        path: of the model; None for the one that is chosen in the list, or that was trained.
-        pack_large: pack it also where it is large.
+        path: of the model; None for the active one of the Model Library, or the trained one.
+        pack_large: whether to pack a large model too.
 
     Raises:
-        FDDAError: it is no model of this rig, or cannot play.
+        FDDAError: the file is not a model of this rig, or the model cannot play.
     """
     from ..models import model_list
 
@@ -142,7 +142,7 @@ def bind_model(scene_rig: SceneRig, path: Path | None = None, pack_large: bool =
     if path is None and chosen_entry(mesh_object) is None:
         path = trained_file(mesh_object)
     if path is not None:
-        # Before it is put into the list: what is no model of this rig does not belong there.
+        # Checked first, so that no model of another rig gets into the list.
         model_list.check(scene_rig, path)
         entry = model_list.remember(mesh_object, path)
     else:
@@ -152,7 +152,7 @@ def bind_model(scene_rig: SceneRig, path: Path | None = None, pack_large: bool =
 
 
 def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pack_large: bool = False) -> str:
-    """Put a model into the .blend file, unless the preferences say otherwise or it is large; returns what to say."""
+    """Pack a model unless the preferences disagree or it is large; return an addition to the message."""
     from ..models import model_list
 
     if entry.packed or not packs_models():
@@ -204,7 +204,7 @@ class FDDA_OT_bind(ModelOperator, ModelFileOperator, bpy.types.Operator):
             self.layout.prop(self, "pack_large")
 
     def _largest_unpacked_bytes(self, context: bpy.types.Context) -> int:
-        """Size of the largest model that would be bound and is not packed; 0 where that cannot be said."""
+        """Return the size of the largest unpacked model to bind, bytes; 0 without one."""
         try:
             rigs = self.rigs(context)
         except FDDAError:

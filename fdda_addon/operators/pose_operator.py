@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators that change the armature of a rig, or what is recorded of it."""
+"""Base of operators on the pose, the limits and the recorded inputs of a rig."""
 
 import bpy
 
@@ -9,7 +9,7 @@ from .rig_operator import RigOperator
 
 
 class PoseOperator(RigOperator):
-    """Mixin for an operator that changes the armature of a rig."""
+    """Mixin for an operator in Object Mode or Pose Mode that changes a rig."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

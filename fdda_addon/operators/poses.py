@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The poses: look at those that are recorded, and state the range of motion."""
+"""Operators on poses and limits: preview random poses, reset the pose, set the limits of a bone."""
 
 import math
 from typing import TYPE_CHECKING
@@ -67,7 +67,7 @@ class FDDA_OT_rest_pose(PoseOperator, bpy.types.Operator):
 
 
 def _sampled_controls(rig: SceneRig) -> "tuple[Control, ...]":
-    """The controls that random poses change; none while the choice is not complete, which the section Rig says."""
+    """Return the extra inputs that random poses change; none while the settings are incomplete."""
     from ..recording.plan import read_sample_selection
 
     try:
@@ -77,7 +77,7 @@ def _sampled_controls(rig: SceneRig) -> "tuple[Control, ...]":
 
 
 class _LimitOperator(PoseOperator):
-    """Mixin for an operator that changes the range of one rotation axis."""
+    """Mixin for an operator on the rotation limit of a bone about one axis."""
 
     bone: bpy.props.StringProperty(name="Bone", description="Name of the bone", options={"SKIP_SAVE"})
     axis: bpy.props.EnumProperty(
@@ -85,10 +85,10 @@ class _LimitOperator(PoseOperator):
     )
 
     def pose_bone(self, context: bpy.types.Context) -> bpy.types.PoseBone:
-        """The bone that is meant.
+        """Return the bone to apply the operator to.
 
         Raises:
-            RigError: there is none of this name.
+            RigError: there is no bone of this name.
         """
         armature_object = self.rig(context).armature_object
         bone = armature_object.pose.bones.get(self.bone)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The recording: evaluate the poses of a character and keep them in a folder."""
+"""Operators that record poses, add poses at the worst errors, and delete a recording."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -19,7 +19,7 @@ from .rig_operator import RigOperator
 
 
 def record_rigs(shown: SceneRig, rigs: list[tuple[SceneRig, Path]], resume: bool = False) -> Iterator[object]:
-    """Record meshes of one armature together, as the settings of the one that is shown say; the others take these over.
+    """Record the meshes of an armature together, with the settings of the one that the sidebar shows.
 
     Raises:
         FDDAError: as `recording.run.record_meshes`.
@@ -32,12 +32,12 @@ def record_rigs(shown: SceneRig, rigs: list[tuple[SceneRig, Path]], resume: bool
             borrowed.enter_context(model_disabled(rig.mesh_object))
             if rig.mesh_object != shown.mesh_object:
                 copy_sampling_settings(rig.mesh_object.fdda.settings, shown.mesh_object.fdda.settings)
-        # The one that is shown may be recorded already, and its settings still count.
+        # The shown mesh may be recorded already; its settings are used all the same.
         yield from record_meshes(rigs, recording_settings(shown, resume))
 
 
 def is_recorded(path: Path) -> bool:
-    """Whether there is a complete recording in a folder."""
+    """Return whether a folder has a complete recording."""
     from ..core.recording.index import read_index
 
     try:
@@ -76,7 +76,7 @@ class FDDA_OT_record(RigOperator, JobOperator, bpy.types.Operator):
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         rigs = self.rigs(context)
-        # The others take over the settings of the one that is shown.
+        # The other meshes get the settings of the shown one.
         self.changes_file = len(rigs) > 1
         if self.folder:
             self._paths = [Path(bpy.path.abspath(self.folder))]
@@ -155,7 +155,7 @@ class FDDA_OT_delete_recording(RigOperator, bpy.types.Operator):
         )
 
     def _deletion_message(self, context: bpy.types.Context) -> str:
-        """What would be removed, a sentence."""
+        """Return a message about what would be deleted."""
         from ..core.recording.index import read_index
 
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The rig: add the sample arm, measure what a frame costs."""
+"""Operators of the section "Rig": add the sample arm, measure the speed."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -14,11 +14,11 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from ..timing.rig_cost import RigCost
 
 _measured_costs: "dict[int, RigCost]" = {}
-"""What was measured in this session, by session_uid of the mesh object."""
+"""Measurements of this session, by session_uid of the mesh object."""
 
 
 def measured_cost(mesh_object: bpy.types.Object) -> "RigCost | None":
-    """What a frame of a rig costs, None when that was not measured, or for another number of vertices."""
+    """Return the measured cost of a rig, None without a measurement for its number of vertices."""
     cost = _measured_costs.get(mesh_object.session_uid)
     return cost if cost is not None and cost.vertices == len(mesh_object.data.vertices) else None
 
@@ -59,7 +59,7 @@ class FDDA_OT_add_sample_arm(bpy.types.Operator):
         has_animation = len(bpy.data.actions) > 0
         mesh_object, armature_object = build_arm(int(self.density))
         if has_animation:
-            # The range is that of the arm's action in an empty scene only.
+            # Only a scene without actions gets the frame range of the arm's action.
             scene.frame_start, scene.frame_end = frames[:2]
             scene.frame_set(frames[2])
         for selected in context.selected_objects:
@@ -76,7 +76,7 @@ class FDDA_OT_add_sample_arm(bpy.types.Operator):
 
 
 def _hide_startup_cube(context: bpy.types.Context) -> bool:
-    """Hide the cube that a new file of Blender's has where the arm goes; returns whether there was one."""
+    """Hide the unchanged default cube; return whether there was one."""
     cube = context.scene.objects.get("Cube")
     is_untouched = (
         cube is not None
@@ -122,7 +122,7 @@ CLASSES = (FDDA_OT_add_sample_arm, FDDA_OT_measure)
 
 
 def register() -> None:
-    """Put the arm into the menu Add > Armature."""
+    """Add the arm to the menu Add > Armature."""
     bpy.types.VIEW3D_MT_armature_add.append(_draw_add_menu)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators that work on a rig: the active one, or that of a mesh object by its name."""
+"""Base of operators on a rig: the active one, or that of a named mesh object."""
 
 import bpy
 
@@ -9,7 +9,7 @@ from ..scene.scene_rig import SceneRig, armature_of
 
 
 class RigOperator:
-    """Mixin for an operator that works on a rig."""
+    """Mixin for an operator on a rig."""
 
     object: bpy.props.StringProperty(
         name="Object",
@@ -24,9 +24,9 @@ class RigOperator:
 
     @classmethod
     def has_rig(cls, context: bpy.types.Context) -> bool:
-        """Whether there is a rig to work on; sets the poll message otherwise. For `poll`.
+        """Return whether the scene has a rig, else set the poll message. For `poll`.
 
-        A rig anywhere in the scene will do: a script may name its object.
+        The rig need not be active: a script may name its object.
         """
         if cached_active_rig(context) is not None or any_mesh_object(context, armature_of):
             return True
@@ -37,7 +37,7 @@ class RigOperator:
         return False
 
     def rig(self, context: bpy.types.Context) -> SceneRig:
-        """The rig that is meant.
+        """Return the rig to apply the operator to.
 
         Raises:
             RigError: there is none.
@@ -45,7 +45,7 @@ class RigOperator:
         return active_rig(context, self.object)
 
     def rigs(self, context: bpy.types.Context) -> list[SceneRig]:
-        """The rigs that are meant: of all meshes of the active armature where `all_meshes` says so, else the one.
+        """Return the rigs to apply the operator to: those of all meshes of the armature with `all_meshes`, else one.
 
         Raises:
             RigError: there is none.
@@ -54,5 +54,5 @@ class RigOperator:
         return together or [self.rig(context)]
 
     def subject(self, context: bpy.types.Context) -> int:
-        """session_uid of the mesh object, for the state of a job."""
+        """Return the session_uid of the mesh object, for the state of a job."""
         return self.rig(context).mesh_object.session_uid

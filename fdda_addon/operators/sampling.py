@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Chooses the bones that random poses move, and the controls that are sampled beside them."""
+"""Operators that choose the bones and extra inputs of random poses."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -60,7 +60,7 @@ class FDDA_OT_add_control(PoseOperator, bpy.types.Operator):
             try:
                 wanted = recording_settings(rig)
             except RigError:
-                # What random poses move has not been chosen yet.
+                # The bones to pose have not been chosen yet.
                 wanted = RecordingSettings()
             listed_controls(rig, replace(wanted, controls=(name,)))
         if name and name in settings.controls:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operators of the trainer's Python: check it, create the add-on's own environment, cancel that, remove it.
+"""Operators on the Python for training: check it; install and remove the training environment.
 
-Pressed in a window they go on by themselves (`jobs.background`). Executed, or without a window, they work to their end.
+Invoked in a window they run in the background (`jobs.background`). Executed they run to their end.
 """
 
 import time
@@ -21,11 +21,11 @@ from ..training.environment.check_result import CheckResult
 
 WAIT_SECONDS = 0.05
 _EnvironmentJob = tuple[Iterator[Progress | CheckResult], Callable[[], None] | None]
-"""The steps, and what has them end soon."""
+"""An iterator of steps, and a function that cancels them."""
 
 
 class _EnvironmentOperator:
-    """Mixin: a job on the trainer's environment, in a thread; a timer looks after it where there is a window."""
+    """Mixin for a job on the training environment. It runs in a thread that a timer polls."""
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -35,12 +35,12 @@ class _EnvironmentOperator:
         return True
 
     def steps(self) -> _EnvironmentJob:
-        """The work. FDDAError: it cannot begin."""
+        """Return the steps of the job and how to cancel it. Raises FDDAError if it cannot start."""
         raise NotImplementedError
 
     @staticmethod
     def store_result(outcome: CheckResult) -> None:
-        """Have the outcome shown."""
+        """Show the result in the preferences."""
         session.remember(None, outcome)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
@@ -49,7 +49,7 @@ class _EnvironmentOperator:
         run = self._begin()
         if run.work(0):
             return self._end(run.state)
-        # The operator is gone when the job ends: of it the run has nothing but its class.
+        # Blender frees the operator before the job ends, so the job must not refer to it.
         look_after(run)
         return {"FINISHED"}
 
@@ -81,13 +81,13 @@ def start_job(
     cancel: Callable[[], None] | None,
     store_result: Callable[[CheckResult], None],
 ) -> Run:
-    """Begin a job on the trainer's environment.
+    """Start a job on the training environment.
 
     Args:
         verb, title: of its `JobState`.
-        steps: yields how far it is, and last its outcome; iterated in a thread.
-        cancel: has `steps` end soon, called from another thread; None where that is not possible.
-        store_result: takes the outcome, in the main thread.
+        steps: yields progress and then the result; iterated in a thread.
+        cancel: makes `steps` end soon, called from another thread; None if it cannot be canceled.
+        store_result: called with the result, in the main thread.
     """
     state = JobState(verb, title, works_on=ENVIRONMENT, can_cancel=cancel is not None)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The training: start the trainer on a character's recording and follow it."""
+"""The operator that trains in another process and follows its progress."""
 
 import time
 from collections.abc import Iterator
@@ -22,22 +22,22 @@ FOLLOW_DELAY_SECONDS = 0.5
 
 
 class TrainingOperator(RigOperator):
-    """Mixin for the operator of a job that trains.
+    """Mixin for a job operator that trains.
 
-    A training goes on when Blender is closed (`training.detached_process`).
+    The training continues after Blender quits (`training.detached_process`).
     """
 
     def train(
         self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool = False
     ) -> Iterator[object]:
-        """Train a model, or follow its training where one was left; yields as `steps` does, at last the seconds.
+        """Train a model, or follow its running training. Yields as `steps` does, and at last the seconds.
 
         Raises:
             FDDAError: the recording is not complete, or the training fails.
         """
         from ..core.messages import MessageType
 
-        # Nothing of Blender's data is used after this: the user may do as they like.
+        # The user may change Blender's data from here on, so none of it is used.
         uid, began = mesh_object.session_uid, time.monotonic()
         state = self.state
         state.curves.update(training=[], validation=[])
@@ -48,17 +48,17 @@ class TrainingOperator(RigOperator):
                         training.cancel()
                     if message is not None:
                         if message.type is MessageType.FINISHED:
-                            # Perhaps after Cancel: what is being written is written to its end.
+                            # This may follow a Cancel: the trainer finishes writing.
                             self.trained_models.append((uid, model))
                         yield self._to_progress(message)
                         continue
                     if not state.total:
-                        # It says nothing for some seconds: that it works is all that can be shown.
+                        # The trainer sends nothing for some seconds; show that it is running.
                         yield Progress(STARTING_STAGE, int(time.monotonic() - began), 0)
                     yield None
             except GeneratorExit:
                 if not bpy.app.background:
-                    # Another file is opened, or Blender is closed.
+                    # Another file is opened, or Blender quits.
                     training.detach()
                 raise
 
@@ -80,7 +80,7 @@ class TrainingOperator(RigOperator):
         return Training(arguments) if bpy.app.background else DetachedTraining(arguments, model)
 
     def _to_progress(self, message: object) -> object:
-        """What a message of the trainer is to a job: progress, a line of its log, or the result."""
+        """Convert a message of the trainer to `Progress` or the result, or add it to the log and return None."""
         from ..core.messages import WARNING_LINE, MessageType
 
         values, state = message.values, self.state
@@ -104,7 +104,7 @@ class TrainingOperator(RigOperator):
         return None
 
     def add_trained_models_to_list(self) -> None:
-        """Put what was trained into the lists of the meshes, as far as these are there still."""
+        """Add the trained models to the Model Library of their meshes."""
         from ..models.model_list import remember
 
         self.changes_file = bool(self.trained_models)
@@ -114,13 +114,13 @@ class TrainingOperator(RigOperator):
                 remember(mesh_object, model)
 
     def on_failure(self) -> None:
-        # What was trained before the mesh that failed is on the disk, and a packed model would stay the old one.
+        # Models that were trained before the failure are on the disk; packed copies of them are outdated.
         with suppress(FDDAError):
             self.add_trained_models_to_list()
 
     @property
     def trained_models(self) -> list[tuple[int, Path]]:
-        """session_uid of the mesh and file of the model of each training that is done."""
+        """Return session_uid of the mesh and path of the model for each finished training."""
         if not hasattr(self, "_trained_models"):
             self._trained_models: list[tuple[int, Path]] = []
         return self._trained_models
@@ -130,7 +130,7 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
     bl_idname = "fdda.train"
     bl_label = "Train"
     bl_description = "Train a model on the recording, in the background. Training continues when Blender is closed"
-    # Not UNDO: Adjust Last Operation would train once more at each change, in the foreground.
+    # Without UNDO: Adjust Last Operation would train again at each change.
     bl_options = {"REGISTER"}
     verb, title = "train", "Training"
     borrows_scene = False
@@ -181,7 +181,7 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
         return {**given, "replace": True}
 
     def _models_of_other_rigs(self, context: bpy.types.Context) -> str:
-        """Which models a training would replace that are of another rig: a sentence, empty for none."""
+        """Return a message about models of other rigs that training would overwrite; empty without one."""
         from ..models.model_list import check
         from ..training.detached_process import is_detached
 
@@ -195,7 +195,7 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
         return ""
 
     def _files(self, mesh_object: bpy.types.Object) -> tuple[Path, Path]:
-        """Folder of the recording and file of the model."""
+        """Return the folder of the recording and the file of the model."""
         recording = Path(bpy.path.abspath(self.recording)) if self.recording else recording_folder(mesh_object)
         return recording, Path(bpy.path.abspath(self.model)) if self.model else model_file(mesh_object)
 
@@ -218,7 +218,7 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
 
 
 def _check_recording(path: Path) -> None:
-    """Say at once what the trainer would say after it has started."""
+    """Raise at once the error that the trainer would report after it has started."""
     from ..core.recording.index import read_index
 
     index = read_index(path)
@@ -238,7 +238,7 @@ def _make_folder(model: Path) -> None:
 
 
 def _follow_detached_training() -> None:
-    """Follow a training of the open file that was left when Blender was closed or another file opened."""
+    """Follow the training of the open file that still runs from an earlier session."""
     from ..training.detached_process import is_detached
 
     windows = bpy.context.window_manager.windows
@@ -270,7 +270,7 @@ HANDLERS = {"load_post": _on_load}
 
 
 def register() -> None:
-    """Follow what was left of a file that is open already."""
+    """Follow the training of a file that is already open."""
     _on_load()
 
 

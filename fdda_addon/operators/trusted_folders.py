@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Adds folders to those that the preferences trust, and takes them off."""
+"""Operators that add and remove the folders in the preferences from which models are loaded."""
 
 import bpy
 
@@ -7,7 +7,7 @@ from ..properties.preferences import preferences
 
 
 class _FolderOperator:
-    """Mixin for an operator on the folders in the preferences."""
+    """Mixin for an operator on these folders."""
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:

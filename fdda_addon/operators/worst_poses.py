@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators of the section Evaluation for the worst frames: mark them in the timeline, and jump to them."""
+"""Operators on the worst frames: add timeline markers, and jump to them."""
 
 import bpy
 
@@ -14,10 +14,10 @@ class WorstPosesOperator(EvaluationOperator):
     """Mixin for an operator on the poses with the largest errors."""
 
     def worst_poses(self, context: bpy.types.Context, count: int) -> tuple[object, object, list[tuple[int, float]]]:
-        """The rig, its last evaluation and the worst of its poses: index and largest error in mm.
+        """Return the rig, its last evaluation, and index and largest error in mm of its worst poses.
 
         Raises:
-            FDDAError: there is no evaluation, or no pose of it has an error.
+            FDDAError: there is no evaluation, or all errors are zero.
         """
         scene_rig, last = self.last_evaluation(context)
         found = last.worst(count)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The sidebar panel "FDDA" of the 3D View: a section a module, in the order of the work."""
+"""The tab "FDDA" in the sidebar of the 3D View. Each module has one section."""
 
 MODULES: tuple[str, ...] = ("rig", "poses", "recording", "training", "playback", "evaluation", "models")
-"""The modules of this package in the order of their sections; each lists its classes in `CLASSES`."""
+"""Modules in the order of their sections. Each lists its classes in `CLASSES`."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Names as the narrow tables of the sidebar show them: without what all bones of an armature begin with."""
+"""Short bone names for narrow tables: without the prefix that all bones of an armature have."""
 
 import re
 from collections import Counter
@@ -11,11 +11,11 @@ from ..scene.draw_cache import draw_cached
 
 MIN_PREFIX_LENGTH = 4
 MAX_UNPREFIXED_RATIO = 0.3
-"""So large a part of the bones may lack the prefix: helpers beside those of a library, for example."""
+"""Part of the bones that may lack the prefix, such as helper bones."""
 
 
 def common_prefix(names: Sequence[str]) -> str:
-    """What names begin with and what says nothing in a table: "mixamorig:", "DEF-"; empty where there is nothing."""
+    """Return the prefix that nearly all names share, "mixamorig:" or "DEF-"; empty without one."""
     namespaces = Counter(name[: name.rindex(":") + 1] for name in names if ":" in name)
     for prefix, count in namespaces.most_common(1):
         if count >= max(2, (1 - MAX_UNPREFIXED_RATIO) * len(names)):
@@ -27,7 +27,7 @@ def common_prefix(names: Sequence[str]) -> str:
 
 
 def short_bone_name(armature_object: bpy.types.Object, name: str) -> str:
-    """The name of a bone in a table."""
+    """Return the name of a bone without the common prefix."""
     return name.removeprefix(_cached_prefix(armature_object)) or name
 
 

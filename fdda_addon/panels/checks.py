@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks of rigs that panels may draw: a check runs when something has changed, in a timer, never while drawing."""
+"""Checks of rigs for panels to draw. A timer runs a check after a change; drawing never does."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -17,20 +17,20 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from ..recording.rig_check import RigCheck
 
 CHECK_INTERVAL_SECONDS = 0.3
-"""While something changes all the time, a rig is checked this often."""
+"""Shortest time between two checks of a rig that keeps changing."""
 
 _checks: dict[int, "tuple[RigCheck, tuple]"] = {}
-"""By session_uid of the mesh object: the last check and `_change_signature` at that time."""
+"""Last check, and `_change_signature` at that time, by session_uid of the mesh object."""
 _requested: set[int] = set()
 _outdated: set[int] = set()
-"""Meshes whose pose, modifiers or limits may have changed since their check, beside what `_change_signature` has."""
+"""Mesh objects to check again for a reason that `_change_signature` does not contain, by session_uid."""
 _changed_meshes: set[str] = set()
-"""Names of meshes whose data has changed."""
+"""Names of meshes whose geometry or weights have changed."""
 
 
 @draw_cache.draw_cached
 def last_check(scene_rig: SceneRig) -> "RigCheck | None":
-    """The last check of a rig, None before the first. When something has changed since, another is on its way."""
+    """Return the last check of a rig, None before the first. Schedule another one after a change."""
     uid = scene_rig.mesh_object.session_uid
     stored = _checks.get(uid)
     if stored is None or uid in _outdated or stored[1] != _change_signature(scene_rig) or _is_mesh_changed(scene_rig):
@@ -41,7 +41,7 @@ def last_check(scene_rig: SceneRig) -> "RigCheck | None":
 
 
 def check_now(scene_rig: SceneRig) -> "RigCheck":
-    """Check a rig, as far as it has changed."""
+    """Check a rig now. What has not changed is not read again."""
     from ..recording.plan import RecordingSettings
     from ..recording.rig_check import check
 
@@ -68,7 +68,7 @@ def _run_requested_checks() -> None:
         _requested.discard(uid)
         mesh_object = meshes.get(uid)
         armature_object = mesh_object and armature_of(mesh_object)
-        # While a job borrows the scene, nothing is as the user left it.
+        # A job that borrows the scene has changed the pose and the modifiers.
         if armature_object and not (running and running.borrows_scene):
             check_now(SceneRig(mesh_object, armature_object))
     if _drawn_values() != before:
@@ -76,7 +76,7 @@ def _run_requested_checks() -> None:
 
 
 def _drawn_values() -> dict[int, tuple]:
-    """What panels draw of the checks."""
+    """Return what panels draw of the checks."""
     return {
         uid: (id(check.rig), check.problems, check.channels, check.replaced_modifiers, check.automatic_controls)
         for uid, (check, _) in _checks.items()
@@ -84,7 +84,7 @@ def _drawn_values() -> dict[int, tuple]:
 
 
 def _change_signature(scene_rig: SceneRig) -> tuple:
-    """What is cheap to read and changes when a check may come out differently: (rest pose, the rest)."""
+    """Return cheap values that change when a check may change: (those of the rest pose, all others)."""
     from ..scene.arrays import REST_MATRIX, read
 
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
@@ -105,7 +105,7 @@ def _change_signature(scene_rig: SceneRig) -> tuple:
 
 
 def _sampling_settings(scene_rig: SceneRig) -> tuple:
-    """What the user has chosen to sample."""
+    """Return the settings that choose what random poses move."""
     try:
         settings = recording_settings(scene_rig)
     except RigError as error:
@@ -115,7 +115,7 @@ def _sampling_settings(scene_rig: SceneRig) -> tuple:
 
 def _is_mesh_changed(scene_rig: SceneRig) -> bool:
     mesh_object = scene_rig.mesh_object
-    # Reading a large mesh takes a moment: not at each stroke of a brush.
+    # Reading a large mesh takes a moment, which would be noticed at each stroke of a brush.
     if mesh_object.mode not in {"OBJECT", "POSE"} or not _changed_meshes:
         return False
     return mesh_object.data.name in _changed_meshes
@@ -128,7 +128,7 @@ def _on_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
         return
     _outdated.update(_checks)
     for update in depsgraph.updates:
-        # Not the armatures: Blender counts them as changed with every pose.
+        # Armatures are left out: Blender reports them as changed with every pose.
         if isinstance(update.id, bpy.types.Mesh):
             _changed_meshes.add(update.id.name)
 
@@ -156,7 +156,7 @@ HANDLERS = {
 
 
 def unregister() -> None:
-    """Forget all checks."""
+    """Remove the timer and all checks."""
     if bpy.app.timers.is_registered(_run_requested_checks):
         bpy.app.timers.unregister(_run_requested_checks)
     _on_loaded()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The curves of a training, drawn into a panel as a preview that lives in memory alone."""
+"""Draws the error curves of a training into a panel, as a preview image in memory."""
 
 import math
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 
 WIDTH, HEIGHT = 224, 224
 MARGIN_LEFT, MARGIN_BOTTOM = 34, 16
-"""Room for the numbers of the axes, pixels."""
+"""Space for the numbers of the axes, pixels."""
 LINE_HALF_WIDTH = 1.6
 """Half the width of a line, pixels."""
 LEGEND = {
@@ -21,19 +21,19 @@ LEGEND = {
 BACKGROUND_COLOR, GRID_COLOR = (0.10, 0.10, 0.10, 1.0), (0.20, 0.20, 0.20, 1.0)
 TEXT_COLOR = (0.75, 0.75, 0.75)
 TICK_STEPS = (1, 2, 5)
-"""Of each decade, the errors that have a line and a number."""
+"""Errors with a grid line and a number in each decade."""
 DIGIT_GLYPHS = {
     "0": "757555557", "1": "262222227", "2": "711744447", "3": "711711117", "4": "555711111", "5": "744711117",
     "6": "744755557", "7": "711111111", "8": "757557557", "9": "757711117", ".": "000000002",
 }  # fmt: skip
-"""Glyphs of 3 by 9 pixels, a row a digit, bits from the left."""
+"""Glyphs of 3 by 9 pixels. Each digit of a string is a row of 3 bits."""
 
 _previews: object = None
 _drawn_key: tuple = ()
 
 
 def draw(layout: bpy.types.UILayout, curves: dict[str, list[float]]) -> None:
-    """Draw curves of an error by epoch, on a logarithmic scale, with a legend; nothing before there are two points."""
+    """Draw error curves by epoch on a logarithmic scale, with a legend. Draw nothing before the second epoch."""
     lengths = [len(curves.get(name, ())) for name in LEGEND]
     if min(lengths) < 2:
         return
@@ -45,7 +45,7 @@ def draw(layout: bpy.types.UILayout, curves: dict[str, list[float]]) -> None:
 
 
 def _icon(curves: dict[str, list[float]]) -> int:
-    """Icon of the picture of the curves; it is painted again when they have grown."""
+    """Return the icon of the curves. Paint it again when they have grown."""
     import bpy.utils.previews
 
     from ..scene.arrays import write_pixels
@@ -63,7 +63,7 @@ def _icon(curves: dict[str, list[float]]) -> int:
 
 
 def paint(curves: "dict[str, list[float]]") -> "np.ndarray":
-    """(HEIGHT, WIDTH, 4) float32, rows from the bottom: the curves in their colours, with axes."""
+    """Return an image of the curves with axes: (HEIGHT, WIDTH, 4) float32 RGBA, rows from the bottom."""
     import numpy as np
 
     pixels = np.empty((HEIGHT, WIDTH, 4), np.float32)
@@ -95,7 +95,7 @@ def paint(curves: "dict[str, list[float]]") -> "np.ndarray":
 
 
 def _tick_errors(low: float, high: float) -> list[float]:
-    """The round errors from `low` to `high` that have a line, mm; at least one when the range is not tiny."""
+    """Return the round errors from `low` to `high` that get a grid line, mm; usually at least one."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     marks = [mark * 10.0**decade for decade in decades for mark in TICK_STEPS if low <= mark * 10.0**decade <= high]
     decadic = [mark for mark in marks if round(math.log10(mark), 6) % 1 == 0]
@@ -103,7 +103,7 @@ def _tick_errors(low: float, high: float) -> list[float]:
 
 
 def _paint_grid(pixels: "np.ndarray", marks: dict[float, int]) -> None:
-    """A line and a number for each marked error; numbers that would touch the one below are left out."""
+    """Paint a grid line and a number for each error. Leave out numbers that would touch the one below."""
     above = -1
     for error, row in sorted(marks.items()):
         pixels[MARGIN_BOTTOM + row, MARGIN_LEFT:] = GRID_COLOR
@@ -115,7 +115,7 @@ def _paint_grid(pixels: "np.ndarray", marks: dict[float, int]) -> None:
 
 
 def _paint_number(pixels: "np.ndarray", text: str, left: int, bottom: int) -> None:
-    """Write a number into a picture, twice as wide as its glyphs."""
+    """Paint a number, with glyphs of double width."""
     for index, character in enumerate(text):
         for row, bits in enumerate(DIGIT_GLYPHS[character]):
             for column in range(3):
@@ -125,7 +125,7 @@ def _paint_number(pixels: "np.ndarray", text: str, left: int, bottom: int) -> No
 
 
 def release() -> None:
-    """Free the picture."""
+    """Free the image."""
     global _previews, _drawn_key
     if _previews is not None:
         bpy.utils.previews.remove(_previews)

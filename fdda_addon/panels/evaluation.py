@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The section Evaluation: how far the model is from the rig, in figures, in colours and on the timeline."""
+"""Section "Compare with Rig": errors of the model in numbers, as colors and in the timeline."""
 
 import bpy
 
@@ -62,11 +62,14 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         if view.source == "RANDOM":
             column.prop(view, "poses")
             column.prop(view, "seed")
-        elif action is None:
-            draw_wrapped(layout, context, f"'{scene_rig.armature_object.name}' has no action.", "ERROR")
         else:
-            first, last = (round(frame) for frame in action.frame_range)
-            layout.label(text=f"{action.name}, frames {first} to {last}", icon="ACTION")
+            if animation is not None:
+                layout.prop_search(animation, "action", bpy.data, "actions", text="")
+            if action is None:
+                draw_wrapped(layout, context, f"'{scene_rig.armature_object.name}' has no action.", "ERROR")
+            else:
+                first, last = (round(frame) for frame in action.frame_range)
+                layout.label(text=f"Frames {first} to {last}", icon="TIME")
         row = layout.row()
         row.scale_y = 1.4
         row.enabled = view.source == "RANDOM" or action is not None
@@ -133,7 +136,7 @@ def _draw_figures(
 
 
 def active_bone_name(context: bpy.types.Context, rig: SceneRig) -> str:
-    """Name of the bone that was clicked last in pose mode; empty outside of it."""
+    """Return the name of the active bone in Pose Mode; empty in other modes."""
     bone = rig.armature_object.data.bones.active if context.mode == "POSE" else None
     return bone.name if bone is not None else ""
 
@@ -203,7 +206,7 @@ _worst_cache: dict[int, tuple[object, int, list[tuple[int, float]]]] = {}
 
 
 def _worst_poses(last: last_evaluation.LastEvaluation, count: int) -> list[tuple[int, float]]:
-    """The worst poses, found once for an evaluation: drawing computes nothing twice."""
+    """Return the poses with the largest errors. They are computed once for each evaluation."""
     kept = _worst_cache.get(0)
     if kept is None or kept[0] is not last or kept[1] != count:
         _worst_cache[0] = (last, count, last.worst(count))
@@ -227,5 +230,5 @@ CLASSES = (FDDA_PT_evaluation,)
 
 
 def unregister() -> None:
-    """Let go of the last evaluation."""
+    """Clear the cache."""
     _worst_cache.clear()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The section Models: those of a mesh, which is bound, packing, and what has changed since they were trained."""
+"""Section "Model Library": the models of a mesh, packing, and changes of the rig since their training."""
 
 from typing import TYPE_CHECKING
 
@@ -20,7 +20,7 @@ _rig_cache: dict[tuple, object] = {}
 
 
 def rig_of_model(scene_rig: object, rig: object, info: object) -> object:
-    """The rig with the joints of a model, read once for each rig that was checked: panels are drawn often."""
+    """Return the rig with the joints of a model. It is read once for each checked rig."""
     from ..rig.reading import read_model_rig
 
     if set(rig.joint_names) == set(info.joint_names):
@@ -28,13 +28,13 @@ def rig_of_model(scene_rig: object, rig: object, info: object) -> object:
     key = (id(rig), info.joint_names)
     if key not in _rig_cache:
         _rig_cache.clear()
-        # The checked rig stands beside what was read, so that its identifier is no other's.
+        # Keep the checked rig alive: a later one must not get its id.
         _rig_cache[key] = (rig, read_model_rig(scene_rig, info))
     return _rig_cache[key][1]
 
 
 def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
-    """What is wrong with the models of a mesh: icon and sentence by path and name; all is well with those left out."""
+    """Return icon and message of each model of a mesh that has a problem, by `_entry_key`."""
     from ..models.changes import changes
     from ..models.model_list import info_of
     from ..scene.scene_rig import SceneRig, armature_of
@@ -59,7 +59,7 @@ def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
 def _compared_channels(
     mesh_object: bpy.types.Object, channels: "tuple[Channel, ...]", info: "ModelInfo"
 ) -> "tuple[Channel, ...]":
-    """Ranges to compare those of a model with: of the rig as it stands, or its own where others are chosen now."""
+    """Return the ranges to compare a model's ranges with: those of the rig, or its own where other bones are posed."""
     from ..core.poses import CONTROL
 
     if mesh_object.fdda.settings.sample != "WEIGHTS":
@@ -143,5 +143,5 @@ CLASSES = (FDDA_UL_models, FDDA_PT_models)
 
 
 def unregister() -> None:
-    """Work nothing out any more."""
+    """Stop the timer."""
     _problems.stop()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The section Playback: bind a model, choose what deforms the mesh, and see what a frame costs."""
+"""Section "Model": bind a model, choose what deforms the mesh, measure its speed."""
 
 from pathlib import Path
 
@@ -24,14 +24,14 @@ MODES = (("RIG", "Rig"), ("LINEAR", "Skinning"), ("FDDA", "Model"))
 
 @draw_cached
 def is_outside_model_folders(mesh_object: bpy.types.Object) -> bool:
-    """Whether the bound model plays in this session only, as its file may not be followed from this one."""
+    """Return whether the file of the bound model will not load when the .blend file is opened again."""
     path = resolve_path(mesh_object.fdda.model, mesh_object.library).resolve()
     file = Path(bpy.data.filepath).resolve()
     return bool(bpy.data.filepath) and not path.is_relative_to(file.parent) and not is_trusted(path)
 
 
 def mask_problem(mesh_object: bpy.types.Object) -> str:
-    """What is wrong with the mask of a mesh; empty when nothing is, or there is none."""
+    """Return the problem with the mask of a mesh as a message; empty without one."""
     name = mesh_object.fdda.mask
     if not name or name in mesh_object.vertex_groups:
         return ""
@@ -155,7 +155,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         body.operator("fdda.measure_model", text="Measure Speed", icon="TIME")
 
     def _draw_confidence(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
-        # Closed, nobody looks and the model is not asked.
+        # While the sub-panel is closed the model is not evaluated.
         header, body = self.layout.panel("fdda_confidence", default_closed=True)
         header.label(text="Confidence in This Pose")
         if body is None:
@@ -186,5 +186,5 @@ CLASSES = (FDDA_PT_playback,)
 
 
 def unregister() -> None:
-    """Work nothing out any more."""
+    """Stop the timer."""
     _confidence_value.stop()

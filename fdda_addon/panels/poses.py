@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Section "Poses": the range of motion, the random poses that are drawn from it, and the actions to record."""
+"""Section "Training Poses": rotation limits, random poses within them, and actions to record."""
 
 import math
 from typing import TYPE_CHECKING
@@ -20,11 +20,11 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 
 AXES = "xyz"
 WIDE_SIDEBAR_PIXELS = 380
-"""From this width of the sidebar on the table has both ends of a range, pixels at a scale of 1."""
+"""Sidebar width from which the table shows both ends of a range, pixels at a UI scale of 1."""
 
 
 class FDDA_UL_bones(bpy.types.UIList):
-    """The joints of the rig, or the control bones that were chosen, with their range about each axis."""
+    """The bones that random poses move, with their rotation limits about each axis."""
 
     def filter_items(self, context: bpy.types.Context, data: object, name: str) -> tuple[list[int], list[int]]:
         rig = panel_rig(context)[0]
@@ -39,7 +39,7 @@ class FDDA_UL_bones(bpy.types.UIList):
         icon, name, ranges, has_limits = _bone_row(rig, bone, is_wide)
         row = layout.split(factor=0.5)
         left = row.row(align=True)
-        # The selection in the view: who ticks a box here selects the bone there.
+        # The checkbox is the selection in the viewport.
         box = "CHECKBOX_HLT" if is_selected(bone) else "CHECKBOX_DEHLT"
         left.prop(selection_owner(bone), "select", text="", icon=box, emboss=False)
         left.label(text=name, icon=icon)
@@ -56,7 +56,7 @@ def _ui_scale(preferences: bpy.types.Preferences) -> float:
 
 @draw_cached
 def _visible_bone_flags(rig: SceneRig, text: str, flag: int) -> tuple[int, ...]:
-    """Which bones the list shows: the joints of the mesh, or those that were chosen, as far as they are looked for."""
+    """Return a filter flag for each bone: whether random poses may move it and its name matches the search."""
     check, channels = checks.last_check(rig), sampled_channels_by_bone(rig)
     listed = set(check.rig.joint_names) if check and check.rig else set()
     if channels is not None:
@@ -67,7 +67,7 @@ def _visible_bone_flags(rig: SceneRig, text: str, flag: int) -> tuple[int, ...]:
 
 @draw_cached
 def _bone_row(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[str, str, str, bool]:
-    """Icon, name and ranges of a bone in the list, and whether it states any of them."""
+    """Return icon, name and limits of a bone for the list, and whether it has any limits of its own."""
     from ..poses.motion_range import DEFAULT, rotation_ranges
     from ..poses.sampling import is_moved_by_constraints
 
@@ -84,7 +84,7 @@ def _bone_row(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[s
 
 @draw_cached
 def has_any_limits(rig: SceneRig) -> bool:
-    """Whether any bone of the armature states a range of motion, or locks an axis."""
+    """Return whether any bone of the armature has limits or a locked axis."""
     from ..poses.motion_range import DEFAULT, rotation_ranges
 
     bones = rig.armature_object.pose.bones
@@ -93,7 +93,7 @@ def has_any_limits(rig: SceneRig) -> bool:
 
 @draw_cached
 def sampled_channels_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None":
-    """Channels of the bones that a user has chosen to sample, by bone; None where none were chosen, or not known."""
+    """Return the sampled channels by bone, None for deforming bones or before the first check."""
     check = checks.last_check(rig)
     if rig.mesh_object.fdda.settings.sample == "WEIGHTS" or check is None or not check.channels:
         return None
@@ -107,7 +107,7 @@ def sampled_channels_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None"
 
 
 def _format_channels(channels: "list[Channel]", is_wide: bool) -> str:
-    """The ranges about the axes, and by which other channels the bone is moved."""
+    """Return the rotation ranges, and the axes along which the bone is moved, as text."""
     from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR
 
     channels = [channel for channel in channels if channel.low < channel.high]
@@ -132,7 +132,7 @@ def _format_range(low: float, high: float, is_wide: bool) -> str:
 
 
 class FDDA_UL_actions(bpy.types.UIList):
-    """The actions of the file that move this rig, each with a box to tick."""
+    """The actions of the file that move this rig, each with a checkbox."""
 
     def filter_items(self, context: bpy.types.Context, data: object, name: str) -> tuple[list[int], list[int]]:
         rig = panel_rig(context)[0]
@@ -195,7 +195,7 @@ def _draw_limit_sources(layout: bpy.types.UILayout, rig: SceneRig) -> None:
 
 
 def _draw_selected_bones(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    """What works on many bones: those that are ticked, which are those that are selected in the view."""
+    """Draw the sub-panel with the buttons for the selected bones."""
     header, body = layout.panel("fdda_many_bones", default_closed=has_any_limits(rig))
     count = _count_selected(rig)
     header.label(text=f"Selected Bones ({count})")
@@ -216,7 +216,7 @@ def _count_selected(rig: SceneRig) -> int:
 
 
 def _draw_bone(layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
-    """The active bone; where others are chosen than those that are listed, none."""
+    """Draw the active bone of the list; nothing if the list does not show it."""
     channels = sampled_channels_by_bone(rig)
     if channels is None:
         _draw_limits(layout.box(), rig, bone)
@@ -229,7 +229,7 @@ def _draw_bone(layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBo
 
 @draw_cached
 def _read_limits(rig: SceneRig, bone: bpy.types.PoseBone) -> tuple[str, list, tuple[int, ...]]:
-    """Name of a bone and where its ranges come from, its ranges about the axes, and the axes that it is moved along."""
+    """Return a label with name and kind of limits of a bone, its rotation ranges, and its location axes."""
     from ..poses.motion_range import CONSTRAINT, DEFAULT, IK, location_ranges, rotation_ranges
 
     ranges = rotation_ranges(bone)
@@ -240,7 +240,7 @@ def _read_limits(rig: SceneRig, bone: bpy.types.PoseBone) -> tuple[str, list, tu
 
 
 def _draw_limits(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
-    """The ranges of a bone as the fields in which Blender keeps them."""
+    """Draw the limits of a bone as fields of Blender's own properties."""
     from ..poses.motion_range import CONSTRAINT, DEFAULT, find_local_limit
 
     text, ranges, locations = _read_limits(rig, bone)
@@ -275,7 +275,7 @@ def _draw_limit_button(
     properties = layout.operator(operator, text="", icon=icon)
     properties.object, properties.bone, properties.axis = rig.mesh_object.name, bone.name, AXES[axis].upper()
     if operator == FDDA_OT_set_limit.bl_idname:
-        # Blender would take what was stated last.
+        # Blender would use the last values.
         properties.low, properties.high = -math.pi / 4, math.pi / 4
 
 
@@ -304,7 +304,7 @@ def _draw_actions(layout: bpy.types.UILayout, context: bpy.types.Context, rig: S
     layout.template_list("FDDA_UL_actions", "", bpy.data, "actions", session, "action_index", rows=min(4, len(fitting)))
     settings = rig.mesh_object.fdda.settings
     row = layout.row()
-    # Mirrored are the frames of ticked actions.
+    # Only the frames of checked actions are mirrored.
     row.active = any(action.fdda.record for action in fitting)
     row.prop(settings, "mirror")
     if not settings.poses and not any(action.fdda.record for action in fitting):

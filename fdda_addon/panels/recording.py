@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Section "Recording": what is in the folder, and the button that comes next."""
+"""Section "Recording": settings, the content of the folder, and the button to record."""
 
 import json
 import os
@@ -21,12 +21,12 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.recording.folder import FolderContent
 
 _content_cache: "dict[int, tuple[tuple, FolderContent]]" = {}
-"""What was found in the folder of a character, by session_uid of its mesh object, and for which question."""
+"""Content of the recording folder, and what it was read for, by session_uid of the mesh object."""
 
 
 @draw_cached
 def read_content(rig: SceneRig) -> "tuple[Path, FolderContent] | str":
-    """The folder of a character and what is in it; a sentence where that cannot be said."""
+    """Return the recording folder of a character and its content, or a message why there is none."""
     try:
         path = recording_folder(rig.mesh_object)
         return path, cached_content(rig, path)
@@ -35,7 +35,7 @@ def read_content(rig: SceneRig) -> "tuple[Path, FolderContent] | str":
 
 
 def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
-    """What is in the folder of a recording; it is read again when it, the rig or the settings have changed."""
+    """Return the content of a recording folder. Read it again after a change of the folder, the rig or the settings."""
     from ..core.recording.folder import read_folder
     from ..core.recording.index import INDEX
     from ..recording.plan import make_sampling

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Section "Rig": which character this is about, whether it can be recorded, and whether a model would pay."""
+"""Section "Rig": the character, problems that prevent recording, and whether a model would be faster."""
 
 import bpy
 
@@ -51,7 +51,7 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
 
 
 def _draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    """The meshes of the active armature, where there are several: which is shown, and whether buttons are about all."""
+    """Draw the meshes of the active armature if there are several, and whether buttons apply to all."""
     rigs = cached_rigs_of_active_armature(context)
     if not rigs:
         return
@@ -92,7 +92,7 @@ def _draw_replaced(layout: bpy.types.UILayout, mesh_object: bpy.types.Object, re
 
 
 def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """All steps below in one, for the impatient."""
+    """Draw the button that does all steps below, or its progress."""
     if draw_job(layout, context, "build_model"):
         state = job.state_of("build_model")
         if not state.borrows_scene:
@@ -127,5 +127,5 @@ CLASSES = (FDDA_PT_rig,)
 
 
 def unregister() -> None:
-    """Forget what was found out about the rigs that were drawn."""
+    """Clear all checks."""
     checks.unregister()

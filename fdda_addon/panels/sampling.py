@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The part of the section "Poses" about what random poses move: which bones, and which controls beside them."""
+"""Part of the section "Training Poses": the bones and extra inputs that random poses move."""
 
 import math
 from typing import TYPE_CHECKING
@@ -16,11 +16,11 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from ..recording.rig_check import RigCheck
 
 MAX_SHOWN_CONTROLS = 8
-"""The panel lists at most this number of the controls that were found."""
+"""Number of detected extra inputs that the panel lists at most."""
 
 
 class FDDA_UL_controls(bpy.types.UIList):
-    """The controls that a user has listed, with the ranges in which they are sampled."""
+    """The extra inputs of the user, with their ranges."""
 
     def draw_item(self, _context: bpy.types.Context, layout: bpy.types.UILayout, _data, control, _icon, _active, _name):
         row = layout.row()
@@ -32,7 +32,7 @@ class FDDA_UL_controls(bpy.types.UIList):
 
 
 def draw_bones_to_pose(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    """Which bones random poses move."""
+    """Draw the settings that choose the bones of random poses."""
     settings = rig.mesh_object.fdda.settings
     column = layout.column()
     column.label(text="Bones to Pose")
@@ -52,7 +52,7 @@ def draw_bones_to_pose(layout: bpy.types.UILayout, context: bpy.types.Context, r
 
 
 def describe_channels(check: "RigCheck") -> str:
-    """How much random poses move, a sentence."""
+    """Return a sentence with the numbers of bones and extra inputs that random poses move."""
     from ..core.poses import CONTROL
 
     channels = [channel for channel in check.channels if channel.kind != CONTROL]
@@ -70,7 +70,7 @@ def _count(count: int, noun: str) -> str:
 
 
 def draw_channels(box: bpy.types.UILayout, bone: bpy.types.PoseBone, channels: "list[Channel]") -> None:
-    """How a bone is sampled that was chosen: nothing to edit, for the ranges may come from actions."""
+    """Draw the ranges of a bone as labels: those from actions cannot be edited."""
     from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR
 
     box.label(text=f"{bone.name} (from actions)", icon="BONE_DATA")
@@ -87,7 +87,7 @@ def draw_channels(box: bpy.types.UILayout, bone: bpy.types.PoseBone, channels: "
 
 
 def draw_extra_inputs(layout: bpy.types.UILayout, rig: SceneRig) -> None:
-    """The controls that are listed, and those that were found."""
+    """Draw the extra inputs of the user, and the detected ones."""
     settings, check = rig.mesh_object.fdda.settings, checks.last_check(rig)
     found = check.automatic_controls if check is not None else ()
     count = len(check.rig.controls) if check is not None and check.rig else len(settings.controls)

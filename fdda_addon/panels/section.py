@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the sections of the sidebar have in common: where they are, the rig they are about, sentences and jobs."""
+"""Base of all sections of the sidebar, and functions to draw wrapped text, paths and jobs."""
 
 import functools
 
@@ -13,19 +13,19 @@ from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 
 TEXT_MARGIN, ICON_WIDTH = 74, 22
-"""Width of what is left and right of text in a box, and of an icon, pixels at a scale of 1."""
+"""Width of both margins of text in a box, and of an icon, pixels at a UI scale of 1."""
 MIN_TEXT_WIDTH = 60
 OUTCOME_ICONS = {"INFO": "CHECKMARK", "WARNING": "INFO", "ERROR": "ERROR"}
 
 
 class Section:
-    """Mixin for a panel of the tab "FDDA". It is there when the active object has a rig, or a job of its own runs."""
+    """Mixin for a panel of the tab "FDDA". It shows while the active object has a rig, or one of its jobs runs."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "FDDA"
     verbs: tuple[str, ...] = ()
-    """The jobs that this section starts."""
+    """Verbs of the jobs that this section starts."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -33,14 +33,14 @@ class Section:
         return cached_active_rig(context) is not None or (running is not None and running.verb in cls.verbs)
 
     def enabled_layout(self) -> bpy.types.UILayout:
-        """The layout of the panel; nothing in it can be changed while the job of another section borrows the scene."""
+        """Return the layout of the panel, disabled while a job of another section borrows the scene."""
         running = job.current()
         self.layout.enabled = running is None or not running.borrows_scene or running.verb in self.verbs
         return self.layout
 
     @classmethod
     def is_done(cls, _context: bpy.types.Context) -> bool:
-        """Whether what this section is for has been done; the header has a tick then."""
+        """Return whether the step of this section is done; its header then has a check mark."""
         return False
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
@@ -50,7 +50,7 @@ class Section:
 
 
 def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
-    """The rig that the sidebar is about, or None and the sentence that says why there is none."""
+    """Return the rig that the sidebar shows, or None and a message why there is none."""
     if (rig := cached_active_rig(context)) is not None:
         return rig, ""
     try:
@@ -60,7 +60,7 @@ def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
 
 
 def mesh_count(context: bpy.types.Context) -> int:
-    """How many meshes the buttons work on at once; 0 where they work on the one that is shown."""
+    """Return the number of meshes that buttons apply to; 0 if only to the one that is shown."""
     rigs = cached_rigs_of_active_armature(context)
     return len(rigs) if rigs and context.window_manager.fdda.all_meshes else 0
 
@@ -68,7 +68,7 @@ def mesh_count(context: bpy.types.Context) -> int:
 def draw_button(
     layout: bpy.types.UILayout, context: bpy.types.Context, name: str, text: str, icon: str
 ) -> bpy.types.OperatorProperties:
-    """Draw the button of an operator that may work on all meshes of an armature; it says of how many."""
+    """Draw the button of an operator that may apply to all meshes of an armature, with their number."""
     count = mesh_count(context)
     properties = layout.operator(name, text=f"{text} ({count} Meshes)" if count else text, icon=icon)
     if count:
@@ -77,7 +77,7 @@ def draw_button(
 
 
 def draw_wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
-    """Draw text in as many lines as the width of the sidebar takes."""
+    """Draw text, wrapped to the width of the sidebar."""
     scale, points = _text_size(context.preferences)
     width = context.region.width - (TEXT_MARGIN + (ICON_WIDTH if icon != "NONE" else 0)) * scale
     lines = _wrap(text, max(width, MIN_TEXT_WIDTH * scale), points)
@@ -92,14 +92,14 @@ def draw_wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: s
 
 @draw_cached
 def _text_size(preferences: bpy.types.Preferences) -> tuple[float, float]:
-    """Scale of the interface, and height of its text in points."""
+    """Return the UI scale, and the height of text in points."""
     scale = preferences.system.ui_scale
     return scale, preferences.ui_styles[0].widget.points * scale
 
 
 @functools.lru_cache(maxsize=256)
 def _wrap(text: str, width: float, points: float) -> tuple[str, ...]:
-    """Text in lines of a width in pixels, as the interface's font has it; only a word that is longer goes beyond."""
+    """Wrap text to a width in pixels, in the font of the interface. A longer word is not broken."""
     blf.size(0, points)
     lines: list[str] = []
     for word in text.split():
@@ -134,15 +134,15 @@ def draw_job(
     verb: str,
     levels: tuple[str, ...] = ("INFO", "WARNING", "ERROR"),
 ) -> bool:
-    """Draw how far the job of this verb is with a button to cancel it, or how it ended.
+    """Draw the progress of a job with a button to cancel it, or its outcome.
 
     Args:
-        layout, context: as in `draw`.
+        layout, context: of the panel.
         verb: of the job.
-        levels: ends of these levels are drawn; others, the section says itself.
+        levels: levels of outcomes to draw.
 
     Returns:
-        Whether it runs.
+        Whether the job is running.
     """
     state = job.state_of(verb)
     if state is None:
@@ -157,20 +157,20 @@ def draw_job(
     if state.total:
         column.progress(factor=state.fraction, text=state.sentence)
     else:
-        # A bar that stands still would look as if nothing happened.
+        # A bar without progress would look as if nothing happened.
         draw_wrapped(column, context, state.sentence, "SORTTIME")
     row = column.row(align=True)
     row.enabled = not state.cancel_requested
     row.operator("fdda.cancel", text="Canceling…" if state.cancel_requested else "Cancel", icon="X")
     remaining = state.remaining_seconds
-    # The line is always there: what is below would jump.
+    # The line is always drawn, so that what is below does not jump.
     text = f"About {format_duration(remaining)} left" if remaining is not None else "…"
     layout.label(text="Finishing…" if state.is_finishing else text, icon="TIME")
     return True
 
 
 def format_duration(seconds: float) -> str:
-    """A time for people: "40 s", "5 min", "2 h 10 min"."""
+    """Return a duration as text: "40 s", "5 min", "2 h 10 min"."""
     if seconds < 90:
         return f"{max(1, round(seconds))} s"
     minutes = round(seconds / 60)

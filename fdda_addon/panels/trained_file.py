@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The model that a training of a character has written: whether it is there, and whether it is of this rig."""
+"""The model file that the training of a character has written, and whether it matches the rig."""
 
 import os
 from dataclasses import dataclass
@@ -12,25 +12,30 @@ from ..scene.scene_rig import SceneRig
 from . import checks
 
 _mismatch_cache: dict[tuple, str] = {}
-"""Why models do not fit, by file, its time and size, and the check of the rig; empty for those that fit."""
+"""Mismatches between model files and rigs, by path, time and size of the file, and id of the checked rig."""
 
 
 @dataclass(frozen=True)
 class TrainedFile:
-    """A model where the training of a character writes it: its file, and why it is not of this rig, empty if it is."""
+    """A trained model file.
+
+    Attributes:
+        path: the file.
+        mismatch: how it differs from the rig; empty if it matches.
+    """
 
     path: Path
     mismatch: str = ""
 
 
 def find_trained_file(rig: SceneRig) -> TrainedFile | None:
-    """The model that a training of this rig has written, also where an undo has taken it off the list."""
+    """Return the model file that a training of this rig has written, even if it is not in the Model Library."""
     return _find_trained_file(rig)[0]
 
 
 @draw_cached
 def _find_trained_file(rig: SceneRig) -> tuple[TrainedFile | None]:
-    """As `find_trained_file`; in a tuple, for that there is none is kept as well."""
+    """As `find_trained_file`, in a tuple: the cache does not store None."""
     path = trained_file(rig.mesh_object)
     check = checks.last_check(rig)
     if path is None:

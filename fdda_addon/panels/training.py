@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Section "Training": which Python trains, the curves while it does, and the partitions when it has."""
+"""Section "Training": the setup, settings, error curves, and errors of the trained model."""
 
 import os
 from pathlib import Path
@@ -22,7 +22,7 @@ from .trained_file import TrainedFile, find_trained_file
 SHOWN_PARTITIONS = 8
 
 _report_cache: dict[Path, tuple[int, dict | None]] = {}
-"""Reports that were read, by path, with the time of their change."""
+"""Modification time and content of training reports, by path."""
 
 
 class FDDA_PT_training(Section, bpy.types.Panel):
@@ -73,7 +73,7 @@ class FDDA_PT_training(Section, bpy.types.Panel):
 
 
 def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
-    """Which Python trains and what is known of it; returns whether it may be tried."""
+    """Draw the Python for training and the result of its check; return whether training may be tried."""
     answer = session.check_result
     if answer is not None and answer.level == "INFO":
         draw_wrapped(layout, context, answer.message, "CHECKMARK")
@@ -129,7 +129,7 @@ def _draw_settings(
     draw_button(row, context, "fdda.train", "Train" if found is None else "Train Again", "PLAY")
     if found is None or found.mismatch:
         return
-    # What a better model takes, in the order of the work.
+    # What improves the model, in the order of the steps.
     on = layout.column(align=True)
     on.enabled = ready
     on.operator("fdda.refine", text="Add Poses at Worst Errors", icon="ADD")
@@ -174,7 +174,7 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 
 
 def _table_columns(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
-    """A column for names, and three for numbers at the right."""
+    """Return a column for names and three right-aligned columns for numbers."""
     left = layout.split(factor=0.4)
     columns = [left.column(align=True)]
     right = left.row(align=True)
@@ -185,7 +185,7 @@ def _table_columns(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
 
 
 def _describe_goal(goal: dict) -> tuple[str, str]:
-    """A sentence and an icon for what the report says of the accuracy goal."""
+    """Return a sentence and an icon about the accuracy goal in a report."""
     reached = f"99.9 % of points within {goal['p999']:.2f} mm, goal {goal['goal']:g} mm"
     return {
         Verdict.MET: (f"{reached}: met.", "CHECKMARK"),
@@ -195,7 +195,7 @@ def _describe_goal(goal: dict) -> tuple[str, str]:
 
 
 def _read_report(path: Path) -> dict | None:
-    """The report beside a model, read again when it has changed; None when there is none that can be drawn."""
+    """Return the report next to a model, read again after a change; None without a valid one."""
     try:
         stamp = os.stat(path).st_mtime_ns
     except OSError:
@@ -213,5 +213,5 @@ CLASSES = (FDDA_PT_training,)
 
 
 def unregister() -> None:
-    """Let go of the picture of the curves."""
+    """Free the image of the curves."""
     curves.release()

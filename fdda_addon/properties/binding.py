@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a bound object keeps in the .blend file: `Object.fdda`."""
+"""Properties of a mesh object with a model, saved in the .blend file: `Object.fdda`."""
 
 import bpy
 from bpy.props import (
@@ -16,9 +16,9 @@ from .character import FDDA_PG_character
 from .not_animatable import not_animatable
 
 OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}
-"""A linked character keeps in the shot what is set there: Blender resets everything else of a library override."""
+"""Options of properties that a library override may change. Blender resets all others."""
 INSERTABLE = OVERRIDABLE | {"USE_INSERTION"}
-"""As `OVERRIDABLE`, and a library override may have entries besides those of its library."""
+"""Options of collections to which a library override may add entries."""
 
 
 def _apply(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
@@ -35,7 +35,7 @@ def _apply_mask(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None
 
 @not_animatable
 class FDDA_PG_modifier(bpy.types.PropertyGroup):
-    """A modifier of the rig and how it was shown before a model took its place."""
+    """A modifier of the rig, and its visibility before the model replaced it."""
 
     uid: IntProperty(override=OVERRIDABLE)
     show_viewport: BoolProperty(override=OVERRIDABLE)
@@ -44,7 +44,7 @@ class FDDA_PG_modifier(bpy.types.PropertyGroup):
 
 @not_animatable
 class FDDA_PG_model(bpy.types.PropertyGroup):
-    """A model of a mesh: its file, or the text that holds it."""
+    """A model of the Model Library: its file, or the text datablock that contains it."""
 
     name: StringProperty(name="Name", description="Name of the model", override=OVERRIDABLE)
     path: StringProperty(
@@ -145,7 +145,7 @@ CLASSES = (FDDA_PG_modifier, FDDA_PG_model, FDDA_PG_binding)
 
 
 def register() -> None:
-    """Give objects their property."""
+    """Add the property of objects."""
     bpy.types.Object.fdda = PointerProperty(type=FDDA_PG_binding, override=OVERRIDABLE)
 
 

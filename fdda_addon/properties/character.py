@@ -53,7 +53,7 @@ def _shorten_data_path(control: "FDDA_PG_control", _context: bpy.types.Context) 
 
 @not_animatable
 class FDDA_PG_control(bpy.types.PropertyGroup):
-    """A number that is an input of the model, as `scene.controls.parse_controls` reads it."""
+    """An extra input of the model, in the syntax of `scene.controls.parse_controls`."""
 
     name: StringProperty(
         name="Extra Input",
@@ -71,7 +71,7 @@ class FDDA_PG_control(bpy.types.PropertyGroup):
 
 @not_animatable
 class FDDA_PG_character(bpy.types.PropertyGroup):
-    """How a character is sampled, recorded and trained; saved with its mesh object."""
+    """Settings of poses, recording and training of a character."""
 
     poses: IntProperty(
         name="Poses", description="Number of random poses to record", default=POSES, min=0, soft_max=10000
@@ -203,13 +203,13 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
 
 
 def fit_kind(settings: FDDA_PG_character) -> str:
-    """Kind of the skin weights that are fitted (`core.skin_fit.KINDS`); empty for those of the rig."""
+    """Return the kind of fitted skin weights (`core.skin_fit.KINDS`); empty for the weights of the rig."""
     return "" if settings.fit_linear == "RIG" else settings.fit_linear.lower()
 
 
 @not_animatable
 class FDDA_PG_action(bpy.types.PropertyGroup):
-    """What an action is used for; saved with it."""
+    """Settings of an action."""
 
     record: BoolProperty(name="Record", description="Record the frames of this action too")
 
@@ -242,25 +242,25 @@ def default_model(mesh_object: bpy.types.Object) -> str:
 
 
 def recording_folder(mesh_object: bpy.types.Object) -> Path:
-    """Where the character is recorded: the folder that it names, else FILE_NAME_recording beside the .blend file.
+    """Return the folder of the recording: the chosen one, else FILE_NAME_recording next to the .blend file.
 
     Raises:
-        OutputError: it is to lie beside a file that has not been saved.
+        OutputError: the path is relative to a .blend file that has not been saved.
     """
     return _path(mesh_object.fdda.settings.recording, default_recording(mesh_object), "recording", "Folder")
 
 
 def model_file(mesh_object: bpy.types.Object) -> Path:
-    """Where the character's model is written: the file that it names, else FILE_NAME_model/FILE_NAME.onnx.
+    """Return the file of the model: the chosen one, else FILE_NAME_model/FILE_NAME.onnx next to the .blend file.
 
     Raises:
-        OutputError: it is to lie beside a file that has not been saved.
+        OutputError: the path is relative to a .blend file that has not been saved.
     """
     return _path(mesh_object.fdda.settings.model, default_model(mesh_object), "model", "Model file")
 
 
 def trained_file(mesh_object: bpy.types.Object) -> Path | None:
-    """The model that a training of the character has written, None when there is none."""
+    """Return the model file that a training of the character has written, None without one."""
     try:
         path = model_file(mesh_object)
     except OutputError:
@@ -269,7 +269,7 @@ def trained_file(mesh_object: bpy.types.Object) -> Path | None:
 
 
 def _file_name(mesh_object: bpy.types.Object) -> str:
-    """Names of the .blend file and of the mesh in one: files of a folder may have meshes of the same name."""
+    """Return a file name from the names of the .blend file and the mesh, unique among the files of a folder."""
     file, name = Path(bpy.data.filepath).stem, mesh_object.name
     return bpy.path.clean_name(name if name == file else f"{file}_{name}")
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Properties that Blender lets nobody key or drive: nothing is called when animation sets a property."""
+"""A decorator that makes properties not animatable: Blender calls no update function during animation."""
 
 import bpy
 
 
 def not_animatable(group: type[bpy.types.PropertyGroup]) -> type[bpy.types.PropertyGroup]:
-    """Decorate a property group: keys and drivers are refused for its properties that do not state their options."""
+    """Remove the option ANIMATABLE from the properties of a group that set no options themselves."""
     collections = (bpy.props.CollectionProperty, bpy.props.PointerProperty)
     for declared in group.__annotations__.values():
         if declared.function not in collections:

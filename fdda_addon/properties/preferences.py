@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The add-on's preferences: which Python trains, and the environment that the add-on can make for it."""
+"""The preferences of the add-on: folders of models, and the Python for training."""
 
 import os
 from pathlib import Path
@@ -14,7 +14,7 @@ from ..training.environment.check_result import CheckResult
 from ..training.environment.folder import EXTENSION, FolderState, obstacle, own_folder
 
 MODULE = EXTENSION or __package__.partition(".")[0]
-"""Under which Blender keeps the preferences. Imported without being installed, the add-on has none."""
+"""Name under which Blender stores the preferences. Without installation there are none."""
 
 LEVEL_ICONS = {"INFO": "CHECKMARK", "WARNING": "INFO", "ERROR": "ERROR"}
 STATE_LABELS = {
@@ -27,7 +27,7 @@ STATE_LABELS = {
 
 
 class FDDA_PG_folder(bpy.types.PropertyGroup):
-    """A folder that the user trusts: .blend files may name models in it and below."""
+    """A folder from which any .blend file may load models."""
 
     path: StringProperty(
         name="Folder", description="Load models from this folder and its subfolders", subtype="DIR_PATH"
@@ -78,7 +78,7 @@ class FDDA_AP_preferences(bpy.types.AddonPreferences):
 
 
 def draw_models(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -> None:
-    """Where models are kept, and from which folders they are followed."""
+    """Draw the settings of packing, and the folders from which models are loaded."""
     column = layout.column()
     column.label(text="Models load if packed, or in the .blend file's folder")
     column.prop(own, "pack_models")
@@ -91,31 +91,31 @@ def draw_models(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -> None:
 
 
 def packs_models() -> bool:
-    """Whether models go into the .blend file when they are bound."""
+    """Return whether models are packed when they are bound."""
     own = preferences()
     return own is None or own.pack_models
 
 
 def trusted_folders() -> list[Path]:
-    """The folders that the user trusts, absolute and without links."""
+    """Return the trusted folders as absolute paths with symbolic links resolved."""
     own = preferences()
     return [Path(bpy.path.abspath(folder.path)).resolve() for folder in own.folders if folder.path] if own else []
 
 
 def preferences() -> FDDA_AP_preferences | None:
-    """The preferences, None where the add-on is not installed as an extension."""
+    """Return the preferences, None without an installed extension."""
     addon = bpy.context.preferences.addons.get(MODULE)
     return addon.preferences if addon else None
 
 
 def wheels_folder() -> str:
-    """The folder of wheels that the user has chosen, empty for none."""
+    """Return the folder under Offline Packages, empty without one."""
     own = preferences()
     return own.wheels_folder if own else ""
 
 
 def draw_check(layout: bpy.types.UILayout) -> None:
-    """Which Python trains, a button to check it, and what the last check said. Asks nothing."""
+    """Draw a button that checks the Python for training, and the result of the last check."""
     _, right = _split_row(layout)
     right.operator("fdda.check_trainer", text="Check Setup", icon="VIEWZOOM")
     if current(ENVIRONMENT) is None:
@@ -123,7 +123,7 @@ def draw_check(layout: bpy.types.UILayout) -> None:
 
 
 def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -> None:
-    """The environment that the add-on makes: its state, its buttons, its progress."""
+    """Draw state, buttons and progress of the training environment."""
     state = session.own_state()
     left, right = _split_row(layout)
     left.label(text="Training Environment")
@@ -152,7 +152,7 @@ def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -
 
 
 def _split_row(layout: bpy.types.UILayout) -> tuple[bpy.types.UILayout, bpy.types.UILayout]:
-    """A row as Blender splits those of properties: names on the left, values on the right."""
+    """Return the two parts of a row that is split as Blender splits properties: name and value."""
     split = layout.split(factor=0.4)
     left, right = split.row(), split.row()
     left.alignment = "RIGHT"
@@ -160,7 +160,7 @@ def _split_row(layout: bpy.types.UILayout) -> tuple[bpy.types.UILayout, bpy.type
 
 
 def draw_job(layout: bpy.types.UILayout, job: JobState) -> None:
-    """How far a job is, and a button to cancel it."""
+    """Draw the progress of a job, and a button to cancel it."""
     row = layout.row()
     text = job.stage if len(job.stage) < 90 else f"{job.stage[:88]}…"
     if job.total:
@@ -172,7 +172,7 @@ def draw_job(layout: bpy.types.UILayout, job: JobState) -> None:
 
 
 def draw_check_result(layout: bpy.types.UILayout, answer: CheckResult | None) -> None:
-    """What was found out, if anything was."""
+    """Draw the result of a check, if there is one."""
     if answer is None:
         return
     box = layout.box()
@@ -184,7 +184,7 @@ def draw_check_result(layout: bpy.types.UILayout, answer: CheckResult | None) ->
 
 
 def draw_lines(layout: bpy.types.UILayout, text: str, icon: str = "NONE", alert: bool = False) -> None:
-    """A sentence, wrapped to the width of the region: Blender cuts off what does not fit."""
+    """Draw text, wrapped to the width of the region."""
     import textwrap
 
     region = bpy.context.region
@@ -205,13 +205,13 @@ CLASSES = (FDDA_PG_folder, FDDA_AP_preferences)
 
 
 def register() -> None:
-    """Let the trainer's Python be the one that the preferences name."""
+    """Make the settings of the preferences known to the packages below."""
     choice.preferred_python = _preferred_python
     folder_trust.trusted_folders = trusted_folders
 
 
 def unregister() -> None:
-    """Undo `register`, and forget what was found out."""
+    """Undo `register`, and clear the result of the check."""
     session.remember(None)
     choice.preferred_python = None
     folder_trust.trusted_folders = list

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the choices of the sidebar come to: the settings of a recording."""
+"""Settings of a recording from the properties of a character."""
 
 from typing import TYPE_CHECKING
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from ..rig.pose_setter import TargetSettings
 
 ALL_SHAPE_KEYS = "shape_keys"
-"""Stands for all shape keys that no driver moves (`scene.controls.parse_controls`)."""
+"""Name that means all shape keys without drivers (`scene.controls.parse_controls`)."""
 
 
 def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingSettings":
-    """The settings of a recording of a character.
+    """Return the settings of a recording of a character.
 
     Raises:
-        RigError: what random poses are to move has not been chosen.
+        RigError: the bones to pose have not been chosen.
     """
     from ..recording.plan import RecordingSettings
 
@@ -31,7 +31,7 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
         poses=settings.poses,
         seed=settings.seed,
         spread=settings.spread,
-        # The property holds float32, and files what was typed.
+        # Round the float32 property to the number that the user typed.
         margin=round(settings.margin, 6),
         actions=actions,
         resume=resume,
@@ -45,7 +45,7 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
 
 
 def target_settings(settings: FDDA_PG_character) -> "TargetSettings":
-    """Which target a character is recorded and evaluated with, and how it is brought to poses."""
+    """Return the target object of a character, and the frames that a simulation needs."""
     from ..rig.pose_setter import TargetSettings
 
     if not settings.target:
@@ -54,7 +54,7 @@ def target_settings(settings: FDDA_PG_character) -> "TargetSettings":
 
 
 def copy_sampling_settings(settings: FDDA_PG_character, other: FDDA_PG_character) -> None:
-    """Give a mesh what another on the same armature is recorded with; its files and its training stay its own."""
+    """Copy the settings of poses and recording from another mesh; keep paths and training settings."""
     for name in (
         "poses",
         "seed",
@@ -77,7 +77,7 @@ def copy_sampling_settings(settings: FDDA_PG_character, other: FDDA_PG_character
 
 
 def _sample_options(settings: FDDA_PG_character, actions: tuple[str, ...]) -> tuple[str, ...]:
-    """What random poses move, as `poses.sampling.choose` reads it."""
+    """Return the choice of bones in the syntax of `poses.sampling.choose`."""
     if settings.sample == "COLLECTION":
         if not settings.bone_collection:
             raise RigError(
@@ -100,7 +100,7 @@ def _sample_options(settings: FDDA_PG_character, actions: tuple[str, ...]) -> tu
 
 
 def _control_options(settings: FDDA_PG_character) -> tuple[str, ...]:
-    """The listed controls as `scene.controls.parse_controls` reads them; those without a name yet are left out."""
+    """Return the named extra inputs in the syntax of `scene.controls.parse_controls`."""
     return tuple(
         f"{control.name}={control.low!r}:{control.high!r}" if control.has_range else control.name
         for control in settings.controls
@@ -109,14 +109,14 @@ def _control_options(settings: FDDA_PG_character) -> tuple[str, ...]:
 
 
 def recorded_actions(armature_object: bpy.types.Object) -> tuple[str, ...]:
-    """Names of the actions that the user has chosen for recording and that move a bone of this armature."""
+    """Return the names of the checked actions that move a bone of an armature."""
     return tuple(
         action.name for action in bpy.data.actions if action.fdda.record and action_moves_bones(action, armature_object)
     )
 
 
 def action_moves_bones(action: bpy.types.Action, armature_object: bpy.types.Object) -> bool:
-    """Whether an action moves a bone of this armature."""
+    """Return whether an action animates a bone of an armature."""
     from ..scene.compatibility import animation_curves
 
     bones = armature_object.pose.bones

@@ -22,7 +22,7 @@ def _show_random_pose(session: "FDDA_PG_session", number: int) -> None:
     rig = cached_active_rig(context)
     if rig is None or context.mode not in {"OBJECT", "POSE"} or (job is not None and job.borrows_scene):
         return
-    # The section Rig says why where there is nothing to pose.
+    # The section Rig shows the problem if there is nothing to pose.
     with suppress(FDDAError):
         show_random_pose(rig, recording_settings(rig), number - 1)
         session.pose_index = number - 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the section Evaluation compares and how it shows it: `WindowManager.fdda_view`, not saved with the file."""
+"""Settings of the section "Compare with Rig", not saved with the file: `WindowManager.fdda_view`."""
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty
@@ -13,14 +13,14 @@ def _redraw(_view: "FDDA_PG_view", _context: bpy.types.Context) -> None:
 
 
 def show_graph(shown: bool) -> None:
-    """Draw the errors in the timeline, or not."""
+    """Show or hide the error graph in the timeline."""
     from ..evaluation import timeline
 
     (timeline.start if shown else timeline.stop)()
 
 
 class FDDA_PG_view(bpy.types.PropertyGroup):
-    """Settings of the evaluation and of the colours in the viewport."""
+    """Settings of the evaluation and of the colors in the viewport."""
 
     source: EnumProperty(
         name="Compare On",
@@ -79,7 +79,7 @@ CLASSES = (FDDA_PG_view,)
 
 
 def register() -> None:
-    """Give the window manager its property."""
+    """Add the property of the window manager."""
     bpy.types.WindowManager.fdda_view = PointerProperty(type=FDDA_PG_view)
 
 
