@@ -104,8 +104,8 @@ def run(line: str, tier: str, arguments: tuple[str, ...]) -> Result:
     report = log.with_suffix(".xml")
     log.parent.mkdir(parents=True, exist_ok=True)
     report.unlink(missing_ok=True)
-    options = ["-q", "--tb=short", "-p", "no:cacheprovider", f"--junit-xml={report.relative_to(ROOT)}"]
-    options += [f"--deselect={test}" for test in OF_WINE]
+    options = ["-q", "--tb=short", "-p", "no:cacheprovider", "-m", "not slow"]
+    options += [f"--junit-xml={report.relative_to(ROOT)}", *(f"--deselect={test}" for test in OF_WINE)]
     command = ["timeout", "--kill-after=10", str(SECONDS), RUN, PYTHONS[line], "-m", "pytest", *arguments, *options]
     environment = {**os.environ, "PYTHONUTF8": "1"}
     environment.pop("FDDA_TRAINER_PYTHON", None)  # that of Linux
