@@ -109,7 +109,7 @@ def test_without_the_group_the_model_counts_everywhere(masked, elbow, what):
     bpy.context.view_layer.update()
     assert_plays(masked, elbow.model)
     name = masked.fdda.mask
-    said = f"'elbow' has no vertex group '{name}', so the model counts everywhere; choose another mask."
+    said = f"'elbow' has no vertex group '{name}', so the mask has no effect; choose another."
     assert mask_problem(masked) == (said if name else "")
 
 

@@ -200,7 +200,7 @@ def test_damaged_borders_are_refused(trained, tmp_path, change):
 
 def test_borders_of_another_mesh_are_refused(odd, trained):
     checkpoint = read_checkpoint(checkpoint_path(trained))
-    with pytest.raises(TrainingError, match="are of other partitions; train without --warm-start"):
+    with pytest.raises(TrainingError, match="is of other partitions; train without --warm-start"):
         checkpoint.cut(odd.partitions[:2])
 
 

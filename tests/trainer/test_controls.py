@@ -210,7 +210,7 @@ def test_a_warm_start_takes_the_same_controls(controlled, model, tmp_path, capsy
     other = controlled_rig(PUFF, BULGE, LOCKED)
     write_controlled(tmp_path / "other", other)
     assert main([str(tmp_path / "other"), str(again), *QUICK, "--warm-start"]) == 1
-    assert "are of other controls; train without --warm-start." in capsys.readouterr().err
+    assert "is of other controls; train without --warm-start." in capsys.readouterr().err
 
 
 def test_poses_that_differ_in_controls_alone_are_other_poses(controlled, model, tmp_path, capsys):

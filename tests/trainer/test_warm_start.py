@@ -112,10 +112,10 @@ def test_there_must_be_a_checkpoint(recording, tmp_path, capsys):
     assert "There is no checkpoint" in refused(capsys, recording, tmp_path / "m.onnx")
 
 
-def test_a_checkpoint_of_other_networks_or_rigs_are_refused(recording, model, tmp_path, capsys):
-    assert "are of networks --hidden 24 24 --activation silu" in refused(capsys, recording, model, "--hidden", "8")
+def test_a_checkpoint_of_other_networks_or_rigs_is_refused(recording, model, tmp_path, capsys):
+    assert "is of networks --hidden 24 24 --activation silu" in refused(capsys, recording, model, "--hidden", "8")
     write_chain(tmp_path / "other", joints=4)
-    assert "are of another rig" in refused(capsys, tmp_path / "other", model)
+    assert "is of another rig" in refused(capsys, tmp_path / "other", model)
 
 
 @pytest.mark.parametrize("options", [["--seed", "1"], ["--held-out-fraction", "0.2"], ["--validation-fraction", "0.2"]])
@@ -125,7 +125,7 @@ def test_poses_that_were_trained_on_are_never_held_out(recording, model, capsys,
 
 def test_another_recording_of_the_rig_is_refused(model, tmp_path, capsys):
     write_chain(tmp_path / "other", seed=3)
-    assert "are of another recording or seed" in refused(capsys, tmp_path / "other", model)
+    assert "is of another recording or seed" in refused(capsys, tmp_path / "other", model)
 
 
 @pytest.mark.parametrize(
