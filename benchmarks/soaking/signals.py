@@ -87,7 +87,7 @@ def _cancelled(training: process.Training) -> int | None:
     began = time.monotonic()
     for _ in training.messages():
         pass
-    if (seconds := time.monotonic() - began) > process.CANCEL_SECONDS:
+    if (seconds := time.monotonic() - began) > process.KILL_AFTER_SECONDS:
         raise ShortfallError(f"it was killed after {seconds:.0f} s")
     return training._process.wait()
 

@@ -68,12 +68,12 @@ def _put_beside(scene_rig: "SceneRig", model: Path, out: Path) -> Path:
     """Let the bound object find its model from the file; returns the copy if one was made, else the model."""
     from ..core.output import atomic_write
     from ..models.entries import bound_entry
-    from ..models.model_list import adopt
+    from ..models.model_list import add_bound_model
     from ..scene.stored_paths import stored_path
 
     place = beside(model, out)
     binding = scene_rig.mesh_object.fdda
-    adopt(scene_rig.mesh_object)
+    add_bound_model(scene_rig.mesh_object)
     entry = bound_entry(scene_rig.mesh_object)
     # Through links the way may lead elsewhere than to what lies below the file.
     entry.path = binding.model = stored_path(out.parent / place.resolve().relative_to(out.resolve().parent))

@@ -4,7 +4,7 @@
 import argparse
 
 from ..core.errors import TrainerEnvironmentError
-from ..training.environment.choice import ping
+from ..training.environment.choice import check_trainer_python
 
 
 def add_options(_parser: argparse.ArgumentParser) -> None:
@@ -17,7 +17,7 @@ def run(_options: argparse.Namespace) -> None:
     Raises:
         TrainerEnvironmentError: it cannot train.
     """
-    answer = ping()
+    answer = check_trainer_python()
     for line in answer.details:
         print(line)
     if answer.level == "ERROR":

@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from .run import Evaluation
 
 MAX_STORED = 4
-"""Errors of a dense mesh take some hundred megabytes."""
+"""Errors of a dense mesh take some hundred format_file_size."""
 FRAMES_APART = 10
 """Worst frames that are nearer belong to one movement."""
 METHODS = ("fdda", "linear")

@@ -10,16 +10,18 @@ from collections.abc import Callable, Iterator
 
 import bpy
 
-from .job import ENVIRONMENT, JobState, Run, current, redraw
+from .job import ENVIRONMENT, JobRunner, JobState, current, redraw
 
-TICK_SECONDS, TICK_BUDGET = 0.2, 0.02
-STOP_SECONDS = 10.0
+TICK_SECONDS, TICK_WORK_SECONDS = 0.2, 0.02
+THREAD_JOIN_SECONDS = 10.0
 """A thread that was asked to end is left to itself after so long."""
 
-_run: Run | None = None
+_run: JobRunner | None = None
 
 
-def in_thread(steps: Iterator[object], state: JobState, cancel: Callable[[], None] | None = None) -> Iterator[object]:
+def iterate_in_thread(
+    steps: Iterator[object], state: JobState, cancel: Callable[[], None] | None = None
+) -> Iterator[object]:
     """Iterate `steps` in a thread of its own: for what blocks, and touches no data of Blender's.
 
     Args:
@@ -30,26 +32,26 @@ def in_thread(steps: Iterator[object], state: JobState, cancel: Callable[[], Non
     Yields:
         What `steps` yields, None while there is nothing. It raises what `steps` raises.
     """
-    found: queue.SimpleQueue[tuple[object, BaseException | None]] = queue.SimpleQueue()
+    results: queue.SimpleQueue[tuple[object, BaseException | None]] = queue.SimpleQueue()
 
     def work() -> None:
         try:
             for step in steps:
-                found.put((step, None))
-            found.put((None, StopIteration()))
+                results.put((step, None))
+            results.put((None, StopIteration()))
         except BaseException as error:  # Not lost: it is raised where the job is looked after.
-            found.put((None, error))
+            results.put((None, error))
 
     thread = threading.Thread(target=work, name=f"FDDA: {state.title}", daemon=True)
     thread.start()
-    is_asked = False
+    is_cancel_sent = False
     try:
         while True:
-            if state.cancel_requested and cancel and not is_asked:
-                is_asked = True
+            if state.cancel_requested and cancel and not is_cancel_sent:
+                is_cancel_sent = True
                 cancel()
             try:
-                step, error = found.get_nowait()
+                step, error = results.get_nowait()
             except queue.Empty:
                 yield None
                 continue
@@ -61,10 +63,10 @@ def in_thread(steps: Iterator[object], state: JobState, cancel: Callable[[], Non
     finally:
         if cancel and thread.is_alive():
             cancel()
-        thread.join(STOP_SECONDS)
+        thread.join(THREAD_JOIN_SECONDS)
 
 
-def look_after(run: Run) -> None:
+def run_in_background(run: JobRunner) -> None:
     """Iterate a job on the trainer's environment until it ends, whatever happens to windows and files."""
     global _run
     _run = run
@@ -82,7 +84,7 @@ def _tick() -> float | None:
     if current(ENVIRONMENT) is None:
         # It was ended from outside.
         return None
-    if _run.work(TICK_BUDGET):
+    if _run.work(TICK_WORK_SECONDS):
         print(f"FDDA: {_run.state.outcome}")
         return None
     redraw()

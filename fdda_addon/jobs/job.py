@@ -23,7 +23,7 @@ CHARACTER, ENVIRONMENT = "character", "environment"
 """What jobs work on. That on a character ends with the file; that on the trainer's environment touches no data of
 Blender's, and goes on when its window is closed and another file is opened.
 """
-UNITS = {
+STAGE_UNITS = {
     "fit": "vertices fitted",
     "probes": "poses compared with the rig",
     "epochs": "training passes",
@@ -32,7 +32,7 @@ UNITS = {
     "benchmark": "measurements",
 }
 """What the stages of jobs count, where their names do not say it."""
-EARLY_STAGES = {
+STAGE_LABELS = {
     "influences": "Step 1 of 2: testing bones",
     "starting": "Step 1 of 3: reading the recording",
     "partitions prepared": "Step 2 of 3: preparing body parts",
@@ -50,7 +50,7 @@ class JobState:
         subject: session_uid of the object that it is about, 0 for none.
         works_on: `CHARACTER` or `ENVIRONMENT`.
         can_cancel: whether it can be cancelled.
-        borrows_scene: it changes the scene and gives it back when it ends.
+        changes_scene: it changes the scene and gives it back when it ends.
         is_running: under way.
         cancel_requested: the user wants it to end.
         part: name of the object that it works on now, of several; empty for one.
@@ -66,7 +66,7 @@ class JobState:
     verb: str
     title: str
     subject: int = 0
-    borrows_scene: bool = False
+    changes_scene: bool = False
     works_on: str = CHARACTER
     can_cancel: bool = True
     is_running: bool = True
@@ -101,12 +101,12 @@ class JobState:
     def sentence(self) -> str:
         """How far it is: "212 of 1,000 poses"."""
         stage, of_mesh, mesh = self.stage.partition(" of '")
-        unit = UNITS.get(stage, stage) + of_mesh + mesh
+        unit = STAGE_UNITS.get(stage, stage) + of_mesh + mesh
         if not self.stage:
             text = "Starting…"
-        elif stage in EARLY_STAGES:
+        elif stage in STAGE_LABELS:
             count = f"{self.done:,} of {self.total:,}" if self.total else f"{self.done} s"
-            text = f"{EARLY_STAGES[stage]}{of_mesh}{mesh} ({count})"
+            text = f"{STAGE_LABELS[stage]}{of_mesh}{mesh} ({count})"
         elif not self.total:
             text = f"{unit[:1].upper()}{unit[1:]}: {self.done} s"
         else:
@@ -116,9 +116,9 @@ class JobState:
     @property
     def is_finishing(self) -> bool:
         """Whether all of the last stage is done."""
-        return 0 < self.total == self.done and self.stage.partition(" of '")[0] not in EARLY_STAGES
+        return 0 < self.total == self.done and self.stage.partition(" of '")[0] not in STAGE_LABELS
 
-    def begin_part(self, name: str) -> None:
+    def begin_object(self, name: str) -> None:
         """Note that the work on another of several objects begins."""
         self.part, self.stage, self.done, self.total = name, "", 0, 0
         self.curves.clear()
@@ -133,7 +133,7 @@ class JobState:
 
 
 _states: dict[str, JobState] = {}
-_running: "dict[str, Run]" = {}
+_running: "dict[str, JobRunner]" = {}
 
 
 def current(works_on: str = CHARACTER) -> JobState | None:
@@ -168,7 +168,7 @@ def stop(reason: str, works_on: str = CHARACTER) -> None:
         run.end(reason, "WARNING")
 
 
-class Run:
+class JobRunner:
     """A job under way: its state, its generator, and what is said at its end."""
 
     def __init__(
@@ -283,7 +283,7 @@ def _on_load(*_: object) -> None:
 
 @persistent
 def _on_undo(*_: object) -> None:
-    if (state := current()) and state.borrows_scene:
+    if (state := current()) and state.changes_scene:
         _stop("the scene was undone")
 
 

@@ -11,7 +11,7 @@ from ..core.rig import Rig, rig_differences
 from ..poses.sampling import sampled_channels
 from ..rig.reading import read_model_rig
 from ..scene.scene_rig import SceneRig
-from .model_list import info_of
+from .model_list import entry_info
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Changes:
     limits: tuple[str, ...] = ()
 
     @property
-    def prevents(self) -> bool:
+    def prevents_playback(self) -> bool:
         """Whether the model cannot play any more."""
         return bool(self.clauses)
 
@@ -51,7 +51,7 @@ class Changes:
         )
 
 
-def changes(name: str, info: ModelInfo, rig: Rig, channels: tuple[Channel, ...]) -> Changes:
+def compare_with_model(name: str, info: ModelInfo, rig: Rig, channels: tuple[Channel, ...]) -> Changes:
     """Compare a rig, and the range of motion of its poses, with what a model was trained for.
 
     Args:
@@ -61,18 +61,20 @@ def changes(name: str, info: ModelInfo, rig: Rig, channels: tuple[Channel, ...])
             are not compared.
     """
     clauses = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
-    is_own = all(c.name in rig.joint_names and c.kind != ROTATION_VECTOR for c in info.limits)
+    covers_joints = all(c.name in rig.joint_names and c.kind != ROTATION_VECTOR for c in info.limits)
     return Changes(
-        name, tuple(clauses), tuple(bones_with_changed_range(info.limits, channels)) if info.limits and is_own else ()
+        name,
+        tuple(clauses),
+        tuple(bones_with_changed_range(info.limits, channels)) if info.limits and covers_joints else (),
     )
 
 
-def changes_since(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> Changes:
+def find_changes(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> Changes:
     """What has changed of a rig since a model of its list was trained.
 
     Raises:
         FDDAError: the rig or the model cannot be read.
     """
-    info = info_of(scene_rig.mesh_object, entry)
+    info = entry_info(scene_rig.mesh_object, entry)
     rig = read_model_rig(scene_rig, info)
-    return changes(entry.name, info, rig, sampled_channels(scene_rig, rig))
+    return compare_with_model(entry.name, info, rig, sampled_channels(scene_rig, rig))

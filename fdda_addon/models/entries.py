@@ -4,7 +4,7 @@
 import bpy
 
 
-def chosen_entry(mesh_object: bpy.types.Object) -> bpy.types.PropertyGroup | None:
+def active_entry(mesh_object: bpy.types.Object) -> bpy.types.PropertyGroup | None:
     """The entry that is chosen in the list, None when the list is empty."""
     binding = mesh_object.fdda
     if not binding.models:
@@ -23,12 +23,12 @@ def bound_entry(mesh_object: bpy.types.Object) -> bpy.types.PropertyGroup | None
     return next((entry for entry in mesh_object.fdda.models if is_bound(mesh_object, entry)), None)
 
 
-def bound_name(mesh_object: bpy.types.Object) -> str:
+def bound_model_name(mesh_object: bpy.types.Object) -> str:
     """What the bound model is called."""
     entry = bound_entry(mesh_object)
     return entry.name if entry else bpy.path.display_name_from_filepath(mesh_object.fdda.model)
 
 
-def megabytes(count: int) -> str:
+def format_file_size(count: int) -> str:
     """A size for people: "1.3 MB"."""
     return f"{count / 1e6:.1f} MB" if count >= 1e5 else f"{count / 1e3:.1f} kB"

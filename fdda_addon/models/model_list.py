@@ -15,12 +15,12 @@ from ..runtime.binding import bind, unbind
 from ..runtime.opened_model import read_matching_rig
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import absolute_path, stored_path_for
-from .entries import bound_entry, bound_name, chosen_entry, is_bound
+from .entries import active_entry, bound_entry, bound_model_name, is_bound
 
-_infos: dict[tuple, ModelInfo] = {}
+_info_cache: dict[tuple, ModelInfo] = {}
 
 
-def remember(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGroup:
+def add_model(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGroup:
     """Put a model that the user has chosen or trained into the list of its mesh; it becomes the chosen entry.
 
     Returns:
@@ -36,10 +36,12 @@ def remember(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGro
         if absolute_path(mesh_object, entry.path) == Path(os.path.normpath(path.absolute())):
             binding.model_index = index
             was_bound = is_bound(mesh_object, entry)
-            is_other = (
-                _pack_anew(mesh_object, entry, path) if entry.packed else playback.has_outdated_model(mesh_object)
+            is_changed = (
+                _repack_if_changed(mesh_object, entry, path)
+                if entry.packed
+                else playback.has_outdated_model(mesh_object)
             )
-            if was_bound and is_other:
+            if was_bound and is_changed:
                 last_evaluation.remove(mesh_object)
                 registry.reset_players()
                 mesh_object.update_tag()
@@ -51,28 +53,28 @@ def remember(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGro
     return entry
 
 
-def adopt(mesh_object: bpy.types.Object) -> None:
+def add_bound_model(mesh_object: bpy.types.Object) -> None:
     """Put the model that is bound into the list, where a script or the command line has bound it."""
     binding = mesh_object.fdda
     if binding.is_bound and bound_entry(mesh_object) is None:
         entry = binding.models.add()
-        entry.name, entry.path, entry.packed = bound_name(mesh_object), binding.model, binding.packed
+        entry.name, entry.path, entry.packed = bound_model_name(mesh_object), binding.model, binding.packed
         entry.packed_bytes = len(packed_model.read(binding.packed)) if binding.packed else 0
 
 
-def chosen(mesh_object: bpy.types.Object) -> bpy.types.PropertyGroup:
+def require_active_entry(mesh_object: bpy.types.Object) -> bpy.types.PropertyGroup:
     """The entry that is chosen in the list.
 
     Raises:
         ModelError: the list is empty.
     """
-    entry = chosen_entry(mesh_object)
+    entry = active_entry(mesh_object)
     if entry is None:
         raise ModelError(f"'{mesh_object.name}' has no model yet; train one, or choose a file.")
     return entry
 
 
-def check(scene_rig: SceneRig, path: Path) -> None:
+def check_matches_rig(scene_rig: SceneRig, path: Path) -> None:
     """Fail when a file is no model, or was trained for another rig.
 
     Raises:
@@ -97,15 +99,15 @@ def _bind(scene_rig: SceneRig, path: Path, packed_model: bpy.types.Text | None =
     """As `bind_entry`; the list is left as it is."""
     mesh_object, binding = scene_rig.mesh_object, scene_rig.mesh_object.fdda
     use_in_render = binding.use_in_render
-    before = (binding.model, binding.packed, binding.mode) if binding.is_bound else None
+    previous = (binding.model, binding.packed, binding.mode) if binding.is_bound else None
     bind(scene_rig, path, use_in_render, packed_model)
     # Evaluated here, so that what cannot play is told now and not at the next frame.
     bpy.context.view_layer.update()
     if problem := binding.status:
-        is_other = before is not None and before[:2] != (binding.model, binding.packed)
+        is_changed = previous is not None and previous[:2] != (binding.model, binding.packed)
         unbind(mesh_object)
-        if is_other:
-            model, packed_before, mode = before
+        if is_changed:
+            model, packed_before, mode = previous
             bind(scene_rig, absolute_path(mesh_object, model), use_in_render, packed_before)
             binding.model, binding.mode = model, mode
         raise ModelError(problem)
@@ -123,14 +125,14 @@ def relink(scene_rig: SceneRig, path: Path) -> None:
     _bind(scene_rig, path)
     model_files.allow(path)
     if index < 0:
-        remember(mesh_object, path)
+        add_model(mesh_object, path)
         return
     entry, mesh_object.fdda.model_index = mesh_object.fdda.models[index], index
     entry.path, entry.packed, entry.packed_bytes = mesh_object.fdda.model, None, 0
     packed_model.remove_unused()
 
 
-def forget_entry(mesh_object: bpy.types.Object, index: int) -> str:
+def remove_entry(mesh_object: bpy.types.Object, index: int) -> str:
     """Take a model off the list and unbind it if it is bound; returns its name. Its file stays, a packed one goes.
 
     Raises:
@@ -171,7 +173,7 @@ def pack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pa
     return len(data)
 
 
-def _pack_anew(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path) -> bool:
+def _repack_if_changed(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path) -> bool:
     """Pack the file of a packed model where it is another now; returns whether it was."""
     if entry.packed.get(packed_model.KEY) == read_model(path)[1]:
         return False
@@ -190,7 +192,7 @@ def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, 
     data = packed_model.read(entry.packed)
     check_model(data, entry.packed.name)
     check_writable(path)
-    if not (os.path.lexists(path) and path.is_file() and _same(path, data)):
+    if not (os.path.lexists(path) and path.is_file() and _has_content(path, data)):
         if os.path.lexists(path):
             raise OutputError(f"There is another file '{path}'; choose another name.")
         with atomic_write(path) as temporary:
@@ -213,7 +215,7 @@ def entry_path(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) ->
     return absolute_path(mesh_object, entry.path) if entry.packed else model_files.allowed_path(mesh_object, entry.path)
 
 
-def info_of(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> ModelInfo:
+def entry_info(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> ModelInfo:
     """What a model of the list says of itself; read once.
 
     Raises:
@@ -221,9 +223,9 @@ def info_of(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> Mo
     """
     if entry.packed:
         key = (entry.packed.session_uid,)
-        if key not in _infos:
-            _infos[key] = check_model(packed_model.read(entry.packed), entry.packed.name)
-        return _infos[key]
+        if key not in _info_cache:
+            _info_cache[key] = check_model(packed_model.read(entry.packed), entry.packed.name)
+        return _info_cache[key]
     path = entry_path(mesh_object, entry)
     try:
         status = os.stat(path)
@@ -232,12 +234,12 @@ def info_of(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> Mo
             f"The model '{path}' cannot be read: {os_error_text(error)}; find it, or choose another."
         ) from error
     key = (path, status.st_mtime_ns, status.st_size)
-    if key not in _infos:
-        for old in [old for old in _infos if old[0] == path]:
-            del _infos[old]
-        _infos[key] = read_model_info(path)
-    return _infos[key]
+    if key not in _info_cache:
+        for old in [old for old in _info_cache if old[0] == path]:
+            del _info_cache[old]
+        _info_cache[key] = read_model_info(path)
+    return _info_cache[key]
 
 
-def _same(path: Path, data: bytes) -> bool:
+def _has_content(path: Path, data: bytes) -> bool:
     return path.stat().st_size == len(data) <= MAX_BYTES and path.read_bytes() == data

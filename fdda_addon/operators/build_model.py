@@ -42,10 +42,10 @@ class FDDA_OT_build_model(TrainingOperator, JobOperator, bpy.types.Operator):
                 yield step
                 if self.state.cancel_requested:
                     return
-        self.borrows_scene = self.state.borrows_scene = False
+        self.changes_scene = self.state.changes_scene = False
         meshes = [(rig.mesh_object, recording, model) for rig, recording, model in files]
         for mesh_object, recording, model in meshes:
-            self.state.begin_part(mesh_object.name if len(meshes) > 1 else "")
+            self.state.begin_object(mesh_object.name if len(meshes) > 1 else "")
             yield from self.train(mesh_object, recording, model)
             if self.state.cancel_requested:
                 return

@@ -13,7 +13,7 @@ from ..core.progress import Progress
 from ..core.report import REPORT_HTML, page_path
 from ..evaluation import last_evaluation, side_by_side
 from ..evaluation.loaded_heat_map import loaded_heat_map
-from ..models.entries import bound_entry, bound_name
+from ..models.entries import bound_entry, bound_model_name
 from ..properties.recording_options import target_settings
 from ..properties.view import show_graph
 from ..scene.active_rig import any_mesh_object
@@ -63,7 +63,7 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
         self._evaluations: list[tuple[int, object]] = []
         for scene_rig in rigs:
             mesh_object = scene_rig.mesh_object
-            self.state.begin_part(mesh_object.name if len(rigs) > 1 else "")
+            self.state.begin_object(mesh_object.name if len(rigs) > 1 else "")
             network, uid = network_of(mesh_object), mesh_object.session_uid
             target = target_settings(mesh_object.fdda.settings)
             with model_disabled(mesh_object):
@@ -90,7 +90,7 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
         for uid, evaluation in result:
             mesh_object = next(o for o in bpy.data.objects if o.session_uid == uid)
             last = last_evaluation.store(
-                mesh_object, evaluation, bound_name(mesh_object), self._action, first, self.seed
+                mesh_object, evaluation, bound_model_name(mesh_object), self._action, first, self.seed
             )
             fdda, linear = last.total["fdda"], last.total["linear"]
             of = f" of '{mesh_object.name}'" if len(result) > 1 else ""
@@ -228,7 +228,7 @@ class FDDA_OT_open_report(ModelOperator, bpy.types.Operator):
 
         entry = bound_entry(mesh_object)
         if entry is None:
-            model_list.adopt(mesh_object)
+            model_list.add_bound_model(mesh_object)
             entry = bound_entry(mesh_object)
         return page_path(model_list.entry_path(mesh_object, entry).resolve())
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import bpy
 
 from ..core.errors import FDDAError
-from ..jobs.job import JobState, Run, current, redraw, request_cancel, stop, unregister
+from ..jobs.job import JobRunner, JobState, current, redraw, request_cancel, stop, unregister
 
 TICK_BUDGET, MAX_BUDGET = 0.03, 0.2
 """Seconds that a job may work in one tick. A step is always finished, so steps must be short.
@@ -37,7 +37,7 @@ class JobOperator:
 
     verb = ""
     title = ""
-    borrows_scene = True
+    changes_scene = True
     """Whether the job changes the scene and restores it. Meanwhile only the view can be navigated; ESC cancels."""
     changes_file = False
     """Whether the job changes data of the .blend file. Its end then adds an undo step and marks the file as changed."""
@@ -95,7 +95,7 @@ class JobOperator:
         if (result := self._tick(context)) is not None:
             return result
         manager = context.window_manager
-        seconds = TICK_SECONDS if self.borrows_scene else IDLE_TICK_SECONDS
+        seconds = TICK_SECONDS if self.changes_scene else IDLE_TICK_SECONDS
         self._timer = manager.event_timer_add(seconds, window=context.window)
         manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
@@ -105,13 +105,13 @@ class JobOperator:
             # An undo or another file has ended the job.
             self._end_modal(context)
             return {"CANCELLED"}
-        if event.type == "ESC" and self.borrows_scene:
+        if event.type == "ESC" and self.changes_scene:
             request_cancel()
         if event.type == "TIMER" or self._run.state.cancel_requested:
             result = self._tick(context)
             if result is not None:
                 return result
-        if event.type == "TIMER" or not self.borrows_scene or _is_view_event(context, event):
+        if event.type == "TIMER" or not self.changes_scene or _is_view_event(context, event):
             # With RUNNING_MODAL Blender would not track the region below the mouse, and no button would work.
             return {"PASS_THROUGH"}
         return {"RUNNING_MODAL"}
@@ -127,13 +127,13 @@ class JobOperator:
             self.report({"ERROR"}, f"{job.title} is under way; wait for it or cancel it.")
             return False
         try:
-            state = JobState(self.verb, self.title, self.subject(context), self.borrows_scene)
+            state = JobState(self.verb, self.title, self.subject(context), self.changes_scene)
         except FDDAError as error:
             self.report({"ERROR"}, str(error))
             return False
         self._timer, self._status_text, self._drawn_progress = None, None, None
         self._last_redraw, self._last_work = 0.0, time.monotonic()
-        self._run = Run(
+        self._run = JobRunner(
             state,
             self.steps(context),
             lambda result: self.finish(bpy.context, result),
@@ -145,7 +145,7 @@ class JobOperator:
     def _tick(self, context: bpy.types.Context) -> set[str] | None:
         """Work for one tick; return the result of the operator once the job has ended."""
         budget = TICK_BUDGET
-        if self.borrows_scene:
+        if self.changes_scene:
             budget = min(max(budget, time.monotonic() - self._last_work), MAX_BUDGET)
         try:
             has_ended = self._run.work(budget)
@@ -160,7 +160,7 @@ class JobOperator:
         shown = (state.stage, state.done, len(state.log) + len(state.warnings), state.cancel_requested)
         if shown != self._drawn_progress and now - self._last_redraw >= REDRAW_SECONDS:
             self._drawn_progress, self._last_redraw = shown, now
-            text = f"{self.title}: {state.sentence} (ESC: cancel)" if self.borrows_scene else None
+            text = f"{self.title}: {state.sentence} (ESC: cancel)" if self.changes_scene else None
             self._set_status_text(context, text)
             redraw()
         return None

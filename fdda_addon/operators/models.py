@@ -4,7 +4,7 @@
 import bpy
 
 from ..core.errors import ModelError
-from ..models.entries import megabytes
+from ..models.entries import format_file_size
 from ..scene.active_rig import any_mesh_object
 from .playback import ModelFileOperator, ModelOperator
 
@@ -44,11 +44,13 @@ class ModelListOperator(ModelOperator):
 
         scene_rig = self.rig(context)
         mesh_object = scene_rig.mesh_object
-        model_list.adopt(mesh_object)
+        model_list.add_bound_model(mesh_object)
         count = len(mesh_object.fdda.models)
         if self.index >= count:
             raise ModelError(f"'{mesh_object.name}' has {count} models and none with index {self.index}.")
-        return scene_rig, model_list.chosen(mesh_object) if self.index < 0 else mesh_object.fdda.models[self.index]
+        return scene_rig, model_list.require_active_entry(mesh_object) if self.index < 0 else mesh_object.fdda.models[
+            self.index
+        ]
 
 
 class FDDA_OT_add_model(ModelOperator, ModelFileOperator, bpy.types.Operator):
@@ -70,9 +72,9 @@ class FDDA_OT_add_model(ModelOperator, ModelFileOperator, bpy.types.Operator):
         scene_rig = self.rig(context)
         if not self.filepath:
             raise ModelError("No file was chosen; choose a model file.")
-        model_list.check(scene_rig, self.chosen_path())
-        model_list.adopt(scene_rig.mesh_object)
-        entry = model_list.remember(scene_rig.mesh_object, self.chosen_path())
+        model_list.check_matches_rig(scene_rig, self.chosen_path())
+        model_list.add_bound_model(scene_rig.mesh_object)
+        entry = model_list.add_model(scene_rig.mesh_object, self.chosen_path())
         return f"Added {entry.name}; bind it to use it."
 
 
@@ -91,7 +93,7 @@ class FDDA_OT_remove_model(ModelListOperator, bpy.types.Operator):
 
         scene_rig, entry = self.active_entry(context)
         mesh_object = scene_rig.mesh_object
-        name = model_list.forget_entry(mesh_object, list(mesh_object.fdda.models).index(entry))
+        name = model_list.remove_entry(mesh_object, list(mesh_object.fdda.models).index(entry))
         return f"Removed {name}."
 
 
@@ -112,7 +114,7 @@ class FDDA_OT_pack_model(ModelListOperator, bpy.types.Operator):
         if entry.packed:
             raise ModelError(f"{entry.name} is already packed.")
         size = model_list.pack_entry(scene_rig.mesh_object, entry)
-        return f"Packed {entry.name}, {megabytes(size)}. Save the .blend file to keep it."
+        return f"Packed {entry.name}, {format_file_size(size)}. Save the .blend file to keep it."
 
 
 class FDDA_OT_unpack_model(ModelListOperator, bpy.types.Operator):
@@ -159,11 +161,11 @@ class FDDA_OT_check_model(ModelListOperator, bpy.types.Operator):
         return cls.has_models(context)
 
     def apply(self, context: bpy.types.Context) -> str:
-        from ..models.changes import changes_since
+        from ..models.changes import find_changes
 
         scene_rig, entry = self.active_entry(context)
-        found = changes_since(scene_rig, entry)
-        if found.prevents:
+        found = find_changes(scene_rig, entry)
+        if found.prevents_playback:
             raise ModelError(found.sentence)
         return found.sentence or f"{entry.name} matches '{scene_rig.mesh_object.name}'."
 

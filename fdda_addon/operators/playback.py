@@ -9,7 +9,7 @@ import bpy
 from ..core.errors import FDDAError, ModelError
 from ..evaluation import side_by_side
 from ..jobs.job import current
-from ..models.entries import bound_name, chosen_entry, megabytes
+from ..models.entries import active_entry, bound_model_name, format_file_size
 from ..properties.character import trained_file
 from ..properties.preferences import packs_models
 from ..scene.active_rig import any_mesh_object
@@ -33,7 +33,7 @@ class ModelOperator(RigOperator):
     def can_change_scene(cls, context: bpy.types.Context) -> bool:
         """Return whether there is a rig and no job borrows the scene, else set the poll message. For `poll`."""
         job = current()
-        if job is not None and job.borrows_scene:
+        if job is not None and job.changes_scene:
             cls.poll_message_set(f"{job.title} is under way; wait for it or cancel it")
             return False
         return cls.has_rig(context)
@@ -111,14 +111,14 @@ class ModelFileOperator:
 
 def _has_model(mesh_object: bpy.types.Object) -> bool:
     """Return whether there is a model to bind: in the Model Library, or from a training."""
-    return chosen_entry(mesh_object) is not None or trained_file(mesh_object) is not None
+    return active_entry(mesh_object) is not None or trained_file(mesh_object) is not None
 
 
 def _unpacked_file(mesh_object: bpy.types.Object) -> Path | None:
     """Return the file of the model that would be bound, None if it is packed."""
     from ..models import model_list
 
-    entry = chosen_entry(mesh_object)
+    entry = active_entry(mesh_object)
     if entry is None:
         return trained_file(mesh_object)
     return None if entry.packed else model_list.entry_path(mesh_object, entry)
@@ -138,15 +138,15 @@ def bind_model(scene_rig: SceneRig, path: Path | None = None, pack_large: bool =
     from ..models import model_list
 
     mesh_object = scene_rig.mesh_object
-    model_list.adopt(mesh_object)
-    if path is None and chosen_entry(mesh_object) is None:
+    model_list.add_bound_model(mesh_object)
+    if path is None and active_entry(mesh_object) is None:
         path = trained_file(mesh_object)
     if path is not None:
         # Checked first, so that no model of another rig gets into the list.
-        model_list.check(scene_rig, path)
-        entry = model_list.remember(mesh_object, path)
+        model_list.check_matches_rig(scene_rig, path)
+        entry = model_list.add_model(mesh_object, path)
     else:
-        entry = model_list.chosen(mesh_object)
+        entry = model_list.require_active_entry(mesh_object)
     model_list.bind_entry(scene_rig, entry)
     return f"'{mesh_object.name}' plays {entry.name}.{pack_by_default(mesh_object, entry, pack_large)}"
 
@@ -159,7 +159,7 @@ def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGrou
         return ""
     size = model_list.entry_path(mesh_object, entry).stat().st_size
     if size > LARGE_MODEL_BYTES and not pack_large:
-        return f" It is large ({megabytes(size)}) and was not packed; pack it in the Model Library."
+        return f" It is large ({format_file_size(size)}) and was not packed; pack it in the Model Library."
     model_list.pack_entry(mesh_object, entry)
     return ""
 
@@ -200,7 +200,7 @@ class FDDA_OT_bind(ModelOperator, ModelFileOperator, bpy.types.Operator):
 
     def draw(self, _context: bpy.types.Context) -> None:
         if size := getattr(self, "_size", 0):
-            self.layout.label(text=f"The model has {megabytes(size)}. Packed, it is written with every save.")
+            self.layout.label(text=f"The model has {format_file_size(size)}. Packed, it is written with every save.")
             self.layout.prop(self, "pack_large")
 
     def _largest_unpacked_bytes(self, context: bpy.types.Context) -> int:
@@ -237,8 +237,8 @@ class FDDA_OT_unbind(ModelOperator, bpy.types.Operator):
         names = []
         for scene_rig in self.bound_rigs(context):
             mesh_object = scene_rig.mesh_object
-            model_list.adopt(mesh_object)
-            names.append(bound_name(mesh_object))
+            model_list.add_bound_model(mesh_object)
+            names.append(bound_model_name(mesh_object))
             side_by_side.hide(mesh_object)
             unbind(mesh_object)
         return f"Unbound {' and '.join(names)}."
@@ -299,7 +299,7 @@ class FDDA_OT_relink(ModelOperator, ModelFileOperator, bpy.types.Operator):
         if not self.filepath:
             raise ModelError("No file was chosen; give the model's file.")
         model_list.relink(scene_rig, self.chosen_path())
-        message = pack_by_default(scene_rig.mesh_object, chosen_entry(scene_rig.mesh_object))
+        message = pack_by_default(scene_rig.mesh_object, active_entry(scene_rig.mesh_object))
         return f"'{scene_rig.mesh_object.name}' plays {self.chosen_path()}.{message}"
 
 

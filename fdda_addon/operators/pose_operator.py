@@ -14,7 +14,7 @@ class PoseOperator(RigOperator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         job = current()
-        if job is not None and job.borrows_scene:
+        if job is not None and job.changes_scene:
             cls.poll_message_set(f"{job.title} is under way; wait for it or cancel it")
             return False
         if context.mode not in {"OBJECT", "POSE"}:

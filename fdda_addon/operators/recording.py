@@ -10,7 +10,7 @@ import bpy
 from ..core.defaults import REFINEMENT_POSES
 from ..core.errors import FDDAError
 from ..jobs.job import current
-from ..models.entries import megabytes
+from ..models.entries import format_file_size
 from ..properties.character import model_file, recording_folder
 from ..properties.recording_options import copy_sampling_settings, recording_settings
 from ..scene.scene_rig import SceneRig
@@ -164,7 +164,7 @@ class FDDA_OT_delete_recording(RigOperator, bpy.types.Operator):
         except FDDAError as error:
             return str(error)
         size = sum(file.stat().st_size for file in path.glob("*.npy"))
-        return f"{count:,} poses, {megabytes(size)}, in '{path}'. This cannot be undone. Models are kept."
+        return f"{count:,} poses, {format_file_size(size)}, in '{path}'. This cannot be undone. Models are kept."
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         from ..core.recording.folder import remove_recording

@@ -13,8 +13,8 @@ from bpy.props import StringProperty
 
 from ..core.errors import FDDAError, TrainerEnvironmentError
 from ..core.progress import Progress
-from ..jobs.background import in_thread, look_after, unregister
-from ..jobs.job import ENVIRONMENT, JobState, Run, current, request_cancel
+from ..jobs.background import iterate_in_thread, run_in_background, unregister
+from ..jobs.job import ENVIRONMENT, JobRunner, JobState, current, request_cancel
 from ..properties.preferences import wheels_folder
 from ..training.environment import choice, folder, session
 from ..training.environment.check_result import CheckResult
@@ -41,7 +41,7 @@ class _EnvironmentOperator:
     @staticmethod
     def store_result(outcome: CheckResult) -> None:
         """Show the result in the preferences."""
-        session.remember(None, outcome)
+        session.store_result(None, outcome)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if bpy.app.background or context.window is None:
@@ -50,7 +50,7 @@ class _EnvironmentOperator:
         if run.work(0):
             return self._end(run.state)
         # Blender frees the operator before the job ends, so the job must not refer to it.
-        look_after(run)
+        run_in_background(run)
         return {"FINISHED"}
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
@@ -62,7 +62,7 @@ class _EnvironmentOperator:
             time.sleep(WAIT_SECONDS)
         return self._end(run.state)
 
-    def _begin(self) -> Run:
+    def _begin(self) -> JobRunner:
         try:
             steps, cancel = self.steps()
         except FDDAError as error:
@@ -80,7 +80,7 @@ def start_job(
     steps: Iterator[Progress | CheckResult],
     cancel: Callable[[], None] | None,
     store_result: Callable[[CheckResult], None],
-) -> Run:
+) -> JobRunner:
     """Start a job on the training environment.
 
     Args:
@@ -93,7 +93,7 @@ def start_job(
 
     def check_results() -> Iterator[object]:
         try:
-            yield from in_thread(steps, state, cancel)
+            yield from iterate_in_thread(steps, state, cancel)
         except FDDAError as error:
             yield CheckResult("WARNING" if state.cancel_requested else "ERROR", str(error))
 
@@ -104,7 +104,7 @@ def start_job(
             raise TrainerEnvironmentError(outcome.message)
         return outcome.message
 
-    return Run(state, check_results(), finish, lambda: f"{title} was canceled.", ends_itself=True)
+    return JobRunner(state, check_results(), finish, lambda: f"{title} was canceled.", ends_itself=True)
 
 
 class FDDA_OT_check_trainer(_EnvironmentOperator, bpy.types.Operator):
@@ -113,16 +113,16 @@ class FDDA_OT_check_trainer(_EnvironmentOperator, bpy.types.Operator):
     bl_description = "Check whether the Python for training has PyTorch, and show which device it will train on"
 
     def steps(self) -> _EnvironmentJob:
-        return _check(choice.chosen_python()), None
+        return _check(choice.select_python()), None
 
     @staticmethod
     def store_result(outcome: CheckResult) -> None:
-        session.remember(outcome)
+        session.store_result(outcome)
 
 
 def _check(python: choice.TrainerPython) -> Iterator[Progress | CheckResult]:
     yield Progress(f"asking '{python.path}'", 0, 0)
-    yield choice.ping(python)
+    yield choice.check_trainer_python(python)
 
 
 class FDDA_OT_create_trainer_environment(_EnvironmentOperator, bpy.types.Operator):
@@ -143,26 +143,26 @@ class FDDA_OT_create_trainer_environment(_EnvironmentOperator, bpy.types.Operato
     )
 
     def steps(self) -> _EnvironmentJob:
-        from ..training.environment.creation import Creation
+        from ..training.environment.creation import EnvironmentCreation
 
         wheels = self.wheels or wheels_folder()
-        if reason := folder.obstacle(wheels):
+        if reason := folder.creation_obstacle(wheels):
             raise TrainerEnvironmentError(f"{reason}.")
         path = Path(bpy.path.abspath(wheels)) if wheels else None
-        creation = Creation(folder.own_folder(), folder.log_path(), path, self.python)
+        creation = EnvironmentCreation(folder.environment_folder(), folder.log_path(), path, self.python)
         return creation.steps(), creation.cancel
 
     @staticmethod
     def store_result(outcome: CheckResult) -> None:
-        origin = choice.chosen_python().origin
+        origin = choice.select_python().origin
         if outcome.level != "INFO":
-            session.remember(None, outcome)
+            session.store_result(None, outcome)
         elif origin is choice.Origin.OWN:
-            session.remember(outcome)
+            session.store_result(outcome)
         else:
             field = "Existing Python" if origin is choice.Origin.PREFERENCES else choice.PYTHON_VARIABLE
             text = f"The training environment is ready, but {field} names another Python, which is used instead."
-            session.remember(None, CheckResult("WARNING", text))
+            session.store_result(None, CheckResult("WARNING", text))
 
 
 class FDDA_OT_remove_trainer_environment(_EnvironmentOperator, bpy.types.Operator):
@@ -176,14 +176,14 @@ class FDDA_OT_remove_trainer_environment(_EnvironmentOperator, bpy.types.Operato
         return context.window_manager.invoke_confirm(self, event)
 
     def steps(self) -> _EnvironmentJob:
-        return _remove(folder.own_folder()), None
+        return _remove(folder.environment_folder()), None
 
 
 def _remove(path: Path) -> Iterator[Progress | CheckResult]:
     yield Progress(f"removing '{path}'", 0, 0)
-    with folder.claimed(path):
+    with folder.creation_lock(path):
         existed = path.exists()
-        folder.remove(path)
+        folder.remove_environment(path)
     yield CheckResult(
         "INFO", "The training environment was removed." if existed else "There is no training environment."
     )

@@ -105,13 +105,13 @@ class TrainingOperator(RigOperator):
 
     def add_trained_models_to_list(self) -> None:
         """Add the trained models to the Model Library of their meshes."""
-        from ..models.model_list import remember
+        from ..models.model_list import add_model
 
         self.changes_file = bool(self.trained_models)
         for uid, model in self.trained_models:
             mesh_object = next((o for o in bpy.data.objects if o.session_uid == uid), None)
             if mesh_object is not None:
-                remember(mesh_object, model)
+                add_model(mesh_object, model)
 
     def on_failure(self) -> None:
         # Models that were trained before the failure are on the disk; packed copies of them are outdated.
@@ -133,7 +133,7 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
     # Without UNDO: Adjust Last Operation would train again at each change.
     bl_options = {"REGISTER"}
     verb, title = "train", "Training"
-    borrows_scene = False
+    changes_scene = False
     ends_itself = True
 
     recording: bpy.props.StringProperty(
@@ -182,14 +182,14 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
 
     def _models_of_other_rigs(self, context: bpy.types.Context) -> str:
         """Return a message about models of other rigs that training would overwrite; empty without one."""
-        from ..models.model_list import check
+        from ..models.model_list import check_matches_rig
         from ..training.detached_process import is_detached
 
         try:
             for rig in self.rigs(context):
                 model = self._files(rig.mesh_object)[1]
                 if model.is_file() and not is_detached(model):
-                    check(rig, model)
+                    check_matches_rig(rig, model)
         except FDDAError as error:
             return f"{error} Training will overwrite it; to keep it, choose another file under Model."
         return ""
@@ -202,7 +202,7 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
         files = [(rig.mesh_object, *self._files(rig.mesh_object)) for rig in self.rigs(context)]
         for mesh_object, recording, model in files:
-            self.state.begin_part(mesh_object.name if len(files) > 1 else "")
+            self.state.begin_object(mesh_object.name if len(files) > 1 else "")
             yield from self.train(mesh_object, recording, model, self.warm_start)
             if self.state.cancel_requested:
                 return

@@ -69,7 +69,7 @@ def _run_requested_checks() -> None:
         mesh_object = meshes.get(uid)
         armature_object = mesh_object and armature_of(mesh_object)
         # A job that borrows the scene has changed the pose and the modifiers.
-        if armature_object and not (running and running.borrows_scene):
+        if armature_object and not (running and running.changes_scene):
             check_now(SceneRig(mesh_object, armature_object))
     if _drawn_values() != before:
         job.redraw()

@@ -6,7 +6,7 @@ import bpy
 from ..evaluation import last_evaluation, markers, side_by_side
 from ..evaluation.loaded_heat_map import loaded_heat_map
 from ..jobs import job
-from ..models.entries import bound_name
+from ..models.entries import bound_model_name
 from ..scene.scene_rig import SceneRig
 from .bone_names import short_bone_name
 from .section import Section, draw_button, draw_job, draw_wrapped, mesh_count, panel_rig
@@ -98,7 +98,7 @@ def _draw_figures(
     last: last_evaluation.LastEvaluation,
     rig: SceneRig,
 ) -> None:
-    bound = bound_name(rig.mesh_object)
+    bound = bound_model_name(rig.mesh_object)
     what = f"{last.poses} frames of {last.name}" if last.name else f"{last.poses} random poses"
     header, body = layout.panel("fdda_figures", default_closed=False)
     header.label(text="Error (mm)")

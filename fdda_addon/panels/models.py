@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..core.errors import FDDAError
-from ..models.entries import chosen_entry, is_bound, megabytes
+from ..models.entries import active_entry, format_file_size, is_bound
 from ..scene.stored_paths import resolve_path
 from . import checks
 from .section import Section, draw_wrapped, panel_rig
@@ -35,8 +35,8 @@ def rig_of_model(scene_rig: object, rig: object, info: object) -> object:
 
 def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
     """Return icon and message of each model of a mesh that has a problem, by `_entry_key`."""
-    from ..models.changes import changes
-    from ..models.model_list import info_of
+    from ..models.changes import compare_with_model
+    from ..models.model_list import entry_info
     from ..scene.scene_rig import SceneRig, armature_of
 
     armature_object = armature_of(mesh_object)
@@ -45,12 +45,14 @@ def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
     found = {}
     for entry in mesh_object.fdda.models:
         try:
-            info = info_of(mesh_object, entry)
+            info = entry_info(mesh_object, entry)
             if check is not None and check.rig is not None:
                 rig = rig_of_model(scene_rig, check.rig, info)
-                changed = changes(entry.name, info, rig, _compared_channels(mesh_object, check.channels, info))
+                changed = compare_with_model(
+                    entry.name, info, rig, _compared_channels(mesh_object, check.channels, info)
+                )
                 if changed.sentence:
-                    found[_entry_key(entry)] = ("ERROR" if changed.prevents else "INFO", changed.sentence)
+                    found[_entry_key(entry)] = ("ERROR" if changed.prevents_playback else "INFO", changed.sentence)
         except FDDAError as error:
             found[_entry_key(entry)] = ("ERROR", str(error))
     return found
@@ -82,7 +84,7 @@ class FDDA_UL_models(bpy.types.UIList):
         row = layout.row(align=True)
         row.prop(item, "name", text="", emboss=False, icon="LINKED" if is_bound(mesh_object, item) else "BLANK1")
         if item.packed:
-            row.label(text=megabytes(item.packed_bytes), icon="PACKAGE")
+            row.label(text=format_file_size(item.packed_bytes), icon="PACKAGE")
         if (state := (_problems.get(mesh_object) or {}).get(_entry_key(item))) is not None:
             row.label(icon=state[0])
 
@@ -109,7 +111,7 @@ class FDDA_PT_models(Section, bpy.types.Panel):
         column = row.column(align=True)
         column.operator("fdda.add_model", text="", icon="ADD")
         column.operator("fdda.remove_model", text="", icon="REMOVE")
-        entry = chosen_entry(mesh_object)
+        entry = active_entry(mesh_object)
         if entry is not None:
             self._draw_entry(context, mesh_object, entry)
 
@@ -126,7 +128,7 @@ class FDDA_PT_models(Section, bpy.types.Panel):
             row.scale_y = 1.2
             row.operator("fdda.bind", text=f"Bind {entry.name}", icon="LINKED").filepath = ""
         if entry.packed:
-            draw_wrapped(layout, context, f"Packed, {megabytes(entry.packed_bytes)}", "PACKAGE")
+            draw_wrapped(layout, context, f"Packed, {format_file_size(entry.packed_bytes)}", "PACKAGE")
             layout.operator("fdda.unpack_model", icon="EXPORT")
         else:
             draw_wrapped(layout, context, str(resolve_path(entry.path)), "FILE")

@@ -6,7 +6,7 @@ from pathlib import Path
 import bpy
 
 from ..jobs import job
-from ..models.entries import bound_name, chosen_entry
+from ..models.entries import active_entry, bound_model_name
 from ..scene.draw_cache import draw_cached
 from ..scene.folder_trust import is_trusted
 from ..scene.scene_rig import SceneRig, armature_of
@@ -76,7 +76,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
 
     def _draw_unbound(self, context: bpy.types.Context, rig: SceneRig) -> None:
         mesh_object = rig.mesh_object
-        layout, entry, found = self.layout, chosen_entry(mesh_object), find_trained_file(rig)
+        layout, entry, found = self.layout, active_entry(mesh_object), find_trained_file(rig)
         if mesh_object.fdda.status:
             draw_wrapped(layout, context, mesh_object.fdda.status, "ERROR")
         if entry is None and (found is None or found.mismatch):
@@ -91,7 +91,7 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
     def _draw_bound(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
         layout, binding = self.layout, mesh_object.fdda
         where = " (in this file)" if binding.packed else ""
-        layout.label(text=f"{bound_name(mesh_object)}{where}", icon="ERROR" if binding.status else "LINKED")
+        layout.label(text=f"{bound_model_name(mesh_object)}{where}", icon="ERROR" if binding.status else "LINKED")
         if not binding.packed and not binding.status and is_outside_model_folders(mesh_object):
             text = "The model is not packed, and not in the folder of this file: it will not load again."
             draw_wrapped(layout, context, text, "ERROR")

@@ -95,7 +95,7 @@ def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context) ->
     """Draw the button that does all steps below, or its progress."""
     if draw_job(layout, context, "build_model"):
         state = job.state_of("build_model")
-        if not state.borrows_scene:
+        if not state.changes_scene:
             curves.draw(layout, state.curves)
         return
     row = layout.row()

@@ -35,7 +35,7 @@ class Section:
     def enabled_layout(self) -> bpy.types.UILayout:
         """Return the layout of the panel, disabled while a job of another section borrows the scene."""
         running = job.current()
-        self.layout.enabled = running is None or not running.borrows_scene or running.verb in self.verbs
+        self.layout.enabled = running is None or not running.changes_scene or running.verb in self.verbs
         return self.layout
 
     @classmethod

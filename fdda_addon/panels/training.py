@@ -83,11 +83,11 @@ def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool
         draw_wrapped(box, context, f"{checking.title}: {checking.stage}", "SORTTIME")
     elif answer is not None:
         draw_wrapped(box, context, answer.message, "ERROR" if answer.level == "ERROR" else "INFO")
-    elif choice.chosen_python().origin is choice.Origin.THIS:
+    elif choice.select_python().origin is choice.Origin.THIS:
         text = "Training needs PyTorch, which is not installed yet; install it in the preferences."
         draw_wrapped(box, context, text, "ERROR")
     else:
-        draw_wrapped(box, context, f"Python not checked yet: {choice.chosen_python().path}", "INFO")
+        draw_wrapped(box, context, f"Python not checked yet: {choice.select_python().path}", "INFO")
     row = box.row(align=True)
     row.operator("fdda.check_trainer", text="Check Setup", icon="VIEWZOOM")
     if preferences() is not None:

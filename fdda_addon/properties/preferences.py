@@ -11,7 +11,7 @@ from ..jobs.job import ENVIRONMENT, JobState, current
 from ..scene import folder_trust
 from ..training.environment import choice, session
 from ..training.environment.check_result import CheckResult
-from ..training.environment.folder import EXTENSION, FolderState, obstacle, own_folder
+from ..training.environment.folder import EXTENSION, FolderState, creation_obstacle, environment_folder
 
 MODULE = EXTENSION or __package__.partition(".")[0]
 """Name under which Blender stores the preferences. Without installation there are none."""
@@ -19,7 +19,7 @@ MODULE = EXTENSION or __package__.partition(".")[0]
 LEVEL_ICONS = {"INFO": "CHECKMARK", "WARNING": "INFO", "ERROR": "ERROR"}
 STATE_LABELS = {
     FolderState.MISSING: "Not installed",
-    FolderState.HALF_MADE: "Incomplete: its installation was interrupted; reinstall it, or remove it",
+    FolderState.INCOMPLETE: "Incomplete: its installation was interrupted; reinstall it, or remove it",
     FolderState.BROKEN: "Broken: its Python is missing; reinstall it",
     FolderState.OUTDATED: "Ready, but this add-on expects other versions; reinstall it when convenient",
     FolderState.READY: "Ready",
@@ -44,7 +44,7 @@ class FDDA_AP_preferences(bpy.types.AddonPreferences):
         description="Python with PyTorch, or the folder of its virtual environment. Empty for the environment "
         f"variable {choice.PYTHON_VARIABLE}, or else the environment above",
         subtype="FILE_PATH",
-        update=lambda _preferences, _context: session.remember(None),
+        update=lambda _preferences, _context: session.store_result(None),
     )
     wheels_folder: StringProperty(
         name="Offline Packages",
@@ -124,11 +124,11 @@ def draw_check(layout: bpy.types.UILayout) -> None:
 
 def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -> None:
     """Draw state, buttons and progress of the training environment."""
-    state = session.own_state()
+    state = session.environment_state()
     left, right = _split_row(layout)
     left.label(text="Training Environment")
     right.label(
-        text=STATE_LABELS[state], icon="ERROR" if state in (FolderState.HALF_MADE, FolderState.BROKEN) else "NONE"
+        text=STATE_LABELS[state], icon="ERROR" if state in (FolderState.INCOMPLETE, FolderState.BROKEN) else "NONE"
     )
     layout.prop(own, "wheels_folder", placeholder="None: install from the internet")
     if (job := current(ENVIRONMENT)) is not None:
@@ -136,7 +136,7 @@ def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -
     else:
         _, row = _split_row(layout)
         row = row.row(align=True)
-        reason = obstacle(own.wheels_folder)
+        reason = creation_obstacle(own.wheels_folder)
         again = state is not FolderState.MISSING
         create = row.row()
         create.enabled = not reason
@@ -148,7 +148,7 @@ def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -
         if reason:
             draw_lines(layout, f"{reason}.", "INFO")
         draw_check_result(layout, session.notice)
-    draw_lines(layout, f"Folder: {own_folder()}")
+    draw_lines(layout, f"Folder: {environment_folder()}")
 
 
 def _split_row(layout: bpy.types.UILayout) -> tuple[bpy.types.UILayout, bpy.types.UILayout]:
@@ -212,6 +212,6 @@ def register() -> None:
 
 def unregister() -> None:
     """Undo `register`, and clear the result of the check."""
-    session.remember(None)
+    session.store_result(None)
     choice.preferred_python = None
     folder_trust.trusted_folders = list

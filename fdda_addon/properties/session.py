@@ -20,7 +20,7 @@ def _show_random_pose(session: "FDDA_PG_session", number: int) -> None:
 
     context, job = bpy.context, current()
     rig = cached_active_rig(context)
-    if rig is None or context.mode not in {"OBJECT", "POSE"} or (job is not None and job.borrows_scene):
+    if rig is None or context.mode not in {"OBJECT", "POSE"} or (job is not None and job.changes_scene):
         return
     # The section Rig shows the problem if there is nothing to pose.
     with suppress(FDDAError):

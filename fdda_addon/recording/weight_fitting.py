@@ -31,8 +31,8 @@ class SkinFitting(TrainerProcess):
     """Process that fits skin weights; takes the arguments of `trainer.skin_fit`."""
 
     module = "trainer.skin_fit"
-    failed = "The skin weights could not be fitted."
-    lost = "no skin weights were fitted, record again"
+    failure_message = "The skin weights could not be fitted."
+    loss_advice = "no skin weights were fitted, record again"
 
 
 def choose_fit_poses(total: int, vertices: int) -> list[int]:

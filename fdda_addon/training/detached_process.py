@@ -21,7 +21,7 @@ from typing import BinaryIO, TextIO
 from ..core.errors import OutputError, os_error_text
 from ..core.output import write_json
 from .environment.folder import user_folder
-from .environment.subprocesses import hidden
+from .environment.subprocesses import popen_options
 from .process import Training
 
 POLL_SECONDS = 0.1
@@ -32,7 +32,7 @@ _child_processes: dict[int, subprocess.Popen] = {}
 class DetachedTraining(Training):
     """A training that goes on when `leave` was called before the block ends; otherwise its process is gone then."""
 
-    lost = "no model was written, train again"
+    loss_advice = "no model was written, train again"
 
     def __init__(self, arguments: list[str], model: Path):
         """Start the trainer.
@@ -70,27 +70,27 @@ class DetachedTraining(Training):
                 stdout=file,
                 stderr=self._errors,
                 env=environment,
-                **hidden(own_session=True),
+                **popen_options(own_session=True),
             )
 
     def _read(self) -> None:
-        place, rest = 0, b""
+        offset, rest = 0, b""
         while not self._is_detached:
             # Asked before reading: what was written before it ended is read.
             is_alive = self._process.poll() is None
             try:
                 with self._files.messages.open("rb") as file:
-                    file.seek(place)
-                    read = file.read()
+                    file.seek(offset)
+                    chunk = file.read()
             except PermissionError:
                 # On Windows, while `is_running` of another thread tries the file.
                 time.sleep(POLL_SECONDS)
                 continue
-            place += len(read)
-            *lines, rest = (rest + read).split(b"\n")
+            offset += len(chunk)
+            *lines, rest = (rest + chunk).split(b"\n")
             for line in lines:
                 self._lines.put(line.decode("utf-8", "replace"))
-            if not is_alive and not read:
+            if not is_alive and not chunk:
                 break
             time.sleep(0 if lines else POLL_SECONDS)
         self._lines.put(None)
@@ -98,8 +98,8 @@ class DetachedTraining(Training):
     def detach(self) -> None:
         """Let it go on when the block ends."""
         self._is_detached = True
-        if self._abandoned is not None:
-            self._abandoned.detach()
+        if self._finalizer is not None:
+            self._finalizer.detach()
 
     def __exit__(self, *error: object) -> None:
         if self._is_detached:
@@ -119,7 +119,7 @@ class AttachedTraining(DetachedTraining):
         self._stop_file, self._errors = self._files.stop_file, self._files.errors()
         pid = self._files.process_id
         self._process = _child_processes.get(pid) or _ForeignProcess(pid, self._files)
-        self._follow()
+        self._start_reader()
 
 
 def is_detached(model: Path) -> bool:

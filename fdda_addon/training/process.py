@@ -23,22 +23,22 @@ from ..core.messages import STOP_FILE_VARIABLE, Message, MessageType
 from ..core.native_library import runtime_advice
 from ..core.stop_signals import INTERRUPTED
 from ..core.temporary import temporary_folder_error
-from .endings import explain_status
-from .environment.choice import chosen_python
+from .environment.choice import select_python
 from .environment.folder import ROOT
-from .environment.subprocesses import UTF8_OUTPUT, hidden
+from .environment.subprocesses import UTF8_OUTPUT, popen_options
+from .process_exit import explain_exit_status
 
-CANCEL_SECONDS = 20.0
+KILL_AFTER_SECONDS = 20.0
 """A trainer that was asked to stop is killed after so long."""
-READER_SECONDS = 1.0
-WAIT_SECONDS = 0.05
-FULL_BYTES = 1 << 16
+READER_JOIN_SECONDS = 1.0
+POLL_SECONDS = 0.05
+MIN_FREE_BYTES = 1 << 16
 """Free space of a disk that counts as full."""
 
 
 def trainer_python() -> str:
     """Path of the Python that runs the trainer; `training.environment.choice` says how it is chosen."""
-    return chosen_python().path
+    return select_python().path
 
 
 def trainer_command(
@@ -62,13 +62,13 @@ class TrainerProcess:
 
     Attributes:
         module: what `python -m` runs.
-        failed, lost: what errors say where the process does not.
+        failure_message, loss_advice: what errors say where the process does not.
     """
 
     module = "trainer"
-    _abandoned: weakref.finalize | None = None
-    failed = "The training failed."
-    lost = "no model was written, train again"
+    _finalizer: weakref.finalize | None = None
+    failure_message = "The training failed."
+    loss_advice = "no model was written, train again"
 
     def __init__(self, arguments: list[str], python: str | None = None):
         """Start the process.
@@ -81,7 +81,7 @@ class TrainerProcess:
             TrainingError: the interpreter cannot be started.
             OutputError: there is no room for what it writes to stderr.
         """
-        advice = chosen_python().origin.value if python is None else "name a Python that has torch"
+        advice = select_python().origin.value if python is None else "name a Python that has torch"
         command, environment = trainer_command(arguments, python, self.module)
         try:
             self._stop_file, self._errors = self._new_stop_file(), self._new_errors()
@@ -89,16 +89,16 @@ class TrainerProcess:
             raise temporary_folder_error(error) from error
         environment |= {STOP_FILE_VARIABLE: str(self._stop_file), **UTF8_OUTPUT}
         # Ctrl-C may strike between the start of the process and the block that ends it.
-        self._abandoned = weakref.finalize(self, Path.touch, self._stop_file)
+        self._finalizer = weakref.finalize(self, Path.touch, self._stop_file)
         try:
             self._process = self._start(command, environment)
         except OSError as error:
-            self._abandoned.detach()
+            self._finalizer.detach()
             self._errors.close()
             raise TrainingError(
                 f"The trainer's Python '{command[0]}' cannot be started ({os_error_text(error)}); {advice}."
             ) from error
-        self._follow()
+        self._start_reader()
 
     def _new_stop_file(self) -> Path:
         # Nobody else can guess the name, and no file is there until the trainer is to stop.
@@ -117,10 +117,10 @@ class TrainerProcess:
             text=True,
             encoding="utf-8",
             errors="replace",
-            **hidden(),
+            **popen_options(),
         )
 
-    def _follow(self) -> None:
+    def _start_reader(self) -> None:
         self._cancelled_at: float | None = None
         # A thread of its own: Blender must never wait for a line.
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
@@ -155,11 +155,11 @@ class TrainerProcess:
         """
         last = None
         while True:
-            if self._cancelled_at is not None and time.monotonic() > self._cancelled_at + CANCEL_SECONDS:
+            if self._cancelled_at is not None and time.monotonic() > self._cancelled_at + KILL_AFTER_SECONDS:
                 self._process.kill()
             try:
                 # Not for longer: Windows takes no Ctrl-C to a thread that waits.
-                line = self._lines.get(block=wait, timeout=WAIT_SECONDS)
+                line = self._lines.get(block=wait, timeout=POLL_SECONDS)
             except queue.Empty:
                 if not wait:
                     yield None
@@ -173,12 +173,12 @@ class TrainerProcess:
                 continue
             if message.type is MessageType.FAILED:
                 kind = TrainingDiedError if message.values.get("try_again") is True else TrainingError
-                raise kind(str(message.values.get("text", self.failed)))
+                raise kind(str(message.values.get("text", self.failure_message)))
             yield message
             last = message
         while self._process.poll() is None:
             if wait:
-                time.sleep(WAIT_SECONDS)
+                time.sleep(POLL_SECONDS)
             else:
                 yield None
         status = self._process.wait()
@@ -191,25 +191,25 @@ class TrainerProcess:
                 # It was asked to stop while it was starting.
                 yield Message(MessageType.CANCELLED)
                 return
-            raise self._death(status)
+            raise self._exit_error(status)
 
-    def _death(self, status: int | None) -> TrainingError:
+    def _exit_error(self, status: int | None) -> TrainingError:
         text = self._error_text().strip().splitlines()
         reason = f" ({text[-1].strip()})" if text else ""
-        ending = explain_status(status, not text)
-        if status == TRY_AGAIN and (full := self._full_disk()):
+        process_exit = explain_exit_status(status, not text)
+        if status == TRY_AGAIN and (full_folder := self._find_full_disk()):
             # It could not even say so.
-            return TrainingDiedError(f"The disk of '{full}' is full; {self.lost} when there is room.")
-        kind = TrainingDiedError if ending.is_machines else TrainingError
+            return TrainingDiedError(f"The disk of '{full_folder}' is full; {self.loss_advice} when there is room.")
+        kind = TrainingDiedError if process_exit.is_machine_fault else TrainingError
         if advice := runtime_advice(reason):
-            return kind(f"The trainer {ending.text}{reason}; {advice}, and train again.")
-        return kind(f"The trainer {ending.text}{reason}; {self.lost}.")
+            return kind(f"The trainer {process_exit.text}{reason}; {advice}, and train again.")
+        return kind(f"The trainer {process_exit.text}{reason}; {self.loss_advice}.")
 
-    def _full_disk(self) -> Path | None:
+    def _find_full_disk(self) -> Path | None:
         """The folder that the process writes to whose disk is full, if one is."""
         for folder in (self._stop_file.parent, Path(tempfile.gettempdir())):
             with suppress(OSError):
-                if shutil.disk_usage(folder).free < FULL_BYTES:
+                if shutil.disk_usage(folder).free < MIN_FREE_BYTES:
                     return folder
         return None
 
@@ -225,18 +225,18 @@ class TrainerProcess:
             if self._process.poll() is None:
                 self.cancel()
                 with suppress(subprocess.TimeoutExpired):
-                    self._process.wait(CANCEL_SECONDS)
+                    self._process.wait(KILL_AFTER_SECONDS)
         finally:
             # Also when Ctrl-C is pressed once more meanwhile.
             if self._process.poll() is None:
                 self._process.kill()
                 self._process.wait()
-            if self._abandoned is not None:
-                self._abandoned.detach()
+            if self._finalizer is not None:
+                self._finalizer.detach()
             with suppress(OSError):
                 self._stop_file.unlink(missing_ok=True)
         # A process that the trainer has started may hold its output open: then it is left to the thread.
-        self._reader.join(READER_SECONDS)
+        self._reader.join(READER_JOIN_SECONDS)
         if not self._reader.is_alive() and self._process.stdout is not None:
             self._process.stdout.close()
         self._errors.close()

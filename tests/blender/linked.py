@@ -152,7 +152,7 @@ def pack_model(path: str) -> None:
     """Pack the model into the file of the character, and let the character be saved with the rig shown."""
     bpy.ops.wm.open_mainfile(filepath=path)
     mesh_object = bpy.data.objects[ELBOW]
-    model_list.adopt(mesh_object)
+    model_list.add_bound_model(mesh_object)
     model_list.pack_entry(mesh_object, mesh_object.fdda.models[0])
     mesh_object.fdda.mode = "RIG"
     bpy.ops.wm.save_mainfile()

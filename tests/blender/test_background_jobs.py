@@ -12,8 +12,8 @@ import fdda_addon
 from fdda_addon.core.errors import FDDAError
 from fdda_addon.core.progress import Progress
 from fdda_addon.jobs import background
-from fdda_addon.jobs.background import in_thread, look_after
-from fdda_addon.jobs.job import CHARACTER, ENVIRONMENT, JobState, Run, current, request_cancel, state_of
+from fdda_addon.jobs.background import iterate_in_thread, run_in_background
+from fdda_addon.jobs.job import CHARACTER, ENVIRONMENT, JobRunner, JobState, current, request_cancel, state_of
 
 pytestmark = pytest.mark.one_blender_version
 
@@ -35,10 +35,10 @@ class Work:
         yield Progress("going", 1, 2)
         yield "done"
 
-    def begin(self) -> Run:
+    def begin(self) -> JobRunner:
         state = JobState("fetch", "Fetching", works_on=ENVIRONMENT)
-        steps = in_thread(self.steps(), state, self.cancelled.set)
-        return Run(state, steps, lambda result: f"Fetched: {result}.", lambda: "Cancelled.", ends_itself=True)
+        steps = iterate_in_thread(self.steps(), state, self.cancelled.set)
+        return JobRunner(state, steps, lambda result: f"Fetched: {result}.", lambda: "Cancelled.", ends_itself=True)
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_it_works_in_a_thread_and_never_waits(work):
 
 
 def test_it_goes_on_beside_a_job_on_a_character_and_through_another_file(work):
-    beside, run = work.begin(), Run(JobState("count", "Counting"), (step for step in ()), str, str)
+    beside, run = work.begin(), JobRunner(JobState("count", "Counting"), (step for step in ()), str, str)
     assert current(CHARACTER) is run.state and current(ENVIRONMENT) is beside.state
     beside.work(0)
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -105,7 +105,7 @@ def test_an_error_is_its_outcome_and_a_bug_is_raised():
 
 def test_a_timer_looks_after_it(work, capsys):
     run = work.begin()
-    look_after(run)
+    run_in_background(run)
     assert bpy.app.timers.is_registered(background._tick)
     bpy.app.timers.unregister(background._tick)
     assert background._tick() == background.TICK_SECONDS
@@ -117,7 +117,7 @@ def test_a_timer_looks_after_it(work, capsys):
 
 def test_it_ends_with_the_addon(work):
     run = work.begin()
-    look_after(run)
+    run_in_background(run)
     assert not run.work(0)
     fdda_addon.unregister()
     assert work.cancelled.is_set() and not next(iter(work.threads)).is_alive()

@@ -163,7 +163,7 @@ def test_a_trainer_that_does_not_stop_is_stopped(tmp_path, monkeypatch):
     """Leaving the block ends the process, also one that would go on for an hour and heeds nothing."""
     from fdda_addon.training import process
 
-    monkeypatch.setattr(process, "CANCEL_SECONDS", 0.5)
+    monkeypatch.setattr(process, "KILL_AFTER_SECONDS", 0.5)
     stand_in_trainer(tmp_path, monkeypatch, STARTED, "time.sleep(3600)")
     with process.Training([]) as training:
         assert next(training.messages()).type is MessageType.STARTED
@@ -183,7 +183,7 @@ def test_nobody_waits_for_a_trainer_that_is_silent(tmp_path, monkeypatch):
         start = time.monotonic()
         assert [next(messages) for _ in range(100)] == [None] * 100
         assert time.monotonic() - start < 0.05
-        monkeypatch.setattr(process, "CANCEL_SECONDS", 0.5)
+        monkeypatch.setattr(process, "KILL_AFTER_SECONDS", 0.5)
         training.cancel()
         assert first_of(messages) is None
 

@@ -109,7 +109,7 @@ def test_a_shot_that_was_saved_by_itself(library, tmp_path):
 def test_a_packed_model_is_found_in_the_library(library, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(library.path))
     mesh_object = bpy.data.objects[ELBOW]
-    model_list.adopt(mesh_object)
+    model_list.add_bound_model(mesh_object)
     model_list.pack_entry(mesh_object, mesh_object.fdda.models[0])
     bpy.ops.wm.save_as_mainfile(filepath=str(library.path))
     moved = library.model.rename(tmp_path / "moved.onnx")

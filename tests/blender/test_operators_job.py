@@ -9,7 +9,7 @@ import pytest
 from fdda_addon.core.errors import FDDAError
 from fdda_addon.core.progress import Progress
 from fdda_addon.jobs import job
-from fdda_addon.jobs.job import JobState, Run
+from fdda_addon.jobs.job import JobRunner, JobState
 from fdda_addon.operators.job import JobOperator
 
 events: list[str] = []
@@ -123,7 +123,7 @@ def test_cancel_without_a_job_says_so():
         bpy.ops.fdda.cancel()
 
 
-def under_way(borrows_scene: bool) -> JobState:
+def under_way(changes_scene: bool) -> JobState:
     """A job as a window has it between two ticks."""
 
     def steps() -> Iterator[Progress]:
@@ -133,26 +133,26 @@ def under_way(borrows_scene: bool) -> JobState:
         finally:
             events.append("given back")
 
-    run = Run(JobState("count", "Counting", borrows_scene=borrows_scene), steps(), str, str)
+    run = JobRunner(JobState("count", "Counting", changes_scene=changes_scene), steps(), str, str)
     assert not run.advance(0)
     return run.state
 
 
 def test_another_file_ends_a_job(rig):
-    state = under_way(borrows_scene=False)
+    state = under_way(changes_scene=False)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     assert not state.is_running and state.outcome == "Counting ended because another file was opened."
     assert events == ["given back"] and job.current() is None
 
 
-@pytest.mark.parametrize("borrows_scene", [True, False])
-def test_an_undo_ends_a_job_that_borrows_the_scene_and_no_other(rig, borrows_scene):
+@pytest.mark.parametrize("changes_scene", [True, False])
+def test_an_undo_ends_a_job_that_borrows_the_scene_and_no_other(rig, changes_scene):
     bpy.ops.ed.undo_push()
     rig.mesh_object.location.x = 1
     bpy.ops.ed.undo_push()
-    state = under_way(borrows_scene)
+    state = under_way(changes_scene)
     bpy.ops.ed.undo()
-    assert state.is_running is not borrows_scene
+    assert state.is_running is not changes_scene
     job.stop("The test is over.")
     assert events == ["given back"]
 
@@ -160,7 +160,7 @@ def test_an_undo_ends_a_job_that_borrows_the_scene_and_no_other(rig, borrows_sce
 def test_disabling_the_addon_ends_a_job():
     import fdda_addon
 
-    state = under_way(borrows_scene=False)
+    state = under_way(changes_scene=False)
     fdda_addon.unregister()
     assert not state.is_running and events == ["given back"]
     fdda_addon.register()

@@ -7,7 +7,7 @@ import bpy
 import pytest
 
 from fdda_addon.core.errors import ModelError
-from fdda_addon.models.entries import bound_entry, megabytes
+from fdda_addon.models.entries import bound_entry, format_file_size
 from fdda_addon.runtime import packed_model
 
 from .. import systems
@@ -227,14 +227,14 @@ def test_a_stale_model_says_what_changed(bound, change, words):
 
 
 def test_another_range_of_motion_is_told_and_prevents_nothing(bound, elbow):
-    from fdda_addon.models.changes import changes_since
+    from fdda_addon.models.changes import find_changes
     from fdda_addon.scene.scene_rig import find_rig
 
     bpy.context.view_layer.objects.active = bound
-    assert not changes_since(find_rig(), bound.fdda.models[0]).sentence
+    assert not find_changes(find_rig(), bound.fdda.models[0]).sentence
     bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints[0].max_x += 0.1
-    found = changes_since(find_rig(), bound.fdda.models[0])
-    assert found.limits == ("lower",) and not found.prevents
+    found = find_changes(find_rig(), bound.fdda.models[0])
+    assert found.limits == ("lower",) and not found.prevents_playback
     assert "The range of motion of 'lower' has changed since elbow was trained" in found.sentence
     assert bpy.ops.fdda.check_model() == {"FINISHED"}
     pose(angle=0.1)
@@ -277,7 +277,7 @@ def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_pa
     (checksum,) = (prop for prop in model.metadata_props if prop.key == CHECKSUM_KEY)
     checksum.value = read_onnx(model.SerializeToString()).checksum
     onnx.save(model, path)
-    model_list.remember(bound, path)
+    model_list.add_model(bound, path)
     bpy.context.view_layer.update()
     after = assert_plays(bound, path)
     np.testing.assert_allclose(after, 2 * before, atol=1e-5)
@@ -302,4 +302,4 @@ def test_what_the_section_says_of_the_models(bound, elbow):
 
 
 def test_megabytes():
-    assert [megabytes(count) for count in (2_340, 1_340_169)] == ["2.3 kB", "1.3 MB"]
+    assert [format_file_size(count) for count in (2_340, 1_340_169)] == ["2.3 kB", "1.3 MB"]

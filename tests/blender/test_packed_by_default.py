@@ -81,16 +81,16 @@ def test_the_preferences_can_leave_models_outside(rig, model, monkeypatch):
 
 
 def test_a_packed_model_that_is_trained_anew_is_packed_anew(rig, elbow, model):
-    from fdda_addon.models.model_list import remember
+    from fdda_addon.models.model_list import add_model
 
     bpy.ops.fdda.bind(filepath=str(model))
     before = rig.mesh_object.fdda.packed.session_uid
-    remember(rig.mesh_object, model_files.Path(model))
+    add_model(rig.mesh_object, model_files.Path(model))
     assert rig.mesh_object.fdda.packed.session_uid == before, "the same file is not packed again"
     with open(model, "ab") as file:
         # A field that nobody knows: another file, the same model.
         file.write(b"\xfa\x3f\x00")
-    remember(rig.mesh_object, model_files.Path(model))
+    add_model(rig.mesh_object, model_files.Path(model))
     assert packed_model.read(rig.mesh_object.fdda.packed) == model_files.Path(model).read_bytes()
     assert len(rig.mesh_object.fdda.models) == 1 and len(bpy.data.texts) == 1
 

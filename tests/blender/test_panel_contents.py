@@ -10,7 +10,7 @@ import pytest
 
 from fdda_addon.core.recording.folder import FolderState
 from fdda_addon.jobs import job
-from fdda_addon.jobs.job import JobState, Run
+from fdda_addon.jobs.job import JobRunner, JobState
 from fdda_addon.panels import checks, curves
 from fdda_addon.panels.recording import cached_content
 from fdda_addon.panels.section import format_duration, panel_rig
@@ -186,7 +186,7 @@ class TestTraining:
                 trainings.append(training)
                 yield from training.messages(wait=False)
 
-        run = Run(JobState("train", "Training"), steps(), str, str)
+        run = JobRunner(JobState("train", "Training"), steps(), str, str)
         run.advance(0)
         process = trainings[0]._process
         assert process.poll() is None

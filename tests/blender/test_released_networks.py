@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Files that are opened one after the other leave no network behind: each has some twenty megabytes."""
+"""Files that are opened one after the other leave no network behind: each has some twenty format_file_size."""
 
 import gc
 import shutil
@@ -9,7 +9,7 @@ import bpy
 import pytest
 
 from fdda_addon.models.entries import bound_entry
-from fdda_addon.models.model_list import adopt, pack_entry
+from fdda_addon.models.model_list import add_bound_model, pack_entry
 from fdda_addon.runtime.model_files import network_of
 from fdda_addon.scene.blend_file import save_copy
 
@@ -38,7 +38,7 @@ def test_the_networks_of_files_that_were_open_are_released(elbow, tmp_path, pack
         for path in paths:
             opened(path)
             mesh_object = bpy.data.objects[ELBOW]
-            adopt(mesh_object)
+            add_bound_model(mesh_object)
             pack_entry(mesh_object, bound_entry(mesh_object))
             save_copy(path)
     networks = [opened(path) for path in paths]

@@ -37,7 +37,7 @@ def test_binding_to_an_override(elbow, tmp_path):
     mesh_object = override(link(source), 1.1)
     bpy.context.view_layer.update()
     true = evaluated(mesh_object)
-    model_list.bind_entry(rig_of(mesh_object), model_list.remember(mesh_object, model))
+    model_list.bind_entry(rig_of(mesh_object), model_list.add_model(mesh_object, model))
     model_files._chosen_paths.clear()
     for _ in range(2):
         mesh_object = own_characters()[0]
@@ -84,7 +84,7 @@ def test_another_model_in_the_shot(pair, library, elbow, tmp_path):
     save_and_open(tmp_path)
     first, second = own_characters()
     assert not first.fdda.is_bound and second.fdda.is_bound
-    model_list.bind_entry(rig_of(first), model_list.remember(first, model))
+    model_list.bind_entry(rig_of(first), model_list.add_model(first, model))
     model_files._chosen_paths.clear()
     assert sum(m.type == "NODES" for m in first.modifiers) == 1
     assert model_files.model_path(first) == model
@@ -97,7 +97,7 @@ def test_another_model_in_the_shot(pair, library, elbow, tmp_path):
 
 
 def test_an_override_keeps_the_name_of_the_librarys_model(pair, library, tmp_path):
-    model_list.adopt(pair[0])
+    model_list.add_bound_model(pair[0])
     model_list.bind_entry(rig_of(pair[0]), pair[0].fdda.models[0])
     model_files._chosen_paths.clear()
     assert pair[0].fdda.model == "//elbow.onnx"
@@ -108,11 +108,11 @@ def test_an_override_keeps_the_name_of_the_librarys_model(pair, library, tmp_pat
 def test_a_model_of_the_librarys_list_is_not_forgotten(library, elbow, tmp_path):
     elsewhere(f"pack_model({str(library.path)!r})")
     mesh_object = override(link(library.path), 0.6)
-    own = model_list.remember(mesh_object, elbow.model)
+    own = model_list.add_model(mesh_object, elbow.model)
     assert [entry.name for entry in mesh_object.fdda.models] == ["elbow", own.name]
     with pytest.raises(ModelError, match=r"'elbow' is in the list of 'elbow\.blend'; remove it there, or unbind"):
-        model_list.forget_entry(mesh_object, 0)
-    model_list.forget_entry(mesh_object, 1)
+        model_list.remove_entry(mesh_object, 0)
+    model_list.remove_entry(mesh_object, 1)
     assert mesh_object.fdda.is_bound and len(mesh_object.fdda.models) == 1
 
 

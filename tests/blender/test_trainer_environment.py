@@ -12,11 +12,11 @@ import bpy
 import pytest
 
 from fdda_addon.core.errors import TrainerEnvironmentError
-from fdda_addon.jobs.job import ENVIRONMENT, Run, current, state_of, stop
+from fdda_addon.jobs.job import ENVIRONMENT, JobRunner, current, state_of, stop
 from fdda_addon.operators.trainer_environment import FDDA_OT_create_trainer_environment, start_job
 from fdda_addon.training.environment import choice, creation, folder, session
 from fdda_addon.training.environment.choice import Origin
-from fdda_addon.training.environment.creation import Creation
+from fdda_addon.training.environment.creation import EnvironmentCreation
 from fdda_addon.training.environment.folder import FolderState
 
 from .conftest import run
@@ -34,7 +34,7 @@ def user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(folder, "user_folder", lambda: tmp_path / "user")
     monkeypatch.delenv(choice.PYTHON_VARIABLE, raising=False)
     stop("of another test", ENVIRONMENT)
-    session.remember(None)
+    session.store_result(None)
     return tmp_path / "user"
 
 
@@ -47,7 +47,7 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def made(wheels: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An environment that is complete."""
     path = tmp_path_factory.mktemp("made") / "trainer"
-    *_, answer = Creation(path, path.with_name("log"), wheels, sys.executable).steps()
+    *_, answer = EnvironmentCreation(path, path.with_name("log"), wheels, sys.executable).steps()
     assert answer.level == "INFO"
     return path
 
@@ -55,8 +55,8 @@ def made(wheels: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def own(made: Path, user: Path) -> Path:
     """The add-on's own environment, complete."""
-    shutil.copytree(made, folder.own_folder(), symlinks=True)
-    return folder.own_folder()
+    shutil.copytree(made, folder.environment_folder(), symlinks=True)
+    return folder.environment_folder()
 
 
 @pytest.fixture
@@ -80,34 +80,34 @@ def refused(operator, **options: str) -> str:
 
 
 def test_it_is_created_from_a_folder_of_wheels(user: Path, wheels: Path):
-    junk = folder.own_folder() / "bin" / "left by one that was interrupted"
+    junk = folder.environment_folder() / "bin" / "left by one that was interrupted"
     junk.mkdir(parents=True)
-    assert session.own_state() is FolderState.HALF_MADE
+    assert session.environment_state() is FolderState.INCOMPLETE
     assert create(wheels=str(wheels)) == {"FINISHED"}
-    assert session.own_state() is FolderState.READY and not junk.exists()
-    assert choice.chosen_python() == (str(folder.python_in(folder.own_folder())), Origin.OWN)
+    assert session.environment_state() is FolderState.READY and not junk.exists()
+    assert choice.select_python() == (str(folder.interpreter_path(folder.environment_folder())), Origin.OWN)
     assert session.check_result.message.endswith(f"torch {pinned('torch')}.")
     assert session.check_result.message.startswith("Ready to train on the CPU: Python 3.")
     assert f"onnx {pinned('onnx')}" in session.check_result.details
     log = folder.log_path().read_text()
     assert "-m venv" in log and "Successfully installed" in log and "Ready to train" in log
     assert sorted(path.name for path in user.iterdir()) == ["trainer", "trainer.lock", "trainer.log"]
-    assert not (folder.own_folder() / "temporary").exists()
+    assert not (folder.environment_folder() / "temporary").exists()
 
 
 @pytest.mark.slow
 def test_the_other_pythons_come_first(own: Path, preferences, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    assert choice.chosen_python() == (str(folder.python_in(own)), Origin.OWN)
+    assert choice.select_python() == (str(folder.interpreter_path(own)), Origin.OWN)
     monkeypatch.setenv(choice.PYTHON_VARIABLE, "/of/the/variable")
-    assert choice.chosen_python() == ("/of/the/variable", Origin.VARIABLE)
+    assert choice.select_python() == ("/of/the/variable", Origin.VARIABLE)
     preferences.trainer_python = "/of/the/preferences"
-    assert choice.chosen_python() == ("/of/the/preferences", Origin.PREFERENCES)
+    assert choice.select_python() == ("/of/the/preferences", Origin.PREFERENCES)
     preferences.trainer_python = str(own) + os.sep
-    assert choice.chosen_python() == (str(folder.python_in(own)), Origin.PREFERENCES)
+    assert choice.select_python() == (str(folder.interpreter_path(own)), Origin.PREFERENCES)
 
 
 def test_without_any_it_is_the_python_that_runs_this():
-    assert choice.chosen_python() == (sys.executable, Origin.THIS)
+    assert choice.select_python() == (sys.executable, Origin.THIS)
 
 
 def test_one_that_another_python_hides_says_so(user: Path, wheels: Path, monkeypatch: pytest.MonkeyPatch):
@@ -123,7 +123,7 @@ def test_a_wheel_that_is_missing(own: Path, wheels: Path, tmp_path: Path):
     text = refused(create, wheels=str(tmp_path / "fewer"))
     assert text.startswith(f"The folder '{tmp_path}/fewer' lacks the packages onnx {pinned('onnx')} for Python 3.1")
     assert " -m pip download --only-binary=:all: " in folder.log_path().read_text()
-    assert session.own_state() is FolderState.READY
+    assert session.environment_state() is FolderState.READY
     assert session.notice.message == text
 
 
@@ -135,7 +135,7 @@ def test_a_wheel_of_a_package_that_those_need_is_missing(user: Path, wheels: Pat
         f"The packages of '{tmp_path}/fewer' could not be installed (No matching distribution found for fdda-nowhere); "
         f"add what is missing; the log is '{folder.log_path()}'."
     )
-    assert session.own_state() is FolderState.MISSING
+    assert session.environment_state() is FolderState.MISSING
     assert "No matching distribution" in folder.log_path().read_text()
 
 
@@ -145,13 +145,13 @@ def test_packages_that_do_not_work_are_no_environment(user: Path, wheels: Path, 
     write_wheel(tmp_path / "broken", "torch", "raise OSError('libcudart.so.13 is missing')\n")
     text = refused(create, wheels=str(tmp_path / "broken"))
     assert "installed but do not work: torch of" in text and "libcudart.so.13 is missing" in text
-    assert session.own_state() is FolderState.MISSING
+    assert session.environment_state() is FolderState.MISSING
 
 
 def test_a_folder_without_wheels_leaves_what_is_there(own: Path, tmp_path: Path):
     assert refused(create, wheels=str(tmp_path)).startswith(f"The folder '{tmp_path}' lacks the packages ")
     assert refused(create, wheels="/none").startswith("'/none' is no folder; ")
-    assert session.own_state() is FolderState.READY
+    assert session.environment_state() is FolderState.READY
 
 
 def test_offline_it_asks_for_wheels(user: Path, preferences, tmp_path: Path):
@@ -165,10 +165,10 @@ def test_offline_it_asks_for_wheels(user: Path, preferences, tmp_path: Path):
 
 
 def test_a_full_disk_is_noticed_before(user: Path, own: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(creation, "NEEDED_GB", 10**9)
+    monkeypatch.setattr(creation, "MIN_FREE_GB", 10**9)
     with pytest.raises(TrainerEnvironmentError, match=r"needs 1000000000 GB and '.*' has [\d.]+ GB left; make room"):
-        list(Creation(own, folder.log_path()).steps())
-    assert session.own_state() is FolderState.READY
+        list(EnvironmentCreation(own, folder.log_path()).steps())
+    assert session.environment_state() is FolderState.READY
 
 
 def test_a_python_that_cannot_make_one(user: Path, wheels: Path, tmp_path: Path):
@@ -190,8 +190,8 @@ def test_a_python_that_cannot_make_one(user: Path, wheels: Path, tmp_path: Path)
 
 
 def test_a_second_blender_waits(user: Path, own: Path):
-    code = "import sys; from pathlib import Path; from fdda_addon.training.environment.folder import claimed\n"
-    code += "with claimed(Path(sys.argv[1])): print('mine', flush=True); sys.stdin.read()"
+    code = "import sys; from pathlib import Path; from fdda_addon.training.environment.folder import creation_lock\n"
+    code += "with creation_lock(Path(sys.argv[1])): print('mine', flush=True); sys.stdin.read()"
     with subprocess.Popen(
         [sys.executable, "-c", code, own], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as other:
@@ -201,7 +201,7 @@ def test_a_second_blender_waits(user: Path, own: Path):
         assert own.is_dir()
         other.communicate()
     assert bpy.ops.fdda.remove_trainer_environment() == {"FINISHED"}
-    assert session.own_state() is FolderState.MISSING
+    assert session.environment_state() is FolderState.MISSING
 
 
 def wait_for(condition, seconds: float = 60.0) -> None:
@@ -211,7 +211,7 @@ def wait_for(condition, seconds: float = 60.0) -> None:
         time.sleep(0.02)
 
 
-def begin_creation(job: Creation) -> Run:
+def begin_creation(job: EnvironmentCreation) -> JobRunner:
     """As the button does in a window."""
     return start_job(
         "create_trainer_environment", "Create", job.steps(), job.cancel, FDDA_OT_create_trainer_environment.store_result
@@ -219,42 +219,42 @@ def begin_creation(job: Creation) -> Run:
 
 
 def test_cancelled_it_ends_at_once_and_leaves_nothing(user: Path, wheels: Path):
-    job = Creation(folder.own_folder(), folder.log_path(), wheels, sys.executable)
+    job = EnvironmentCreation(folder.environment_folder(), folder.log_path(), wheels, sys.executable)
     run = begin_creation(job)
     assert not bpy.ops.fdda.create_trainer_environment.poll() and not run.work(0)
-    wait_for(lambda: folder.own_folder().is_dir())
+    wait_for(lambda: folder.environment_folder().is_dir())
     process = job._process
     assert bpy.ops.fdda.cancel_trainer_environment() == {"FINISHED"}
     wait_for(lambda: run.work(0), 10)
     assert process is None or process.poll() is not None
     assert current(ENVIRONMENT) is None and run.state.outcome == session.notice.message
     assert session.notice.level == "WARNING" and "was cancelled; nothing is left of it" in session.notice.message
-    assert session.own_state() is FolderState.MISSING
+    assert session.environment_state() is FolderState.MISSING
     assert not bpy.ops.fdda.cancel_trainer_environment.poll()
 
 
 def test_cancelled_before_it_begins_it_leaves_what_is_there(own: Path, wheels: Path):
-    job = Creation(own, folder.log_path(), wheels, sys.executable)
+    job = EnvironmentCreation(own, folder.log_path(), wheels, sys.executable)
     job.cancel()
     with pytest.raises(TrainerEnvironmentError, match="was cancelled; what was there stays"):
         list(job.steps())
-    assert session.own_state() is FolderState.READY
+    assert session.environment_state() is FolderState.READY
 
 
 def test_unregistering_ends_what_is_under_way(user: Path, wheels: Path):
     import fdda_addon
 
-    job = Creation(folder.own_folder(), folder.log_path(), wheels, sys.executable)
+    job = EnvironmentCreation(folder.environment_folder(), folder.log_path(), wheels, sys.executable)
     begin_creation(job).work(0)
-    wait_for(lambda: folder.own_folder().is_dir())
+    wait_for(lambda: folder.environment_folder().is_dir())
     fdda_addon.unregister()
-    assert current(ENVIRONMENT) is None and choice.preferred_python is None and not folder.own_folder().exists()
+    assert current(ENVIRONMENT) is None and choice.preferred_python is None and not folder.environment_folder().exists()
 
 
 def test_a_check_in_the_background_is_kept(own: Path):
-    python = choice.chosen_python()
-    steps = (choice.ping(python) for _ in range(1))
-    run = start_job("check_trainer", "Check", steps, None, session.remember)
+    python = choice.select_python()
+    steps = (choice.check_trainer_python(python) for _ in range(1))
+    run = start_job("check_trainer", "Check", steps, None, session.store_result)
     assert not run.work(0) and not run.state.can_cancel and not bpy.ops.fdda.cancel_trainer_environment.poll()
     wait_for(lambda: run.work(0))
     assert state_of("check_trainer").outcome == session.check_result.message
@@ -262,10 +262,10 @@ def test_a_check_in_the_background_is_kept(own: Path):
 
 
 def test_an_environment_whose_python_is_gone(own: Path, elbow, tmp_path: Path, capfd: pytest.CaptureFixture):
-    folder.python_in(own).unlink()
-    assert session.own_state() is FolderState.BROKEN
+    folder.interpreter_path(own).unlink()
+    assert session.environment_state() is FolderState.BROKEN
     assert run("train", elbow.recording, tmp_path / "m.onnx") == 1
-    python = folder.python_in(own)
+    python = folder.interpreter_path(own)
     assert capfd.readouterr().err.strip() == (
         f"Error: The trainer's Python '{python}' cannot be started (No such file or directory); reinstall the "
         "training environment in the add-on's preferences."
@@ -280,11 +280,11 @@ def test_an_environment_whose_torch_is_gone(own: Path):
 
 
 def test_an_environment_of_other_versions_still_trains(own: Path):
-    (own / folder.MARK).write_text("of another time\n")
-    assert session.own_state() is FolderState.OUTDATED
-    assert choice.chosen_python().origin is Origin.OWN
-    (own / folder.MARK).write_bytes(b"\xff\xfe\x00")
-    assert folder.folder_state(own) is FolderState.HALF_MADE
+    (own / folder.COMPLETION_MARKER).write_text("of another time\n")
+    assert session.environment_state() is FolderState.OUTDATED
+    assert choice.select_python().origin is Origin.OWN
+    (own / folder.COMPLETION_MARKER).write_bytes(b"\xff\xfe\x00")
+    assert folder.folder_state(own) is FolderState.INCOMPLETE
 
 
 def test_what_is_removed_is_half_made_first(own: Path, monkeypatch: pytest.MonkeyPatch):
@@ -294,4 +294,4 @@ def test_what_is_removed_is_half_made_first(own: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(shutil, "rmtree", full)
     text = refused(bpy.ops.fdda.remove_trainer_environment)
     assert text.startswith("The training environment cannot be removed (Permission denied: ") and str(own) in text
-    assert session.own_state() is FolderState.HALF_MADE and choice.chosen_python().origin is Origin.THIS
+    assert session.environment_state() is FolderState.INCOMPLETE and choice.select_python().origin is Origin.THIS

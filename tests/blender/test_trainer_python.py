@@ -15,8 +15,8 @@ from fdda_addon.core.errors import TrainerEnvironmentError
 from fdda_addon.training.environment import check, creation, folder, interpreters
 from fdda_addon.training.environment.check_result import CheckResult
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
-from fdda_addon.training.environment.folder import MARK, PACKAGES, missing_letters, python_in
-from fdda_addon.training.environment.interpreters import ask, find_interpreters
+from fdda_addon.training.environment.folder import COMPLETION_MARKER, PACKAGES, excess_path_length, interpreter_path
+from fdda_addon.training.environment.interpreters import find_interpreters, query_interpreter
 
 from .conftest import run
 from .stand_ins import program
@@ -135,7 +135,7 @@ def test_a_base_is_run_and_not_just_found(tmp_path: Path):
     if os.name != "nt":
         real = program(tmp_path / "real", f"os.execv({python!r}, [{python!r}, *sys.argv[1:]])")
     found = list(find_interpreters(iter([[shim], [hangs], ["/none"], [real], [sys.executable]])))
-    assert [(base.path, base.version, base.lacks) for base in found] == [(sys.executable, sys.version_info[:2], "")]
+    assert [(base.path, base.version, base.problem) for base in found] == [(sys.executable, sys.version_info[:2], "")]
 
 
 @pytest.mark.parametrize(
@@ -147,20 +147,20 @@ def test_a_base_is_run_and_not_just_found(tmp_path: Path):
     ],
 )
 def test_what_a_base_lacks(tmp_path: Path, answer: list, lacks: str):
-    base = ask([program(tmp_path / "python", f"print({json.dumps(answer)!r})")])
-    assert base.lacks == lacks and str(base) == f"'/p' (Python {answer[0][0]}.{answer[0][1]})"
+    base = query_interpreter([program(tmp_path / "python", f"print({json.dumps(answer)!r})")])
+    assert base.problem == lacks and str(base) == f"'/p' (Python {answer[0][0]}.{answer[0][1]})"
 
 
 def test_blenders_own_python_is_the_first(monkeypatch: pytest.MonkeyPatch):
-    assert next(interpreters.usual_candidates()) == [sys.executable]
+    assert next(interpreters.default_candidates()) == [sys.executable]
     assert next(find_interpreters()).path == sys.executable
 
 
 def test_a_training_without_blenders_program_finds_the_environment_that_blender_made(tmp_path: Path):
     own = tmp_path / "datafiles" / "fdda" / "trainer"
-    python = python_in(own)
+    python = interpreter_path(own)
     python.parent.mkdir(parents=True)
-    (own / MARK).write_text("made with other versions\n")
+    (own / COMPLETION_MARKER).write_text("made with other versions\n")
     python.write_text("no program")
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path), "PYTHONPATH": str(ROOT)}
     environment.pop(PYTHON_VARIABLE, None)
@@ -198,7 +198,7 @@ def windows_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         monkeypatch.setenv(variable, str(tmp_path / name))
     monkeypatch.delenv("UV_PYTHON_INSTALL_DIR", raising=False)
     monkeypatch.setattr(
-        interpreters, "_registered", lambda version: iter([tmp_path / f"of_registry/{version}/python.exe"])
+        interpreters, "_registry_interpreters", lambda version: iter([tmp_path / f"of_registry/{version}/python.exe"])
     )
     monkeypatch.setenv(
         "PATH", os.pathsep.join(str(tmp_path / name) for name in ("Local/Microsoft/WindowsApps", "path"))
@@ -246,7 +246,9 @@ def test_a_python_of_the_registry_is_found(tmp_path: Path):
     with winreg.CreateKey(winreg.HKEY_CURRENT_USER, rf"{key}\3.13-64\InstallPath") as opened:
         winreg.SetValue(opened, "", winreg.REG_SZ, str(tmp_path))
     try:
-        assert tmp_path / "python.exe" in interpreters._registered("3.13") and not [*interpreters._registered("3.1")]
+        assert tmp_path / "python.exe" in interpreters._registry_interpreters("3.13") and not [
+            *interpreters._registry_interpreters("3.1")
+        ]
     finally:
         for name in (rf"{key}\3.13-64\InstallPath", rf"{key}\3.13-64", key):
             winreg.DeleteKey(winreg.HKEY_CURRENT_USER, name)
@@ -257,17 +259,17 @@ def test_paths_that_are_too_long_for_windows_are_noticed_before(tmp_path: Path, 
     temporary = r"AppData\Local\Temp\fdda-12345678"
 
     def missing(name: str) -> int:
-        return missing_letters(*(Path(rf"C:\Users\{name}\{rest}") for rest in (extension, temporary)))
+        return excess_path_length(*(Path(rf"C:\Users\{name}\{rest}") for rest in (extension, temporary)))
 
     assert [missing(letters * "x") for letters in (15, 33, 34, 60)] == [0, 0, 1, 27]
     monkeypatch.setattr(creation, "has_path_limit", lambda: True)
-    monkeypatch.setattr(creation, "missing_letters", lambda *_: 7)
+    monkeypatch.setattr(creation, "excess_path_length", lambda *_: 7)
     with pytest.raises(TrainerEnvironmentError, match=r"would be 7 letters too long for Windows; allow long paths \("):
-        list(creation.Creation(tmp_path / "trainer", tmp_path / "log").steps())
+        list(creation.EnvironmentCreation(tmp_path / "trainer", tmp_path / "log").steps())
     assert not (tmp_path / "trainer").exists()
 
 
 def test_the_packages_are_what_the_trainer_asks_for():
     groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
     assert sorted(folder.PACKAGES) == sorted(requirement.partition("==")[0] for requirement in groups["trainer"])
-    assert all(path.is_file() for path in map(folder.pins, folder.PINS))
+    assert all(path.is_file() for path in map(folder.requirements_file, folder.PINNED_REQUIREMENTS))

@@ -6,7 +6,7 @@ import sys
 import zipfile
 from pathlib import Path
 
-from fdda_addon.training.environment.folder import PACKAGES, pins
+from fdda_addon.training.environment.folder import PACKAGES, requirements_file
 
 TORCH = """__version__ = "{version}"
 class cuda:
@@ -16,7 +16,7 @@ class cuda:
 
 def pinned(package: str) -> str:
     """The version that an environment made from this Python gets."""
-    return re.search(rf"^{package}==(\S+)$", pins(sys.version_info[:2]).read_text(), re.MULTILINE)[1]
+    return re.search(rf"^{package}==(\S+)$", requirements_file(sys.version_info[:2]).read_text(), re.MULTILINE)[1]
 
 
 def write_wheel(folder: Path, package: str, text: str = '__version__ = "{version}"\n', requires: str = "") -> Path:

@@ -83,7 +83,7 @@ def test_no_file_names_a_package_registry():
 
 
 def test_processes_of_blender_open_no_console_window():
-    """`hidden` keeps Windows from it. A verb has a console already, and what it starts prints there."""
+    """`popen_options` keeps Windows from it. A verb has a console already, and what it starts prints there."""
     calls, bare = 0, []
     for file in sorted((ROOT / "fdda_addon").rglob("*.py")):
         if "cli" in file.parts:
@@ -91,6 +91,6 @@ def test_processes_of_blender_open_no_console_window():
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func) in {f"subprocess.{n}" for n in NEW_PROCESS}:
                 calls += 1
-                if not any(k.arg is None and ast.unparse(k.value).startswith("hidden(") for k in node.keywords):
+                if not any(k.arg is None and ast.unparse(k.value).startswith("popen_options(") for k in node.keywords):
                     bare.append(f"{file.relative_to(ROOT).as_posix()}:{node.lineno}")
     assert calls > 4 and bare == []

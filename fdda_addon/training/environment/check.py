@@ -7,17 +7,17 @@ import subprocess
 
 from ...core.errors import os_error_text
 from ...core.native_library import runtime_advice
-from ..endings import explain_status
+from ..process_exit import explain_exit_status
 from .check_result import CheckResult
 from .folder import PACKAGES, ROOT
-from .subprocesses import UTF8_OUTPUT, hidden
+from .subprocesses import UTF8_OUTPUT, popen_options
 
-OLDEST = (3, 11)
+MIN_VERSION = (3, 11)
 TIMEOUT_SECONDS = 180.0
 """torch takes half a minute to load from a cold or remote disk."""
 
 # Runs in whatever the user named, an ancient Python too. Its last line is the answer; a library may print before it.
-_QUESTION = """
+_PROBE_SCRIPT = """
 import json, sys
 answer = {"version": list(sys.version_info[:3]), "packages": {}, "broken": {}}
 for name in sys.argv[1:] if sys.version_info[:2] >= (3, 11) else []:
@@ -45,7 +45,7 @@ def check(python: str, advice: str) -> CheckResult:
         python: path of the interpreter.
         advice: what to do when it cannot, ending the sentence.
     """
-    command = [python, "-c", _QUESTION, *PACKAGES]
+    command = [python, "-c", _PROBE_SCRIPT, *PACKAGES]
     try:
         # -c imports from the current folder; the trainer finds its modules in ours.
         result = subprocess.run(
@@ -56,7 +56,7 @@ def check(python: str, advice: str) -> CheckResult:
             cwd=ROOT,
             env={**os.environ, **UTF8_OUTPUT},
             check=False,
-            **hidden(),
+            **popen_options(),
         )
     except OSError as error:
         return CheckResult(
@@ -66,27 +66,27 @@ def check(python: str, advice: str) -> CheckResult:
         return CheckResult(
             "ERROR", f"The trainer's Python '{python}' did not answer in {TIMEOUT_SECONDS:.0f} s; {advice}."
         )
-    said = result.stdout.decode("utf-8", "replace").strip().splitlines()
+    output_lines = result.stdout.decode("utf-8", "replace").strip().splitlines()
     try:
-        answer = json.loads(said[-1])
-        return _judge(python, answer, advice)
+        report = json.loads(output_lines[-1])
+        return _evaluate_report(python, report, advice)
     except (IndexError, ValueError, TypeError, KeyError):
-        text = result.stderr.decode("utf-8", "replace").strip().splitlines()
-        ending = explain_status(result.returncode, is_silent=True)
-        reason = ending.text if ending.is_machines else f"status {result.returncode}"
-        reason = text[-1].strip() if text else reason
+        error_lines = result.stderr.decode("utf-8", "replace").strip().splitlines()
+        process_exit = explain_exit_status(result.returncode, is_silent=True)
+        reason = process_exit.text if process_exit.is_machine_fault else f"status {result.returncode}"
+        reason = error_lines[-1].strip() if error_lines else reason
         return CheckResult("ERROR", f"'{python}' does not answer as a Python does ({reason}); {advice}.")
 
 
-def _judge(python: str, answer: dict, advice: str) -> CheckResult:
-    version = ".".join(str(number) for number in answer["version"])
-    packages, broken = answer["packages"], answer["broken"]
+def _evaluate_report(python: str, report: dict, advice: str) -> CheckResult:
+    version = ".".join(str(number) for number in report["version"])
+    packages, broken = report["packages"], report["broken"]
     details = [f"Python {version}: {python}"]
     details += [f"{name} {packages[name] or 'is missing'}" for name in PACKAGES if name in packages]
     details += [f"{name} cannot be imported: {reason}" for name, reason in broken.items()]
-    if tuple(answer["version"]) < OLDEST:
-        oldest = ".".join(str(number) for number in OLDEST)
-        message = f"'{python}' is Python {version}, and the trainer needs {oldest} or later; {advice}."
+    if tuple(report["version"]) < MIN_VERSION:
+        min_version = ".".join(str(number) for number in MIN_VERSION)
+        message = f"'{python}' is Python {version}, and the trainer needs {min_version} or later; {advice}."
         return CheckResult("ERROR", message, tuple(details))
     if missing := [name for name in PACKAGES if name in packages and packages[name] is None]:
         names = " and ".join([", ".join(missing[:-1]), missing[-1]] if missing[:-1] else missing)
@@ -95,7 +95,7 @@ def _judge(python: str, answer: dict, advice: str) -> CheckResult:
         name, reason = next(iter(broken.items()))
         advice = runtime_advice(reason) or advice
         return CheckResult("ERROR", f"{name} of '{python}' cannot be imported ({reason}); {advice}.", tuple(details))
-    device = answer["device"]
+    device = report["device"]
     details.append(f"Device: {'the CPU' if device == 'cpu' else f'{device} (CUDA)'}")
     where = "on the CPU" if device == "cpu" else f"on {device}"
     return CheckResult("INFO", f"Ready to train {where}: Python {version}, torch {packages['torch']}.", tuple(details))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from .check_result import CheckResult
-from .folder import own_python, python_in
+from .folder import environment_python, interpreter_path
 
 PYTHON_VARIABLE = "FDDA_TRAINER_PYTHON"
 """Environment variable: the Python that has torch, when the preferences name none."""
@@ -37,7 +37,7 @@ class TrainerPython(NamedTuple):
     origin: Origin
 
 
-def chosen_python() -> TrainerPython:
+def select_python() -> TrainerPython:
     """The Python that runs the trainer.
 
     The first of: what the preferences name, the environment variable, the add-on's own environment, and the Python
@@ -45,18 +45,18 @@ def chosen_python() -> TrainerPython:
     """
     if preferred_python is not None and (preferred := preferred_python()):
         folder = Path(preferred)
-        return TrainerPython(str(python_in(folder)) if folder.is_dir() else preferred, Origin.PREFERENCES)
+        return TrainerPython(str(interpreter_path(folder)) if folder.is_dir() else preferred, Origin.PREFERENCES)
     if named := os.environ.get(PYTHON_VARIABLE):
         return TrainerPython(named, Origin.VARIABLE)
     with suppress(ImportError):
-        if own := own_python():
+        if own := environment_python():
             return TrainerPython(own, Origin.OWN)
     return TrainerPython(sys.executable, Origin.THIS)
 
 
-def ping(python: TrainerPython | None = None) -> CheckResult:
+def check_trainer_python(python: TrainerPython | None = None) -> CheckResult:
     """Ask the Python that runs the trainer whether it can train. Takes seconds: never while drawing."""
     from .check import check
 
-    python = python or chosen_python()
+    python = python or select_python()
     return check(python.path, python.origin.value)

@@ -19,8 +19,8 @@ EXTENSION = __package__.rpartition(".fdda_addon")[0]
 """The extension's module, "bl_ext.REPOSITORY.fdda"; empty where the add-on was imported and not installed."""
 PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "scipy", "matplotlib")
 """What the trainer imports."""
-MARK = "fdda-complete"
-LONGEST_PATH = 126
+COMPLETION_MARKER = "fdda-complete"
+MAX_WHEEL_PATH_LENGTH = 126
 """Letters of the longest path in the wheels for Windows: a license in the dist-info of torch 2.15.0.
 
 In the folder where they are installed: `find . -printf '%P\\n' | awk '{print length}' | sort -n | tail -1`.
@@ -30,7 +30,7 @@ PIP_TARGET = "/pip-target-12345678/lib/python"
 ROOT = Path(__file__).parents[3]
 """What holds the packages `fdda_addon` and `trainer`: the checkout, or the installed extension."""
 REQUIREMENTS = ROOT / "requirements"
-PINS = {(3, 11): "python-3.11.txt", (3, 12): "python-3.11.txt", (3, 13): "python-3.13.txt"}
+PINNED_REQUIREMENTS = {(3, 11): "python-3.11.txt", (3, 12): "python-3.11.txt", (3, 13): "python-3.13.txt"}
 """Versions of Python that an environment can be made from, and the file of pinned versions for each."""
 OFFLINE = (
     "Blender's online access is off: allow it in Preferences > System > Network, choose a folder under Offline "
@@ -42,7 +42,7 @@ class FolderState(enum.Enum):
     """State of the environment."""
 
     MISSING = "missing"
-    HALF_MADE = "half-made"
+    INCOMPLETE = "incomplete"
     """Its creation was interrupted."""
     BROKEN = "broken"
     """Its Python is gone, or what that was made from."""
@@ -60,22 +60,22 @@ def user_folder() -> Path:
     return Path(bpy.utils.user_resource("DATAFILES", path="fdda"))
 
 
-def own_folder() -> Path:
+def environment_folder() -> Path:
     """The folder of the environment. Blender removes it with the extension, so it lies nowhere else.
 
-    On Windows it has 91 letters beside the name of the user's folder, which may have 33: see `LONGEST_PATH`.
+    On Windows it has 91 letters beside the name of the user's folder, which may have 33: see `MAX_WHEEL_PATH_LENGTH`.
     """
     return user_folder() / "trainer"
 
 
-def missing_letters(folder: Path, temporary: Path) -> int:
+def excess_path_length(folder: Path, temporary: Path) -> int:
     """How many letters the paths of an environment would be too long for Windows, 0 for none.
 
     Args:
         folder: of the environment.
         temporary: the folder for temporary files while it is made.
     """
-    longest = max(len(str(folder)), len(str(temporary)) + len(PIP_TARGET)) + 1 + LONGEST_PATH
+    longest = max(len(str(folder)), len(str(temporary)) + len(PIP_TARGET)) + 1 + MAX_WHEEL_PATH_LENGTH
     return max(0, longest - MAX_WINDOWS_PATH_LENGTH)
 
 
@@ -97,12 +97,12 @@ def log_path() -> Path:
     return user_folder() / "trainer.log"
 
 
-def python_in(folder: Path) -> Path:
+def interpreter_path(folder: Path) -> Path:
     """The interpreter of a virtual environment, or of one of conda's, which has it elsewhere on Windows."""
     if os.name != "nt":
         return folder / "bin/python"
-    of_conda, python = folder / "python.exe", folder / "Scripts/python.exe"
-    return of_conda if of_conda.is_file() and not python.is_file() else python
+    conda_python, python = folder / "python.exe", folder / "Scripts/python.exe"
+    return conda_python if conda_python.is_file() and not python.is_file() else python
 
 
 def site_packages(folder: Path, version: tuple[int, int]) -> Path:
@@ -110,12 +110,12 @@ def site_packages(folder: Path, version: tuple[int, int]) -> Path:
     return folder / ("Lib" if os.name == "nt" else f"lib/python{version[0]}.{version[1]}") / "site-packages"
 
 
-def pins(version: tuple[int, int]) -> Path:
-    """The file that pins every package for a version of Python that `PINS` has."""
-    return REQUIREMENTS / PINS[version]
+def requirements_file(version: tuple[int, int]) -> Path:
+    """The file that pins every package for a version of Python that `PINNED_REQUIREMENTS` has."""
+    return REQUIREMENTS / PINNED_REQUIREMENTS[version]
 
 
-def obstacle(wheels: str) -> str:
+def creation_obstacle(wheels: str) -> str:
     """Why the environment cannot be created now, empty when it can; `wheels` is the folder to install from, if any."""
     import bpy
 
@@ -127,29 +127,33 @@ def folder_state(folder: Path) -> FolderState:
     if not folder.is_dir():
         return FolderState.MISSING
     try:
-        mark = (folder / MARK).read_text(encoding="utf-8").split()
+        marker = (folder / COMPLETION_MARKER).read_text(encoding="utf-8").split()
     except (OSError, UnicodeDecodeError):
-        return FolderState.HALF_MADE
-    if not python_in(folder).is_file():
+        return FolderState.INCOMPLETE
+    if not interpreter_path(folder).is_file():
         return FolderState.BROKEN
-    current = {_fingerprint(path) for path in set(map(pins, PINS)) if path.is_file()}
-    return FolderState.READY if mark and mark[0] in current else FolderState.OUTDATED
+    current = {
+        _requirements_fingerprint(path) for path in set(map(requirements_file, PINNED_REQUIREMENTS)) if path.is_file()
+    }
+    return FolderState.READY if marker and marker[0] in current else FolderState.OUTDATED
 
 
-def own_python() -> str | None:
+def environment_python() -> str | None:
     """The Python of the add-on's own environment, None when there is none that is complete."""
-    folder = own_folder()
-    complete = folder_state(folder) not in (FolderState.MISSING, FolderState.HALF_MADE)
-    return str(python_in(folder)) if complete else None
+    folder = environment_folder()
+    complete = folder_state(folder) not in (FolderState.MISSING, FolderState.INCOMPLETE)
+    return str(interpreter_path(folder)) if complete else None
 
 
-def write_mark(folder: Path, version: tuple[int, int]) -> None:
+def write_completion_marker(folder: Path, version: tuple[int, int]) -> None:
     """Mark an environment as complete."""
-    (folder / MARK).write_text(_fingerprint(pins(version)) + "\n", encoding="utf-8")
+    (folder / COMPLETION_MARKER).write_text(
+        _requirements_fingerprint(requirements_file(version)) + "\n", encoding="utf-8"
+    )
 
 
-def remove(folder: Path) -> None:
-    """Remove an environment, its mark first: a removal that is interrupted leaves it half-made.
+def remove_environment(folder: Path) -> None:
+    """Remove an environment, its mark first: a removal that is interrupted leaves it incomplete.
 
     Raises:
         TrainerEnvironmentError: something cannot be removed.
@@ -157,7 +161,7 @@ def remove(folder: Path) -> None:
     import shutil
 
     try:
-        (folder / MARK).unlink(missing_ok=True)
+        (folder / COMPLETION_MARKER).unlink(missing_ok=True)
         # On Windows a virus scanner may hold what was just written.
         for pause in (0.2, 1, 3) if os.name == "nt" else ():
             shutil.rmtree(folder, ignore_errors=True)
@@ -174,7 +178,7 @@ def remove(folder: Path) -> None:
 
 
 @contextmanager
-def claimed(folder: Path) -> Iterator[None]:
+def creation_lock(folder: Path) -> Iterator[None]:
     """Keep other Blenders from making or removing the environment meanwhile; the claim ends with the process.
 
     Raises:
@@ -191,7 +195,7 @@ def claimed(folder: Path) -> Iterator[None]:
         ) from error
     with file:
         try:
-            _lock(file.fileno())
+            _lock_file(file.fileno())
         except OSError as error:
             raise TrainerEnvironmentError(
                 "Another Blender is installing or removing the training environment; wait until it is done."
@@ -199,7 +203,7 @@ def claimed(folder: Path) -> Iterator[None]:
         yield
 
 
-def _lock(descriptor: int) -> None:
+def _lock_file(descriptor: int) -> None:
     if os.name == "nt":
         import msvcrt
 
@@ -210,7 +214,7 @@ def _lock(descriptor: int) -> None:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-def _fingerprint(requirements: Path) -> str:
+def _requirements_fingerprint(requirements: Path) -> str:
     import hashlib
 
     text = requirements.read_text(encoding="utf-8") + repr(PACKAGES)

@@ -15,16 +15,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from .folder import PINS
-from .subprocesses import clean_environment, hidden
+from .folder import PINNED_REQUIREMENTS
+from .subprocesses import clean_environment, popen_options
 
 TIMEOUT_SECONDS = 30.0
 # Newest first, but those that Blender itself has before the one between.
-VERSIONS = ("3.13", "3.11", "3.12")
-NO_DOWNLOADS = {"PYTHON_MANAGER_AUTOMATIC_INSTALL": "false"}
+PREFERRED_VERSIONS = ("3.13", "3.11", "3.12")
+NO_DOWNLOAD_ENVIRONMENT = {"PYTHON_MANAGER_AUTOMATIC_INSTALL": "false"}
 """Keeps the launcher `py` from installing a Python that it does not find."""
 
-_QUESTION = """
+_PROBE_SCRIPT = """
 import json, sys
 missing = []
 for name in ("ctypes", "ensurepip", "ssl", "venv"):
@@ -42,7 +42,7 @@ class Interpreter:
 
     path: str
     version: tuple[int, int]
-    lacks: str
+    problem: str
 
     def __str__(self) -> str:
         return f"'{self.path}' (Python {self.version[0]}.{self.version[1]})"
@@ -55,40 +55,40 @@ def find_interpreters(candidates: Iterator[list[str]] | None = None) -> Iterator
         candidates: command lines to try, the usual places when left out.
     """
     seen = set()
-    for command in usual_candidates() if candidates is None else candidates:
-        base = ask(command)
-        if base is not None and os.path.realpath(base.path) not in seen:
-            seen.add(os.path.realpath(base.path))
-            yield base
+    for command in default_candidates() if candidates is None else candidates:
+        interpreter = query_interpreter(command)
+        if interpreter is not None and os.path.realpath(interpreter.path) not in seen:
+            seen.add(os.path.realpath(interpreter.path))
+            yield interpreter
 
 
-def ask(command: list[str]) -> Interpreter | None:
+def query_interpreter(command: list[str]) -> Interpreter | None:
     """What a command line starts; None when that is no Python."""
     try:
         result = subprocess.run(
-            [*command, "-I", "-c", _QUESTION],
+            [*command, "-I", "-c", _PROBE_SCRIPT],
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=TIMEOUT_SECONDS,
-            env=clean_environment() | NO_DOWNLOADS,
+            env=clean_environment() | NO_DOWNLOAD_ENVIRONMENT,
             check=True,
-            **hidden(),
+            **popen_options(),
         )
         version, is_64_bit, missing, path = json.loads(result.stdout.decode("utf-8", "replace").splitlines()[-1])
     except (OSError, subprocess.SubprocessError, ValueError, TypeError, IndexError):
         return None
-    lacks = ""
-    if tuple(version) not in PINS:
-        known = ", ".join(f"{major}.{minor}" for major, minor in sorted(PINS))
-        lacks = f"is none of {known}"
+    problem = ""
+    if tuple(version) not in PINNED_REQUIREMENTS:
+        supported = ", ".join(f"{major}.{minor}" for major, minor in sorted(PINNED_REQUIREMENTS))
+        problem = f"is none of {supported}"
     elif not is_64_bit:
-        lacks = "is not 64-bit"
+        problem = "is not 64-bit"
     elif missing:
-        lacks = f"lacks the module {missing[0]}"
-    return Interpreter(path, tuple(version), lacks)
+        problem = f"lacks the module {missing[0]}"
+    return Interpreter(path, tuple(version), problem)
 
 
-def usual_candidates() -> Iterator[list[str]]:
+def default_candidates() -> Iterator[list[str]]:
     """Command lines that may start a Python: Blender's own, those on the path, those of installers."""
     if sys.executable:
         yield [sys.executable]
@@ -96,22 +96,22 @@ def usual_candidates() -> Iterator[list[str]]:
 
 
 def _unix_candidates() -> Iterator[list[str]]:
-    yield from ([f"python{version}"] for version in VERSIONS)
+    yield from ([f"python{version}"] for version in PREFERRED_VERSIONS)
     # On macOS the name in /usr/bin asks to install the developer tools.
     if sys.platform != "darwin":
         yield from (["python3"], ["python"])
     home = Path.home()
     pyenv = Path(os.environ.get("PYENV_ROOT") or home / ".pyenv")
     data = Path(os.environ.get("XDG_DATA_HOME") or home / ".local/share")
-    for version in VERSIONS:
-        for place in (
+    for version in PREFERRED_VERSIONS:
+        for path in (
             *sorted(pyenv.glob(f"versions/{version}.*/bin/python")),
             *sorted(data.glob(f"uv/python/cpython-{version}.*/bin/python")),
             *(Path(folder) / f"python{version}" for folder in ("/opt/homebrew/bin", "/usr/local/bin", "/usr/bin")),
             Path(f"/Library/Frameworks/Python.framework/Versions/{version}/bin/python{version}"),
         ):
-            if place.is_file():
-                yield [str(place)]
+            if path.is_file():
+                yield [str(path)]
 
 
 def _windows_candidates() -> Iterator[list[str]]:
@@ -127,25 +127,25 @@ def _windows_candidates() -> Iterator[list[str]]:
     uv = [roaming / "uv/python", roaming / "uv/data/python"]
     if folder := os.environ.get("UV_PYTHON_INSTALL_DIR"):
         uv.insert(0, Path(folder))
-    for version in VERSIONS:
+    for version in PREFERRED_VERSIONS:
         digits = version.replace(".", "")
-        for place in (
-            *_registered(version),
+        for path in (
+            *_registry_interpreters(version),
             *(folder / f"Python{digits}/python.exe" for folder in (local / "Programs/Python", *programs, drive)),
             local / f"Python/pythoncore-{version}-64/python.exe",
-            *(place for folder in uv for place in sorted(folder.glob(f"cpython-{version}.*/python.exe"))),
+            *(path for folder in uv for path in sorted(folder.glob(f"cpython-{version}.*/python.exe"))),
             *sorted(pyenv.glob(f"versions/{version}.*/python.exe")),
         ):
-            if place.is_file() and not _is_of_store(place):
-                yield [str(place)]
-        if launcher := _on_path("py.exe"):
+            if path.is_file() and not _is_store_app(path):
+                yield [str(path)]
+        if launcher := _find_on_path("py.exe"):
             yield [launcher, f"-{version}"]
-    for name in (*(f"python{version}.exe" for version in VERSIONS), "python3.exe", "python.exe"):
-        if found := _on_path(name):
+    for name in (*(f"python{version}.exe" for version in PREFERRED_VERSIONS), "python3.exe", "python.exe"):
+        if found := _find_on_path(name):
             yield [found]
 
 
-def _registered(version: str) -> Iterator[Path]:
+def _registry_interpreters(version: str) -> Iterator[Path]:
     """Pythons of a version that installers have registered (PEP 514), of python.org and of others."""
     import winreg
 
@@ -164,23 +164,23 @@ def _subkeys(root: int, key: str) -> list[str]:
 
     try:
         with winreg.OpenKey(root, key) as opened:
-            return [winreg.EnumKey(opened, number) for number in range(winreg.QueryInfoKey(opened)[0])]
+            return [winreg.EnumKey(opened, index) for index in range(winreg.QueryInfoKey(opened)[0])]
     except OSError:
         return []
 
 
-def _on_path(name: str) -> str:
+def _find_on_path(name: str) -> str:
     """The program of a name on the path, empty for none. Windows itself would look in the current folder first."""
     for folder in map(Path, filter(None, os.environ.get("PATH", "").split(os.pathsep))):
-        place = folder / name
-        if folder.is_absolute() and place.is_file() and not _is_of_store(place):
-            return str(place)
+        path = folder / name
+        if folder.is_absolute() and path.is_file() and not _is_store_app(path):
+            return str(path)
     return ""
 
 
-def _is_of_store(place: Path) -> bool:
+def _is_store_app(path: Path) -> bool:
     """Whether a program is Microsoft Store's. Its python.exe opens the shop where no Python is installed.
 
     One that is installed keeps to itself what it writes to AppData, and with it the environment that it makes there.
     """
-    return "windowsapps" in (part.lower() for part in place.parts)
+    return "windowsapps" in (part.lower() for part in path.parts)

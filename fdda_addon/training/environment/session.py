@@ -5,7 +5,7 @@ Nothing here is asked while drawing; `check_result` is what the last check said.
 """
 
 from .check_result import CheckResult
-from .folder import FolderState, folder_state, own_folder
+from .folder import FolderState, environment_folder, folder_state
 
 check_result: CheckResult | None = None
 """What the last check of the trainer's Python said; None: not checked in this session."""
@@ -14,15 +14,15 @@ notice: CheckResult | None = None
 _folder_state: FolderState | None = None
 
 
-def remember(new_result: CheckResult | None, new_notice: CheckResult | None = None) -> None:
+def store_result(new_result: CheckResult | None, new_notice: CheckResult | None = None) -> None:
     """Keep what was found out, and look at the environment's folder anew when it is next drawn."""
     global check_result, notice, _folder_state
     check_result, notice, _folder_state = new_result, new_notice, None
 
 
-def own_state() -> FolderState:
+def environment_state() -> FolderState:
     """The state of the add-on's own environment as this session knows it."""
     global _folder_state
     if _folder_state is None:
-        _folder_state = folder_state(own_folder())
+        _folder_state = folder_state(environment_folder())
     return _folder_state

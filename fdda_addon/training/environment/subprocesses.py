@@ -8,7 +8,7 @@ UTF8_OUTPUT = {"PYTHONIOENCODING": "utf-8:backslashreplace"}
 """Environment of a Python whose output is read here: on Windows a pipe has the code page of the country otherwise."""
 
 
-def hidden(*, own_session: bool = False) -> dict:
+def popen_options(*, own_session: bool = False) -> dict:
     """Options of `subprocess` that keep Windows from opening a console window.
 
     Args:

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""How a process ended, in words, from its exit status on Linux, macOS or Windows."""
+
+import os
+from typing import NamedTuple
+
+from ..core.errors import TRY_AGAIN
+from ..core.native_library import runtime_url
+
+_WINDOWS_CRASHES = {
+    0x80000003: "a breakpoint",
+    0xC0000005: "access violation",
+    0xC0000006: "a page could not be read from the disk",
+    0xC0000017: "out of memory",
+    0xC000001D: "this processor lacks an instruction",
+    0xC0000094: "division by zero",
+    0xC00000FD: "stack overflow",
+    0xC000012D: "the paging file is too small",
+    0xC0000374: "the heap is corrupted",
+    0xC0000409: "aborted",
+    0xE06D7363: "an exception of C++",
+}
+"""Exit statuses of Windows for a process that crashed."""
+_MISSING_DLL_STATUSES = {0xC0000135, 0xC0000139, 0xC0000142}
+_CONSOLE_CLOSED_STATUS = 0xC000013A
+_TERMINATED_STATUSES = {1, 15}
+"""Status of a process that the Task Manager, or `os.kill` of another Python, ends on Windows."""
+
+
+class ProcessExit(NamedTuple):
+    """How a process ended.
+
+    Attributes:
+        text: goes on after "The trainer".
+        is_machine_fault: whether it crashed or was ended from outside, so that the same may work later.
+    """
+
+    text: str
+    is_machine_fault: bool
+
+
+def explain_exit_status(status: int | None, is_silent: bool) -> ProcessExit:
+    """Explain the status of a process that ended without a last message.
+
+    Args:
+        status: its exit status, signed or unsigned; None where it is not known.
+        is_silent: whether it wrote nothing to stderr. A Python that fails by itself writes a traceback.
+    """
+    if status is None:
+        return ProcessExit("was ended before it was done" if is_silent else "ended before it was done", is_silent)
+    code = status & 0xFFFFFFFF
+    if code in _MISSING_DLL_STATUSES:
+        return ProcessExit(f"cannot start: a DLL is missing (0x{code:08X}); install {runtime_url()}", False)
+    if code == _CONSOLE_CLOSED_STATUS:
+        return ProcessExit("was ended with its console before it was done", True)
+    if code in _WINDOWS_CRASHES or 0xC0000000 <= code < 0xD0000000:
+        reason = f"{_WINDOWS_CRASHES[code]}, " if code in _WINDOWS_CRASHES else ""
+        return ProcessExit(f"crashed: {reason}status 0x{code:08X}", True)
+    if status < 0:
+        return ProcessExit(f"was ended by signal {-status} before it was done", True)
+    was_terminated = os.name == "nt" and is_silent and status in _TERMINATED_STATUSES
+    description = "was ended from outside" if was_terminated else f"ended with status {status}"
+    return ProcessExit(f"{description} before it was done", was_terminated or status == TRY_AGAIN)
