@@ -36,7 +36,7 @@ def _degrees(*angles: float) -> tuple[float, float, float]:
 
 
 def _metacarpals(factor: float) -> dict[str, tuple[float, float, float]]:
-    """All four at `factor` times their range, neighbours one against the other."""
+    """All four at `factor` times their range, neighbors one against the other."""
     angle = factor * METACARPAL_RANGE
     return {f"{finger}_0": _degrees(angle * (-1) ** i, 0, angle * (-1) ** i) for i, finger in enumerate(FINGERS)}
 

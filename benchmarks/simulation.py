@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is learnt of a simulation: `python benchmarks/simulation.py OUT`, the figures of docs/simulations.md.
+"""What is learned of a simulation: `python benchmarks/simulation.py OUT`, the figures of docs/simulations.md.
 
 Gives the arm flesh that sags and bulges, held to the skin of its bones: a soft body of Blender's own. Records settled
 poses, trains, and compares model and linear skinning with settled poses that training never saw, beside how far two

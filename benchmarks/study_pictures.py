@@ -13,8 +13,8 @@ from fdda_addon.core.output import atomic_write
 
 from .study_tables import held_out
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-"""Told apart by the colour-blind too (Okabe and Ito)."""
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+"""Told apart by the color-blind too (Okabe and Ito)."""
 GREY = "#666666"
 DASHES = (0, (4, 3))
 LABEL, TICK = 9, 8
@@ -22,8 +22,8 @@ LABEL, TICK = 9, 8
 
 
 def draw_curves(result: dict, path: Path) -> None:
-    """Validation error by epoch: a row for each partition, a column for each size, a colour for each activation."""
-    sizes, colours = _sizes(result), _colours(result)
+    """Validation error by epoch: a row for each partition, a column for each size, a color for each activation."""
+    sizes, colors = _sizes(result), _colors(result)
     names = result["partitions"]
     figure = Figure(figsize=(1.2 + 2.1 * len(sizes), 0.8 + 2.1 * len(names)), layout="constrained")
     grid = figure.subplots(len(names), len(sizes), sharex=True, sharey="row", squeeze=False)
@@ -32,8 +32,8 @@ def draw_curves(result: dict, path: Path) -> None:
             for configuration in members:
                 for training in configuration["trainings"]:
                     curve = training["partitions"][name]["curve"]["validation"]
-                    colour = colours[configuration["activation"]]
-                    axes.plot(range(1, len(curve) + 1), curve, color=colour, linewidth=0.9, alpha=0.85)
+                    color = colors[configuration["activation"]]
+                    axes.plot(range(1, len(curve) + 1), curve, color=color, linewidth=0.9, alpha=0.85)
             axes.axhline(_basis_left(result, name, "validation"), color=GREY, linewidth=0.8, linestyle=DASHES)
             axes.set_yscale("log")
             _plain(axes)
@@ -41,13 +41,13 @@ def draw_curves(result: dict, path: Path) -> None:
                 axes.set_title(size, fontsize=LABEL)
         axes_row[0].set_ylabel(f"{name}\nvalidation error, mm", fontsize=LABEL)
     figure.supxlabel("epoch", fontsize=LABEL)
-    _legend(figure, colours)
+    _legend(figure, colors)
     _save(figure, path)
 
 
 def draw_errors(result: dict, path: Path) -> None:
     """Held-out error: a panel for each partition, a row for each size, a dot for each seed."""
-    sizes, colours = _sizes(result), _colours(result)
+    sizes, colors = _sizes(result), _colors(result)
     names = result["partitions"]
     figure = Figure(figsize=(8.4, 0.9 + 0.55 * len(sizes)), layout="constrained")
     grid = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
@@ -56,9 +56,9 @@ def draw_errors(result: dict, path: Path) -> None:
             for place, configuration in enumerate(members):
                 values = held_out(configuration, name)
                 height = row + 0.2 * (place - (len(members) - 1) / 2)
-                colour = colours[configuration["activation"]]
-                axes.plot(values, [height] * len(values), "o", color=colour, markersize=4, alpha=0.7, markeredgewidth=0)
-                axes.plot([fmean(values)] * 2, [height - 0.1, height + 0.1], color=colour, linewidth=1.4)
+                color = colors[configuration["activation"]]
+                axes.plot(values, [height] * len(values), "o", color=color, markersize=4, alpha=0.7, markeredgewidth=0)
+                axes.plot([fmean(values)] * 2, [height - 0.1, height + 0.1], color=color, linewidth=1.4)
         axes.axvline(_basis_left(result, name, "held_out"), color=GREY, linewidth=0.8, linestyle=DASHES)
         axes.set_xlim(0, 1.04 * axes.get_xlim()[1])
         axes.set_yticks(range(len(sizes)), list(sizes))
@@ -67,7 +67,7 @@ def draw_errors(result: dict, path: Path) -> None:
         axes.grid(axis="x", color="#dddddd", linewidth=0.6)
         axes.tick_params(labelsize=TICK)
         axes.spines[["top", "right"]].set_visible(False)
-    _legend(figure, colours)
+    _legend(figure, colors)
     _save(figure, path)
 
 
@@ -79,9 +79,9 @@ def _sizes(result: dict) -> dict[str, list[dict]]:
     return sizes
 
 
-def _colours(result: dict) -> dict[str, str]:
+def _colors(result: dict) -> dict[str, str]:
     activations = dict.fromkeys(configuration["activation"] for configuration in result["configurations"])
-    return dict(zip(activations, COLOURS, strict=False))
+    return dict(zip(activations, COLORS, strict=False))
 
 
 def _basis_left(result: dict, name: str, poses: str) -> float:
@@ -97,8 +97,8 @@ def _plain(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _legend(figure: Figure, colours: dict[str, str]) -> None:
-    handles = [Line2D([], [], color=colour, linewidth=2, label=name) for name, colour in colours.items()]
+def _legend(figure: Figure, colors: dict[str, str]) -> None:
+    handles = [Line2D([], [], color=color, linewidth=2, label=name) for name, color in colors.items()]
     handles.append(Line2D([], [], color=GREY, linewidth=1, linestyle=DASHES, label="a network without error"))
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=LABEL)
 

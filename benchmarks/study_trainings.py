@@ -85,7 +85,7 @@ def read_material(training: Path, held_out: Path, names: tuple[str, ...]) -> Mat
             "record it with another --seed."
         )
     small = cut(whole, names)
-    # The neighbours' middles are those of the whole mesh: the networks see what they see when all partitions train.
+    # The neighbors' middles are those of the whole mesh: the networks see what they see when all partitions train.
     inputs = inputs_of_rig(whole.rig, middles(whole.rig, whole.partitions), small.partitions)
     return Material(whole, small, cut(other, names), inputs)
 

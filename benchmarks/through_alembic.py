@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The arm learnt through an Alembic file of its own action: `python benchmarks/through_alembic.py OUT`.
+"""The arm learned through an Alembic file of its own action: `python benchmarks/through_alembic.py OUT`.
 
 Exports what the arm shows, throws its stack away, and learns from the file with `examples/cache/learn_from_cache.py`.
 Prints how far the residuals are from those of the rig itself, and the held-out errors of both with several seeds: the
@@ -63,16 +63,16 @@ def main() -> None:
     out = parser.parse_args().out.resolve()
     out.mkdir(parents=True, exist_ok=True)
     fdda_addon.register()
-    rig, bare, cache, own, learnt = (out / name for name in ("rig.blend", "bare.blend", "arm.abc", "own", "learnt"))
+    rig, bare, cache, own, learned = (out / name for name in ("rig.blend", "bare.blend", "arm.abc", "own", "learned"))
     build(rig, bare, cache)
     verb("record", rig, own, "--object", "arm", "--poses", 0, "--action", ACTION, "--resume")
     example = ROOT / "examples" / "cache" / "learn_from_cache.py"
-    command = [sys.executable, str(example), str(bare), str(cache), str(learnt), "--object", "arm", "--action", ACTION]
+    command = [sys.executable, str(example), str(bare), str(cache), str(learned), "--object", "arm", "--action", ACTION]
     subprocess.run(command, check=True, cwd=ROOT)
-    recordings = [read_recording(path) for path in (own, learnt / "recording")]
+    recordings = [read_recording(path) for path in (own, learned / "recording")]
     apart = np.abs(recordings[0].residuals - recordings[1].residuals).max() / recordings[0].rig.size
     print(f"{recordings[0].residuals.shape[0]} frames; largest difference of the residuals: {apart:.1e} of the size")
-    for name, recording in (("the rig itself", own), ("through Alembic", learnt / "recording")):
+    for name, recording in (("the rig itself", own), ("through Alembic", learned / "recording")):
         errors = held_out_mm(recording, out / f"{recording.parent.name}_{recording.name}")
         seeds = ", ".join(f"{error:.4f}" for error in errors)
         print(f"{name}: held-out mean {statistics.median(errors):.4f} mm, median of the seeds ({seeds})")

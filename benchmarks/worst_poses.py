@@ -146,7 +146,7 @@ def rendered(scene: bpy.types.Scene) -> np.ndarray:
 def save(pixels: np.ndarray, path: Path) -> None:
     """Write (H, W, 4) float32, top row first, as a PNG file."""
     height, width = pixels.shape[:2]
-    # Grey where there is nothing: neither stripe.
+    # Gray where there is nothing: neither stripe.
     shown, covered = pixels[..., :3], pixels[..., 3:]
     flat = np.concatenate([shown * covered + BACKGROUND * (1 - covered), np.ones_like(covered)], axis=2)
     image = bpy.data.images.new("worst poses", width, height)

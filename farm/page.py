@@ -183,6 +183,6 @@ def _pictures(pictures: dict[str, list[tuple[str, bytes]]]) -> str:
     if not figures:
         return ""
     return (
-        "<h2>Heat maps</h2><p>Rig, linear skinning and model; the colour is the distance from the rig.</p>"
+        "<h2>Heat maps</h2><p>Rig, linear skinning and model; the color is the distance from the rig.</p>"
         f'<div class="pictures">{"".join(figures)}</div>'
     )

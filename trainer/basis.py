@@ -112,10 +112,10 @@ def make_basis(
     products = np.zeros((min(count, width),) * 2)
     for block in _blocks(width if by_pose else count):
         part = residuals[:, block] if by_pose else residuals[block]
-        centred = (part.astype(np.float64) - (mean[block] if by_pose else mean)) * roots[
+        centered = (part.astype(np.float64) - (mean[block] if by_pose else mean)) * roots[
             slice(None) if by_pose else block
         ]
-        products += centred @ centred.T if by_pose else centred.T @ centred
+        products += centered @ centered.T if by_pose else centered.T @ centered
     values, vectors = np.linalg.eigh(products)
     values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1]
     # What is left after the first k components, as an rms over poses and vertices.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Charts of the report as inline SVG; colours come from the page's style sheet."""
+"""Charts of the report as inline SVG; colors come from the page's style sheet."""
 
 import math
 from collections.abc import Sequence

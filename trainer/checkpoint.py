@@ -47,7 +47,7 @@ class PartitionCheckpoint:
         feature_mean, feature_scale: (F',) float32.
         basis_mean: (3 Vp,) float32, mesh units.
         basis_shapes: (K, 3 Vp) float32, orthonormal rows, no unit.
-        network: from standardised features to coefficients in mesh units.
+        network: from standardized features to coefficients in mesh units.
     """
 
     columns: np.ndarray

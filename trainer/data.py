@@ -23,7 +23,7 @@ from .turns import fit_matrices
 
 MIN_POSES = 10
 BLOCK_FRAMES = 10
-"""Frames of animation that are held back together: neighbours are nearly the same pose."""
+"""Frames of animation that are held back together: neighbors are nearly the same pose."""
 MARGIN_WEIGHT = 0.1
 """What a pose of the margin counts for in the basis, where others count 1: its residual is many times as large, and the
 shapes are chosen for the range of motion."""
@@ -86,7 +86,7 @@ class PreparedPartition:
         vertices: Vp.
         columns: (F',) int32, the features that vary over the training poses and that the network sees.
         feature_mean, feature_scale: (F',) float32, mean and standard deviation over the training poses.
-        inputs: (N, F') float32, standardised features of all poses.
+        inputs: (N, F') float32, standardized features of all poses.
         fit: the part of the residuals that follows from the joints around.
         basis: of what the fit leaves of the residuals of the training poses.
         coefficients: (N, K) float32, of all poses, mesh units.
@@ -280,7 +280,7 @@ def partitions_of(
 def prepare(
     partition: PartitionData, split: Split, tolerance_mm: float, seed: int, metres_per_unit: float = 1.0
 ) -> PreparedPartition:
-    """Standardise the features of a partition and turn its residuals into coefficients.
+    """Standardize the features of a partition and turn its residuals into coefficients.
 
     What the joints around say is taken off first. Everything is measured on the training poses alone. A partition that
     sees no varying feature gets no shapes: its mean is the best that can be said of it.

@@ -41,7 +41,7 @@ class Deformation:
     activation: str
     sheared: bool
 
-    def standardisation(self) -> tuple[np.ndarray, np.ndarray]:
+    def standardization(self) -> tuple[np.ndarray, np.ndarray]:
         """(F,) float64 mean and scale of each feature; 0 and 1 where no network looks at it."""
         size = len(self.training_range.low)
         mean, scale = np.zeros(size), np.ones(size)

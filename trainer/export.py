@@ -71,7 +71,7 @@ def reference_positions(
     rig, training_range = deformation.rig, deformation.training_range
     features = deformation.inputs.features(pose_matrices, rig.rest_matrices, controls)
     confidence = training_range.confidence(features)
-    mean, scale = deformation.standardisation()
+    mean, scale = deformation.standardization()
     clamped = np.clip(features, training_range.low, training_range.high)
     inputs = ((clamped - mean) / scale).astype(np.float32)
     matrices = fit_matrices(pose_matrices, rig, len(deformation.turns()) > 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What each network sees: its joints relative to their parents, its controls, where its neighbours are, and deltas.
+"""What each network sees: its joints relative to their parents, its controls, where its neighbors are, and deltas.
 
 A smoothed surface depends on where the surface around it is. From the parent-relative transforms a network would have
 to multiply its way to that; so it is also given the middle of the partitions around it, seen from its main joint, and

@@ -56,20 +56,20 @@ class Surroundings:
 
     Attributes:
         joints: (Jf,) int64, the main joint first, turns last, as in `JointFit`.
-        centre: (3,) float64, middle of the partition at rest, mesh-object space, mesh units.
-        rows: (N, 3, 4 Jf) float64, R_m^-1 S_j of each joint; the last column of each says how the centre moves, which
+        center: (3,) float64, middle of the partition at rest, mesh-object space, mesh units.
+        rows: (N, 3, 4 Jf) float64, R_m^-1 S_j of each joint; the last column of each says how the center moves, which
             keeps the fit well conditioned far away from the origin.
         metres_per_unit: as in `Rig`: the ridge weighs lengths as mesh units, whatever they are in.
     """
 
     joints: np.ndarray
-    centre: np.ndarray
+    center: np.ndarray
     rows: np.ndarray
     metres_per_unit: float = 1.0
 
     def alone(self) -> "Surroundings":
         """The main joint alone, seen from which nothing moves."""
-        return Surroundings(self.joints[:1], self.centre, self.rows[:, :, :4], self.metres_per_unit)
+        return Surroundings(self.joints[:1], self.center, self.rows[:, :, :4], self.metres_per_unit)
 
     def rows_of(self, joints: np.ndarray) -> np.ndarray:
         """(N, 3, 4 n) float64 rows of some of the joints, in the order given."""
@@ -125,9 +125,9 @@ class Surroundings:
         """(Jf, 4, Vp) for the rows as they are to (4 Jf, Vp) for skin matrices."""
         factors, parts = solved.copy(), solved[:, 3]
         factors[0, 3] = 0
-        factors[1:, :3] += self.centre[:, None] * parts[1:, None]
+        factors[1:, :3] += self.center[:, None] * parts[1:, None]
         together = parts[1:].sum(axis=0)
-        factors[0, :3] -= self.centre[:, None] * together
+        factors[0, :3] -= self.center[:, None] * together
         factors[0, 3] -= together
         return factors.reshape(-1, solved.shape[2]).astype(np.float32)
 
@@ -162,8 +162,8 @@ def _useful(products: np.ndarray, moments: np.ndarray, total: float) -> np.ndarr
 
 def surroundings_of_rig(rig: Rig, partition: Partition, matrices: np.ndarray) -> Surroundings:
     """The joints around a partition of a rig; `matrices` as in `make_surroundings`."""
-    centre = rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
-    surroundings = make_surroundings(rig.parents, partition, matrices, centre, unmoved_joints(rig))
+    center = rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
+    surroundings = make_surroundings(rig.parents, partition, matrices, center, unmoved_joints(rig))
     return replace(surroundings, metres_per_unit=rig.metres_per_unit)
 
 
@@ -171,7 +171,7 @@ def make_surroundings(
     parents: np.ndarray,
     partition: Partition,
     matrices: np.ndarray,
-    centre: np.ndarray,
+    center: np.ndarray,
     unmoved: frozenset[int] = frozenset(),
 ) -> Surroundings:
     """The joints that may move a partition's residuals: those that only influencing joints move against the main one.
@@ -181,7 +181,7 @@ def make_surroundings(
         partition: with its main joint and the influencing ones.
         matrices: (N, J, 3, 4) skin matrices of all poses, mesh units, or (N, 2 J, 3, 4) with turn matrices behind them
             (`turns.fit_matrices`); any fixed matrices may stand in for the rest pose, the fit takes them up.
-        centre: (3,) middle of the partition where all skin matrices are the identity, mesh units.
+        center: (3,) middle of the partition where all skin matrices are the identity, mesh units.
         unmoved: joints that never move.
     """
     influencing, main, count = set(partition.influencing), partition.joint, len(parents)
@@ -196,5 +196,5 @@ def make_surroundings(
     apart = matrices[:, joints, :3].astype(np.float64)
     apart[:, :, :, 3] -= moves_along * matrices[:, main, None, :3, 3]
     relative = np.linalg.inv(matrices[:, main, None, :3, :3].astype(np.float64)) @ apart
-    relative[:, :, :, 3] += moves_along * (relative[:, :, :, :3] @ centre - centre)
-    return Surroundings(joints, centre, relative.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1))
+    relative[:, :, :, 3] += moves_along * (relative[:, :, :, :3] @ center - center)
+    return Surroundings(joints, center, relative.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1))

@@ -137,7 +137,7 @@ class _Loop:
         self._start_average()
         self.best = [average.clone() for average in self.averaged]
         self.best_mm = torch.full((len(partitions),), torch.inf, device=device)
-        # (P, F): what the standardised features have been multiplied by.
+        # (P, F): what the standardized features have been multiplied by.
         self.input_weights = torch.ones_like(self.x[:, 0])
 
     @torch.enable_grad()

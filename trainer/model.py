@@ -22,7 +22,7 @@ class Network:
     """The trained network of one partition, in numpy.
 
     Attributes:
-        weights: one (in, out) float32 a layer; standardised features in, coefficients in mesh units out.
+        weights: one (in, out) float32 a layer; standardized features in, coefficients in mesh units out.
         biases: one (out,) float32 a layer.
     """
 
@@ -30,7 +30,7 @@ class Network:
     biases: tuple[np.ndarray, ...]
 
     def coefficients(self, inputs: np.ndarray, activation: str) -> np.ndarray:
-        """(N, F) float32 standardised features to (N, K) float32 coefficients, mesh units, in PyTorch."""
+        """(N, F) float32 standardized features to (N, K) float32 coefficients, mesh units, in PyTorch."""
         values = torch.from_numpy(inputs)
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             values = torch.addmm(torch.from_numpy(bias), values, torch.from_numpy(weight))
@@ -89,7 +89,7 @@ class PartitionNetworks(torch.nn.Module):
         """Evaluate.
 
         Args:
-            inputs: (P, n, F) standardised features, padded.
+            inputs: (P, n, F) standardized features, padded.
             generator: drops hidden units at random when given; none evaluates without dropout.
 
         Returns:

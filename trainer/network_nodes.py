@@ -3,7 +3,7 @@
 
 Networks differ in what they see and in how many shapes they have; in one product for all, each would be padded to the
 largest. So first and last layers are cut into pieces of the same size: a network has as many as it needs, and what the
-pieces of a first layer come to is summed. What the first layer would standardise is in its weights, as its bias is; the
+pieces of a first layer come to is summed. What the first layer would standardize is in its weights, as its bias is; the
 last layer's is in the mean residual.
 """
 
@@ -123,7 +123,7 @@ def _add_last_layer(graph: Graph, values: str, layers: dict[int, np.ndarray]) ->
 
 
 def _first_layer(features: Features, deformation: Deformation, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """The vectors that a network sees, and its first layer for these as they are, not standardised.
+    """The vectors that a network sees, and its first layer for these as they are, not standardized.
 
     Returns:
         (Bn,) int64 vectors, the last of them ones; (Bn, 3, H) float64 weights, in which the bias is that of a one.

@@ -64,7 +64,7 @@ def find_patterns(
     height, vertices = _height(fit, basis), fit.factors.shape[1]
     rows = _rows(surroundings.rows_of(fit.joints)[training], coefficients[training], weights)
     values, vectors = np.linalg.eigh(rows.T @ rows)
-    weighed = (np.sqrt(np.maximum(values, 0)) * vectors).T @ _numbers(fit, basis, surroundings.centre)
+    weighed = (np.sqrt(np.maximum(values, 0)) * vectors).T @ _numbers(fit, basis, surroundings.center)
     squares, vectors = np.linalg.eigh(weighed @ weighed.T)
     squares, vectors = np.maximum(squares[::-1], 0), vectors[:, ::-1]
     left = np.sqrt(np.append(np.cumsum(squares[::-1])[::-1], 0) / (weights.sum() * vertices))
@@ -89,11 +89,11 @@ def _rows(moved: np.ndarray, coefficients: np.ndarray, weights: np.ndarray) -> n
     return (rows * np.sqrt(weights)[:, None, None]).reshape(3 * len(rows), -1)
 
 
-def _numbers(fit: JointFit, basis: Basis, centre: np.ndarray) -> np.ndarray:
+def _numbers(fit: JointFit, basis: Basis, center: np.ndarray) -> np.ndarray:
     """(4 Jf + 3 K, Vp) float64, the numbers of the vertices; the mean belongs to the main joint, which sees it rest."""
     vertices, shapes = fit.factors.shape[1], len(basis.shapes)
     factors = fit.factors.reshape(-1, 4, vertices).astype(np.float64)
-    factors[:, :3] -= centre[:, None] * factors[:, 3:]
+    factors[:, :3] -= center[:, None] * factors[:, 3:]
     factors[0, :3] += basis.mean.reshape(vertices, 3).T
     return np.concatenate(
         [factors.reshape(-1, vertices), _by_axis(basis.shapes, vertices).reshape(3 * shapes, vertices)]

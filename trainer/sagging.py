@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Whether a surface that was simulated, or comes from a file, depends on which way is down.
 
-Nobody can move a joint of it to see. With all joints above as inputs, what sags is learnt, and what does not is learnt
-worse, as there is more that frames of one action have in common by chance: docs/simulations.md has both. So it is asked
-of the poses, by kernel ridge regression: a network for each answer would take as long as the training.
+Nobody can move a joint of it to see. With all joints above as inputs, what sags is learned, and what does not is
+learned worse, as there is more that frames of one action have in common by chance: docs/simulations.md has both. So
+it is asked of the poses, by kernel ridge regression: a network for each answer would take as long as the training.
 """
 
 from dataclasses import replace

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Skin weights that explain recorded poses, fitted vertex by vertex.
 
-For a vertex, find weights w that minimise sum_n |sum_j w_j S_nj x - y_n|^2 with w >= 0 and sum w = 1: rigid (one joint)
+For a vertex, find weights w that minimize sum_n |sum_j w_j S_nj x - y_n|^2 with w >= 0 and sum w = 1: rigid (one joint)
 or at most four joints. The idea and the sparsity: James and Twigg, Skinning Mesh Animations, 2005; Le and Deng, Smooth
 Skinning Decomposition with Rigid Bones, 2012. The least squares: `scipy.optimize.nnls`, Lawson and Hanson, 1974.
 """
@@ -45,17 +45,17 @@ class SkinSolver:
         rig = poses.rig
         self._count, self._joints = len(poses.pose_matrices), len(rig.joints)
         # About the middle of the mesh, at rest and in each pose: large numbers would leave the squares no digits.
-        self._centre = rig.rest_positions.mean(axis=0, dtype=np.float64)
+        self._center = rig.rest_positions.mean(axis=0, dtype=np.float64)
         self._middles = np.array([positions.mean(axis=0, dtype=np.float64) for positions in poses.positions])
         skin = skin_matrices(poses.pose_matrices, rig.rest_matrices)[:, :, :3].astype(np.float64)
-        skin[:, :, :, 3] += skin[:, :, :, :3] @ self._centre - self._middles[:, None]
+        skin[:, :, :, 3] += skin[:, :, :, :3] @ self._center - self._middles[:, None]
         self._rows = np.ascontiguousarray(skin.transpose(0, 2, 1, 3).reshape(3 * self._count, 4 * self._joints))
         self._products = self._rows.T @ self._rows
         blocks = self._products.reshape(self._joints, 4, self._joints, 4).transpose(0, 2, 1, 3)
         self._blocks = np.ascontiguousarray(blocks).reshape(self._joints, self._joints, 16)
         self._size = max(rig.size, 1e-9)
         self.tie = self._count * (TIE * self._size) ** 2
-        self._heads = rig.rest_matrices[:, :3, 3].astype(np.float64) - self._centre
+        self._heads = rig.rest_matrices[:, :3, 3].astype(np.float64) - self._center
 
     def fit(self, kind: str) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
         """Fit all vertices, a block an iteration.
@@ -89,7 +89,7 @@ class _Block:
     def __init__(self, solver: SkinSolver, vertices: slice):
         self._solver = solver
         poses, rig = solver._poses, solver._poses.rig
-        rest = rig.rest_positions[vertices].astype(np.float64) - solver._centre
+        rest = rig.rest_positions[vertices].astype(np.float64) - solver._center
         self.rest = np.concatenate([rest, np.ones((len(rest), 1))], axis=1)
         recorded = poses.positions[:, vertices].astype(np.float64) - solver._middles[:, None]
         recorded = recorded.transpose(0, 2, 1).reshape(-1, len(rest))
@@ -213,7 +213,7 @@ def _repeated(errors: np.ndarray, tolerance: float) -> np.ndarray:
 
 
 def simplex_weights(errors: np.ndarray, usable: np.ndarray, ridge: float) -> np.ndarray:
-    """Minimise w' E w with w >= 0 and sum w = 1.
+    """Minimize w' E w with w >= 0 and sum w = 1.
 
     Without the sum, min over u >= 0 of u' E u + (1 - sum u)^2 has the same solution up to a factor: for u = s w the
     best s leaves q / (1 + q) with q = w' E w, which grows with q. And that is a problem of non-negative least squares.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From the order of the partitions back to that of the mesh, in blocks of neighbours.
+"""From the order of the partitions back to that of the mesh, in blocks of neighbors.
 
-To gather vertices one by one takes as long as all products of a large mesh. Most vertices have neighbours of the same
+To gather vertices one by one takes as long as all products of a large mesh. Most vertices have neighbors of the same
 partition before and behind them, so most of the mesh can be gathered in blocks; blocks that lie in several partitions
 are put together first.
 """

@@ -69,7 +69,7 @@ def _frames(build: Callable[[], object], text: str) -> Row:
 
 
 def _settled(build: Callable[[], object], text: str) -> Row:
-    """A simulation that is learnt and compared in poses that settle."""
+    """A simulation that is learned and compared in poses that settle."""
     target = TargetSettings(targets.TARGET, max_settle_frames=80, repeatability_poses=0)
     return _tube(TARGETS, build, f"{text}; poses settle", recording=_recording(poses=60, target=target))
 
@@ -77,7 +77,7 @@ def _settled(build: Callable[[], object], text: str) -> Row:
 ROWS: tuple[Row, ...] = (
     _limb(skinning.smooth_weights, "smooth weights alone", is_linear=True),
     _limb(skinning.many_influences, "seven bones a vertex, delta mush"),
-    _tube(SKINNING, skinning.unnormalised, "weights that do not sum to 1, delta mush"),
+    _tube(SKINNING, skinning.unnormalized, "weights that do not sum to 1, delta mush"),
     _tube(SKINNING, skinning.partly_missing, "vertices without weights, delta mush"),
     _limb(skinning.preserve_volume, "Preserve Volume"),
     _limb(skinning.envelopes, "bone envelopes, no vertex groups", is_linear=True),

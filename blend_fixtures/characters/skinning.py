@@ -26,7 +26,7 @@ def many_influences() -> None:
     mush(mesh_object)
 
 
-def unnormalised() -> None:
+def unnormalized() -> None:
     """Weights that sum to anything between 0.1 and 2, and delta mush."""
     mesh_object, _ = tube()
     for vertex in mesh_object.data.vertices:
@@ -156,7 +156,7 @@ def stretched() -> None:
 
 
 SKINNINGS: tuple[Callable[[], None], ...] = (
-    smooth_weights, many_influences, unnormalised, partly_missing, preserve_volume, envelopes,
+    smooth_weights, many_influences, unnormalized, partly_missing, preserve_volume, envelopes,
     envelopes_where_groups_are_missing, b_bones, masked, multi_modifier, two_armatures, non_deforming_bones,
     scaled_bones, stretched,
 )  # fmt: skip

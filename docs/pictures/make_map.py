@@ -30,8 +30,8 @@ WINGS = {
     "rig": ("Blender's data", "#3a7d44"),
     "core.checks": ("without Blender", "#6b5b95"),
 }
-"""From the floor of this room down: what the floors have in common, and their colour."""
-TRAINER, TRAINER_COLOUR = "trainer", "#8a6d3b"
+"""From the floor of this room down: what the floors have in common, and their color."""
+TRAINER, TRAINER_COLOR = "trainer", "#8a6d3b"
 WIDTH, HEIGHT, LANE, GAP = 6.9, 1.72, 0.3, 0.55
 """Of a room, of a place that an arrow holds, and between two of either."""
 FLOOR = 2.45
@@ -184,16 +184,16 @@ def draw(path: Path) -> None:
         # Towards the process that it starts, which is drawn on the right.
         for item in y:
             item.x = -item.x
-    colours, wing = {}, None
+    colors, wing = {}, None
     spans: dict[tuple[str, str], list[int]] = {}
     for floor, row in enumerate(FLOORS):
         wing = next((WINGS[room] for room in row if room in WINGS), wing)
-        colours |= dict.fromkeys(row, wing[1])
+        colors |= dict.fromkeys(row, wing[1])
         spans.setdefault(wing, []).append(floor)
     left = min(item.x - item.width / 2 for row in rows for item in row) - 0.6
     right = max(item.x + item.width / 2 for row in rows for item in row) + 0.6
     trainer = Item(TRAINER, WIDTH, right + 1.6 + WIDTH / 2)
-    rooms[TRAINER], colours[TRAINER] = trainer, TRAINER_COLOUR
+    rooms[TRAINER], colors[TRAINER] = trainer, TRAINER_COLOR
     y[trainer] = y[rooms["training"]]
     low, high = -(len(rows) - 1) * FLOOR - 1.2, 1.2
     end = trainer.x + WIDTH / 2 + 0.7
@@ -202,16 +202,16 @@ def draw(path: Path) -> None:
     axes.set(xlim=(left - 1.2, end), ylim=(low, high))
     axes.axis("off")
     figure.patch.set_facecolor(PAPER)
-    for (text, colour), numbers in spans.items():
+    for (text, color), numbers in spans.items():
         top, bottom = -numbers[0] * FLOOR + FLOOR / 2, -numbers[-1] * FLOOR - FLOOR / 2
-        axes.add_patch(_box(left, bottom + 0.08, right - left, top - bottom - 0.16, colour, 0.07, 0.3))
-        axes.text(left - 0.55, (top + bottom) / 2, text, rotation=90, ha="center", va="center", size=15, color=colour)
+        axes.add_patch(_box(left, bottom + 0.08, right - left, top - bottom - 0.16, color, 0.07, 0.3))
+        axes.text(left - 0.55, (top + bottom) / 2, text, rotation=90, ha="center", va="center", size=15, color=color)
     for room in edges:
         for item in rooms[room].below:
-            _arrow(axes, _curve(rooms[room], item, y), colours[room])
+            _arrow(axes, _curve(rooms[room], item, y), colors[room])
     _draw_trainer(axes, rooms, y)
     for name, item in rooms.items():
-        _draw_room(axes, item, y[item], colours[name])
+        _draw_room(axes, item, y[item], colors[name])
     figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None, dpi=100)
 
 
@@ -219,11 +219,9 @@ def _draw_trainer(axes, rooms: dict[str, Item], y: dict[Item, float]) -> None:
     """The building beside: who starts it, and what it uses of the other."""
     trainer, training, used = rooms[TRAINER], rooms["training"], rooms["core.checks"]
     width, height = trainer.width + 0.6, HEIGHT + 1.3
-    axes.add_patch(
-        _box(trainer.x - width / 2, y[trainer] - HEIGHT / 2 - 0.35, width, height, TRAINER_COLOUR, 0.09, 0.3)
-    )
+    axes.add_patch(_box(trainer.x - width / 2, y[trainer] - HEIGHT / 2 - 0.35, width, height, TRAINER_COLOR, 0.09, 0.3))
     text = "another process, with PyTorch and without Blender"
-    axes.text(trainer.x, y[trainer] + HEIGHT / 2 + 0.45, text, ha="center", size=10, color=TRAINER_COLOUR)
+    axes.text(trainer.x, y[trainer] + HEIGHT / 2 + 0.45, text, ha="center", size=10, color=TRAINER_COLOR)
     # Below its floor, where no room is in the way.
     start, level, turn = training.x + 0.4 * training.width, y[training] - HEIGHT / 2 - 0.4, trainer.x - width / 2 - 0.6
     points = [(start, level + 0.4), (start, level), (turn, level), (turn, y[trainer])]
@@ -233,37 +231,37 @@ def _draw_trainer(axes, rooms: dict[str, Item], y: dict[Item, float]) -> None:
     down, level = trainer.x, y[used]
     points = [(down, y[trainer] - HEIGHT / 2), (down, level + 1), (down, level), (down - 1, level)]
     codes = [Curve.MOVETO, Curve.LINETO, Curve.CURVE3, Curve.CURVE3, Curve.LINETO]
-    _arrow(axes, Curve([*points, (used.x + used.width / 2, level)], codes), TRAINER_COLOUR)
+    _arrow(axes, Curve([*points, (used.x + used.width / 2, level)], codes), TRAINER_COLOR)
 
 
-def _box(x: float, y: float, width: float, height: float, colour: str, alpha: float, radius: float) -> FancyBboxPatch:
+def _box(x: float, y: float, width: float, height: float, color: str, alpha: float, radius: float) -> FancyBboxPatch:
     style = f"round,pad=0,rounding_size={radius}"
-    return FancyBboxPatch((x, y), width, height, boxstyle=style, facecolor=colour, alpha=alpha, linewidth=0, zorder=0)
+    return FancyBboxPatch((x, y), width, height, boxstyle=style, facecolor=color, alpha=alpha, linewidth=0, zorder=0)
 
 
-def _arrow(axes, curve: Curve, colour: str, style: str = "-") -> None:
+def _arrow(axes, curve: Curve, color: str, style: str = "-") -> None:
     axes.add_patch(
         FancyArrowPatch(
-            path=curve, arrowstyle="-|>", mutation_scale=13, color=colour, linewidth=1.5, linestyle=style, zorder=1
+            path=curve, arrowstyle="-|>", mutation_scale=13, color=color, linewidth=1.5, linestyle=style, zorder=1
         )
     )
 
 
-def _draw_room(axes, item: Item, y: float, colour: str) -> None:
+def _draw_room(axes, item: Item, y: float, color: str) -> None:
     x = item.x - item.width / 2
     box = _box(x, y - HEIGHT / 2, item.width, HEIGHT, PAPER, 1.0, 0.16)
-    box.set(edgecolor=colour, linewidth=1.6, zorder=2)
+    box.set(edgecolor=color, linewidth=1.6, zorder=2)
     axes.add_patch(box)
     files = files_of(item.name)
     lines = sum(map(_lines, files))
     count = f"{len(files)} files, {lines:,} lines" if len(files) > 1 else f"{lines:,} lines"
-    axes.text(x + 0.2, y + 0.58, item.name, size=13, weight="bold", color=colour, va="center", zorder=3)
+    axes.text(x + 0.2, y + 0.58, item.name, size=13, weight="bold", color=color, va="center", zorder=3)
     axes.text(x + item.width - 0.2, y + 0.58, count, size=9, color="#666666", ha="right", va="center", zorder=3)
     text = "\n".join(textwrap.wrap(purpose(item.name), SENTENCE, max_lines=2, placeholder=" …"))
     axes.text(x + 0.2, y + 0.33, text, size=9, color=INK, va="top", zorder=3, linespacing=1.3)
     if len(files) > 1:
         names = textwrap.shorten(" ".join(main_files(item.name)), FILES, placeholder="").replace(" ", "  ")
-        axes.text(x + 0.2, y - 0.62, names, size=8.5, color=colour, va="center", zorder=3, family="DejaVu Sans Mono")
+        axes.text(x + 0.2, y - 0.62, names, size=8.5, color=color, va="center", zorder=3, family="DejaVu Sans Mono")
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ def import_cache(path: Path, mesh_object: bpy.types.Object) -> bpy.types.Object:
     count = len(mesh_object.data.vertices)
     found = [o for o in bpy.data.objects if o not in before and o.type == "MESH" and len(o.data.vertices) == count]
     if len(found) != 1:
-        sys.exit(f"'{path}' holds {len(found)} meshes of {count} vertices; export the one that is to be learnt.")
+        sys.exit(f"'{path}' holds {len(found)} meshes of {count} vertices; export the one that is to be learned.")
     return found[0]
 
 

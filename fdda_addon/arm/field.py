@@ -14,7 +14,7 @@ import numpy as np
 class Form(Protocol):
     """A solid with a bounding sphere."""
 
-    centre: np.ndarray
+    center: np.ndarray
     reach: float
 
     def distance(self, points: np.ndarray) -> np.ndarray: ...
@@ -55,16 +55,16 @@ def smooth_curve(at: np.ndarray, knots: np.ndarray, values: np.ndarray) -> np.nd
 
 
 class Ellipsoid:
-    """centre (3,), radii (3,) along the rows of `frame` (3, 3), metres."""
+    """center (3,), radii (3,) along the rows of `frame` (3, 3), metres."""
 
-    def __init__(self, centre, radii, frame=None):
-        self.centre = np.asarray(centre, float)
+    def __init__(self, center, radii, frame=None):
+        self.center = np.asarray(center, float)
         self.radii = np.asarray(radii, float)
         self.frame = np.eye(3) if frame is None else frame
         self.reach = float(self.radii.max())
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        local = (points - self.centre) @ self.frame.T / self.radii
+        local = (points - self.center) @ self.frame.T / self.radii
         k0 = np.sqrt(np.einsum("ij,ij->i", local, local))
         scaled = local / self.radii
         k1 = np.sqrt(np.einsum("ij,ij->i", scaled, scaled))
@@ -75,19 +75,19 @@ class HalfSpace:
     """Everything on the side of `point` (3,) that `outward` (3,) looks away from."""
 
     def __init__(self, point, outward):
-        self.centre = np.asarray(point, float)
+        self.center = np.asarray(point, float)
         self.outward = np.asarray(outward, float)
         self.reach = np.inf
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        return (points - self.centre) @ self.outward
+        return (points - self.center) @ self.outward
 
 
 class Loft:
-    """A limb: cross-sections along a straight axis, each with its own centre and four half-widths.
+    """A limb: cross-sections along a straight axis, each with its own center and four half-widths.
 
     origin (3,): where station 0 is. frame: rows along, side, up. stations: (k, 7) float, columns
-    along, centre side, centre up, half-width to +side, -side, +up, -up; metres. caps: how far the rounded ends reach
+    along, center side, center up, half-width to +side, -side, +up, -up; metres. caps: how far the rounded ends reach
     in from the first and last station. power: 2 is an ellipse, more is boxier.
     """
 
@@ -98,7 +98,7 @@ class Loft:
         self.caps = caps
         self.power = power
         first, last = self.stations[0, 0], self.stations[-1, 0]
-        self.centre = self.origin + self.frame[0] * (first + last) / 2
+        self.center = self.origin + self.frame[0] * (first + last) / 2
         self.reach = float((last - first) / 2 + np.abs(self.stations[:, 1:]).max() * 1.5)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
@@ -161,7 +161,7 @@ class Field:
         """For each stroke, the points that it may matter to: those near its form."""
         near = []
         for stroke in self.strokes:
-            offset = points - stroke.form.centre
+            offset = points - stroke.form.center
             limit = stroke.form.reach + stroke.blend + 0.03
             near.append(np.flatnonzero(np.einsum("ij,ij->i", offset, offset) < limit * limit))
         return near

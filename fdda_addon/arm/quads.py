@@ -50,7 +50,7 @@ class Grid:
     digit: (n,) int, -1 for arm and palm, else 0 for the thumb, 1..4 from index to little finger.
     column: (n,) int, in the palm the finger 1..4 in whose columns a vertex runs.
     plane_point, plane_normal (n, 3), plane_hold (n,) 0..1: the plane of a vertex's ring, and how firmly it keeps to it.
-    loose: (n,) bool, to be drawn out between its neighbours before anything else.
+    loose: (n,) bool, to be drawn out between its neighbors before anything else.
     seats: n of them. sheets: vertices of each sheet, (rows, columns) int, -1 where it has a hole.
     """
 

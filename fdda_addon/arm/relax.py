@@ -7,8 +7,8 @@ from .field import Field
 from .quads import Grid
 
 
-def neighbour_table(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(count, k) int neighbours along edges, rows filled up with the vertex itself, and (count,) how many are real."""
+def neighbor_table(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(count, k) int neighbors along edges, rows filled up with the vertex itself, and (count,) how many are real."""
     edges = np.concatenate([faces[:, [i, (i + 1) % 4]] for i in range(4)])
     edges = np.unique(np.sort(edges, axis=1), axis=0)
     both = np.concatenate([edges, edges[:, ::-1]])
@@ -21,12 +21,12 @@ def neighbour_table(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarr
 
 
 def draw_out(grid: Grid) -> np.ndarray:
-    """(n, 3) float64: the grid's points, the loose ones moved to the middle of their neighbours, like a soap film.
+    """(n, 3) float64: the grid's points, the loose ones moved to the middle of their neighbors, like a soap film.
 
     From there the surface is reached without folds.
     """
     x = grid.points.copy()
-    table, valence = neighbour_table(grid.faces, len(x))
+    table, valence = neighbor_table(grid.faces, len(x))
     loose = np.flatnonzero(grid.loose)
     near, count = table[loose], valence[loose, None]
     spare = table.shape[1] - count
@@ -41,7 +41,7 @@ def relax(points: np.ndarray, grid: Grid, field: Field, rounds: int) -> np.ndarr
     The step is Newton's, inside the vertex's plane as far as the plane holds it, at most 6 mm long.
     """
     x = points.copy()
-    table, valence = neighbour_table(grid.faces, len(x))
+    table, valence = neighbor_table(grid.faces, len(x))
     spare = table.shape[1] - valence
     normal, hold = grid.plane_normal, grid.plane_hold[:, None]
     outward = np.zeros_like(x)

@@ -93,14 +93,14 @@ def _mesh_object(surface: Surface) -> bpy.types.Object:
     return arm
 
 
-def _material(name: str, colour: tuple[float, float, float, float], roughness: float) -> bpy.types.Material:
+def _material(name: str, color: tuple[float, float, float, float], roughness: float) -> bpy.types.Material:
     material = bpy.data.materials.new(name)
-    material.diffuse_color = colour
+    material.diffuse_color = color
     material.roughness = roughness
     if material.node_tree is None:
         material.use_nodes = True
     shader = material.node_tree.nodes["Principled BSDF"]
-    shader.inputs["Base Color"].default_value = colour
+    shader.inputs["Base Color"].default_value = color
     shader.inputs["Roughness"].default_value = roughness
     shader.inputs["Subsurface Weight"].default_value = 0.15
     shader.inputs["Subsurface Scale"].default_value = 0.01

@@ -13,7 +13,7 @@ from .joints import FINGERS, HAND, joint
 
 _X, _Z = np.array([1.0, 0, 0]), np.array([0.0, 0, 1.0])
 
-# x, centre y, centre z, half-width to +y (triceps, little finger), -y (biceps, thumb), +z (back), -z (palm)
+# x, center y, center z, half-width to +y (triceps, little finger), -y (biceps, thumb), +z (back), -z (palm)
 _LIMB = [
     (-0.070, 0.000, -0.002, 0.048, 0.047, 0.046, 0.050),
     (0.020, 0.000, -0.002, 0.047, 0.045, 0.044, 0.050),
@@ -52,8 +52,8 @@ def _belly(start, end, width: float, thickness: float, out, peak: float = 0.45, 
     return Loft(start, frame_along(end - start, out), stations, caps=(0.012, 0.012))
 
 
-def _ball(centre, *radii) -> Ellipsoid:
-    return Ellipsoid(centre, radii if len(radii) == 3 else (radii[0],) * 3)
+def _ball(center, *radii) -> Ellipsoid:
+    return Ellipsoid(center, radii if len(radii) == 3 else (radii[0],) * 3)
 
 
 def _upper_arm() -> list[Stroke]:
@@ -130,7 +130,7 @@ def _palm() -> list[Stroke]:
 
 
 def _finger_form(name: str) -> list[Stroke]:
-    """The free finger as a loft along its first phalanx, the centre line bending with the bones."""
+    """The free finger as a loft along its first phalanx, the center line bending with the bones."""
     bones = [joint(f"{name}_{i}") for i in (1, 2, 3)]
     heads = [np.array(bone.head) for bone in bones] + [np.array(bones[-1].tail)]
     frame = frame_along(heads[1] - heads[0], _Z)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The tube of quads from the shoulder to the webs of the fingers.
 
-Around it run the columns of a modelled hand: each finger's own on the back and on the palm, narrow web columns between
+Around it run the columns of a modeled hand: each finger's own on the back and on the palm, narrow web columns between
 them, and two sides. An address counts them from the thumb's side across the back, down the little finger's side, back
 across the palm and up the thumb's side.
 """
@@ -100,7 +100,7 @@ def _ring_places(ring: np.ndarray) -> np.ndarray:
     density = 1.0 / np.interp(fine, _SPACING[:, 0], _SPACING[:, 1])
     count = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(fine))])
     at = np.interp([_START_X, UPPER_ARM_LENGTH, WRIST_X, _END_X], fine, count)
-    # A smooth map from ring number to count keeps neighbouring spacings alike across the joints.
+    # A smooth map from ring number to count keeps neighboring spacings alike across the joints.
     return np.interp(smooth_curve(ring, _marks(DIVISIONS[1].rings), at[:, None])[:, 0], count, fine)
 
 

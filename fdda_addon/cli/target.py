@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Options about a target: another object whose surface is learnt in place of the rig's own."""
+"""Options about a target: another object whose surface is learned in place of the rig's own."""
 
 import argparse
 import math

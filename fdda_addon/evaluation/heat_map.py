@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Colours over meshes in the viewport: their errors as a heat map, or their partitions.
+"""Colors over meshes in the viewport: their errors as a heat map, or their partitions.
 
 They are drawn over what Blender evaluates, so nothing of the file is touched, and they follow the animation. Which
 meshes are painted lasts for the session; without a window nothing is drawn.
@@ -29,7 +29,7 @@ BONE, SELECTED, ACTIVE = (0.75, 0.75, 0.75, 1.0), (0.3, 0.85, 1.0, 1.0), (1.0, 1
 
 @dataclass(frozen=True)
 class Paint:
-    """What a mesh is painted with: ERRORS or PARTITIONS, and for those their (V, 3) sRGB colours and number."""
+    """What a mesh is painted with: ERRORS or PARTITIONS, and for those their (V, 3) sRGB colors and number."""
 
     kind: str
     colors: np.ndarray | None = None
@@ -83,12 +83,12 @@ def painted(mesh_object: bpy.types.Object) -> str:
 
 
 def is_hidden(mesh_object: bpy.types.Object) -> bool:
-    """Whether the colours of a mesh could not be drawn: it is edited, or a modifier changes its topology."""
+    """Whether the colors of a mesh could not be drawn: it is edited, or a modifier changes its topology."""
     return mesh_object.session_uid in _hidden
 
 
 def colors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
-    """The colours of a painted mesh at the current frame: (V, 3) float32 sRGB, None when there is nothing to show."""
+    """The colors of a painted mesh at the current frame: (V, 3) float32 sRGB, None when there is nothing to show."""
     paint = _painted.get(mesh_object.session_uid)
     if paint is None:
         return None
@@ -108,7 +108,7 @@ def errors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
 
 
 def fitting_range_mm(mesh_object: bpy.types.Object) -> float:
-    """A range in mm in which the errors that are shown have colours from blue to red: nearly the largest of them."""
+    """A range in mm in which the errors that are shown have colors from blue to red: nearly the largest of them."""
     errors = errors_of(mesh_object)
     return 0.0 if errors is None else float(f"{np.percentile(errors, 99.5) * 1000:.2g}")
 
@@ -144,7 +144,7 @@ def _sheets(context: bpy.types.Context) -> list["overlay.OverlayMesh"]:
 
 
 def _sticks(context: bpy.types.Context) -> list["overlay.OverlayBone"]:
-    """The bones of armatures in pose mode whose mesh is painted: the colours would hide them."""
+    """The bones of armatures in pose mode whose mesh is painted: the colors would hide them."""
     found = []
     for mesh_object in context.view_layer.objects:
         armature_object = armature_of(mesh_object) if mesh_object.session_uid in _painted else None
@@ -160,7 +160,7 @@ def _sticks(context: bpy.types.Context) -> list["overlay.OverlayBone"]:
 
 
 def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:
-    """Lines below the colours, and the range of the heat map in mm, None where no errors are shown."""
+    """Lines below the colors, and the range of the heat map in mm, None where no errors are shown."""
     uids = {o.session_uid: o for o in context.view_layer.objects if o.session_uid in _painted}
     active = context.view_layer.objects.active
     chosen = uids.get(active.session_uid) if active else None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draws meshes with a colour for each vertex, and a legend, over the 3D viewports."""
+"""Draws meshes with a color for each vertex, and a legend, over the 3D viewports."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from ..scene.arrays import TRIANGLE, VECTOR, read
 from ..scene.mesh import mesh_positions
 
 TOWARDS_VIEWER = 2e-5
-"""How far the colours lie before the mesh, in depth: enough to cover it, too little to show through another."""
+"""How far the colors lie before the mesh, in depth: enough to cover it, too little to show through another."""
 STICK_PIXELS = 3
 VERTEX = """
 void main()
@@ -41,7 +41,7 @@ _triangles: dict[int, tuple[tuple[int, int], gpu.types.GPUIndexBuf]] = {}
 
 @dataclass(frozen=True)
 class OverlayMesh:
-    """A mesh: (V, 3) float32 positions and normals in its own space, sRGB colours, triangles, and its matrix_world."""
+    """A mesh: (V, 3) float32 positions and normals in its own space, sRGB colors, triangles, and its matrix_world."""
 
     positions: np.ndarray
     normals: np.ndarray
@@ -52,7 +52,7 @@ class OverlayMesh:
 
 @dataclass(frozen=True)
 class OverlayBone:
-    """A bone: its ends in world space, and its colour, RGBA."""
+    """A bone: its ends in world space, and its color, RGBA."""
 
     head: tuple[float, float, float]
     tail: tuple[float, float, float]
@@ -87,7 +87,7 @@ def stop() -> None:
 
 
 def sheet(context: bpy.types.Context, mesh_object: bpy.types.Object, colors: np.ndarray) -> OverlayMesh | None:
-    """What Blender shows of an object, with other colours; None when its modifiers change the topology."""
+    """What Blender shows of an object, with other colors; None when its modifiers change the topology."""
     evaluated = mesh_object.evaluated_get(context.evaluated_depsgraph_get())
     mesh = evaluated.data
     if evaluated.mode == "EDIT" or len(mesh.vertices) != len(colors):

@@ -86,7 +86,7 @@ def draw(
         title: a line above all.
         view: from where.
         heat_scale: draw the scale of the heat map below all.
-        sculpted: light that shows the shape; else light that shows the colours.
+        sculpted: light that shows the shape; else light that shows the colors.
 
     Raises:
         OutputError: the file cannot be written, or the machine lacks what Workbench needs.
@@ -133,8 +133,8 @@ class _Picture:
             for c, cell in enumerate(row):
                 left = gap + c * step[0]
                 self._text(cell.label, (left, -(top + r * step[1] + 1.4 * text)), text)
-                centre = (left + size[0] / 2, -(top + r * step[1] + 2.4 * text + size[1] / 2))
-                self._cell(template, cell, centre)
+                center = (left + size[0] / 2, -(top + r * step[1] + 2.4 * text + size[1] / 2))
+                self._cell(template, cell, center)
         bottom = top + len(rows) * step[1]
         if heat_scale:
             self._scale((gap, -(bottom + 1.2 * text)), text)
@@ -150,11 +150,11 @@ class _Picture:
         self._made += [made, *([data] if data is not None else [])]
         return made
 
-    def _cell(self, template: "_Template", cell: Cell, centre: tuple[float, float]) -> None:
+    def _cell(self, template: "_Template", cell: Cell, center: tuple[float, float]) -> None:
         projected = (cell.positions @ self._axes.T).astype(np.float32)
         middle = (projected.max(axis=0) + projected.min(axis=0)) / 2
         made = self._add("cell", template.mesh(projected - middle, cell.colors))
-        self._place(made, *centre)
+        self._place(made, *center)
 
     def _text(self, words: str, place: tuple[float, float], size: float) -> None:
         curve = bpy.data.curves.new("text", "FONT")
@@ -164,7 +164,7 @@ class _Picture:
         self._place(made, *place)
 
     def _scale(self, place: tuple[float, float], text: float) -> None:
-        """The colours of the heat map: a box for no error, a strip from the first to the last stop."""
+        """The colors of the heat map: a box for no error, a strip from the first to the last stop."""
         x, y = place
         box = 1.2 * text
         self._strip((x, y - box), (box, box), np.array([NO_ERROR_COLOR, NO_ERROR_COLOR]))
@@ -245,7 +245,7 @@ class _Template:
         self._loop_starts, self._loop_vertices = topology(mesh)
 
     def mesh(self, positions: np.ndarray, colors: np.ndarray) -> bpy.types.Mesh:
-        """A mesh with (V, 3) positions and (V, 3) sRGB colours."""
+        """A mesh with (V, 3) positions and (V, 3) sRGB colors."""
         mesh = bpy.data.meshes.new("cell")
         mesh.vertices.add(self._vertices)
         mesh.loops.add(len(self._loop_vertices))
@@ -268,6 +268,6 @@ def _paint(mesh: bpy.types.Mesh, colors: np.ndarray) -> None:
 
 
 def _linear(srgb: object) -> np.ndarray:
-    """sRGB to linear colour (IEC 61966-2-1)."""
+    """sRGB to linear color (IEC 61966-2-1)."""
     srgb = np.asarray(srgb, np.float64)
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The pictures of an evaluation: partitions in colour; rig, linear skinning and model side by side, or as heat."""
+"""The pictures of an evaluation: partitions in color; rig, linear skinning and model side by side, or as heat."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +43,7 @@ def worst_poses(errors: PoseErrors) -> list[PicturedPose]:
 
 
 def draw_partitions(scene_rig: SceneRig, path: Path, view: View = View()) -> None:  # noqa: B008 - frozen
-    """Draw the rest pose with a colour for each partition.
+    """Draw the rest pose with a color for each partition.
 
     Raises:
         OutputError: the file cannot be written.
@@ -71,7 +71,7 @@ def draw_comparison(
         scene_rig: the rig. model: bound or not.
         poses: what to draw.
         path: of the PNG file.
-        heat: colour each vertex by its distance from the true rig.
+        heat: color each vertex by its distance from the true rig.
         true: what the positions of the poses are of.
 
     Raises:

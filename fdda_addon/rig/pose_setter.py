@@ -222,7 +222,7 @@ def _roll_in(target: Target, player: ClipPlayer, clip: Clip, first: int) -> None
 
 def _between(name: str, start: np.ndarray, end: np.ndarray, part: np.float32) -> np.ndarray:
     if name == "rotation_quaternion":
-        # The shorter way; Blender normalises.
+        # The shorter way; Blender normalizes.
         end = np.where((start * end).sum(axis=1, keepdims=True) < 0, -end, end)
     return start + part * (end - start)
 

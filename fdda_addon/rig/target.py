@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A target: another object, of the same vertices, whose surface is learnt in place of the rig's own."""
+"""A target: another object, of the same vertices, whose surface is learned in place of the rig's own."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The example of docs/simulations.md, as a user runs it: a cache is made, its stack thrown away, the cache learnt."""
+"""The example of docs/simulations.md, as a user runs it: a cache is made, its stack thrown away, the cache learned."""
 
 import json
 import os
@@ -37,7 +37,7 @@ def make_cache(path: Path, mesh_object: bpy.types.Object) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["abc", "pc2"])
-def test_a_cache_is_learnt_from_files_alone(suffix, tmp_path):
+def test_a_cache_is_learned_from_files_alone(suffix, tmp_path):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh_object, _ = build_elbow()
     cache, rig, out = tmp_path / f"elbow.{suffix}", tmp_path / "rig.blend", tmp_path / "out"

@@ -125,7 +125,7 @@ def test_bones_that_are_no_joints_may_come_go_and_change_places(bound, elbow, wh
 def test_an_edit_that_changes_nothing_of_the_rig(bound, elbow):
     edit(bound, lambda: bpy.ops.mesh.select_all(action="SELECT"))
     bound.vertex_groups.new(name="no bone").add([0, 5], 0.5, "REPLACE")
-    bound.data.attributes.new("colour", "FLOAT_COLOR", "POINT")
+    bound.data.attributes.new("color", "FLOAT_COLOR", "POINT")
     look("update")
     pose(angle=1.1)
     assert_plays(bound, elbow.model)

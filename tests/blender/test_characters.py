@@ -40,7 +40,7 @@ def parameter(row: Row) -> object:
 
 
 @pytest.mark.parametrize("row", map(parameter, ROWS))
-def test_a_character_is_learnt_and_played(row: Row, tmp_path: Path):
+def test_a_character_is_learned_and_played(row: Row, tmp_path: Path):
     for recording, model in record_row(row, tmp_path):
         train(recording, model, "--epochs", row.epochs, *SMALL)
     results = compare_row(row, tmp_path)

@@ -41,7 +41,7 @@ def test_help(arguments, capfd):
         ["record", "a.blend", "b", "--spread", "0"],
         ["record", "a.blend", "b", "--spread", "nan"],
         ["record", "a.blend", "b", "--spread", "inf"],
-        ["record", "a.blend", "b", "--colour"],
+        ["record", "a.blend", "b", "--color"],
         ["record", "a.blend", "b", "--overwrite", "--resume"],
         ["record", "a.blend", "b", "--max-settle-frames", "3"],
         ["record", "a.blend", "b", "--pre-roll", "3"],
@@ -56,7 +56,7 @@ def test_help(arguments, capfd):
         ["benchmark", "a.blend", "m.onnx", "--json", "b.json", "--frames", "0"],
         ["train"],
         ["train", "recording", "m.onnx", "--activation", "step"],
-        ["train", "recording", "m.onnx", "--colour", "red"],
+        ["train", "recording", "m.onnx", "--color", "red"],
     ],
     ids=" ".join,
 )

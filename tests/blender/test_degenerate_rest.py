@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rest poses that no model can be learnt of are refused before any work, with what to do about them."""
+"""Rest poses that no model can be learned of are refused before any work, with what to do about them."""
 
 import math
 

@@ -176,7 +176,7 @@ def test_heat_map(elbow, tmp_path):
     assert path.read_bytes().startswith(b"\x89PNG")
     picture = pixels(path)[..., :3]
     assert min(picture.shape[:2]) > 300
-    # Green where there is no error, and colours of the scale that are not: linear skinning is off by millimetres.
+    # Green where there is no error, and colors of the scale that are not: linear skinning is off by millimetres.
     green = (picture[..., 1] > 1.5 * picture[..., 0]) & (picture[..., 1] > 1.5 * picture[..., 2])
     blue = picture[..., 2] > 1.3 * picture[..., 1]
     assert green.mean() > 0.02 and blue.mean() > 0.02

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A face of bones, shape keys and correctives: learnt from its controls, and played by an action it has not seen."""
+"""A face of bones, shape keys and correctives: learned from its controls, and played by an action it has not seen."""
 
 import json
 from pathlib import Path

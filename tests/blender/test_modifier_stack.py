@@ -78,7 +78,7 @@ def test_what_makes_vertices_after_the_rig_works_on_what_the_model_gives(loose_m
     bind(rig, loose_model)
     playing = evaluated(rig.mesh_object)
     assert len(playing) == len(true) > 8 * len(rig.mesh_object.data.vertices)
-    # The mush of this character is not quite the one that the model has learnt.
+    # The mush of this character is not quite the one that the model has learned.
     assert np.linalg.norm(playing - true, axis=1).mean() < 0.002
     assert [m.name for m in rig.mesh_object.modifiers if m.show_viewport] == [
         "FDDA", "Subdivision", "Thickness", "Detail",

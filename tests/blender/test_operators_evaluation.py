@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operators of the section Evaluation: figures, colours and markers are those of the evaluation itself."""
+"""The operators of the section Evaluation: figures, colors and markers are those of the evaluation itself."""
 
 import bpy
 import numpy as np
@@ -73,7 +73,7 @@ def test_what_cannot_be_evaluated_says_why(active):
     assert last_evaluation.get(active) is None and active.fdda.mode == "FDDA"
 
 
-def test_colours_are_those_of_the_report(active, evaluated_action, view):
+def test_colors_are_those_of_the_report(active, evaluated_action, view):
     bpy.ops.fdda.color_mesh()
     assert heat_map.painted(active) == "ERRORS"
     errors = evaluated_action.errors
@@ -90,7 +90,7 @@ def test_colours_are_those_of_the_report(active, evaluated_action, view):
     assert heat_map.colors_of(active) is None and heat_map.painted(active) == ""
 
 
-def test_colours_follow_the_timeline(active, evaluated_action, view):
+def test_colors_follow_the_timeline(active, evaluated_action, view):
     bpy.ops.fdda.color_mesh()
     view.statistic = "pose"
     for frame in (evaluated_action.first_frame, 12):
@@ -103,7 +103,7 @@ def test_colours_follow_the_timeline(active, evaluated_action, view):
     refused(bpy.ops.fdda.fit_color_range, "choose another frame, or show the mean")
 
 
-def test_partitions_in_colour(active):
+def test_partitions_in_color(active):
     bpy.ops.fdda.color_mesh(colors="PARTITIONS")
     colors, partitions = heat_map.colors_of(active), make_partitions(read_rig(find_rig()))
     assert [len(np.unique(colors[p.vertices], axis=0)) for p in partitions] == [1, 1]
@@ -111,7 +111,7 @@ def test_partitions_in_colour(active):
     heat_map.clear_all()
 
 
-def test_nothing_of_the_file_is_touched_by_colours(active, evaluated_action):
+def test_nothing_of_the_file_is_touched_by_colors(active, evaluated_action):
     def datablocks():
         attributes = [attribute.name for attribute in active.data.attributes]
         return attributes, len(bpy.data.objects), len(bpy.data.materials), [m.name for m in active.modifiers]

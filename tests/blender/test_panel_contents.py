@@ -143,7 +143,7 @@ class TestFolder:
 
 
 class TestTraining:
-    def test_curves_fall_in_their_colours(self):
+    def test_curves_fall_in_their_colors(self):
         falling = {"training": [1.0, 0.1, 0.01], "validation": [2.0, 0.2, 0.02]}
         pixels = curves.paint(falling)
         assert pixels.shape == (curves.HEIGHT, curves.WIDTH, 4) and pixels.dtype == np.float32

@@ -149,7 +149,7 @@ def test_disabled_and_enabled(bound, elbow, capfd):
 
 
 def test_a_file_that_was_saved_by_itself(bound, elbow, tmp_path):
-    """An auto-save calls no handler. Where the add-on is missing, the mesh is as it was modelled, not a point."""
+    """An auto-save calls no handler. Where the add-on is missing, the mesh is as it was modeled, not a point."""
     handlers = [bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:]]
     bpy.app.handlers.save_pre.clear()
     bpy.app.handlers.save_post.clear()

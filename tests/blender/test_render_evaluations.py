@@ -40,12 +40,12 @@ def test_obj(character, tmp_path):
 
 
 def test_bake(character):
-    """Cycles bakes where each vertex is into a colour attribute."""
+    """Cycles bakes where each vertex is into a color attribute."""
     bound, shown, other = character
     scene = bpy.context.scene
     scene.render.engine, scene.cycles.samples = "CYCLES", 1
-    colours = bound.data.attributes.new("baked", "FLOAT_COLOR", "POINT")
-    bound.data.attributes.active_color = colours
+    colors = bound.data.attributes.new("baked", "FLOAT_COLOR", "POINT")
+    bound.data.attributes.active_color = colors
     if not bound.data.materials:
         bound.data.materials.append(bpy.data.materials.new("plain"))
     bpy.ops.object.select_all(action="DESELECT")

@@ -42,7 +42,7 @@ def plain(mesh_object: bpy.types.Object) -> None:
     pass
 
 
-def unnormalised(mesh_object: bpy.types.Object) -> None:
+def unnormalized(mesh_object: bpy.types.Object) -> None:
     for vertex in range(0, 40, 3):
         mesh_object.vertex_groups["upper"].add([vertex], 0.9, "REPLACE")
         mesh_object.vertex_groups["lower"].add([vertex], 0.7, "REPLACE")
@@ -105,7 +105,7 @@ def a_bone_that_does_not_deform(mesh_object: bpy.types.Object) -> None:
 
 
 CASES = (
-    *(plain, unnormalised, missing, without_groups, mask, inverted_mask, envelopes, narrow_envelopes),
+    *(plain, unnormalized, missing, without_groups, mask, inverted_mask, envelopes, narrow_envelopes),
     *(envelopes_where_groups_are_missing, multiplied, a_bone_that_does_not_deform),
 )
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Recordings of a target: another object whose surface is learnt in place of the rig's own."""
+"""Recordings of a target: another object whose surface is learned in place of the rig's own."""
 
 import json
 from pathlib import Path

@@ -56,7 +56,7 @@ WEB_FILES = (".js", ".mjs", ".css", ".html")
 PYTHON_FILES = {str(path): text for path, text in sorted(text_files()) if path.suffix == ".py"}
 
 
-def test_files_of_web_pages_name_their_licence():
+def test_files_of_web_pages_name_their_license():
     texts = {str(path): text for path, text in text_files() if path.suffix in WEB_FILES}
     assert texts and [path for path, text in texts.items() if SPDX[2:] not in "".join(text.splitlines()[:2])] == []
 

@@ -64,7 +64,7 @@ def test_what_another_joint_does_in_few_poses_is_no_flip():
 
 @pytest.fixture
 def many() -> Recording:
-    """Enough poses for neighbours in all inputs: a joint or two, and a control."""
+    """Enough poses for neighbors in all inputs: a joint or two, and a control."""
     return good_recording(1000)
 
 
@@ -97,7 +97,7 @@ def test_alike_poses_are_near():
     assert len(find_similar_poses(np.ones((300, 4)), 0.2)) == 0
 
 
-def test_equal_poses_are_no_neighbours():
+def test_equal_poses_are_no_neighbors():
     values = np.repeat(np.random.default_rng(0).uniform(0, 1, (100, 1)), 3, axis=0)
     pairs = find_similar_poses(values, 0.2)
     assert len(pairs) and (values[pairs[:, 0]] != values[pairs[:, 1]]).all()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Error statistics in mm, and the colours of heat maps."""
+"""Error statistics in mm, and the colors of heat maps."""
 
 import numpy as np
 import pytest
@@ -68,7 +68,7 @@ def test_more_error_is_more_red():
     assert (np.diff(reds) > 0).all()
 
 
-def test_a_narrower_range_moves_the_colours_and_not_what_counts_as_none():
+def test_a_narrower_range_moves_the_colors_and_not_what_counts_as_none():
     np.testing.assert_allclose(heat_colors(np.array([0.0005, 0.001]), 0.001), [VIOLET, RED], atol=1e-5)
     assert np.array_equal(heat_colors(np.array([0.5e-6]), 0.001)[0], np.float32(NO_ERROR_COLOR))
 

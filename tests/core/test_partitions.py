@@ -53,7 +53,7 @@ def test_residual_changes_are_the_largest_distance_in_each_partition():
     np.testing.assert_allclose(max_residual_changes(partitions, moved[1:], base[1:]), expected[1:], atol=1e-6)
 
 
-def test_every_partition_has_one_colour_of_its_own():
+def test_every_partition_has_one_color_of_its_own():
     partitions = partitions_of(make_rig())
     colors = partition_colors(partitions, VERTICES)
     assert colors.shape == (VERTICES, 3) and colors.dtype == np.float32 and colors.max() <= 1

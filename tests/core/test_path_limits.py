@@ -120,7 +120,7 @@ def test_names_that_differ_by_letter_case_alone(tmp_path, monkeypatch, system):
         check_outputs(outputs)
 
 
-def test_a_file_that_is_read_is_recognised_in_other_letters(tmp_path):
+def test_a_file_that_is_read_is_recognized_in_other_letters(tmp_path):
     (tmp_path / "rig.blend").write_bytes(b"BLENDER")
     if not os.path.exists(tmp_path / "RIG.blend"):
         pytest.skip("this disk tells small letters from capital ones")

@@ -138,7 +138,7 @@ def sliders(turns: Turns) -> list[str]:
 
 
 def mesh_part(view: np.ndarray) -> np.ndarray:
-    """(H, W), where the mesh is: it is light and grey, the ground is dark and the axes are colourful."""
+    """(H, W), where the mesh is: it is light and gray, the ground is dark and the axes are colorful."""
     return (view.min(axis=-1) > 0.3) & (np.ptp(view, axis=-1) < 0.08)
 
 

@@ -36,7 +36,7 @@ MODIFIERS = ["ARMATURE", "CORRECTIVE_SMOOTH"]
 PLAY_SECONDS, SLOW_SECONDS = 4, 30
 """The second where the processor draws, and is busy."""
 COLORED = 0.01
-"""Part of the viewport that the arm takes, at least; without colours it is 0.001."""
+"""Part of the viewport that the arm takes, at least; without colors it is 0.001."""
 
 _rig_shape: np.ndarray | None = None
 _model_shape: np.ndarray | None = None
@@ -264,7 +264,7 @@ def evaluate(_folder: Path) -> Iterator[float]:
 
 
 def show_the_heat_map(folder: Path) -> Iterator[float]:
-    """Press Heat Map: the errors as colours on the arm."""
+    """Press Heat Map: the errors as colors on the arm."""
     yield from _paint("ERRORS", folder)
 
 
@@ -285,7 +285,7 @@ def _paint(colors: str, folder: Path) -> Iterator[float]:
     yield from picture(shown)
     vivid = vivid_part(shown)
     shown.unlink()
-    check(vivid > COLORED, f"{100 * vivid:.2f} % of the viewport has a colour")
+    check(vivid > COLORED, f"{100 * vivid:.2f} % of the viewport has a color")
 
 
 def mark_the_worst_frames(_folder: Path) -> Iterator[float]:

@@ -28,7 +28,7 @@ LACKING = 3
 FEW_VALUES = 32
 STORIES = ("path", "work", "shot", "cast", "ranges", "flesh", "session", "leave", "back")
 """Each in a Blender of its own, with the files of those before: the path of a first model, the work with it, what a
-shot takes, several characters, ranges of motion, a simulation that is learnt, what a long session must not spoil, a
+shot takes, several characters, ranges of motion, a simulation that is learned, what a long session must not spoil, a
 Blender that is closed while it trains, and the next one."""
 LONG = ("endure",)
 """Run by name alone: five minutes of work with one character."""
@@ -89,14 +89,14 @@ def run(command: list[str], environment: dict[str, str], seconds: float, output:
 
 
 def is_one_color(picture: Path) -> bool:
-    """Whether a PNG file is a single colour, as of a screen on which nothing was drawn."""
+    """Whether a PNG file is a single color, as of a screen on which nothing was drawn."""
     data, place, packed = picture.read_bytes(), 8, b""
     while place < len(data):
         length, kind = struct.unpack(">I4s", data[place : place + 8])
         if kind == b"IDAT":
             packed += data[place + 8 : place + 8 + length]
         place += 12 + length
-    # Stored are differences of neighbours: of a single colour there are but a few.
+    # Stored are differences of neighbors: of a single color there are but a few.
     return len(set(zlib.decompress(packed))) < FEW_VALUES
 
 

@@ -17,7 +17,7 @@ MOMENT = 0.03
 DRAWING = 0.25
 """Seconds until a region that was tagged is on the screen."""
 VIVID = 0.45
-"""Difference between the strongest and the weakest channel from which on a pixel has a colour."""
+"""Difference between the strongest and the weakest channel from which on a pixel has a color."""
 
 
 class StepError(Exception):
@@ -185,7 +185,7 @@ def pixels(path: Path) -> np.ndarray:
 
 
 def vivid_part(path: Path) -> float:
-    """Which part of the viewport in a picture has a strong colour. Left out are the lowest quarter, where the legend
+    """Which part of the viewport in a picture has a strong color. Left out are the lowest quarter, where the legend
     is, and the highest, where the gizmos are."""
     view, sidebar = region("WINDOW"), region("UI")
     low, high = view.y + view.height // 4, view.y + view.height * 3 // 4

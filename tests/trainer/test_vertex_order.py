@@ -12,7 +12,7 @@ from trainer.vertex_order import VertexOrder, vertex_order
 
 
 def in_strips(vertices: int, strip: int, partitions: int) -> list[np.ndarray]:
-    """Partitions of strips of neighbours by turns."""
+    """Partitions of strips of neighbors by turns."""
     owner = np.arange(vertices) // strip % partitions
     return [np.flatnonzero(owner == number) for number in range(partitions)]
 
@@ -50,7 +50,7 @@ def test_every_vertex_has_one_column():
 
 
 @pytest.mark.parametrize(("strip", "blocks"), [(500, True), (1, False), (100_000, True)])
-def test_blocks_only_where_neighbours_are_of_one_partition(strip, blocks):
+def test_blocks_only_where_neighbors_are_of_one_partition(strip, blocks):
     assert (vertex_order(in_strips(50_000, strip, 5)).size > 1) == blocks
 
 

@@ -58,7 +58,7 @@ export function fillPanel(info, pose, changed) {
   refresh();
 }
 
-/** A labelled slider; `row` is its element. */
+/** A labeled slider; `row` is its element. */
 class Slider {
   constructor(label, id, low, high, step, unit, changed) {
     this.unit = unit;

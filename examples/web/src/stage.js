@@ -54,8 +54,8 @@ export class Stage {
     this.geometry.setIndex(new BufferAttribute(triangles, 1));
     this.geometry.setAttribute("position", new BufferAttribute(positions.slice(), 3).setUsage(DynamicDrawUsage));
     this.geometry.computeVertexNormals();
-    const grey = new MeshStandardMaterial({ color: 0xc4c4c4, roughness: 0.55, side: DoubleSide });
-    const mesh = new Mesh(this.geometry, grey);
+    const gray = new MeshStandardMaterial({ color: 0xc4c4c4, roughness: 0.55, side: DoubleSide });
+    const mesh = new Mesh(this.geometry, gray);
     mesh.frustumCulled = false; // its bounds would have to follow each pose
     this.box = new Box3().setFromBufferAttribute(this.geometry.getAttribute("position"));
     this.sphere = this.box.getBoundingSphere(new Sphere());

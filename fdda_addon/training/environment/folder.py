@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Where the add-on's own training environment lies, and what state it is in.
 
-It is complete when its mark is there, and the mark is written last: whatever was interrupted is recognised. Blender
+It is complete when its mark is there, and the mark is written last: whatever was interrupted is recognized. Blender
 leaves the folder alone when it updates the extension and removes it when it uninstalls the extension.
 """
 
