@@ -21,14 +21,14 @@ ROOT = Path(__file__).resolve().parent.parent
 POSES = 1000
 
 
-class Cost(NamedTuple):
+class ProcessCost(NamedTuple):
     """What a command took."""
 
     seconds: float
     peak_mb: float
 
 
-def run(*arguments: object) -> Cost:
+def run(*arguments: object) -> ProcessCost:
     """Run a command in the project's environment."""
     start = time.monotonic()
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -39,7 +39,7 @@ def run(*arguments: object) -> Cost:
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         sys.exit(f"{' '.join(command)} ended with status {process.returncode}.")
-    return Cost(time.monotonic() - start, usage.ru_maxrss / 1024)
+    return ProcessCost(time.monotonic() - start, usage.ru_maxrss / 1024)
 
 
 def measure(*arguments: object) -> dict:
@@ -99,8 +99,8 @@ ROWS = (
     ("`record`, s / MB", lambda r: f"{r['seconds']['record']:.0f} / {r['peak_memory_mb']['record']:.0f}"),
     ("`train`, s / MB", lambda r: f"{r['seconds']['train']:.0f} / {r['peak_memory_mb']['train']:.0f}"),
     ("model, MB", lambda r: f"{r['model_mb']:.1f}"),
-    ("held-out error, mean / max, mm", lambda r: _errors(r["errors_mm"]["fdda"])),
-    ("… of linear skinning", lambda r: _errors(r["errors_mm"]["linear"])),
+    ("held-out error, mean / max, mm", lambda r: _format_errors(r["errors_mm"]["fdda"])),
+    ("… of linear skinning", lambda r: _format_errors(r["errors_mm"]["linear"])),
     ("… FDDA's part", lambda r: " / ".join(f"{100 * _part(r, figure):.1f} %" for figure in ("mean", "max"))),
 )
 
@@ -113,7 +113,7 @@ def _part(result: dict, figure: str) -> float:
     return result["errors_mm"]["fdda"][figure] / result["errors_mm"]["linear"][figure]
 
 
-def _errors(errors: dict) -> str:
+def _format_errors(errors: dict) -> str:
     return f"{errors['mean']:.3f} / {errors['max']:.1f}"
 
 
@@ -127,7 +127,7 @@ def table(results: list[dict]) -> str:
     return "\n".join(lines)
 
 
-COMPARED = (
+COMPARED_TIMES = (
     ("rig", lambda r: _median(r, "rig")),
     ("FDDA", lambda r: _median(r, "fdda")),
     ("model alone", lambda r: _median(r, "inference")),
@@ -136,12 +136,12 @@ COMPARED = (
 )
 
 
-def against(last: list[dict], results: list[dict]) -> str:
+def compare_with_last_run(last: list[dict], results: list[dict]) -> str:
     """The times of each rig as parts of those of the last run, a line a rig; empty where none was measured before."""
     before = {result["name"]: result for result in last}
     return "\n".join(
         f"{r['name']}, now / last run: "
-        + ", ".join(f"{label} {show(r) / show(before[r['name']]):.2f}" for label, show in COMPARED)
+        + ", ".join(f"{label} {show(r) / show(before[r['name']]):.2f}" for label, show in COMPARED_TIMES)
         for r in results
         if r["name"] in before
     )
@@ -188,7 +188,7 @@ def main() -> None:
         path.write_text(content, encoding="utf-8")
     print(f"{about['date']}, Blender {about['blender']}, {about['processor']}, {about['cores']} cores\n")
     print(table(results))
-    if compared := against(last, results):
+    if compared := compare_with_last_run(last, results):
         print(f"\n{compared}")
 
 

@@ -41,7 +41,7 @@ def _metacarpals(factor: float) -> dict[str, tuple[float, float, float]]:
     return {f"{finger}_0": _degrees(angle * (-1) ** i, 0, angle * (-1) ** i) for i, finger in enumerate(FINGERS)}
 
 
-BEYOND = (
+EXTREME_POSES = (
     NamedPose("elbow 3x its range, off its axis", {"elbow": _degrees(70, 0, 3 * ELBOW_FLEXION)}),
     NamedPose("metacarpals 2.5x their range", _metacarpals(2.5)),
 )
@@ -103,7 +103,7 @@ def main(folder: Path) -> int:
 def _evaluate(rig: Path, model: Path, out: Path, pictures: Path) -> Evaluation:
     open_file(rig)
     scene_rig = find_rig()
-    settings = EvaluationSettings(HELD_OUT_POSES, actions=(ACTION,), range_scales=(1.5, 2.0, 3.0), named=BEYOND)
+    settings = EvaluationSettings(HELD_OUT_POSES, actions=(ACTION,), range_scales=(1.5, 2.0, 3.0), named=EXTREME_POSES)
     evaluation = run_evaluation(scene_rig, model, settings)
     write_json(out, evaluation.to_json())
 

@@ -34,11 +34,11 @@ from farm.characters import Plan, read_plan  # noqa: E402
 from farm.fingerprints import check_outputs, read_manifest  # noqa: E402
 from farm.tasks import MERGE, RECORD, REFINE, TRAIN, make_tasks  # noqa: E402
 
-INSIDE = "FDDA_CHAOS_INSIDE"
+NAMESPACE_VARIABLE = "FDDA_CHAOS_INSIDE"
 DISK_MB = 400
 TRY_AGAIN, KILLED = 75, -9
-FULL_SECONDS = 12
-UNWRITTEN = 2 * 250
+DISK_FULL_SECONDS = 12
+MAX_LOST_POSES = 2 * 250
 """Poses that a kill may lose: a batch that is being written, and one that is collected."""
 PLAN = """
 [farm]
@@ -72,8 +72,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     options.out = options.out.absolute()
-    if not os.environ.get(INSIDE):
-        return _inside(sys.argv[1:])
+    if not os.environ.get(NAMESPACE_VARIABLE):
+        return _run_in_namespace(sys.argv[1:])
     disk = options.out / "disk"
     disk.mkdir(parents=True, exist_ok=True)
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "tmpfs", disk], check=True)
@@ -85,7 +85,7 @@ def main() -> int:
     if status:
         return 1
     random_numbers = random.Random(options.seed)
-    storm = Storm(options.kills, random_numbers, disk)
+    storm = RandomFaults(options.kills, random_numbers, disk)
     runs = 0
     while storm.kills < options.kills or not runs:
         runs += 1
@@ -101,11 +101,11 @@ def main() -> int:
     return 0
 
 
-def _inside(arguments: list[str]) -> int:
+def _run_in_namespace(arguments: list[str]) -> int:
     """Run again where a disk can be made that nobody else sees."""
     own = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
     start = ["unshare", *own, "--mount", "--propagation", "private", sys.executable, __file__, *arguments]
-    return subprocess.run(start, env={**os.environ, INSIDE: "1"}, check=False).returncode
+    return subprocess.run(start, env={**os.environ, NAMESPACE_VARIABLE: "1"}, check=False).returncode
 
 
 def write_plan(folder: Path, name: str, work: Path) -> Plan:
@@ -121,7 +121,7 @@ def command(plan: Plan) -> list[str]:
     return [sys.executable, "-m", "farm", str(plan.path), "--workers", "2", "--dashboard-port", "0", *report]
 
 
-class Storm:
+class RandomFaults:
     """What happens to a farm, and how often it did."""
 
     def __init__(self, kills: int, numbers: random.Random, disk: Path):
@@ -171,7 +171,7 @@ class Storm:
 
     def _kill_one(self, farm: int) -> None:
         """Kill a worker, or every third time a verb with all that it started; a verb whose worker is gone too."""
-        verbs = [process for process in psutil.process_iter() if is_verb(process, self._disk)]
+        verbs = [process for process in psutil.process_iter() if is_farm_process(process, self._disk)]
         workers = [process for process in children(farm) if "spawn_main" in command_line(process)]
         if verbs and self.kills % 3 == 2:
             victim = self._numbers.choice(verbs)
@@ -191,7 +191,7 @@ class Storm:
                     file.write(bytes(1 << 20))
         except OSError as error:
             print(f"  {error.strerror}", flush=True)
-        stop.wait(FULL_SECONDS)
+        stop.wait(DISK_FULL_SECONDS)
         ballast.unlink()
         print("The disk has room again.", flush=True)
 
@@ -210,7 +210,7 @@ def command_line(process: psutil.Process) -> str:
         return ""
 
 
-def is_verb(process: psutil.Process, disk: Path) -> bool:
+def is_farm_process(process: psutil.Process, disk: Path) -> bool:
     """Whether a process is a verb of the farm on this disk; its worker may be gone."""
     try:
         return "fdda_addon" in process.cmdline() and Path(process.cwd()).is_relative_to(disk)
@@ -241,7 +241,7 @@ def differences(calm: Plan, storm: Plan) -> list[str]:
             if models[0] != models[1] or len(models[0]) != 1:
                 wrong.append(f"the models of {name} differ")
         if task.kind in (RECORD, REFINE):
-            wrong += repeated(name, task.log)
+            wrong += find_repeated_poses(name, task.log)
     for own in calm.characters:
         other = next(one for one in storm.characters if one.name == own.name)
         pair = [hashlib.sha256((c.output / f"{c.name}.onnx").read_bytes()).digest() for c in (own, other)]
@@ -251,7 +251,7 @@ def differences(calm: Plan, storm: Plan) -> list[str]:
     return wrong + [f"half a file was left: {path}" for path in halves]
 
 
-def repeated(name: str, log: Path) -> list[str]:
+def find_repeated_poses(name: str, log: Path) -> list[str]:
     """Whether poses were recorded twice: each start of the verb says how many are there, and none may be lost."""
     attempts = [
         [int(done) for done in re.findall(r"^poses: (\d+) of", text, re.MULTILINE)]
@@ -261,7 +261,7 @@ def repeated(name: str, log: Path) -> list[str]:
     wrong = []
     for before, after in itertools.pairwise(attempts):
         # What is said to be done is evaluated; what was not on the disk yet is evaluated once more.
-        if after[0] < max(before[0], before[-1] - UNWRITTEN):
+        if after[0] < max(before[0], before[-1] - MAX_LOST_POSES):
             wrong.append(f"{name} went on from {after[0]} poses after it had {before[-1]}")
     return wrong
 

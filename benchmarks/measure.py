@@ -147,10 +147,10 @@ def cold_start(bound: str) -> dict:
 
     imported_before = "onnxruntime" in sys.modules
     seconds = _seconds(start)
-    return {"seconds": seconds, "onnxruntime_at_start_up": imported_before, "is_right": _shows_the_model()}
+    return {"seconds": seconds, "onnxruntime_at_start_up": imported_before, "is_right": _is_model_shown()}
 
 
-def _shows_the_model() -> bool:
+def _is_model_shown() -> bool:
     mesh_object = next(o for o in bpy.data.objects if o.fdda.is_bound)
     armature_object = armature_modifier(mesh_object).object
     network = Network(model_files.model_path(mesh_object))

@@ -22,13 +22,13 @@ from fdda_addon.core.errors import FDDAError  # noqa: E402
 from fdda_addon.runtime.network import Network  # noqa: E402
 
 CROWD = 20
-SWEPT_BYTES = 32 << 20
+CACHE_FLUSH_BYTES = 32 << 20
 """Read between two cold calls."""
-TURNS, RUNS = 7, 40
+ROUNDS, RUNS = 7, 40
 """Of every model and way; the first few runs of a turn only warm up."""
 
 
-def milliseconds(network: Network, count: int, swept: np.ndarray | None) -> list[float]:
+def time_calls(network: Network, count: int, swept: np.ndarray | None) -> list[float]:
     """Times of one turn: `RUNS` calls of so many poses each, with a sweep before each where there is one."""
     poses = np.repeat(network.info.rest_matrices[None], count, axis=0)
     values = np.float32([[(control.low + control.high) / 2 for control in network.info.controls]] * count)
@@ -44,17 +44,17 @@ def milliseconds(network: Network, count: int, swept: np.ndarray | None) -> list
 
 def measure(networks: list[Network]) -> list[dict[str, float]]:
     """Median milliseconds a call of each model, by `hot`, `cold` and the same of a crowd."""
-    swept = np.ones(SWEPT_BYTES // 4, np.float32)
+    swept = np.ones(CACHE_FLUSH_BYTES // 4, np.float32)
     ways = {"hot": (1, None), "cold": (1, swept), "hot_crowd": (CROWD, None), "cold_crowd": (CROWD, swept)}
     times = [{way: [] for way in ways} for _ in networks]
-    for _ in range(TURNS):
+    for _ in range(ROUNDS):
         for network, own in zip(networks, times, strict=True):
             for way, (count, memory) in ways.items():
-                own[way] += milliseconds(network, count, memory)
+                own[way] += time_calls(network, count, memory)
     return [{way: float(np.median(values)) for way, values in own.items()} for own in times]
 
 
-def constants_of(path: Path) -> tuple[int, int]:
+def count_constants(path: Path) -> tuple[int, int]:
     """Nodes of a model, and bytes of its constants."""
     graph = onnx.load(path).graph
     return len(graph.node), sum(onnx.numpy_helper.to_array(tensor).nbytes for tensor in graph.initializer)
@@ -75,7 +75,7 @@ def main() -> int:
     heads = f"{'vertices':>8} {'nodes':>5} {'MB':>6} {'hot':>7} {'cold':>7} {'ratio':>5} {'of 20: hot':>10} {'cold':>7}"
     print(heads, " model")
     for path, network, times in zip(options.models, networks, measure(networks), strict=True):
-        nodes, read = constants_of(path)
+        nodes, read = count_constants(path)
         rows.append({"model": str(path), "vertices": network.info.vertex_count, "nodes": nodes, "bytes": read, **times})
         print(
             f"{network.info.vertex_count:8} {nodes:5} {read / 1e6:6.2f} {times['hot']:7.3f} {times['cold']:7.3f} "

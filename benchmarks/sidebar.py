@@ -22,16 +22,16 @@ import bpy
 ROUNDS = 6
 SECONDS = 3.0
 SETTLE_SECONDS = 1.5
-WAYS = ("FDDA", "View", "")
+TABS = ("FDDA", "View", "")
 """Tabs of the sidebar; empty where it is closed."""
-FAST = 1000
+UNREACHABLE_FPS = 1000
 """Frames a second that are asked for: more than there can be."""
 
 taken: dict[str, list[float]] = {}
 """Calls and seconds in the code of classes, by class and function, since it was emptied."""
 
 
-def _timed(key: str, work: object, arguments: tuple) -> object:
+def _timed_call(key: str, work: object, arguments: tuple) -> object:
     start = time.perf_counter()
     try:
         return work(*arguments)
@@ -41,28 +41,28 @@ def _timed(key: str, work: object, arguments: tuple) -> object:
         entry[1] += time.perf_counter() - start
 
 
-def watch(cls: type) -> None:
+def time_methods(cls: type) -> None:
     """Count the time in a class. Blender looks at how many arguments a function has, so each is written out."""
 
     def drawing(name: str, work: object) -> object:
-        return lambda self, context: _timed(f"{cls.__name__}.{name}", work, (self, context))
+        return lambda self, context: _timed_call(f"{cls.__name__}.{name}", work, (self, context))
 
     def polling(work: object) -> object:
-        return classmethod(lambda own, context: _timed(f"{cls.__name__}.poll", work, (own, context)))
+        return classmethod(lambda own, context: _timed_call(f"{cls.__name__}.poll", work, (own, context)))
 
     def listing(work: object) -> object:
         count = work.__code__.co_argcount
         key = f"{cls.__name__}.draw_item"
         if count == 9:
-            return lambda self, c, layout, data, item, icon, active, name, index: _timed(
+            return lambda self, c, layout, data, item, icon, active, name, index: _timed_call(
                 key, work, (self, c, layout, data, item, icon, active, name, index)
             )
-        return lambda self, c, layout, data, item, icon, active, name: _timed(
+        return lambda self, c, layout, data, item, icon, active, name: _timed_call(
             key, work, (self, c, layout, data, item, icon, active, name)
         )
 
     def filtering(work: object) -> object:
-        return lambda self, context, data, name: _timed(
+        return lambda self, context, data, name: _timed_call(
             f"{cls.__name__}.filter_items", work, (self, context, data, name)
         )
 
@@ -77,14 +77,14 @@ def watch(cls: type) -> None:
         cls.poll = polling(cls.poll.__func__)
 
 
-def classes() -> list[type]:
+def addon_classes() -> list[type]:
     """The panels, lists and operators of the add-on."""
     found = [getattr(bpy.types, name) for name in dir(bpy.types) if name.startswith(("FDDA_PT_", "FDDA_UL_"))]
     operators = [cls for cls in bpy.types.Operator.__subclasses__() if cls.__name__.startswith("FDDA_OT_")]
     return [*found, *operators]
 
 
-def sidebar() -> tuple[bpy.types.Area, bpy.types.Region]:
+def find_sidebar() -> tuple[bpy.types.Area, bpy.types.Region]:
     area = max(
         (a for a in bpy.context.window_manager.windows[0].screen.areas if a.type == "VIEW_3D"),
         key=lambda a: a.width * a.height,
@@ -92,9 +92,9 @@ def sidebar() -> tuple[bpy.types.Area, bpy.types.Region]:
     return area, next(region for region in area.regions if region.type == "UI")
 
 
-def show(tab: str) -> Iterator[float]:
+def show_tab(tab: str) -> Iterator[float]:
     """Show a tab of the sidebar, or none."""
-    area, region = sidebar()
+    area, region = find_sidebar()
     area.spaces.active.show_region_ui = bool(tab)
     yield 0.5
     if tab:
@@ -103,7 +103,7 @@ def show(tab: str) -> Iterator[float]:
     yield 0.5
 
 
-def toggle() -> None:
+def toggle_animation() -> None:
     with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
         bpy.ops.screen.animation_play()
 
@@ -112,21 +112,21 @@ def measure(seconds: float, found: dict[str, dict]) -> Iterator[float]:
     """Alternate between the tabs; what is found goes into a dictionary."""
     scene, times = bpy.context.scene, []
     bpy.app.handlers.frame_change_post.append(lambda _scene, _graph: times.append(time.perf_counter()))
-    scene.render.fps, scene.sync_mode = FAST, "NONE"
-    for tab in WAYS:
+    scene.render.fps, scene.sync_mode = UNREACHABLE_FPS, "NONE"
+    for tab in TABS:
         found[tab or "closed"] = {"frames": [], "code": [], "by": {}}
     for number in range(ROUNDS):
         # Each is first as often as the others.
-        for tab in (*WAYS[number % len(WAYS) :], *WAYS[: number % len(WAYS)]):
-            yield from show(tab)
+        for tab in (*TABS[number % len(TABS) :], *TABS[: number % len(TABS)]):
+            yield from show_tab(tab)
             of = found[tab or "closed"]
-            toggle()
+            toggle_animation()
             yield 0.3
             times.clear()
             taken.clear()
             yield seconds
             frames, now = len(times), dict(taken)
-            toggle()
+            toggle_animation()
             of["frames"] += [(b - a) * 1000 for a, b in pairwise(times)]
             of["code"].append(sum(entry[1] for entry in now.values()) * 1000 / frames)
             for key, (count, spent) in now.items():
@@ -138,14 +138,14 @@ def measure(seconds: float, found: dict[str, dict]) -> Iterator[float]:
 
 def main(out: Path, seconds: float, all_open: bool) -> Iterator[float]:
     """Measure, write and print."""
-    space = sidebar()[0].spaces.active
+    space = find_sidebar()[0].spaces.active
     space.shading.type, space.overlay.show_overlays, space.show_gizmo = "WIREFRAME", False, False
     mesh_object = next(o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound)
     bpy.context.view_layer.objects.active = mesh_object
     # Evaluated, and not drawn: a processor that draws is busy with nothing else.
     space.region_3d.view_location.x += 1000
-    for cls in classes():
-        watch(cls)
+    for cls in addon_classes():
+        time_methods(cls)
         if all_open and issubclass(cls, bpy.types.Panel):
             bpy.utils.unregister_class(cls)
             # Under another name: Blender remembers which were closed.

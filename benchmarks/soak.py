@@ -25,16 +25,16 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks.soaking.cases import FELL_SHORT, PLAYED, REFUSED, Case, heard  # noqa: E402
 
-PATIENCE = 30
-START = 120
+CASE_TIMEOUT_SECONDS = 30
+START_TIMEOUT_SECONDS = 120
 """Seconds until the first case: Blender and torch are loaded."""
-FLAT_MB = 60
+MAX_GROWTH_MB = 60
 """What a part may take more of memory in its second half than in its first, per process."""
-SHOWN = 12
+MAX_SHOWN_CASES = 12
 
 
 @dataclass(frozen=True)
-class Part:
+class SoakPart:
     """A part of the soak: its name, how many cases, and how many a process."""
 
     name: str
@@ -42,26 +42,26 @@ class Part:
     each: int
 
 
-PARTS = (
-    Part("models", 3000, 750),
-    Part("recordings", 2000, 500),
-    Part("kills", 45, 45),
-    Part("disks", 40, 40),
-    Part("outputs", 60, 60),
-    Part("signals", 20, 20),
-    Part("frames", 10_000, 10_000),
-    Part("undo", 1000, 1000),
-    Part("loads", 200, 200),
-    Part("paths", 17, 17),
-    Part("time", 300, 100),
-    Part("armatures", 200, 100),
-    Part("mode", 1000, 1000),
-    Part("topology", 1000, 1000),
-    Part("controls", 300, 300),
+SOAK_PARTS = (
+    SoakPart("models", 3000, 750),
+    SoakPart("recordings", 2000, 500),
+    SoakPart("kills", 45, 45),
+    SoakPart("disks", 40, 40),
+    SoakPart("outputs", 60, 60),
+    SoakPart("signals", 20, 20),
+    SoakPart("frames", 10_000, 10_000),
+    SoakPart("undo", 1000, 1000),
+    SoakPart("loads", 200, 200),
+    SoakPart("paths", 17, 17),
+    SoakPart("time", 300, 100),
+    SoakPart("armatures", 200, 100),
+    SoakPart("mode", 1000, 1000),
+    SoakPart("topology", 1000, 1000),
+    SoakPart("controls", 300, 300),
 )
 
 
-def work(part: str, folder: Path, seed: int, first: int, end: int) -> None:
+def run_part(part: str, folder: Path, seed: int, first: int, end: int) -> None:
     """Be the process of a part."""
     if part == "recordings":
         from benchmarks.soaking.recordings import run
@@ -93,7 +93,7 @@ def work(part: str, folder: Path, seed: int, first: int, end: int) -> None:
     os._exit(0)
 
 
-def watch(part: Part, folder: Path, seed: int, hear: Callable[[Case], None]) -> None:
+def watch_part(part: SoakPart, folder: Path, seed: int, hear: Callable[[Case], None]) -> None:
     """Run a part, process by process; crashes and hangs become cases."""
     place = 0
     while place < part.count:
@@ -112,12 +112,12 @@ def watch(part: Part, folder: Path, seed: int, hear: Callable[[Case], None]) -> 
         with open(folder / f"{part.name}.log", "a", encoding="utf-8") as log:
             process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, errors="replace")
             lines: queue.Queue[str] = queue.Queue()
-            threading.Thread(target=_read, args=(process, lines), daemon=True).start()
-            patience, began = START, place
-            while line := _next(lines, patience):
+            threading.Thread(target=_read_lines, args=(process, lines), daemon=True).start()
+            patience, began = START_TIMEOUT_SECONDS, place
+            while line := _next_line(lines, patience):
                 if case := heard(line):
                     hear(case)
-                    place, patience = place + 1, PATIENCE + 10
+                    place, patience = place + 1, CASE_TIMEOUT_SECONDS + 10
             if process.poll() is None and line is None:
                 process.kill()
                 problem = f"it hung for {patience} s"
@@ -131,20 +131,20 @@ def watch(part: Part, folder: Path, seed: int, hear: Callable[[Case], None]) -> 
             return
 
 
-def _read(process: subprocess.Popen, lines: "queue.Queue[str]") -> None:
+def _read_lines(process: subprocess.Popen, lines: "queue.Queue[str]") -> None:
     for line in process.stdout:
         lines.put(line)
     lines.put("")
 
 
-def _next(lines: "queue.Queue[str]", patience: float) -> str | None:
+def _next_line(lines: "queue.Queue[str]", patience: float) -> str | None:
     try:
         return lines.get(timeout=patience)
     except queue.Empty:
         return None
 
 
-def prepare(folder: Path) -> None:
+def build_elbow_files(folder: Path) -> None:
     """The elbow: its file, two recordings, its model and its bound file, where they are not there yet."""
     import bpy
 
@@ -174,12 +174,12 @@ def table(cases: list[Case]) -> str:
         lines.append(
             f"| {name} | {len(own):,} | " + " | ".join(f"{count:,}" for count in counts) + f" | "
             f"{max(case.seconds for case in own):.1f} | {max(case.peak_mb for case in own):.0f} | "
-            f"{round(growth(own))} | {off:.2g} |"
+            f"{round(growth_mb(own))} | {off:.2g} |"
         )
     return "\n".join(lines)
 
 
-def growth(cases: list[Case]) -> float:
+def growth_mb(cases: list[Case]) -> float:
     """MB that a part holds at its end beyond what it held at its half; what is loaded once is loaded by then."""
     held = [case.memory_mb for case in cases if case.memory_mb]
     half = len(held) // 2
@@ -195,17 +195,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--part", action="append", choices=[part.name for part in PARTS], help="only this one")
+    parser.add_argument("--part", action="append", choices=[part.name for part in SOAK_PARTS], help="only this one")
     parser.add_argument("--scale", type=float, default=1.0, help="of the numbers of cases")
     parser.add_argument("--work", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
     folder = options.folder.absolute()
     if options.work:
         name, first, end = options.work
-        work(name, folder, options.seed, int(first), int(end))
+        run_part(name, folder, options.seed, int(first), int(end))
     folder.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
-    prepare(folder)
+    build_elbow_files(folder)
     cases: list[Case] = []
     with open(folder / "cases.jsonl", "w", encoding="utf-8") as file:
 
@@ -213,17 +213,18 @@ def main() -> int:
             cases.append(case)
             file.write(json.dumps(asdict(case)) + "\n")
 
-        for part in PARTS:
+        for part in SOAK_PARTS:
             if not options.part or part.name in options.part:
                 began = time.perf_counter()
                 count = part.count if part.name == "paths" else max(1, round(part.count * options.scale))
-                watch(Part(part.name, count, part.each), folder, options.seed, hear)
+                watch_part(SoakPart(part.name, count, part.each), folder, options.seed, hear)
                 print(f"{part.name}: {time.perf_counter() - began:.0f} s", flush=True)
     print(table(cases))
     bad = [case for case in cases if case.outcome == FELL_SHORT]
-    for case in bad[:SHOWN]:
+    for case in bad[:MAX_SHOWN_CASES]:
         print(f"{case.name}: {case.text}")
-    grown = [p for p in dict.fromkeys(c.part for c in cases) if growth([c for c in cases if c.part == p]) > FLAT_MB]
+    names = dict.fromkeys(case.part for case in cases)
+    grown = [name for name in names if growth_mb([c for c in cases if c.part == name]) > MAX_GROWTH_MB]
     for name in grown:
         print(f"{name}: memory grows")
     print(f"{len(cases):,} cases, {len(bad)} fell short; seed {options.seed}, {time.perf_counter() - started:.0f} s")

@@ -27,10 +27,10 @@ from fdda_addon.rig.reading import PoseReader, read_model_rig  # noqa: E402
 from fdda_addon.runtime.network import Network  # noqa: E402
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier  # noqa: E402
 
-LARGEST = 1e-5
+MAX_DIFFERENCE_M = 1e-5
 """Metres. What Blender shows may be so far from what the model says."""
 BONES = ("upper", "lower")
-WEIGHTS = {
+OPERATION_WEIGHTS = {
     "frame": 30, "subframe": 6, "pose": 30, "pose of several": 6, "undo": 5, "redo": 4, "render": 2, "mode": 6,
     "strength": 4, "use in render": 2, "duplicate": 2, "delete": 2, "save": 1, "view layer": 3,
 }  # fmt: skip
@@ -55,7 +55,7 @@ class Outcome:
         return "\n".join(lines)
 
 
-class Stress:
+class PlaybackStress:
     """Characters of the open file, and operations on them at random."""
 
     def __init__(self, first: bpy.types.Object, model: Path, characters: int, folder: Path, seed: int):
@@ -86,7 +86,7 @@ class Stress:
 
     def run(self, evaluations: int) -> Outcome:
         """Do so many operations, each followed by an evaluation and a comparison."""
-        names, weights = list(WEIGHTS), np.array([*WEIGHTS.values()], float)
+        names, weights = list(OPERATION_WEIGHTS), np.array([*OPERATION_WEIGHTS.values()], float)
         bpy.context.view_layer.update()
         for number in range(evaluations):
             name = names[self._random.choice(len(names), p=weights / weights.sum())]
@@ -95,8 +95,8 @@ class Stress:
             self.outcome.operations[name] += 1
             self._compare(f"({name}, operation {number})")
             if number % max(1, evaluations // 8) == 0:
-                self.outcome.memory.append(_memory())
-        self.outcome.memory.append(_memory())
+                self.outcome.memory.append(_memory_mb())
+        self.outcome.memory.append(_memory_mb())
         return self.outcome
 
     def _characters(self) -> list[bpy.types.Object]:
@@ -223,7 +223,7 @@ def _positions(mesh: bpy.types.Mesh) -> np.ndarray:
     return positions.reshape(-1, 3)
 
 
-def _memory() -> float:
+def _memory_mb() -> float:
     """MB that the process holds in memory now; NaN where the system is not Linux."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6 if sys.platform == "linux" else np.nan
 
@@ -242,12 +242,12 @@ def main() -> int:
     fdda_addon.register()
     first = next(o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound)
     start = time.perf_counter()
-    stress = Stress(first, model, options.characters, options.folder, options.seed)
+    stress = PlaybackStress(first, model, options.characters, options.folder, options.seed)
     outcome = stress.run(options.evaluations)
     print(f"Blender {bpy.app.version_string}, seed {options.seed}, {time.perf_counter() - start:.0f} s")
     print(outcome.table())
     fdda_addon.unregister()
-    return int(outcome.largest > LARGEST)
+    return int(outcome.largest > MAX_DIFFERENCE_M)
 
 
 def _bound_elbow(folder: Path) -> tuple[Path, Path]:

@@ -15,7 +15,7 @@ from .study_tables import held_out
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 """Told apart by the color-blind too (Okabe and Ito)."""
-GREY = "#666666"
+GRAY = "#666666"
 DASHES = (0, (4, 3))
 LABEL, TICK = 9, 8
 """Sizes of text, points."""
@@ -23,7 +23,7 @@ LABEL, TICK = 9, 8
 
 def draw_curves(result: dict, path: Path) -> None:
     """Validation error by epoch: a row for each partition, a column for each size, a color for each activation."""
-    sizes, colors = _sizes(result), _colors(result)
+    sizes, colors = _configurations_by_size(result), _colors(result)
     names = result["partitions"]
     figure = Figure(figsize=(1.2 + 2.1 * len(sizes), 0.8 + 2.1 * len(names)), layout="constrained")
     grid = figure.subplots(len(names), len(sizes), sharex=True, sharey="row", squeeze=False)
@@ -34,9 +34,9 @@ def draw_curves(result: dict, path: Path) -> None:
                     curve = training["partitions"][name]["curve"]["validation"]
                     color = colors[configuration["activation"]]
                     axes.plot(range(1, len(curve) + 1), curve, color=color, linewidth=0.9, alpha=0.85)
-            axes.axhline(_basis_left(result, name, "validation"), color=GREY, linewidth=0.8, linestyle=DASHES)
+            axes.axhline(_basis_left(result, name, "validation"), color=GRAY, linewidth=0.8, linestyle=DASHES)
             axes.set_yscale("log")
-            _plain(axes)
+            _style_axes(axes)
             if name == names[0]:
                 axes.set_title(size, fontsize=LABEL)
         axes_row[0].set_ylabel(f"{name}\nvalidation error, mm", fontsize=LABEL)
@@ -47,7 +47,7 @@ def draw_curves(result: dict, path: Path) -> None:
 
 def draw_errors(result: dict, path: Path) -> None:
     """Held-out error: a panel for each partition, a row for each size, a dot for each seed."""
-    sizes, colors = _sizes(result), _colors(result)
+    sizes, colors = _configurations_by_size(result), _colors(result)
     names = result["partitions"]
     figure = Figure(figsize=(8.4, 0.9 + 0.55 * len(sizes)), layout="constrained")
     grid = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
@@ -59,7 +59,7 @@ def draw_errors(result: dict, path: Path) -> None:
                 color = colors[configuration["activation"]]
                 axes.plot(values, [height] * len(values), "o", color=color, markersize=4, alpha=0.7, markeredgewidth=0)
                 axes.plot([fmean(values)] * 2, [height - 0.1, height + 0.1], color=color, linewidth=1.4)
-        axes.axvline(_basis_left(result, name, "held_out"), color=GREY, linewidth=0.8, linestyle=DASHES)
+        axes.axvline(_basis_left(result, name, "held_out"), color=GRAY, linewidth=0.8, linestyle=DASHES)
         axes.set_xlim(0, 1.04 * axes.get_xlim()[1])
         axes.set_yticks(range(len(sizes)), list(sizes))
         axes.set_ylim(len(sizes) - 0.5, -0.5)
@@ -71,7 +71,7 @@ def draw_errors(result: dict, path: Path) -> None:
     _save(figure, path)
 
 
-def _sizes(result: dict) -> dict[str, list[dict]]:
+def _configurations_by_size(result: dict) -> dict[str, list[dict]]:
     """The configurations by the size of their networks."""
     sizes: dict[str, list[dict]] = {}
     for configuration in result["configurations"]:
@@ -88,7 +88,7 @@ def _basis_left(result: dict, name: str, poses: str) -> float:
     return fmean(t["partitions"][name]["basis_left"][poses] for c in result["configurations"] for t in c["trainings"])
 
 
-def _plain(axes: Axes) -> None:
+def _style_axes(axes: Axes) -> None:
     """Numbers as they are written, not as powers of ten, and lines to read them by."""
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
@@ -99,7 +99,7 @@ def _plain(axes: Axes) -> None:
 
 def _legend(figure: Figure, colors: dict[str, str]) -> None:
     handles = [Line2D([], [], color=color, linewidth=2, label=name) for name, color in colors.items()]
-    handles.append(Line2D([], [], color=GREY, linewidth=1, linestyle=DASHES, label="a network without error"))
+    handles.append(Line2D([], [], color=GRAY, linewidth=1, linestyle=DASHES, label="a network without error"))
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=LABEL)
 
 

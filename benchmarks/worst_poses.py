@@ -50,14 +50,14 @@ def main() -> None:
     pictures = render_worst(scene_rig, options.model, evaluation, options.poses)
     pictures += [np.zeros_like(pictures[0])] * (-len(pictures) % COLUMNS)
     rows = [np.concatenate(pictures[start : start + COLUMNS], axis=1) for start in range(0, len(pictures), COLUMNS)]
-    save(np.concatenate(rows, axis=0), options.out)
+    save_png(np.concatenate(rows, axis=0), options.out)
 
 
 def render_worst(scene_rig: SceneRig, model: Path, evaluation: Evaluation, count: int) -> list[np.ndarray]:
     """(2 * SIZE + 3 * GAP, SIZE + GAP, 4) float32 of each of the worst poses, rig above model, top row first."""
     errors, network = evaluation.held_out, open_model(scene_rig, model).network
     mesh = scene_rig.mesh_object.data.copy()
-    scene = studio(mesh)
+    scene = build_polished_scene(mesh)
     found = []
     for pose in np.argsort(errors.fdda.max(axis=1))[::-1][:count]:
         vertex = int(errors.fdda[pose].argmax())
@@ -66,17 +66,17 @@ def render_worst(scene_rig: SceneRig, model: Path, evaluation: Evaluation, count
         print(f"pose {pose}: vertex {vertex} is {errors.fdda[pose, vertex] * 1000:.1f} mm off", flush=True)
         set_mesh_positions(mesh, true)
         mesh.update()
-        aim(scene.camera, mesh, vertex, float(np.ptp(true, axis=0).max()))
+        aim_camera(scene.camera, mesh, vertex, float(np.ptp(true, axis=0).max()))
         both = np.zeros((2 * SIZE + 3 * GAP, SIZE + GAP, 4), np.float32)
         for top, positions in ((GAP, true), (SIZE + 2 * GAP, fdda)):
             set_mesh_positions(mesh, positions)
             mesh.update()
-            both[top : top + SIZE, :SIZE] = rendered(scene)
+            both[top : top + SIZE, :SIZE] = render_image(scene)
         found.append(both)
     return found
 
 
-def studio(mesh: bpy.types.Mesh) -> bpy.types.Scene:
+def build_polished_scene(mesh: bpy.types.Mesh) -> bpy.types.Scene:
     """A scene with the mesh polished, under stripes of light."""
     scene = bpy.data.scenes.new("worst poses")
     shown = bpy.data.objects.new("shown", mesh)
@@ -111,11 +111,11 @@ def studio(mesh: bpy.types.Mesh) -> bpy.types.Scene:
     return scene
 
 
-def aim(camera: bpy.types.Object, mesh: bpy.types.Mesh, vertex: int, size: float) -> None:
+def aim_camera(camera: bpy.types.Object, mesh: bpy.types.Mesh, vertex: int, size: float) -> None:
     """Look at a vertex from where it can be seen, as straight as that goes."""
     place, normal = mesh.vertices[vertex].co, mesh.vertices[vertex].normal
     tree = BVHTree.FromPolygons([v.co for v in mesh.vertices], [face.vertices for face in mesh.polygons])
-    ways = sorted(directions(), key=normal.dot, reverse=True)
+    ways = sorted(unit_directions(), key=normal.dot, reverse=True)
     free = (way for way in ways if tree.ray_cast(place + (normal + way) * size * CLOSE, way)[0] is None)
     way = next(free, normal)
     camera.location = place + way * size
@@ -123,7 +123,7 @@ def aim(camera: bpy.types.Object, mesh: bpy.types.Mesh, vertex: int, size: float
     camera.data.ortho_scale, camera.data.clip_end = size * SHOWN, size * 4
 
 
-def directions() -> list[Vector]:
+def unit_directions() -> list[Vector]:
     """Unit vectors all around, evenly spread (a spiral of golden angles)."""
     up = 1 - 2 * (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
     turn = np.arange(DIRECTIONS) * np.pi * (3 - 5**0.5)
@@ -131,7 +131,7 @@ def directions() -> list[Vector]:
     return [Vector(way) for way in np.stack([across * np.cos(turn), across * np.sin(turn), up], axis=1).tolist()]
 
 
-def rendered(scene: bpy.types.Scene) -> np.ndarray:
+def render_image(scene: bpy.types.Scene) -> np.ndarray:
     """(SIZE, SIZE, 4) float32 of the scene, top row first."""
     with tempfile.TemporaryDirectory() as folder:
         scene.render.filepath = str(Path(folder) / "picture.png")
@@ -143,7 +143,7 @@ def rendered(scene: bpy.types.Scene) -> np.ndarray:
     return pixels.reshape(SIZE, SIZE, 4)[::-1]
 
 
-def save(pixels: np.ndarray, path: Path) -> None:
+def save_png(pixels: np.ndarray, path: Path) -> None:
     """Write (H, W, 4) float32, top row first, as a PNG file."""
     height, width = pixels.shape[:2]
     # Gray where there is nothing: neither stripe.

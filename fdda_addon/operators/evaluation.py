@@ -70,10 +70,10 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
                 if self._action:
                     steps = evaluate_action(scene_rig, network, self._action, replace(target, max_settle_frames=0))
                 else:
-                    wanted = EvaluationSettings(
+                    settings = EvaluationSettings(
                         self.poses, self.seed, surface=False, target=replace(target, pre_roll=0)
                     )
-                    steps = evaluate(scene_rig, network, wanted)
+                    steps = evaluate(scene_rig, network, settings)
                 for step in steps:
                     if isinstance(step, Progress):
                         yield step
@@ -268,8 +268,8 @@ class FDDA_OT_show_rig(ModelOperator, bpy.types.Operator):
         for scene_rig in rigs:
             side_by_side.show(scene_rig.mesh_object, self.way, self.distance)
         names = " and ".join(f"'{rig.mesh_object.name}'" for rig in rigs)
-        where = {"NONE": "is shown alone", "BESIDE": "has its rig beside it", "OVERLAY": "has its rig over it"}
-        return f"{names} {where[self.way]}."
+        results = {"NONE": "is shown alone", "BESIDE": "has its rig beside it", "OVERLAY": "has its rig over it"}
+        return f"{names} {results[self.way]}."
 
 
 class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):

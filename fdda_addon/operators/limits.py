@@ -27,12 +27,12 @@ class _SelectedBonesOperator(PoseOperator):
             RigError: there is none.
         """
         armature_object = self.rig(context).armature_object
-        found = [bone for bone in armature_object.pose.bones if is_selected(bone)]
-        if not found:
+        bones = [bone for bone in armature_object.pose.bones if is_selected(bone)]
+        if not bones:
             raise RigError(
                 f"No bone of '{armature_object.name}' is selected; check bones in the list or select them in Pose Mode."
             )
-        return found
+        return bones
 
 
 def _copy_limits(source: bpy.types.PoseBone, target: bpy.types.PoseBone, mirrored: bool = False) -> None:

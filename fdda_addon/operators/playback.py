@@ -188,10 +188,10 @@ class FDDA_OT_bind(ModelOperator, ModelFileOperator, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         try:
-            known = any(_has_model(rig.mesh_object) for rig in self.rigs(context))
+            has_model = any(_has_model(rig.mesh_object) for rig in self.rigs(context))
         except FDDAError:
-            known = None
-        if not (self.filepath or known):
+            has_model = None
+        if not (self.filepath or has_model):
             return self.open_file_browser(context)
         self._size = self._largest_unpacked_bytes(context)
         if self._size > LARGE_MODEL_BYTES and packs_models() and context.window is not None:

@@ -161,15 +161,15 @@ class FDDA_OT_limits_from_actions(PoseOperator, bpy.types.Operator):
                 "No action is checked; check the actions under Also Record Actions that show how the rig moves."
             )
         limits = set_limits_from_actions(rig, [bpy.data.actions[name] for name in names], self.margin)
-        stated = {limit.bone for limit in limits if not limit.reason_unset}
-        left = [limit for limit in limits if limit.reason_unset]
-        others = f"; {len(left)} axes were not changed ('{left[0].bone}' {left[0].reason_unset})" if left else ""
+        bones_set = {limit.bone for limit in limits if not limit.reason_unset}
+        unset = [limit for limit in limits if limit.reason_unset]
+        remarks = f"; {len(unset)} axes were not changed ('{unset[0].bone}' {unset[0].reason_unset})" if unset else ""
         if wide := list(dict.fromkeys(limit.bone for limit in limits if limit.near_gimbal_lock)):
-            others += (
+            remarks += (
                 f"; {len(wide)} bones ('{wide[0]}') rotate near gimbal lock, so their limits are too wide: choose "
             )
-            others += "Bones in the Checked Actions instead"
-        return f"Set the limits of {len(stated)} bones from {', '.join(names)}{others}."
+            remarks += "Bones in the Checked Actions instead"
+        return f"Set the limits of {len(bones_set)} bones from {', '.join(names)}{remarks}."
 
 
 CLASSES = (

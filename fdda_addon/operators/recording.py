@@ -117,9 +117,9 @@ class FDDA_OT_refine(RigOperator, JobOperator, bpy.types.Operator):
 
         rig = self.rig(context)
         self._path, model = recording_folder(rig.mesh_object), model_file(rig.mesh_object)
-        wanted = RefinementSettings(self.poses, rig.mesh_object.fdda.settings.seed)
+        settings = RefinementSettings(self.poses, rig.mesh_object.fdda.settings.seed)
         with model_disabled(rig.mesh_object):
-            yield from refine(rig, self._path, model, wanted)
+            yield from refine(rig, self._path, model, settings)
 
     def finish(self, _context: bpy.types.Context, _result: object) -> str:
         return f"Added {self.state.total:,} poses to '{self._path.name}'; press Continue Training."

@@ -68,9 +68,9 @@ class FDDA_OT_add_sample_arm(bpy.types.Operator):
         context.view_layer.objects.active = mesh_object
         frame_objects([mesh_object])
         count = len(mesh_object.data.vertices)
-        others = " The default cube is hidden." if hidden else ""
+        remark = " The default cube is hidden." if hidden else ""
         self.report(
-            {"INFO"}, f"Added '{mesh_object.name}' with {count:,} vertices on '{armature_object.name}'.{others}"
+            {"INFO"}, f"Added '{mesh_object.name}' with {count:,} vertices on '{armature_object.name}'.{remark}"
         )
         return {"FINISHED"}
 

@@ -58,11 +58,11 @@ class FDDA_OT_add_control(PoseOperator, bpy.types.Operator):
         name = control_at(rig, self.name)
         if name:
             try:
-                wanted = recording_settings(rig)
+                recording_options = recording_settings(rig)
             except RigError:
                 # The bones to pose have not been chosen yet.
-                wanted = RecordingSettings()
-            listed_controls(rig, replace(wanted, controls=(name,)))
+                recording_options = RecordingSettings()
+            listed_controls(rig, replace(recording_options, controls=(name,)))
         if name and name in settings.controls:
             raise RigError(f"'{name}' is already in the list.")
         settings.controls.add().name = name

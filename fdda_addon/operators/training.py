@@ -38,7 +38,7 @@ class TrainingOperator(RigOperator):
         from ..core.messages import MessageType
 
         # The user may change Blender's data from here on, so none of it is used.
-        uid, began = mesh_object.session_uid, time.monotonic()
+        uid, started = mesh_object.session_uid, time.monotonic()
         state = self.state
         state.curves.update(training=[], validation=[])
         with self._training(mesh_object, recording, model, warm_start) as training:
@@ -54,7 +54,7 @@ class TrainingOperator(RigOperator):
                         continue
                     if not state.total:
                         # The trainer sends nothing for some seconds; show that it is running.
-                        yield Progress(STARTING_STAGE, int(time.monotonic() - began), 0)
+                        yield Progress(STARTING_STAGE, int(time.monotonic() - started), 0)
                     yield None
             except GeneratorExit:
                 if not bpy.app.background:

@@ -20,10 +20,10 @@ class WorstPosesOperator(EvaluationOperator):
             FDDAError: there is no evaluation, or all errors are zero.
         """
         scene_rig, last = self.last_evaluation(context)
-        found = last.worst(count)
-        if not found:
+        poses = last.worst(count)
+        if not poses:
             raise ModelError("The model is exact in all compared poses; there is no worst one.")
-        return scene_rig, last, found
+        return scene_rig, last, poses
 
 
 class FDDA_OT_add_worst_markers(WorstPosesOperator, bpy.types.Operator):
@@ -41,10 +41,10 @@ class FDDA_OT_add_worst_markers(WorstPosesOperator, bpy.types.Operator):
         return cls.has_evaluation(context)
 
     def apply(self, context: bpy.types.Context) -> str:
-        _, last, found = self.worst_poses(context, self.count)
+        _, last, poses = self.worst_poses(context, self.count)
         if not last.name:
             raise ModelError("Random poses have no frames to mark; evaluate the active action.")
-        worst = [(last.first_frame + index, error_mm) for index, error_mm in found]
+        worst = [(last.first_frame + index, error_mm) for index, error_mm in poses]
         markers.place(context.scene, worst)
         return f"Added {len(worst)} markers. The worst frame is {worst[0][0]}, with {worst[0][1]:.2f} mm."
 
@@ -79,8 +79,8 @@ class FDDA_OT_jump_to_worst(WorstPosesOperator, bpy.types.Operator):
         return cls.has_evaluation(context)
 
     def apply(self, context: bpy.types.Context) -> str:
-        scene_rig, last, found = self.worst_poses(context, self.rank)
-        index, error_mm = found[-1]
+        scene_rig, last, poses = self.worst_poses(context, self.rank)
+        index, error_mm = poses[-1]
         if last.name:
             context.scene.frame_set(last.first_frame + index)
             return f"Frame {last.first_frame + index}: max error {error_mm:.2f} mm."

@@ -22,8 +22,8 @@ def common_prefix(names: Sequence[str]) -> str:
             return prefix
     first, last = min(names, default=""), max(names, default="")
     count = next((n for n, pair in enumerate(zip(first, last, strict=False)) if pair[0] != pair[1]), 0)
-    shared = re.match(r".*[-_. ]", first[:count])
-    return shared[0] if shared and len(shared[0]) >= MIN_PREFIX_LENGTH else ""
+    match = re.match(r".*[-_. ]", first[:count])
+    return match[0] if match and len(match[0]) >= MIN_PREFIX_LENGTH else ""
 
 
 def short_bone_name(armature_object: bpy.types.Object, name: str) -> str:

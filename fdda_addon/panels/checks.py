@@ -49,14 +49,14 @@ def check_now(scene_rig: SceneRig) -> "RigCheck":
         settings, problems = recording_settings(scene_rig), ()
     except RigError as error:
         settings, problems = RecordingSettings(poses=0), (str(error),)
-    uid, counters = scene_rig.mesh_object.session_uid, _change_signature(scene_rig)
+    uid, signature = scene_rig.mesh_object.session_uid, _change_signature(scene_rig)
     stored = _checks.get(uid)
-    same_rest = stored is not None and stored[1][0] == counters[0] and not _is_mesh_changed(scene_rig)
+    same_rest = stored is not None and stored[1][0] == signature[0] and not _is_mesh_changed(scene_rig)
     result = stored[0].recheck(scene_rig, settings) if same_rest else check(scene_rig, settings)
     result = replace(result, problems=result.problems + problems)
     _outdated.discard(uid)
     _changed_meshes.discard(scene_rig.mesh_object.data.name)
-    _checks[uid] = (result, counters)
+    _checks[uid] = (result, signature)
     return result
 
 

@@ -99,12 +99,12 @@ def _draw_figures(
     rig: SceneRig,
 ) -> None:
     bound = bound_model_name(rig.mesh_object)
-    what = f"{last.poses} frames of {last.name}" if last.name else f"{last.poses} random poses"
+    poses_text = f"{last.poses} frames of {last.name}" if last.name else f"{last.poses} random poses"
     header, body = layout.panel("fdda_figures", default_closed=False)
     header.label(text="Error (mm)")
     if body is None:
         return
-    draw_wrapped(body, context, f"{last.model} on {what}")
+    draw_wrapped(body, context, f"{last.model} on {poses_text}")
     if bound != last.model:
         draw_wrapped(body, context, f"{last.model} is no longer the bound model; evaluate again.", "INFO")
     table = body.column(align=True)
@@ -207,8 +207,8 @@ _worst_cache: dict[int, tuple[object, int, list[tuple[int, float]]]] = {}
 
 def _worst_poses(last: last_evaluation.LastEvaluation, count: int) -> list[tuple[int, float]]:
     """Return the poses with the largest errors. They are computed once for each evaluation."""
-    kept = _worst_cache.get(0)
-    if kept is None or kept[0] is not last or kept[1] != count:
+    cached = _worst_cache.get(0)
+    if cached is None or cached[0] is not last or cached[1] != count:
         _worst_cache[0] = (last, count, last.worst(count))
     return _worst_cache[0][2]
 

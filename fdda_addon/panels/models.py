@@ -42,7 +42,7 @@ def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
     armature_object = armature_of(mesh_object)
     scene_rig = SceneRig(mesh_object, armature_object)
     check = checks.last_check(scene_rig) if armature_object else None
-    found = {}
+    problems = {}
     for entry in mesh_object.fdda.models:
         try:
             info = entry_info(mesh_object, entry)
@@ -52,10 +52,10 @@ def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
                     entry.name, info, rig, _compared_channels(mesh_object, check.channels, info)
                 )
                 if changed.sentence:
-                    found[_entry_key(entry)] = ("ERROR" if changed.prevents_playback else "INFO", changed.sentence)
+                    problems[_entry_key(entry)] = ("ERROR" if changed.prevents_playback else "INFO", changed.sentence)
         except FDDAError as error:
-            found[_entry_key(entry)] = ("ERROR", str(error))
-    return found
+            problems[_entry_key(entry)] = ("ERROR", str(error))
+    return problems
 
 
 def _compared_channels(

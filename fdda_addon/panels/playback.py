@@ -76,22 +76,22 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
 
     def _draw_unbound(self, context: bpy.types.Context, rig: SceneRig) -> None:
         mesh_object = rig.mesh_object
-        layout, entry, found = self.layout, active_entry(mesh_object), find_trained_file(rig)
+        layout, entry, trained = self.layout, active_entry(mesh_object), find_trained_file(rig)
         if mesh_object.fdda.status:
             draw_wrapped(layout, context, mesh_object.fdda.status, "ERROR")
-        if entry is None and (found is None or found.mismatch):
+        if entry is None and (trained is None or trained.mismatch):
             draw_wrapped(layout, context, "No model yet: train one above, or choose a file.", "INFO")
             layout.operator("fdda.bind", text="Choose Model and Bind…", icon="FILEBROWSER")
             return
         column = layout.column()
         column.scale_y = 1.4
-        name = entry.name if entry is not None else found.path.stem
+        name = entry.name if entry is not None else trained.path.stem
         draw_button(column, context, "fdda.bind", f"Bind {name}", "LINKED")
 
     def _draw_bound(self, context: bpy.types.Context, mesh_object: bpy.types.Object) -> None:
         layout, binding = self.layout, mesh_object.fdda
-        where = " (in this file)" if binding.packed else ""
-        layout.label(text=f"{bound_model_name(mesh_object)}{where}", icon="ERROR" if binding.status else "LINKED")
+        suffix = " (in this file)" if binding.packed else ""
+        layout.label(text=f"{bound_model_name(mesh_object)}{suffix}", icon="ERROR" if binding.status else "LINKED")
         if not binding.packed and not binding.status and is_outside_model_folders(mesh_object):
             text = "The model is not packed, and not in the folder of this file: it will not load again."
             draw_wrapped(layout, context, text, "ERROR")

@@ -38,11 +38,11 @@ class FDDA_UL_bones(bpy.types.UIList):
         is_wide = region is not None and region.width >= WIDE_SIDEBAR_PIXELS * _ui_scale(context.preferences)
         icon, name, ranges, has_limits = _bone_row(rig, bone, is_wide)
         row = layout.split(factor=0.5)
-        left = row.row(align=True)
+        name_row = row.row(align=True)
         # The checkbox is the selection in the viewport.
         box = "CHECKBOX_HLT" if is_selected(bone) else "CHECKBOX_DEHLT"
-        left.prop(selection_owner(bone), "select", text="", icon=box, emboss=False)
-        left.label(text=name, icon=icon)
+        name_row.prop(selection_owner(bone), "select", text="", icon=box, emboss=False)
+        name_row.label(text=name, icon=icon)
         if not has_limits:
             row = row.row()
             row.active = False
@@ -99,11 +99,11 @@ def sampled_channels_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None"
         return None
     from ..core.poses import CONTROL
 
-    found: dict[str, list[Channel]] = {}
+    by_bone: dict[str, list[Channel]] = {}
     for channel in check.channels:
         if channel.kind != CONTROL:
-            found.setdefault(channel.name, []).append(channel)
-    return found
+            by_bone.setdefault(channel.name, []).append(channel)
+    return by_bone
 
 
 def _format_channels(channels: "list[Channel]", is_wide: bool) -> str:
@@ -111,15 +111,15 @@ def _format_channels(channels: "list[Channel]", is_wide: bool) -> str:
     from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR
 
     channels = [channel for channel in channels if channel.low < channel.high]
-    turns = {channel.axis: channel for channel in channels if channel.kind in {ROTATION, ROTATION_VECTOR}}
-    moves = "".join("XYZ"[channel.axis] for channel in channels if channel.kind == LOCATION)
+    rotations = {channel.axis: channel for channel in channels if channel.kind in {ROTATION, ROTATION_VECTOR}}
+    location_axes = "".join("XYZ"[channel.axis] for channel in channels if channel.kind == LOCATION)
     texts = [
-        _format_range(turns[axis].low, turns[axis].high, is_wide) if axis in turns else "locked"
+        _format_range(rotations[axis].low, rotations[axis].high, is_wide) if axis in rotations else "locked"
         for axis in range(3)
-        if turns
+        if rotations
     ]
-    if moves:
-        texts.append(f"Loc {moves}")
+    if location_axes:
+        texts.append(f"Loc {location_axes}")
     return "  ".join(texts)
 
 
@@ -296,18 +296,18 @@ def _actions_of_rig(rig: SceneRig) -> "tuple[bpy.types.Action, ...]":
 
 
 def _draw_actions(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    fitting = _actions_of_rig(rig)
-    if not fitting:
+    actions = _actions_of_rig(rig)
+    if not actions:
         return
     layout.label(text="Also Record Actions")
     session = context.window_manager.fdda
-    layout.template_list("FDDA_UL_actions", "", bpy.data, "actions", session, "action_index", rows=min(4, len(fitting)))
+    layout.template_list("FDDA_UL_actions", "", bpy.data, "actions", session, "action_index", rows=min(4, len(actions)))
     settings = rig.mesh_object.fdda.settings
     row = layout.row()
     # Only the frames of checked actions are mirrored.
-    row.active = any(action.fdda.record for action in fitting)
+    row.active = any(action.fdda.record for action in actions)
     row.prop(settings, "mirror")
-    if not settings.poses and not any(action.fdda.record for action in fitting):
+    if not settings.poses and not any(action.fdda.record for action in actions):
         draw_wrapped(layout, context, "Nothing to record: raise Random Poses, or check an action.", "ERROR")
 
 

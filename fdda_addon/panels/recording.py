@@ -40,18 +40,20 @@ def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
     from ..core.recording.index import INDEX
     from ..recording.plan import make_sampling
 
-    check, wanted = checks.last_check(rig), recording_settings(rig)
+    check, settings = checks.last_check(rig), recording_settings(rig)
     try:
-        stamp = os.stat(path / INDEX).st_mtime_ns
+        modified_ns = os.stat(path / INDEX).st_mtime_ns
     except OSError:
-        stamp = -1 if path.exists() else 0
+        modified_ns = -1 if path.exists() else 0
     uid = rig.mesh_object.session_uid
-    question = (path, stamp, id(check), wanted)
-    if uid not in _content_cache or _content_cache[uid][0] != question:
-        own, sampling = None, None
+    cache_key = (path, modified_ns, id(check), settings)
+    if uid not in _content_cache or _content_cache[uid][0] != cache_key:
+        current_rig, sampling = None, None
         if check is not None and check.rig is not None:
-            own, sampling = check.rig, json.loads(json.dumps(make_sampling(rig, wanted, check.channels).to_json()))
-        _content_cache[uid] = (question, read_folder(path, own, sampling, wanted.fit_linear))
+            # Through JSON, as the sampling in a recording has gone.
+            sampling = json.loads(json.dumps(make_sampling(rig, settings, check.channels).to_json()))
+            current_rig = check.rig
+        _content_cache[uid] = (cache_key, read_folder(path, current_rig, sampling, settings.fit_linear))
     return _content_cache[uid][1]
 
 
@@ -69,8 +71,8 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
         running = job.current()
         if rig is None or (running and running.verb == "record"):
             return False
-        found = read_content(rig)
-        return not isinstance(found, str) and found[1].state is FolderState.COMPLETE
+        content = read_content(rig)
+        return not isinstance(content, str) and content[1].state is FolderState.COMPLETE
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.enabled_layout()

@@ -89,7 +89,7 @@ def draw_channels(box: bpy.types.UILayout, bone: bpy.types.PoseBone, channels: "
 def draw_extra_inputs(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     """Draw the extra inputs of the user, and the detected ones."""
     settings, check = rig.mesh_object.fdda.settings, checks.last_check(rig)
-    found = check.automatic_controls if check is not None else ()
+    detected = check.automatic_controls if check is not None else ()
     count = len(check.rig.controls) if check is not None and check.rig else len(settings.controls)
     header, body = layout.panel("fdda_controls", default_closed=True)
     header.label(text=f"Extra Inputs ({count})" if count else "Extra Inputs")
@@ -113,10 +113,10 @@ def draw_extra_inputs(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     if rig.mesh_object.data.shape_keys and ALL_SHAPE_KEYS not in settings.controls:
         properties = body.operator("fdda.add_control", text="All Shape Keys", icon="SHAPEKEY_DATA")
         properties.object, properties.name = rig.mesh_object.name, ALL_SHAPE_KEYS
-    if found:
+    if detected:
         column = body.column(align=True)
         column.label(text="Detected automatically")
-        for control in found[:MAX_SHOWN_CONTROLS]:
+        for control in detected[:MAX_SHOWN_CONTROLS]:
             column.label(text=f"{control.name} {control.low:g}…{control.high:g}", icon="DOT")
-        if len(found) > MAX_SHOWN_CONTROLS:
-            column.label(text=f"and {len(found) - MAX_SHOWN_CONTROLS} more", icon="BLANK1")
+        if len(detected) > MAX_SHOWN_CONTROLS:
+            column.label(text=f"and {len(detected) - MAX_SHOWN_CONTROLS} more", icon="BLANK1")

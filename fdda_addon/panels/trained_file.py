@@ -57,7 +57,8 @@ def _describe_mismatch(scene_rig: SceneRig, rig: object, path: Path) -> str:
 
     try:
         info = read_model_info(path)
-        own = rig_of_model(scene_rig, rig, info)
-        return "; ".join(rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, own))
+        current_rig = rig_of_model(scene_rig, rig, info)
+        model_rig = (info.joints, info.rest_matrices, info.vertex_count, info.fingerprint)
+        return "; ".join(rig_differences(*model_rig, current_rig))
     except FDDAError as error:
         return str(error)

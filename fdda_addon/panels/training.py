@@ -37,8 +37,8 @@ class FDDA_PT_training(Section, bpy.types.Panel):
         running = job.current()
         if rig is None or (running and running.verb == "train"):
             return False
-        found = find_trained_file(rig)
-        return found is not None and not found.mismatch
+        trained = find_trained_file(rig)
+        return trained is not None and not trained.mismatch
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.enabled_layout()
@@ -58,15 +58,15 @@ class FDDA_PT_training(Section, bpy.types.Panel):
         if rig is None:
             return
         ready = _draw_python(layout, context)
-        found = find_trained_file(rig)
-        _draw_settings(layout, context, rig, found, ready)
+        trained = find_trained_file(rig)
+        _draw_settings(layout, context, rig, trained, ready)
         draw_job(layout, context, "refine")
         draw_job(layout, context, "train")
         ended = job.state_of("train")
         if ended is not None and ended.subject == rig.mesh_object.session_uid:
             curves.draw(layout, ended.curves)
-        if found is not None and not found.mismatch:
-            _draw_report(layout, context, rig, found.path)
+        if trained is not None and not trained.mismatch:
+            _draw_report(layout, context, rig, trained.path)
         if (advanced := draw_advanced(layout, "fdda_training_advanced")) is not None:
             advanced.prop(rig.mesh_object.fdda.settings, "tolerance_mm")
             advanced.prop(rig.mesh_object.fdda.settings, "training_seed")
@@ -96,7 +96,7 @@ def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool
 
 
 def _draw_settings(
-    layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, found: TrainedFile | None, ready: bool
+    layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, trained: TrainedFile | None, ready: bool
 ) -> None:
     from ..core.recording.folder import FolderState
 
@@ -118,28 +118,28 @@ def _draw_settings(
     elif content[1].state is not FolderState.COMPLETE:
         draw_wrapped(layout, context, "This rig has no complete recording yet; record first.", "INFO")
         ready = False
-    if found is not None and found.mismatch:
-        text = f"{found.path.name} belongs to another rig: {found.mismatch}. Train will ask before it overwrites it."
+    if trained is not None and trained.mismatch:
+        text = f"{trained.path.name} belongs to another rig: {trained.mismatch}. Train asks before it overwrites it."
         draw_wrapped(layout, context, text, "ERROR")
-    elif found is not None:
-        draw_wrapped(layout, context, f"{found.path.name} exists; Train will overwrite it.", "CHECKMARK")
+    elif trained is not None:
+        draw_wrapped(layout, context, f"{trained.path.name} exists; Train will overwrite it.", "CHECKMARK")
     row = layout.row()
     row.enabled = ready
     row.scale_y = 1.3
-    draw_button(row, context, "fdda.train", "Train" if found is None else "Train Again", "PLAY")
-    if found is None or found.mismatch:
+    draw_button(row, context, "fdda.train", "Train" if trained is None else "Train Again", "PLAY")
+    if trained is None or trained.mismatch:
         return
     # What improves the model, in the order of the steps.
-    on = layout.column(align=True)
-    on.enabled = ready
-    on.operator("fdda.refine", text="Add Poses at Worst Errors", icon="ADD")
-    if checkpoint_path(found.path).is_file():
-        on.operator("fdda.train", text="Continue Training", icon="FF").warm_start = True
+    improve = layout.column(align=True)
+    improve.enabled = ready
+    improve.operator("fdda.refine", text="Add Poses at Worst Errors", icon="ADD")
+    if checkpoint_path(trained.path).is_file():
+        improve.operator("fdda.train", text="Continue Training", icon="FF").warm_start = True
     else:
         draw_wrapped(layout, context, "Its checkpoint is missing, so training cannot continue from it.", "INFO")
     if not rig.mesh_object.fdda.is_bound:
-        bind = layout.operator("fdda.bind", text=f"Bind '{found.path.name}'", icon="LINKED")
-        bind.object, bind.filepath = rig.mesh_object.name, str(found.path)
+        bind = layout.operator("fdda.bind", text=f"Bind '{trained.path.name}'", icon="LINKED")
+        bind.object, bind.filepath = rig.mesh_object.name, str(trained.path)
 
 
 def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, model: Path) -> None:
@@ -160,14 +160,14 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         return
     partitions = sorted(report["partitions"], key=lambda p: -p["held_out"]["max"])
     shown = partitions if context.window_manager.fdda.show_all_partitions else partitions[:SHOWN_PARTITIONS]
-    names, means, nearly, largest = _table_columns(body.box())
-    for column, text in ((names, "Body Part"), (means, "Mean"), (nearly, "99.9 %"), (largest, "Max")):
+    names, means, p999s, maxima = _table_columns(body.box())
+    for column, text in ((names, "Body Part"), (means, "Mean"), (p999s, "99.9 %"), (maxima, "Max")):
         column.label(text=text)
     for p in shown:
         names.label(text=short_bone_name(rig.armature_object, p["joint"]))
         means.label(text=f"{p['held_out']['mean']:.3f}")
-        nearly.label(text=f"{p['held_out']['p999']:.2f}")
-        largest.label(text=f"{p['held_out']['max']:.2f}")
+        p999s.label(text=f"{p['held_out']['p999']:.2f}")
+        maxima.label(text=f"{p['held_out']['max']:.2f}")
     if len(partitions) > SHOWN_PARTITIONS:
         text = f"Show All {len(partitions)} Body Parts"
         body.prop(context.window_manager.fdda, "show_all_partitions", text=text, toggle=True)
@@ -175,9 +175,9 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
 
 def _table_columns(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
     """Return a column for names and three right-aligned columns for numbers."""
-    left = layout.split(factor=0.4)
-    columns = [left.column(align=True)]
-    right = left.row(align=True)
+    split = layout.split(factor=0.4)
+    columns = [split.column(align=True)]
+    right = split.row(align=True)
     for _ in range(3):
         columns.append(right.column(align=True))
         columns[-1].alignment = "RIGHT"

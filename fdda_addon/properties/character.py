@@ -271,7 +271,7 @@ def trained_file(mesh_object: bpy.types.Object) -> Path | None:
 def _file_name(mesh_object: bpy.types.Object) -> str:
     """Return a file name from the names of the .blend file and the mesh, unique among the files of a folder."""
     file, name = Path(bpy.data.filepath).stem, mesh_object.name
-    return bpy.path.clean_name(name if name == file else f"{file}_{name}")
+    return bpy.path.clean_name(name if file in ("", name) else f"{file}_{name}")
 
 
 def _path(chosen: str, default: str, what: str, field: str) -> Path:

@@ -77,13 +77,13 @@ class FDDA_AP_preferences(bpy.types.AddonPreferences):
         draw_check(layout)
 
 
-def draw_models(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -> None:
+def draw_models(layout: bpy.types.UILayout, settings: FDDA_AP_preferences) -> None:
     """Draw the settings of packing, and the folders from which models are loaded."""
     column = layout.column()
     column.label(text="Models load if packed, or in the .blend file's folder")
-    column.prop(own, "pack_models")
+    column.prop(settings, "pack_models")
     column.label(text="Also load models from:")
-    for index, folder in enumerate(own.folders):
+    for index, folder in enumerate(settings.folders):
         row = column.row(align=True)
         row.prop(folder, "path", text="")
         row.operator("fdda.remove_trusted_folder", text="", icon="REMOVE").index = index
@@ -92,14 +92,15 @@ def draw_models(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -> None:
 
 def packs_models() -> bool:
     """Return whether models are packed when they are bound."""
-    own = preferences()
-    return own is None or own.pack_models
+    settings = preferences()
+    return settings is None or settings.pack_models
 
 
 def trusted_folders() -> list[Path]:
     """Return the trusted folders as absolute paths with symbolic links resolved."""
-    own = preferences()
-    return [Path(bpy.path.abspath(folder.path)).resolve() for folder in own.folders if folder.path] if own else []
+    settings = preferences()
+    folders = settings.folders if settings else ()
+    return [Path(bpy.path.abspath(folder.path)).resolve() for folder in folders if folder.path]
 
 
 def preferences() -> FDDA_AP_preferences | None:
@@ -110,8 +111,8 @@ def preferences() -> FDDA_AP_preferences | None:
 
 def wheels_folder() -> str:
     """Return the folder under Offline Packages, empty without one."""
-    own = preferences()
-    return own.wheels_folder if own else ""
+    settings = preferences()
+    return settings.wheels_folder if settings else ""
 
 
 def draw_check(layout: bpy.types.UILayout) -> None:
@@ -122,21 +123,21 @@ def draw_check(layout: bpy.types.UILayout) -> None:
         draw_check_result(layout, session.check_result)
 
 
-def draw_own_environment(layout: bpy.types.UILayout, own: FDDA_AP_preferences) -> None:
+def draw_own_environment(layout: bpy.types.UILayout, settings: FDDA_AP_preferences) -> None:
     """Draw state, buttons and progress of the training environment."""
     state = session.environment_state()
-    left, right = _split_row(layout)
-    left.label(text="Training Environment")
-    right.label(
+    name_part, value_part = _split_row(layout)
+    name_part.label(text="Training Environment")
+    value_part.label(
         text=STATE_LABELS[state], icon="ERROR" if state in (FolderState.INCOMPLETE, FolderState.BROKEN) else "NONE"
     )
-    layout.prop(own, "wheels_folder", placeholder="None: install from the internet")
+    layout.prop(settings, "wheels_folder", placeholder="None: install from the internet")
     if (job := current(ENVIRONMENT)) is not None:
         draw_job(layout, job)
     else:
         _, row = _split_row(layout)
         row = row.row(align=True)
-        reason = creation_obstacle(own.wheels_folder)
+        reason = creation_obstacle(settings.wheels_folder)
         again = state is not FolderState.MISSING
         create = row.row()
         create.enabled = not reason
@@ -197,8 +198,8 @@ def draw_lines(layout: bpy.types.UILayout, text: str, icon: str = "NONE", alert:
 
 
 def _preferred_python() -> str:
-    own = preferences()
-    return bpy.path.abspath(own.trainer_python) if own else ""
+    settings = preferences()
+    return bpy.path.abspath(settings.trainer_python) if settings else ""
 
 
 CLASSES = (FDDA_PG_folder, FDDA_AP_preferences)

@@ -68,10 +68,10 @@ def copy_sampling_settings(settings: FDDA_PG_character, other: FDDA_PG_character
     ):
         setattr(settings, name, getattr(other, name))
     for name, values in (("sampled_bones", ("name",)), ("controls", ("name", "has_range", "low", "high"))):
-        own = getattr(settings, name)
-        own.clear()
+        collection = getattr(settings, name)
+        collection.clear()
         for entry in getattr(other, name):
-            new = own.add()
+            new = collection.add()
             for value in values:
                 setattr(new, value, getattr(entry, value))
 

@@ -76,9 +76,9 @@ def test_a_process_that_dies_and_one_that_hangs_are_cases(tmp_path, monkeypatch)
     script = tmp_path / "odd.py"
     script.write_text(ODD_PROCESS)
     monkeypatch.setattr(soak, "__file__", str(script))
-    monkeypatch.setattr(soak, "START", 3)
+    monkeypatch.setattr(soak, "START_TIMEOUT_SECONDS", 3)
     heard = []
-    soak.watch(soak.Part("models", 5, 5), tmp_path, 0, heard.append)
+    soak.watch_part(soak.SoakPart("models", 5, 5), tmp_path, 0, heard.append)
     assert [case.outcome for case in heard] == ["held", "fell short", "fell short", "fell short", "held"]
     assert "ended" in heard[1].text and "hung" in heard[2].text
     assert "| p | 3 | 0 | 2 | 1 |" in soak.table(heard)
