@@ -24,7 +24,7 @@ sys.path.insert(0, str(ROOT))
 
 from farm.characters import read_plan  # noqa: E402
 from farm.fingerprints import read_manifest  # noqa: E402
-from farm.run import GOOD, run_task  # noqa: E402
+from farm.run import SUCCESS_STATES, run_task  # noqa: E402
 from farm.tasks import make_tasks  # noqa: E402
 
 HUMANS = ("BASIC_HUMAN", "HUMAN")
@@ -111,7 +111,7 @@ def measure(out: Path, name: str, workers: int, options: argparse.Namespace) -> 
     else:
         for task in tasks:
             outcome = run_task(plan.farm, tasks, task)
-            assert outcome.state in GOOD, outcome
+            assert outcome.state in SUCCESS_STATES, outcome
     seconds, after = time.monotonic() - started, resource.getrusage(resource.RUSAGE_CHILDREN)
     manifests = [read_manifest(task) for task in tasks.values()]
     return {

@@ -22,7 +22,7 @@ WINDOWS = "win32"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Do as the arguments say; returns the exit status."""
+    """Run the command line of the farm; return the exit status."""
     try:
         return _run(_parser().parse_args(arguments))
     except FDDAError as error:
@@ -91,7 +91,7 @@ def _run(options: argparse.Namespace) -> int:
     plan = read_plan(options.plan)
     tasks = make_tasks(plan)
     if options.task:
-        return _one(plan, tasks, options)
+        return _run_one(plan, tasks, options)
     if unknown := sorted(set(options.only) - {character.name for character in plan.characters}):
         raise WrongUsageError(f"The plan has no character '{unknown[0]}'.")
     if options.only:
@@ -101,7 +101,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.dry_run:
         from .simulation import print_estimate
 
-        return print_estimate(plan.farm, tasks, _counts(options.workers))
+        return print_estimate(plan.farm, tasks, _parse_counts(options.workers))
     page = options.report or plan.path.with_name("report.html")
     report = [(page, FARM_PAGE), (page.with_suffix(".json"), FARM_REPORT)]
     if options.report_only:
@@ -114,11 +114,11 @@ def _run(options: argparse.Namespace) -> int:
     if not options.list:
         check_farm_outputs(plan, tasks.values(), report, options.overwrite, runs=True)
         check_folder_writable(plan.farm.work)
-    return _all(options, plan, tasks, page)
+    return _run_all(options, plan, tasks, page)
 
 
 def _write_graph(plan: "Plan", tasks: dict[str, "Task"], options: argparse.Namespace) -> int:
-    """Write the graph for another engine; returns the exit status."""
+    """Write the graph for another engine; return the exit status."""
     from .flamenco import write_job
     from .openjd import write_template
     from .outputs import JOB, TEMPLATE, check_farm_outputs
@@ -130,17 +130,17 @@ def _write_graph(plan: "Plan", tasks: dict[str, "Task"], options: argparse.Names
     return write(plan, tasks, path)
 
 
-def _counts(text: str) -> list[int]:
+def _parse_counts(text: str) -> list[int]:
     counts = [int(part) for part in (text or "1,8,64,512").split(",") if part.strip().isdecimal()]
     if not counts or min(counts) < 1 or max(counts) > 100_000:
         raise WrongUsageError("--workers is a list of numbers from 1 to 100,000, such as 1,8,64.")
     return counts
 
 
-def _one(plan: "Plan", tasks: dict[str, "Task"], options: argparse.Namespace) -> int:
-    """Do one task for another engine, which has done those before it."""
+def _run_one(plan: "Plan", tasks: dict[str, "Task"], options: argparse.Namespace) -> int:
+    """Run one task for another engine, which has run its dependencies."""
     from .outputs import check_farm_outputs
-    from .run import AGAIN, GOOD, run_task
+    from .run import AGAIN, SUCCESS_STATES, run_task
 
     name = options.task
     if name not in tasks:
@@ -148,19 +148,19 @@ def _one(plan: "Plan", tasks: dict[str, "Task"], options: argparse.Namespace) ->
     check_farm_outputs(plan, [tasks[name]], (), options.overwrite, runs=True)
     outcome = run_task(plan.farm, tasks, name, options.overwrite)
     print(f"{name}: {outcome.state}{f', {outcome.sentence}' if outcome.sentence else ''}")
-    if outcome.state in GOOD:
+    if outcome.state in SUCCESS_STATES:
         return 0
     print(f"Error: {outcome.sentence}", file=sys.stderr)
     return TRY_AGAIN if outcome.state == AGAIN else 1
 
 
-def _all(options: argparse.Namespace, plan: "Plan", tasks: dict[str, "Task"], page: Path) -> int:
+def _run_all(options: argparse.Namespace, plan: "Plan", tasks: dict[str, "Task"], page: Path) -> int:
     from fdda_addon.core.temporary import check_temporary_folder
 
-    from .cluster import connected, local_workers, run_on
+    from .cluster import connect_cluster, local_workers, run_on
     from .fingerprints import InputFingerprints, outdated_tasks
     from .report import write_report
-    from .run import AGAIN, FAILED, GOOD, Outcome
+    from .run import AGAIN, FAILED, SUCCESS_STATES, Outcome
 
     names, unreadable = outdated_tasks(tasks, InputFingerprints(plan.farm, tasks))
     outcomes = {name: Outcome(name, FAILED, sentence) for name, sentence in unreadable.items()}
@@ -169,39 +169,39 @@ def _all(options: argparse.Namespace, plan: "Plan", tasks: dict[str, "Task"], pa
             print(f"{name}: {'to do' if name in names else 'cannot be done' if name in outcomes else 'up to date'}")
         return 0
     for outcome in outcomes.values():
-        _say(outcome, len(outcomes), len(names) + len(unreadable))
-    workers = _counts(options.workers)[0] if options.workers else local_workers()
+        _print_outcome(outcome, len(outcomes), len(names) + len(unreadable))
+    workers = _parse_counts(options.workers)[0] if options.workers else local_workers()
     try:
         if names:
             check_temporary_folder()
             plan.farm.work.mkdir(parents=True, exist_ok=True)
-            with connected(plan.farm, options.scheduler, workers, options.host, options.dashboard_port) as client:
+            with connect_cluster(plan.farm, options.scheduler, workers, options.host, options.dashboard_port) as client:
                 print(f"{len(names)} of {len(tasks)} tasks to do; {client.dashboard_link} shows them", flush=True)
                 for outcome in run_on(client, plan.farm, tasks, names, options.overwrite):
                     outcomes[outcome.task] = outcome
-                    _say(outcome, len(outcomes), len(names) + len(unreadable))
+                    _print_outcome(outcome, len(outcomes), len(names) + len(unreadable))
     finally:
         write_report(plan, tasks, outcomes, page)
     print(f"{page}: {len(plan.characters)} characters")
     states = {outcome.state for outcome in outcomes.values()}
-    if states <= set(GOOD):
+    if states <= set(SUCCESS_STATES):
         return 0
     return 1 if FAILED in states or AGAIN not in states else TRY_AGAIN
 
 
-def _say(outcome, done: int, total: int) -> None:
+def _print_outcome(outcome, done: int, total: int) -> None:
     seconds = f" in {outcome.seconds:.1f} s" if outcome.seconds else ""
     text = f": {outcome.sentence}" if outcome.sentence else ""
     print(f"[{done}/{total}] {outcome.task} {outcome.state}{seconds}{text}", flush=True)
 
 
 def program() -> NoReturn:
-    """Run the farm as a program: what it has started ends with it."""
+    """Run the farm as a program, and end its child processes with it."""
     if sys.platform == WINDOWS:
         sys.exit(main())
-    from .stopping import ending_all
+    from .stopping import end_all_when_done
 
-    ending_all(main)
+    end_all_when_done(main)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The plan of a farm, `characters.toml`: which rigs, how they are recorded, how exact they have to be. docs/farm.md."""
+"""The plan of a farm, `characters.toml`: rigs, settings of recording and training, accuracy goals. docs/farm.md."""
 
 import math
 import re
@@ -19,12 +19,12 @@ SETTING = re.compile(r"[a-z][a-z0-9_]*")
 
 
 class PlanError(FDDAError):
-    """The plan makes no sense."""
+    """The plan is invalid."""
 
 
 @dataclass(frozen=True)
 class Farm:
-    """What holds for all characters.
+    """Settings of all characters.
 
     Attributes:
         work: folder of what tasks hand on to each other; every machine sees it under the same path.
@@ -51,7 +51,7 @@ class Farm:
 
 @dataclass(frozen=True)
 class Character:
-    """One character.
+    """Settings of one character.
 
     Attributes:
         name: of the character; letters, digits, - and _.
@@ -97,19 +97,19 @@ class Character:
 
 @dataclass(frozen=True)
 class Plan:
-    """What `characters.toml` says; all paths are absolute."""
+    """Content of `characters.toml`, with absolute paths."""
 
     path: Path
     farm: Farm
     characters: tuple[Character, ...]
 
 
-LEAST = {
+MIN_VALUES = {
     **{"poses": 0, "seed": 0, "rounds": 0},
     **{"shards": 1, "refine_poses": 1, "evaluate_poses": 1, "threads": 1, "margin": 1},
 }
-MOST = {"shards": MAX_SHARDS, "rounds": MAX_ROUNDS, "threads": 1024, "retries": 10_000}
-MOST |= {"spread": 10, "margin": int(MAX_MARGIN)}
+MAX_VALUES = {"shards": MAX_SHARDS, "rounds": MAX_ROUNDS, "threads": 1024, "retries": 10_000}
+MAX_VALUES |= {"spread": 10, "margin": int(MAX_MARGIN)}
 
 
 def read_plan(path: Path) -> Plan:
@@ -127,107 +127,107 @@ def read_plan(path: Path) -> Plan:
         raise PlanError(f"Cannot read the plan '{path}': {error.strerror}; give the path of a .toml file.") from error
     except (ValueError, RecursionError) as error:
         raise PlanError(f"The plan '{path}' is no TOML: {error}.") from error
-    return _plan(path, values)
+    return _read_plan(path, values)
 
 
-def _plan(path: Path, values: dict) -> Plan:
-    known = {"farm", "defaults", "characters"}
-    if unknown := sorted(set(values) - known):
-        raise PlanError(f"'{path.name}' has a section [{unknown[0]}]; known are {', '.join(sorted(known))}.")
-    sections = {name: values.get(name, {}) for name in known}
+def _read_plan(path: Path, values: dict) -> Plan:
+    section_names = {"farm", "defaults", "characters"}
+    if unknown := sorted(set(values) - section_names):
+        raise PlanError(f"'{path.name}' has a section [{unknown[0]}]; known are {', '.join(sorted(section_names))}.")
+    sections = {name: values.get(name, {}) for name in section_names}
     for name, section in sections.items():
         if not isinstance(section, dict):
             raise PlanError(f"[{name}] in '{path.name}' is no section; write its keys below [{name}].")
-    given = sections["characters"]
-    if not given:
+    values_given = sections["characters"]
+    if not values_given:
         raise PlanError(f"'{path.name}' has no characters; add a section [characters.NAME] with rig and output.")
     folder, taken = path.parent, {}
-    farm = Farm(**{"work": folder / "farm", **_values(Farm, sections["farm"], "[farm]", folder)})
+    farm = Farm(**{"work": folder / "farm", **_read_fields(Farm, sections["farm"], "[farm]", folder)})
     characters = []
-    for name, own in given.items():
-        place = f"[characters.{name}]"
+    for name, own in values_given.items():
+        section = f"[characters.{name}]"
         if not NAME.fullmatch(name):
             raise PlanError(
-                f"{place}: a character's name has only letters, digits, - and _, at most 64, and not {name!r}."
+                f"{section}: a character's name has only letters, digits, - and _, at most 64, and not {name!r}."
             )
         if not isinstance(own, dict):
-            raise PlanError(f"{place} is no section; write rig and output below it.")
+            raise PlanError(f"{section} is no section; write rig and output below it.")
         merged = {**sections["defaults"], **own}
         if lacks := [key for key in ("rig", "output") if key not in merged]:
-            raise PlanError(f"{place} lacks {' and '.join(lacks)}.")
-        character = Character(name, **_values(Character, merged, place, folder))
-        _check_character(character, place)
+            raise PlanError(f"{section} lacks {' and '.join(lacks)}.")
+        character = Character(name, **_read_fields(Character, merged, section, folder))
+        _check_character(character, section)
         for what in (("name", name.lower()), ("output", character.output)):
             if what in taken:
                 raise PlanError(
-                    f"{place} has the same {what[0]} as [characters.{taken[what]}]; give it one of its own."
+                    f"{section} has the same {what[0]} as [characters.{taken[what]}]; give it one of its own."
                 )
             taken[what] = name
         characters.append(character)
     return Plan(path, farm, tuple(characters))
 
 
-def _check_character(character: Character, place: str) -> None:
+def _check_character(character: Character, section: str) -> None:
     if len(set(map(folder_of_mesh, character.objects))) < len(character.objects):
-        raise PlanError(f"{place}: two of the objects would have the same folder; rename one of them.")
+        raise PlanError(f"{section}: two of the objects would have the same folder; rename one of them.")
     if not character.poses and not character.actions and not character.strips:
-        raise PlanError(f"{place}: there is nothing to record; give poses or actions.")
+        raise PlanError(f"{section}: there is nothing to record; give poses or actions.")
     if character.fit_linear not in ("", "hard", "smooth"):
-        raise PlanError(f"{place}: fit_linear is hard or smooth, and not {character.fit_linear!r}.")
+        raise PlanError(f"{section}: fit_linear is hard or smooth, and not {character.fit_linear!r}.")
     for key, value in character.train.items():
         if not SETTING.fullmatch(key) or key in ("messages", "warm_start", "goal_mm"):
             raise PlanError(
-                f"{place}: train cannot have {key!r}; it takes settings of train, and goal_mm stands beside it."
+                f"{section}: train cannot have {key!r}; it takes settings of train, and goal_mm stands beside it."
             )
         values = value if isinstance(value, list) else [value]
         if not values or not all(isinstance(one, int | float | str) for one in values):
-            raise PlanError(f"{place}: train.{key} is {value!r}; give a number, a text, or a list of them.")
+            raise PlanError(f"{section}: train.{key} is {value!r}; give a number, a text, or a list of them.")
         if isinstance(value, bool) and not value:
-            raise PlanError(f"{place}: train.{key} is false; leave it out.")
+            raise PlanError(f"{section}: train.{key} is false; leave it out.")
 
 
-def _values(kind: type, given: dict, place: str, folder: Path) -> dict:
-    """Values for the fields of a dataclass, checked against their types."""
+def _read_fields(kind: type, values_given: dict, section: str, folder: Path) -> dict:
+    """Read the fields of a dataclass, and check their types."""
     types = {each.name: each.type for each in fields(kind) if each.name != "name"}
     found = {}
-    for key, value in given.items():
+    for key, value in values_given.items():
         if key not in types:
-            raise PlanError(f"{place} has the key {key!r}; known are {', '.join(sorted(types))}.")
-        found[key] = _value(key, value, types[key], place, folder)
+            raise PlanError(f"{section} has the key {key!r}; known are {', '.join(sorted(types))}.")
+        found[key] = _read_value(key, value, types[key], section, folder)
     return found
 
 
-def _value(key: str, value: Any, kind: Any, place: str, folder: Path) -> Any:
+def _read_value(key: str, value: Any, kind: Any, section: str, folder: Path) -> Any:
     if kind in (tuple[str, ...], tuple[Path, ...]):
         if not isinstance(value, list):
-            raise PlanError(f'{place}: {key} is a list of texts, such as ["a"], and not {value!r}.')
-        return tuple(_value(key, one, kind.__args__[0], place, folder) for one in value)
+            raise PlanError(f'{section}: {key} is a list of texts, such as ["a"], and not {value!r}.')
+        return tuple(_read_value(key, one, kind.__args__[0], section, folder) for one in value)
     if kind is Path:
-        return (folder / _text(key, value, place)).absolute()
+        return (folder / _read_text(key, value, section)).absolute()
     if kind is str:
-        return _text(key, value, place)
+        return _read_text(key, value, section)
     if kind is bool or kind == dict[str, Any]:
         wanted = bool if kind is bool else dict
         if not isinstance(value, wanted):
             raise PlanError(
-                f"{place}: {key} is {'true or false' if wanted is bool else 'a section'}, and not {value!r}."
+                f"{section}: {key} is {'true or false' if wanted is bool else 'a section'}, and not {value!r}."
             )
         return value
     is_whole = kind in (int, int | None)
     if isinstance(value, bool) or not isinstance(value, int if is_whole else int | float) or not math.isfinite(value):
-        raise PlanError(f"{place}: {key} is a {'whole ' if is_whole else ''}number, and not {value!r}.")
-    low, high = LEAST.get(key, 0), MOST.get(key, 10**9)
+        raise PlanError(f"{section}: {key} is a {'whole ' if is_whole else ''}number, and not {value!r}.")
+    low, high = MIN_VALUES.get(key, 0), MAX_VALUES.get(key, 10**9)
     if not low <= value <= high:
-        raise PlanError(f"{place}: {key} is from {low:,} to {high:,}, and not {value!r}.")
+        raise PlanError(f"{section}: {key} is from {low:,} to {high:,}, and not {value!r}.")
     return value
 
 
-def _text(key: str, value: Any, place: str) -> str:
+def _read_text(key: str, value: Any, section: str) -> str:
     if not isinstance(value, str) or "\0" in value:
-        raise PlanError(f"{place}: {key} is a text, and not {value!r}.")
+        raise PlanError(f"{section}: {key} is a text, and not {value!r}.")
     return value
 
 
 def folder_of_mesh(name: str) -> str:
-    """The folder that `record` gives the recording of one of several meshes: `bpy.path.clean_name` without Blender."""
+    """Return the subfolder of a mesh in a recording of several meshes, as `bpy.path.clean_name` makes it."""
     return re.sub(r"(?![A-Za-z0-9-])[\x00-\xfe]", "_", name)

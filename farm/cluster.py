@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The tasks on a Dask cluster: a local one, or one that is there. Workers start processes, and compute nothing."""
+"""Running of tasks on a Dask cluster, local or existing. Workers start processes and compute nothing themselves."""
 
 import contextlib
 import itertools
@@ -14,8 +14,8 @@ from fdda_addon.core.errors import TRY_AGAIN, FDDAError, exit_status
 
 from .characters import Farm
 from .process import TryAgainError
-from .run import AGAIN, BLOCKED, FAILED, GOOD, Outcome, run_task
-from .simulation import rest_seconds, task_seconds
+from .run import AGAIN, BLOCKED, FAILED, SUCCESS_STATES, Outcome, run_task
+from .simulation import seconds_to_end, task_seconds
 from .tasks import TRAIN, Task
 
 if TYPE_CHECKING:
@@ -45,19 +45,19 @@ _left_open: list[contextlib.ExitStack] = []
 
 
 class ClusterError(TryAgainError):
-    """The cluster is not there, or not any more."""
+    """The cluster cannot be reached, or was lost."""
 
 
 def local_workers() -> int:
-    """How many workers this machine has the cores and the memory for."""
+    """Return the number of workers for the cores and the memory of this machine."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e6
     return max(1, min(cores, int(memory // TASK_MB)))
 
 
 @contextlib.contextmanager
-def connected(farm: Farm, scheduler: str, workers: int, host: str, port: int) -> Iterator["Client"]:
-    """A client of a cluster.
+def connect_cluster(farm: Farm, scheduler: str, workers: int, host: str, port: int) -> Iterator["Client"]:
+    """Yield a client of a cluster.
 
     Args:
         farm: whether trainings need a GPU.
@@ -101,7 +101,7 @@ def connected(farm: Farm, scheduler: str, workers: int, host: str, port: int) ->
 
 @contextlib.contextmanager
 def _local_cluster(farm: Farm, workers: int, host: str, port: int) -> Iterator[object]:
-    """A cluster of processes on this machine. What workers start counts to no limit of Dask's: they are sized here."""
+    """Make a cluster of processes on this machine. Dask does not limit child processes, so workers are sized here."""
     from distributed import Nanny, Scheduler, SpecCluster
 
     quiet = logging.CRITICAL
@@ -121,7 +121,7 @@ def _local_cluster(farm: Farm, workers: int, host: str, port: int) -> Iterator[o
 
 
 def _keep_workers(cluster: object, stop: threading.Event) -> None:
-    """Replace workers that do not come back: a nanny starts its worker again, and gives up if that is killed too."""
+    """Replace lost workers: a nanny restarts its worker, but gives up when that is killed, too."""
     absent: dict[int, int] = {}
     following = itertools.count(len(cluster.worker_spec))
     while not stop.wait(KEEP_SECONDS):
@@ -136,7 +136,7 @@ def _keep_workers(cluster: object, stop: threading.Event) -> None:
 def run_on(
     client: "Client", farm: Farm, tasks: dict[str, Task], names: list[str], overwrite: bool = False
 ) -> Iterator[Outcome]:
-    """Run tasks on a cluster, each when those before it are done.
+    """Run tasks on a cluster, each after its dependencies.
 
     Args:
         client: of the cluster.
@@ -153,7 +153,7 @@ def run_on(
     from distributed import as_completed
 
     futures, run_id = {}, f"{time.time():.3f}"
-    rest = rest_seconds(tasks, task_seconds(tasks)[0])
+    rest = seconds_to_end(tasks, task_seconds(tasks)[0])
     for name in names:
         task = tasks[name]
         own = {other: tasks[other] for other in _ancestors(tasks, name)} | {name: task}
@@ -196,11 +196,11 @@ def _ancestors(tasks: dict[str, Task], name: str) -> list[str]:
 
 
 def _run(farm: Farm, tasks: dict[str, Task], name: str, before: list[Outcome], overwrite: bool) -> Outcome:
-    """What a worker does."""
+    """Run a task on a worker."""
     from distributed import get_worker
 
     for outcome in before:
-        if outcome.state not in GOOD:
+        if outcome.state not in SUCCESS_STATES:
             return Outcome(name, BLOCKED, f"'{outcome.task}' is not done.")
     worker = get_worker()
     key = worker.get_current_task()

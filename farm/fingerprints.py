@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fingerprints: what a task depends on, and what it left. What is up to date follows, and what was changed since."""
+"""Fingerprints of inputs and outputs of tasks, which show what is up to date and what was changed since."""
 
 import hashlib
 import json
@@ -19,27 +19,27 @@ from .tasks import TRAIN, Task
 
 FORMAT, VERSION = "fdda-farm-task", 1
 MAX_JSON_BYTES = 64 << 20
-LARGEST = 1e12
+MAX_RECORDED_VALUE = 1e12
 ROOT = Path(__file__).resolve().parent.parent
-PIECE = 4 << 20
+READ_CHUNK_BYTES = 4 << 20
 
 
 class ManifestError(FDDAError):
-    """What a task left is not as it was left."""
+    """Outputs of a task are missing or were changed."""
 
 
 @dataclass(frozen=True)
 class TaskManifest:
-    """What is written when a task is done.
+    """Manifest of a finished task.
 
     Attributes:
-        key: fingerprint of what it depended on.
-        outputs: size in bytes and SHA-256 of each file below the folder of the task that is an output or in one.
-        skipped: why there was nothing to do; empty where there was.
-        seconds: that its verbs took.
-        peak_mb: most memory that a process of it took.
+        key: fingerprint of its inputs.
+        outputs: size in bytes and SHA-256 of each output file, by its name relative to the folder of the task.
+        skipped: why the task was skipped; empty where it ran.
+        seconds: wall-clock time of its verbs.
+        peak_mb: largest memory of a process.
         host: name of the machine.
-        notes: what the report wants to know, such as the task whose model was bound.
+        notes: values for the report, such as the task whose model was bound.
     """
 
     key: str
@@ -52,7 +52,7 @@ class TaskManifest:
 
 
 def read_json(path: Path) -> dict:
-    """The object that a file of JSON holds; no number in it is NaN or infinite.
+    """Read an object from a JSON file, without NaN and infinity.
 
     Raises:
         OSError: the file cannot be read, or is too large.
@@ -68,7 +68,7 @@ def read_json(path: Path) -> dict:
 
 
 def finite_float(value: object) -> float:
-    """A number as a float.
+    """Convert a number to a finite float.
 
     Raises:
         ValueError: it is none, NaN, or infinite.
@@ -79,7 +79,7 @@ def finite_float(value: object) -> float:
 
 
 def read_manifest(task: Task) -> TaskManifest | None:
-    """The manifest of a task; None where there is none that can be read: the task is not done."""
+    """Read the manifest of a task; None where it is missing or invalid, so that the task is not done."""
     try:
         value = read_json(task.manifest)
         if (value["format"], value["version"]) != (FORMAT, VERSION):
@@ -89,7 +89,7 @@ def read_manifest(task: Task) -> TaskManifest | None:
         if not all(isinstance(text, str) for text in texts) or not isinstance(value["notes"], dict):
             return None
         seconds, peak_mb = finite_float(value["seconds"]), finite_float(value["peak_mb"])
-        if not (0 <= seconds < LARGEST and 0 <= peak_mb < LARGEST):
+        if not (0 <= seconds < MAX_RECORDED_VALUE and 0 <= peak_mb < MAX_RECORDED_VALUE):
             return None
         return TaskManifest(texts[0], outputs, texts[1], seconds, peak_mb, texts[2], value["notes"])
     except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError):
@@ -97,7 +97,7 @@ def read_manifest(task: Task) -> TaskManifest | None:
 
 
 def write_manifest(task: Task, manifest: TaskManifest) -> None:
-    """Say that a task is done.
+    """Write the manifest of a finished task.
 
     Raises:
         OutputError: the disk is full.
@@ -106,36 +106,36 @@ def write_manifest(task: Task, manifest: TaskManifest) -> None:
 
 
 def digest_file(path: Path) -> tuple[int, str]:
-    """Size and SHA-256 of a file.
+    """Compute size and SHA-256 of a file.
 
     Raises:
         OSError: it cannot be read.
     """
     digest, size = hashlib.sha256(), 0
     with open(path, "rb") as file:
-        while piece := file.read(PIECE):
+        while piece := file.read(READ_CHUNK_BYTES):
             digest.update(piece)
             size += len(piece)
     return size, digest.hexdigest()
 
 
 def output_files(folder: Path, names: Iterable[str]) -> dict[str, Path]:
-    """The files that outputs are, or that are in outputs that are folders, by their names below the folder."""
-    found = {}
+    """List the files of outputs and in output folders, by their names relative to the folder."""
+    files_by_name = {}
     for name in names:
         path = folder / name
-        inner = sorted(filter(_is_kept, path.rglob("*"))) if path.is_dir() else [path]
-        found |= {file.relative_to(folder).as_posix(): file for file in inner}
-    return found
+        inner = sorted(filter(_is_output_file, path.rglob("*"))) if path.is_dir() else [path]
+        files_by_name |= {file.relative_to(folder).as_posix(): file for file in inner}
+    return files_by_name
 
 
-def _is_kept(path: Path) -> bool:
-    """Whether a file belongs to an output, and is no lock and no temporary file."""
+def _is_output_file(path: Path) -> bool:
+    """Return whether a file is an output, and no lock or temporary file."""
     return path.is_file() and path.suffix != ".lock" and not is_temporary_name(path.name)
 
 
 def digest_outputs(task: Task) -> dict[str, tuple[int, str]]:
-    """Size and SHA-256 of every file that a task has left.
+    """Compute size and SHA-256 of all output files of a task.
 
     Raises:
         ManifestError: an output is missing.
@@ -147,8 +147,8 @@ def digest_outputs(task: Task) -> dict[str, tuple[int, str]]:
 
 
 def outputs_are_intact(task: Task, manifest: TaskManifest) -> bool:
-    """Whether the outputs, and what was published of them, hold what they held when the task was done."""
-    published = {place: manifest.outputs.get(name) for name, place in task.publishes if not manifest.skipped}
+    """Return whether outputs and published copies are unchanged since the task finished."""
+    published = {path: manifest.outputs.get(name) for name, path in task.publishes if not manifest.skipped}
     expected = {task.folder / name: output for name, output in manifest.outputs.items()} | published
     try:
         # Most of what differs is not there, or has another size: nothing large is read for that.
@@ -160,7 +160,7 @@ def outputs_are_intact(task: Task, manifest: TaskManifest) -> bool:
 
 
 def check_outputs(task: Task, only: Callable[[str], bool] = lambda _: True) -> TaskManifest:
-    """Check that the outputs of a task are as it left them, before they are used.
+    """Check before use that the outputs of a task are unchanged.
 
     Raises:
         ManifestError: it is not done, or an output was changed.
@@ -173,20 +173,20 @@ def check_outputs(task: Task, only: Callable[[str], bool] = lambda _: True) -> T
             continue
         path = task.folder / name
         try:
-            found = digest_file(path)
+            actual = digest_file(path)
         except OSError as error:
-            found = (-1, str(error.strerror))
-        if found != expected:
+            actual = (-1, str(error.strerror))
+        if actual != expected:
             task.manifest.unlink(missing_ok=True)
             raise ManifestError(
-                f"'{path}' is not what '{task.name}' left ({found[0]:,} bytes, {expected[0]:,} were written); run the "
-                "farm again, and it is made again."
+                f"'{path}' is not what '{task.name}' left ({actual[0]:,} bytes, {expected[0]:,} were written); "
+                "run the farm again, and it is made again."
             )
     return manifest
 
 
 class InputFingerprints:
-    """Fingerprints of what tasks depend on: verbs, files from outside, settings, and the tasks before."""
+    """Fingerprints of the inputs of tasks: verbs, external files, settings, and earlier tasks."""
 
     def __init__(self, farm: Farm, tasks: dict[str, Task]):
         self._farm, self._tasks = farm, tasks
@@ -194,7 +194,7 @@ class InputFingerprints:
         self._files: dict[Path, tuple[int, str]] = {}
 
     def of_task(self, name: str) -> str:
-        """The key of a task.
+        """Return the fingerprint of a task.
 
         Raises:
             ManifestError: a file from outside cannot be read.
@@ -202,12 +202,26 @@ class InputFingerprints:
         if name not in self._keys:
             task = self._tasks[name]
             files = [self._file(path) for path in task.files]
-            before = [self.of_task(other) for other in task.after]
-            own = [_without(str(self._farm.work), task.verbs), list(task.outputs), task.poses, str(task.round)]
+            previous = [self.of_task(other) for other in task.after]
+            task_settings = [
+                _to_relative_texts(str(self._farm.work), task.verbs),
+                list(task.outputs),
+                task.poses,
+                str(task.round),
+            ]
             # Where the verbs run counts where it changes what they make.
             settings = [self._farm.threads, self._farm.gpu, self._farm.trainer_python] if task.kind == TRAIN else []
-            runs = [self._farm.python, self._farm.blender, version()]
-            text = json.dumps([own, _without(str(self._farm.work), task.publishes), settings, runs, files, before])
+            programs = [self._farm.python, self._farm.blender, addon_version()]
+            text = json.dumps(
+                [
+                    task_settings,
+                    _to_relative_texts(str(self._farm.work), task.publishes),
+                    settings,
+                    programs,
+                    files,
+                    previous,
+                ]
+            )
             self._keys[name] = hashlib.sha256(text.encode()).hexdigest()
         return self._keys[name]
 
@@ -220,14 +234,14 @@ class InputFingerprints:
         return self._files[path]
 
 
-def _without(folder: str, values: tuple) -> list:
-    """Values as texts, without the folder that all work lies in: it may be moved."""
+def _to_relative_texts(folder: str, values: tuple) -> list:
+    """Convert values to texts without the work folder, which may be moved."""
     return [[str(one).replace(folder, "") for one in value] for value in values]
 
 
 @cache
-def version() -> str:
-    """The version of the add-on, which its recordings and models are those of."""
+def addon_version() -> str:
+    """Return the version of the add-on."""
     try:
         return str(tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))["version"])
     except (OSError, ValueError, KeyError):
@@ -235,19 +249,19 @@ def version() -> str:
 
 
 def outdated_tasks(tasks: dict[str, Task], fingerprints: InputFingerprints) -> tuple[list[str], dict[str, str]]:
-    """Names of the tasks that have to run, and why some cannot even be looked at.
+    """Find the tasks that have to run, and tasks whose inputs cannot be read.
 
-    As `make` does, from the end: what is done, and whose outputs are there, needs nothing before it.
+    Works backwards as `make` does: a finished task with unchanged outputs needs no earlier task.
 
     Returns:
         The names, in the order of `tasks`; and for tasks of characters whose files cannot be read a sentence each.
     """
     needed: set[str] = set()
     failed: dict[str, str] = {}
-    waiting = [name for name in tasks if not any(name in task.after for task in tasks.values())]
-    seen = set(waiting)
-    while waiting:
-        name = waiting.pop()
+    pending = [name for name in tasks if not any(name in task.after for task in tasks.values())]
+    seen = set(pending)
+    while pending:
+        name = pending.pop()
         try:
             is_done = is_up_to_date(tasks[name], fingerprints.of_task(name))
         except ManifestError as error:
@@ -258,11 +272,11 @@ def outdated_tasks(tasks: dict[str, Task], fingerprints: InputFingerprints) -> t
             for other in tasks[name].after:
                 if other not in seen:
                     seen.add(other)
-                    waiting.append(other)
+                    pending.append(other)
     return [name for name in tasks if name in needed], failed
 
 
 def is_up_to_date(task: Task, key: str) -> bool:
-    """Whether a task is done, with what it depends on now."""
+    """Return whether a task is done with its current inputs."""
     manifest = read_manifest(task)
     return manifest is not None and manifest.key == key and outputs_are_intact(task, manifest)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The graph as a job for Flamenco, as its manager takes it, of the job type `flamenco_job/fdda_characters.js`."""
+"""Export of the graph as a job for Flamenco, of the job type `flamenco_job/fdda_characters.js`."""
 
 import json
 import sys
@@ -17,7 +17,7 @@ PRIORITY = 50
 
 
 def write_job(plan: Plan, tasks: dict[str, Task], path: Path) -> int:
-    """Write the job of a plan, as `POST /api/v3/jobs` of the manager takes it; returns the exit status.
+    """Write the job of a plan for `POST /api/v3/jobs` of the manager; return the exit status.
 
     Raises:
         OutputError: the file cannot be written.
@@ -28,7 +28,7 @@ def write_job(plan: Plan, tasks: dict[str, Task], path: Path) -> int:
 
 
 def make_job(plan: Plan, tasks: dict[str, Task]) -> dict:
-    """The job. A job type reads no files, so that the graph is one of its settings."""
+    """Make the job. A job type cannot read files, so the graph is one of its settings."""
     graph = [{"name": task.name, "kind": task.kind, "after": list(task.after)} for task in tasks.values()]
     return {
         "name": f"FDDA {plan.path.stem}",

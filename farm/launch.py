@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Runs the farm from its file, for engines that start a program and set no environment: `python farm/launch.py …`."""
+"""Entry point of the farm as a file, for engines that set no environment: `python farm/launch.py …`."""
 
 import sys
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The graph as a job template of Open Job Description (jobtemplate-2023-09), which render-farm managers take."""
+"""Export of the graph as a job template of Open Job Description (jobtemplate-2023-09) for render-farm managers."""
 
 import sys
 from pathlib import Path
@@ -15,7 +15,7 @@ SHARD = "Shard"
 
 
 def write_template(plan: Plan, tasks: dict[str, Task], path: Path) -> int:
-    """Write the template of a plan; returns the exit status.
+    """Write the template of a plan; return the exit status.
 
     Raises:
         OutputError: the file cannot be written.
@@ -27,7 +27,7 @@ def write_template(plan: Plan, tasks: dict[str, Task], path: Path) -> int:
 
 
 def make_template(plan: Plan, tasks: dict[str, Task], folder: Path) -> dict:
-    """The template: a step for each task, one for all shards of a recording, and the report as the last.
+    """Make the template: a step per task, one step for all shards of a recording, and the report as last step.
 
     Args:
         plan, tasks: the graph.
@@ -68,7 +68,7 @@ def _text(name: str, default: str, description: str) -> dict:
 
 
 def step_name(task: Task) -> str:
-    """Name of the step of a task; the shards of a recording share one."""
+    """Return the name of the step of a task; the shards of a recording share a step."""
     return task.name.rpartition("-")[0] if task.kind == RECORD else task.name
 
 

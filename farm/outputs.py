@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a farm may write over: nothing that it reads, nothing of another kind, no bound file that somebody changed."""
+"""Checks of what a farm may overwrite: no inputs, no files of another kind, no bound file that was edited."""
 
 import os
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ TEMPLATE = FileKind("an OpenJD job template", rb'\s*\{\s*"specificationVersion":
 JOB = FileKind("a job for Flamenco", rb'\s*\{\s*"name":\s*"(?:[^"\\]|\\.)*",\s*"type":\s*"fdda-characters"')
 MANIFEST = FileKind("the fingerprint of a task", rb'\s*\{\s*"format":\s*"fdda-farm-task"')
 LOG = FileKind("the log of a task", rb"\$ ")
-KINDS_OF_PUBLISHED = {
+PUBLISHED_KINDS = {
     **{".blend": BLEND, ".onnx": MODEL, ".png": PICTURE, "report.json": REPORT},
     **{"report.html": PAGE, "evaluation.json": EVALUATION},
 }
@@ -33,7 +33,7 @@ def check_farm_outputs(
     overwrite: bool = False,
     runs: bool = False,
 ) -> None:
-    """Fail before the work when the farm would take something away.
+    """Check before the work that the farm overwrites no other data.
 
     Args:
         plan: whose files are read.
@@ -48,7 +48,7 @@ def check_farm_outputs(
     """
     tasks, own = list(tasks), list(own)
     read = [plan.path, *(path for each in plan.characters for path in (each.rig, *each.depends))]
-    published = [(place, kind_of(name)) for task in tasks for name, place in task.publishes]
+    published = [(place, published_kind(name)) for task in tasks for name, place in task.publishes]
     kept = {
         os.path.realpath(path): path for task in tasks for path in (task.folder, task.manifest, task.log, task.lock)
     }
@@ -69,15 +69,15 @@ def check_farm_outputs(
 
 
 def check_published(task: Task, overwrite: bool = False) -> None:
-    """Fail before the work of a task when what it publishes would take something away.
+    """Check before a task that its published files overwrite no other data.
 
     Raises:
         OutputError: a file is there that is of another kind, is read, or is a bound file that somebody has changed.
     """
-    _check_files([(place, kind_of(name)) for name, place in task.publishes], task.files, overwrite)
+    _check_files([(place, published_kind(name)) for name, place in task.publishes], task.files, overwrite)
     manifest = None if overwrite else read_manifest(task)
     # Of the other files nobody makes anything: they are made again.
-    bound = [(name, place) for name, place in task.publishes if kind_of(name) is BLEND and os.path.exists(place)]
+    bound = [(name, place) for name, place in task.publishes if published_kind(name) is BLEND and os.path.exists(place)]
     for name, place in bound if manifest else ():
         if os.path.getsize(place) and digest_file(place) != manifest.outputs.get(name):
             raise OutputError(
@@ -85,8 +85,8 @@ def check_published(task: Task, overwrite: bool = False) -> None:
             )
 
 
-def check_unclaimed(task: Task) -> None:
-    """Check that where a task keeps its files none of somebody else's are, which would be removed.
+def check_task_folder_free(task: Task) -> None:
+    """Check that the folder of a task has no files from elsewhere, which would be removed.
 
     Raises:
         OutputError: there are.
@@ -106,7 +106,7 @@ def _check_files(outputs: list[tuple[Path, FileKind]], read: Iterable[Path], ove
     check_outputs([one for one in outputs if os.path.isdir(one[0].parent)], (), overwrite)
 
 
-def kind_of(name: str) -> FileKind:
-    """Of which kind a file is that a task publishes."""
+def published_kind(name: str) -> FileKind:
+    """Return the kind of a published file."""
     path = Path(name)
-    return KINDS_OF_PUBLISHED.get(path.name) or KINDS_OF_PUBLISHED[path.suffix]
+    return PUBLISHED_KINDS.get(path.name) or PUBLISHED_KINDS[path.suffix]

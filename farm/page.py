@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report of all characters as one page of HTML that asks for nothing from outside."""
+"""The report of all characters as a self-contained HTML page."""
 
 import base64
 from html import escape
@@ -43,7 +43,14 @@ def render_page(report: dict, pictures: dict[str, list[tuple[str, bytes]]]) -> s
         pictures: by the name of a character, PNG files each with a name.
     """
     title = f"{escape(str(report['plan']))}: characters"
-    parts = [_head(report), _failures(report), _errors(report), _times(report), _warnings(report), _pictures(pictures)]
+    parts = [
+        _head(report),
+        _failures(report),
+        _errors(report),
+        _times_table(report),
+        _warnings(report),
+        _pictures(pictures),
+    ]
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head><body>'
@@ -58,7 +65,7 @@ def _head(report: dict) -> str:
     cards = [
         (f"{states.count('done')} of {len(states)}", "characters are done", ""),
         (str(states.count("failed")), "failed", "bad" if "failed" in states else ""),
-        (str(sum(_misses(own) for own in characters)), "done, and miss their goal", ""),
+        (str(sum(_misses_goal(own) for own in characters)), "done, and miss their goal", ""),
         (str(sum(own["ran_now"] for own in characters)), "tasks ran now, the others were up to date", ""),
         (format_duration(seconds).removeprefix("about "), "of processes, one after the other", ""),
         (f"{max((own['peak_mb'] for own in characters), default=0):,.0f} MB", "most memory of a process", ""),
@@ -70,7 +77,7 @@ def _head(report: dict) -> str:
     return f'<h1>{name}</h1><p>Written {written}.</p><div class="cards">{shown}</div>'
 
 
-def _misses(own: dict) -> bool:
+def _misses_goal(own: dict) -> bool:
     return any(own["goal_mm"] and model["fdda"].get("p999", 0) > own["goal_mm"] for model in own["models"])
 
 
@@ -143,7 +150,7 @@ def _change(value: float | None, last: float | None) -> str:
     return f'<td class="{kind}">{100 * part:+.0f} %</td>'
 
 
-def _times(report: dict) -> str:
+def _times_table(report: dict) -> str:
     head = "".join(f"<th>{kind}</th>" for kind in KINDS)
     rows = []
     for name, own in report["characters"].items():

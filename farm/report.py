@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What became of all characters: `report.json`, and the page made of it. docs/farm.md has the keys."""
+"""The report of all characters: `report.json` and a page. docs/farm.md has the keys."""
 
 import time
 from pathlib import Path
@@ -8,9 +8,9 @@ from typing import Any
 from fdda_addon.core.output import write_json, write_text
 
 from .characters import Character, Plan
-from .fingerprints import LARGEST, TaskManifest, read_json, read_manifest
+from .fingerprints import MAX_RECORDED_VALUE, TaskManifest, read_json, read_manifest
 from .page import render_page
-from .run import BLOCKED, GOOD, Outcome
+from .run import BLOCKED, SUCCESS_STATES, Outcome
 from .tasks import BIND, EVALUATE, EVALUATION, KINDS, PICTURE, REFINE, REPORT, Task
 
 FORMAT, VERSION = "fdda-farm-report", 1
@@ -55,7 +55,7 @@ def write_report(plan: Plan, tasks: dict[str, Task], outcomes: dict[str, Outcome
     for name, value in characters.items():
         # A run that did nothing is compared with what the last that did something was compared with.
         last = before.get(name, {})
-        value["before"] = last.get("before") if not _is_changed(value, last) else _summary(last)
+        value["before"] = last.get("before") if not _differs_from_last(value, last) else _summary(last)
     content = {
         "format": FORMAT,
         "version": VERSION,
@@ -73,10 +73,10 @@ def _character(character: Character, tasks: dict[str, Task], outcomes: dict[str,
     failures = [
         {"task": name, "state": outcomes[name].state, "sentence": outcomes[name].sentence}
         for name in tasks
-        if name in outcomes and outcomes[name].state not in (*GOOD, BLOCKED)
+        if name in outcomes and outcomes[name].state not in (*SUCCESS_STATES, BLOCKED)
     ]
     bind = next(task for task in tasks.values() if task.kind == BIND)
-    is_bound = manifests[bind.name] is not None and not failures and bind.name not in _not_good(outcomes)
+    is_bound = manifests[bind.name] is not None and not failures and bind.name not in _unfinished_tasks(outcomes)
     ran = {name: manifest for name, manifest in manifests.items() if manifest is not None and not manifest.skipped}
     return {
         "state": BOUND if is_bound else BROKEN if failures else UNFINISHED,
@@ -94,12 +94,12 @@ def _character(character: Character, tasks: dict[str, Task], outcomes: dict[str,
     }
 
 
-def _not_good(outcomes: dict[str, Outcome]) -> set[str]:
-    return {name for name, outcome in outcomes.items() if outcome.state not in GOOD}
+def _unfinished_tasks(outcomes: dict[str, Outcome]) -> set[str]:
+    return {name for name, outcome in outcomes.items() if outcome.state not in SUCCESS_STATES}
 
 
 def _models(tasks: dict[str, Task], bind: Task, manifest: TaskManifest) -> list[dict]:
-    """Of each model that is bound: its errors, and the round that it is of."""
+    """Return errors and round of each bound model."""
     found = []
     for place, rounds in bind.choices:
         bound = manifest.notes.get("bound")
@@ -119,11 +119,11 @@ def _models(tasks: dict[str, Task], bind: Task, manifest: TaskManifest) -> list[
                 "round": int(train.rpartition("-")[2]),
                 "rounds": rounds_done,
                 "poses_added": len(refined) > 0,
-                "vertices": _taken(errors.get("vertices"), int, 0),
+                "vertices": _value_or_default(errors.get("vertices"), int, 0),
                 "fdda": _errors(errors.get("fdda")),
                 "linear": _errors(errors.get("linear")),
-                "verdict": _taken(_taken(report.get("goal"), dict, {}).get("verdict"), str, ""),
-                "warnings": [own["text"] for own in _taken(report.get("warnings"), [{"text": str}], [])],
+                "verdict": _value_or_default(_value_or_default(report.get("goal"), dict, {}).get("verdict"), str, ""),
+                "warnings": [own["text"] for own in _value_or_default(report.get("warnings"), [{"text": str}], [])],
             }
         )
     return found
@@ -135,7 +135,7 @@ def _was_skipped(task: Task) -> bool:
 
 
 def _pictures(tasks: dict[str, Task], character: Character) -> list[tuple[str, bytes]]:
-    """Heat maps of the bound models of a character, by the names of the models."""
+    """Return the heat maps of the bound models of a character, by model name."""
     bind = tasks.get(f"{character.name}/{BIND}")
     found = []
     for place, _ in bind.choices if bind else ():
@@ -145,25 +145,25 @@ def _pictures(tasks: dict[str, Task], character: Character) -> list[tuple[str, b
     return found
 
 
-def _is_changed(value: dict, last: dict) -> bool:
+def _differs_from_last(value: dict, last: dict) -> bool:
     keys = ("state", "key", "models", "failures")
     return any(value.get(key) != last.get(key) for key in keys)
 
 
 def _summary(last: dict) -> dict | None:
-    """What the next report compares with; None where there was none."""
+    """Return the values that the next report compares with; None without a report."""
     if not last:
         return None
     return {key: last.get(key) for key in ("state", "models", "seconds", "failures")}
 
 
 def _read(path: Path) -> dict:
-    """What the last report says of characters; nothing of those that this one could not have written."""
+    """Read the characters of the last report, without invalid ones."""
     value = _read_json(path)
     characters = value.get("characters")
     if (value.get("format"), value.get("version")) != (FORMAT, VERSION) or not isinstance(characters, dict):
         return {}
-    return {name: own for name, own in characters.items() if _is_a(own, CHARACTER)}
+    return {name: own for name, own in characters.items() if _matches_schema(own, CHARACTER)}
 
 
 def _read_json(path: Path) -> dict:
@@ -174,28 +174,28 @@ def _read_json(path: Path) -> dict:
 
 
 def _errors(value: object) -> dict[str, float]:
-    values = _taken(value, dict, {})
-    return {key: values[key] for key in ("mean", "p999", "max") if _is_a(values.get(key), float)}
+    values = _value_or_default(value, dict, {})
+    return {key: values[key] for key in ("mean", "p999", "max") if _matches_schema(values.get(key), float)}
 
 
-def _taken(value: object, kind: Any, otherwise: Any) -> Any:
-    return value if _is_a(value, kind) else otherwise
+def _value_or_default(value: object, kind: Any, default: Any) -> Any:
+    return value if _matches_schema(value, kind) else default
 
 
-def _is_a(value: object, kind: Any) -> bool:
-    """Whether a value of JSON is of a kind, as `CHARACTER` is one."""
+def _matches_schema(value: object, kind: Any) -> bool:
+    """Return whether a JSON value matches a schema such as `CHARACTER`."""
     if isinstance(kind, tuple):
-        return any(_is_a(value, one) for one in kind)
+        return any(_matches_schema(value, one) for one in kind)
     if isinstance(kind, list):
-        return isinstance(value, list) and all(_is_a(one, kind[0]) for one in value)
+        return isinstance(value, list) and all(_matches_schema(one, kind[0]) for one in value)
     if isinstance(kind, dict):
         of_all = kind.get(str)
         return isinstance(value, dict) and (
-            all(_is_a(one, of_all) for one in value.values())
+            all(_matches_schema(one, of_all) for one in value.values())
             if of_all
-            else all(_is_a(value.get(name), one) for name, one in kind.items())
+            else all(_matches_schema(value.get(name), one) for name, one in kind.items())
         )
     if kind in (int, float):
         is_number = isinstance(value, (int, kind)) and not isinstance(value, bool)
-        return is_number and abs(value) < LARGEST
+        return is_number and abs(value) < MAX_RECORDED_VALUE
     return value is None if kind is None else isinstance(value, kind)

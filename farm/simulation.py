@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How long the graph will take on so many workers, from what tasks took that were measured. docs/farm.md derives it."""
+"""Simulation of the graph's run time for a number of workers, from measured times of tasks. docs/farm.md derives it."""
 
 import heapq
 import statistics
@@ -14,17 +14,17 @@ from .tasks import BIND, EVALUATE, INFLUENCES, KINDS, MERGE, RECORD, REFINE, TRA
 
 START_SECONDS = 2.0
 """What every task takes before it does anything: a process, Blender, the file, PyTorch."""
-SECONDS_A_POSE = {RECORD: 0.006, MERGE: 0.0002, TRAIN: 0.03, EVALUATE: 0.01, REFINE: 0.012}
+SECONDS_PER_POSE = {RECORD: 0.006, MERGE: 0.0002, TRAIN: 0.03, EVALUATE: 0.01, REFINE: 0.012}
 """Of the arm of 1,476 vertices, where nothing has been measured; docs/farm.md says how."""
-ONCE = {INFLUENCES: 3.0, BIND: 8.0}
+SINGLE_TASK_KINDS = {INFLUENCES: 3.0, BIND: 8.0}
 """Of tasks that have no number of poses."""
-GOOD_USE = 0.5
+GOOD_UTILIZATION = 0.5
 """More workers are worth having while this part of them works."""
 
 
 @dataclass(frozen=True)
-class Simulated:
-    """A run that was simulated.
+class SimulatedRun:
+    """Result of a simulated run.
 
     Attributes:
         workers: how many.
@@ -40,7 +40,7 @@ class Simulated:
 
 
 def task_seconds(tasks: dict[str, Task]) -> tuple[dict[str, float], int]:
-    """What each task takes, and of how many that was measured; the others are estimated from those of their kind."""
+    """Return the seconds of each task, measured or estimated by kind, and the number of measured ones."""
     measured: dict[str, float] = {}
     rates: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for name, task in tasks.items():
@@ -49,17 +49,19 @@ def task_seconds(tasks: dict[str, Task]) -> tuple[dict[str, float], int]:
             measured[name] = manifest.seconds
             if not manifest.skipped:
                 rates[task.kind].append((max(0.0, manifest.seconds - START_SECONDS)) / max(1, task.poses))
-    return {name: measured.get(name, _estimated(task, rates[task.kind])) for name, task in tasks.items()}, len(measured)
+    return {name: measured.get(name, _estimate_seconds(task, rates[task.kind])) for name, task in tasks.items()}, len(
+        measured
+    )
 
 
-def _estimated(task: Task, rates: list[float]) -> float:
+def _estimate_seconds(task: Task, rates: list[float]) -> float:
     if rates:
         return START_SECONDS + statistics.median(rates) * max(1, task.poses)
-    return START_SECONDS + ONCE.get(task.kind, 0.0) + SECONDS_A_POSE.get(task.kind, 0.0) * task.poses
+    return START_SECONDS + SINGLE_TASK_KINDS.get(task.kind, 0.0) + SECONDS_PER_POSE.get(task.kind, 0.0) * task.poses
 
 
-def rest_seconds(tasks: dict[str, Task], seconds: dict[str, float]) -> dict[str, float]:
-    """For each task, the longest way from its start to an end of the graph."""
+def seconds_to_end(tasks: dict[str, Task], seconds: dict[str, float]) -> dict[str, float]:
+    """Compute for each task the longest path from its start to the end of the graph, seconds."""
     rest = dict.fromkeys(tasks, 0.0)
     for name in reversed(tasks):
         # What waits for it comes later in the graph, and has told already what follows.
@@ -70,8 +72,8 @@ def rest_seconds(tasks: dict[str, Task], seconds: dict[str, float]) -> dict[str,
     return rest
 
 
-def simulate(tasks: dict[str, Task], seconds: dict[str, float], workers: int) -> Simulated:
-    """Run the graph on paper: a free worker takes the task with the longest way to the end of those that can begin.
+def simulate(tasks: dict[str, Task], seconds: dict[str, float], workers: int) -> SimulatedRun:
+    """Simulate the graph: a free worker takes the ready task with the longest path to the end.
 
     Args:
         tasks: the graph, each task after those that it needs.
@@ -83,7 +85,7 @@ def simulate(tasks: dict[str, Task], seconds: dict[str, float], workers: int) ->
     for name, before in missing.items():
         for other in before:
             users[other].append(name)
-    rest = rest_seconds(tasks, seconds)
+    rest = seconds_to_end(tasks, seconds)
     left = {name: len(before) for name, before in missing.items()}
     ready = [(-rest[name], name) for name, count in left.items() if not count]
     heapq.heapify(ready)
@@ -104,11 +106,11 @@ def simulate(tasks: dict[str, Task], seconds: dict[str, float], workers: int) ->
     while path and waited_for[path[-1]]:
         path.append(waited_for[path[-1]])
     busy = sum(seconds[name] for name in tasks) / (now * workers) if now else 1.0
-    return Simulated(workers, now, busy, tuple(reversed(path)))
+    return SimulatedRun(workers, now, busy, tuple(reversed(path)))
 
 
 def longest_path(tasks: dict[str, Task], seconds: dict[str, float]) -> tuple[float, list[str]]:
-    """What no number of workers makes shorter: seconds, and names of the tasks that follow one another."""
+    """Find the longest path, a lower bound for any number of workers: its seconds and the names of its tasks."""
     until: dict[str, tuple[float, list[str]]] = {}
     for name, task in tasks.items():
         before = max(
@@ -119,7 +121,7 @@ def longest_path(tasks: dict[str, Task], seconds: dict[str, float]) -> tuple[flo
 
 
 def print_estimate(farm: Farm, tasks: dict[str, Task], counts: Sequence[int]) -> int:
-    """Print how long the graph takes on so many workers, where more stop helping, and why; returns the exit status."""
+    """Print run times for numbers of workers, and what limits them; return the exit status."""
     seconds, measured = task_seconds(tasks)
     total = sum(seconds.values())
     runs = [simulate(tasks, seconds, count) for count in sorted(set(counts))]
@@ -136,11 +138,11 @@ def print_estimate(farm: Farm, tasks: dict[str, Task], counts: Sequence[int]) ->
     return 0
 
 
-def _advice(farm: Farm, tasks: dict[str, Task], seconds: dict[str, float], runs: list[Simulated]) -> list[str]:
+def _advice(farm: Farm, tasks: dict[str, Task], seconds: dict[str, float], runs: list[SimulatedRun]) -> list[str]:
     shortest, path = longest_path(tasks, seconds)
     if not path:
         return ["There is nothing to do."]
-    good = [run.workers for run in runs if run.busy >= GOOD_USE]
+    good = [run.workers for run in runs if run.busy >= GOOD_UTILIZATION]
     lines = [
         f"More than {max(good):,} workers stand idle for more than half of the time."
         if good and len(good) < len(runs)

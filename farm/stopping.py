@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ends everything that a farm has started when the farm ends, in whatever way: workers, verbs, and their trainers.
+"""Ending of all child processes of a farm when it ends in any way: workers, verbs and trainers.
 
 Verbs have sessions of their own, and outlast a worker that is killed, so neither process groups nor parents lead to
 them. All of them inherit a mark in their environment. A watcher outside of the farm's session looks for it when the
@@ -19,13 +19,13 @@ MARK = "FDDA_FARM_RUN"
 """Variable of the environment of whatever a run of the farm has started."""
 GRACE_SECONDS = 10.0
 """A process that was asked to end is killed after so long."""
-PAUSE_SECONDS = 0.05
+POLL_SECONDS = 0.05
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 STATUS_OF_SIGNAL = 128
 
 
-class Stopped(KeyboardInterrupt):
-    """The farm was told to stop by a signal: Ctrl-C, SIGTERM, or SIGHUP of a terminal that was closed.
+class StoppedBySignal(KeyboardInterrupt):
+    """A signal asked the farm to stop: Ctrl-C, SIGTERM, or SIGHUP of a closed terminal.
 
     Attributes:
         exit_status: 128 and the number of the signal, as a shell has it.
@@ -36,21 +36,21 @@ class Stopped(KeyboardInterrupt):
         self.exit_status = STATUS_OF_SIGNAL + number
 
 
-def ending_all(work: Callable[[], int]) -> NoReturn:
-    """Run the farm as a program, which ends with the exit status of `work`, and with it what it has started."""
+def end_all_when_done(work: Callable[[], int]) -> NoReturn:
+    """Run the farm, end its child processes, and exit with the status of `work`."""
     os.environ[MARK] = mark = secrets.token_hex(16)
-    lifeline = _watch(mark)
+    lifeline = _start_watcher(mark)
     # Of Python's own helper, which tidies up after the workers that were ended.
     sys.warnoptions.append("ignore:resource_tracker:UserWarning")
     for number in SIGNALS:
         # Whoever had one ignored, as nohup does, still wants that.
         if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _stop)
+            signal.signal(number, _raise_stopped)
     try:
         status = work()
     except BaseException:
         _ignore()
-        end_marked(mark)
+        end_marked_processes(mark)
         raise
     _ignore()
     for stream in (sys.stdout, sys.stderr):
@@ -62,10 +62,10 @@ def ending_all(work: Callable[[], int]) -> NoReturn:
     os.execve(sys.executable, [sys.executable, "-I", "-S", __file__, mark, str(status)], environment)
 
 
-def _stop(number: int, _frame: object) -> None:
+def _raise_stopped(number: int, _frame: object) -> None:
     # Once: a second one would break off what is in the way of ending the rest.
     _ignore()
-    raise Stopped(number)
+    raise StoppedBySignal(number)
 
 
 def _ignore() -> None:
@@ -73,8 +73,8 @@ def _ignore() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def _watch(mark: str) -> int:
-    """Start the watcher. Returns the end of a pipe; when it is closed, the watcher ends what has the mark."""
+def _start_watcher(mark: str) -> int:
+    """Start the watcher; return the end of a pipe. When it is closed, the watcher ends all marked processes."""
     reader, writer = os.pipe()
     if os.fork():
         os.close(reader)
@@ -89,17 +89,17 @@ def _watch(mark: str) -> int:
         os.dup2(reader, 3)
         os.closerange(4, os.sysconf("SC_OPEN_MAX"))
         os.read(3, 1)
-        end_marked(mark)
+        end_marked_processes(mark)
     finally:
         os._exit(0)
 
 
-def end_marked(mark: str) -> None:
-    """End all processes that have the mark; those that do not end when asked are killed."""
+def end_marked_processes(mark: str) -> None:
+    """End all marked processes, and kill those that do not end in time."""
     start, asked, is_none = time.monotonic(), set(), False
     while time.monotonic() < start + 2 * GRACE_SECONDS:
         is_late = time.monotonic() > start + GRACE_SECONDS
-        found = list(_marked(mark))
+        found = list(_find_marked_processes(mark))
         if not found and is_none:
             return
         # What has just been forked shows the environment of its parent until it is a program of its own: look twice.
@@ -109,11 +109,11 @@ def end_marked(mark: str) -> None:
                 asked.add(process)
                 with contextlib.suppress(ProcessLookupError, PermissionError):
                     os.kill(process, signal.SIGKILL if is_late else signal.SIGTERM)
-        time.sleep(PAUSE_SECONDS)
+        time.sleep(POLL_SECONDS)
 
 
-def _marked(mark: str) -> Iterator[int]:
-    """Processes with the mark, but for this one; none where the system has no /proc."""
+def _find_marked_processes(mark: str) -> Iterator[int]:
+    """Find the marked processes except this one; empty on systems without /proc."""
     wanted = f"{MARK}={mark}".encode()
     for name in os.listdir("/proc") if sys.platform == "linux" else ():
         if name.isdecimal() and int(name) != os.getpid():
@@ -123,5 +123,5 @@ def _marked(mark: str) -> Iterator[int]:
 
 
 if __name__ == "__main__":
-    end_marked(sys.argv[1])
+    end_marked_processes(sys.argv[1])
     sys.exit(int(sys.argv[2]))

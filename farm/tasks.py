@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The graph of a plan: which verbs run on which files, and what has to be there first.
+"""The task graph of a plan: verbs, their files and their dependencies.
 
     influences → record 1 … N → merge → train 0 → evaluate 0 → refine 1 → train 1 → evaluate 1 → … → bind
 
-for each character; from train 0 on for each of its meshes. A round that is not needed, because the goal is met, ends
-at once. The graph is the same for every engine: a task is run by its name, wherever the plan and its files are.
+for each character, and from train 0 on for each of its meshes. A round that is not needed, because the goal is met,
+ends at once. The graph is the same for all engines: a task is run by its name, wherever the plan and its files are.
 """
 
 from collections.abc import Iterable
@@ -24,7 +24,7 @@ PICTURE_POSES = 20
 
 @dataclass(frozen=True)
 class Round:
-    """Whether a round is needed: it is not where the round before ended, or met the goal.
+    """Condition of a round: it is skipped where the previous round was skipped or met the goal.
 
     Attributes:
         evaluate: name of the task that measured the model of the round before.
@@ -39,7 +39,7 @@ class Round:
 
 @dataclass(frozen=True)
 class Task:
-    """A piece of work: verbs in processes of their own, whose files all lie in a folder of the task.
+    """Verbs in their own processes, whose files are in the folder of the task.
 
     Attributes:
         name: "hero/record-2"; parts of the path of its folder below `work`.
@@ -74,88 +74,104 @@ class Task:
 
     @property
     def manifest(self) -> Path:
-        """What is written when it is done."""
+        """Path of the manifest, written when the task is done."""
         return self.folder.with_name(f"{self.folder.name}.json")
 
     @property
     def log(self) -> Path:
-        """What its verbs printed."""
+        """Path of the output of its verbs."""
         return self.folder.with_name(f"{self.folder.name}.log")
 
     @property
     def lock(self) -> Path:
-        """Held while it runs, by whatever process of it is still alive."""
+        """Path of the lock, held while any of its processes runs."""
         return self.folder.with_name(f"{self.folder.name}.lock")
 
     def to_json(self) -> dict:
-        """All of it in plain values, paths as texts."""
-        return asdict(self, dict_factory=lambda items: {key: _plain(value) for key, value in items})
+        """Return the JSON of the task, with paths as strings."""
+        return asdict(self, dict_factory=lambda items: {key: _to_plain(value) for key, value in items})
 
 
-def _plain(value: object) -> object:
+def _to_plain(value: object) -> object:
     if isinstance(value, Path):
         return str(value)
-    return [_plain(one) for one in value] if isinstance(value, tuple) else value
+    return [_to_plain(one) for one in value] if isinstance(value, tuple) else value
 
 
 def make_tasks(plan: Plan) -> dict[str, Task]:
-    """The tasks of a plan by their names, each after those that it needs."""
+    """Make the tasks of a plan by name, in an order that respects their dependencies."""
     tasks: dict[str, Task] = {}
     for character in plan.characters:
-        for task in _Tasks(plan.farm, character).all():
+        for task in _TaskBuilder(plan.farm, character).build_all():
             tasks[task.name] = task
     return tasks
 
 
-class _Tasks:
-    """The tasks of one character."""
+class _TaskBuilder:
+    """Builds the tasks of one character."""
 
     def __init__(self, farm: Farm, character: Character):
         self._farm, self._character = farm, character
         self._several = len(character.objects) > 1
         self._files = (character.rig, *character.depends)
 
-    def all(self) -> Iterable[Task]:
+    def build_all(self) -> Iterable[Task]:
         character = self._character
-        influences = self._task(INFLUENCES, self._record("--detect-influences"), (RECORDING,))
-        found = ("--influences", str(influences.folder / RECORDING))
+        influences = self._make_task(INFLUENCES, self._record_verb("--detect-influences"), (RECORDING,))
+        influence_options = ("--influences", str(influences.folder / RECORDING))
         shards = [
-            self._task(
-                f"{RECORD}-{number}",
-                self._record("--shard", f"{number}/{character.shards}", *found),
+            self._make_task(
+                f"{RECORD}-{index}",
+                self._record_verb("--shard", f"{index}/{character.shards}", *influence_options),
                 (RECORDING,),
                 after=(influences,),
                 poses=character.poses // character.shards,
             )
-            for number in range(1, character.shards + 1)
+            for index in range(1, character.shards + 1)
         ]
-        merged = ("merge-recordings", *(str(shard.folder / RECORDING) for shard in shards), RECORDING)
-        merge = self._task(MERGE, merged, (RECORDING,), after=shards, files=(), poses=character.poses)
+        merge_verb = ("merge-recordings", *(str(shard.folder / RECORDING) for shard in shards), RECORDING)
+        merge = self._make_task(MERGE, merge_verb, (RECORDING,), after=shards, files=(), poses=character.poses)
         yield from (influences, *shards, merge)
-        chosen = []
+        rounds_by_mesh = []
         for name in character.objects if self._several else (character.objects or ("",)):
-            rounds = list(self._rounds(name, merge))
+            rounds = list(self._make_rounds(name, merge))
             yield from (task for tasks in rounds for task in tasks)
-            chosen.append((name, [(tasks[-2], tasks[-1]) for tasks in rounds]))
-        yield self._bind(chosen)
+            rounds_by_mesh.append((name, [(tasks[-2], tasks[-1]) for tasks in rounds]))
+        yield self._make_bind(rounds_by_mesh)
 
-    def _record(self, *options: str) -> tuple[str, ...]:
-        own = self._character
-        lists = {"--object": own.objects, "--action": own.actions, "--strip": own.strips, "--sample": own.sample}
-        lists["--control"] = own.controls
+    def _record_verb(self, *options: str) -> tuple[str, ...]:
+        character = self._character
+        lists = {
+            "--object": character.objects,
+            "--action": character.actions,
+            "--strip": character.strips,
+            "--sample": character.sample,
+        }
+        lists["--control"] = character.controls
         min_vertices = (
-            () if own.min_partition_vertices is None else ("--min-partition-vertices", str(own.min_partition_vertices))
+            ()
+            if character.min_partition_vertices is None
+            else ("--min-partition-vertices", str(character.min_partition_vertices))
         )
         return (
-            *("record", str(own.rig), RECORDING, "--resume", "--poses", str(own.poses), "--seed", str(own.seed)),
-            *("--spread", repr(float(own.spread)), *(("--mirror",) if own.mirror else ()), *min_vertices),
-            *(("--margin", repr(float(own.margin))) if own.margin != 1 else ()),
-            *(("--fit-linear", own.fit_linear) if own.fit_linear else ()),
+            *(
+                "record",
+                str(character.rig),
+                RECORDING,
+                "--resume",
+                "--poses",
+                str(character.poses),
+                "--seed",
+                str(character.seed),
+            ),
+            *("--spread", repr(float(character.spread)), *(("--mirror",) if character.mirror else ()), *min_vertices),
+            *(("--margin", repr(float(character.margin))) if character.margin != 1 else ()),
+            *(("--fit-linear", character.fit_linear) if character.fit_linear else ()),
             *(f"{option}={value}" for option, values in lists.items() for value in values),
             *options,
         )
 
-    def _task(
+    def _make_task(
         self,
         name: str,
         verbs: tuple,
@@ -179,93 +195,104 @@ class _Tasks:
             **values,
         )
 
-    def _rounds(self, mesh: str, merge: Task) -> Iterable[tuple[Task, ...]]:
-        """The tasks of each round of a mesh; training and evaluation are the last two of them."""
-        own, model = self._character, f"{self._model_name(mesh)}.onnx"
+    def _make_rounds(self, mesh: str, merge: Task) -> Iterable[tuple[Task, ...]]:
+        """Yield the tasks of each round of a mesh; the last two are training and evaluation."""
+        character, model = self._character, f"{self._model_name(mesh)}.onnx"
         of_mesh = (f"--object={mesh}",) if mesh else ()
         recording, before, condition = merge.folder / RECORDING, (), None
         if self._several:
             recording /= folder_of_mesh(mesh)
-        source, refined, last = merge, (), None
-        for number in range(1 + (own.rounds if own.goal_mm else 0)):
-            if number:
-                condition = Round(before[1].name, before[0].name, own.goal_mm)
-                last = before[0].folder / model
-                verb = ("record", str(own.rig), RECORDING, "--resume", "--refine", str(last), *of_mesh)
-                options = ("--poses", str(own.refine_poses), "--seed", str(number))
-                source = self._task(
-                    f"{REFINE}-{number}",
+        recording_task, refine_tasks, last_model = merge, (), None
+        for index in range(1 + (character.rounds if character.goal_mm else 0)):
+            if index:
+                condition = Round(before[1].name, before[0].name, character.goal_mm)
+                last_model = before[0].folder / model
+                verb = ("record", str(character.rig), RECORDING, "--resume", "--refine", str(last_model), *of_mesh)
+                options = ("--poses", str(character.refine_poses), "--seed", str(index))
+                recording_task = self._make_task(
+                    f"{REFINE}-{index}",
                     (*verb, *options),
                     (RECORDING,),
-                    after=(*before, source),
+                    after=(*before, recording_task),
                     mesh=mesh,
                     copies=((recording, RECORDING),),
                     round=condition,
-                    poses=own.refine_poses,
+                    poses=character.refine_poses,
                 )
-                recording, refined = source.folder / RECORDING, (source,)
+                recording, refine_tasks = recording_task.folder / RECORDING, (recording_task,)
             checkpoint = model.removesuffix(".onnx") + CHECKPOINT
-            train = self._task(
-                f"{TRAIN}-{number}",
-                ("train", str(recording), model, *_options(own), *(("--warm-start",) if number else ())),
+            train = self._make_task(
+                f"{TRAIN}-{index}",
+                ("train", str(recording), model, *_train_options(character), *(("--warm-start",) if index else ())),
                 (model, checkpoint, *REPORT),
-                after=(*before[:1], source),
+                after=(*before[:1], recording_task),
                 mesh=mesh,
                 files=(),
-                copies=((last.with_name(checkpoint), checkpoint),) if number else (),
+                copies=((last_model.with_name(checkpoint), checkpoint),) if index else (),
                 round=condition,
-                poses=own.poses + number * own.refine_poses,
+                poses=character.poses + index * character.refine_poses,
             )
-            measured = ("--json", EVALUATION, "--poses", str(own.evaluate_poses), *of_mesh)
-            evaluate = self._task(
-                f"{EVALUATE}-{number}",
-                ("evaluate", str(own.rig), str(train.folder / model), *measured),
+            evaluate_options = ("--json", EVALUATION, "--poses", str(character.evaluate_poses), *of_mesh)
+            evaluate = self._make_task(
+                f"{EVALUATE}-{index}",
+                ("evaluate", str(character.rig), str(train.folder / model), *evaluate_options),
                 (EVALUATION,),
                 after=(train,),
                 mesh=mesh,
                 round=condition,
-                poses=own.evaluate_poses,
+                poses=character.evaluate_poses,
             )
             before = (train, evaluate)
-            yield (*refined, train, evaluate)
+            yield (*refine_tasks, train, evaluate)
 
     def _model_name(self, mesh: str) -> str:
         return folder_of_mesh(mesh) if self._several else self._character.name
 
-    def _bind(self, chosen: list[tuple[str, list[tuple[Task, Task]]]]) -> Task:
-        """Bind the best model of each mesh, and put it where the plan says."""
-        own, blend = self._character, f"{self._character.name}.blend"
-        names = [self._model_name(mesh) for mesh, _ in chosen]
-        places = [f"models/{name}/{name}.onnx" if self._several else f"{name}.onnx" for name in names]
-        model = "models" if self._several else places[0]
-        of_mesh = tuple(f"--object={name}" for name in own.objects) if len(own.objects) == 1 else ()
-        verbs = [("bind", str(own.rig), model, blend, *of_mesh, *(("--use-in-render",) if own.use_in_render else ()))]
+    def _make_bind(self, rounds_by_mesh: list[tuple[str, list[tuple[Task, Task]]]]) -> Task:
+        """Make the task that binds the best model of each mesh and publishes it."""
+        character, blend = self._character, f"{self._character.name}.blend"
+        names = [self._model_name(mesh) for mesh, _ in rounds_by_mesh]
+        model_paths = [f"models/{name}/{name}.onnx" if self._several else f"{name}.onnx" for name in names]
+        model = "models" if self._several else model_paths[0]
+        of_mesh = tuple(f"--object={name}" for name in character.objects) if len(character.objects) == 1 else ()
+        verbs = [
+            (
+                "bind",
+                str(character.rig),
+                model,
+                blend,
+                *of_mesh,
+                *(("--use-in-render",) if character.use_in_render else ()),
+            )
+        ]
         pictures = []
-        for (mesh, _), place in zip(chosen, places, strict=True):
+        for (mesh, _), model_path in zip(rounds_by_mesh, model_paths, strict=True):
             if self._farm.pictures:
-                folder = str(Path(place).parent)
-                drawn = (str(Path(folder, PICTURE)), str(Path(folder, f"drawn_{EVALUATION}")))
-                options = ("--heatmap", drawn[0], "--json", drawn[1], "--poses", str(PICTURE_POSES))
-                verbs.append(("evaluate", str(own.rig), place, *options, *((f"--object={mesh}",) if mesh else ())))
-                pictures.append(drawn[0])
-        besides = [str(Path(place).parent / name) for place in places for name in (*REPORT, EVALUATION)]
-        outputs = (*places, *besides, *pictures, blend)
-        after = [task for _, rounds in chosen for pair in rounds for task in pair]
-        return self._task(
+                folder = str(Path(model_path).parent)
+                picture_files = (str(Path(folder, PICTURE)), str(Path(folder, f"drawn_{EVALUATION}")))
+                options = ("--heatmap", picture_files[0], "--json", picture_files[1], "--poses", str(PICTURE_POSES))
+                verbs.append(
+                    ("evaluate", str(character.rig), model_path, *options, *((f"--object={mesh}",) if mesh else ()))
+                )
+                pictures.append(picture_files[0])
+        reports = [str(Path(model_path).parent / name) for model_path in model_paths for name in (*REPORT, EVALUATION)]
+        outputs = (*model_paths, *reports, *pictures, blend)
+        after = [task for _, rounds in rounds_by_mesh for pair in rounds for task in pair]
+        return self._make_task(
             BIND,
             tuple(verbs),
             outputs,
             after=after,
-            publishes=tuple((name, own.output / name) for name in outputs),
+            publishes=tuple((name, character.output / name) for name in outputs),
             choices=tuple(
-                (place, tuple((train.name, evaluate.name) for train, evaluate in rounds))
-                for place, (_, rounds) in zip(places, chosen, strict=True)
+                (model_path, tuple((train.name, evaluate.name) for train, evaluate in rounds))
+                for model_path, (_, rounds) in zip(model_paths, rounds_by_mesh, strict=True)
             ),
         )
 
 
-def _options(character: Character) -> tuple[str, ...]:
-    """Options of `train`."""
+def _train_options(character: Character) -> tuple[str, ...]:
+    """Return the options of `train`."""
     options = ["--goal-mm", repr(float(character.goal_mm))] if character.goal_mm else []
     for key, value in character.train.items():
         values = value if isinstance(value, list) else [value]

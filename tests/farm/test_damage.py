@@ -18,7 +18,7 @@ from farm.fingerprints import (
     read_manifest,
     write_manifest,
 )
-from farm.run import reached_mm
+from farm.run import read_p999_mm
 from farm.tasks import make_tasks
 
 from .conftest import ONE
@@ -128,7 +128,7 @@ def test_damaged_evaluations_and_reports(bound, content):
     with pytest.raises(
         ManifestError, match=r"evaluation\.json' is damaged \(.*\); run the farm again, and it is made again"
     ):
-        reached_mm(evaluate)
+        read_p999_mm(evaluate)
     assert read_manifest(evaluate) is None
 
 
@@ -143,7 +143,7 @@ def test_evaluations_and_reports_of_wrong_values(bound):
         for wrong in ({"fdda": value}, {"fdda": {"p999": value}} if value != -1 else {}, value):
             (evaluate.folder / "evaluation.json").write_text(json.dumps(wrong))
             with pytest.raises(ManifestError):
-                reached_mm(evaluate)
+                read_p999_mm(evaluate)
 
 
 def test_a_last_report_of_wrong_values_is_none(bound):

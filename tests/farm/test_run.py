@@ -15,7 +15,7 @@ import pytest
 from farm import process
 from farm.characters import Farm, read_plan
 from farm.fingerprints import InputFingerprints, outdated_tasks, read_manifest
-from farm.process import TryAgainError, VerbError, held, run_verb, verb_environment
+from farm.process import TryAgainError, VerbError, hold_lock, run_verb, verb_environment
 from farm.run import AGAIN, DONE, FAILED, NOT_NEEDED, UP_TO_DATE, run_task
 from farm.tasks import make_tasks
 from fdda_addon.core.errors import TRY_AGAIN
@@ -202,9 +202,9 @@ def test_two_workers_take_turns(written):
 
 def test_a_lock_is_free_when_its_last_process_is_gone(tmp_path):
     done = []
-    with held(tmp_path / "lock") as lock:
+    with hold_lock(tmp_path / "lock") as lock:
         sleeper = subprocess.Popen(["sleep", "0.5"], pass_fds=(lock,))
-    waiting = threading.Thread(target=lambda: done.append(held(tmp_path / "lock").__enter__()))
+    waiting = threading.Thread(target=lambda: done.append(hold_lock(tmp_path / "lock").__enter__()))
     waiting.start()
     time.sleep(0.1)
     assert not done and sleeper.poll() is None
@@ -214,7 +214,7 @@ def test_a_lock_is_free_when_its_last_process_is_gone(tmp_path):
 
 def ended(tmp_path: Path, monkeypatch, code: str) -> None:
     monkeypatch.setattr(process, "verb_command", lambda farm, verb: [sys.executable, "-c", code])
-    with held(tmp_path / "lock") as lock:
+    with hold_lock(tmp_path / "lock") as lock:
         run_verb(None, ("record",), tmp_path, tmp_path / "log", lock)
 
 

@@ -7,7 +7,15 @@ import pytest
 
 from farm.characters import Farm
 from farm.fingerprints import TaskManifest, write_manifest
-from farm.simulation import ONCE, START_SECONDS, longest_path, print_estimate, rest_seconds, simulate, task_seconds
+from farm.simulation import (
+    SINGLE_TASK_KINDS,
+    START_SECONDS,
+    longest_path,
+    print_estimate,
+    seconds_to_end,
+    simulate,
+    task_seconds,
+)
 from farm.tasks import RECORD, Task, make_tasks
 
 from .conftest import ONE
@@ -40,7 +48,7 @@ def test_what_has_the_longest_way_goes_first():
     """Shards and their merge; a short task that nothing waits for comes last, and hides beside the others."""
     tasks = graph(short="", a="", b="", merge="a b", train="merge")
     seconds = {"short": 2.0, "a": 2.0, "b": 2.0, "merge": 1.0, "train": 5.0}
-    assert rest_seconds(tasks, seconds) == {"short": 2, "a": 8, "b": 8, "merge": 6, "train": 5}
+    assert seconds_to_end(tasks, seconds) == {"short": 2, "a": 8, "b": 8, "merge": 6, "train": 5}
     assert simulate(tasks, seconds, 2).seconds == 8
     assert simulate(tasks, seconds, 1).seconds == sum(seconds.values())
 
@@ -68,7 +76,7 @@ def test_what_was_measured_is_taken_and_carried_over(written):
     assert measured == 1 and seconds["elbow/record-1"] == manifest.seconds
     # 10 poses took 5 seconds, and 30 take 15.
     assert seconds["other/record-1"] == pytest.approx(START_SECONDS + 15)
-    assert seconds["other/influences"] == START_SECONDS + ONCE["influences"]
+    assert seconds["other/influences"] == START_SECONDS + SINGLE_TASK_KINDS["influences"]
 
 
 def test_the_estimate_says_what_bounds_it(written, capsys):
