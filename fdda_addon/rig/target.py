@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A target: another object, of the same vertices, whose surface is learned in place of the rig's own."""
+"""Targets: a target is another object with the same vertices, whose surface a model learns instead of the rig's."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -20,12 +20,12 @@ from .target_caches import Cache, read_caches
 
 @dataclass(frozen=True)
 class Target:
-    """A target of a rig. Holds RNA references: not to be kept.
+    """A target of a rig. Holds RNA references, so do not store it.
 
     Attributes:
-        scene_rig: the rig that learns.
-        target_object: whose surface it learns.
-        caches: what of it depends on time.
+        scene_rig: the rig.
+        target_object: the object whose surface is learned.
+        caches: the simulations and caches that the target depends on.
     """
 
     scene_rig: SceneRig
@@ -34,95 +34,98 @@ class Target:
 
     @property
     def follows(self) -> str:
-        """`POSE`, `FRAMES` or `SIMULATION` of `core.recording.target`."""
+        """Return what its surface follows from: `POSE`, `FRAMES` or `SIMULATION` of `core.recording.target`."""
         if any(cache.is_simulation for cache in self.caches):
             return SIMULATION
         return FRAMES if self.caches else POSE
 
     @property
     def simulations(self) -> tuple[Cache, ...]:
-        """The caches that are simulated while frames are visited."""
+        """Return the caches that Blender simulates while frames are visited."""
         return tuple(cache for cache in self.caches if cache.is_simulation)
 
     @property
     def first_frame(self) -> int:
-        """The frame where its simulations start; that of the scene where none says."""
-        starts = [cache.first for cache in self.simulations if cache.first is not None]
-        return int(min(starts, default=bpy.context.scene.frame_start))
+        """Return the first frame of its simulations, or of the scene if they have none."""
+        first_frames = [cache.first for cache in self.simulations if cache.first is not None]
+        return int(min(first_frames, default=bpy.context.scene.frame_start))
 
     def positions(self, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
-        """What it shows: (V, 3) float32, the space of the rig's mesh object, mesh units.
+        """Read its evaluated positions.
+
+        Returns:
+            (V, 3) float32, space of the rig's mesh object, mesh units.
 
         Raises:
-            RigError: it has other vertices in this pose.
+            RigError: it has another number of vertices in this pose.
         """
-        shown = self.target_object.evaluated_get(depsgraph)
+        evaluated = self.target_object.evaluated_get(depsgraph)
         mesh_object = self.scene_rig.mesh_object.evaluated_get(depsgraph)
-        if len(shown.data.vertices) != len(self.scene_rig.mesh_object.data.vertices):
-            raise RigError(self._other_count(len(shown.data.vertices)))
-        positions = mesh_io.mesh_positions(shown.data)
-        relation = np.array(mesh_object.matrix_world.inverted_safe() @ shown.matrix_world, np.float64)
-        if np.array_equal(relation, np.eye(4)):
+        if len(evaluated.data.vertices) != len(self.scene_rig.mesh_object.data.vertices):
+            raise RigError(self._count_message(len(evaluated.data.vertices)))
+        positions = mesh_io.mesh_positions(evaluated.data)
+        target_to_mesh = np.array(mesh_object.matrix_world.inverted_safe() @ evaluated.matrix_world, np.float64)
+        if np.array_equal(target_to_mesh, np.eye(4)):
             return positions
-        return (positions @ relation[:3, :3].T + relation[:3, 3]).astype(np.float32)
+        return (positions @ target_to_mesh[:3, :3].T + target_to_mesh[:3, 3]).astype(np.float32)
 
     def check_mesh(self) -> None:
-        """Fail where what it shows now has other vertices, or other faces, than the mesh of the rig.
+        """Check that its evaluated mesh has the same vertices and faces as the mesh of the rig.
 
         Raises:
-            RigError: says how many.
+            RigError: the numbers of vertices or the faces differ.
         """
-        shown = self.target_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+        target_mesh = self.target_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
         mesh = self.scene_rig.mesh_object.data
-        if len(shown.vertices) != len(mesh.vertices):
-            raise RigError(self._other_count(len(shown.vertices)))
-        # A cache may hold points alone.
-        if len(shown.polygons) and len(mesh.polygons) and not _have_same_faces(shown, mesh):
+        if len(target_mesh.vertices) != len(mesh.vertices):
+            raise RigError(self._count_message(len(target_mesh.vertices)))
+        # The mesh of a cache may have no faces.
+        if len(target_mesh.polygons) and len(mesh.polygons) and not _have_same_faces(target_mesh, mesh):
             raise RigError(
                 f"The target '{self.name}' has as many vertices as '{self.scene_rig.mesh_object.name}' and other "
                 "faces, so its vertices are in another order or of another mesh; export it with the vertices of the "
                 "mesh in their order."
             )
 
-    def _other_count(self, count: int) -> str:
-        own = len(self.scene_rig.mesh_object.data.vertices)
+    def _count_message(self, count: int) -> str:
+        expected = len(self.scene_rig.mesh_object.data.vertices)
         return (
-            f"The target '{self.name}' has {count:,} vertices and '{self.scene_rig.mesh_object.name}' has {own:,}; "
-            "a target needs the same vertices in the same order."
+            f"The target '{self.name}' has {count:,} vertices and '{self.scene_rig.mesh_object.name}' has "
+            f"{expected:,}; a target needs the same vertices in the same order."
         )
 
     @property
     def name(self) -> str:
-        """Of its object."""
+        """Return the name of its object."""
         return self.target_object.name
 
     def restart_simulations(self) -> None:
-        """Let its simulations begin anew at their first frame: what they keep of frames may be of another pose."""
+        """Restart its simulations at their first frame, because their cached frames may be of another pose."""
         for cache in self.simulations:
             if cache.owner is not None:
-                # Posing alone does not tell a soft body.
+                # Posing alone does not invalidate the cache of a soft body.
                 cache.owner.id_data.update_tag()
         self.target_object.update_tag()
 
     @contextmanager
     def prepared(self) -> Iterator[None]:
-        """Switch off what makes new vertices after the target is deformed, a subdivision for example."""
+        """Switch its downstream modifiers off, such as a subdivision, and restore them afterwards."""
         with downstream_disabled_unchecked(self.target_object):
             yield
 
 
 def find_target(scene_rig: SceneRig, name: str) -> Target:
-    """The target of a rig by the name of its object.
+    """Find the target of a rig by the name of its object.
 
     Raises:
-        RigError: there is no mesh of this name, it is the rig's own, plays a model, is hidden, has other vertices or
-            faces, or a file that it plays is missing.
+        RigError: there is no such mesh, it is the mesh of the rig, plays a model, is hidden, has other vertices or
+            faces, or a cache file is missing.
     """
     mesh_object, scene = scene_rig.mesh_object, bpy.context.scene
     target_object = scene.objects.get(name)
     if target_object is None or target_object.type != "MESH":
-        known = ", ".join(f"'{o.name}'" for o in scene.objects if o.type == "MESH" and o != mesh_object) or "none"
-        raise RigError(f"The scene has no mesh object '{name}' to be the target; its other mesh objects: {known}.")
+        names = ", ".join(f"'{o.name}'" for o in scene.objects if o.type == "MESH" and o != mesh_object) or "none"
+        raise RigError(f"The scene has no mesh object '{name}' to be the target; its other mesh objects: {names}.")
     if target_object == mesh_object:
         raise RigError(
             f"'{name}' cannot be its own target: a target is another object, which shows what '{name}' is to learn; "
@@ -146,10 +149,10 @@ def find_target(scene_rig: SceneRig, name: str) -> Target:
 
 
 def check_clips(target: Target, clips: Sequence[Clip], pre_roll: int) -> None:
-    """Fail where frames of clips are not among those that a target has, or cannot be brought into it.
+    """Check that a target has the frames of clips, and that a pre-roll is possible.
 
     Raises:
-        RigError: names the frames of both.
+        RigError: the target lacks frames, shows no mirrored frames, or cannot use the pre-roll.
     """
     if pre_roll and not target.simulations:
         raise RigError(
@@ -180,11 +183,17 @@ def check_clips(target: Target, clips: Sequence[Clip], pre_roll: int) -> None:
 
 @contextmanager
 def temporary_frame_range(target: Target, first: int | None, last: int) -> Iterator[None]:
-    """Let the simulations of a target start at a frame, None for where each does, and last until another at least."""
+    """Extend the frame ranges of a target's simulations, and restore them afterwards.
+
+    Args:
+        target: the target.
+        first: first frame; None to keep that of each simulation.
+        last: the ranges end at this frame or later.
+    """
     with ExitStack() as stack:
         for cache in target.simulations:
             if cache.owner is not None:
-                # The end first: Blender lets none of the two pass the other.
+                # The end first, because Blender keeps the end after the start.
                 stack.enter_context(temporary_attributes(cache.owner, frame_end=max(cache.owner.frame_end, last)))
                 if first is not None:
                     stack.enter_context(temporary_attributes(cache.owner, frame_start=first))
@@ -192,7 +201,7 @@ def temporary_frame_range(target: Target, first: int | None, last: int) -> Itera
 
 
 def _have_same_faces(first: bpy.types.Mesh, second: bpy.types.Mesh) -> bool:
-    """Whether two meshes have the same faces, in any order and wherever and in whichever direction each begins."""
+    """Return whether two meshes have the same faces, ignoring their order, first corner and direction."""
     faces = [_faces_by_size(*mesh_io.topology(mesh)) for mesh in (first, second)]
     return faces[0].keys() == faces[1].keys() and all(
         np.array_equal(rows, faces[1][size]) for size, rows in faces[0].items()
@@ -200,10 +209,10 @@ def _have_same_faces(first: bpy.types.Mesh, second: bpy.types.Mesh) -> bool:
 
 
 def _faces_by_size(starts: np.ndarray, vertices: np.ndarray) -> dict[int, np.ndarray]:
-    """For each number of corners the (n, corners) vertices of the faces that have it, all sorted."""
+    """Return the sorted vertices (n, corners) of the faces, by their number of corners."""
     sizes = np.diff(np.append(starts, len(vertices)))
-    found = {}
+    faces = {}
     for size in np.unique(sizes).tolist():
         rows = np.sort(vertices[starts[sizes == size][:, None] + np.arange(size)], axis=1)
-        found[size] = rows[np.lexsort(rows.T[::-1])]
-    return found
+        faces[size] = rows[np.lexsort(rows.T[::-1])]
+    return faces
