@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Brings a target that depends on time to poses: frames in their order with a pre-roll, poses held until it rests."""
+"""Sets the poses of a rig and of a target that depends on time: with a pre-roll, or held until a simulation rests."""
 
 import time
 from collections.abc import Callable, Collection, Container, Iterator, Sequence
@@ -20,23 +20,26 @@ from ..scene.unit import metres_per_unit
 from .target import Target, check_clips, find_target, temporary_frame_range
 
 APPROACH_FRAMES = 10
-"""Frames in which a pose is approached that is held afterwards."""
+"""Frames in which the rig moves from the rest pose to a pose that is held."""
 MAX_REVERSED_FRAMES = 100
-"""Frames of a clip beyond so many are not shown from the other side: all that are before them are played twice."""
+"""Only this number of frames of a clip is shown in reverse, because all frames before them are played twice."""
 REST_FRAMES = 3
-"""So many frames in a row no vertex may move: what swings stands still for one at each turn."""
+"""Consecutive frames without motion at rest: a vertex that swings stands still for one frame at each turn."""
+
+PoseFunction = Callable[[float], None]
+"""Sets a pose that is a fraction, 0 to 1, of the way from the rest pose to another one."""
 
 
 @dataclass(frozen=True)
 class TargetSettings:
-    """Which target is evaluated, and how.
+    """Settings of a target.
 
     Attributes:
-        name: of its object; empty for the rig itself.
-        pre_roll: frames before the first of an action, in which the rig goes from the rest pose to it.
-        max_settle_frames: most frames for which a random pose is held until the target is at rest; 0 does not hold it.
-        rest_threshold_mm: it is at rest when no vertex moves by more from a frame to the next, mm.
-        repeatability_poses: how many poses that are held, or frames of actions, are reached a second time, from another
+        name: name of its object; empty for the rig itself.
+        pre_roll: frames before the first frame of an action, in which the rig moves from the rest pose to that frame.
+        max_settle_frames: most frames for which a random pose is held until the target is at rest; 0 to hold no pose.
+        rest_threshold_mm: the target is at rest when no vertex moves by more in a frame, mm.
+        repeatability_poses: number of held poses, or frames of actions, that are set a second time, from another
             direction.
     """
 
@@ -48,18 +51,18 @@ class TargetSettings:
 
 
 NO_TARGET = TargetSettings()
-"""No target: the rig is evaluated itself."""
+"""The surface of the rig itself is evaluated."""
 
 
 @dataclass(frozen=True)
 class RestState:
-    """Whether a target came to rest in a pose, and after how long.
+    """How a target came to rest in a pose.
 
     Attributes:
-        frames: for which the pose was held.
-        speed_mm: of the fastest vertex in the last of them, mm a frame.
-        is_at_rest: it came to rest.
-        seconds: that all of it took.
+        frames: frames for which the pose was held.
+        speed_mm: speed of the fastest vertex in the last frame, mm per frame.
+        is_at_rest: the target came to rest.
+        seconds: the time that it took.
     """
 
     frames: int
@@ -68,62 +71,63 @@ class RestState:
     seconds: float
 
     def __str__(self) -> str:
-        what = f"{self.frames} frames, {self.seconds:.1f} s"
-        return what if self.is_at_rest else f"not at rest after {what}: {self.speed_mm:.2g} mm a frame"
+        duration = f"{self.frames} frames, {self.seconds:.1f} s"
+        return duration if self.is_at_rest else f"not at rest after {duration}: {self.speed_mm:.2g} mm a frame"
 
 
 class Settler:
-    """Holds poses until a target has come to rest: what it shows depends on the pose alone then.
+    """Holds poses until a simulated target is at rest, so that its surface depends on the pose alone.
 
     Attributes:
-        frames: for which a pose is held at most.
-        rest_threshold_mm: the target is at rest when no vertex moves by more from a frame to the next, mm.
-        last: how the last pose came to rest, None before the first.
+        frames: most frames for which a pose is held.
+        rest_threshold_mm: the target is at rest when no vertex moves by more in a frame, mm.
+        last: the rest state of the last pose; None before the first.
     """
 
     def __init__(self, target: Target, frames: int, rest_threshold_mm: float = REST_THRESHOLD_MM):
-        """Args:
-        target: a simulation.
-        frames, rest_threshold_mm: as above.
+        """Prepare to settle a target.
+
+        Args:
+            target: a target with simulations.
+            frames, rest_threshold_mm: as above.
         """
         self._target, self.frames, self.rest_threshold_mm = target, frames, rest_threshold_mm
         self._mm_per_unit = 1000 * metres_per_unit(target.scene_rig.mesh_object)
-        self._first = target.first_frame
+        self._first_frame = target.first_frame
         self.last: RestState | None = None
 
     @contextmanager
     def prepared(self) -> Iterator[None]:
-        """Let the simulations of the target last for as long as it takes; poses are settled inside."""
-        with temporary_frame_range(self._target, self._first, self._first + 2 * APPROACH_FRAMES + self.frames):
+        """Extend the simulations of the target to the frames that `settle` needs; restore them afterwards."""
+        last_frame = self._first_frame + 2 * APPROACH_FRAMES + self.frames
+        with temporary_frame_range(self._target, self._first_frame, last_frame):
             yield
 
-    def settle(self, pose: Callable[[float], None], over: Callable[[float], None] | None = None) -> RestState:
-        """Go from the rest pose to a pose, and hold it until the target rests or the frames are over.
+    def settle(self, pose: PoseFunction, via_pose: PoseFunction | None = None) -> RestState:
+        """Move from the rest pose to a pose, and hold it until the target is at rest or the frames are used up.
 
         Args:
-            pose: sets what part of the way from the rest pose is done, 0 to 1.
-            over: the same of another pose, which is passed through on the way.
+            pose: the pose.
+            via_pose: another pose that is passed on the way.
         """
-        start, scene, frame = time.perf_counter(), bpy.context.scene, self._first
+        start, scene, frame = time.perf_counter(), bpy.context.scene, self._first_frame
         self._target.restart_simulations()
-        ways = (
-            [(over, range(APPROACH_FRAMES + 1)), (pose, range(1, APPROACH_FRAMES + 1))]
-            if over
-            else [(pose, range(APPROACH_FRAMES + 1))]
-        )
-        for way, steps in ways:
+        all_steps, later_steps = range(APPROACH_FRAMES + 1), range(1, APPROACH_FRAMES + 1)
+        moves = [(via_pose, all_steps), (pose, later_steps)] if via_pose else [(pose, all_steps)]
+        for set_fraction, steps in moves:
             for step in steps:
-                way(step / APPROACH_FRAMES)
+                set_fraction(step / APPROACH_FRAMES)
                 scene.frame_set(frame)
                 frame += 1
-        before, quiet, held, speed = self._positions(), 0, 0, 0.0
-        while held < self.frames and quiet < REST_FRAMES:
-            scene.frame_set(frame + held)
-            now = self._positions()
-            speed = float(np.sqrt(np.einsum("vc,vc->v", now - before, now - before).max())) * self._mm_per_unit
-            before, held = now, held + 1
-            quiet = quiet + 1 if speed <= self.rest_threshold_mm else 0
-        self.last = RestState(held, speed, quiet >= REST_FRAMES, time.perf_counter() - start)
+        previous, rest_frames, held_frames, speed = self._positions(), 0, 0, 0.0
+        while held_frames < self.frames and rest_frames < REST_FRAMES:
+            scene.frame_set(frame + held_frames)
+            current = self._positions()
+            offsets = current - previous
+            speed = float(np.sqrt(np.einsum("vc,vc->v", offsets, offsets).max())) * self._mm_per_unit
+            previous, held_frames = current, held_frames + 1
+            rest_frames = rest_frames + 1 if speed <= self.rest_threshold_mm else 0
+        self.last = RestState(held_frames, speed, rest_frames >= REST_FRAMES, time.perf_counter() - start)
         return self.last
 
     def _positions(self) -> np.ndarray:
@@ -133,69 +137,81 @@ class Settler:
 def show_frames(
     player: ClipPlayer, clip: Clip, wanted: Container[int], target: Target | None = None, pre_roll: int = 0
 ) -> Iterator[int]:
-    """Show frames of a clip, one an iteration, in their order; yields their numbers in the clip.
+    """Show frames of a clip in their order, one for each iteration.
 
-    Where the target is a simulation, all frames from its first on are visited, until the last that is wanted.
+    If the target is a simulation, all frames from its first frame to the last wanted one are visited.
 
     Args:
-        player: plays the clip.
+        player: the player of the clip.
         clip: the clip.
-        wanted: numbers of the frames that are yielded.
-        target: what is evaluated; None for the rig itself.
-        pre_roll: frames before the first, in which the rig goes from the rest pose to that of the first.
+        wanted: indices of the frames to yield.
+        target: the target; None for the rig itself.
+        pre_roll: frames before the first one, in which the rig moves from the rest pose to the first pose.
+
+    Yields:
+        The index of the frame in the clip.
     """
-    numbers = [number for number in range(len(clip.frames)) if number in wanted]
-    if target is None or not target.simulations or not numbers:
-        for number in numbers:
-            player.show(clip, clip.frames[number])
-            yield number
+    indices = [index for index in range(len(clip.frames)) if index in wanted]
+    if target is None or not target.simulations or not indices:
+        for index in indices:
+            player.show(clip, clip.frames[index])
+            yield index
         return
-    with _begun(player, clip, target, pre_roll):
-        for number, frame in enumerate(clip.frames[: numbers[-1] + 1]):
+    with _started_simulations(player, clip, target, pre_roll):
+        for index, frame in enumerate(clip.frames[: indices[-1] + 1]):
             player.show(clip, frame)
-            if number in wanted:
-                yield number
+            if index in wanted:
+                yield index
 
 
 def reversible_frames(clip: Clip) -> range:
-    """Numbers of the frames of a clip that can be shown from the other side: there are some to come back from."""
+    """Return the indices of the frames of a clip that can be shown in reverse: later frames must come before them."""
     return range(min(len(clip.frames) - APPROACH_FRAMES, MAX_REVERSED_FRAMES))
 
 
 def show_frames_reversed(
     player: ClipPlayer, clip: Clip, wanted: Collection[int], target: Target, pre_roll: int = 0
 ) -> Iterator[int]:
-    """Show frames of a clip from the other side: it is played past the last, and back to the first, as time goes on.
+    """Show frames of a clip from the other direction: play past the last one, then back to the first, as time goes on.
 
     Args:
-        player: plays the clip.
+        player: the player of the clip.
         clip: the clip.
-        wanted: numbers of the frames that are yielded, at least one, each of `reversible_frames`.
-        target: a simulation.
+        wanted: indices of the frames to yield, at least one, from `reversible_frames`.
+        target: a target with simulations.
         pre_roll: as in `show_frames`.
 
     Yields:
-        Their numbers in the clip, the last one first.
+        The index of the frame in the clip, the last one first.
     """
-    turn = max(wanted) + APPROACH_FRAMES
-    with _begun(player, clip, target, pre_roll, beyond=turn):
-        ways = []
-        for frame in clip.frames[: turn + 1]:
+    turning_index = max(wanted) + APPROACH_FRAMES
+    with _started_simulations(player, clip, target, pre_roll, extra_frames=turning_index):
+        shown_frames = []
+        for frame in clip.frames[: turning_index + 1]:
             player.show(clip, frame)
-            ways.append(player.shown)
-        for step, number in enumerate(range(turn - 1, min(wanted) - 1, -1), 1):
-            player.put(ways[number], clip.frames[turn] + step)
-            if number in wanted:
-                yield number
+            shown_frames.append(player.shown)
+        for step, index in enumerate(range(turning_index - 1, min(wanted) - 1, -1), 1):
+            player.put(shown_frames[index], clip.frames[turning_index] + step)
+            if index in wanted:
+                yield index
 
 
 @contextmanager
-def _begun(player: ClipPlayer, clip: Clip, target: Target, pre_roll: int, beyond: int = 0) -> Iterator[None]:
-    """A simulation is at the frame before the first of a clip, and goes on until so many frames beyond its last."""
-    first, last = (clip.frames[0] - pre_roll if pre_roll else None), clip.frames[-1] + beyond
-    with temporary_frame_range(target, first, last) if pre_roll or beyond else nullcontext():
+def _started_simulations(
+    player: ClipPlayer, clip: Clip, target: Target, pre_roll: int, extra_frames: int = 0
+) -> Iterator[None]:
+    """Play simulations up to the frame before a clip; inside, they can continue past the end of the clip.
+
+    Args:
+        player, clip, target, pre_roll: as in `show_frames`.
+        extra_frames: frames after the last one of the clip.
+    """
+    first_frame = clip.frames[0] - pre_roll if pre_roll else None
+    last_frame = clip.frames[-1] + extra_frames
+    needs_range = pre_roll or extra_frames
+    with temporary_frame_range(target, first_frame, last_frame) if needs_range else nullcontext():
         if pre_roll:
-            _roll_in(target, player, clip, first)
+            _play_pre_roll(target, player, clip, first_frame)
         else:
             target.restart_simulations()
             for frame in range(target.first_frame, clip.frames[0]):
@@ -203,112 +219,118 @@ def _begun(player: ClipPlayer, clip: Clip, target: Target, pre_roll: int, beyond
         yield
 
 
-def _roll_in(target: Target, player: ClipPlayer, clip: Clip, first: int) -> None:
-    """Go from the rest pose, at a frame, to the pose of the first frame of a clip, up to the frame before it."""
+def _play_pre_roll(target: Target, player: ClipPlayer, clip: Clip, first_frame: int) -> None:
+    """Move from the rest pose at a frame to the first pose of a clip, up to the frame before it."""
     armature_object = target.scene_rig.armature_object
     bones = armature_object.pose.bones
     player.show(clip, clip.frames[0])
-    goal = player.shown.channels
+    end_channels = player.shown.channels
     player.stop()
-    rest = player.shown.channels
+    rest_channels = player.shown.channels
     target.restart_simulations()
-    for frame in range(first, clip.frames[0]):
-        part = (frame - first) / (clip.frames[0] - first)
-        for channel, start, end in zip(POSE_CHANNELS, rest, goal, strict=True):
-            write(bones, channel, _between(channel.name, start, end, np.float32(part)))
+    for frame in range(first_frame, clip.frames[0]):
+        fraction = (frame - first_frame) / (clip.frames[0] - first_frame)
+        for channel, start, end in zip(POSE_CHANNELS, rest_channels, end_channels, strict=True):
+            write(bones, channel, _interpolate_channel(channel.name, start, end, np.float32(fraction)))
         armature_object.update_tag(refresh={"DATA"})
         bpy.context.scene.frame_set(frame)
 
 
-def _between(name: str, start: np.ndarray, end: np.ndarray, part: np.float32) -> np.ndarray:
+def _interpolate_channel(name: str, start: np.ndarray, end: np.ndarray, fraction: np.float32) -> np.ndarray:
     if name == "rotation_quaternion":
-        # The shorter way; Blender normalizes.
+        # q and -q are the same rotation: take the shorter way. Blender normalizes quaternions.
         end = np.where((start * end).sum(axis=1, keepdims=True) < 0, -end, end)
-    return start + part * (end - start)
+    return start + fraction * (end - start)
 
 
-def blend_from_rest(
-    set_values: Callable[[np.ndarray], None], rest: np.ndarray, values: np.ndarray
-) -> Callable[[float], None]:
-    """Sets what part of the way from values (C,) of the rest pose to those of a pose is done, 0 to 1."""
+def blend_from_rest(set_values: Callable[[np.ndarray], None], rest: np.ndarray, values: np.ndarray) -> PoseFunction:
+    """Return a function that sets a fraction of a pose.
 
-    def pose(part: float) -> None:
-        set_values(values if part == 1 else rest + part * (values - rest))
+    Args:
+        set_values: sets the values of channels.
+        rest: (C,) values of the rest pose.
+        values: (C,) values of the pose.
+    """
 
-    return pose
+    def set_fraction(fraction: float) -> None:
+        set_values(values if fraction == 1 else rest + fraction * (values - rest))
+
+    return set_fraction
 
 
 class PoseSetter:
-    """How a rig, or a target, is brought to poses.
+    """Sets poses of a rig, or of a target that depends on time.
 
     Attributes:
-        target: what is evaluated; None for the rig itself.
-        settler: holds the random poses; None where they are evaluated at once.
+        target: the target; None for the rig itself.
+        settler: holds the random poses; None to evaluate them at once.
     """
 
     def __init__(self, target: Target | None = None, pre_roll: int = 0, settler: Settler | None = None):
-        """Args:
-        target, settler: as above.
-        pre_roll: as in `show_frames`.
+        """Prepare to set poses.
+
+        Args:
+            target, settler: as above.
+            pre_roll: as in `show_frames`.
         """
         self.target, self.settler = target, settler
         self._pre_roll = pre_roll
 
     @property
     def recorded(self) -> RecordedTarget | None:
-        """What a recording says of the target."""
+        """Return the description of the target in a recording; None without a target."""
         if self.target is None:
             return None
-        held = (self.settler.frames, self.settler.rest_threshold_mm) if self.settler else ()
-        return RecordedTarget(self.target.name, self.target.follows, self._pre_roll, *held)
+        settling = (self.settler.frames, self.settler.rest_threshold_mm) if self.settler else ()
+        return RecordedTarget(self.target.name, self.target.follows, self._pre_roll, *settling)
 
     @contextmanager
     def prepared(self) -> Iterator[None]:
-        """Random poses are reached inside."""
+        """Prepare the simulations of the target for random poses; restore them afterwards."""
         with self.settler.prepared() if self.settler else nullcontext():
             yield
 
-    def set_pose(self, pose: Callable[[float], None]) -> None:
-        """Bring it to a random pose; `pose` sets what part of the way from the rest pose is done, 0 to 1."""
+    def set_pose(self, pose: PoseFunction) -> None:
+        """Set a random pose, and hold it if there is a settler."""
         if self.settler:
             self.settler.settle(pose)
         else:
             pose(1)
 
     def show_frames(self, player: ClipPlayer, clip: Clip, wanted: Container[int]) -> Iterator[int]:
-        """As `show_frames`."""
+        """Show frames of a clip, as the function `show_frames` does."""
         yield from show_frames(player, clip, wanted, self.target, self._pre_roll)
 
     def show_frames_reversed(self, player: ClipPlayer, clip: Clip, wanted: Collection[int]) -> Iterator[int]:
-        """As `show_frames_reversed`."""
+        """Show frames of a clip from the other direction, as the function `show_frames_reversed` does."""
         yield from show_frames_reversed(player, clip, wanted, self.target, self._pre_roll)
 
     @property
     def depends_on_history(self) -> bool:
-        """Whether what is shown may depend on the way to a pose, and not on the pose alone."""
+        """Return whether the surface may depend on earlier poses, not only on the current one."""
         return self.target is not None and bool(self.target.simulations)
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether the last random pose came to rest, or was not held."""
+        """Return whether the last random pose came to rest, or was not held."""
         return self.settler is None or self.settler.last is None or self.settler.last.is_at_rest
 
 
 DIRECT_POSE_SETTER = PoseSetter()
-"""Of a rig, which follows from its pose at once."""
+"""Sets poses of a rig, whose surface follows from the pose at once."""
 
 
 def make_pose_setter(scene_rig: SceneRig, settings: TargetSettings, clips: Sequence[Clip], random: int) -> PoseSetter:
-    """How poses are reached with these settings; all that can be refused is refused.
+    """Make the pose setter for a target, and check that the target can be used.
 
     Args:
         scene_rig: the rig.
-        settings: of the target.
-        clips: whose frames are evaluated.
-        random: how many random poses are.
+        settings: settings of the target.
+        clips: the clips whose frames are evaluated.
+        random: number of random poses.
 
     Raises:
-        RigError: as `find_target` and `check_clips`, or the target cannot be brought to these poses.
+        RigError: as `find_target` and `check_clips`, or the target cannot be set to these poses.
     """
     if not settings.name:
         if settings.pre_roll or settings.max_settle_frames:
@@ -319,16 +341,18 @@ def make_pose_setter(scene_rig: SceneRig, settings: TargetSettings, clips: Seque
     target = find_target(scene_rig, settings.name)
     if random and target.follows == FRAMES:
         raise RigError(
-            f"The target '{target.name}' shows frames ({target.caches[0].words}), and not random poses; record 0 of "
-            "them, and the action that it was made with."
+            f"The target '{target.name}' shows frames ({target.caches[0].description}), and not random poses; record 0 "
+            "of them, and the action that it was made with."
         )
     if random and target.follows == SIMULATION and not settings.max_settle_frames:
         raise RigError(
-            f"The target '{target.name}' is a simulation ({target.simulations[0].words}): what it shows in a random "
-            "pose depends on the pose before; let it settle, or record 0 of them, and actions."
+            f"The target '{target.name}' is a simulation ({target.simulations[0].description}): what it shows in a "
+            "random pose depends on the pose before; let it settle, or record 0 of them, and actions."
         )
     if settings.max_settle_frames and (target.follows != SIMULATION or any(not c.is_simulation for c in target.caches)):
-        raise RigError(f"The target '{target.name}' cannot settle: {_why_not(target)}; leave settling out.")
+        raise RigError(
+            f"The target '{target.name}' cannot settle: {_reason_against_settling(target)}; leave settling out."
+        )
     if settings.max_settle_frames and clips:
         raise RigError(
             f"Settled poses are random ones, and '{clips[0].name}' is to be recorded too, frame by frame; leave it "
@@ -341,8 +365,8 @@ def make_pose_setter(scene_rig: SceneRig, settings: TargetSettings, clips: Seque
     return PoseSetter(target, settings.pre_roll, settler)
 
 
-def _why_not(target: Target) -> str:
+def _reason_against_settling(target: Target) -> str:
     if target.follows == POSE:
         return "it follows the pose at once"
     cache = next(cache for cache in target.caches if not cache.is_simulation)
-    return f"{cache.words} has the frames that it has"
+    return f"{cache.description} has the frames that it has"

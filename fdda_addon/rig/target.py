@@ -171,7 +171,7 @@ def check_clips(target: Target, clips: Sequence[Clip], pre_roll: int) -> None:
             if (first is not None and frames[0] < first) or (cache.last is not None and frames[-1] > cache.last):
                 to = "on" if cache.last is None else f"to {cache.last:g}"
                 raise RigError(
-                    f"The {what} has the frames {frames[0]} to {frames[-1]}, and {cache.words} has those from "
+                    f"The {what} has the frames {frames[0]} to {frames[-1]}, and {cache.description} has those from "
                     f"{cache.first:g} {to}; record an action within, or give it more frames."
                 )
         if pre_roll and clip.frames[0] - pre_roll < 0 and any(c.owner == bpy.context.scene for c in target.simulations):

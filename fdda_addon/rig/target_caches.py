@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What in a target depends on time: simulations and caches, with the frames that they have. Nothing is evaluated."""
+"""Finds the simulations and caches that a target depends on, and their frames. Evaluates nothing."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,21 +17,21 @@ from .modifier_stack import TIME_DEPENDENT
 from .sources import Sources
 from .time_inputs import time_inputs
 
-ALEMBIC, USD = {".abc"}, {".usd", ".usda", ".usdc", ".usdz"}
+ALEMBIC_SUFFIXES, USD_SUFFIXES = {".abc"}, {".usd", ".usda", ".usdc", ".usdz"}
 
 
 @dataclass(frozen=True)
 class Cache:
-    """A simulation or a cache that a target shows.
+    """A simulation or a cache that a target depends on.
 
     Attributes:
-        words: what it is, "the modifier 'Cloth' of 'flesh'".
-        first, last: the frames that it has; None where there is no end, or nothing says one.
-        is_simulation: each frame follows from the one before it, unless it is baked.
-        owner: RNA struct whose frames bound it, where they can be set.
+        description: such as "the modifier 'Cloth' of 'flesh'".
+        first, last: first and last frame; None if there is none or it is unknown.
+        is_simulation: each frame depends on the one before; False for a baked simulation.
+        owner: the RNA struct that has its frame range, if that can be set.
     """
 
-    words: str
+    description: str
     first: float | None = None
     last: float | None = None
     is_simulation: bool = False
@@ -39,85 +39,86 @@ class Cache:
 
 
 def read_caches(scene_rig: SceneRig, target_object: bpy.types.Object) -> tuple[Cache, ...]:
-    """The simulations and caches of a target and of all that it reads, the rig left out.
+    """Find the simulations and caches of a target and of everything that it depends on, except the rig.
 
     Raises:
         RigError: a file is missing or damaged.
     """
     sources = Sources(scene_rig, target_object, [modifier.name for modifier in target_object.modifiers])
-    found = [cache for scene_object in sources.objects for cache in _caches_of(scene_object)]
-    return tuple(dict.fromkeys([*found, *(Cache(moving.words) for moving in time_inputs(sources))]))
+    caches = [cache for scene_object in sources.objects for cache in _object_caches(scene_object)]
+    return tuple(dict.fromkeys([*caches, *(Cache(time_input.description) for time_input in time_inputs(sources))]))
 
 
-def _caches_of(scene_object: bpy.types.Object) -> Iterator[Cache]:
+def _object_caches(scene_object: bpy.types.Object) -> Iterator[Cache]:
     name = scene_object.name
     for modifier in scene_object.modifiers:
         if modifier.show_viewport:
-            yield from _of_modifier(modifier, f"the modifier '{modifier.name}' of '{name}'")
+            yield from _modifier_caches(modifier, f"the modifier '{modifier.name}' of '{name}'")
     for constraint in scene_object.constraints:
         if constraint.type == "TRANSFORM_CACHE" and constraint.cache_file and not constraint.mute:
-            yield _of_file(constraint.cache_file, f"the constraint '{constraint.name}' of '{name}'")
+            yield _file_cache(constraint.cache_file, f"the constraint '{constraint.name}' of '{name}'")
 
 
-def _of_modifier(modifier: bpy.types.Modifier, words: str) -> Iterator[Cache]:
+def _modifier_caches(modifier: bpy.types.Modifier, description: str) -> Iterator[Cache]:
     scene = bpy.context.scene
     if modifier.type in {"CLOTH", "SOFT_BODY"}:
-        cache = modifier.point_cache
-        yield Cache(words, cache.frame_start, cache.frame_end, not cache.is_baked, cache)
+        point_cache = modifier.point_cache
+        is_simulation = not point_cache.is_baked
+        yield Cache(description, point_cache.frame_start, point_cache.frame_end, is_simulation, point_cache)
     elif modifier.type == "NODES":
         node = find_time_node(modifier.node_group)
         if node is not None and node.bl_idname in SIMULATION_NODES:
-            yield Cache(words, scene.frame_start, scene.frame_end, True, scene)
+            yield Cache(description, scene.frame_start, scene.frame_end, True, scene)
         elif node is not None:
-            yield Cache(words)
+            yield Cache(description)
     elif modifier.type == "MESH_CACHE":
-        yield _of_mesh_cache(modifier, words)
+        yield _mesh_cache(modifier, description)
     elif modifier.type == "MESH_SEQUENCE_CACHE":
         if modifier.cache_file is None:
-            raise RigError(f"{words[0].upper()}{words[1:]} has no cache file; choose one, or another target.")
-        yield _of_file(modifier.cache_file, words)
+            raise RigError(f"{_capitalize(description)} has no cache file; choose one, or another target.")
+        yield _file_cache(modifier.cache_file, description)
     elif modifier.type in TIME_DEPENDENT:
         is_simulation = TIME_DEPENDENT[modifier.type] == "is a simulation"
-        yield Cache(words, scene.frame_start if is_simulation else None, None, is_simulation)
+        yield Cache(description, scene.frame_start if is_simulation else None, None, is_simulation)
 
 
-def _of_mesh_cache(modifier: bpy.types.MeshCacheModifier, words: str) -> Cache:
-    path = _existing(modifier.filepath, words, modifier.id_data)
+def _mesh_cache(modifier: bpy.types.MeshCacheModifier, description: str) -> Cache:
+    path = _existing_path(modifier.filepath, description, modifier.id_data)
     if modifier.time_mode != "FRAME" or modifier.play_mode != "SCENE":
-        return Cache(words)
+        return Cache(description)
     try:
         frames = mesh_cache_frames(path)
     except PointCacheError as error:
-        raise RigError(f"{words[0].upper()}{words[1:]} plays what cannot be read. {error}") from error
-    return Cache(words, modifier.frame_start, modifier.frame_start + (frames - 1) / modifier.frame_scale)
+        raise RigError(f"{_capitalize(description)} plays what cannot be read. {error}") from error
+    return Cache(description, modifier.frame_start, modifier.frame_start + (frames - 1) / modifier.frame_scale)
 
 
-def _of_file(cache_file: bpy.types.CacheFile, words: str) -> Cache:
-    path = _existing(cache_file.filepath, words, cache_file)
-    found = None
+def _file_cache(cache_file: bpy.types.CacheFile, description: str) -> Cache:
+    path = _existing_path(cache_file.filepath, description, cache_file)
+    frame_range = None
     if not cache_file.is_sequence and not cache_file.override_frame:
         try:
-            found = _frames_of(path, bpy.context.scene.render.fps / bpy.context.scene.render.fps_base)
+            frame_range = _file_frames(path, bpy.context.scene.render.fps / bpy.context.scene.render.fps_base)
         except OSError as error:
-            raise RigError(f"'{path}' of {words} cannot be read: {os_error_text(error)}.") from error
-    if found is None:
-        return Cache(words)
-    # Blender asks a file for the frame of the scene less the offset.
-    return Cache(words, *(round(frame + cache_file.frame_offset, 3) for frame in found))
+            raise RigError(f"'{path}' of {description} cannot be read: {os_error_text(error)}.") from error
+    if frame_range is None:
+        return Cache(description)
+    # Blender reads a file at the frame of the scene minus the offset.
+    return Cache(description, *(round(frame + cache_file.frame_offset, 3) for frame in frame_range))
 
 
-def _frames_of(path: Path, fps: float) -> tuple[float, float] | None:
-    """First and last frame of a cache file, as far as it says."""
-    if path.suffix.lower() in ALEMBIC:
+def _file_frames(path: Path, fps: float) -> tuple[float, float] | None:
+    """Read the first and last frame of a cache file; return None if they are unknown."""
+    if path.suffix.lower() in ALEMBIC_SUFFIXES:
         seconds = time_range(path)
         return None if seconds is None else (seconds[0] * fps, seconds[1] * fps)
-    if path.suffix.lower() in USD:
+    if path.suffix.lower() in USD_SUFFIXES:
         return _usd_frames(path)
     return None
 
 
 def _usd_frames(path: Path) -> tuple[float, float] | None:
-    """What the head of a USD layer says; None where it says nothing, or cannot be read."""
+    """Read the first and last frame from the metadata of a USD layer; return None if they are unknown."""
     bpy.utils.expose_bundled_modules()
     try:
         from pxr import Sdf, Tf
@@ -129,15 +130,19 @@ def _usd_frames(path: Path) -> tuple[float, float] | None:
         return None
     if layer is None or not (layer.HasStartTimeCode() and layer.HasEndTimeCode()):
         return None
-    # Blender shows time code t at the frame t, whatever the rates.
+    # Blender shows time code t at frame t, for any frame rate.
     return layer.startTimeCode, layer.endTimeCode
 
 
-def _existing(filepath: str, words: str, owner: bpy.types.ID) -> Path:
+def _existing_path(filepath: str, description: str, owner: bpy.types.ID) -> Path:
     path = resolve_path(filepath, owner.library).resolve() if filepath else None
     if path is None or not path.is_file():
         raise RigError(
-            f"{words[0].upper()}{words[1:]} plays the file '{path or filepath}', which is not there; put it there, "
+            f"{_capitalize(description)} plays the file '{path or filepath}', which is not there; put it there, "
             "or choose another file in the modifier."
         )
     return path
+
+
+def _capitalize(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}"

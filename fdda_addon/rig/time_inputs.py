@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What moves a surface beside the pose without a model being told: keys, drivers and modifiers that depend on time."""
+"""Finds what changes a surface with time, besides the pose and the controls: keyframes, drivers, modifiers."""
 
 import ast
 from collections.abc import Iterable, Iterator
@@ -16,13 +16,13 @@ from .modifier_stack import ModifierStack, is_fdda_modifier, time_dependence
 from .other_armatures import check_other_armatures
 from .sources import Curve, Sources
 
-_FRAME = {"frame", "frame_current", "frame_current_final", "frame_float", "frame_subframe"}
-_TRACKING = {"FOLLOW_TRACK", "CAMERA_SOLVER", "OBJECT_SOLVER", "TRANSFORM_CACHE"}
-_MOVING_IMAGES = {"MOVIE", "SEQUENCE"}
-_MUTE = "mute it, or let it read a number that is a control"
+_FRAME_PROPERTIES = {"frame", "frame_current", "frame_current_final", "frame_float", "frame_subframe"}
+_TIME_CONSTRAINTS = {"FOLLOW_TRACK", "CAMERA_SOLVER", "OBJECT_SOLVER", "TRANSFORM_CACHE"}
+_MOVING_IMAGE_SOURCES = {"MOVIE", "SEQUENCE"}
+_DRIVER_REMEDY = "mute it, or let it read a number that is a control"
 
-Place = tuple[bpy.types.ID, str, int]
-"""A number as `scene.controls.fcurve_target` gives it."""
+PropertyKey = tuple[bpy.types.ID, str, int]
+"""A number as `scene.controls.fcurve_target` returns it."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class TimeInput:
     """Something that changes a surface with time.
 
     Attributes:
-        words: what it is, "the driver of 'location' of 'handle'".
+        description: such as "the driver of 'location' of 'handle'".
         remedy: what a user can do about it.
     """
 
-    words: str
+    description: str
     remedy: str
 
 
@@ -44,16 +44,16 @@ def check_time_inputs(
     stack: ModifierStack,
     actions: Iterable[bpy.types.Action] = (),
 ) -> None:
-    """Fail where the surface of a mesh follows from more than the pose of its armature and the controls of a model.
+    """Check that the surface of a mesh depends only on the pose of its armature and on controls.
 
     Args:
         scene_rig: the rig.
-        controls: of the model, or of the recording that is made.
-        stack: of the mesh object.
-        actions: whose frames are recorded.
+        controls: the controls of the model or the recording.
+        stack: the modifiers of the mesh object.
+        actions: the actions whose frames are recorded.
 
     Raises:
-        RigError: names what depends on time, or a bone of another armature.
+        RigError: names something that depends on time, or a bone of another armature.
     """
     mesh_object = scene_rig.mesh_object
     names = [modifier.name for modifier in mesh_object.modifiers if not is_fdda_modifier(modifier)][
@@ -61,86 +61,88 @@ def check_time_inputs(
     ]
     sources = Sources(scene_rig, mesh_object, names)
     owners = [(owner_of(scene_rig, control.owner), control.path) for control in controls]
-    places = {fcurve_target(owner, path) for owner, path in owners if owner is not None}
-    for found in (*_modifiers_in_time(sources), *time_inputs(sources, places, actions)):
+    control_keys = {fcurve_target(owner, path) for owner, path in owners if owner is not None}
+    for time_input in (*_time_modifiers(sources), *time_inputs(sources, control_keys, actions)):
         raise RigError(
-            f"The surface of '{mesh_object.name}' changes with time through {found.words}, so it does not follow from "
-            f"the pose; {found.remedy}."
+            f"The surface of '{mesh_object.name}' changes with time through {time_input.description}, so it does not "
+            f"follow from the pose; {time_input.remedy}."
         )
-    check_other_armatures(scene_rig, sources, places)
+    check_other_armatures(scene_rig, sources, control_keys)
 
 
 def time_inputs(
-    sources: Sources, controls: Iterable[Place] = (), actions: Iterable[bpy.types.Action] = ()
+    sources: Sources, controls: Iterable[PropertyKey] = (), actions: Iterable[bpy.types.Action] = ()
 ) -> Iterator[TimeInput]:
-    """What changes a surface with time, modifiers left out.
+    """Find what changes a surface with time, except modifiers.
 
     Args:
-        sources: what the surface is computed from.
+        sources: what the surface depends on.
         controls: numbers that may change.
-        actions: that may be played beside what is active.
+        actions: further actions that may be played.
     """
     controls, actions = set(controls), tuple(actions)
     for datablock in (*sources.objects, *sources.datablocks):
         for curve in curves_with_actions(datablock, actions):
-            place = (datablock, curve.data_path, curve.array_index)
-            if place not in controls and sources.affects_surface(datablock, curve.data_path) and changes_value(curve):
-                yield _keyed(sources, datablock, curve)
+            key = (datablock, curve.data_path, curve.array_index)
+            if key not in controls and sources.affects_surface(datablock, curve.data_path) and changes_value(curve):
+                yield _keyed_input(sources, datablock, curve)
     numbers = [*sources.numbers, *((scene, path) for _, scene, path in sources.scene_reads)]
-    for place in dict.fromkeys(fcurve_target(*number) for number in numbers):
-        for curve in curves_with_actions(place[0], actions):
-            if (curve.data_path, curve.array_index) == place[1:] and place not in controls and changes_value(curve):
-                yield _keyed(sources, place[0], curve)
+    for key in dict.fromkeys(fcurve_target(*number) for number in numbers):
+        for curve in curves_with_actions(key[0], actions):
+            if (curve.data_path, curve.array_index) == key[1:] and key not in controls and changes_value(curve):
+                yield _keyed_input(sources, key[0], curve)
     for driver, _, path in sources.scene_reads:
-        if path in _FRAME:
-            yield _driven(driver)
+        if path in _FRAME_PROPERTIES:
+            yield _driver_input(driver)
     for driver in sources.drivers.values():
         if _reads_frame(driver[1].driver):
-            yield _driven(driver)
+            yield _driver_input(driver)
     for scene_object in sources.objects:
         name = scene_object.name
         world = bpy.context.scene.rigidbody_world
         if scene_object.rigid_body and world and world.enabled and scene_object.rigid_body.type == "ACTIVE":
             yield TimeInput(f"the rigid body of '{name}'", "bake it to a pose, or remove it")
         for constraint in scene_object.constraints:
-            if constraint.type in _TRACKING and not constraint.mute:
+            if constraint.type in _TIME_CONSTRAINTS and not constraint.mute:
                 yield TimeInput(f"the constraint '{constraint.name}' of '{name}'", "mute it, or remove it")
     for texture in sources.datablocks:
         image = getattr(texture, "image", None)
-        if image is not None and image.source in _MOVING_IMAGES:
+        if image is not None and image.source in _MOVING_IMAGE_SOURCES:
             yield TimeInput(f"the image '{image.name}' of '{texture.name}'", "choose a still image")
 
 
-def _modifiers_in_time(sources: Sources) -> Iterator[TimeInput]:
-    """Of the objects that a mesh reads: a cage that is cloth, a lattice that waves."""
+def _time_modifiers(sources: Sources) -> Iterator[TimeInput]:
+    """Find time-dependent modifiers of the objects that a mesh reads, such as a cage with cloth."""
     for scene_object, uses_geometry in list(sources.objects.items())[1:]:
         for modifier in scene_object.modifiers if uses_geometry else ():
-            if modifier.show_viewport and (what := time_dependence(modifier)):
-                words = f"the modifier '{modifier.name}' of '{scene_object.name}', which {what}"
-                yield TimeInput(words, "switch it off in the viewport, or remove it")
+            if modifier.show_viewport and (dependence := time_dependence(modifier)):
+                description = f"the modifier '{modifier.name}' of '{scene_object.name}', which {dependence}"
+                yield TimeInput(description, "switch it off in the viewport, or remove it")
 
 
-def _keyed(sources: Sources, datablock: bpy.types.ID, curve: bpy.types.FCurve) -> TimeInput:
-    words = f"the keys of '{curve.data_path}' of '{datablock.name}'"
+def _keyed_input(sources: Sources, datablock: bpy.types.ID, curve: bpy.types.FCurve) -> TimeInput:
+    description = f"the keys of '{curve.data_path}' of '{datablock.name}'"
     name = sources.control_name(datablock, curve.data_path)
     if not name:
-        return TimeInput(words, "remove them")
+        return TimeInput(description, "remove them")
     try:
         is_array = hasattr(datablock.path_resolve(curve.data_path), "__len__")
     except ValueError:
-        return TimeInput(words, "remove them")
+        return TimeInput(description, "remove them")
     low, high = value_range(curve)
     path = f"{name}[{curve.array_index}]" if is_array else name
-    return TimeInput(words, f"name what they set as a control (--control '{path}={low:g}:{high:g}'), or remove them")
+    remedy = f"name what they set as a control (--control '{path}={low:g}:{high:g}'), or remove them"
+    return TimeInput(description, remedy)
 
 
-def _driven(driver: Curve) -> TimeInput:
+def _driver_input(driver: Curve) -> TimeInput:
     datablock, curve = driver
-    return TimeInput(f"the driver of '{curve.data_path}' of '{datablock.name}', which reads the frame", _MUTE)
+    description = f"the driver of '{curve.data_path}' of '{datablock.name}', which reads the frame"
+    return TimeInput(description, _DRIVER_REMEDY)
 
 
 def _reads_frame(driver: bpy.types.Driver) -> bool:
-    """Whether the expression of a driver asks for the frame by itself, not through a variable."""
+    """Return whether the expression of a driver reads the frame itself, not through a variable."""
     if driver.type != "SCRIPTED":
         return False
     try:
@@ -149,4 +151,4 @@ def _reads_frame(driver: bpy.types.Driver) -> bool:
         return False
     variables = {variable.name for variable in driver.variables}
     names = {node.id for node in nodes if isinstance(node, ast.Name)} - variables
-    return "frame" in names or any(isinstance(node, ast.Attribute) and node.attr in _FRAME for node in nodes)
+    return "frame" in names or any(isinstance(node, ast.Attribute) and node.attr in _FRAME_PROPERTIES for node in nodes)
