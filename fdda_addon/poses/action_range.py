@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How far actions move a rig: ranges of the channels of its bones and of its controls, measured from the F-curves.
+"""Measures the ranges in which actions move the bones and controls of a rig, from their F-curves.
 
-Nothing is evaluated and the scene is not touched.
+It evaluates nothing and does not change the scene.
 """
 
 import hashlib
@@ -23,21 +23,21 @@ from ..scene.compatibility import curves_of
 from ..scene.controls import is_driven, is_number, make_control, owner_of
 from ..scene.scene_rig import SceneRig
 
-_OF_BONE = re.compile(r'pose\.bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]\.(?P<channel>\w+)')
-_CONTROL = re.compile(r'.*(?:\]\.influence|key_blocks\["(?:[^"\\]|\\.)*"\]\.value|\["(?:[^"\\]|\\.)*"\])')
-_REST = {
+_BONE_CHANNEL_PATH = re.compile(r'pose\.bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]\.(?P<channel>\w+)')
+_CONTROL_PATH = re.compile(r'.*(?:\]\.influence|key_blocks\["(?:[^"\\]|\\.)*"\]\.value|\["(?:[^"\\]|\\.)*"\])')
+_REST_VALUES = {
     "rotation_euler": (0.0, 0.0, 0.0),
     "rotation_quaternion": (1.0, 0.0, 0.0, 0.0),
     "rotation_axis_angle": (0.0, 0.0, 1.0, 0.0),
     LOCATION: (0.0, 0.0, 0.0),
     SCALE: (1.0, 1.0, 1.0),
 }
-"""What an action leaves a channel at that it does not key."""
+"""Values of the channels that an action does not key."""
 
-MAX_MEASURED_BYTES = 64_000_000
-"""Rotations of actions that are kept; beyond so many bytes all are measured again."""
-CONTINUOUS_PREFERENCE = 0.9
-"""Angles that follow on from frame to frame are taken unless others have ranges that are narrower by this factor."""
+MAX_CACHE_BYTES = 64_000_000
+"""Size of the cached rotations at which the cache is cleared."""
+CONTINUOUS_ANGLES_PREFERENCE = 0.9
+"""Euler angles that are continuous over frames are used unless others have ranges narrower by this factor."""
 
 Ranges = dict[tuple[str, str, int], tuple[float, float]]
 """Lowest and highest value by bone, kind and axis."""
@@ -47,13 +47,13 @@ Curves = dict[str, dict[int, bpy.types.FCurve]]
 
 
 @dataclass(frozen=True)
-class _Measured:
-    """What an action keys.
+class _Measurement:
+    """The motion that an action keys.
 
     Attributes:
-        content: the keys that it was measured of; None where it follows from more than the keys.
-        ranges: of all channels, Euler angles as they follow on from frame to frame.
-        rotations: (F, 4) float32 quaternions of the bones that are not keyed as Euler angles.
+        content: the keyframes that were measured; None if the motion depends on more than keyframes.
+        ranges: ranges of all channels, with Euler angles that are continuous over frames.
+        rotations: (F, 4) float32 quaternions by bone, of the bones that are not keyed as Euler angles.
     """
 
     content: tuple | None
@@ -61,110 +61,112 @@ class _Measured:
     rotations: dict[str, np.ndarray]
 
 
-_measured: dict[tuple[int, int], _Measured] = {}
-"""By session_uid of the armature object and of the action."""
+_cache: dict[tuple[int, int], _Measurement] = {}
+"""Measurements by the session ids of the armature object and the action."""
 
 
 def action_frames(action: bpy.types.Action) -> range:
-    """The whole frames of an action."""
+    """Return the whole frames of an action."""
     first, last = (round(frame) for frame in action.frame_range)
     return range(first, last + 1)
 
 
 def measured_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action]) -> Ranges:
-    """How far actions move the bones of an armature, over all their whole frames.
+    """Measure the ranges in which actions move the bones of an armature, at all whole frames.
 
     Args:
         armature_object: the armature object.
         actions: the actions.
 
     Returns:
-        Lowest and highest value by bone, kind and axis, of what the actions key and move: `ROTATION` in radians, the
-        Euler angles as `armature.Poser` sets them (in the order of the bone, of quaternions and axis angles XYZ, and
-        turning on beyond a half turn), `LOCATION` in metres and `SCALE` as factors, relative to the rest pose.
+        Ranges of the channels that the actions key and change, relative to the rest pose: `ROTATION` in radians,
+        `LOCATION` in metres, `SCALE` as factors. Rotations are Euler angles as `armature.Poser` sets them: in the
+        rotation order of the bone (XYZ for quaternions and axis angles), continuous beyond half a turn.
     """
     return moving_ranges(keyed_ranges(armature_object, actions))
 
 
 def moving_ranges(keyed: Ranges) -> Ranges:
-    """Of the ranges that `keyed_ranges` returns those of `measured_ranges`."""
+    """Select from the ranges of `keyed_ranges` those that `measured_ranges` returns."""
     return {key: bounds for key, bounds in keyed.items() if key[1] != ROTATION_VECTOR and has_width(bounds)}
 
 
 def has_width(bounds: tuple[float, float]) -> bool:
-    """Whether a range is more than a point."""
+    """Return whether a range contains more than one value."""
     return bounds[1] - bounds[0] > RANGE_TOLERANCE
 
 
 def keyed_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action]) -> Ranges:
-    """As `measured_ranges`, also of what is keyed and stands still, and with `ROTATION_VECTOR`s.
+    """Measure ranges as `measured_ranges` does, with those of constant channels and of `ROTATION_VECTOR`s.
 
-    Bones that are keyed as quaternions or axis angles have rotation vectors beside their Euler angles. Three Euler
-    angles wrap, and widen near gimbal lock. The ranges of rotation vectors are about as wide as the motion.
+    Bones that are keyed as quaternions or axis angles have rotation vectors besides their Euler angles. Euler angles
+    wrap, and have wide ranges near gimbal lock; the ranges of rotation vectors are about as wide as the motion.
     """
-    found: Ranges = {}
+    ranges: Ranges = {}
     rotations: dict[str, list[np.ndarray]] = {}
-    for measured in [_measure(armature_object, action) for action in actions]:
-        for key, (low, high) in measured.ranges.items():
-            lowest, highest = found.get(key, (np.inf, -np.inf))
-            found[key] = min(lowest, low), max(highest, high)
-        for bone, own in measured.rotations.items():
-            rotations.setdefault(bone, []).append(own)
-    for bone, parts in rotations.items():
-        quaternions = np.concatenate(parts)
+    for measurement in [_measure(armature_object, action) for action in actions]:
+        for key, (low, high) in measurement.ranges.items():
+            lowest, highest = ranges.get(key, (np.inf, -np.inf))
+            ranges[key] = min(lowest, low), max(highest, high)
+        for bone, quaternions in measurement.rotations.items():
+            rotations.setdefault(bone, []).append(quaternions)
+    for bone, arrays in rotations.items():
+        quaternions = np.concatenate(arrays)
         angles = euler_angles(quaternions)
-        width = sum(high - low for low, high in (found[bone, ROTATION, axis] for axis in range(3)))
-        if total_range_width(angles) < CONTINUOUS_PREFERENCE * width:
-            found |= _by_axis(bone, ROTATION, angles)
-        found |= _by_axis(bone, ROTATION_VECTOR, rotation_vectors(quaternions))
-    return found
+        width = sum(high - low for low, high in (ranges[bone, ROTATION, axis] for axis in range(3)))
+        if total_range_width(angles) < CONTINUOUS_ANGLES_PREFERENCE * width:
+            ranges |= _ranges_by_axis(bone, ROTATION, angles)
+        ranges |= _ranges_by_axis(bone, ROTATION_VECTOR, rotation_vectors(quaternions))
+    return ranges
 
 
-def _by_axis(bone: str, kind: str, values: np.ndarray) -> Ranges:
+def _ranges_by_axis(bone: str, kind: str, values: np.ndarray) -> Ranges:
+    """Return the ranges of (n, 3) values of a bone."""
     bounds = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
-    return {(bone, kind, axis): ends for axis, ends in enumerate(bounds)}
+    return {(bone, kind, axis): low_high for axis, low_high in enumerate(bounds)}
 
 
-def _measure(armature_object: bpy.types.Object, action: bpy.types.Action) -> _Measured:
-    """Measure an action; again when its keys have changed, for one of many bones takes a second."""
+def _measure(armature_object: bpy.types.Object, action: bpy.types.Action) -> _Measurement:
+    """Measure an action, and cache the result until its keyframes change: an action of many bones takes a second."""
     frames, curves = action_frames(action), _curves_by_bone(armature_object, action)
-    content = _content(armature_object, frames, curves)
-    place = armature_object.session_uid, action.session_uid
-    known = _measured.get(place)
-    if content is None or known is None or known.content != content:
-        known = _Measured(content, {}, {})
-        for bone, own in curves.items():
-            for kind, axis, values in _channels(armature_object.pose.bones[bone], own, frames, known.rotations):
-                known.ranges[bone, kind, axis] = float(values.min()), float(values.max())
-        if sum(array.nbytes for each in _measured.values() for array in each.rotations.values()) > MAX_MEASURED_BYTES:
-            _measured.clear()
-        _measured[place] = known
-    return known
+    content = _keyframe_content(armature_object, frames, curves)
+    cache_key = armature_object.session_uid, action.session_uid
+    measurement = _cache.get(cache_key)
+    if content is None or measurement is None or measurement.content != content:
+        measurement = _Measurement(content, {}, {})
+        for name, bone_curves in curves.items():
+            bone = armature_object.pose.bones[name]
+            for kind, axis, values in _channel_values(bone, bone_curves, frames, measurement.rotations):
+                measurement.ranges[name, kind, axis] = float(values.min()), float(values.max())
+        if sum(array.nbytes for cached in _cache.values() for array in cached.rotations.values()) > MAX_CACHE_BYTES:
+            _cache.clear()
+        _cache[cache_key] = measurement
+    return measurement
 
 
-def _content(
+def _keyframe_content(
     armature_object: bpy.types.Object, frames: range, curves: dict[str, Curves]
 ) -> tuple[range, bytes, tuple] | None:
-    """What ranges follow from; None where that is more than the keys."""
-    digest, places = hashlib.sha256(), []
+    """Return what the ranges depend on; None if they depend on more than keyframes."""
+    digest, curve_settings = hashlib.sha256(), []
     for bone, channels in curves.items():
         for channel, by_index in channels.items():
             for index, curve in by_index.items():
                 points = curve.keyframe_points
                 if curve.modifiers or not points:
                     return None
-                places.append((bone, armature_object.pose.bones[bone].rotation_mode, channel, index, len(points)))
-                places.append(curve.extrapolation)
+                rotation_mode = armature_object.pose.bones[bone].rotation_mode
+                curve_settings.append((bone, rotation_mode, channel, index, len(points), curve.extrapolation))
                 for element in KEYFRAME:
                     digest.update(read(points, element))
-    return frames, digest.digest(), tuple(places)
+    return frames, digest.digest(), tuple(curve_settings)
 
 
 def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> tuple[Control, ...]:
-    """The numbers of a rig that actions key and move, beside its bones, with the ranges they move in.
+    """Measure the numbers of a rig, besides its bones, that actions key and change, as controls with their ranges.
 
-    Custom properties, influences of constraints and values of shape keys count. What a file lacks, or what is wider
-    than any control, is left out.
+    These are custom properties, influences of constraints and values of shape keys. Numbers that the file lacks, and
+    those with a range too wide for a control, are left out.
 
     Args:
         scene_rig: the rig.
@@ -179,7 +181,7 @@ def measured_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) 
 
 
 def constant_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) -> tuple[Channel, ...]:
-    """The numbers as of `measured_controls` that actions key at one value, where the file has another value now."""
+    """Find numbers, as of `measured_controls`, that actions key at a single value other than the current one."""
     channels = []
     for (owner, path), (low, high) in _keyed_controls(scene_rig, actions).items():
         datablock = owner_of(scene_rig, owner)
@@ -193,81 +195,99 @@ def constant_controls(scene_rig: SceneRig, actions: Iterable[bpy.types.Action]) 
 def _keyed_controls(
     scene_rig: SceneRig, actions: Iterable[bpy.types.Action]
 ) -> dict[tuple[str, str], tuple[float, float]]:
-    """Lowest and highest value by owner and path."""
-    found: dict[tuple[str, str], tuple[float, float]] = {}
+    """Measure the lowest and highest value of keyed numbers, by owner and path."""
+    ranges: dict[tuple[str, str], tuple[float, float]] = {}
     for action in actions:
         frames = action_frames(action)
         for owner in (ARMATURE_OBJECT, ARMATURE, MESH_OBJECT, SHAPE_KEYS):
             datablock = owner_of(scene_rig, owner)
-            for curve in _playing_curves(action, datablock) if datablock else ():
-                if _CONTROL.fullmatch(curve.data_path):
+            for curve in _unmuted_curves(action, datablock) if datablock else ():
+                if _CONTROL_PATH.fullmatch(curve.data_path):
                     values = [curve.evaluate(frame) for frame in frames]
-                    low, high = found.get((owner, curve.data_path), (np.inf, -np.inf))
-                    found[owner, curve.data_path] = min(low, *values), max(high, *values)
-    return found
+                    low, high = ranges.get((owner, curve.data_path), (np.inf, -np.inf))
+                    ranges[owner, curve.data_path] = min(low, *values), max(high, *values)
+    return ranges
 
 
 def _curves_by_bone(armature_object: bpy.types.Object, action: bpy.types.Action) -> dict[str, Curves]:
-    found: dict[str, Curves] = {}
-    for curve in _playing_curves(action, armature_object):
-        match = _OF_BONE.fullmatch(curve.data_path)
+    curves: dict[str, Curves] = {}
+    for curve in _unmuted_curves(action, armature_object):
+        match = _BONE_CHANNEL_PATH.fullmatch(curve.data_path)
         name = bpy.utils.unescape_identifier(match["bone"]) if match else ""
-        if match and match["channel"] in _REST and name in armature_object.pose.bones:
-            found.setdefault(name, {}).setdefault(match["channel"], {})[curve.array_index] = curve
-    return found
+        if match and match["channel"] in _REST_VALUES and name in armature_object.pose.bones:
+            curves.setdefault(name, {}).setdefault(match["channel"], {})[curve.array_index] = curve
+    return curves
 
 
-def _playing_curves(action: bpy.types.Action, datablock: bpy.types.ID) -> Iterator[bpy.types.FCurve]:
-    """The F-curves of a datablock that are not muted, by themselves or with their group."""
+def _unmuted_curves(action: bpy.types.Action, datablock: bpy.types.ID) -> Iterator[bpy.types.FCurve]:
+    """Yield the F-curves of a datablock that are not muted, neither themselves nor with their group."""
     for curve in curves_of(action, datablock):
         if not (curve.mute or (curve.group and curve.group.mute)):
             yield curve
 
 
-def _channels(
+def _channel_values(
     bone: bpy.types.PoseBone, curves: Curves, frames: range, rotations: dict[str, np.ndarray]
 ) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Kind, axis and (F,) values over the frames of what is keyed; quaternions are put into `rotations`."""
+    """Evaluate the keyed channels of a bone.
+
+    Args:
+        bone: the bone.
+        curves: its F-curves.
+        frames: F frames.
+        rotations: receives the quaternions of a bone that is not keyed as Euler angles.
+
+    Yields:
+        Kind, axis and (F,) values of each channel.
+    """
     for kind in (LOCATION, SCALE):
         for axis in curves.get(kind, {}):
-            yield kind, axis, _values(curves[kind], kind, frames)[:, axis]
+            yield kind, axis, _evaluate_curves(curves[kind], kind, frames)[:, axis]
     channel = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}.get(bone.rotation_mode)
     channel = channel or "rotation_euler"
     keyed = curves.get(channel)
     if keyed:
-        values = _values(keyed, channel, frames)
+        values = _evaluate_curves(keyed, channel, frames)
         if channel != "rotation_euler":
-            values = values if channel == "rotation_quaternion" else np.array([_of_axis_angle(v) for v in values])
+            if channel == "rotation_axis_angle":
+                values = np.array([_axis_angle_to_quaternion(value) for value in values])
             rotations[bone.name] = values.astype(np.float32)
         angles = _continuous_angles(channel, bone.rotation_mode, values)
         for axis in keyed if channel == "rotation_euler" else range(3):
             yield ROTATION, axis, angles[:, axis]
 
 
-def _values(curves: dict[int, bpy.types.FCurve], channel: str, frames: range) -> np.ndarray:
-    """(F, 3 or 4) float64 values of a channel over the frames."""
-    values = np.tile(np.float64(_REST[channel]), (len(frames), 1))
+def _evaluate_curves(curves: dict[int, bpy.types.FCurve], channel: str, frames: range) -> np.ndarray:
+    """Evaluate the F-curves of a channel, (F, 3 or 4) float64; components without an F-curve are at rest."""
+    values = np.tile(np.float64(_REST_VALUES[channel]), (len(frames), 1))
     for index, curve in curves.items():
         values[:, index] = [curve.evaluate(frame) for frame in frames]
     return values
 
 
 def _continuous_angles(channel: str, mode: str, values: np.ndarray) -> np.ndarray:
-    """(F, 3) Euler angles in radians that do not jump by a turn from one frame to the next."""
-    angles, previous = np.empty((len(values), 3)), Euler((0.0, 0.0, 0.0), "XYZ")
-    for place, value in enumerate(values):
+    """Convert rotations to Euler angles, (F, 3) radians, that do not jump by a turn between frames.
+
+    Args:
+        channel: the channel of the rotations, "rotation_euler" or another one, which holds quaternions.
+        mode: rotation mode of the bone.
+        values: (F, 3 or 4) values.
+    """
+    angles, euler = np.empty((len(values), 3)), Euler((0.0, 0.0, 0.0), "XYZ")
+    for index, value in enumerate(values):
         if channel == "rotation_euler":
-            previous = Euler(value, mode)
-            if place:
-                previous.make_compatible(Euler(angles[place - 1], mode))
+            euler = Euler(value, mode)
+            if index:
+                euler.make_compatible(Euler(angles[index - 1], mode))
         else:
-            turned = Quaternion(value)
-            # A quaternion of length 0 turns nothing, in Blender as well.
-            previous = (turned.normalized() if turned.magnitude else Quaternion()).to_euler("XYZ", previous)
-        angles[place] = previous
+            quaternion = Quaternion(value)
+            # A quaternion of length 0 is no rotation, as in Blender.
+            unit_quaternion = quaternion.normalized() if quaternion.magnitude else Quaternion()
+            euler = unit_quaternion.to_euler("XYZ", euler)
+        angles[index] = euler
     return angles
 
 
-def _of_axis_angle(value: np.ndarray) -> Quaternion:
+def _axis_angle_to_quaternion(value: np.ndarray) -> Quaternion:
     axis = Vector(value[1:])
     return Quaternion(axis, value[0]) if axis.length else Quaternion()

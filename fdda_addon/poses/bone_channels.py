@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Channels of bones as numbers of the armature object: what a channel and a control have in common."""
+"""Converts between channels of bones and controls: both are numbers of the armature object."""
 
 from collections.abc import Iterable
 
@@ -12,7 +12,7 @@ _PATHS = {ROTATION: "rotation_euler", LOCATION: "location", SCALE: "scale"}
 
 
 def control_name(armature_object: bpy.types.Object, channel: Channel) -> str:
-    """The name of the control (`Control.name`) that is the number which a channel of a bone sets; empty for none."""
+    """Return the name of the control (`Control.name`) for the number that a channel sets; empty if there is none."""
     bone = armature_object.pose.bones.get(channel.name)
     if channel.kind not in _PATHS or bone is None:
         return ""
@@ -23,7 +23,7 @@ def control_name(armature_object: bpy.types.Object, channel: Channel) -> str:
 
 
 def ranges_by_control(armature_object: bpy.types.Object, channels: Iterable[Channel]) -> dict[str, tuple[float, float]]:
-    """Ranges of the numbers that channels of bones set, by the names of controls."""
-    found = {control_name(armature_object, channel): (channel.low, channel.high) for channel in channels}
-    found.pop("", None)
-    return found
+    """Return the ranges of channels of bones by the names of the controls for the same numbers."""
+    ranges = {control_name(armature_object, channel): (channel.low, channel.high) for channel in channels}
+    ranges.pop("", None)
+    return ranges

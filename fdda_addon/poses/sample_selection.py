@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which bones and controls a user chose to sample."""
+"""Parses the user's selection of bones and controls for random poses."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from .action_range import constant_controls, keyed_ranges, measured_controls
 from .clip import find_action
 
 SELECTED, COLLECTION, ACTION, BONE = "selected", "collection:", "action:", "bone:"
-"""How a user chooses the control bones that are sampled."""
+"""The forms of an entry: the selected bones, a bone collection, the bones that an action keys, a bone."""
 
 Measured = dict[tuple[str, str, int], tuple[float, float]]
 """Ranges by bone, kind and axis."""
@@ -21,15 +21,15 @@ Measured = dict[tuple[str, str, int], tuple[float, float]]
 
 @dataclass(frozen=True)
 class SampleSelection:
-    """What a user chose to sample.
+    """The bones and controls that random poses set.
 
     Attributes:
-        bones: names of the control bones; None for the bones of the rig as it stands (`default_channels`).
-        measured: ranges of what actions key. Bones that are chosen by action move in these, as far as the rig's limits
-            let them; other chosen bones do where the rig states no range.
-        by_action: names of the bones that are chosen by action alone.
-        controls: the controls, stated or keyed.
-        held: numbers that actions key at one value, which the file has otherwise.
+        bones: names of the selected bones; None for the default bones (`default_channels`).
+        measured: ranges of what the selected actions key. Bones that are selected by an action move in these, within
+            the limits of the rig. Other selected bones use them if they have no range of motion.
+        by_action: names of the bones that are selected by actions alone.
+        controls: the controls, listed by the user or keyed by the actions.
+        held: numbers that the actions key at a single value which differs from the current one.
     """
 
     bones: frozenset[str] | None = None
@@ -40,11 +40,15 @@ class SampleSelection:
 
 
 DEFAULT_SELECTION = SampleSelection()
-"""Nothing was chosen: the bones of the rig as it stands are sampled."""
+"""The user selected nothing, so the default bones are sampled."""
 
 
 def select_bones(scene_rig: SceneRig, texts: Iterable[str]) -> SampleSelection:
-    """Read what a user chose; the choice may be empty.
+    """Parse a selection, which may be empty.
+
+    Args:
+        scene_rig: the rig.
+        texts: as for `sampling.choose`.
 
     Raises:
         RigError: there is no such collection, action or bone.
@@ -52,18 +56,18 @@ def select_bones(scene_rig: SceneRig, texts: Iterable[str]) -> SampleSelection:
     texts = list(texts)
     if not texts:
         return DEFAULT_SELECTION
-    chosen: set[str] = set()
+    selected: set[str] = set()
     actions = []
     for text in texts:
         if text.startswith(ACTION):
             actions.append(find_action(text.removeprefix(ACTION)))
         else:
-            chosen |= _bones_of(scene_rig, text)
+            selected |= _bones_of(scene_rig, text)
     measured = keyed_ranges(scene_rig.armature_object, actions)
     keyed = {bone for bone, _, _ in measured}
     controls, held = measured_controls(scene_rig, actions), constant_controls(scene_rig, actions)
     return SampleSelection(
-        frozenset(chosen | keyed), tuple(measured.items()), frozenset(keyed - chosen), controls, held
+        frozenset(selected | keyed), tuple(measured.items()), frozenset(keyed - selected), controls, held
     )
 
 
@@ -75,8 +79,8 @@ def _bones_of(scene_rig: SceneRig, text: str) -> set[str]:
     if text.startswith(COLLECTION):
         name = text.removeprefix(COLLECTION)
         if name not in data.collections_all:
-            known = ", ".join(f"'{c.name}'" for c in data.collections_all) or "none"
-            raise RigError(f"'{armature_object.name}' has no bone collection '{name}'; its collections: {known}.")
+            names = ", ".join(f"'{c.name}'" for c in data.collections_all) or "none"
+            raise RigError(f"'{armature_object.name}' has no bone collection '{name}'; its collections: {names}.")
         return {bone.name for bone in data.collections_all[name].bones_recursive}
     name = text.removeprefix(BONE)
     if not text.startswith(BONE) or name not in bones:
