@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The range of motion of a person, for bones that are named as parts of a body.
+"""Provides the range of motion of a person for bones that are named as body parts.
 
-A person's ranges are about directions of the body, and bones have axes of their own: each direction goes to the axis of
-the bone that lies nearest to it, with the sign that fits. Arms are taken to be in a T pose, or not far from it.
+A person's ranges refer to directions of the body, but the axes of bones differ. So each direction is assigned to the
+nearest axis of the bone, with the sign that fits. Arms are assumed to be in a T pose, or close to it.
 """
 
 import math
@@ -12,11 +12,11 @@ import bpy
 from mathutils import Matrix, Vector
 
 X, Y, Z = Vector((1, 0, 0)), Vector((0, 1, 0)), Vector((0, 0, 1))
-"""Directions of a character that stands along Z and looks along -Y; X points to its left."""
+"""Axes of a character that stands along Z and faces -Y; X points to its left."""
 
-Side = tuple[Vector, float, float]
-Ranges = tuple[Side, Side, tuple[float, float]]
-"""Degrees about two directions of the body and about the bone itself, of the left side."""
+AxisRange = tuple[Vector, float, float]
+Ranges = tuple[AxisRange, AxisRange, tuple[float, float]]
+"""Ranges in degrees about two directions of the body, and about the bone itself, for the left side."""
 
 _SPINE: Ranges = ((X, -10, 20), (Y, -12, 12), (-12, 12))
 RANGES: tuple[tuple[str, Ranges], ...] = (
@@ -44,38 +44,46 @@ _LETTERS = {"l": "left", "r": "right"}
 
 
 def body_part_of(name: str) -> tuple[Ranges | None, str]:
-    """Ranges of a bone by its name, as of the left side, and "left", "right" or ""; None for what is no such part."""
-    own = name.rpartition(":")[2]
-    own = re.sub(r"(?i)^(def|org|mch|cc_base|bip0+1|b)[-_ ]+", "", own)
+    """Find the body part of a bone by its name.
+
+    Returns:
+        Its ranges for the left side, None if the name is of no body part; and "left", "right" or "".
+    """
+    part_name = name.rpartition(":")[2]
+    part_name = re.sub(r"(?i)^(def|org|mch|cc_base|bip0+1|b)[-_ ]+", "", part_name)
     side = ""
-    if match := _SIDE.search(own):
+    if match := _SIDE.search(part_name):
         side = match["side"] or match["word"]
-        own = own[: match.start()] + own[match.end() :]
+        part_name = part_name[: match.start()] + part_name[match.end() :]
         side = _LETTERS.get(side.lower(), side.lower())
-    plain = re.sub(r"[^a-z0-9]", "", own.lower())
-    ranges = next((ranges for pattern, ranges in RANGES if re.fullmatch(pattern, plain)), None)
+    letters = re.sub(r"[^a-z0-9]", "", part_name.lower())
+    ranges = next((ranges for pattern, ranges in RANGES if re.fullmatch(pattern, letters)), None)
     return ranges, side
 
 
 def human_ranges(armature_object: bpy.types.Object, bone: bpy.types.Bone) -> list[tuple[float, float]] | None:
-    """Ranges of a bone about its own axes x, y and z, radians; None where its name is of no part of a body."""
+    """Return the ranges of a bone about its axes x, y and z in radians; None if its name is of no body part."""
     ranges, side = body_part_of(bone.name)
     if ranges is None:
         return None
     if side == "right":
         first, second, (low, high) = ranges
-        # Mirrored at the plane of Y and Z: rotations about X stay, the others turn round.
-        about = [(axis, *((low_, high_) if axis is X else (-high_, -low_))) for axis, low_, high_ in (first, second)]
-        ranges = (*about, (-high, -low))
+        # Mirrored at the YZ plane: rotations about X keep their sign, the others change it.
+        mirrored = [
+            (axis, *((axis_low, axis_high) if axis is X else (-axis_high, -axis_low)))
+            for axis, axis_low, axis_high in (first, second)
+        ]
+        ranges = (*mirrored, (-high, -low))
     matrix: Matrix = armature_object.matrix_world.to_quaternion().to_matrix() @ bone.matrix_local.to_3x3()
-    return [(math.radians(low), math.radians(high)) for low, high in _about_own_axes(matrix, ranges)]
+    return [(math.radians(low), math.radians(high)) for low, high in _about_bone_axes(matrix, ranges)]
 
 
-def _about_own_axes(matrix: Matrix, ranges: Ranges) -> list[tuple[float, float]]:
-    axes = matrix.transposed()
-    (first, *bounds), (second, *others), twist = ranges
-    place = max((0, 2), key=lambda candidate: abs(axes[candidate].dot(first)))
-    found = [twist, twist, twist]
-    for axis, direction, (low, high) in ((place, first, bounds), (2 - place, second, others)):
-        found[axis] = (low, high) if axes[axis].dot(direction) > 0 else (-high, -low)
-    return found
+def _about_bone_axes(matrix: Matrix, ranges: Ranges) -> list[tuple[float, float]]:
+    """Assign ranges about directions of the body to the axes of a bone, given its matrix in world space."""
+    bone_axes = matrix.transposed()
+    (first, *first_range), (second, *second_range), twist = ranges
+    first_axis = max((0, 2), key=lambda axis: abs(bone_axes[axis].dot(first)))
+    bone_ranges = [twist, twist, twist]
+    for axis, direction, (low, high) in ((first_axis, first, first_range), (2 - first_axis, second, second_range)):
+        bone_ranges[axis] = (low, high) if bone_axes[axis].dot(direction) > 0 else (-high, -low)
+    return bone_ranges

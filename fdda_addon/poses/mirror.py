@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Poses mirrored left to right, for rigs that are the same on both sides."""
+"""Mirrors poses left to right, for symmetric rigs."""
 
 import re
 from collections.abc import Iterable
@@ -12,12 +12,12 @@ from ..scene.arrays import POSE_CHANNELS, read, write
 from ..scene.temporary_state import set_value
 from ..scene.unit import metres_per_unit
 
-MIN_DISTANCE, PART_OF_SIZE = 1e-3, 1e-3
-"""Ends of bones may lie off their mirror image by one millimetre, or by this part of the armature's size if larger."""
+MIN_DISTANCE_TOLERANCE, RELATIVE_DISTANCE_TOLERANCE = 1e-3, 1e-3
+"""Largest distance between an end of a bone and its mirror image: in metres, or relative to the armature's size."""
 AXIS_TOLERANCE = 1e-2
-"""The largest angle by which the axes of a bone and of its mirror image may differ, radians."""
+"""Largest angle between an axis of a bone and that of its mirror image, radians."""
 
-_SIGNS = {
+_MIRROR_SIGNS = {
     "location": (-1, 1, 1),
     "rotation_euler": (1, -1, -1),
     "rotation_quaternion": (1, 1, -1, -1),
@@ -28,55 +28,62 @@ _NAME = re.compile(r'\["((?:[^"\\]|\\.)*)"\]')
 
 
 def flipped_name(name: str) -> str:
-    """The name of the other side: `arm.R` of `arm.L`, `rig:RightArm` of `rig:LeftArm`; the same where it has none."""
-    space, colon, own = name.rpartition(":")
-    return space + colon + bpy.utils.flip_name(own)
+    """Return the name of the other side, `arm.R` for `arm.L`, `rig:RightArm` for `rig:LeftArm`, if there is one."""
+    namespace, colon, base_name = name.rpartition(":")
+    return namespace + colon + bpy.utils.flip_name(base_name)
 
 
 class Mirror:
-    """Mirrors the pose of an armature about its YZ plane, and numbers that have a left and a right."""
+    """Mirrors the pose of an armature about its YZ plane, and numbers that have a left and a right side."""
 
     def __init__(self, armature_object: bpy.types.Object, animated: Iterable[tuple[bpy.types.ID, str]] = ()):
-        """Args:
+        """Prepare to mirror poses.
+
+        Args:
             armature_object: the armature object.
-            animated: numbers, datablock and RNA path, that are exchanged with those of the other side, where there are
-                such; custom properties of bones are anyway.
+            animated: datablocks and RNA paths of numbers to exchange with those of the other side, in addition to
+                custom properties of bones.
 
         Raises:
-            RigError: the rest pose is not the same on both sides, or two bones rotate in different modes.
+            RigError: the rest pose is not symmetric, or two bones have different rotation modes.
         """
         self._armature_object = armature_object
         bones = armature_object.pose.bones
-        index = {bone.name: number for number, bone in enumerate(bones)}
-        self._partners = np.array([index.get(flipped_name(name), number) for name, number in index.items()], int)
+        indices = {bone.name: index for index, bone in enumerate(bones)}
+        self._partners = np.array([indices.get(flipped_name(name), index) for name, index in indices.items()], int)
         _check_symmetric(armature_object, self._partners)
-        paths = {(armature_object, path) for path in _custom_paths(armature_object)} | set(animated)
+        paths = {(armature_object, path) for path in _custom_property_paths(armature_object)} | set(animated)
         self._pairs = [
             (datablock, path, other)
-            for datablock, path in sorted(paths, key=lambda place: place[1])
+            for datablock, path in sorted(paths, key=lambda datablock_path: datablock_path[1])
             if (other := _flipped_path(path)) != path and _is_number(datablock, path) and _is_number(datablock, other)
         ]
 
     @property
     def numbers(self) -> list[tuple[bpy.types.ID, str]]:
-        """The numbers that are exchanged."""
-        return [(datablock, each) for datablock, path, other in self._pairs for each in (path, other)]
+        """Return the datablocks and RNA paths of the numbers that are exchanged."""
+        return [(datablock, number) for datablock, path, other in self._pairs for number in (path, other)]
 
     def apply(self) -> None:
-        """Mirror the pose and the numbers as they are set now. The graph is not evaluated."""
+        """Mirror the current pose and numbers without evaluating them."""
         bones = self._armature_object.pose.bones
         for channel in POSE_CHANNELS:
-            write(bones, channel, read(bones, channel)[self._partners] * np.float32(_SIGNS[channel.name]))
+            write(bones, channel, read(bones, channel)[self._partners] * np.float32(_MIRROR_SIGNS[channel.name]))
         values = {(datablock, other): datablock.path_resolve(path) for datablock, path, other in self._pairs}
         values |= {(datablock, path): datablock.path_resolve(other) for datablock, path, other in self._pairs}
         for (datablock, path), value in values.items():
             set_value(datablock, path, value)
         for datablock in {datablock for datablock, _ in values} | {self._armature_object}:
-            # Custom properties do not tell the graph by themselves.
+            # Custom properties do not tag their datablock.
             datablock.update_tag()
 
 
 def _check_symmetric(armature_object: bpy.types.Object, partners: np.ndarray) -> None:
+    """Check that each bone is the mirror image of its partner, given by (B,) int indices.
+
+    Raises:
+        RigError: names a bone that is not.
+    """
     bones = armature_object.data.bones
     matrices = np.array([bone.matrix_local for bone in bones], np.float64).reshape(-1, 4, 4)
     tails = np.array([bone.tail_local for bone in bones], np.float64).reshape(-1, 3)
@@ -84,37 +91,39 @@ def _check_symmetric(armature_object: bpy.types.Object, partners: np.ndarray) ->
     images = flip @ matrices[partners] @ flip
     ends = np.concatenate([matrices[:, :3, 3], tails])
     metres = metres_per_unit(armature_object)
-    tolerance = max(MIN_DISTANCE, PART_OF_SIZE * metres * float(np.ptp(ends, axis=0).max()))
-    off = metres * np.maximum(
+    size = metres * float(np.ptp(ends, axis=0).max())
+    tolerance = max(MIN_DISTANCE_TOLERANCE, RELATIVE_DISTANCE_TOLERANCE * size)
+    distances = metres * np.maximum(
         np.linalg.norm(images[:, :3, 3] - matrices[:, :3, 3], axis=1),
         np.linalg.norm(tails[partners] * [-1, 1, 1] - tails, axis=1),
     )
-    turned = np.linalg.norm(images[:, :3, :3] - matrices[:, :3, :3], axis=1).max(axis=1)
-    for number, bone in enumerate(bones):
-        other = bones[int(partners[number])]
-        if off[number] > tolerance:
-            what = f"by {off[number] * 1000:.1f} mm"
-        elif turned[number] > AXIS_TOLERANCE:
-            what = f"in roll or direction, by {np.degrees(2 * np.arcsin(min(1.0, turned[number] / 2))):.1f}°"
-        elif armature_object.pose.bones[bone.name].rotation_mode != _mode(armature_object, other.name):
-            what = "in rotation mode"
+    axis_distances = np.linalg.norm(images[:, :3, :3] - matrices[:, :3, :3], axis=1).max(axis=1)
+    for index, bone in enumerate(bones):
+        other = bones[int(partners[index])]
+        if distances[index] > tolerance:
+            difference = f"by {distances[index] * 1000:.1f} mm"
+        elif axis_distances[index] > AXIS_TOLERANCE:
+            angle = np.degrees(2 * np.arcsin(min(1.0, axis_distances[index] / 2)))
+            difference = f"in roll or direction, by {angle:.1f}°"
+        elif armature_object.pose.bones[bone.name].rotation_mode != _rotation_mode(armature_object, other.name):
+            difference = "in rotation mode"
         else:
             continue
         name, flipped = bone.name, flipped_name(bone.name)
         if other != bone:
-            found = f"the bones '{name}' and '{other.name}' differ {what}; symmetrize the armature"
+            problem = f"the bones '{name}' and '{other.name}' differ {difference}; symmetrize the armature"
         elif flipped != name:
-            found = f"there is no bone '{flipped}' for '{name}'; add it"
+            problem = f"there is no bone '{flipped}' for '{name}'; add it"
         else:
-            found = f"the bone '{name}' differs from its mirror image {what}; bring it into the middle"
-        raise RigError(f"'{armature_object.name}' cannot be mirrored: {found}, or leave mirroring out.")
+            problem = f"the bone '{name}' differs from its mirror image {difference}; bring it into the middle"
+        raise RigError(f"'{armature_object.name}' cannot be mirrored: {problem}, or leave mirroring out.")
 
 
-def _mode(armature_object: bpy.types.Object, name: str) -> str:
+def _rotation_mode(armature_object: bpy.types.Object, name: str) -> str:
     return armature_object.pose.bones[name].rotation_mode
 
 
-def _custom_paths(armature_object: bpy.types.Object) -> list[str]:
+def _custom_property_paths(armature_object: bpy.types.Object) -> list[str]:
     escape = bpy.utils.escape_identifier
     return [
         f'pose.bones["{escape(bone.name)}"]["{escape(key)}"]'

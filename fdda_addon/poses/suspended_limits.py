@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Limit constraints that are off while a rig shows a pose that they would hold back."""
+"""Mutes Limit constraints while a pose exceeds them."""
 
 from typing import Self
 
@@ -9,36 +9,40 @@ import numpy as np
 from ..core.poses import LOCATION, ROTATION, SCALE, Channel
 from .motion_range import AXES
 
-KINDS = {ROTATION: "LIMIT_ROTATION", LOCATION: "LIMIT_LOCATION", SCALE: "LIMIT_SCALE"}
+CONSTRAINT_TYPES = {ROTATION: "LIMIT_ROTATION", LOCATION: "LIMIT_LOCATION", SCALE: "LIMIT_SCALE"}
+"""Types of constraints by kind of channel."""
 
 
 class SuspendedLimits:
-    """Switches Limit constraints in local space off, pose by pose; use as a context manager, which gives them back."""
+    """Mutes Limit constraints in local space for each pose. As a context manager, it restores them at the end."""
 
     def __init__(self, armature_object: bpy.types.Object, channels: tuple[Channel, ...]):
-        """Args:
-        armature_object: whose bones have the constraints.
-        channels: of the poses.
+        """Find the constraints that limit channels.
+
+        Args:
+            armature_object: the armature object with the bones.
+            channels: C channels of the poses.
         """
-        places: dict[tuple[str, str], list[int]] = {}
-        for place, channel in enumerate(channels):
-            if channel.kind in KINDS:
-                places.setdefault((channel.name, KINDS[channel.kind]), []).append(place)
-        self._held = [
-            (constraint, own, *_bounds(constraint, [channels[place].axis for place in own]))
-            for (name, kind), own in places.items()
+        indices: dict[tuple[str, str], list[int]] = {}
+        """Indices of channels by the name of the bone and the type of the constraint."""
+        for index, channel in enumerate(channels):
+            if channel.kind in CONSTRAINT_TYPES:
+                indices.setdefault((channel.name, CONSTRAINT_TYPES[channel.kind]), []).append(index)
+        self._limits = [
+            (constraint, limited, *_bounds(constraint, [channels[index].axis for index in limited]))
+            for (name, constraint_type), limited in indices.items()
             for constraint in armature_object.pose.bones[name].constraints
-            if constraint.type == kind
+            if constraint.type == constraint_type
             and constraint.owner_space == "LOCAL"
             and constraint.influence > 0
             and not constraint.mute
         ]
 
     def suspend(self, values: np.ndarray) -> None:
-        """Let these values of the channels stand: what would hold one of them is off, all else is on."""
-        for constraint, own, low, high in self._held:
-            reached = values[own]
-            mute = bool(((reached < low) | (reached > high)).any())
+        """Mute the constraints that values of the channels, (C,), exceed; unmute the others."""
+        for constraint, limited, low, high in self._limits:
+            limited_values = values[limited]
+            mute = bool(((limited_values < low) | (limited_values > high)).any())
             if constraint.mute != mute:
                 constraint.mute = mute
 
@@ -46,18 +50,18 @@ class SuspendedLimits:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for constraint, *_others in self._held:
+        for constraint, *_ in self._limits:
             constraint.mute = False
 
 
 def _bounds(constraint: bpy.types.Constraint, axes: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """What a constraint leaves of each of some axes; infinite where it does not hold them."""
-    ends = []
-    for end, without in (("min", -np.inf), ("max", np.inf)):
-        found = []
+    """Return the lower and upper limits of a constraint for n axes, (n,) each; infinite where it has none."""
+    bounds = []
+    for side, unlimited in (("min", -np.inf), ("max", np.inf)):
+        limits = []
         for letter in (AXES[axis] for axis in axes):
-            # Limit Rotation switches both ends of an axis at once.
-            use = f"use_limit_{letter}" if hasattr(constraint, f"use_limit_{letter}") else f"use_{end}_{letter}"
-            found.append(getattr(constraint, f"{end}_{letter}") if getattr(constraint, use) else without)
-        ends.append(np.array(found))
-    return ends[0], ends[1]
+            # Limit Rotation has one switch for both sides of an axis.
+            use = f"use_limit_{letter}" if hasattr(constraint, f"use_limit_{letter}") else f"use_{side}_{letter}"
+            limits.append(getattr(constraint, f"{side}_{letter}") if getattr(constraint, use) else unlimited)
+        bounds.append(np.array(limits))
+    return bounds[0], bounds[1]
