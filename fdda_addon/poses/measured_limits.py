@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Limits set from actions: how far they move each bone becomes its range of motion. The rig poses as before."""
+"""Sets the ranges of motion of a rig from the ranges in which actions move its bones, without changing its poses."""
 
 import math
 from collections.abc import Iterable
@@ -24,24 +24,25 @@ from .motion_range import (
 )
 
 DEFAULT_MARGIN = 0.1
-"""Part of the width of a measured range that is added at each end."""
+"""Fraction of the width of a measured range that is added at each end."""
 
 MAX_WIDENING = 1.5
-"""Angles about X, Y and Z that are together wider than the rotations by this factor are near gimbal lock."""
+"""Ratio of the ranges of Euler angles to those of rotation vectors above which a motion is near gimbal lock."""
 
-LIMIT_OF = {ROTATION: "LIMIT_ROTATION", LOCATION: "LIMIT_LOCATION", SCALE: "LIMIT_SCALE"}
+CONSTRAINT_TYPES = {ROTATION: "LIMIT_ROTATION", LOCATION: "LIMIT_LOCATION", SCALE: "LIMIT_SCALE"}
 WIDE_NOTE = "; wider than it rotates, as it comes near gimbal lock: sample the action itself, not these ranges"
-_WORDS = {ROTATION: ("turns", "°", 1), LOCATION: ("moves", " mm", 1), SCALE: ("scales", "", 2)}
+_VERBS_AND_UNITS = {ROTATION: ("turns", "°", 1), LOCATION: ("moves", " mm", 1), SCALE: ("scales", "", 2)}
+"""Verb, unit and number of digits by kind of channel."""
 
 
 @dataclass(frozen=True)
 class MeasuredLimit:
-    """One axis of a bone that the actions move.
+    """The range of one axis of a bone that the actions move.
 
     Attributes:
-        bone, kind, axis: as of `Channel`.
-        low, high: radians, metres or factors; the range that is stated now.
-        reason_unset: why it was left as it was; empty when it is stated.
+        bone, kind, axis: as in `Channel`.
+        low, high: the range that was set, radians, metres or factors.
+        reason_unset: why the range was not set; empty if it was.
         near_gimbal_lock: the bone rotates less far than its three Euler angles do (`MAX_WIDENING`).
     """
 
@@ -57,24 +58,24 @@ class MeasuredLimit:
 def set_limits_from_actions(
     scene_rig: SceneRig, actions: Iterable[bpy.types.Action], margin: float = DEFAULT_MARGIN
 ) -> tuple[MeasuredLimit, ...]:
-    """Make what actions do the range of motion of a rig.
+    """Set the ranges of motion of a rig from actions.
 
-    Rotations are stated as IK limits where these can say them and no IK solver reads them, everything else in a Limit
-    constraint of influence 0: the rig poses as before. A limit that holds a bone stays, and the range ends where it
-    does. Locked axes stay locked, and what the actions do not move keeps its range: that they leave it still is no
-    reason that others may not move it. Only where a constraint is made are the other axes of a rotation that had no
-    range stated as still, since the bone would turn about them by the default range otherwise.
+    Rotations are stored as IK limits if these can express them and no IK solver uses them. All other ranges are stored
+    in Limit constraints with an influence of 0, so the poses of the rig do not change. A limit that is enforced stays,
+    and bounds the range. Locked axes stay locked, and axes that the actions do not move keep their range. If a Limit
+    Rotation constraint is added, its other axes without a range are set to no motion: otherwise they would get the
+    default range.
 
     Args:
         scene_rig: the rig.
         actions: the actions.
-        margin: part of the width of each range that is added at each end.
+        margin: fraction of the width of each range that is added at each end.
 
     Returns:
-        What the actions move, and which axes they rotate and hold, in the order of the bones.
+        The axes that the actions move, and those that they hold rotated, in the order of the bones.
 
     Raises:
-        RigError: the actions move no bone of the rig, or it is linked and cannot be changed.
+        RigError: the actions move no bone of the rig, or the rig is linked and cannot be changed.
     """
     armature_object, actions = scene_rig.armature_object, list(actions)
     if armature_object.library is not None:
@@ -84,30 +85,35 @@ def set_limits_from_actions(
         )
     keyed = keyed_ranges(armature_object, actions)
     measured = moving_ranges(keyed)
-    still = {key: bounds for key, bounds in keyed.items() if key[1] == ROTATION and _stands_away(bounds)}
+    held = {key: bounds for key, bounds in keyed.items() if key[1] == ROTATION and _is_held_rotated(bounds)}
     if not measured:
         names = ", ".join(f"'{action.name}'" for action in actions) or "none"
         raise RigError(f"The actions ({names}) move no bone of '{armature_object.name}'; choose actions of this rig.")
-    wide = _wide_bones(keyed)
-    # An IK solver would take the limits of any bone that it moves.
+    gimbal_locked = _bones_near_gimbal_lock(keyed)
+    # An IK solver uses the limits of any bone that it moves.
     has_ik = any(constraint.type == "IK" for bone in armature_object.pose.bones for constraint in bone.constraints)
-    found: list[MeasuredLimit] = []
+    all_limits: list[MeasuredLimit] = []
     for bone in armature_object.pose.bones:
-        own = {key[1:]: bounds for key, bounds in (measured | still).items() if key[0] == bone.name}
-        limits = [_limit(bone, kind, axis, bounds, margin) for (kind, axis), bounds in sorted(own.items())]
+        bone_ranges = {key[1:]: bounds for key, bounds in (measured | held).items() if key[0] == bone.name}
+        limits = [
+            _measured_limit(bone, *kind_axis, bounds, margin) for kind_axis, bounds in sorted(bone_ranges.items())
+        ]
         for kind in (ROTATION, LOCATION, SCALE):
-            stated = [limit for limit in limits if limit.kind == kind and not limit.reason_unset]
-            if kind == ROTATION and not has_ik and find_local_limit(bone, LIMIT_OF[kind]) is None and _fit_ik(stated):
-                for limit in stated:
+            settable = [limit for limit in limits if limit.kind == kind and not limit.reason_unset]
+            has_constraint = find_local_limit(bone, CONSTRAINT_TYPES[kind]) is not None
+            if kind == ROTATION and not has_ik and not has_constraint and _fit_ik_limits(settable):
+                for limit in settable:
                     set_rotation_range(bone, limit.axis, limit.low, limit.high)
-            elif stated:
-                _state_without_holding(bone, kind, stated)
-        found += [replace(limit, near_gimbal_lock=bone.name in wide and limit.kind == ROTATION) for limit in limits]
-    return tuple(found)
+            elif settable:
+                _set_range_constraint(bone, kind, settable)
+        for limit in limits:
+            is_near = bone.name in gimbal_locked and limit.kind == ROTATION
+            all_limits.append(replace(limit, near_gimbal_lock=is_near))
+    return tuple(all_limits)
 
 
-def _wide_bones(keyed: Ranges) -> set[str]:
-    """Bones whose ranges of Euler angles let them rotate much farther than the actions do."""
+def _bones_near_gimbal_lock(keyed: Ranges) -> set[str]:
+    """Find the bones whose ranges of Euler angles allow much larger rotations than the actions have."""
     widths: dict[tuple[str, str], float] = {}
     for (bone, kind, _), (low, high) in keyed.items():
         widths[bone, kind] = widths.get((bone, kind), 0.0) + high - low
@@ -115,19 +121,21 @@ def _wide_bones(keyed: Ranges) -> set[str]:
     return {bone for bone, width in vectors if widths[bone, ROTATION] > MAX_WIDENING * width + RANGE_TOLERANCE}
 
 
-def _stands_away(bounds: tuple[float, float]) -> bool:
-    """Whether a rotation stands still elsewhere than in the rest pose."""
+def _is_held_rotated(bounds: tuple[float, float]) -> bool:
+    """Return whether a rotation is constant and not that of the rest pose."""
     return not has_width(bounds) and abs(bounds[0]) > RANGE_TOLERANCE
 
 
-def _limit(bone: bpy.types.PoseBone, kind: str, axis: int, bounds: tuple[float, float], margin: float) -> MeasuredLimit:
-    """What is to be stated of an axis."""
+def _measured_limit(
+    bone: bpy.types.PoseBone, kind: str, axis: int, bounds: tuple[float, float], margin: float
+) -> MeasuredLimit:
+    """Compute the range to set for an axis, or the reason not to set it."""
     if not has_width(bounds):
         return MeasuredLimit(bone.name, kind, axis, *bounds, "stands still away from rest, has no range")
     low, high = bounds
-    added = (high - low) * margin
-    # A scale of zero has no inverse.
-    low, high = low - added if kind != SCALE or low <= 0 else max(low - added, low / 2), high + added
+    extra = (high - low) * margin
+    # Positive scales stay positive, because a scale of zero has no inverse.
+    low, high = low - extra if kind != SCALE or low <= 0 else max(low - extra, low / 2), high + extra
     if kind == ROTATION:
         is_locked = rotation_ranges(bone)[axis].is_locked
     else:
@@ -136,38 +144,40 @@ def _limit(bone: bpy.types.PoseBone, kind: str, axis: int, bounds: tuple[float, 
         return MeasuredLimit(bone.name, kind, axis, *bounds, "locked, left so")
     if kind == LOCATION and bone.bone.use_connect:
         return MeasuredLimit(bone.name, kind, axis, *bounds, "connected, cannot move")
-    least, most = enforced_range(bone, LIMIT_OF[kind], axis)
-    low, high = max(low, least), min(high, most)
+    enforced_low, enforced_high = enforced_range(bone, CONSTRAINT_TYPES[kind], axis)
+    low, high = max(low, enforced_low), min(high, enforced_high)
     if not low < high:
         return MeasuredLimit(bone.name, kind, axis, *bounds, "held by its limit, left so")
     return MeasuredLimit(bone.name, kind, axis, low, high)
 
 
-def _fit_ik(limits: list[MeasuredLimit]) -> bool:
-    """Whether IK limits can say ranges: they hold the rest pose and go no farther than half a turn."""
+def _fit_ik_limits(limits: list[MeasuredLimit]) -> bool:
+    """Return whether IK limits can express ranges: they include the rest pose and at most half a turn each way."""
     return all(-math.pi <= limit.low <= 0 <= limit.high <= math.pi for limit in limits)
 
 
-def _state_without_holding(bone: bpy.types.PoseBone, kind: str, limits: list[MeasuredLimit]) -> None:
-    constraint = ensure_range_constraint(bone, LIMIT_OF[kind])
+def _set_range_constraint(bone: bpy.types.PoseBone, kind: str, limits: list[MeasuredLimit]) -> None:
+    constraint = ensure_range_constraint(bone, CONSTRAINT_TYPES[kind])
     for limit in limits:
         set_constraint_limit(constraint, limit.axis, limit.low, limit.high)
     if kind == ROTATION:
-        for axis, r in enumerate(rotation_ranges(bone)):
-            if r.source == DEFAULT and not r.is_locked:
+        for axis, rotation_range in enumerate(rotation_ranges(bone)):
+            if rotation_range.source == DEFAULT and not rotation_range.is_locked:
                 set_constraint_limit(constraint, axis, 0.0, 0.0)
 
 
 def describe_limits(armature_object: bpy.types.Object, limits: Iterable[MeasuredLimit]) -> list[str]:
-    """A line for each bone, in degrees and millimetres."""
+    """Describe the limits in a line for each bone, in degrees and millimetres."""
     factors = {ROTATION: 180 / math.pi, LOCATION: 1000 * metres_per_unit(armature_object), SCALE: 1.0}
     limits, by_bone = list(limits), dict[str, list[str]]()
     for limit in limits:
-        (verb, unit, digits), factor = _WORDS[limit.kind], factors[limit.kind]
-        # Adding zero makes -0 a 0.
-        low, high = (round(end * factor, digits) + 0.0 for end in (limit.low, limit.high))
-        ends = f"{low:.{digits}f} to {high:.{digits}f}{unit}"
-        reason_unset = f" ({limit.reason_unset})" if limit.reason_unset else ""
-        by_bone.setdefault(limit.bone, []).append(f"{verb} {AXES[limit.axis].upper()} {ends}{reason_unset}")
-    wide = {limit.bone for limit in limits if limit.near_gimbal_lock}
-    return [f"{bone}: {', '.join(texts)}{WIDE_NOTE if bone in wide else ''}" for bone, texts in by_bone.items()]
+        (verb, unit, digits), factor = _VERBS_AND_UNITS[limit.kind], factors[limit.kind]
+        # Adding zero turns -0 into 0.
+        low, high = (round(bound * factor, digits) + 0.0 for bound in (limit.low, limit.high))
+        bounds = f"{low:.{digits}f} to {high:.{digits}f}{unit}"
+        reason = f" ({limit.reason_unset})" if limit.reason_unset else ""
+        by_bone.setdefault(limit.bone, []).append(f"{verb} {AXES[limit.axis].upper()} {bounds}{reason}")
+    gimbal_locked = {limit.bone for limit in limits if limit.near_gimbal_lock}
+    return [
+        f"{bone}: {', '.join(texts)}{WIDE_NOTE if bone in gimbal_locked else ''}" for bone, texts in by_bone.items()
+    ]

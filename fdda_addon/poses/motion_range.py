@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The range of motion where Blender's users keep it: read from a bone, and written to it.
+"""Reads and writes the range of motion of a bone, where Blender's users keep it.
 
-The range is that of Limit Rotation and Limit Location constraints in local space, else of the bone's IK limits, else
-the default; locked axes do not move. A Limit constraint whose influence is 0 states a range and holds nothing.
+The range is that of Limit constraints in local space, else that of the bone's IK limits, else the default range; locked
+axes do not move. A Limit constraint with an influence of 0 stores a range without enforcing it.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from ..core.poses import DEFAULT_RANGE
 
 AXES = "xyz"
 RANGE_NAME = "FDDA Range"
-"""Name of the constraints that state a range and hold nothing."""
+"""Name of the constraints that store a range without enforcing it."""
 CONSTRAINT, IK, DEFAULT = "CONSTRAINT", "IK", "DEFAULT"
 
 
@@ -24,8 +24,8 @@ class RotationRange:
 
     Attributes:
         low, high: radians.
-        source: `CONSTRAINT`, `IK` or `DEFAULT`: where it is stated.
-        is_locked: the axis is locked and does not move at all.
+        source: where the range is stored: `CONSTRAINT`, `IK` or `DEFAULT`.
+        is_locked: the axis is locked.
     """
 
     low: float
@@ -39,7 +39,7 @@ class RotationRange:
 
 
 def rotation_ranges(bone: bpy.types.PoseBone) -> tuple[RotationRange, RotationRange, RotationRange]:
-    """Range of each rotation axis."""
+    """Return the range of each rotation axis of a bone."""
     constraint = find_local_limit(bone, "LIMIT_ROTATION")
     return tuple(_rotation_range(bone, constraint, axis) for axis in range(3))
 
@@ -58,12 +58,12 @@ def _rotation_range(bone: bpy.types.PoseBone, constraint: bpy.types.Constraint |
 
 
 def location_ranges(bone: bpy.types.PoseBone) -> dict[int, tuple[float, float]]:
-    """Range by axis, metres, of the axes that a Limit Location constraint limits on both ends."""
+    """Return the ranges, in metres, of the axes that a Limit Location constraint limits on both sides."""
     return _limited(find_local_limit(bone, "LIMIT_LOCATION"))
 
 
 def scale_ranges(bone: bpy.types.PoseBone) -> dict[int, tuple[float, float]]:
-    """Range by axis, factors, of the axes that a Limit Scale constraint limits on both ends."""
+    """Return the ranges, as factors, of the axes that a Limit Scale constraint limits on both sides."""
     return _limited(find_local_limit(bone, "LIMIT_SCALE"))
 
 
@@ -77,19 +77,20 @@ def _limited(constraint: bpy.types.Constraint | None) -> dict[int, tuple[float, 
     }
 
 
-def find_local_limit(bone: bpy.types.PoseBone, kind: str) -> bpy.types.Constraint | None:
-    """The constraint of this type that states a range, None when there is none."""
+def find_local_limit(bone: bpy.types.PoseBone, constraint_type: str) -> bpy.types.Constraint | None:
+    """Find the Limit constraint of a type that stores the range of a bone; return None if there is none."""
     for constraint in bone.constraints:
-        if constraint.type == kind and constraint.owner_space == "LOCAL" and not constraint.mute:
+        if constraint.type == constraint_type and constraint.owner_space == "LOCAL" and not constraint.mute:
             return constraint
     return None
 
 
 def set_rotation_range(bone: bpy.types.PoseBone, axis: int, low: float, high: float) -> None:
-    """Write the range of a rotation axis to a bone and unlock the axis.
+    """Set the range of a rotation axis of a bone, and unlock the axis.
 
-    It is written where the bone states its range. A bone that states none gets IK limits, which leave posing by hand
-    free, or a Limit Rotation constraint where the range does not hold the rest pose, which IK limits cannot say.
+    It is stored where the bone has its range. A bone without a range gets IK limits, which do not restrict posing by
+    hand. If the range does not include the rest pose, which IK limits cannot express, it gets a Limit Rotation
+    constraint.
 
     Args:
         bone: the pose bone.
@@ -97,18 +98,18 @@ def set_rotation_range(bone: bpy.types.PoseBone, axis: int, low: float, high: fl
         low, high: radians.
 
     Raises:
-        RigError: the range is empty, or the bone's IK limits cannot say it.
+        RigError: the range is empty, or the bone's IK limits cannot express it.
     """
     if not low < high:
         raise RigError(f"The range of '{bone.name}' about {AXES[axis].upper()} is empty; give a larger maximum.")
     letter, constraint = AXES[axis], find_local_limit(bone, "LIMIT_ROTATION")
-    states_ik = any(r.source == IK for r in rotation_ranges(bone))
+    has_ik_limits = any(rotation_range.source == IK for rotation_range in rotation_ranges(bone))
     if constraint is None and low <= 0 <= high:
         setattr(bone, f"lock_ik_{letter}", False)
         setattr(bone, f"use_ik_limit_{letter}", True)
         setattr(bone, f"ik_min_{letter}", low)
         setattr(bone, f"ik_max_{letter}", high)
-    elif constraint is None and states_ik:
+    elif constraint is None and has_ik_limits:
         raise RigError(
             f"'{bone.name}' states its range as IK limits, which hold the rest pose; begin at 0 or below and end at 0 "
             "or above, or give the bone a Limit Rotation constraint in local space."
@@ -124,7 +125,7 @@ def set_rotation_range(bone: bpy.types.PoseBone, axis: int, low: float, high: fl
 
 
 def clear_rotation_range(bone: bpy.types.PoseBone, axis: int) -> None:
-    """Let a rotation axis have the default range again."""
+    """Remove the range of a rotation axis, so that it has the default range."""
     letter, constraint = AXES[axis], find_local_limit(bone, "LIMIT_ROTATION")
     if constraint is not None:
         setattr(constraint, f"use_limit_{letter}", False)
@@ -133,37 +134,38 @@ def clear_rotation_range(bone: bpy.types.PoseBone, axis: int) -> None:
         setattr(bone, f"lock_ik_{letter}", False)
 
 
-def ensure_range_constraint(bone: bpy.types.PoseBone, kind: str) -> bpy.types.Constraint:
-    """The constraint that states the ranges of a bone without holding it: one of influence 0, made where there is none.
+def ensure_range_constraint(bone: bpy.types.PoseBone, constraint_type: str) -> bpy.types.Constraint:
+    """Return the constraint that stores the ranges of a bone with an influence of 0; add it if there is none.
 
-    It goes before what the bone states its ranges with, and takes them over.
+    An added constraint comes first and takes over the existing ranges.
 
     Args:
         bone: the pose bone.
-        kind: "LIMIT_ROTATION", "LIMIT_LOCATION" or "LIMIT_SCALE".
+        constraint_type: "LIMIT_ROTATION", "LIMIT_LOCATION" or "LIMIT_SCALE".
     """
-    stated = find_local_limit(bone, kind)
-    if stated is not None and stated.influence == 0:
-        return stated
+    existing = find_local_limit(bone, constraint_type)
+    if existing is not None and existing.influence == 0:
+        return existing
     rotations = rotation_ranges(bone)
-    others = {"LIMIT_LOCATION": location_ranges, "LIMIT_SCALE": scale_ranges}.get(kind, lambda _bone: {})(bone)
-    constraint = bone.constraints.new(kind)
+    read_ranges = {"LIMIT_LOCATION": location_ranges, "LIMIT_SCALE": scale_ranges}
+    other_ranges = read_ranges[constraint_type](bone) if constraint_type in read_ranges else {}
+    constraint = bone.constraints.new(constraint_type)
     constraint.name, constraint.owner_space, constraint.influence = RANGE_NAME, "LOCAL", 0.0
     bone.constraints.move(len(bone.constraints) - 1, 0)
-    if kind == "LIMIT_ROTATION":
-        for axis, r in enumerate(rotations):
-            if r.source != DEFAULT:
-                set_constraint_limit(constraint, axis, r.low, r.high)
-            elif r.is_locked and not bone.lock_rotation[axis]:
-                # An IK lock is not read beside a constraint.
+    if constraint_type == "LIMIT_ROTATION":
+        for axis, rotation_range in enumerate(rotations):
+            if rotation_range.source != DEFAULT:
+                set_constraint_limit(constraint, axis, rotation_range.low, rotation_range.high)
+            elif rotation_range.is_locked and not bone.lock_rotation[axis]:
+                # IK locks are ignored if there is a constraint.
                 set_constraint_limit(constraint, axis, 0.0, 0.0)
-    for axis, bounds in others.items():
+    for axis, bounds in other_ranges.items():
         set_constraint_limit(constraint, axis, *bounds)
     return constraint
 
 
 def set_constraint_limit(constraint: bpy.types.Constraint, axis: int, low: float, high: float) -> None:
-    """Limit one axis in a Limit Rotation, Limit Location or Limit Scale constraint; radians, metres or factors."""
+    """Set the limits of one axis of a Limit constraint, in radians, metres or factors."""
     letter = AXES[axis]
     for name in (f"use_limit_{letter}", f"use_min_{letter}", f"use_max_{letter}"):
         if hasattr(constraint, name):
@@ -172,11 +174,13 @@ def set_constraint_limit(constraint: bpy.types.Constraint, axis: int, low: float
     setattr(constraint, f"max_{letter}", high)
 
 
-def enforced_range(bone: bpy.types.PoseBone, kind: str, axis: int) -> tuple[float, float]:
-    """What the Limit constraints in local space that hold a bone leave of an axis; infinite where none does."""
+def enforced_range(bone: bpy.types.PoseBone, constraint_type: str, axis: int) -> tuple[float, float]:
+    """Return the range that Limit constraints in local space enforce on an axis; infinite where there are none."""
     low, high, letter = -float("inf"), float("inf"), AXES[axis]
     for constraint in bone.constraints:
-        if constraint.type != kind or constraint.owner_space != "LOCAL" or constraint.mute or not constraint.influence:
+        if constraint.type != constraint_type or constraint.owner_space != "LOCAL":
+            continue
+        if constraint.mute or not constraint.influence:
             continue
         use = f"use_limit_{letter}"
         if getattr(constraint, use if hasattr(constraint, use) else f"use_min_{letter}"):
