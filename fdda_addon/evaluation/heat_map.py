@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Colors over meshes in the viewport: their errors as a heat map, or their partitions.
+"""Shows errors as a heat map, or partitions, as colors over meshes in the viewport.
 
-They are drawn over what Blender evaluates, so nothing of the file is touched, and they follow the animation. Which
-meshes are painted lasts for the session; without a window nothing is drawn.
+The colors are drawn over the evaluated meshes, so they follow the animation and change nothing in the file. They last
+for the session; without a window nothing is drawn.
 """
 
 from contextlib import suppress
@@ -24,12 +24,18 @@ from ..scene.viewport import redraw_views
 from . import last_evaluation, overlay
 
 ERRORS, PARTITIONS = "ERRORS", "PARTITIONS"
-BONE, SELECTED, ACTIVE = (0.75, 0.75, 0.75, 1.0), (0.3, 0.85, 1.0, 1.0), (1.0, 1.0, 1.0, 1.0)
+BONE_COLOR, SELECTED_COLOR, ACTIVE_COLOR = (0.75, 0.75, 0.75, 1.0), (0.3, 0.85, 1.0, 1.0), (1.0, 1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Paint:
-    """What a mesh is painted with: ERRORS or PARTITIONS, and for those their (V, 3) sRGB colors and number."""
+    """What the colors of a mesh show.
+
+    Attributes:
+        kind: `ERRORS` or `PARTITIONS`.
+        colors: (V, 3) float32, sRGB, colors of partitions; None for errors, whose colors depend on the frame.
+        partitions: number of partitions.
+    """
 
     kind: str
     colors: np.ndarray | None = None
@@ -37,16 +43,22 @@ class Paint:
 
 
 _painted: dict[int, Paint] = {}
+"""Paints by the session ids of mesh objects."""
 _hidden: set[int] = set()
+"""Session ids of painted objects whose colors could not be drawn."""
 
 
 def paint_errors(mesh_object: bpy.types.Object) -> None:
-    """Show the errors of the last evaluation of a mesh."""
+    """Show the errors of the last evaluation of a mesh as colors."""
     _paint(mesh_object, Paint(ERRORS))
 
 
 def paint_partitions(scene_rig: SceneRig, min_partition_vertices: int = MIN_PARTITION_VERTICES) -> None:
-    """Show the partitions of the bound model; where none is bound that can be read, those that a rig is recorded with.
+    """Show the partitions of the bound model as colors; without a readable model, those of a recording of the rig.
+
+    Args:
+        scene_rig: the rig.
+        min_partition_vertices: least number of vertices of a partition in a recording.
 
     Raises:
         RigError: the rig cannot be read.
@@ -56,14 +68,14 @@ def paint_partitions(scene_rig: SceneRig, min_partition_vertices: int = MIN_PART
     if scene_rig.mesh_object.fdda.is_bound:
         with suppress(ModelError):
             opened = open_model(scene_rig, network_of(scene_rig.mesh_object))
-            # Fitted skin weights cut the mesh otherwise than those of the rig.
+            # Fitted skin weights result in other partitions than those of the rig.
             partitions = opened.network.info.partitions_of(opened.linear_rig)
     colors = partition_colors(partitions, rig.vertex_count)
     _paint(scene_rig.mesh_object, Paint(PARTITIONS, colors, len(partitions)))
 
 
 def clear(mesh_object: bpy.types.Object) -> None:
-    """Show a mesh as Blender does."""
+    """Remove the colors of a mesh."""
     _painted.pop(mesh_object.session_uid, None)
     if not _painted:
         overlay.stop()
@@ -71,24 +83,24 @@ def clear(mesh_object: bpy.types.Object) -> None:
 
 
 def clear_all() -> None:
-    """Paint nothing any more."""
+    """Remove the colors of all meshes."""
     _painted.clear()
     overlay.stop()
 
 
 def painted(mesh_object: bpy.types.Object) -> str:
-    """ERRORS or PARTITIONS, empty when the mesh is not painted."""
+    """Return what the colors of a mesh show, `ERRORS` or `PARTITIONS`; empty if it has none."""
     paint = _painted.get(mesh_object.session_uid)
     return paint.kind if paint else ""
 
 
 def is_hidden(mesh_object: bpy.types.Object) -> bool:
-    """Whether the colors of a mesh could not be drawn: it is edited, or a modifier changes its topology."""
+    """Return whether the colors of a mesh could not be drawn: it is edited, or a modifier changes its topology."""
     return mesh_object.session_uid in _hidden
 
 
 def colors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
-    """The colors of a painted mesh at the current frame: (V, 3) float32 sRGB, None when there is nothing to show."""
+    """Return the colors of a mesh at the current frame, (V, 3) float32, sRGB; None if there are none."""
     paint = _painted.get(mesh_object.session_uid)
     if paint is None:
         return None
@@ -99,7 +111,7 @@ def colors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
 
 
 def errors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
-    """The errors that the settings of the view ask for: (V,) metres, None when there are none at this frame."""
+    """Return the errors that the view settings select, (V,) metres; None if there are none at the current frame."""
     last, view = last_evaluation.get(mesh_object), bpy.context.window_manager.fdda_view
     if last is None:
         return None
@@ -108,7 +120,7 @@ def errors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
 
 
 def fitting_range_mm(mesh_object: bpy.types.Object) -> float:
-    """A range in mm in which the errors that are shown have colors from blue to red: nearly the largest of them."""
+    """Return the range of the heat map in mm that fits the shown errors: nearly the largest error."""
     errors = errors_of(mesh_object)
     return 0.0 if errors is None else float(f"{np.percentile(errors, 99.5) * 1000:.2g}")
 
@@ -116,36 +128,36 @@ def fitting_range_mm(mesh_object: bpy.types.Object) -> float:
 def _paint(mesh_object: bpy.types.Object, paint: Paint) -> None:
     _painted[mesh_object.session_uid] = paint
     if not bpy.app.background:
-        overlay.start(_sheets, _legend, _sticks)
+        overlay.start(_overlay_meshes, _legend, _overlay_bones)
     redraw_views()
 
 
-def _sheets(context: bpy.types.Context) -> list["overlay.OverlayMesh"]:
-    """What the overlay draws, object by object."""
-    alive = {o.session_uid: o for o in bpy.data.objects if o.session_uid in _painted}
-    for uid in _painted.keys() - alive.keys():
+def _overlay_meshes(context: bpy.types.Context) -> list["overlay.OverlayMesh"]:
+    """Return the meshes to draw, and forget the paints of removed objects."""
+    existing = {o.session_uid: o for o in bpy.data.objects if o.session_uid in _painted}
+    for uid in _painted.keys() - existing.keys():
         del _painted[uid]
-    drawn, hidden = [], set()
-    for uid, mesh_object in alive.items():
+    meshes, hidden = [], set()
+    for uid, mesh_object in existing.items():
         colors = colors_of(mesh_object)
         if colors is None or not mesh_object.visible_get(view_layer=context.view_layer):
             continue
-        sheet = overlay.sheet(context, mesh_object, colors)
-        if sheet is None:
+        mesh = overlay.overlay_mesh(context, mesh_object, colors)
+        if mesh is None:
             hidden.add(uid)
         else:
-            drawn.append(sheet)
+            meshes.append(mesh)
     if hidden != _hidden:
         _hidden.clear()
         _hidden.update(hidden)
-        # Not from within a drawing.
+        # A draw handler must not request a redraw itself.
         bpy.app.timers.register(redraw_views, first_interval=0)
-    return drawn
+    return meshes
 
 
-def _sticks(context: bpy.types.Context) -> list["overlay.OverlayBone"]:
-    """The bones of armatures in pose mode whose mesh is painted: the colors would hide them."""
-    found = []
+def _overlay_bones(context: bpy.types.Context) -> list["overlay.OverlayBone"]:
+    """Return the bones to draw: those of armatures in pose mode, which the colors of the mesh would hide."""
+    bones = []
     for mesh_object in context.view_layer.objects:
         armature_object = armature_of(mesh_object) if mesh_object.session_uid in _painted else None
         if armature_object is None or armature_object.mode != "POSE":
@@ -154,17 +166,17 @@ def _sticks(context: bpy.types.Context) -> list["overlay.OverlayBone"]:
         for bone in armature_object.pose.bones:
             if is_bone_hidden(bone):
                 continue
-            color = ACTIVE if bone.bone == active else (SELECTED if is_selected(bone) else BONE)
-            found.append(overlay.OverlayBone(tuple(matrix @ bone.head), tuple(matrix @ bone.tail), color))
-    return found
+            color = ACTIVE_COLOR if bone.bone == active else (SELECTED_COLOR if is_selected(bone) else BONE_COLOR)
+            bones.append(overlay.OverlayBone(tuple(matrix @ bone.head), tuple(matrix @ bone.tail), color))
+    return bones
 
 
 def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:
-    """Lines below the colors, and the range of the heat map in mm, None where no errors are shown."""
-    uids = {o.session_uid: o for o in context.view_layer.objects if o.session_uid in _painted}
+    """Return the lines of the legend, and the range of the heat map in mm, None if no errors are shown."""
+    painted_objects = {o.session_uid: o for o in context.view_layer.objects if o.session_uid in _painted}
     active = context.view_layer.objects.active
-    chosen = uids.get(active.session_uid) if active else None
-    mesh_object = chosen or next(iter(uids.values()), None)
+    active_painted = painted_objects.get(active.session_uid) if active else None
+    mesh_object = active_painted or next(iter(painted_objects.values()), None)
     if mesh_object is None:
         return [], None
     paint = _painted[mesh_object.session_uid]
@@ -174,18 +186,18 @@ def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:
     if last is None:
         return [], None
     errors = errors_of(mesh_object)
-    way = "skinning" if view.way == "linear" else "model"
-    what = _what(last, view.statistic, context.scene.frame_current, view.pose)
+    method = "skinning" if view.way == "linear" else "model"
+    description = _describe_errors(last, view.statistic, context.scene.frame_current, view.pose)
     if errors is None:
-        return [f"{mesh_object.name}, {way}: {what}"], None
+        return [f"{mesh_object.name}, {method}: {description}"], None
     numbers = f"mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.2f} mm"
-    return [f"{mesh_object.name}, {way}: {what}", numbers], view.range_mm
+    return [f"{mesh_object.name}, {method}: {description}", numbers], view.range_mm
 
 
-def _what(last: last_evaluation.LastEvaluation, statistic: str, frame: int, pose: int) -> str:
+def _describe_errors(last: last_evaluation.LastEvaluation, statistic: str, frame: int, pose: int) -> str:
     if statistic != "pose":
-        over = f"{last.poses} frames of {last.name}" if last.name else f"{last.poses} random poses"
-        return f"{'mean' if statistic == 'mean' else 'max'} error over {over}"
+        poses = f"{last.poses} frames of {last.name}" if last.name else f"{last.poses} random poses"
+        return f"{'mean' if statistic == 'mean' else 'max'} error over {poses}"
     if not last.name:
         return f"error in random pose {pose}"
     return f"error at frame {frame}" if last.pose_at(frame) is not None else f"frame {frame} was not compared"

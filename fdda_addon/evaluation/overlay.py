@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draws meshes with a color for each vertex, and a legend, over the 3D viewports."""
+"""Draws meshes with vertex colors, bones, and a legend over the 3D viewports."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ from ..core.metrics import NO_ERROR_COLOR, NO_ERROR_METRES, heat_colors
 from ..scene.arrays import TRIANGLE, VECTOR, read
 from ..scene.mesh import mesh_positions
 
-TOWARDS_VIEWER = 2e-5
-"""How far the colors lie before the mesh, in depth: enough to cover it, too little to show through another."""
-STICK_PIXELS = 3
-VERTEX = """
+DEPTH_OFFSET = 2e-5
+"""Offset of the colors towards the viewer, in depth: enough to cover the mesh, too little to show through others."""
+BONE_WIDTH_PIXELS = 3
+VERTEX_SHADER = """
 void main()
 {
   shade = 0.25 + 0.75 * abs(dot(normalize(normal), towards));
@@ -26,7 +26,7 @@ void main()
   gl_Position.z -= offset * gl_Position.w;
 }
 """
-FRAGMENT = """
+FRAGMENT_SHADER = """
 void main()
 {
   vec3 linear = mix(paint / 12.92, pow((paint + 0.055) / 1.055, vec3(2.4)), step(0.04045, paint));
@@ -41,7 +41,14 @@ _triangles: dict[int, tuple[tuple[int, int], gpu.types.GPUIndexBuf]] = {}
 
 @dataclass(frozen=True)
 class OverlayMesh:
-    """A mesh: (V, 3) float32 positions and normals in its own space, sRGB colors, triangles, and its matrix_world."""
+    """A mesh to draw.
+
+    Attributes:
+        positions, normals: (V, 3) float32, object space.
+        colors: (V, 3) float32, sRGB.
+        triangles: its triangles.
+        matrix: `matrix_world` of the object.
+    """
 
     positions: np.ndarray
     normals: np.ndarray
@@ -52,7 +59,7 @@ class OverlayMesh:
 
 @dataclass(frozen=True)
 class OverlayBone:
-    """A bone: its ends in world space, and its color, RGBA."""
+    """A bone to draw: head and tail in world space, color in RGBA."""
 
     head: tuple[float, float, float]
     tail: tuple[float, float, float]
@@ -60,25 +67,25 @@ class OverlayBone:
 
 
 def start(
-    sheets: Callable[[bpy.types.Context], list[OverlayMesh]],
-    legend: Callable[[bpy.types.Context], tuple[list[str], float | None]],
-    sticks: Callable[[bpy.types.Context], list[OverlayBone]],
+    get_meshes: Callable[[bpy.types.Context], list[OverlayMesh]],
+    get_legend: Callable[[bpy.types.Context], tuple[list[str], float | None]],
+    get_bones: Callable[[bpy.types.Context], list[OverlayBone]],
 ) -> None:
-    """Draw from now on, in all viewports.
+    """Start drawing in all viewports.
 
     Args:
-        sheets: gives the meshes, asked at every redraw.
-        legend: gives lines of text and the range of a heat map in mm, None for no scale.
-        sticks: gives the bones that are to be seen over the meshes.
+        get_meshes: returns the meshes, at each redraw.
+        get_legend: returns lines of text, and the range of a heat map in mm or None.
+        get_bones: returns the bones, which are drawn over the meshes.
     """
     if not _handles:
         add = bpy.types.SpaceView3D.draw_handler_add
-        _handles.append(add(_draw_sheets, (sheets, sticks), "WINDOW", "POST_VIEW"))
-        _handles.append(add(_draw_legend, (legend,), "WINDOW", "POST_PIXEL"))
+        _handles.append(add(_draw_view, (get_meshes, get_bones), "WINDOW", "POST_VIEW"))
+        _handles.append(add(_draw_legend, (get_legend,), "WINDOW", "POST_PIXEL"))
 
 
 def stop() -> None:
-    """Draw no more, and let go of what the graphics card holds: it must not outlive its context."""
+    """Stop drawing, and free GPU resources, which must not outlive their context."""
     global _shader
     _shader = None
     while _handles:
@@ -86,8 +93,14 @@ def stop() -> None:
     _triangles.clear()
 
 
-def sheet(context: bpy.types.Context, mesh_object: bpy.types.Object, colors: np.ndarray) -> OverlayMesh | None:
-    """What Blender shows of an object, with other colors; None when its modifiers change the topology."""
+def overlay_mesh(context: bpy.types.Context, mesh_object: bpy.types.Object, colors: np.ndarray) -> OverlayMesh | None:
+    """Create the overlay of an evaluated mesh; return None in edit mode, or if modifiers change the topology.
+
+    Args:
+        context: the context with the dependency graph.
+        mesh_object: the object.
+        colors: (V, 3) float32, sRGB.
+    """
     evaluated = mesh_object.evaluated_get(context.evaluated_depsgraph_get())
     mesh = evaluated.data
     if evaluated.mode == "EDIT" or len(mesh.vertices) != len(colors):
@@ -97,61 +110,62 @@ def sheet(context: bpy.types.Context, mesh_object: bpy.types.Object, colors: np.
 
 
 def _triangles_of(mesh_object: bpy.types.Object, mesh: bpy.types.Mesh) -> gpu.types.GPUIndexBuf:
-    """The triangles; kept as long as the counts stay: finding them anew costs more than drawing them."""
-    key = (len(mesh.vertices), len(mesh.loops))
-    kept = _triangles.get(mesh_object.session_uid)
-    if kept is None or kept[0] != key:
+    """Return the triangles of a mesh, cached until its counts change: computing them takes longer than drawing."""
+    counts = (len(mesh.vertices), len(mesh.loops))
+    cached = _triangles.get(mesh_object.session_uid)
+    if cached is None or cached[0] != counts:
         mesh.calc_loop_triangles()
         triangles = read(mesh.loop_triangles, TRIANGLE)
-        kept = _triangles[mesh_object.session_uid] = (key, gpu.types.GPUIndexBuf(type="TRIS", seq=triangles))
-    return kept[1]
+        cached = _triangles[mesh_object.session_uid] = (counts, gpu.types.GPUIndexBuf(type="TRIS", seq=triangles))
+    return cached[1]
 
 
-def _draw_sheets(
-    sheets: Callable[[bpy.types.Context], list[OverlayMesh]], sticks: Callable[[bpy.types.Context], list[OverlayBone]]
+def _draw_view(
+    get_meshes: Callable[[bpy.types.Context], list[OverlayMesh]],
+    get_bones: Callable[[bpy.types.Context], list[OverlayBone]],
 ) -> None:
     context = bpy.context
     shader, view = _mesh_shader(), context.region_data
     gpu.state.depth_test_set("LESS_EQUAL")
     gpu.state.depth_mask_set(True)
     try:
-        for drawn in sheets(context):
-            content = {"position": drawn.positions, "normal": drawn.normals, "color": drawn.colors}
-            vertices = gpu.types.GPUVertBuf(_vertex_format(content), len(drawn.positions))
-            for name, values in content.items():
+        for mesh in get_meshes(context):
+            attributes = {"position": mesh.positions, "normal": mesh.normals, "color": mesh.colors}
+            vertices = gpu.types.GPUVertBuf(_vertex_format(attributes), len(mesh.positions))
+            for name, values in attributes.items():
                 vertices.attr_fill(name, values)
-            batch = gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=drawn.triangles)
+            batch = gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=mesh.triangles)
             shader.bind()
-            shader.uniform_float("transform", view.perspective_matrix @ drawn.matrix)
-            towards = (view.view_matrix @ drawn.matrix).to_3x3().inverted_safe().col[2].normalized()
-            shader.uniform_float("towards", towards)
-            shader.uniform_float("offset", TOWARDS_VIEWER)
+            shader.uniform_float("transform", view.perspective_matrix @ mesh.matrix)
+            towards_viewer = (view.view_matrix @ mesh.matrix).to_3x3().inverted_safe().col[2].normalized()
+            shader.uniform_float("towards", towards_viewer)
+            shader.uniform_float("offset", DEPTH_OFFSET)
             batch.draw(shader)
     finally:
         gpu.state.depth_mask_set(False)
         gpu.state.depth_test_set("NONE")
-    _draw_sticks(context, sticks(context))
+    _draw_bones(context, get_bones(context))
 
 
-def _draw_sticks(context: bpy.types.Context, sticks: list[OverlayBone]) -> None:
-    if not sticks:
+def _draw_bones(context: bpy.types.Context, bones: list[OverlayBone]) -> None:
+    if not bones:
         return
     shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")
     shader.uniform_float("viewportSize", (context.region.width, context.region.height))
-    for color in {stick.color for stick in sticks}:
-        ends = [end for stick in sticks if stick.color == color for end in (stick.head, stick.tail)]
-        for width, shown in ((STICK_PIXELS + 2, (0, 0, 0, 0.6)), (STICK_PIXELS, color)):
+    for color in {bone.color for bone in bones}:
+        ends = [end for bone in bones if bone.color == color for end in (bone.head, bone.tail)]
+        for width, line_color in ((BONE_WIDTH_PIXELS + 2, (0, 0, 0, 0.6)), (BONE_WIDTH_PIXELS, color)):
             shader.uniform_float("lineWidth", width * context.preferences.system.ui_scale)
-            shader.uniform_float("color", shown)
+            shader.uniform_float("color", line_color)
             batch_for_shader(shader, "LINES", {"pos": ends}).draw(shader)
 
 
 def _vertex_format(names: Iterable[str]) -> gpu.types.GPUVertFormat:
-    """Three floats for each name; stated here, as what a shader says of its inputs lacks them in Blender 5.2."""
-    made = gpu.types.GPUVertFormat()
+    """Create a vertex format with three floats for each name; in Blender 5.2 a shader does not provide it."""
+    vertex_format = gpu.types.GPUVertFormat()
     for name in names:
-        made.attr_add(id=name, comp_type="F32", len=3, fetch_mode="FLOAT")
-    return made
+        vertex_format.attr_add(id=name, comp_type="F32", len=3, fetch_mode="FLOAT")
+    return vertex_format
 
 
 def _mesh_shader() -> gpu.types.GPUShader:
@@ -161,63 +175,64 @@ def _mesh_shader() -> gpu.types.GPUShader:
         info.push_constant("MAT4", "transform")
         info.push_constant("VEC3", "towards")
         info.push_constant("FLOAT", "offset")
-        for place, name in enumerate(("position", "normal", "color")):
-            info.vertex_in(place, "VEC3", name)
-        between = gpu.types.GPUStageInterfaceInfo("fdda_between")
-        between.smooth("VEC3", "paint")
-        between.smooth("FLOAT", "shade")
-        info.vertex_out(between)
+        for slot, name in enumerate(("position", "normal", "color")):
+            info.vertex_in(slot, "VEC3", name)
+        interface = gpu.types.GPUStageInterfaceInfo("fdda_interface")
+        interface.smooth("VEC3", "paint")
+        interface.smooth("FLOAT", "shade")
+        info.vertex_out(interface)
         info.fragment_out(0, "VEC4", "outcome")
-        info.vertex_source(VERTEX)
-        info.fragment_source(FRAGMENT)
+        info.vertex_source(VERTEX_SHADER)
+        info.fragment_source(FRAGMENT_SHADER)
         _shader = gpu.shader.create_from_info(info)
     return _shader
 
 
-def _draw_legend(legend: Callable[[bpy.types.Context], tuple[list[str], float | None]]) -> None:
+def _draw_legend(get_legend: Callable[[bpy.types.Context], tuple[list[str], float | None]]) -> None:
     context = bpy.context
-    lines, range_mm = legend(context)
+    lines, range_mm = get_legend(context)
     if not lines:
         return
-    unit = context.preferences.system.ui_scale
+    ui_scale = context.preferences.system.ui_scale
     regions = [r for r in context.area.regions if r.width > 1]
-    left = 24 * unit + sum(r.width for r in regions if r.type == "TOOLS")
-    # Above what Blender offers there to adjust the last operation.
-    bottom = 30 * unit + sum(r.height for r in regions if r.type == "HUD")
-    blf.size(0, 12 * unit)
+    left = 24 * ui_scale + sum(r.width for r in regions if r.type == "TOOLS")
+    # Above the Adjust Last Operation panel.
+    bottom = 30 * ui_scale + sum(r.height for r in regions if r.type == "HUD")
+    blf.size(0, 12 * ui_scale)
     blf.enable(0, blf.SHADOW)
     blf.shadow(0, 5, 0, 0, 0, 0.9)
     if range_mm is not None:
-        _draw_scale(left, bottom, unit, range_mm)
-        bottom += 46 * unit
+        _draw_color_scale(left, bottom, ui_scale, range_mm)
+        bottom += 46 * ui_scale
     for line in reversed(lines):
-        _write(line, left, bottom)
-        bottom += 18 * unit
+        _draw_text(line, left, bottom)
+        bottom += 18 * ui_scale
     blf.disable(0, blf.SHADOW)
 
 
-def _draw_scale(left: float, bottom: float, unit: float, range_mm: float) -> None:
-    box, width = 14 * unit, 240 * unit
-    top = bottom + 18 * unit
-    _draw_strip(left, top, box, box, np.tile(np.float32(NO_ERROR_COLOR), (2, 1)))
-    _write("none", left - 2 * unit, bottom)
-    start = left + 44 * unit
-    _draw_strip(start, top, width, box, heat_colors(np.linspace(NO_ERROR_METRES, range_mm / 1000, 64), range_mm / 1000))
-    for part, words in ((0, "0"), (0.5, f"{range_mm / 2:.4g}"), (1, f"{range_mm:.4g} mm and more")):
-        across = blf.dimensions(0, words.split(" ")[0])[0] / 2
-        _write(words, start + part * width - across, bottom)
+def _draw_color_scale(left: float, bottom: float, ui_scale: float, range_mm: float) -> None:
+    height, width = 14 * ui_scale, 240 * ui_scale
+    strip_bottom = bottom + 18 * ui_scale
+    _draw_strip(left, strip_bottom, height, height, np.tile(np.float32(NO_ERROR_COLOR), (2, 1)))
+    _draw_text("none", left - 2 * ui_scale, bottom)
+    start = left + 44 * ui_scale
+    strip_colors = heat_colors(np.linspace(NO_ERROR_METRES, range_mm / 1000, 64), range_mm / 1000)
+    _draw_strip(start, strip_bottom, width, height, strip_colors)
+    for fraction, text in ((0, "0"), (0.5, f"{range_mm / 2:.4g}"), (1, f"{range_mm:.4g} mm and more")):
+        half_width = blf.dimensions(0, text.split(" ")[0])[0] / 2
+        _draw_text(text, start + fraction * width - half_width, bottom)
 
 
 def _draw_strip(left: float, bottom: float, width: float, height: float, colors: np.ndarray) -> None:
-    across = left + width * np.linspace(0, 1, len(colors))
-    corners = [(x, y) for x in across for y in (bottom, bottom + height)]
+    x_values = left + width * np.linspace(0, 1, len(colors))
+    corners = [(x, y) for x in x_values for y in (bottom, bottom + height)]
     rgba = [(*color, 1.0) for color in colors.tolist() for _ in range(2)]
     shader = gpu.shader.from_builtin("SMOOTH_COLOR")
     batch = batch_for_shader(shader, "TRI_STRIP", {"pos": corners, "color": rgba})
     batch.draw(shader)
 
 
-def _write(text: str, x: float, y: float) -> None:
+def _draw_text(text: str, x: float, y: float) -> None:
     blf.color(0, 1, 1, 1, 1)
     blf.position(0, round(x), round(y), 0)
     blf.draw(0, text)

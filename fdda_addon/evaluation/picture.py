@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draws meshes and words in rows and columns, with Workbench, in a scene of its own.
+"""Renders pictures of meshes and labels in rows and columns, with Workbench, in a scene of its own.
 
-Everything of a picture, the words and the scale too, is rendered by Blender: it needs no window and no other library.
+Blender renders everything, also the labels and the color scale, so this needs no window and no other library.
 """
 
 import ctypes.util
@@ -21,13 +21,13 @@ from ..scene.arrays import COLOR, LOOP_START, VERTEX_INDEX, write
 from ..scene.blend_file import blender_path
 from ..scene.mesh import set_mesh_positions, topology
 
-PIXELS_WIDE = 1440
-MARGIN = 0.06
-"""Space between cells, as a part of a cell's width."""
+WIDTH_PIXELS = 1440
+CELL_MARGIN = 0.06
+"""Space between cells, relative to the width of a cell."""
 TEXT_SIZE = 0.0145
-"""Height of a line, as a part of the picture's width."""
-BACKGROUND = (0.13, 0.14, 0.15)
-INK = (0.92, 0.92, 0.92)
+"""Height of a line, relative to the width of the picture."""
+BACKGROUND_COLOR = (0.13, 0.14, 0.15)
+TEXT_COLOR = (0.92, 0.92, 0.92)
 PNG_END = b"IEND\xae\x42\x60\x82"
 
 
@@ -37,8 +37,8 @@ class Cell:
 
     Attributes:
         positions: (V, 3) float32, mesh-object space, mesh units.
-        colors: (V, 3) float32 sRGB.
-        label: a line above it.
+        colors: (V, 3) float32, sRGB.
+        label: a line of text above the mesh.
     """
 
     positions: np.ndarray
@@ -48,18 +48,18 @@ class Cell:
 
 @dataclass(frozen=True)
 class View:
-    """From where a picture is drawn.
+    """The view direction of a picture.
 
     Attributes:
-        azimuth, elevation: degrees; 0, 0 looks along +Y, at the front of a character, and a positive azimuth comes
-            from the character's left.
+        azimuth, elevation: degrees. 0, 0 looks along +Y, at the front of a character; with a positive azimuth the
+            viewer is on the character's left.
     """
 
     azimuth: float = 25.0
     elevation: float = 20.0
 
     def axes(self) -> np.ndarray:
-        """(3, 3) float64: right, up and towards the viewer, one a row."""
+        """Return the directions right, up and towards the viewer, one in each row, (3, 3) float64."""
         azimuth, elevation = math.radians(self.azimuth), math.radians(self.elevation)
         towards = np.array(
             [math.sin(azimuth) * math.cos(elevation), -math.cos(azimuth) * math.cos(elevation), math.sin(elevation)]
@@ -77,16 +77,16 @@ def draw(
     heat_scale: bool = False,
     sculpted: bool = False,
 ) -> None:
-    """Draw deformations of one mesh as a PNG file.
+    """Render deformations of one mesh into a PNG file.
 
     Args:
-        mesh: whose faces are drawn.
-        rows: cells, row by row.
-        path: of the file.
-        title: a line above all.
-        view: from where.
-        heat_scale: draw the scale of the heat map below all.
-        sculpted: light that shows the shape; else light that shows the colors.
+        mesh: the mesh with the faces.
+        rows: the cells, row by row.
+        path: path of the file.
+        title: a line of text above all cells.
+        view: the view direction.
+        heat_scale: add the color scale of the heat map at the bottom.
+        sculpted: use lighting that shows the shape, instead of one that shows the colors.
 
     Raises:
         OutputError: the file cannot be written, or the machine lacks what Workbench needs.
@@ -101,110 +101,109 @@ def draw(
 
 
 def _check_can_render() -> None:
-    """Without EGL a render without a window ends the process, with no error that Python could catch."""
+    """Check for EGL: without it, a render without a window ends the process, and Python cannot catch that."""
     if bpy.app.background and sys.platform == "linux" and ctypes.util.find_library("EGL") is None:
         raise OutputError("Pictures need the library EGL; install the package libegl1.")
 
 
 class _Picture:
-    """A scene that holds a picture. Its plane is that of the camera: x to the right, y up, metres."""
+    """A scene that holds a picture. Positions are in the plane of the camera: x to the right, y up, metres."""
 
     def __init__(self, view: View):
         self._axes = view.axes()
-        self._turn = Matrix(self._axes.tolist()).transposed().to_4x4()
+        self._view_to_world = Matrix(self._axes.tolist()).transposed().to_4x4()
         self._scene = bpy.data.scenes.new("FDDA picture")
-        self._made: list[bpy.types.ID] = []
+        self._datablocks: list[bpy.types.ID] = []
         self._width = self._height = 0.0
 
     def compose(self, mesh: bpy.types.Mesh, rows: list[list[Cell]], title: str, heat_scale: bool) -> None:
-        """Lay out cells from the top left, the title above and the scale below."""
-        flat = [cell.positions @ self._axes.T for row in rows for cell in row]
-        size = np.max([np.ptp(projected[:, :2], axis=0) for projected in flat], axis=0)
-        columns = max(len(row) for row in rows)
-        unit = size[0]
-        gap = unit * MARGIN
-        self._width = columns * (unit + gap) + gap
-        text = self._width * TEXT_SIZE
-        step = np.array([unit + gap, size[1] + 3.2 * text])
-        self._text(title, (gap, -2.0 * text), 1.3 * text)
-        top = 3.2 * text
-        template = _Template(mesh)
-        for r, row in enumerate(rows):
-            for c, cell in enumerate(row):
-                left = gap + c * step[0]
-                self._text(cell.label, (left, -(top + r * step[1] + 1.4 * text)), text)
-                center = (left + size[0] / 2, -(top + r * step[1] + 2.4 * text + size[1] / 2))
-                self._cell(template, cell, center)
+        """Lay out cells from the top left, the title above them and the color scale below."""
+        projections = [cell.positions @ self._axes.T for row in rows for cell in row]
+        cell_size = np.max([np.ptp(projected[:, :2], axis=0) for projected in projections], axis=0)
+        column_count = max(len(row) for row in rows)
+        gap = cell_size[0] * CELL_MARGIN
+        self._width = column_count * (cell_size[0] + gap) + gap
+        text_size = self._width * TEXT_SIZE
+        step = np.array([cell_size[0] + gap, cell_size[1] + 3.2 * text_size])
+        self._add_text(title, (gap, -2.0 * text_size), 1.3 * text_size)
+        top = 3.2 * text_size
+        factory = _MeshFactory(mesh)
+        for row_index, row in enumerate(rows):
+            for column_index, cell in enumerate(row):
+                left, cell_top = gap + column_index * step[0], top + row_index * step[1]
+                self._add_text(cell.label, (left, -(cell_top + 1.4 * text_size)), text_size)
+                center = (left + cell_size[0] / 2, -(cell_top + 2.4 * text_size + cell_size[1] / 2))
+                self._add_cell(factory, cell, center)
         bottom = top + len(rows) * step[1]
         if heat_scale:
-            self._scale((gap, -(bottom + 1.2 * text)), text)
-            bottom += 4.4 * text
+            self._add_heat_scale((gap, -(bottom + 1.2 * text_size)), text_size)
+            bottom += 4.4 * text_size
         self._height = bottom + gap
 
-    def _place(self, target: bpy.types.Object, x: float, y: float, depth: float = 0.0) -> None:
-        target.matrix_world = self._turn @ Matrix.Translation((x, y, depth))
+    def _move(self, scene_object: bpy.types.Object, x: float, y: float, depth: float = 0.0) -> None:
+        scene_object.matrix_world = self._view_to_world @ Matrix.Translation((x, y, depth))
 
-    def _add(self, name: str, data: bpy.types.ID | None) -> bpy.types.Object:
-        made = bpy.data.objects.new(name, data)
-        self._scene.collection.objects.link(made)
-        self._made += [made, *([data] if data is not None else [])]
-        return made
+    def _add_object(self, name: str, data: bpy.types.ID | None) -> bpy.types.Object:
+        scene_object = bpy.data.objects.new(name, data)
+        self._scene.collection.objects.link(scene_object)
+        self._datablocks += [scene_object, *([data] if data is not None else [])]
+        return scene_object
 
-    def _cell(self, template: "_Template", cell: Cell, center: tuple[float, float]) -> None:
+    def _add_cell(self, factory: "_MeshFactory", cell: Cell, center: tuple[float, float]) -> None:
         projected = (cell.positions @ self._axes.T).astype(np.float32)
         middle = (projected.max(axis=0) + projected.min(axis=0)) / 2
-        made = self._add("cell", template.mesh(projected - middle, cell.colors))
-        self._place(made, *center)
+        self._move(self._add_object("cell", factory.create(projected - middle, cell.colors)), *center)
 
-    def _text(self, words: str, place: tuple[float, float], size: float) -> None:
+    def _add_text(self, text: str, position: tuple[float, float], size: float) -> None:
         curve = bpy.data.curves.new("text", "FONT")
-        curve.body, curve.size = words, size
-        made = self._add("text", curve)
-        made.color = (*_linear(INK), 1)
-        self._place(made, *place)
+        curve.body, curve.size = text, size
+        scene_object = self._add_object("text", curve)
+        scene_object.color = (*_linear(TEXT_COLOR), 1)
+        self._move(scene_object, *position)
 
-    def _scale(self, place: tuple[float, float], text: float) -> None:
-        """The colors of the heat map: a box for no error, a strip from the first to the last stop."""
-        x, y = place
-        box = 1.2 * text
-        self._strip((x, y - box), (box, box), np.array([NO_ERROR_COLOR, NO_ERROR_COLOR]))
-        self._text("none (below 0.0001 cm)", (x + 1.5 * box, y - box + 0.2 * text), 0.9 * text)
-        left, width = x + 16 * text, self._width * 0.35
-        self._strip(
-            (left, y - box), (width, box), heat_colors(np.linspace(HEAT_MAP_STOPS[0][0], HEAT_MAP_STOPS[-1][0], 64))
-        )
+    def _add_heat_scale(self, position: tuple[float, float], text_size: float) -> None:
+        """Add the colors of the heat map: a box for no error, and a strip from the first to the last stop."""
+        x, y = position
+        box_size = 1.2 * text_size
+        self._add_strip((x, y - box_size), (box_size, box_size), np.array([NO_ERROR_COLOR, NO_ERROR_COLOR]))
+        label_position = (x + 1.5 * box_size, y - box_size + 0.2 * text_size)
+        self._add_text("none (below 0.0001 cm)", label_position, 0.9 * text_size)
+        left, width = x + 16 * text_size, self._width * 0.35
+        strip_colors = heat_colors(np.linspace(HEAT_MAP_STOPS[0][0], HEAT_MAP_STOPS[-1][0], 64))
+        self._add_strip((left, y - box_size), (width, box_size), strip_colors)
         last = HEAT_MAP_STOPS[-1][0]
-        for metres, words in ((0.0, "error 0 cm"), (0.005, "0.5 cm"), (last, "1 cm and above")):
-            self._text(words, (left + width * metres / last - 0.6 * text, y - box - 1.2 * text), 0.9 * text)
+        for metres, text in ((0.0, "error 0 cm"), (0.005, "0.5 cm"), (last, "1 cm and above")):
+            label_position = (left + width * metres / last - 0.6 * text_size, y - box_size - 1.2 * text_size)
+            self._add_text(text, label_position, 0.9 * text_size)
 
-    def _strip(self, place: tuple[float, float], size: tuple[float, float], colors: np.ndarray) -> None:
-        across = np.linspace(0, size[0], len(colors))
-        points = [(x, y, 0) for x in across for y in (0, size[1])]
+    def _add_strip(self, position: tuple[float, float], size: tuple[float, float], colors: np.ndarray) -> None:
+        x_values = np.linspace(0, size[0], len(colors))
+        points = [(x, y, 0) for x in x_values for y in (0, size[1])]
         faces = [(2 * i, 2 * i + 2, 2 * i + 3, 2 * i + 1) for i in range(len(colors) - 1)]
         mesh = bpy.data.meshes.new("scale")
         mesh.from_pydata(points, [], faces)
-        _paint(mesh, np.repeat(colors, 2, axis=0))
-        self._place(self._add("scale", mesh), *place)
+        _set_colors(mesh, np.repeat(colors, 2, axis=0))
+        self._move(self._add_object("scale", mesh), *position)
 
     def render(self, path: Path, sculpted: bool) -> None:
         """Write the PNG file."""
         scene = self._scene
-        camera = self._add("camera", bpy.data.cameras.new("camera"))
+        camera = self._add_object("camera", bpy.data.cameras.new("camera"))
         camera.data.type = "ORTHO"
         camera.data.ortho_scale = max(self._width, self._height)
-        self._place(camera, self._width / 2, -self._height / 2, 100.0)
+        self._move(camera, self._width / 2, -self._height / 2, 100.0)
         camera.data.clip_end = 1000.0
         scene.camera = camera
-        scene.render.resolution_x = PIXELS_WIDE
-        scene.render.resolution_y = round(PIXELS_WIDE * self._height / self._width)
+        scene.render.resolution_x = WIDTH_PIXELS
+        scene.render.resolution_y = round(WIDTH_PIXELS * self._height / self._width)
         scene.render.engine = "BLENDER_WORKBENCH"
         scene.render.image_settings.file_format = "PNG"
         scene.render.image_settings.color_mode = "RGB"
         scene.render.image_settings.compression = 90
-        # Dither is noise, and noise is what does not compress.
+        # Dithering is noise, which does not compress.
         scene.render.dither_intensity = 0
         scene.render.use_file_extension = False
-        # A picture that is passed on must not say where it was made.
+        # A picture that is passed on must not reveal where it was made.
         for name in [p.identifier for p in scene.render.bl_rna.properties if p.identifier.startswith("use_stamp_")]:
             setattr(scene.render, name, False)
         scene.render.film_transparent = False
@@ -219,35 +218,35 @@ class _Picture:
         shading.cavity_ridge_factor = 0.6
         shading.cavity_valley_factor = 1.0
         world = bpy.data.worlds.new("picture")
-        world.color = _linear(BACKGROUND)
+        world.color = _linear(BACKGROUND_COLOR)
         scene.world = world
-        self._made.append(world)
+        self._datablocks.append(world)
         with atomic_write(path) as temporary:
             scene.render.filepath = blender_path(temporary)
             try:
                 bpy.ops.render.render(write_still=True, scene=scene.name)
             except RuntimeError as error:
                 raise OSError(str(error).strip()) from error
-            # Blender does not look whether all of it reached the disk.
+            # Blender does not check whether the whole file reached the disk.
             if not (temporary.exists() and temporary.read_bytes().endswith(PNG_END)):
                 raise OSError("Blender wrote no picture or only a part of it, the disk may be full")
 
     def remove(self) -> None:
-        """Leave nothing of the picture in the file."""
-        bpy.data.batch_remove([*self._made, self._scene])
+        """Remove all datablocks of the picture from the file."""
+        bpy.data.batch_remove([*self._datablocks, self._scene])
 
 
-class _Template:
-    """Makes meshes of one topology."""
+class _MeshFactory:
+    """Creates meshes with the same topology."""
 
     def __init__(self, mesh: bpy.types.Mesh):
-        self._vertices = len(mesh.vertices)
+        self._vertex_count = len(mesh.vertices)
         self._loop_starts, self._loop_vertices = topology(mesh)
 
-    def mesh(self, positions: np.ndarray, colors: np.ndarray) -> bpy.types.Mesh:
-        """A mesh with (V, 3) positions and (V, 3) sRGB colors."""
+    def create(self, positions: np.ndarray, colors: np.ndarray) -> bpy.types.Mesh:
+        """Create a mesh with (V, 3) positions and (V, 3) sRGB colors."""
         mesh = bpy.data.meshes.new("cell")
-        mesh.vertices.add(self._vertices)
+        mesh.vertices.add(self._vertex_count)
         mesh.loops.add(len(self._loop_vertices))
         mesh.polygons.add(len(self._loop_starts))
         set_mesh_positions(mesh, np.ascontiguousarray(positions, np.float32))
@@ -255,11 +254,11 @@ class _Template:
         write(mesh.polygons, LOOP_START, self._loop_starts)
         mesh.update(calc_edges=True)
         mesh.shade_smooth()
-        _paint(mesh, colors)
+        _set_colors(mesh, colors)
         return mesh
 
 
-def _paint(mesh: bpy.types.Mesh, colors: np.ndarray) -> None:
+def _set_colors(mesh: bpy.types.Mesh, colors: np.ndarray) -> None:
     attribute = mesh.color_attributes.new("color", "FLOAT_COLOR", "POINT")
     rgba = np.ones((len(colors), 4), np.float32)
     rgba[:, :3] = _linear(colors)
@@ -268,6 +267,6 @@ def _paint(mesh: bpy.types.Mesh, colors: np.ndarray) -> None:
 
 
 def _linear(srgb: object) -> np.ndarray:
-    """sRGB to linear color (IEC 61966-2-1)."""
+    """Convert sRGB to linear colors (IEC 61966-2-1)."""
     srgb = np.asarray(srgb, np.float64)
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

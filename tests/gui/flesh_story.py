@@ -82,8 +82,8 @@ def evaluate_against_the_flesh(folder: Path) -> Iterator[float]:
     evaluations = part("evaluation.last_evaluation")
     yield from sidebar.open_section("evaluation")
     yield from sidebar.push("fdda.evaluate")
-    yield from until(lambda: evaluations.of(arm()) is not None, 120, "nothing is evaluated")
-    total = evaluations.of(arm()).total
+    yield from until(lambda: evaluations.get(arm()) is not None, 120, "nothing is evaluated")
+    total = evaluations.get(arm()).total
     check(0 < total["fdda"].mean < total["linear"].mean, f"the model is no closer than linear skinning: {total}")
 
 

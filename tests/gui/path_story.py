@@ -226,8 +226,8 @@ def switch_the_deformation(folder: Path) -> Iterator[float]:
 def measure_the_model(_folder: Path) -> Iterator[float]:
     """Press Measure Speed in the section Model."""
     yield from sidebar.push("fdda.measure_model")
-    yield from until(lambda: part("timing.frame_times").of(arm()) is not None, 60, "nothing is measured")
-    times = part("timing.frame_times").of(arm())
+    yield from until(lambda: part("timing.frame_times").get(arm()) is not None, 60, "nothing is measured")
+    times = part("timing.frame_times").get(arm())
     check(min(times.rig, times.linear, times.fdda) > 0, f"there are times of 0: {times}")
 
 
@@ -256,8 +256,8 @@ def evaluate(_folder: Path) -> Iterator[float]:
     yield from sidebar.open_section("evaluation")
     yield from sidebar.push("fdda.evaluate")
     evaluations = part("evaluation.last_evaluation")
-    yield from until(lambda: evaluations.of(arm()) is not None, 90, "nothing is evaluated")
-    last = evaluations.of(arm())
+    yield from until(lambda: evaluations.get(arm()) is not None, 90, "nothing is evaluated")
+    last = evaluations.get(arm())
     check(last.poses == FRAMES, f"{last.poses} frames are compared")
     fdda, linear = last.total["fdda"].mean, last.total["linear"].mean
     check(0 < fdda < linear, f"the model is {fdda} mm from the rig and linear skinning {linear}")
@@ -291,7 +291,7 @@ def _paint(colors: str, folder: Path) -> Iterator[float]:
 def mark_the_worst_frames(_folder: Path) -> Iterator[float]:
     """Press Add Markers, then the first of the worst frames, and look at its errors alone."""
     yield from sidebar.push("fdda.add_worst_markers", across=0.8)
-    worst = part("evaluation.last_evaluation").of(arm()).worst(5)
+    worst = part("evaluation.last_evaluation").get(arm()).worst(5)
     found = part("evaluation.markers").find(bpy.context.scene)
     check(
         {marker.frame for marker in found} == {index + 1 for index, _ in worst},

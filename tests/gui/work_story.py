@@ -133,7 +133,7 @@ def evaluate_all_meshes(folder: Path) -> Iterator[float]:
     yield from sidebar.push("fdda.evaluate")
     yield from job_done("evaluate", 90)
     evaluations = part("evaluation.last_evaluation")
-    missing = [name for name in ("arm", "sleeve") if evaluations.of(bpy.data.objects[name]) is None]
+    missing = [name for name in ("arm", "sleeve") if evaluations.get(bpy.data.objects[name]) is None]
     check(not missing, f"{missing} were not evaluated")
     yield from picture(folder / "evaluated.png")
 
