@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The last evaluation of each mesh object, for the sidebar, the viewport and the timeline; it lasts for the session."""
+"""Stores the last evaluation of each mesh object for the session, for the sidebar, the viewport and the timeline."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -14,17 +14,18 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from .run import Evaluation
 
 MAX_STORED = 4
-"""Errors of a dense mesh take some hundred format_file_size."""
-FRAMES_APART = 10
-"""Worst frames that are nearer belong to one movement."""
+"""The errors of a dense mesh take some hundred megabytes."""
+MIN_FRAMES_APART = 10
+"""Least distance between worst frames: closer ones belong to the same movement."""
 METHODS = ("fdda", "linear")
 
 _evaluations: dict[int, "LastEvaluation"] = {}
+"""Evaluations by the session ids of mesh objects, the oldest first."""
 
 
 @dataclass(frozen=True)
 class PartitionErrors:
-    """Errors of the vertices of one main joint: its name, the number of vertices, statistics in mm."""
+    """Errors of one partition: name of its main joint, number of vertices, statistics in mm."""
 
     joint: str
     vertices: int
@@ -37,14 +38,14 @@ class LastEvaluation:
     """Errors of a model on the frames of an action, or on random poses.
 
     Attributes:
-        name: of the action; empty for random poses.
-        model: name of the model's file.
-        first_frame: of the action, 0 for random poses.
-        seed: of the random poses.
-        errors: (N, V) float32, metres, by the names of `METHODS`.
-        total: statistics of all vertices by the names of `METHODS`.
-        partitions: the worst first, by the largest error of the model.
-        channels: that the random poses were drawn from.
+        name: name of the action; empty for random poses.
+        model: file name of the model.
+        first_frame: first frame of the action; 0 for random poses.
+        seed: seed of the random poses.
+        errors: (N, V) float32, metres, for each of `METHODS`.
+        total: statistics of all vertices, for each of `METHODS`.
+        partitions: errors of the partitions, in descending order of the largest error of the model.
+        channels: channels of the random poses.
     """
 
     name: str
@@ -58,33 +59,42 @@ class LastEvaluation:
 
     @property
     def poses(self) -> int:
-        """How many were compared."""
+        """Return the number of poses."""
         return len(self.errors["fdda"])
 
     @property
     def vertices(self) -> int:
-        """Number of vertices of the mesh."""
+        """Return the number of vertices of the mesh."""
         return self.errors["fdda"].shape[1]
 
     def pose_at(self, frame: int) -> int | None:
-        """Index of the pose of a frame; None where the action has none, and for random poses."""
+        """Return the index of the pose at a frame; None if the action does not have the frame, or for random poses."""
         index = frame - self.first_frame
         return index if self.name and 0 <= index < self.poses else None
 
-    def vertex_errors(self, way: str, statistic: str, pose: int | None = None) -> "np.ndarray | None":
-        """(V,) errors in metres: the "mean" or "max" over the poses, or those of one "pose"; None without a pose."""
-        errors = self.errors[way]
+    def vertex_errors(self, method: str, statistic: str, pose: int | None = None) -> "np.ndarray | None":
+        """Compute the errors of all vertices.
+
+        Args:
+            method: one of `METHODS`.
+            statistic: "mean" or "max" over the poses, or "pose" for those of one pose.
+            pose: index of the pose.
+
+        Returns:
+            (V,) float32, metres; None if there is no such pose.
+        """
+        errors = self.errors[method]
         if statistic == "pose":
             return None if pose is None or not 0 <= pose < len(errors) else errors[pose]
         return errors.mean(axis=0) if statistic == "mean" else errors.max(axis=0)
 
     def worst(self, count: int) -> list[tuple[int, float]]:
-        """The poses with the largest errors of the model, the worst first: index and the largest error in mm."""
+        """Return index and largest error in mm of the poses with the largest errors of the model, the worst first."""
         from ..core.metrics import worst_poses
 
         errors = self.errors["fdda"]
-        found = worst_poses(errors, count, FRAMES_APART if self.name else 1)
-        return [(index, float(errors[index].max()) * 1000) for index in found]
+        indices = worst_poses(errors, count, MIN_FRAMES_APART if self.name else 1)
+        return [(index, float(errors[index].max()) * 1000) for index in indices]
 
 
 def store(
@@ -95,24 +105,23 @@ def store(
     first_frame: int = 0,
     seed: int = 0,
 ) -> LastEvaluation:
-    """Sum an evaluation up and keep it.
+    """Summarize and store an evaluation.
 
     Args:
-        mesh_object: that was evaluated.
-        evaluation: the poses that count are its `held_out`.
-        model: name of the model's file.
-        action, first_frame: the action that was compared; empty for random poses.
-        seed: of the random poses.
+        mesh_object: the object that was evaluated.
+        evaluation: the evaluation; its `held_out` poses are stored.
+        model: file name of the model.
+        action, first_frame: the action that was compared and its first frame; empty for random poses.
+        seed: seed of the random poses.
     """
     from ..core.metrics import error_statistics
 
-    compared = evaluation.held_out
-    errors = {way: getattr(compared, way) for way in METHODS}
+    errors = {method: getattr(evaluation.held_out, method) for method in METHODS}
     partitions = [
         PartitionErrors(
             evaluation.joints[partition.joint],
             len(partition.vertices),
-            *(error_statistics(errors[way][:, partition.vertices]) for way in METHODS),
+            *(error_statistics(errors[method][:, partition.vertices]) for method in METHODS),
         )
         for partition in evaluation.partitions
     ]
@@ -123,7 +132,7 @@ def store(
         first_frame,
         seed,
         errors,
-        {way: error_statistics(errors[way]) for way in METHODS},
+        {method: error_statistics(errors[method]) for method in METHODS},
         tuple(partitions),
         evaluation.channels,
     )
@@ -135,10 +144,10 @@ def store(
 
 
 def get(mesh_object: bpy.types.Object) -> LastEvaluation | None:
-    """The last evaluation of an object, None when there was none in this session."""
+    """Return the last evaluation of an object; None if there was none in this session."""
     return _evaluations.get(mesh_object.session_uid)
 
 
 def remove(mesh_object: bpy.types.Object) -> None:
-    """Drop the last evaluation of an object: its model is another now."""
+    """Remove the last evaluation of an object, because its model has changed."""
     _evaluations.pop(mesh_object.session_uid, None)

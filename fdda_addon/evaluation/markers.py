@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Timeline markers at the worst frames of an action."""
+"""Places timeline markers at the worst frames of an action."""
 
 import re
 
 import bpy
 
 _NAME = r"FDDA \d+: \d+\.\d+ mm"
-"""Ours are known by their names: Blender 5 lets markers carry nothing else."""
+"""Pattern of the names of our markers, which identifies them: Blender 5 allows no custom properties on markers."""
 
 
 def place(scene: bpy.types.Scene, worst: list[tuple[int, float]]) -> None:
-    """Mark frames, and none else.
+    """Place a marker at each of the worst frames, and remove our other markers.
 
     Args:
-        scene: whose timeline.
+        scene: the scene with the timeline.
         worst: frame and largest error in mm, the worst first.
     """
     remove(scene)
@@ -22,13 +22,13 @@ def place(scene: bpy.types.Scene, worst: list[tuple[int, float]]) -> None:
 
 
 def find(scene: bpy.types.Scene) -> list[bpy.types.TimelineMarker]:
-    """Our markers."""
+    """Return our markers."""
     return [marker for marker in scene.timeline_markers if re.fullmatch(_NAME, marker.name)]
 
 
 def remove(scene: bpy.types.Scene) -> int:
-    """Remove our markers, and none else; returns how many there were."""
-    found = find(scene)
-    for marker in found:
+    """Remove our markers; return their number."""
+    markers = find(scene)
+    for marker in markers:
         scene.timeline_markers.remove(marker)
-    return len(found)
+    return len(markers)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The pictures of an evaluation: partitions in color; rig, linear skinning and model side by side, or as heat."""
+"""Draws the pictures of an evaluation: partitions, and rig, linear skinning and model side by side or as heat maps."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +15,19 @@ from ..scene.scene_rig import SceneRig
 from .picture import Cell, View, draw
 from .run import PoseErrors
 
-PLAIN = (0.78, 0.64, 0.55)
+SURFACE_COLOR = (0.78, 0.64, 0.55)
 
 
 @dataclass(frozen=True)
 class PicturedPose:
-    """A pose of a picture: its name, (J, 4, 4) pose matrices and the (V, 3) positions of the true rig."""
+    """A pose of a picture.
+
+    Attributes:
+        name: name of the pose.
+        pose_matrices: (J, 4, 4) float32, mesh-object space, mesh units.
+        positions: (V, 3) float32, positions of the rig, mesh-object space, mesh units.
+        controls: (C,) float32.
+    """
 
     name: str
     pose_matrices: np.ndarray
@@ -29,17 +36,17 @@ class PicturedPose:
 
 
 def pictured(errors: PoseErrors, index: int, name: str = "") -> PicturedPose:
-    """One of the poses that were evaluated."""
+    """Return one of the poses of an evaluation for a picture."""
     return PicturedPose(
         name or f"{errors.name} {index}", errors.pose_matrices[index], errors.positions[index], errors.controls[index]
     )
 
 
 def worst_poses(errors: PoseErrors) -> list[PicturedPose]:
-    """The poses with the median, the 90th percentile and the largest of the mean errors of a pose."""
+    """Return the poses with the median, the 90th percentile and the largest mean error."""
     order = np.argsort(errors.fdda.mean(axis=1))
-    places = {"median pose": len(order) // 2, "90th percentile": int(len(order) * 0.9), "worst pose": len(order) - 1}
-    return [pictured(errors, int(order[place]), name) for name, place in places.items()]
+    ranks = {"median pose": len(order) // 2, "90th percentile": int(len(order) * 0.9), "worst pose": len(order) - 1}
+    return [pictured(errors, int(order[rank]), name) for name, rank in ranks.items()]
 
 
 def draw_partitions(scene_rig: SceneRig, path: Path, view: View = View()) -> None:  # noqa: B008 - frozen
@@ -65,14 +72,17 @@ def draw_comparison(
     view: View = View(),  # noqa: B008 - frozen
     true: str = "true rig",
 ) -> None:
-    """Draw true rig, linear skinning and model side by side, a row a pose.
+    """Draw the rig, linear skinning and the model side by side, with a row for each pose.
 
     Args:
-        scene_rig: the rig. model: bound or not.
-        poses: what to draw.
-        path: of the PNG file.
-        heat: color each vertex by its distance from the true rig.
-        true: what the positions of the poses are of.
+        scene_rig: the rig.
+        model: path of the model, bound or not.
+        poses: the poses.
+        path: path of the PNG file.
+        heat: color each vertex by its distance from the rig.
+        title: title of the picture; empty for a default.
+        view: the view direction.
+        true: label of the positions of the poses.
 
     Raises:
         ModelError: the model cannot be read, or is of another rig.
@@ -96,5 +106,5 @@ def _cell(positions: np.ndarray, true: np.ndarray, label: str, heat: bool, metre
     errors = distances(positions, true, metres_per_unit)
     if errors.any():
         label += f"  mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.1f} mm"
-    colors = heat_colors(errors) if heat else np.tile(np.float32(PLAIN), (len(positions), 1))
+    colors = heat_colors(errors) if heat else np.tile(np.float32(SURFACE_COLOR), (len(positions), 1))
     return Cell(positions, colors, label)

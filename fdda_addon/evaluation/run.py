@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compares a model and linear skinning with the true rig, on poses that training never saw."""
+"""Compares a model and linear skinning with the rig, on poses that were not used in training."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -38,13 +38,13 @@ from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
 
 FIRST_HELD_OUT_INDEX = 1 << 33
-"""Held-out poses are drawn from indices that no recording reaches, so that they differ from the poses of any recording
-even when it was made with the same seed."""
+"""Index of the first held-out random pose. No recording reaches it, so the poses differ from those of any recording,
+even with the same seed."""
 
 
 @dataclass(frozen=True)
 class NamedPose:
-    """A pose given by hand: Euler angles of bones in radians, in the order of the bone; other bones are at rest."""
+    """A pose that is given as Euler angles by bone: radians, in the bone's rotation order; other bones are at rest."""
 
     name: str
     rotations: dict[str, tuple[float, float, float]]
@@ -52,16 +52,17 @@ class NamedPose:
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """What to compare on.
+    """The poses of an evaluation.
 
     Attributes:
-        poses: number of random held-out poses; with 0 of them the first action or strip stands in their place.
-        seed: of the random poses.
-        actions, strips: names of actions, and of strips of the NLA, whose frames are compared as well.
-        range_scales: factors by which the range of motion is widened for further poses, a quarter as many for each.
-        named: poses that are compared as well, each on its own.
-        surface: compare normals and edges too, which takes longer than all else.
-        target: what the model and linear skinning are compared with; the rig itself where it names none.
+        poses: number of random held-out poses; if 0, the first action or strip replaces them.
+        seed: seed of the random poses.
+        actions, strips: names of actions, and of strips of the NLA, whose frames are compared too.
+        range_scales: factors by which the range of motion is widened for further random poses, a quarter of `poses`
+            for each.
+        named: further poses, each compared on its own.
+        surface: compare normals and edges too, which takes longer than everything else.
+        target: the target to compare with; by default the rig itself.
     """
 
     poses: int = EVALUATION_POSES
@@ -79,13 +80,13 @@ class PoseErrors:
     """Errors of one set of poses.
 
     Attributes:
-        name: what the poses are.
+        name: name of the set.
         pose_matrices: (N, J, 4, 4) float32, mesh-object space, mesh units.
-        positions: (N, V, 3) float32, the true rig, mesh-object space, mesh units.
+        positions: (N, V, 3) float32, positions of the rig, mesh-object space, mesh units.
         controls: (N, C) float32, values of the controls.
-        fdda, linear: (N, V) float32, distances from the true rig, metres.
-        fdda_surface, linear_surface: errors of normals and edges, None for a mesh without faces, or where
-            they were not compared.
+        fdda, linear: (N, V) float32, distances of the model and of linear skinning from the rig, metres.
+        fdda_surface, linear_surface: errors of normals and edges; None for a mesh without faces, or if they were not
+            compared.
     """
 
     name: str
@@ -109,14 +110,16 @@ class PoseErrors:
 
 @dataclass
 class Evaluation:
-    """How well a model stands in for its rig.
+    """The errors of a model.
 
     Attributes:
-        partitions: of the rig. joints: names by joint index.
-        held_out: errors of the random poses, or of the first action or strip where there are none.
-        actions, scaled_ranges, named: errors of the actions and strips, of the random poses by scale of the range of
-            motion, and of the poses given by hand.
-        channels: that the random poses were drawn from.
+        partitions: partitions of the model.
+        joints: names of the joints.
+        held_out: errors on the random poses; without any, on the first action or strip.
+        actions: errors on each action and strip.
+        scaled_ranges: errors on the random poses of each scaled range of motion.
+        named: errors on each named pose.
+        channels: channels of the random poses.
     """
 
     partitions: tuple[Partition, ...]
@@ -136,7 +139,7 @@ class Evaluation:
         return error_statistics(self.held_out.linear)
 
     def to_json(self) -> dict:
-        """docs/formats.md describes it; lengths in mm, angles in degrees."""
+        """Return the evaluation as JSON, described in docs/formats.md; lengths in mm, angles in degrees."""
         return {
             "unit": "mm",
             "poses": len(self.held_out.fdda),
@@ -162,13 +165,18 @@ class Evaluation:
 def evaluate(
     scene_rig: SceneRig, model: Path | Network, settings: EvaluationSettings
 ) -> Iterator[Progress | Evaluation]:
-    """Compare a model with its rig; a generator that does the work while it is iterated.
+    """Compare a model with its rig, as a generator that works while it is iterated.
 
-    Where the mesh object has a mask, what is compared is the model as the mask lets it show. The scene is as before
-    when the generator ends, is closed, or raises.
+    If the mesh object has a mask, the masked model is compared. The scene is restored when the generator ends, is
+    closed, or raises.
+
+    Args:
+        scene_rig: the rig.
+        model: path of the model, or the loaded model.
+        settings: the poses to compare.
 
     Yields:
-        Progress, and as the last thing the Evaluation.
+        Progress, and the Evaluation at the end.
 
     Raises:
         RigError: the rig cannot be evaluated.
@@ -181,15 +189,15 @@ def evaluate(
     pose_setter = make_pose_setter(scene_rig, settings.target, clips, random)
     network, skinning = _prepare(scene_rig, model, is_own=not settings.target.name)
     rig = skinning.rig
-    # A rig that is posed by actions alone may have nothing to sample.
+    # A rig that is posed only by actions may have no channels to sample.
     channels = model_channels(scene_rig, rig, network.info) if settings.poses or settings.range_scales else ()
     extra = max(1, settings.poses // 4)
     total = settings.poses + extra * len(settings.range_scales) + len(settings.named)
     total += sum(len(clip.frames) for clip in clips)
-    with ExitStack() as borrowed:
+    with ExitStack() as stack:
         if pose_setter.target:
-            borrowed.enter_context(pose_setter.target.prepared())
-        player = borrowed.enter_context(temporary_rig_state(scene_rig, rig, channels, clips))
+            stack.enter_context(pose_setter.target.prepared())
+        player = stack.enter_context(temporary_rig_state(scene_rig, rig, channels, clips))
         evaluator = PoseEvaluator(scene_rig, rig, pose_setter.target)
         mask = read_mask(scene_rig.mesh_object)
         comparison = _Comparison(evaluator, network, skinning, total, settings.surface, mask)
@@ -198,8 +206,8 @@ def evaluate(
             poses = _random_poses(scene_rig, channels, settings.seed, FIRST_HELD_OUT_INDEX, settings.poses, pose_setter)
             held_out = yield from comparison.compare("held-out poses", poses)
         scaled_ranges = []
-        for number, factor in enumerate(settings.range_scales, 1):
-            first = FIRST_HELD_OUT_INDEX * (1 + number)
+        for scale_index, factor in enumerate(settings.range_scales, 1):
+            first = FIRST_HELD_OUT_INDEX * (1 + scale_index)
             poses = _random_poses(scene_rig, scale_ranges(channels, factor), settings.seed, first, extra, pose_setter)
             scaled_ranges.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
         named = []
@@ -217,10 +225,7 @@ def evaluate(
 def evaluate_action(
     scene_rig: SceneRig, model: Path | Network, name: str, target: TargetSettings = NO_TARGET
 ) -> Iterator[Progress | Evaluation]:
-    """Compare positions on the frames of one action alone, which stand in the place of held-out poses.
-
-    As `evaluate` in all else.
-    """
+    """Compare positions on the frames of one action, which replace the held-out poses, as `evaluate` does."""
     settings = EvaluationSettings(poses=0, actions=(name,), surface=False, target=target)
     for step in evaluate(scene_rig, model, settings):
         if isinstance(step, Evaluation):
@@ -229,7 +234,13 @@ def evaluate_action(
 
 
 def _prepare(scene_rig: SceneRig, model: Path | Network, is_own: bool) -> tuple[Network, LinearSkinning]:
-    """Open a model, and check the rig as far as its own surface is compared."""
+    """Open a model, and check that the rig can be compared with it.
+
+    Args:
+        scene_rig: the rig.
+        model: path of the model, or the loaded model.
+        is_own: the surface of the rig itself is compared, not that of a target.
+    """
     stack = check_evaluable(scene_rig)
     opened = open_model(scene_rig, model)
     rig = opened.linear_rig
@@ -239,7 +250,14 @@ def _prepare(scene_rig: SceneRig, model: Path | Network, is_own: bool) -> tuple[
 
 
 def set_held_out_pose(scene_rig: SceneRig, channels: tuple[Channel, ...], seed: int, index: int) -> None:
-    """Pose a rig as for one of the random poses that `evaluate` compares, with the channels of that evaluation."""
+    """Set one of the random poses of an evaluation.
+
+    Args:
+        scene_rig: the rig.
+        channels: the channels of the evaluation.
+        seed: the seed of the evaluation.
+        index: index of the pose in the evaluation.
+    """
     clear_pose(scene_rig.armature_object)
     next(_random_poses(scene_rig, channels, seed, FIRST_HELD_OUT_INDEX + index, 1))
 
@@ -270,7 +288,7 @@ def _named_pose(scene_rig: SceneRig, pose: NamedPose, pose_setter: PoseSetter) -
 
 
 class _Comparison:
-    """Evaluates poses three ways and counts them."""
+    """Evaluates poses with the rig, the model and linear skinning, and counts them."""
 
     def __init__(
         self,
@@ -291,28 +309,31 @@ class _Comparison:
             self._surface = SurfaceComparison(faces, rig.rest_positions, skinning.partitions)
 
     def compare(self, name: str, poses: Iterator[None]) -> Iterator[Progress]:
-        """Yields progress, returns PoseErrors."""
-        matrices, positions, values, fdda, linear, surface = [], [], [], [], [], []
+        """Compare poses, one for each iteration of `poses`; yields progress and returns the PoseErrors."""
+        all_matrices, all_positions, all_controls, fdda, linear, surface = [], [], [], [], [], []
         for _ in poses:
-            pose, true, controls = self._evaluator.evaluate()
-            moved = self._network.positions(pose[None], controls[None])[0]
-            for points, what in ((true, "The rig"), (moved, f"The model '{self._network.path}'")):
-                if not np.isfinite(points).all():
+            pose_matrices, rig_positions, controls = self._evaluator.evaluate()
+            model_positions = self._network.positions(pose_matrices[None], controls[None])[0]
+            for positions, source in (
+                (rig_positions, "The rig"),
+                (model_positions, f"The model '{self._network.path}'"),
+            ):
+                if not np.isfinite(positions).all():
                     raise FDDAError(
-                        f"{what} gives positions that are not numbers ({name}, pose {len(fdda)}); "
+                        f"{source} gives positions that are not numbers ({name}, pose {len(fdda)}); "
                         "look for a scale of zero or a broken driver in the rig, else train again."
                     )
-            matrices.append(pose)
-            positions.append(true)
-            values.append(controls)
-            skinned = self._skinning.positions(pose[None])[0]
+            all_matrices.append(pose_matrices)
+            all_positions.append(rig_positions)
+            all_controls.append(controls)
+            linear_positions = self._skinning.positions(pose_matrices[None])[0]
             if self._mask is not None:
-                moved = self._mask.blended(skinned, moved)
-            fdda.append(distances(moved, true, self._metres_per_unit))
-            linear.append(distances(skinned, true, self._metres_per_unit))
+                model_positions = self._mask.blended(linear_positions, model_positions)
+            fdda.append(distances(model_positions, rig_positions, self._metres_per_unit))
+            linear.append(distances(linear_positions, rig_positions, self._metres_per_unit))
             if self._surface:
-                surface.append(self._surface.compare(true, (moved, skinned)))
+                surface.append(self._surface.compare(rig_positions, (model_positions, linear_positions)))
             self._done += 1
             yield Progress("evaluation", self._done, self._total)
-        stacked = (np.stack(arrays) for arrays in (matrices, positions, values, fdda, linear))
+        stacked = (np.stack(arrays) for arrays in (all_matrices, all_positions, all_controls, fdda, linear))
         return PoseErrors(name, *stacked, *(surface_errors(rows) for rows in zip(*surface, strict=True)))

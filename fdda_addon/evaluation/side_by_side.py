@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The true rig shown together with what plays: beside it, or over it as a wireframe.
+"""Shows the rig of a playing character beside it, or over it as a wireframe.
 
-It is a copy of the mesh object without the model, which shares its mesh and follows the same armature. The copy is
-runtime data: no file ever has it. It is in the scene, so that Blender evaluates it, and undo takes it back; it cannot
-be selected, and renders leave it out.
+The rig is shown by a comparison object: a copy of the mesh object without the model, with the same mesh and armature.
+The copy is runtime data, so it is never saved. It is linked to the scene, so that Blender evaluates it and undo
+includes it. It cannot be selected, and renders do not show it.
 """
 
 import bpy
@@ -14,40 +14,40 @@ from ..scene.comparison import COMPARISON_KEY, comparisons
 from ..scene.draw_cache import draw_cached
 
 BESIDE, OVERLAY, NONE = "BESIDE", "OVERLAY", "NONE"
-GAP = 1.15
-"""From one to the other, in widths of the character."""
+DISTANCE_IN_WIDTHS = 1.15
+"""Distance between character and copy, in widths of the character."""
 
 _object_count = -1
 
 
 def find(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
-    """The copy that stands beside a mesh object, None where there is none."""
+    """Find the comparison object of a mesh object; return None if there is none."""
     return next((other for other in comparisons() if other[COMPARISON_KEY] == mesh_object), None)
 
 
 @draw_cached
 def display_mode(mesh_object: bpy.types.Object) -> str:
-    """How a mesh object is compared: `BESIDE`, `OVERLAY` or `NONE`."""
+    """Return how the rig of a mesh object is shown: `BESIDE`, `OVERLAY` or `NONE`."""
     other = find(mesh_object)
     if other is None:
         return NONE
     return OVERLAY if other.display_type == "WIRE" else BESIDE
 
 
-def show(mesh_object: bpy.types.Object, way: str, distance: float = 0.0) -> None:
-    """Show the rig of a bound mesh object together with it.
+def show(mesh_object: bpy.types.Object, mode: str, distance: float = 0.0) -> None:
+    """Show the rig of a bound mesh object.
 
     Args:
-        mesh_object: bound.
-        way: `BESIDE`, `OVERLAY`, or `NONE` to show it no more.
-        distance: to the side, along X of the world, in its units; 0 for the width of the character and a little.
+        mesh_object: the bound object.
+        mode: `BESIDE`, `OVERLAY`, or `NONE` to hide the rig.
+        distance: distance to the side, along the X axis of the world, in its units; 0 for a default.
     """
     from ..runtime.binding import unbind
 
     hide(mesh_object)
-    if way == NONE:
+    if mode == NONE:
         return
-    # Local, for of a library override no modifier could be removed.
+    # Local, because modifiers of a library override cannot be removed.
     other = mesh_object.copy().make_local()
     other.is_runtime_data = True
     unbind(other)
@@ -56,48 +56,48 @@ def show(mesh_object: bpy.types.Object, way: str, distance: float = 0.0) -> None
     other.name = f"{mesh_object.name} rig, to compare"
     other.hide_select = other.hide_render = True
     bpy.context.scene.collection.objects.link(other)
-    if way == OVERLAY:
+    if mode == OVERLAY:
         other.display_type, other.show_in_front = "WIRE", True
     else:
-        _move_aside(other, mesh_object, distance or GAP * _width(mesh_object))
+        _move_aside(other, mesh_object, distance or DISTANCE_IN_WIDTHS * _width(mesh_object))
 
 
 def hide(mesh_object: bpy.types.Object) -> None:
-    """Show the rig of a mesh object no more beside it."""
+    """Remove the comparison object of a mesh object."""
     _remove(find(mesh_object))
 
 
 def hide_all() -> None:
-    """Remove all copies of the open file."""
+    """Remove all comparison objects of the open file."""
     for other in comparisons():
         _remove(other)
 
 
 def _remove(other: bpy.types.Object | None) -> None:
     if other is not None:
-        # The mesh is the user's.
+        # Its mesh belongs to the character.
         bpy.data.objects.remove(other)
 
 
 def _width(mesh_object: bpy.types.Object) -> float:
-    """Of what is shown, along X of the world."""
-    shown = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    places = [(shown.matrix_world @ Vector(corner)).x for corner in shown.bound_box]
-    return max(places) - min(places)
+    """Return the evaluated width of an object along the X axis of the world."""
+    evaluated = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    x_values = [(evaluated.matrix_world @ Vector(corner)).x for corner in evaluated.bound_box]
+    return max(x_values) - min(x_values)
 
 
 def _move_aside(other: bpy.types.Object, mesh_object: bpy.types.Object, distance: float) -> None:
-    """Show an object to the side. Moved itself, it would not fit its bones any more; so its vertices are, at last."""
-    aside = mesh_object.matrix_world.to_3x3().inverted_safe() @ Vector((distance, 0, 0))
-    for axis, part in zip("XYZ", aside, strict=True):
-        if abs(part) > 1e-6 * aside.length:
+    """Move an object to the side with modifiers: a transform would change how its armature deforms it."""
+    offset = mesh_object.matrix_world.to_3x3().inverted_safe() @ Vector((distance, 0, 0))
+    for axis, component in zip("XYZ", offset, strict=True):
+        if abs(component) > 1e-6 * offset.length:
             modifier = other.modifiers.new(f"Aside {axis}", "DISPLACE")
-            modifier.direction, modifier.space, modifier.mid_level, modifier.strength = axis, "LOCAL", 0.0, part
+            modifier.direction, modifier.space, modifier.mid_level, modifier.strength = axis, "LOCAL", 0.0, component
 
 
 @persistent
-def _on_changed(*_: object) -> None:
-    """Remove the copies of what was deleted or unbound."""
+def _on_depsgraph_update_post(*_: object) -> None:
+    """Remove the comparison objects of removed objects."""
     global _object_count
     if _object_count == len(bpy.data.objects):
         return
@@ -108,4 +108,4 @@ def _on_changed(*_: object) -> None:
     _object_count = len(bpy.data.objects)
 
 
-HANDLERS = {"depsgraph_update_post": _on_changed}
+HANDLERS = {"depsgraph_update_post": _on_depsgraph_update_post}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The error of a model by frame, as a graph along the bottom of the timeline and of the dope sheet."""
+"""Draws the error of a model by frame as a graph in the timeline and the dope sheet."""
 
 import weakref
 
@@ -11,19 +11,19 @@ from gpu_extras.batch import batch_for_shader
 from ..scene.scene_rig import armature_of
 from . import last_evaluation
 
-HEIGHT, BOTTOM = 34, 18
-"""Of the graph, and of what Blender has below it, pixels at a scale of 1."""
-FILL, LINE = (0.9, 0.3, 0.2, 0.35), (1.0, 0.45, 0.3, 0.9)
+GRAPH_HEIGHT, GRAPH_BOTTOM = 34, 18
+"""Height of the graph, and its distance from the bottom of the region, in pixels at a UI scale of 1."""
+FILL_COLOR, LINE_COLOR = (0.9, 0.3, 0.2, 0.35), (1.0, 0.45, 0.3, 0.9)
 
 _handles: list[object] = []
-_curve: list[object] = []
-"""The evaluation whose errors were asked for last, and they."""
-_made: list[object] = []
-"""The evaluation and the place that batches were made for, and they."""
+_cached_curve: list[object] = []
+"""The last evaluation whose errors were computed, and the errors."""
+_cached_batches: list[object] = []
+"""The evaluation and the rectangle of the last GPU batches, and the batches."""
 
 
 def start() -> None:
-    """Draw from now on where there is an evaluation to draw."""
+    """Start drawing the errors of evaluations."""
     if not _handles and not bpy.app.background:
         add = bpy.types.SpaceDopeSheetEditor.draw_handler_add
         _handles.append(add(_draw, (), "WINDOW", "POST_PIXEL"))
@@ -31,16 +31,16 @@ def start() -> None:
 
 
 def stop() -> None:
-    """Draw no more."""
-    _curve.clear()
-    _made.clear()
+    """Stop drawing."""
+    _cached_curve.clear()
+    _cached_batches.clear()
     while _handles:
         bpy.types.SpaceDopeSheetEditor.draw_handler_remove(_handles.pop(), "WINDOW")
     redraw()
 
 
 def redraw() -> None:
-    """Draw the timelines again."""
+    """Redraw the timelines."""
     for window in getattr(bpy.context.window_manager, "windows", ()):
         for area in window.screen.areas:
             if area.type == "DOPESHEET_EDITOR":
@@ -48,18 +48,19 @@ def redraw() -> None:
 
 
 def errors_by_frame(last: last_evaluation.LastEvaluation) -> list[tuple[int, float]]:
-    """Frame and largest error of the model in mm, of every frame that was compared; none for random poses."""
+    """Return frame and largest error of the model in mm for each compared frame; empty for random poses."""
     if not last.name:
         return []
-    # The timeline is drawn at every frame that plays, and the errors are millions.
-    if not _curve or _curve[0]() is not last:
+    # Cached, because the timeline is redrawn in every frame and there are millions of errors.
+    if not _cached_curve or _cached_curve[0]() is not last:
         largest = last.errors["fdda"].max(axis=1) * 1000
-        _curve[:] = weakref.ref(last), [(last.first_frame + index, float(error)) for index, error in enumerate(largest)]
-    return _curve[1]
+        curve = [(last.first_frame + index, float(error)) for index, error in enumerate(largest)]
+        _cached_curve[:] = weakref.ref(last), curve
+    return _cached_curve[1]
 
 
-def _shown() -> last_evaluation.LastEvaluation | None:
-    """The evaluation of the active mesh, or of one on the active armature."""
+def _active_evaluation() -> last_evaluation.LastEvaluation | None:
+    """Return the evaluation of the active mesh, or of a mesh of the active armature."""
     active = bpy.context.view_layer.objects.active
     if active is None:
         return None
@@ -71,21 +72,21 @@ def _shown() -> last_evaluation.LastEvaluation | None:
 
 
 def _draw() -> None:
-    last = _shown()
+    last = _active_evaluation()
     curve = errors_by_frame(last) if last is not None else []
     if len(curve) < 2:
         return
     context = bpy.context
     scale, view = context.preferences.system.ui_scale, context.region.view2d
     largest = max(error for _, error in curve) or 1.0
-    bottom, height = BOTTOM * scale, HEIGHT * scale
-    # The view maps frames in proportion: two say where all are.
+    bottom, height = GRAPH_BOTTOM * scale, GRAPH_HEIGHT * scale
+    # The view maps frames linearly, so two frames define the positions of all.
     (first, _), (last_frame, _) = curve[0], curve[-1]
     left, right = (view.view_to_region(frame, 0, clip=False)[0] for frame in (first, last_frame))
     shader = gpu.shader.from_builtin("UNIFORM_COLOR")
     batches = _batches(last, (left, right, bottom, height), shader)
     gpu.state.blend_set("ALPHA")
-    for batch, color in zip(batches, (FILL, LINE), strict=True):
+    for batch, color in zip(batches, (FILL_COLOR, LINE_COLOR), strict=True):
         shader.uniform_float("color", color)
         batch.draw(shader)
     gpu.state.blend_set("NONE")
@@ -96,27 +97,27 @@ def _draw() -> None:
 
 
 def _batches(
-    last: last_evaluation.LastEvaluation, place: tuple[float, float, float, float], shader: gpu.types.GPUShader
+    last: last_evaluation.LastEvaluation, rectangle: tuple[float, float, float, float], shader: gpu.types.GPUShader
 ) -> tuple[gpu.types.GPUBatch, ...]:
-    """The area below the graph, and the graph; made anew when it is another or somewhere else, not for every frame.
+    """Return the GPU batches of the area below the graph and of the graph, cached until one of the arguments changes.
 
     Args:
-        last: what is drawn.
-        place: left and right end, bottom and height, pixels.
-        shader: that draws it.
+        last: the evaluation.
+        rectangle: left and right end, bottom and height of the graph, pixels.
+        shader: the shader.
     """
-    if not _made or _made[0]() is not last or _made[1] != place:
-        left, right, bottom, height = place
+    if not _cached_batches or _cached_batches[0]() is not last or _cached_batches[1] != rectangle:
+        left, right, bottom, height = rectangle
         curve = errors_by_frame(last)
         largest, step = max(error for _, error in curve) or 1.0, (right - left) / (len(curve) - 1)
         points = [(left + n * step, bottom + height * error / largest) for n, (_, error) in enumerate(curve)]
-        below = [corner for x, y in points for corner in ((x, bottom), (x, y))]
-        _made[:] = (
+        area = [corner for x, y in points for corner in ((x, bottom), (x, y))]
+        _cached_batches[:] = (
             weakref.ref(last),
-            place,
+            rectangle,
             (
-                batch_for_shader(shader, "TRI_STRIP", {"pos": below}),
+                batch_for_shader(shader, "TRI_STRIP", {"pos": area}),
                 batch_for_shader(shader, "LINE_STRIP", {"pos": points}),
             ),
         )
-    return _made[2]
+    return _cached_batches[2]

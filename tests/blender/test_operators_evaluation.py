@@ -131,13 +131,13 @@ def test_worst_frames_are_marked_and_jumped_to(active, evaluated_action):
     found = markers.find(scene)
     assert found[0].frame == worst and found[0].name == f"FDDA 1: {largest.max() * 1000:.2f} mm"
     frames = sorted(marker.frame for marker in found)
-    assert 1 < len(found) <= 3 and min(np.diff(frames)) >= last_evaluation.FRAMES_APART
+    assert 1 < len(found) <= 3 and min(np.diff(frames)) >= last_evaluation.MIN_FRAMES_APART
     bpy.ops.fdda.add_worst_markers(count=1)
     assert [marker.frame for marker in markers.find(scene)] == [worst]
     bpy.ops.fdda.jump_to_worst()
     assert scene.frame_current == worst
     bpy.ops.fdda.jump_to_worst(rank=2)
-    assert abs(scene.frame_current - worst) >= last_evaluation.FRAMES_APART
+    assert abs(scene.frame_current - worst) >= last_evaluation.MIN_FRAMES_APART
     bpy.ops.fdda.remove_markers()
     assert [marker.name for marker in scene.timeline_markers] == [own.name]
     refused(bpy.ops.fdda.remove_markers, "No frame is marked")
