@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Writes what a model plays to files that need no model: caches, .blend files, shape keys."""
+"""Bakes the output of a model to files that need no model: point caches, .blend files, shape keys."""

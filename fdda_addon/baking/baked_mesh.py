@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A mesh object that plays positions by itself, without its rig and without the add-on, for a file to hand on."""
+"""Makes a mesh object play baked positions, without its rig and without the add-on."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,10 +22,10 @@ BASIS = "Basis"
 
 
 def check_local(mesh_object: bpy.types.Object) -> None:
-    """Fail when the modifiers of an object cannot be replaced because it is linked.
+    """Check that the modifiers of an object can be replaced.
 
     Raises:
-        RigError: says from where.
+        RigError: the object is linked.
     """
     if mesh_object.library is not None:
         raise RigError(
@@ -36,19 +36,18 @@ def check_local(mesh_object: bpy.types.Object) -> None:
 
 @contextmanager
 def temporary_copy(mesh_object: bpy.types.Object) -> Iterator[bpy.types.Object]:
-    """A copy of a mesh object that takes its place and its name in the whole file for a while.
+    """Replace a mesh object in the file by a copy with the same name, without a model; restore it afterwards.
 
-    Whatever is done to the copy, its mesh excepted, the object itself is as it was afterwards. A model that is bound
-    to it is not bound to the copy.
+    Changes of the copy do not affect the object, except changes of its mesh.
 
     Args:
-        mesh_object: a local object, not in edit mode; a model that is bound to it must not play.
+        mesh_object: a local object, not in edit mode, whose model does not play.
     """
     name = mesh_object.name
-    # Local, for of a library override no modifier could be removed.
+    # Local, because modifiers of a library override cannot be removed.
     copy = mesh_object.copy().make_local()
     unbind(copy)
-    # With a fake user the object itself would be saved too.
+    # With a fake user the original object would be saved too.
     with temporary_attributes(mesh_object, use_fake_user=False):
         mesh_object.user_remap(copy)
         try:
@@ -61,34 +60,34 @@ def temporary_copy(mesh_object: bpy.types.Object) -> Iterator[bpy.types.Object]:
 
 
 def play_point_cache(mesh_object: bpy.types.Object, stack: ModifierStack, path: Path, first: int) -> None:
-    """Put a Mesh Cache modifier in the place of the modifiers of the rig; those above stay.
+    """Replace the modifiers of the rig by a Mesh Cache modifier; downstream modifiers stay.
 
     Args:
-        mesh_object: changed.
+        mesh_object: the object to change.
         stack: its modifiers.
-        path: of the point cache; a saved file names it relative to itself.
-        first: frame of its first sample.
+        path: path of the point cache; a saved file stores it relative to itself.
+        first: frame of the first sample.
     """
-    place = _remove_deformation(mesh_object, stack)
+    index = _remove_deformation(mesh_object, stack)
     modifier = mesh_object.modifiers.new(MODIFIER_NAME, "MESH_CACHE")
-    # Not always the last: another may be pinned to the end.
-    mesh_object.modifiers.move(mesh_object.modifiers.find(modifier.name), place)
+    # A new modifier is not the last where another one is pinned to the end.
+    mesh_object.modifiers.move(mesh_object.modifiers.find(modifier.name), index)
     modifier.cache_format, modifier.filepath = "PC2", stored_path(path)
     modifier.time_mode, modifier.play_mode = "FRAME", "SCENE"
     modifier.frame_start, modifier.frame_scale = first, 1.0
     modifier.interpolation, modifier.deform_mode = "LINEAR", "OVERWRITE"
-    # Blender's own axes: nothing is turned, and nothing is flipped as long as nobody says so.
+    # Blender's own axes, without any conversion.
     modifier.forward_axis, modifier.up_axis = "POS_Y", "POS_Z"
 
 
 def play_shape_keys(mesh_object: bpy.types.Object, stack: ModifierStack, positions: np.ndarray, first: int) -> None:
-    """Put absolute shape keys in the place of the modifiers of the rig, one a frame; modifiers above stay.
+    """Replace the modifiers of the rig by absolute shape keys, one for each frame; downstream modifiers stay.
 
     Args:
-        mesh_object: changed; it gets a mesh of its own.
+        mesh_object: the object to change; it gets a mesh of its own.
         stack: its modifiers.
         positions: (N, V, 3) float32, mesh-object space, mesh units.
-        first: frame of the first of them.
+        first: frame of the first positions.
     """
     _remove_deformation(mesh_object, stack)
     rest = rest_positions(mesh_object.data)
@@ -96,26 +95,26 @@ def play_shape_keys(mesh_object: bpy.types.Object, stack: ModifierStack, positio
     mesh_object.shape_key_clear()
     mesh_object.show_only_shape_key = False
     if mesh_object.parent_type in {"ARMATURE", "LATTICE"}:
-        # Such a parent deforms what has no modifier of it.
+        # Such a parent deforms an object that has no modifier for it.
         mesh_object.parent_type = "OBJECT"
     write(mesh_object.shape_key_add(name=BASIS, from_mix=False).data, COORDINATE, rest)
     keys = mesh_object.data.shape_keys
     keys.use_relative = False
-    for number, moved in enumerate(positions, 1):
-        # An absolute key stands where the time is when it is added.
-        keys.eval_time = number
-        key = mesh_object.shape_key_add(name=f"Frame {first + number - 1}", from_mix=False)
+    for eval_time, frame_positions in enumerate(positions, 1):
+        # Blender gives a new absolute key the current evaluation time.
+        keys.eval_time, frame = eval_time, first + eval_time - 1
+        key = mesh_object.shape_key_add(name=f"Frame {frame}", from_mix=False)
         key.interpolation = "KEY_LINEAR"
-        write(key.data, COORDINATE, np.ascontiguousarray(moved, np.float32))
-        # Each frame has its keyframe: between the first and the last alone, rounding would show in long actions.
-        keys.keyframe_insert("eval_time", frame=first + number - 1)
+        write(key.data, COORDINATE, np.ascontiguousarray(frame_positions, np.float32))
+        # Interpolation between only the first and the last frame would show rounding errors in long actions.
+        keys.keyframe_insert("eval_time", frame=frame)
     for curve in animation_curves(keys.animation_data.action):
         for point in curve.keyframe_points:
             point.interpolation = "LINEAR"
 
 
 def _remove(mesh_object: bpy.types.Object) -> None:
-    """Delete an object with what nothing else uses of it: its mesh, and the action of its shape keys."""
+    """Delete an object, its mesh, and the action of its shape keys, if nothing else uses them."""
     mesh = mesh_object.data
     animation = mesh.shape_keys.animation_data if mesh.shape_keys else None
     action = animation.action if animation else None
@@ -127,7 +126,7 @@ def _remove(mesh_object: bpy.types.Object) -> None:
 
 
 def _remove_deformation(mesh_object: bpy.types.Object, stack: ModifierStack) -> int:
-    """Remove the modifiers of the rig; returns the place where they were."""
+    """Remove the modifiers of the rig; return the index that follows them."""
     for name in stack.replaced:
         mesh_object.modifiers.remove(mesh_object.modifiers[name])
     return stack.insert_index - len(stack.replaced)

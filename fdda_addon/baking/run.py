@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bakes an action: what a model makes of it, frame by frame, in a file that plays without the add-on."""
+"""Bakes an action: writes the output of a model for each frame to a file that plays without the add-on."""
 
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -31,24 +31,24 @@ from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import assign_action, temporary_attributes, temporary_pose, temporary_visibility
 from .baked_mesh import check_local, play_point_cache, play_shape_keys, temporary_copy
 
-POINT_CACHE, BLEND = ".pc2", ".blend"
+POINT_CACHE_SUFFIX, BLEND_SUFFIX = ".pc2", ".blend"
 MAX_FRAME = 1048574
-"""Blender counts to it, and as far below zero."""
-BATCH_FRAMES = 32
-BATCH_BYTES = 6 << 20
-"""The model is asked for at most so many frames at once, and for no more bytes, so that no step takes long."""
+"""Largest frame number of Blender; the smallest is its negative."""
+MAX_BATCH_FRAMES = 32
+MAX_BATCH_BYTES = 6 << 20
+"""Limits of the frames for which the model runs at once, so that no step takes long."""
 
 
 @dataclass(frozen=True)
 class BakeSettings:
-    """What to bake.
+    """Settings of a bake.
 
     Attributes:
-        action: name of the action; empty for the scene as it is animated.
+        action: name of the action; empty for the animation of the scene.
         frames: first and last frame; None for those of the action, or of the scene.
-        shape_keys: write the positions as shape keys into the .blend file, not into a point cache beside it.
+        shape_keys: write the positions as shape keys into the .blend file, instead of a point cache beside it.
         overwrite: as in `core.output.check_outputs`.
-        strength: 0 for linear skinning alone, 1 for the model; None for the object's own, frame by frame.
+        strength: 0 for linear skinning alone, 1 for the model; None for the strength of the object in each frame.
     """
 
     action: str = ""
@@ -60,49 +60,49 @@ class BakeSettings:
 
 @dataclass(frozen=True)
 class Bake:
-    """What was baked: the frames, and the files that were written, that of the mesh first."""
+    """The result of a bake: the frames and the written files, the file with the mesh first."""
 
     frames: range
     files: tuple[Path, ...]
 
 
 def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSettings) -> Iterator[Progress | Bake]:
-    """Bake an action; a generator that does the work while it is iterated.
+    """Bake an action, as a generator that works while it is iterated.
 
-    A .pc2 file holds the positions in mesh-object space. A .blend file is a copy of the open file in which the mesh
-    plays them: from a point cache of its name beside it, or from shape keys. The scene is as before when the generator
-    ends, is closed, or raises, and no file is half written.
+    A .pc2 file contains the positions in mesh-object space. A .blend file is a copy of the open file in which the mesh
+    plays them from a point cache beside it, or from shape keys. The scene is restored when the generator ends, is
+    closed, or raises, and no file is left incomplete.
 
     Args:
         scene_rig: the rig.
-        model: of it.
-        out: where to write, a .pc2 or a .blend file.
-        settings: what to bake.
+        model: path of the model, or the loaded model.
+        out: path of the .pc2 or .blend file to write.
+        settings: settings of the bake.
 
     Yields:
-        Progress, and as the last thing the Bake.
+        Progress, and the Bake at the end.
 
     Raises:
         WrongUsageError: `out` has another extension, or there are no frames.
         RigError: there is no such action, or the rig cannot be posed or replaced.
-        ModelError: the model cannot be read, or is of another rig.
+        ModelError: the model cannot be read, or was trained for another rig.
         OutputError: a file cannot be written.
     """
     files = output_files(out, settings, [model.path if isinstance(model, Network) else model])
     action = find_action(settings.action) if settings.action else None
     frames = _frames(action, settings.frames)
-    if out.suffix == BLEND:
+    if out.suffix == BLEND_SUFFIX:
         check_local(scene_rig.mesh_object)
-    with model_disabled(scene_rig.mesh_object), ExitStack() as borrowed:
+    with model_disabled(scene_rig.mesh_object), ExitStack() as exit_stack:
         check_evaluable(scene_rig)
         reader = FrameReader(scene_rig, open_model(scene_rig, model), settings.strength)
         stack = read_stack(scene_rig.mesh_object)
-        borrowed.enter_context(_animated(scene_rig.armature_object, action))
-        if out.suffix == POINT_CACHE:
+        exit_stack.enter_context(_temporary_action(scene_rig.armature_object, action))
+        if out.suffix == POINT_CACHE_SUFFIX:
             with atomic_write(out) as cache:
                 yield from _write_frames(cache, reader, frames)
         elif settings.shape_keys:
-            with _scratch(out) as cache:
+            with _temporary_point_cache(out) as cache:
                 yield from _write_frames(cache, reader, frames)
                 with temporary_copy(scene_rig.mesh_object) as mesh_object:
                     play_shape_keys(mesh_object, stack, read_point_cache(cache).positions, frames.start)
@@ -117,23 +117,23 @@ def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSe
 
 
 def output_files(out: Path, settings: BakeSettings, inputs: Iterable[Path]) -> tuple[Path, ...]:
-    """The files that a bake writes, that of the mesh first.
+    """Return the files that a bake writes, the file with the mesh first, and check that they can be written.
 
     Args:
         out, settings: as for `bake`.
-        inputs: what is read beside the open file.
+        inputs: files that are read, besides the open file.
 
     Raises:
-        WrongUsageError: another extension than .pc2 and .blend, or shape keys in a .pc2 file.
-        OutputError: one cannot be written, or is read, or is a file of another kind.
+        WrongUsageError: the extension is not .pc2 or .blend, or shape keys are requested in a .pc2 file.
+        OutputError: a file cannot be written, is an input, or exists as another kind of file.
     """
-    if out.suffix not in {POINT_CACHE, BLEND}:
+    if out.suffix not in {POINT_CACHE_SUFFIX, BLEND_SUFFIX}:
         raise WrongUsageError(f"'{out}' ends in neither .pc2 nor .blend; give it the extension of what to write.")
-    if settings.shape_keys and out.suffix != BLEND:
+    if settings.shape_keys and out.suffix != BLEND_SUFFIX:
         raise WrongUsageError(f"Shape keys are written into a .blend file; give '{out}' that extension.")
-    with_cache = out.suffix == BLEND and not settings.shape_keys
-    files = (out, out.with_suffix(POINT_CACHE)) if with_cache else (out,)
-    kinds = {BLEND: file_kind.BLEND, POINT_CACHE: file_kind.POINT_CACHE}
+    with_cache = out.suffix == BLEND_SUFFIX and not settings.shape_keys
+    files = (out, out.with_suffix(POINT_CACHE_SUFFIX)) if with_cache else (out,)
+    kinds = {BLEND_SUFFIX: file_kind.BLEND, POINT_CACHE_SUFFIX: file_kind.POINT_CACHE}
     check_outputs(
         [(path, kinds[path.suffix]) for path in files], [Path(bpy.data.filepath), *inputs], settings.overwrite
     )
@@ -153,12 +153,14 @@ def _frames(action: bpy.types.Action | None, frames: tuple[int, int] | None) -> 
 
 
 class FrameReader:
-    """Reads what a model wants to know of a frame, and asks it for many at once."""
+    """Reads the inputs of a model in frames, and runs the model for several frames at once."""
 
     def __init__(self, scene_rig: SceneRig, opened: OpenedModel, strength: float | None = None):
-        """Args:
+        """Prepare to read frames.
+
+        Args:
             scene_rig: the rig; its modifiers may be off.
-            opened: the model, of this rig.
+            opened: the model of the rig.
             strength: as in `BakeSettings`.
 
         Raises:
@@ -166,32 +168,42 @@ class FrameReader:
         """
         self.scene_rig, self.network = scene_rig, opened.network
         info = opened.network.info
-        self._reader = PoseReader(scene_rig, info.joint_names, info.rest_matrices)
-        self._controls = ControlReader(scene_rig, info.controls)
+        self._pose_reader = PoseReader(scene_rig, info.joint_names, info.rest_matrices)
+        self._control_reader = ControlReader(scene_rig, info.controls)
         self._strength = strength
-        # The rest pose of the model: the objects may have moved since.
+        # The objects may have moved since training; pose matrices refer to the rest pose of the model.
         rig = replace(opened.linear_rig, rest_matrices=info.rest_matrices)
         self._blend = SkinningBlend(rig, read_mask(scene_rig.mesh_object))
 
     def read(self, frame: int) -> tuple[np.ndarray, ...]:
-        """Go to a frame; returns the inputs of the model, each without its first axis, and its strength there."""
+        """Read the inputs of the model in a frame.
+
+        Returns:
+            Pose matrices (J, 4, 4) in mesh-object space and controls (C,), both float32, and the strength.
+        """
         bpy.context.scene.frame_set(frame)
         depsgraph = bpy.context.evaluated_depsgraph_get()
         scene_objects = (self.scene_rig.mesh_object, self.scene_rig.armature_object)
-        pose = self._reader.read(*(scene_object.evaluated_get(depsgraph) for scene_object in scene_objects))
+        pose_matrices = self._pose_reader.read(*(o.evaluated_get(depsgraph) for o in scene_objects))
         strength = self.scene_rig.mesh_object.fdda.strength if self._strength is None else self._strength
-        return pose, self._controls.read(self.scene_rig, depsgraph), np.float32(strength)
+        return pose_matrices, self._control_reader.read(self.scene_rig, depsgraph), np.float32(strength)
 
     def positions(self, inputs: list[tuple[np.ndarray, ...]]) -> np.ndarray:
-        """(N, V, 3) float32 of frames that were read, mesh-object space, mesh units; valid until the next call.
+        """Run the model.
+
+        Args:
+            inputs: the inputs of N frames, as `read` returns them.
+
+        Returns:
+            (N, V, 3) float32, mesh-object space, mesh units; valid until the next call.
 
         Raises:
             ModelError: the model fails.
-            FDDAError: it gives positions that are not numbers.
+            FDDAError: the positions are not finite.
         """
-        poses, controls, strengths = (np.stack(values) for values in zip(*inputs, strict=True))
-        positions = self.network.positions(poses, controls)
-        positions = self._blend.apply(positions, poses, strengths)
+        pose_matrices, controls, strengths = (np.stack(values) for values in zip(*inputs, strict=True))
+        positions = self.network.positions(pose_matrices, controls)
+        positions = self._blend.apply(positions, pose_matrices, strengths)
         if not np.isfinite(positions).all():
             raise FDDAError(
                 f"The model '{self.network.path}' gives positions that are not numbers; look for a scale of zero or a "
@@ -204,15 +216,15 @@ def _write_frames(path: Path, reader: FrameReader, frames: range) -> Iterator[Pr
     """Write a point cache; the frame is as before afterwards."""
     scene, count = bpy.context.scene, reader.network.info.vertex_count
     frame, subframe = scene.frame_current, scene.frame_subframe
-    size = max(1, min(BATCH_FRAMES, BATCH_BYTES // (12 * count)))
+    batch_size = max(1, min(MAX_BATCH_FRAMES, MAX_BATCH_BYTES // (12 * count)))
     scene_rig = reader.scene_rig
-    shown = temporary_visibility((scene_rig.mesh_object, scene_rig.armature_object))
-    with open(path, "wb") as file, shown, _undeformed(scene_rig.mesh_object):
+    visible = temporary_visibility((scene_rig.mesh_object, scene_rig.armature_object))
+    with open(path, "wb") as file, visible, _deformation_disabled(scene_rig.mesh_object):
         writer = PointCacheWriter(file, count, frames.start, len(frames))
         inputs = []
         for done, number in enumerate(frames, 1):
             inputs.append(reader.read(number))
-            if len(inputs) == size or done == len(frames):
+            if len(inputs) == batch_size or done == len(frames):
                 writer.append(reader.positions(inputs))
                 inputs.clear()
             yield Progress("frames", done, len(frames))
@@ -221,8 +233,8 @@ def _write_frames(path: Path, reader: FrameReader, frames: range) -> Iterator[Pr
 
 
 @contextmanager
-def _animated(armature_object: bpy.types.Object, action: bpy.types.Action | None) -> Iterator[None]:
-    """Let an action alone drive an armature for a while, or what drives it anyway."""
+def _temporary_action(armature_object: bpy.types.Object, action: bpy.types.Action | None) -> Iterator[None]:
+    """Assign an action to an armature in place of its animation, None to keep that; restore everything afterwards."""
     with temporary_pose(armature_object, [action] if action else (), keep_animation=action is None):
         if action is not None:
             clear_pose(armature_object)
@@ -231,22 +243,22 @@ def _animated(armature_object: bpy.types.Object, action: bpy.types.Action | None
 
 
 @contextmanager
-def _undeformed(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """Spare Blender the deformation of a mesh, most of the time of a frame: the pose is all that is read."""
+def _deformation_disabled(mesh_object: bpy.types.Object) -> Iterator[None]:
+    """Switch the deformation of a mesh off, which takes most of the time of a frame: only the pose is read."""
     with ExitStack() as stack:
         for modifier in mesh_object.modifiers:
             stack.enter_context(temporary_attributes(modifier, show_viewport=False))
         if mesh_object.data.shape_keys is not None:
-            # A pinned key is merely copied.
+            # A pinned shape key is copied, not mixed.
             stack.enter_context(temporary_attributes(mesh_object, show_only_shape_key=True, active_shape_key_index=0))
         yield
 
 
 @contextmanager
-def _scratch(out: Path) -> Iterator[Path]:
-    """A temporary point cache on the disk that `out` is on."""
+def _temporary_point_cache(out: Path) -> Iterator[Path]:
+    """Yield the path of a temporary point cache on the same disk as `out`."""
     try:
         with tempfile.TemporaryDirectory(prefix=".fdda-", dir=out.parent, ignore_cleanup_errors=True) as folder:
-            yield Path(folder) / f"positions{POINT_CACHE}"
+            yield Path(folder) / f"positions{POINT_CACHE_SUFFIX}"
     except OSError as error:
         raise OutputError(f"Cannot write '{out}': {os_error_text(error)}; nothing was changed.") from error

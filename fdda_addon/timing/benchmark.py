@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Times a whole frame of a rig three ways in one process, in turn, so that the ratios hold on a noisy machine."""
+"""Times frames of a rig, of linear skinning and of a model in turn, so that the ratios hold on a noisy machine."""
 
 import os
 import platform
@@ -30,22 +30,25 @@ from ..scene.temporary_state import assign_action, temporary_attributes, tempora
 from .frame_times import FrameTimes, verdict
 
 ROUNDS = 5
-"""How often the ways take turns."""
-WARM_UP = 3
+"""Number of times that each setup is measured, in turn."""
+WARM_UP_FRAMES = 3
 RANDOM_POSES, KEY_STEP = 20, 5
-"""Poses of the animation of a rig that has none, and the frames between them."""
+"""Number of random poses that animate a rig without an action, and the frames between them."""
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Times of a frame, `scene.frame_set` and all that it evaluates, in milliseconds.
+    """Times of `scene.frame_set`, with everything that it evaluates, in milliseconds.
 
     Attributes:
-        vertices: of the mesh. frames: that were timed, each way.
-        rig: all modifiers of the rig. linear: its Armature modifier alone. fdda: the model in their place.
-        floor: as fdda, with constant positions in place of the model's.
-        inference: the model alone, one pose.
-        constant_bytes: of the model's graph, all of which a frame reads; 0 where the model does not say.
+        vertices: number of vertices of the mesh.
+        frames: number of frames for each setup.
+        rig: times with all modifiers of the rig.
+        linear: times with the Armature modifier alone.
+        fdda: times with the model.
+        floor: times as for `fdda`, without running the model.
+        inference: times of the model alone, for one pose.
+        constant_bytes: size of the constants of the model's graph, which each frame reads; 0 if unknown.
     """
 
     vertices: int
@@ -58,20 +61,24 @@ class Benchmark:
     constant_bytes: int
 
     def frame_times(self, model: str) -> FrameTimes:
-        """The medians, for a model's file."""
+        """Return the medians.
+
+        Args:
+            model: path of the model, as its binding stores it.
+        """
         return FrameTimes(
-            **{way: float(np.median(times)) for way, times in self._times()},
+            **{setup: float(np.median(times)) for setup, times in self._times()},
             constant_bytes=self.constant_bytes,
             model=model,
         )
 
     @property
     def ratio(self) -> float:
-        """How many times faster a frame is with the model than with the rig."""
+        """Return how many times faster a frame is with the model than with the rig."""
         return float(np.median(self.rig) / np.median(self.fdda))
 
     def to_json(self) -> dict:
-        """docs/formats.md describes it."""
+        """Return the times as JSON, described in docs/formats.md."""
         return {
             "unit": "ms",
             "vertices": self.vertices,
@@ -79,17 +86,19 @@ class Benchmark:
             "blender": bpy.app.version_string,
             "processor": platform.processor() or platform.machine(),
             "cores": os.cpu_count(),
-            **{way: {"median": _round(np.median(t)), "p90": _round(np.percentile(t, 90))} for way, t in self._times()},
+            **{
+                name: {"median": _round(np.median(t)), "p90": _round(np.percentile(t, 90))} for name, t in self._times()
+            },
             "ratio": _round(self.ratio),
             "pays": self.ratio > 1,
             "constant_bytes": self.constant_bytes,
         }
 
     def _times(self) -> list[tuple[str, list[float]]]:
-        return [(way, getattr(self, way)) for way in ("rig", "linear", "fdda", "floor", "inference")]
+        return [(setup, getattr(self, setup)) for setup in ("rig", "linear", "fdda", "floor", "inference")]
 
     def table(self) -> str:
-        """The times as text, and whether the model pays."""
+        """Format the times as text, with a verdict."""
         labels = {
             "rig": "true rig",
             "linear": "Armature modifier alone",
@@ -98,8 +107,8 @@ class Benchmark:
             "inference": "the model alone, one pose",
         }
         lines = [f"{self.vertices} vertices, ms a frame{'median':>12}{'p90':>10}"]
-        for way, times in self._times():
-            lines.append(f"  {labels[way]:<27}{np.median(times):>10.3f}{np.percentile(times, 90):>10.3f}")
+        for setup, times in self._times():
+            lines.append(f"  {labels[setup]:<27}{np.median(times):>10.3f}{np.percentile(times, 90):>10.3f}")
         if self.constant_bytes:
             lines.append(f"  {'a frame reads of the model, MB':<31}{self.constant_bytes / 1e6:>6.2f}")
         lines.append(f"  {verdict(float(np.median(self.rig)), float(np.median(self.fdda)))}")
@@ -111,47 +120,48 @@ def _round(value: float) -> float:
 
 
 def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[Progress | Benchmark]:
-    """Time a rig and a model in its place; a generator that does the work while it is iterated.
+    """Time a rig and a model, as a generator that works while it is iterated.
 
-    The armature's action is played, or random poses where it has none. The scene is as before afterwards.
+    It plays the action of the armature, or random poses if there is none, and restores the scene afterwards.
 
     Args:
         scene_rig: the rig.
-        model: the model, None for the one that is bound.
-        frames: to time, each way.
+        model: path of the model; None for the bound model.
+        frames: number of frames to time for each setup.
 
     Yields:
-        Progress, and as the last thing the Benchmark.
+        Progress, and the Benchmark at the end.
 
     Raises:
         RigError: the rig cannot be evaluated.
-        ModelError: the model cannot be read, or is of another rig.
+        ModelError: the model cannot be read, or was trained for another rig.
     """
     check_evaluable(scene_rig)
     mesh_object = scene_rig.mesh_object
     opened = open_model(scene_rig, model or model_files.network_of(mesh_object))
     channels = model_channels(scene_rig, opened.rig, opened.network.info)
     with playing(scene_rig, channels) as played, temporary_binding(scene_rig, model):
-        ways = {
+        setups = {
             "rig": model_disabled,
             "linear": skinning_only,
             "fdda": partial(temporary_mode, mode="FDDA"),
             "floor": _floor,
         }
-        times: dict[str, list[float]] = {way: [] for way in ways}
-        each = max(1, -(-frames // ROUNDS))
-        for number in range(ROUNDS):
-            for place, (way, prepare) in enumerate(ways.items(), 1):
+        times: dict[str, list[float]] = {setup: [] for setup in setups}
+        frames_per_round = max(1, -(-frames // ROUNDS))
+        for round_index in range(ROUNDS):
+            for setup_number, (setup, prepare) in enumerate(setups.items(), 1):
                 with prepare(mesh_object):
-                    times[way] += time_frames(played, number * each, each)
-                yield Progress("benchmark", number * len(ways) + place, ROUNDS * len(ways))
+                    times[setup] += time_frames(played, round_index * frames_per_round, frames_per_round)
+                yield Progress("benchmark", round_index * len(setups) + setup_number, ROUNDS * len(setups))
         network = model_files.network_of(mesh_object)
-        pose = network.info.rest_matrices[None]
+        pose_matrices = network.info.rest_matrices[None]
         controls = np.zeros((1, len(network.info.controls)), np.float32)
-        inference = _time([lambda: network.positions(pose, controls)] * (frames + WARM_UP))[WARM_UP:]
+        calls = [lambda: network.positions(pose_matrices, controls)] * (frames + WARM_UP_FRAMES)
+        inference = _time_calls(calls)[WARM_UP_FRAMES:]
     yield Benchmark(
         len(mesh_object.data.vertices),
-        each * ROUNDS,
+        frames_per_round * ROUNDS,
         **times,
         inference=inference,
         constant_bytes=network.info.constant_bytes,
@@ -160,9 +170,10 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
 
 @contextmanager
 def playing(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> Iterator[range]:
-    """Let its action drive the armature, one of random poses (`random_action`) where it has none; gives the frames.
+    """Play the action of an armature, or `random_action` if it has none; restore pose and animation afterwards.
 
-    Pose and animation are as before afterwards.
+    Yields:
+        The frames of the action.
     """
     animation = scene_rig.armature_object.animation_data
     own_action = animation.action if animation else None
@@ -178,11 +189,11 @@ def playing(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> Iterator
 
 
 def random_action(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> bpy.types.Action:
-    """Key random poses on the armature, a pose every few frames; its action.
+    """Key random poses on the armature, `KEY_STEP` frames apart, and return its action.
 
     Args:
         scene_rig: the rig.
-        channels: what a pose moves, those of the rig when left out; controls are left as they are.
+        channels: the channels of the poses, except controls; empty for those of the rig.
     """
     armature_object = scene_rig.armature_object
     channels = [c for c in channels or sampled_channels(scene_rig, read_rig(scene_rig)) if c.kind != CONTROL]
@@ -199,17 +210,26 @@ def random_action(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> bp
 
 
 def time_frames(played: range, first: int, count: int) -> list[float]:
-    """Milliseconds of `count` frames from the animation, the first few not counted."""
+    """Time frames of an animation after some warm-up frames.
+
+    Args:
+        played: frames of the animation.
+        first: index of the first frame; indices wrap around.
+        count: number of frames.
+
+    Returns:
+        Milliseconds of each frame.
+    """
     scene = bpy.context.scene
 
-    def show(number: int) -> Callable[[], None]:
-        return lambda: scene.frame_set(played[number % len(played)])
+    def frame_call(index: int) -> Callable[[], None]:
+        return lambda: scene.frame_set(played[index % len(played)])
 
-    return _time([show(first + number) for number in range(-WARM_UP, count)])[WARM_UP:]
+    return _time_calls([frame_call(first + offset) for offset in range(-WARM_UP_FRAMES, count)])[WARM_UP_FRAMES:]
 
 
-def _time(calls: list[Callable[[], object]]) -> list[float]:
-    """Milliseconds of each call."""
+def _time_calls(calls: list[Callable[[], object]]) -> list[float]:
+    """Time each call, in milliseconds."""
     times = []
     for call in calls:
         start = time.perf_counter()
@@ -220,7 +240,7 @@ def _time(calls: list[Callable[[], object]]) -> list[float]:
 
 @contextmanager
 def skinning_only(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """Blender's own linear skinning: the Armature modifier alone, shape keys pinned."""
+    """Show Blender's own linear skinning: the Armature modifier alone, with pinned shape keys."""
     skinning = armature_modifier(mesh_object)
     if skinning is None:
         raise RigError(f"'{mesh_object.name}' has no Armature modifier: there is no linear skinning to time.")
@@ -236,7 +256,7 @@ def skinning_only(mesh_object: bpy.types.Object) -> Iterator[None]:
 
 @contextmanager
 def _floor(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """The playback with a model that costs nothing: it answers the same positions for every pose."""
+    """Play without running the model."""
     with temporary_mode(mesh_object, "FDDA"):
         bpy.context.view_layer.update()
         with playback.without_model_runs():

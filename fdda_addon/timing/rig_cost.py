@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a frame of a rig costs, and whether a model would cost less. Measured before there is a model."""
+"""Measures the time of a frame of a rig, and estimates that of a model before there is one."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,22 +13,22 @@ from ..scene.scene_rig import SceneRig
 from .benchmark import playing, skinning_only, time_frames
 
 ROUNDS = 4
-FRAMES_EACH = 5
+FRAMES_PER_ROUND = 5
 
 PLAYBACK_MS = ((1_476, 0.50), (9_960, 0.51), (50_618, 0.73))
-"""By vertex count: what a frame with a model costs beyond the Armature modifier alone, ms; from docs/benchmarks.md."""
+"""Vertex counts, and the time of a frame with a model beyond that of the Armature modifier alone, ms."""
 MIN_CLEAR_SPEEDUP = 1.3
-"""Below this an estimate is too close to call."""
+"""Smallest estimated speed-up that is reported as one."""
 
 
 @dataclass(frozen=True)
 class RigCost:
-    """Milliseconds of a frame, medians.
+    """Median times of a frame in milliseconds.
 
     Attributes:
-        vertices: of the mesh.
-        rig: with all modifiers of the rig.
-        linear: with its Armature modifier alone.
+        vertices: number of vertices of the mesh.
+        rig: time with all modifiers of the rig.
+        linear: time with the Armature modifier alone.
     """
 
     vertices: int
@@ -37,12 +37,12 @@ class RigCost:
 
     @property
     def model(self) -> float:
-        """Estimate of a frame with a model, ms."""
+        """Estimate the time of a frame with a model, ms."""
         return self.linear + estimated_playback(self.vertices)
 
     @property
     def sentence(self) -> str:
-        """Whether a model would pay."""
+        """Tell whether a model would be faster."""
         gain = self.rig / self.model
         if gain >= MIN_CLEAR_SPEEDUP:
             return f"Worth it: about {gain:.1f}x faster."
@@ -52,7 +52,7 @@ class RigCost:
 
 
 def estimated_playback(vertices: int) -> float:
-    """What the playback of a model costs a frame, ms: between the meshes that were measured, in proportion beyond."""
+    """Estimate the time of playback in a frame, ms, by linear interpolation and extrapolation of `PLAYBACK_MS`."""
     counts, times = np.array(PLAYBACK_MS).T
     if vertices <= counts[-1]:
         return float(np.interp(vertices, counts, times))
@@ -61,12 +61,12 @@ def estimated_playback(vertices: int) -> float:
 
 
 def measure(scene_rig: SceneRig) -> Iterator[Progress | RigCost]:
-    """Time a rig and its Armature modifier alone, in turn; a generator that does the work while it is iterated.
+    """Time a rig and its Armature modifier alone, in turn, as a generator that works while it is iterated.
 
-    The armature's action is played, or random poses where it has none. The scene is as before afterwards.
+    It plays the action of the armature, or random poses if there is none, and restores the scene afterwards.
 
     Yields:
-        Progress, and as the last thing the RigCost.
+        Progress, and the RigCost at the end.
 
     Raises:
         RigError: the rig cannot be evaluated.
@@ -76,10 +76,11 @@ def measure(scene_rig: SceneRig) -> Iterator[Progress | RigCost]:
         check_evaluable(scene_rig)
         times: dict[str, list[float]] = {"rig": [], "linear": []}
         with playing(scene_rig) as frames:
-            for number in range(ROUNDS):
-                times["rig"] += time_frames(frames, number * FRAMES_EACH, FRAMES_EACH)
-                yield Progress("frames", 2 * number + 1, 2 * ROUNDS)
+            for round_index in range(ROUNDS):
+                first = round_index * FRAMES_PER_ROUND
+                times["rig"] += time_frames(frames, first, FRAMES_PER_ROUND)
+                yield Progress("frames", 2 * round_index + 1, 2 * ROUNDS)
                 with skinning_only(mesh_object):
-                    times["linear"] += time_frames(frames, number * FRAMES_EACH, FRAMES_EACH)
-                yield Progress("frames", 2 * number + 2, 2 * ROUNDS)
-    yield RigCost(len(mesh_object.data.vertices), *(float(np.median(times[way])) for way in ("rig", "linear")))
+                    times["linear"] += time_frames(frames, first, FRAMES_PER_ROUND)
+                yield Progress("frames", 2 * round_index + 2, 2 * ROUNDS)
+    yield RigCost(len(mesh_object.data.vertices), *(float(np.median(times[setup])) for setup in ("rig", "linear")))

@@ -5,7 +5,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.baking.run import BATCH_FRAMES, BakeSettings, bake
+from fdda_addon.baking.run import MAX_BATCH_FRAMES, BakeSettings, bake
 from fdda_addon.scene.scene_rig import find_rig
 
 from .baked_files import CLOSE, elbow_wave, model_says, read_pc2
@@ -20,7 +20,7 @@ def wave(elbow) -> np.ndarray:
 
 
 def test_more_frames_than_a_batch_take(elbow, tmp_path):
-    frames = range(-9, 3 * BATCH_FRAMES)
+    frames = range(-9, 3 * MAX_BATCH_FRAMES)
     out = tmp_path / "long.pc2"
     assert run("bake", elbow.rig, elbow.model, out, "--frames", frames[0], frames[-1]) == 0
     start, _, positions = read_pc2(out)
