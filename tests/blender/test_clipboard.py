@@ -84,5 +84,5 @@ def test_what_blenders_own_operator_copied_plays_too(bound, elbow):
 def test_in_another_mode_it_says_why_not(bound):
     bpy.context.view_layer.objects.active = bound
     bpy.ops.object.mode_set(mode="EDIT")
-    with pytest.raises(RuntimeError, match="Objects are copied in object mode"):
+    with pytest.raises(RuntimeError, match="Objects can only be copied in Object Mode"):
         bpy.ops.fdda.copy_objects()

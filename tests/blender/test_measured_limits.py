@@ -252,7 +252,7 @@ def test_command_line(tmp_path, capsys):
 
 def test_button(figure):
     bpy.context.view_layer.objects.active = figure.mesh_object
-    with pytest.raises(RuntimeError, match="No action is ticked; tick those of Actions to record as well"):
+    with pytest.raises(RuntimeError, match="No action is checked; check the actions under Also Record Actions"):
         bpy.ops.fdda.limits_from_actions()
     wave().fdda.record = True
     assert bpy.ops.fdda.limits_from_actions(margin=0.5) == {"FINISHED"}

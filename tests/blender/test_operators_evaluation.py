@@ -67,9 +67,9 @@ def test_what_cannot_be_evaluated_says_why(active):
     refused(lambda: bpy.ops.fdda.evaluate(action="jump"), "no action 'jump'")
     bpy.data.objects[ELBOW_RIG].animation_data.action = None
     refused(bpy.ops.fdda.evaluate, "'elbow_rig' has no action; give it one, or compare on random poses.")
-    for name in ("fit_range", "mark_worst", "jump_to_worst"):
-        refused(getattr(bpy.ops.fdda, name), "Nothing was evaluated since Blender was started; evaluate first")
-    refused(lambda: bpy.ops.fdda.color_mesh(colors="ERRORS"), "'elbow' was not evaluated since Blender was started")
+    for name in ("fit_color_range", "add_worst_markers", "jump_to_worst"):
+        refused(getattr(bpy.ops.fdda, name), "Nothing has been compared in this session; press Evaluate first")
+    refused(lambda: bpy.ops.fdda.color_mesh(colors="ERRORS"), "'elbow' has not been compared in this session")
     assert last_evaluation.get(active) is None and active.fdda.mode == "FDDA"
 
 
@@ -140,7 +140,7 @@ def test_worst_frames_are_marked_and_jumped_to(active, evaluated_action):
     assert abs(scene.frame_current - worst) >= last_evaluation.MIN_FRAMES_APART
     bpy.ops.fdda.remove_markers()
     assert [marker.name for marker in scene.timeline_markers] == [own.name]
-    refused(bpy.ops.fdda.remove_markers, "No frame is marked")
+    refused(bpy.ops.fdda.remove_markers, "There are no markers at worst frames")
 
 
 def test_the_worst_random_pose_is_set(active, view):

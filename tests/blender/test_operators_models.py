@@ -53,7 +53,7 @@ def test_removing_a_model_unbinds_it(rig, elbow, second):
     assert fdda.is_bound and [entry.name for entry in fdda.models] == ["elbow"]
     bpy.ops.fdda.remove_model()
     assert not fdda.is_bound and not fdda.models and elbow.model.is_file()
-    refused(bpy.ops.fdda.remove_model, "The list of models is empty")
+    refused(bpy.ops.fdda.remove_model, "The model library is empty")
 
 
 def test_the_list_comes_back_with_the_file(bound, elbow):
@@ -76,7 +76,7 @@ def test_packed_model_plays_without_its_file(packed_elbow, elbow, tmp_path):
     assert entry.packed_bytes == elbow.model.stat().st_size and not entry.packed.use_fake_user
     pose(angle=0.9)
     assert_plays(packed_elbow, elbow.model)
-    refused(bpy.ops.fdda.pack_model, "is packed already")
+    refused(bpy.ops.fdda.pack_model, "is already packed")
     path = tmp_path / "alone.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
     bpy.ops.wm.open_mainfile(filepath=str(path))

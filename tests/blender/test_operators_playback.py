@@ -93,7 +93,7 @@ def test_undo_of_bind_and_unbind(rig, elbow):
 def test_poll_says_why_not(elbow):
     refused(bpy.ops.fdda.unbind, "Nothing with a rig is active")
     bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
-    for name in ("unbind", "switch", "measure_model", "relink", "evaluate", "open_report"):
+    for name in ("unbind", "set_mode", "measure_model", "relink", "evaluate", "open_report"):
         refused(getattr(bpy.ops.fdda, name), "No model is bound; bind one first")
 
 

@@ -81,7 +81,7 @@ class TestRig:
 
     def test_not_in_edit_mode(self, saved):
         bpy.ops.object.mode_set(mode="EDIT")
-        with pytest.raises(RuntimeError, match="Objects are added in object mode; switch to it first"):
+        with pytest.raises(RuntimeError, match="Objects can only be added in Object Mode"):
             bpy.ops.fdda.add_sample_arm(density="1")
 
     def test_measuring_gives_back_the_scene_and_keeps_the_cost(self, saved):
@@ -237,7 +237,9 @@ class TestRecording:
 
     def test_an_unsaved_file_has_no_place_for_it(self):
         bpy.ops.fdda.add_sample_arm(density="1")
-        with pytest.raises(RuntimeError, match=r"The \.blend file has not been saved, so there is no place beside it"):
+        with pytest.raises(
+            RuntimeError, match=r"Save the \.blend file first \(recordings are stored next to it\), or choose a Folder"
+        ):
             bpy.ops.fdda.record()
 
     def test_a_folder_that_is_named(self, saved, tmp_path):

@@ -88,9 +88,9 @@ class TestBones:
         settings = arm.mesh_object.fdda.settings
         settings.sample = "COLLECTION"
         assert checks.check_now(arm).problems == (
-            "Random poses are to move a bone collection, and none is chosen; choose it under Poses.",
+            "Bones to Pose is set to Bone Collection, but no collection is chosen; choose one in Training Poses.",
         )
-        with pytest.raises(RuntimeError, match="move a bone collection, and none is chosen"):
+        with pytest.raises(RuntimeError, match="set to Bone Collection, but no collection is chosen"):
             bpy.ops.fdda.record()
         settings.bone_collection = control_rigs.CONTROLS
         bpy.ops.fdda.add_control(name=IK)
@@ -113,7 +113,7 @@ class TestBones:
     def test_what_the_ticked_actions_key(self, arm):
         settings = arm.mesh_object.fdda.settings
         settings.sample = "ACTIONS"
-        with pytest.raises(RuntimeError, match="what the ticked actions key, and none is ticked; tick one"):
+        with pytest.raises(RuntimeError, match="but no action is checked; check one"):
             bpy.ops.fdda.record()
         action = wave(arm)
         check = checks.check_now(arm)
@@ -154,7 +154,7 @@ class TestBones:
         settings = arm.mesh_object.fdda.settings
         settings.sample = "SELECTED"
         select(arm)
-        assert checks.check_now(arm).problems[0].endswith("select them and press Use Selected Bones.")
+        assert checks.check_now(arm).problems[0].endswith("select bones and press Use Selected Bones.")
         with pytest.raises(RuntimeError, match="No bone of 'elbow_rig' is selected; select bones in Pose Mode"):
             bpy.ops.fdda.use_selected_bones()
         select(arm, "ik_hand", "ik_pole")
