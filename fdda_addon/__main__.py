@@ -12,7 +12,7 @@ if __name__ == "__main__":
 
     restart_in_utf8_mode()
     if sys.argv[1:2] == ["farm"]:
-        from .cli.farm import become_farm
+        from .cli.farm import replace_process_with_farm
 
-        become_farm(sys.argv[2:])
+        replace_process_with_farm(sys.argv[2:])
     sys.exit(main(sys.argv[1:], "python -m fdda_addon"))

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line: one verb a file, each with its options and what it runs; `main` finds it."""
+"""The command line: one module per verb with its options and its `run`; `main` imports it."""

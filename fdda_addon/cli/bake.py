@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`bake RIG.blend MODEL.onnx OUT`: an action as the model shows it, in a file that plays without the add-on."""
+"""`bake RIG.blend MODEL.onnx OUT`: bakes an action of the model to a file that plays without the add-on."""
 
 import argparse
 from pathlib import Path
@@ -7,7 +7,7 @@ from pathlib import Path
 from ..baking.run import BakeSettings, bake, output_files
 from ..core.progress import Progress
 from .files import add_rig_options, open_rig
-from .outputs import add_overwrite
+from .outputs import add_overwrite_option
 from .progress import ProgressPrinter
 
 
@@ -32,7 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--shape-keys", action="store_true", help="keep the positions in the .blend file, a shape key each frame"
     )
-    add_overwrite(parser)
+    add_overwrite_option(parser)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`benchmark RIG.blend MODEL.onnx --json OUT.json`: what a frame costs."""
+"""`benchmark RIG.blend MODEL.onnx --json OUT.json`: measures the time of a frame."""
 
 import argparse
 from pathlib import Path
@@ -11,8 +11,8 @@ from ..core.progress import Progress
 from ..runtime.binding import model_disabled
 from ..timing.benchmark import benchmark
 from .files import add_rig_options
-from .folders import by_object, headed, open_rigs
-from .outputs import add_overwrite
+from .folders import open_rigs, to_json_by_object, with_heading
+from .outputs import add_overwrite_option
 from .progress import ProgressPrinter
 
 
@@ -21,7 +21,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
     parser.add_argument("--json", metavar="OUT.json", type=Path, required=True, help="where to write the times")
     parser.add_argument("--frames", type=int, default=100, help="frames to time, each way (default 100)")
-    add_overwrite(parser)
+    add_overwrite_option(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -35,6 +35,6 @@ def run(options: argparse.Namespace) -> None:
                 if isinstance(step, Progress):
                     progress.show(step.stage, step.done, step.total)
         benchmarks[name] = step
-    write_json(options.json, by_object({name: measured.to_json() for name, measured in benchmarks.items()}))
+    write_json(options.json, to_json_by_object({name: measured.to_json() for name, measured in benchmarks.items()}))
     for name, measured in benchmarks.items():
-        print(headed(name, measured.table()))
+        print(with_heading(name, measured.table()))

@@ -6,13 +6,13 @@ from pathlib import Path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    from .outputs import add_overwrite
+    from .outputs import add_overwrite_option
 
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="where to save the rig")
     parser.add_argument(
         "--density", type=int, choices=(1, 2, 3), default=1, help="about 1,450, 10,000 or 50,000 vertices (default 1)"
     )
-    add_overwrite(parser)
+    add_overwrite_option(parser)
 
 
 def run(options: argparse.Namespace) -> None:

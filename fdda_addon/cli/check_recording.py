@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`check-recording RECORDING`: what is suspicious about a recording."""
+"""`check-recording RECORDING`: checks a recording before training."""
 
 import argparse
 from pathlib import Path
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    from .outputs import add_overwrite
+    from .outputs import add_overwrite_option
 
     parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
     parser.add_argument("--strict", action="store_true", help="let warnings be errors")
     parser.add_argument("--json", metavar="OUT.json", type=Path, help="write the warnings")
-    add_overwrite(parser)
+    add_overwrite_option(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the warnings, one a line.
+    """Print the warnings, one per line.
 
     Raises:
         RecordingError: the recording cannot be read, or there are warnings and they are errors.

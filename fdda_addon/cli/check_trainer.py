@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`check-trainer`: whether the Python that trains can, as the preferences show it."""
+"""`check-trainer`: checks the Python that trains, as the preferences do."""
 
 import argparse
 
@@ -8,11 +8,11 @@ from ..training.environment.choice import check_trainer_python
 
 
 def add_options(_parser: argparse.ArgumentParser) -> None:
-    """It has none."""
+    """Declare no options."""
 
 
 def run(_options: argparse.Namespace) -> None:
-    """Print what the Python says of itself.
+    """Print the result of the check.
 
     Raises:
         TrainerEnvironmentError: it cannot train.

@@ -13,10 +13,10 @@ from ..evaluation.run import Evaluation, EvaluationSettings, evaluate
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig
 from .files import add_rig_options
-from .folders import by_object, headed, open_rigs
-from .outputs import add_overwrite
+from .folders import open_rigs, to_json_by_object, with_heading
+from .outputs import add_overwrite_option
 from .progress import ProgressPrinter
-from .target import add_target, target_settings
+from .target import add_target_options, target_settings
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -44,11 +44,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="X",
         help="compare at X times the range as well",
     )
-    add_target(parser)
+    add_target_options(parser)
     parser.add_argument(
         "--heatmap", metavar="OUT.png", type=Path, help="draw rig, linear skinning and model as heat maps"
     )
-    add_overwrite(parser)
+    add_overwrite_option(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -85,14 +85,14 @@ def run(options: argparse.Namespace) -> None:
             true = f"target '{options.target}'" if options.target else "true rig"
             poses = worst_poses(evaluations[name].held_out)
             draw_comparison(scene_rig, model, poses, picture, heat=True, true=true)
-        content = by_object({name: evaluation.to_json() for name, evaluation in evaluations.items()})
+        content = to_json_by_object({name: evaluation.to_json() for name, evaluation in evaluations.items()})
         errors.write_text(to_json_text(content), encoding="utf-8")
     for name, evaluation in evaluations.items():
-        print(headed(name, table(evaluation)))
+        print(with_heading(name, table(evaluation)))
 
 
 def run_evaluation(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> Evaluation:
-    """Evaluate with progress on stderr."""
+    """Evaluate a model with progress on stderr."""
     with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
         for step in evaluate(scene_rig, model, settings):
             if isinstance(step, Progress):
@@ -101,7 +101,7 @@ def run_evaluation(scene_rig: SceneRig, model: Path, settings: EvaluationSetting
 
 
 def table(evaluation: Evaluation) -> str:
-    """The errors as text, in mm."""
+    """Format the errors as a text table, in mm."""
     head = f"{'error in mm':<24}{'mean':>10}{'rms':>10}{'p99':>10}{'p99.9':>10}{'max':>10}"
     lines = [head, "-" * len(head)]
     random = [] if any(errors is evaluation.held_out for errors in evaluation.actions) else [evaluation.held_out]
@@ -123,7 +123,7 @@ def table(evaluation: Evaluation) -> str:
 
 
 def _surface_lines(normals: dict, edges: dict) -> list[str]:
-    """What shading shows: a line on normals, one on edges."""
+    """Format errors of normals and of edge lengths, one line each."""
     angles, lengths = [], []
     for way, label in (("fdda", "FDDA"), ("linear", "linear skinning")):
         angle, edge = normals[way], edges[way]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`farm characters.toml …`: many characters on many machines; the farm reads its own options, in a process of its own.
+"""`farm characters.toml …`: records and trains many characters; the farm parses its options in its own process.
 
 It is no part of the extension: it starts Blender, and never runs in it.
 """
@@ -13,7 +13,7 @@ from ..training.environment.folder import ROOT
 
 
 def run(arguments: list[str]) -> int:
-    """Run the farm; returns its exit status.
+    """Run the farm; return its exit status.
 
     Raises:
         FDDAError: it is not there.
@@ -26,8 +26,8 @@ def run(arguments: list[str]) -> int:
     return subprocess.run(command, env=environment, check=False).returncode
 
 
-def become_farm(arguments: list[str]) -> None:
-    """Run the farm in place of this program, so that signals reach it; returns where that is not possible."""
+def replace_process_with_farm(arguments: list[str]) -> None:
+    """Replace this process with the farm, so that signals reach it; return where that is not possible."""
     # On Windows the program would end at once, and the farm go on without it.
     if os.name == "posix" and _is_there():
         command, environment = _command(arguments)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Opening .blend files, with sentences in place of Blender's reports."""
+"""Opening of .blend files, with error messages in place of Blender's reports."""
 
 import argparse
 from pathlib import Path
@@ -12,13 +12,13 @@ from ..scene.scene_rig import SceneRig, find_rig
 
 
 def add_rig_options(parser: argparse.ArgumentParser) -> None:
-    """The rig file and its object."""
-    add_rig(parser)
+    """Declare the rig file and its object."""
+    add_rig_argument(parser)
     parser.add_argument("--object", default="", metavar="NAME", help="the mesh object, when several have a rig")
 
 
-def add_rig(parser: argparse.ArgumentParser) -> None:
-    """The rig file alone."""
+def add_rig_argument(parser: argparse.ArgumentParser) -> None:
+    """Declare the rig file."""
     parser.add_argument("rig", metavar="RIG.blend", type=Path, help="the file with the rig")
 
 
@@ -26,7 +26,7 @@ def open_rig(options: argparse.Namespace) -> SceneRig:
     """Open a .blend file and find its rig.
 
     Raises:
-        FDDAError: the file cannot be opened, or holds no rig.
+        FDDAError: the file cannot be opened, or has no rig.
     """
     open_file(options.rig)
     return find_rig(options.object)

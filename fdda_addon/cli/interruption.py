@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Ctrl-C, and other requests to stop, while a verb runs.
+"""Handling of Ctrl-C and other stop signals while a verb runs.
 
-Blender prints an exception that leaves a handler, a property's update function or what it calls to register a class,
-and goes on; numpy turns one that strikes while it is imported into an ImportError. So a request that comes there is
-repeated until the verb is elsewhere.
+Blender catches and prints exceptions in handlers, in update functions of properties and while it registers classes.
+numpy converts an exception during its import to an ImportError. So a signal that arrives there is repeated until the
+verb has left that code.
 """
 
 import threading
@@ -22,16 +22,16 @@ _REGISTRATION_UPDATES_AND_DRAWING = {
 }
 
 _called_by_blender: set[str] = set(_REGISTRATION_UPDATES_AND_DRAWING)
-"""Modules whose functions Blender calls."""
+"""Names of modules whose functions Blender calls."""
 _pending = 0
-"""Signal of a request that had to wait."""
+"""Number of a signal that is delayed, 0 for none."""
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Inside, a request to stop raises KeyboardInterrupt(signal), at once or as soon as it does not get lost."""
+    """Raise KeyboardInterrupt(signal) for stop signals in the block, as soon as Blender cannot catch it."""
     if threading.current_thread() is not threading.main_thread():
-        # Only the main thread may say what a signal does; it is not this job that Ctrl-C ends.
+        # Only the main thread can install signal handlers.
         yield
         return
     global _pending
@@ -43,14 +43,14 @@ def interruptible() -> Iterator[None]:
         restore_handlers(previous)
 
 
-def note_callbacks(modules: Iterable[str]) -> None:
-    """Let no KeyboardInterrupt be raised in functions of these modules, which Blender calls."""
+def set_callback_modules(modules: Iterable[str]) -> None:
+    """Set the modules whose functions Blender calls, in which no KeyboardInterrupt is raised."""
     global _called_by_blender
     _called_by_blender = {*modules} | _REGISTRATION_UPDATES_AND_DRAWING
 
 
 def raise_pending() -> None:
-    """Raise the KeyboardInterrupt of a request that had to wait, if there is one; for the end of imports."""
+    """Raise the KeyboardInterrupt of a delayed signal, if there is one, after imports."""
     global _pending
     if _pending:
         number, _pending = _pending, 0

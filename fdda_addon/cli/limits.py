@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`limits RIG.blend OUT.blend --action NAME`: the range of motion of a rig, set from actions."""
+"""`limits RIG.blend OUT.blend --action NAME`: sets the range of motion of a rig from actions."""
 
 import argparse
 import math
@@ -9,7 +9,7 @@ from pathlib import Path
 def add_options(parser: argparse.ArgumentParser) -> None:
     from ..poses.measured_limits import DEFAULT_MARGIN
     from .files import add_rig_options
-    from .outputs import add_overwrite
+    from .outputs import add_overwrite_option
 
     add_rig_options(parser)
     parser.add_argument("out", metavar="OUT.blend", type=Path, help="where to save the file with the limits")
@@ -20,7 +20,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default=DEFAULT_MARGIN,
         help=f"part of the width of a range that is added at each end (default {DEFAULT_MARGIN})",
     )
-    add_overwrite(parser)
+    add_overwrite_option(parser)
 
 
 def run(options: argparse.Namespace) -> None:

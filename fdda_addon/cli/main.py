@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Runs a verb: the command line of the add-on.
+"""The command line of the add-on, which runs a verb.
 
-Exit status: 0 done, 1 failed with one sentence on stderr, 2 wrong usage, 75 failed for a reason of the machine's (disk,
-memory, a process that was killed), so that trying again may help, 130 interrupted.
+Exit status: 0 done, 1 failed with one sentence on stderr, 2 wrong usage, 75 failed because of the machine (disk,
+memory, a killed process), so that the command may work later, 130 interrupted.
 """
 
 import argparse
@@ -28,10 +28,10 @@ VERBS = {
     "farm": ("farm", "record, train and bind many characters on many machines"),
     "bake": ("bake", "write an action as the model shows it, to play without the add-on"),
 }
-OF_ANOTHER_PROCESS = {"train", "farm"}
-"""Verbs whose options are read by the process that they start."""
-WITHOUT_BLENDER = {"merge-recordings"}
-"""Verbs that run in this process, where there is no Blender."""
+SUBPROCESS_VERBS = {"train", "farm"}
+"""Verbs whose options are parsed by the process that they start."""
+VERBS_WITHOUT_BLENDER = {"merge-recordings"}
+"""Verbs that need no Blender."""
 
 
 def main(arguments: list[str], program: str) -> int:
@@ -39,7 +39,7 @@ def main(arguments: list[str], program: str) -> int:
 
     Args:
         arguments: the verb and its options.
-        program: how the user called it, for the usage lines.
+        program: name of the program in usage lines.
 
     Returns:
         The exit status.
@@ -59,15 +59,15 @@ def _run(arguments: list[str], program: str) -> int:
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     for name, (module_name, summary) in VERBS.items():
         subparser = verbs.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
-        if name == verb and verb not in OF_ANOTHER_PROCESS:
-            # The other verbs are not imported: a verb costs what it needs.
+        if name == verb and verb not in SUBPROCESS_VERBS:
+            # Other verbs are not imported, so that a verb starts fast.
             import_module(f".{module_name}", __package__).add_options(subparser)
     try:
-        if verb in OF_ANOTHER_PROCESS:
+        if verb in SUBPROCESS_VERBS:
             return import_module(f".{verb}", __package__).run(arguments[1:])
         options = parser.parse_args(arguments)
         module = import_module(f".{VERBS[verb][0]}", __package__)
-        if verb in WITHOUT_BLENDER:
+        if verb in VERBS_WITHOUT_BLENDER:
             module.run(options)
             return 0
         from .registered import registered
@@ -76,7 +76,7 @@ def _run(arguments: list[str], program: str) -> int:
             module.run(options)
         return 0
     except SystemExit as usage:
-        # Blender must not be ended by a wrong option of ours.
+        # A wrong option must not end Blender.
         return int(usage.code or 0)
     except FDDAError as error:
         status = exit_status(error)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`merge-recordings SHARD… RECORDING`: what `record --shard` made, joined; Blender is not needed for it."""
+"""`merge-recordings SHARD… RECORDING`: merges the shards of `record --shard`, without Blender."""
 
 import argparse
 import time

@@ -1,52 +1,52 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Progress on stderr: a bar on a terminal, plain lines elsewhere."""
+"""Progress on stderr: a bar on a terminal, plain lines otherwise."""
 
 import sys
 import time
 from typing import TextIO
 
-WIDTH = 30
-PLAIN_PARTS = 10
-"""Plain output has a line for each tenth of a stage."""
+BAR_WIDTH = 30
+PLAIN_LINES = 10
+"""Number of plain lines per stage."""
 
 
 class ProgressPrinter:
-    """Prints how far the stages of a job are; use as a context manager, so that a bar's line is always ended."""
+    """Context manager that prints the progress of a job, and ends the line of the bar."""
 
     def __init__(self, stream: TextIO | None = None):
         self._stream = stream or sys.stderr
-        self._bar = self._stream.isatty()
-        self._stage, self._part, self._start, self._open = "", -1, 0.0, False
+        self._uses_bar = self._stream.isatty()
+        self._stage, self._last_tenth, self._start, self._has_open_line = "", -1, 0.0, False
 
     def show(self, stage: str, done: int, total: int, note: str = "") -> None:
         """Show `done` of `total` steps of a stage."""
         if stage != self._stage:
             self.end_line()
-            self._stage, self._part, self._start = stage, -1, time.monotonic()
+            self._stage, self._last_tenth, self._start = stage, -1, time.monotonic()
         seconds = time.monotonic() - self._start
         note = f"  {note}" if note else ""
-        if self._bar:
-            filled = WIDTH * done // max(total, 1)
-            bar = "█" * filled + "░" * (WIDTH - filled)
+        if self._uses_bar:
+            filled = BAR_WIDTH * done // max(total, 1)
+            bar = "█" * filled + "░" * (BAR_WIDTH - filled)
             self._stream.write(f"\r{stage:<12} {bar} {done}/{total}  {seconds:.0f} s{note}\x1b[K")
-            self._open = True
-        elif (part := PLAIN_PARTS * done // max(total, 1)) != self._part:
-            self._part = part
+            self._has_open_line = True
+        elif (tenth := PLAIN_LINES * done // max(total, 1)) != self._last_tenth:
+            self._last_tenth = tenth
             self._stream.write(f"{stage}: {done} of {total}, {seconds:.1f} s{note}\n")
         self._stream.flush()
 
     def say(self, text: str) -> None:
-        """Print a line of its own."""
+        """Print a separate line."""
         self.end_line()
         self._stream.write(f"{text}\n")
         self._stream.flush()
 
     def end_line(self) -> None:
-        """End the line of a bar, so that something else can be printed."""
-        if self._open:
+        """End the line of the bar, so that other text can be printed."""
+        if self._has_open_line:
             self._stream.write("\n")
             self._stream.flush()
-            self._open = False
+            self._has_open_line = False
 
     def __enter__(self) -> "ProgressPrinter":
         return self

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`record RIG.blend RECORDING`: random poses and their residuals, or more of them where a model is worst.
+"""`record RIG.blend RECORDING`: records random poses and their residuals, or adds poses where a model is worst.
 
 With `--all`, or with several `--object`, the meshes share the poses, each with a recording of its own in the folder.
 """
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    from .files import add_rig
-    from .target import add_repeatability, add_target
+    from .files import add_rig_argument
+    from .target import add_repeatability_option, add_target_options
 
-    add_rig(parser)
+    add_rig_argument(parser)
     parser.add_argument(
         "--object",
         action="append",
@@ -97,7 +97,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--shard",
-        type=_shard,
+        type=_parse_shard,
         metavar="K/N",
         help="record part K of N of the poses; all parts, joined by merge-recordings, are the recording of one run",
     )
@@ -107,18 +107,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--influences", metavar="FOLDER", type=Path, help="take them from what --detect-influences made of the same rig"
     )
-    add_target(parser)
-    add_repeatability(parser)
+    add_target_options(parser)
+    add_repeatability_option(parser)
     parser.add_argument(
         "--refine", metavar="MODEL.onnx", type=Path, help="add poses to the recording where this model is worst"
     )
 
 
-def _shard(text: str) -> tuple[int, int]:
-    """Number and count of "2/8".
+def _parse_shard(text: str) -> tuple[int, int]:
+    """Parse number and count of a shard such as "2/8".
 
     Raises:
-        argparse.ArgumentTypeError: it is something else.
+        argparse.ArgumentTypeError: the text is invalid.
     """
     from ..core.recording.shard import MAX_SHARDS
 
@@ -147,7 +147,7 @@ def run(options: argparse.Namespace) -> None:
     if not 1 <= options.margin <= MAX_MARGIN:
         raise WrongUsageError(f"--margin must be 1, for none, to {MAX_MARGIN:g} times the range of motion.")
     target_settings(options)
-    of_new = (
+    new_recording_options = (
         options.action,
         options.strip,
         options.mirror,
@@ -159,7 +159,7 @@ def run(options: argparse.Namespace) -> None:
         options.influences,
         options.target,
     )
-    if options.refine and (any(of_new) or options.poses == 0):
+    if options.refine and (any(new_recording_options) or options.poses == 0):
         raise WrongUsageError(
             "--refine adds random poses to a complete recording; leave --action, --strip, --mirror, --sample, "
             "--control, --fit-linear, --shard, --influences and --target out."
@@ -175,12 +175,12 @@ def run(options: argparse.Namespace) -> None:
     if options.overwrite and (options.resume or options.refine):
         raise WrongUsageError("--overwrite makes a new recording; leave --resume and --refine out.")
     open_file(options.rig)
-    rigs = _rigs(options)
+    rigs = _find_rigs(options)
     start = time.monotonic()
     with ProgressPrinter() as progress, ExitStack() as stack:
         for scene_rig, _ in rigs:
             stack.enter_context(model_disabled(scene_rig.mesh_object))
-        for step in _steps(rigs, options):
+        for step in _make_job(rigs, options):
             if step.note:
                 progress.end_line()
                 print(step.note, flush=True)
@@ -200,8 +200,8 @@ def run(options: argparse.Namespace) -> None:
         print(f"{recording}: {done} in {seconds:.1f} s")
 
 
-def _rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":
-    """The meshes to record, each with the folder of its recording."""
+def _find_rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":
+    """Find the meshes to record, each with the folder of its recording."""
     from ..scene.scene_rig import find_rig, find_rigs
     from .folders import mesh_folders
 
@@ -213,16 +213,16 @@ def _rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":
     return [(find_rig(*names), options.recording)]
 
 
-def _steps(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> "Iterator[Progress]":
+def _make_job(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> "Iterator[Progress]":
     from ..recording.plan import RecordingSettings
     from ..recording.refinement import RefinementSettings, refine
     from ..recording.run import record_meshes
-    from .target import poses_of, target_settings
+    from .target import requested_poses, target_settings
 
-    poses = poses_of(rigs[0][0], options)
-    given = {} if poses is None else {"poses": poses}
+    poses = requested_poses(rigs[0][0], options)
+    pose_options = {} if poses is None else {"poses": poses}
     if options.refine:
-        settings = RefinementSettings(seed=options.seed, resume=options.resume, **given)
+        settings = RefinementSettings(seed=options.seed, resume=options.resume, **pose_options)
         return refine(rigs[0][0], options.recording, options.refine, settings)
     settings = RecordingSettings(
         seed=options.seed,
@@ -241,6 +241,6 @@ def _steps(rigs: "list[tuple[SceneRig, Path]]", options: argparse.Namespace) -> 
         detect_influences=options.detect_influences,
         influences=options.influences,
         target=target_settings(options),
-        **given,
+        **pose_options,
     )
     return record_meshes(rigs, settings)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Options about a target: another object whose surface is learned in place of the rig's own."""
+"""Options of a target, an object whose surface is recorded in place of the rig's own."""
 
 import argparse
 import math
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ..scene.scene_rig import SceneRig
 
 
-def add_repeatability(parser: argparse.ArgumentParser) -> None:
+def add_repeatability_option(parser: argparse.ArgumentParser) -> None:
     """Declare `--repeatability-poses`."""
     parser.add_argument(
         "--repeatability-poses",
@@ -25,8 +25,8 @@ def add_repeatability(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_target(parser: argparse.ArgumentParser) -> None:
-    """Declare `--target` and how it is brought to poses."""
+def add_target_options(parser: argparse.ArgumentParser) -> None:
+    """Declare `--target` and its settings."""
     parser.add_argument(
         "--target",
         default="",
@@ -58,10 +58,10 @@ def add_target(parser: argparse.ArgumentParser) -> None:
 
 
 def target_settings(options: argparse.Namespace) -> "TargetSettings":
-    """The settings that the options state.
+    """Make the settings of the target from the options.
 
     Raises:
-        WrongUsageError: they make no sense.
+        WrongUsageError: the options are invalid.
     """
     from ..rig.pose_setter import TargetSettings
 
@@ -81,10 +81,10 @@ def target_settings(options: argparse.Namespace) -> "TargetSettings":
     )
 
 
-def poses_of(scene_rig: "SceneRig", options: argparse.Namespace) -> int | None:
-    """How many random poses are asked for; None where nothing says.
+def requested_poses(scene_rig: "SceneRig", options: argparse.Namespace) -> int | None:
+    """Return the number of random poses; None for the default.
 
-    A target that shows frames has none: 0 where actions or strips are given.
+    A target that depends on frames has no random poses where actions or strips are given.
     """
     from ..core.recording.target import POSE
     from ..rig.target import find_target

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`train RECORDING MODEL.onnx …`: the trainer with its own options, started in the Python that has torch.
+"""`train RECORDING MODEL.onnx …`: starts the trainer with its own options in the Python that has torch.
 
-RECORDING may be a folder of recordings, and MODEL.onnx is then the folder of their models. With `--refine RIG.blend` it
-goes on by itself: while the goal is missed and more poses help, it adds poses to the recording where the model is
-worst, and trains on.
+RECORDING may be a folder of recordings; then MODEL.onnx is a folder of models. With `--refine RIG.blend` the verb adds
+poses where the model is worst and trains again, while the goal is missed and more poses help.
 """
 
 import argparse
@@ -28,7 +27,7 @@ MAX_ROUNDS = 20
 
 
 def run(arguments: list[str]) -> int:
-    """Train; `arguments` are those of `python -m trainer` and of `_refinement_parser`. Returns the exit status."""
+    """Train with the arguments of `python -m trainer` and of `_refinement_parser`; return the exit status."""
     parser = _refinement_parser()
     if not arguments or {"-h", "--help"} & set(arguments):
         command, environment = trainer_command(arguments)
@@ -36,12 +35,12 @@ def run(arguments: list[str]) -> int:
         if arguments:
             print(f"\n{parser.format_help()}", end="")
         return status
-    options, own = parser.parse_known_args(arguments)
+    options, trainer_arguments = parser.parse_known_args(arguments)
     if options.refine is None:
         if options.object or options.poses is not None:
             raise WrongUsageError("--object and --poses say how to refine; give --refine RIG.blend with them.")
-        return _train(own)[0]
-    return _train_to_goal(own, options)
+        return _train(trainer_arguments)[0]
+    return _train_to_goal(trainer_arguments, options)
 
 
 def _refinement_parser() -> argparse.ArgumentParser:
@@ -56,7 +55,7 @@ def _refinement_parser() -> argparse.ArgumentParser:
 
 
 def _train(arguments: list[str]) -> tuple[int, dict]:
-    """One training; its exit status, and what it said last."""
+    """Run one training; return its exit status and its last message."""
     values: dict = {}
     with Training(arguments) as training, ProgressPrinter() as progress:
         for message in training.messages():
@@ -72,23 +71,23 @@ def _train(arguments: list[str]) -> tuple[int, dict]:
                 progress.say(WARNING_LINE.format(**values))
             elif message.type is MessageType.MODEL_FINISHED:
                 progress.end_line()
-                print(_line(values), flush=True)
+                print(_finished_line(values), flush=True)
             elif message.type is MessageType.CANCELLED:
                 return INTERRUPTED, values
     if models := values.get("models"):
         print(f"{values['model']}: {models} models in {values['seconds']:.1f} s")
     else:
-        print(_line(values))
+        print(_finished_line(values))
     return 0, values
 
 
-def _line(values: dict) -> str:
-    """About a model that is trained."""
+def _finished_line(values: dict) -> str:
+    """Describe a trained model."""
     return f"{values['model']}: trained in {values['seconds']:.1f} s, held-out error {values['held_out_mm']:.4f} mm"
 
 
 def _train_to_goal(arguments: list[str], options: argparse.Namespace) -> int:
-    """Train, and refine the recording, in turn."""
+    """Alternate training and refinement until the goal is met."""
     if len(arguments) < 2 or any(argument.startswith("-") for argument in arguments[:2]):
         raise WrongUsageError("With --refine, give RECORDING and MODEL.onnx before the training settings.")
     if not any(argument.partition("=")[0] == GOAL for argument in arguments):
@@ -103,12 +102,12 @@ def _train_to_goal(arguments: list[str], options: argparse.Namespace) -> int:
     from .registered import registered
 
     with registered():
-        # Before the first training: a wrong path or object shows at once.
+        # Open the rig first, so that a wrong path or object is an error at once.
         _open_rig(options)
-        for number in range(MAX_ROUNDS):
-            if number:
-                _refine(recording, model, options, number)
-            warm = [WARM_START] if number and WARM_START not in arguments else []
+        for round_index in range(MAX_ROUNDS):
+            if round_index:
+                _refine(recording, model, options, round_index)
+            warm = [WARM_START] if round_index and WARM_START not in arguments else []
             status, values = _train([*arguments, *warm])
             if status or values.get("verdict") != Verdict.MISSED.value:
                 return status
@@ -124,13 +123,13 @@ def _open_rig(options: argparse.Namespace) -> "SceneRig":
     return find_rig(options.object)
 
 
-def _refine(recording: Path, model: Path, options: argparse.Namespace, number: int) -> None:
+def _refine(recording: Path, model: Path, options: argparse.Namespace, round_index: int) -> None:
     from ..recording.refinement import RefinementSettings, refine
     from ..runtime.binding import model_disabled
 
     scene_rig = _open_rig(options)
-    given = {} if options.poses is None else {"poses": options.poses}
+    pose_options = {} if options.poses is None else {"poses": options.poses}
     with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
-        for step in refine(scene_rig, recording, model, RefinementSettings(seed=number, **given)):
+        for step in refine(scene_rig, recording, model, RefinementSettings(seed=round_index, **pose_options)):
             progress.show(step.stage, step.done, step.total)
     print(f"{recording}: {step.total} poses added where the model is worst")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Jobs that go on by themselves: they wait for other processes, and touch no data of Blender's.
+"""Background jobs, which wait for other processes and use no data of Blender.
 
-A timer looks after them: unlike a modal operator it does not end with its window, that of the preferences for instance.
+A timer runs them, because a modal operator would end with its window, such as the preferences.
 """
 
 import queue
@@ -14,7 +14,7 @@ from .job import ENVIRONMENT, JobRunner, JobState, current, redraw
 
 TICK_SECONDS, TICK_WORK_SECONDS = 0.2, 0.02
 THREAD_JOIN_SECONDS = 10.0
-"""A thread that was asked to end is left to itself after so long."""
+"""Time to wait for a thread that was asked to end."""
 
 _run: JobRunner | None = None
 
@@ -22,15 +22,18 @@ _run: JobRunner | None = None
 def iterate_in_thread(
     steps: Iterator[object], state: JobState, cancel: Callable[[], None] | None = None
 ) -> Iterator[object]:
-    """Iterate `steps` in a thread of its own: for what blocks, and touches no data of Blender's.
+    """Iterate `steps` in a thread, for work that blocks and uses no data of Blender.
 
     Args:
         steps: the work.
-        state: of its job; when it is to be cancelled, `steps` is.
-        cancel: has `steps` end soon, called from another thread; None where that is not possible.
+        state: of the job, which may request its cancellation.
+        cancel: thread-safe function that ends `steps` soon; None where that is not possible.
 
     Yields:
-        What `steps` yields, None while there is nothing. It raises what `steps` raises.
+        The values of `steps`, None while there is none.
+
+    Raises:
+        BaseException: as `steps`.
     """
     results: queue.SimpleQueue[tuple[object, BaseException | None]] = queue.SimpleQueue()
 
@@ -39,7 +42,7 @@ def iterate_in_thread(
             for step in steps:
                 results.put((step, None))
             results.put((None, StopIteration()))
-        except BaseException as error:  # Not lost: it is raised where the job is looked after.
+        except BaseException as error:  # Raised again in the main thread.
             results.put((None, error))
 
     thread = threading.Thread(target=work, name=f"FDDA: {state.title}", daemon=True)
@@ -67,7 +70,7 @@ def iterate_in_thread(
 
 
 def run_in_background(run: JobRunner) -> None:
-    """Iterate a job on the trainer's environment until it ends, whatever happens to windows and files."""
+    """Iterate a job on the training environment until it ends, independent of windows and files."""
     global _run
     _run = run
     if not bpy.app.timers.is_registered(_tick):
@@ -75,14 +78,14 @@ def run_in_background(run: JobRunner) -> None:
 
 
 def unregister() -> None:
-    """Look after nothing any more; `job.unregister` ends the job."""
+    """Remove the timer; `job.unregister` ends the job."""
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
 
 
 def _tick() -> float | None:
     if current(ENVIRONMENT) is None:
-        # It was ended from outside.
+        # The job was stopped.
         return None
     if _run.work(TICK_WORK_SECONDS):
         print(f"FDDA: {_run.state.outcome}")

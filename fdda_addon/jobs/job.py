@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The jobs under way and those that have ended: what panels draw, and what ends a job from outside.
+"""Running and ended jobs, for panels to draw, and stopping of jobs.
 
-A job is a generator that works while it is iterated: it yields `Progress`, None when there is nothing to do at the
-moment, and at most one other value, its result. One job at a time works on a character, and one beside it on the
-trainer's environment. `operators.job` iterates the one, `background` the other.
+A job is a generator that yields `Progress`, None while it waits, and at most one other value, its result. One job at a
+time works on a character, iterated by `operators.job`, and one on the training environment, iterated by `background`.
 """
 
 import time
@@ -20,9 +19,8 @@ from ..scene import draw_cache
 
 LOG_LINES = 2000
 CHARACTER, ENVIRONMENT = "character", "environment"
-"""What jobs work on. That on a character ends with the file; that on the trainer's environment touches no data of
-Blender's, and goes on when its window is closed and another file is opened.
-"""
+"""What a job works on. A job on a character ends with the file. A job on the training environment uses no data of
+Blender and continues when another file is opened."""
 STAGE_UNITS = {
     "fit": "vertices fitted",
     "probes": "poses compared with the rig",
@@ -31,13 +29,13 @@ STAGE_UNITS = {
     "evaluation": "poses compared",
     "benchmark": "measurements",
 }
-"""What the stages of jobs count, where their names do not say it."""
+"""Labels for the units of stages whose names do not say what they count."""
 STAGE_LABELS = {
     "influences": "Step 1 of 2: testing bones",
     "starting": "Step 1 of 3: reading the recording",
     "partitions prepared": "Step 2 of 3: preparing body parts",
 }
-"""How panels name the stages that another one follows."""
+"""Labels of preparing stages in panels."""
 
 
 @dataclass

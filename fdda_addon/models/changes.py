@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What has changed of a rig since a model of it was trained."""
+"""Changes of a rig since a model of it was trained."""
 
 from dataclasses import dataclass
 
@@ -16,12 +16,12 @@ from .model_list import entry_info
 
 @dataclass(frozen=True)
 class Changes:
-    """What has changed of a rig since a model of it was trained.
+    """Changes of a rig since a model of it was trained.
 
     Attributes:
-        model: what the model is called.
-        clauses: changes that keep it from playing ("the skin weights differ").
-        limits: bones whose range of motion is another; there the model plays, but leaves what it was trained on.
+        model: name of the model.
+        clauses: changes that prevent playback ("the skin weights differ").
+        limits: bones whose range of motion has changed; the model plays, but outside of its training poses.
     """
 
     model: str
@@ -30,12 +30,12 @@ class Changes:
 
     @property
     def prevents_playback(self) -> bool:
-        """Whether the model cannot play any more."""
+        """Whether the changes prevent playback."""
         return bool(self.clauses)
 
     @property
     def sentence(self) -> str:
-        """Says what has changed and what to do; empty when nothing has."""
+        """One sentence with the changes and what to do; empty without changes."""
         if self.clauses:
             return (
                 f"{self.model} is of this rig as it was before: {'; '.join(self.clauses)}. Undo the change, or record "
@@ -52,7 +52,7 @@ class Changes:
 
 
 def compare_with_model(name: str, info: ModelInfo, rig: Rig, channels: tuple[Channel, ...]) -> Changes:
-    """Compare a rig, and the range of motion of its poses, with what a model was trained for.
+    """Compare a rig and its range of motion with those that a model was trained for.
 
     Args:
         name, info: the model.
@@ -70,7 +70,7 @@ def compare_with_model(name: str, info: ModelInfo, rig: Rig, channels: tuple[Cha
 
 
 def find_changes(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> Changes:
-    """What has changed of a rig since a model of its list was trained.
+    """Find the changes of a rig since a model of its list was trained.
 
     Raises:
         FDDAError: the rig or the model cannot be read.

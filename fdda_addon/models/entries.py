@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The list of models that a mesh object keeps, as panels draw it: nothing is read from disk and numpy is not needed."""
+"""Entries in the list of models of a mesh object, for drawing: reads no files and needs no numpy."""
 
 import bpy
 
 
 def active_entry(mesh_object: bpy.types.Object) -> bpy.types.PropertyGroup | None:
-    """The entry that is chosen in the list, None when the list is empty."""
+    """Return the active entry of the list; None where the list is empty."""
     binding = mesh_object.fdda
     if not binding.models:
         return None
@@ -13,22 +13,22 @@ def active_entry(mesh_object: bpy.types.Object) -> bpy.types.PropertyGroup | Non
 
 
 def is_bound(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> bool:
-    """Whether an entry of the list is the model that is bound."""
+    """Return whether an entry is the bound model."""
     binding = mesh_object.fdda
     return binding.is_bound and binding.packed == entry.packed and binding.model == entry.path
 
 
 def bound_entry(mesh_object: bpy.types.Object) -> bpy.types.PropertyGroup | None:
-    """The entry of the model that is bound, None when it is not in the list."""
+    """Return the entry of the bound model; None where it is not in the list."""
     return next((entry for entry in mesh_object.fdda.models if is_bound(mesh_object, entry)), None)
 
 
 def bound_model_name(mesh_object: bpy.types.Object) -> str:
-    """What the bound model is called."""
+    """Return the name of the bound model."""
     entry = bound_entry(mesh_object)
     return entry.name if entry else bpy.path.display_name_from_filepath(mesh_object.fdda.model)
 
 
 def format_file_size(count: int) -> str:
-    """A size for people: "1.3 MB"."""
+    """Format a size in bytes: "1.3 MB"."""
     return f"{count / 1e6:.1f} MB" if count >= 1e5 else f"{count / 1e3:.1f} kB"

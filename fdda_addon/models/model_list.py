@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The models of a mesh object: the list that it keeps, and which of them is bound."""
+"""The list of models of a mesh object: adding, binding, packing and removing of models."""
 
 import os
 from pathlib import Path
@@ -21,14 +21,14 @@ _info_cache: dict[tuple, ModelInfo] = {}
 
 
 def add_model(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGroup:
-    """Put a model that the user has chosen or trained into the list of its mesh; it becomes the chosen entry.
+    """Add a model to the list of its mesh and make it active.
 
     Returns:
-        Its entry, the one that is there already for the same file. Where that is bound, the file is loaded anew, and
-        packed anew where it is packed.
+        The entry, an existing one for the same file. A changed file is packed again where it is packed, and loaded
+        again where it is bound.
 
     Raises:
-        ModelError: a packed model is to be replaced, and the file cannot be read or is no model.
+        ModelError: a packed model changed, and its file cannot be read or is no model.
     """
     binding = mesh_object.fdda
     model_files.allow(path)
@@ -54,7 +54,7 @@ def add_model(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGr
 
 
 def add_bound_model(mesh_object: bpy.types.Object) -> None:
-    """Put the model that is bound into the list, where a script or the command line has bound it."""
+    """Add the bound model to the list where a script or the command line has bound it."""
     binding = mesh_object.fdda
     if binding.is_bound and bound_entry(mesh_object) is None:
         entry = binding.models.add()
@@ -63,7 +63,7 @@ def add_bound_model(mesh_object: bpy.types.Object) -> None:
 
 
 def require_active_entry(mesh_object: bpy.types.Object) -> bpy.types.PropertyGroup:
-    """The entry that is chosen in the list.
+    """Return the active entry of the list.
 
     Raises:
         ModelError: the list is empty.
@@ -75,19 +75,19 @@ def require_active_entry(mesh_object: bpy.types.Object) -> bpy.types.PropertyGro
 
 
 def check_matches_rig(scene_rig: SceneRig, path: Path) -> None:
-    """Fail when a file is no model, or was trained for another rig.
+    """Check that a file is a model of this rig.
 
     Raises:
-        FDDAError: says why.
+        FDDAError: it is no model, or of another rig.
     """
     read_matching_rig(scene_rig, path, read_model_info(path))
 
 
 def bind_entry(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> None:
-    """Bind a model of the list and play it, in place of the one that is bound.
+    """Bind a model of the list in place of the bound one.
 
     Raises:
-        FDDAError: as `bind`, or it cannot play; what was bound is bound again.
+        FDDAError: as `bind`, or the model cannot play; the previous model is bound again.
     """
     mesh_object = scene_rig.mesh_object
     _bind(scene_rig, entry_path(mesh_object, entry), entry.packed)
@@ -96,12 +96,12 @@ def bind_entry(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> None:
 
 
 def _bind(scene_rig: SceneRig, path: Path, packed_model: bpy.types.Text | None = None) -> None:
-    """As `bind_entry`; the list is left as it is."""
+    """Bind a model as `bind_entry` does, without changing the list."""
     mesh_object, binding = scene_rig.mesh_object, scene_rig.mesh_object.fdda
     use_in_render = binding.use_in_render
     previous = (binding.model, binding.packed, binding.mode) if binding.is_bound else None
     bind(scene_rig, path, use_in_render, packed_model)
-    # Evaluated here, so that what cannot play is told now and not at the next frame.
+    # Evaluate now, so that a model that cannot play is an error here and not at the next frame.
     bpy.context.view_layer.update()
     if problem := binding.status:
         is_changed = previous is not None and previous[:2] != (binding.model, binding.packed)
@@ -114,10 +114,10 @@ def _bind(scene_rig: SceneRig, path: Path, packed_model: bpy.types.Text | None =
 
 
 def relink(scene_rig: SceneRig, path: Path) -> None:
-    """Bind the file that the bound model has moved to; its entry in the list follows.
+    """Bind the new location of the bound model, and update its entry.
 
     Raises:
-        FDDAError: as `bind_entry`; the list is as before.
+        FDDAError: as `bind_entry`; the list is unchanged.
     """
     mesh_object = scene_rig.mesh_object
     entry = bound_entry(mesh_object)
@@ -133,10 +133,10 @@ def relink(scene_rig: SceneRig, path: Path) -> None:
 
 
 def remove_entry(mesh_object: bpy.types.Object, index: int) -> str:
-    """Take a model off the list and unbind it if it is bound; returns its name. Its file stays, a packed one goes.
+    """Remove a model from the list, and unbind it where it is bound; return its name. Its file is kept.
 
     Raises:
-        ModelError: a library override has the entry from its library.
+        ModelError: the entry belongs to the library of an override.
     """
     binding = mesh_object.fdda
     entry = binding.models[index]
@@ -154,11 +154,11 @@ def remove_entry(mesh_object: bpy.types.Object, index: int) -> str:
 
 
 def pack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path | None = None) -> int:
-    """Put a model of the list into the .blend file; returns its size in bytes.
+    """Pack a model of the list into the .blend file; return its size in bytes.
 
     Args:
         mesh_object, entry: the model.
-        path: of its file, where that was chosen just now; None to follow the entry.
+        path: of its file; None for the path of the entry.
 
     Raises:
         ModelError: its file cannot be read or is no model.
@@ -174,7 +174,7 @@ def pack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pa
 
 
 def _repack_if_changed(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path) -> bool:
-    """Pack the file of a packed model where it is another now; returns whether it was."""
+    """Pack the file of a packed model again where it has changed; return whether it has."""
     if entry.packed.get(packed_model.KEY) == read_model(path)[1]:
         return False
     pack_entry(mesh_object, entry, path)
@@ -183,11 +183,11 @@ def _repack_if_changed(mesh_object: bpy.types.Object, entry: bpy.types.PropertyG
 
 
 def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path) -> None:
-    """Write a packed model to a file and play that from now on.
+    """Write a packed model to a file, and use this file from now on.
 
     Raises:
-        ModelError: what is packed is no model any more.
-        OutputError: the file cannot be written, or another is there.
+        ModelError: the packed data is no valid model.
+        OutputError: the file cannot be written, or another file exists.
     """
     data = packed_model.read(entry.packed)
     check_model(data, entry.packed.name)
@@ -207,19 +207,19 @@ def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, 
 
 
 def entry_path(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> Path:
-    """Where the model of an entry is, or was before it was packed.
+    """Return the path of the model of an entry, or its path before packing.
 
     Raises:
-        ModelError: the path of a saved file leads out of the file's folder.
+        ModelError: the path in a saved file leads out of the file's folder.
     """
     return absolute_path(mesh_object, entry.path) if entry.packed else model_files.allowed_path(mesh_object, entry.path)
 
 
 def entry_info(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> ModelInfo:
-    """What a model of the list says of itself; read once.
+    """Return the cached metadata of a model of the list.
 
     Raises:
-        ModelError: it cannot be read or is no model.
+        ModelError: the model cannot be read or is invalid.
     """
     if entry.packed:
         key = (entry.packed.session_uid,)

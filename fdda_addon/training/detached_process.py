@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Trainings that outlast the Blender that has started them.
+"""Detached trainings, which continue after Blender has closed.
 
-What such a training says goes into a file among the add-on's own, by the path of its model. So another file may be
-opened and Blender closed, or crash: whoever opens the character again follows the training from its first message, also
-where it has ended meanwhile. No file beside a model, which may be anyone's, is trusted to name a process.
+The messages of such a training are written to a file in the user's folder of the add-on, by the path of its model. So
+another file may be opened, and Blender may be closed or crash. When the character is opened again, the training is
+read from its first message, also where it has ended. Files beside a model are untrusted and never name a process.
 """
 
 import contextlib
@@ -26,11 +26,11 @@ from .process import Training
 
 POLL_SECONDS = 0.1
 _child_processes: dict[int, subprocess.Popen] = {}
-"""Processes of this Blender, by their number: somebody has to ask for their status once they have ended."""
+"""Child processes of this Blender by process id, whose exit status must be collected."""
 
 
 class DetachedTraining(Training):
-    """A training that goes on when `leave` was called before the block ends; otherwise its process is gone then."""
+    """A training that continues after the block when it was detached; otherwise it ends with the block."""
 
     loss_advice = "no model was written, train again"
 
@@ -39,11 +39,11 @@ class DetachedTraining(Training):
 
         Args:
             arguments: of `python -m trainer`.
-            model: the file that it writes; one training of it at a time.
+            model: the file to write; one training at a time.
 
         Raises:
             TrainingError: the interpreter cannot be started.
-            OutputError: the folder for what it says cannot be written.
+            OutputError: the folder for its messages cannot be written.
         """
         self._files, self._is_detached = _ProcessFiles(model), False
         super().__init__(arguments)
@@ -51,7 +51,7 @@ class DetachedTraining(Training):
         try:
             self._files.write_process_id(self._process.pid)
         except OutputError:
-            # Nobody would find it again.
+            # Without its process id the training cannot be attached again.
             self.__exit__()
             raise
 
@@ -76,14 +76,14 @@ class DetachedTraining(Training):
     def _read(self) -> None:
         offset, rest = 0, b""
         while not self._is_detached:
-            # Asked before reading: what was written before it ended is read.
+            # Polled before reading, so that all output of an ended process is read.
             is_alive = self._process.poll() is None
             try:
                 with self._files.messages.open("rb") as file:
                     file.seek(offset)
                     chunk = file.read()
             except PermissionError:
-                # On Windows, while `is_running` of another thread tries the file.
+                # On Windows, while `is_running` of another thread accesses the file.
                 time.sleep(POLL_SECONDS)
                 continue
             offset += len(chunk)
@@ -96,7 +96,7 @@ class DetachedTraining(Training):
         self._lines.put(None)
 
     def detach(self) -> None:
-        """Let it go on when the block ends."""
+        """Let the training continue after the block."""
         self._is_detached = True
         if self._finalizer is not None:
             self._finalizer.detach()
@@ -111,10 +111,10 @@ class DetachedTraining(Training):
 
 
 class AttachedTraining(DetachedTraining):
-    """A training that was left, followed from its first message."""
+    """A detached training, attached and read from its first message."""
 
     def __init__(self, model: Path):
-        """Follow the training of a model; `is_detached` has to be true."""
+        """Attach to the training of a model, for which `is_detached` is true."""
         self._files, self._is_detached = _ProcessFiles(model), False
         self._stop_file, self._errors = self._files.stop_file, self._files.errors()
         pid = self._files.process_id
@@ -123,12 +123,12 @@ class AttachedTraining(DetachedTraining):
 
 
 def is_detached(model: Path) -> bool:
-    """Whether a training of a model was left and nobody has seen its end yet."""
+    """Return whether a model has a detached training whose end was not read yet."""
     return _ProcessFiles(model).process_id > 0
 
 
 class _ProcessFiles:
-    """What is known of the training of a model, on the disk: its process, and what that has said."""
+    """Files of a detached training: process id, messages, stderr and stop file."""
 
     def __init__(self, model: Path):
         name = hashlib.sha256(os.path.normcase(model.resolve()).encode("utf-8", "surrogateescape")).hexdigest()[:24]
@@ -138,7 +138,7 @@ class _ProcessFiles:
         self._errors = self._path.with_suffix(".errors")
 
     def new_messages(self) -> BinaryIO:
-        """The file for what a process says, which holds it locked as long as it lives.
+        """Create the file for messages, which the process keeps locked while it runs.
 
         Raises:
             OutputError: it cannot be written.
@@ -152,11 +152,11 @@ class _ProcessFiles:
         return file
 
     def new_errors(self) -> TextIO:
-        """The file for what a process writes to stderr; raises as `new_messages`."""
+        """Create the file for stderr; raises as `new_messages`."""
         return io.TextIOWrapper(self._new(self._errors), encoding="utf-8", errors="replace")
 
     def errors(self) -> TextIO:
-        """What a process wrote to stderr."""
+        """Open the stderr of the process."""
         try:
             return self._errors.open(encoding="utf-8", errors="replace")
         except OSError:
@@ -170,21 +170,21 @@ class _ProcessFiles:
             raise OutputError(f"Cannot write '{path}': {os_error_text(error)}; make room there.") from error
 
     def write_process_id(self, process_id: int) -> None:
-        """Keep the number of the process; raises OutputError."""
+        """Write the process id; raises OutputError."""
         write_json(self._path, {"process": process_id})
 
     @property
     def process_id(self) -> int:
-        """Number of the process, 0 when there is none."""
+        """Process id, 0 where there is none."""
         try:
             return int(json.loads(self._path.read_text(encoding="utf-8"))["process"]) * self.messages.is_file()
         except (OSError, ValueError, KeyError, TypeError):
             return 0
 
     def is_running(self) -> bool:
-        """Whether a process still has the file of the messages. Its number alone may be another's by now."""
+        """Return whether a process has the messages open, because the process id may be reused."""
         if sys.platform == "win32":
-            # There a file that is open cannot be renamed.
+            # Windows cannot rename an open file.
             try:
                 os.replace(self.messages, self.messages)
             except OSError:
@@ -208,7 +208,7 @@ class _ProcessFiles:
 
 
 class _ForeignProcess:
-    """A process that another Blender has started, as far as `Training` uses one. Its exit status is not known."""
+    """Process of another Blender with the interface that `Training` uses; its exit status is unknown."""
 
     stdout = None
 
@@ -232,7 +232,7 @@ class _ForeignProcess:
         self._send(getattr(signal, "SIGKILL", signal.SIGTERM))
 
     def _send(self, number: int) -> None:
-        # Its number alone may be that of another process by now.
+        # The process id may be reused by another process.
         if self._files.is_running():
             with contextlib.suppress(OSError):
                 os.kill(self.pid, number)

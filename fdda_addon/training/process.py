@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Starts the trainer in a Python of its own, reads its messages and cancels it.
+"""The process of the trainer: starting, reading of messages and cancelling.
 
-torch never enters Blender's process: it would bring its own threads and libraries, and Blender's Python has none.
+torch runs outside of Blender's process, because it has its own threads and libraries and Blender's Python lacks it.
 """
 
 import os
@@ -29,40 +29,40 @@ from .environment.subprocesses import UTF8_OUTPUT, popen_options
 from .process_exit import explain_exit_status
 
 KILL_AFTER_SECONDS = 20.0
-"""A trainer that was asked to stop is killed after so long."""
+"""Time after which a trainer that was asked to stop is killed."""
 READER_JOIN_SECONDS = 1.0
 POLL_SECONDS = 0.05
 MIN_FREE_BYTES = 1 << 16
-"""Free space of a disk that counts as full."""
+"""A disk with less free space counts as full."""
 
 
 def trainer_python() -> str:
-    """Path of the Python that runs the trainer; `training.environment.choice` says how it is chosen."""
+    """Return the path of the Python that runs the trainer (`training.environment.choice`)."""
     return select_python().path
 
 
 def trainer_command(
     arguments: list[str], python: str | None = None, module: str = "trainer"
 ) -> tuple[list[str], dict[str, str]]:
-    """Command line and environment of the trainer, for `subprocess`.
+    """Return command line and environment of the trainer for `subprocess`.
 
     Args:
         arguments: of `python -m trainer`.
         python: the interpreter, `trainer_python()` when left out.
-        module: another one of the trainer's that can be run.
+        module: the module to run.
     """
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-    # -P: a folder `trainer` in the current folder must not be run in place of ours.
+    # -P, so that a folder `trainer` in the current folder is not run instead.
     command = [python or trainer_python(), "-P", "-m", module, *arguments]
     return command, {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 class TrainerProcess:
-    """A process of the trainer; use as a context manager: the process is gone when the block ends.
+    """Context manager for a process of the trainer, which ends with the block.
 
     Attributes:
-        module: what `python -m` runs.
-        failure_message, loss_advice: what errors say where the process does not.
+        module: that `python -m` runs.
+        failure_message, loss_advice: parts of error messages where the process has none.
     """
 
     module = "trainer"
@@ -79,7 +79,7 @@ class TrainerProcess:
 
         Raises:
             TrainingError: the interpreter cannot be started.
-            OutputError: there is no room for what it writes to stderr.
+            OutputError: the file for stderr cannot be written.
         """
         advice = select_python().origin.value if python is None else "name a Python that has torch"
         command, environment = trainer_command(arguments, python, self.module)
@@ -88,7 +88,7 @@ class TrainerProcess:
         except OSError as error:
             raise temporary_folder_error(error) from error
         environment |= {STOP_FILE_VARIABLE: str(self._stop_file), **UTF8_OUTPUT}
-        # Ctrl-C may strike between the start of the process and the block that ends it.
+        # Ctrl-C may arrive between the start of the process and the block that ends it.
         self._finalizer = weakref.finalize(self, Path.touch, self._stop_file)
         try:
             self._process = self._start(command, environment)
@@ -101,7 +101,7 @@ class TrainerProcess:
         self._start_reader()
 
     def _new_stop_file(self) -> Path:
-        # Nobody else can guess the name, and no file is there until the trainer is to stop.
+        # The name cannot be guessed, and the file does not exist until the trainer is asked to stop.
         return Path(tempfile.gettempdir(), f"fdda-stop-{secrets.token_hex(12)}")
 
     def _new_errors(self) -> TextIO:
@@ -122,7 +122,7 @@ class TrainerProcess:
 
     def _start_reader(self) -> None:
         self._cancelled_at: float | None = None
-        # A thread of its own: Blender must never wait for a line.
+        # In a thread, because Blender must not block on a line.
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -133,7 +133,7 @@ class TrainerProcess:
         self._lines.put(None)
 
     def cancel(self) -> None:
-        """Ask the trainer to stop; `messages` ends when it has. Does not wait."""
+        """Ask the trainer to stop without waiting; `messages` ends when it has stopped."""
         if self._cancelled_at is not None:
             return
         self._cancelled_at = time.monotonic()
@@ -144,21 +144,21 @@ class TrainerProcess:
             self._process.terminate()
 
     def messages(self, wait: bool = True) -> Iterator[Message | None]:
-        """What the trainer says, until it is finished or cancelled.
+        """Yield the messages of the trainer until it has finished or was cancelled.
 
         Args:
-            wait: for the next message. Otherwise None is given at once when there is none yet.
+            wait: block until the next message; otherwise yield None while there is none.
 
         Raises:
-            WrongUsageError: it does not understand its options.
-            TrainingError: it failed, or died without a last message, unless it was cancelled.
+            WrongUsageError: the options of the trainer are wrong.
+            TrainingError: the trainer failed, or ended without a last message, unless it was cancelled.
         """
         last = None
         while True:
             if self._cancelled_at is not None and time.monotonic() > self._cancelled_at + KILL_AFTER_SECONDS:
                 self._process.kill()
             try:
-                # Not for longer: Windows takes no Ctrl-C to a thread that waits.
+                # With a short timeout, because a blocked thread gets no Ctrl-C on Windows.
                 line = self._lines.get(block=wait, timeout=POLL_SECONDS)
             except queue.Empty:
                 if not wait:
@@ -169,7 +169,7 @@ class TrainerProcess:
             try:
                 message = Message.decode(line)
             except ValueError:
-                # A library that prints; not worth losing a training.
+                # A library may print other lines.
                 continue
             if message.type is MessageType.FAILED:
                 kind = TrainingDiedError if message.values.get("try_again") is True else TrainingError
@@ -188,7 +188,7 @@ class TrainerProcess:
             raise WrongUsageError(self._error_text().strip())
         if last is None or not last.type.is_last:
             if status == INTERRUPTED:
-                # It was asked to stop while it was starting.
+                # It was stopped while starting.
                 yield Message(MessageType.CANCELLED)
                 return
             raise self._exit_error(status)
@@ -198,7 +198,7 @@ class TrainerProcess:
         reason = f" ({text[-1].strip()})" if text else ""
         process_exit = explain_exit_status(status, not text)
         if status == TRY_AGAIN and (full_folder := self._find_full_disk()):
-            # It could not even say so.
+            # It could not write its message.
             return TrainingDiedError(f"The disk of '{full_folder}' is full; {self.loss_advice} when there is room.")
         kind = TrainingDiedError if process_exit.is_machine_fault else TrainingError
         if advice := runtime_advice(reason):
@@ -206,7 +206,7 @@ class TrainerProcess:
         return kind(f"The trainer {process_exit.text}{reason}; {self.loss_advice}.")
 
     def _find_full_disk(self) -> Path | None:
-        """The folder that the process writes to whose disk is full, if one is."""
+        """Return a folder of the process whose disk is full; None where there is none."""
         for folder in (self._stop_file.parent, Path(tempfile.gettempdir())):
             with suppress(OSError):
                 if shutil.disk_usage(folder).free < MIN_FREE_BYTES:
@@ -227,7 +227,7 @@ class TrainerProcess:
                 with suppress(subprocess.TimeoutExpired):
                     self._process.wait(KILL_AFTER_SECONDS)
         finally:
-            # Also when Ctrl-C is pressed once more meanwhile.
+            # Also after another Ctrl-C.
             if self._process.poll() is None:
                 self._process.kill()
                 self._process.wait()
@@ -235,7 +235,7 @@ class TrainerProcess:
                 self._finalizer.detach()
             with suppress(OSError):
                 self._stop_file.unlink(missing_ok=True)
-        # A process that the trainer has started may hold its output open: then it is left to the thread.
+        # A child process of the trainer may keep the pipe open; then the reader thread stays.
         self._reader.join(READER_JOIN_SECONDS)
         if not self._reader.is_alive() and self._process.stdout is not None:
             self._process.stdout.close()
@@ -243,8 +243,8 @@ class TrainerProcess:
 
 
 class Training(TrainerProcess):
-    """A training in a process of its own."""
+    """The process of a training."""
 
     def __init__(self, arguments: list[str], python: str | None = None):
-        """Start the trainer; `arguments` are recording, model and settings, all else as in `TrainerProcess`."""
+        """Start the trainer with recording, model and settings as arguments, as `TrainerProcess` does."""
         super().__init__(["--messages", *arguments], python)

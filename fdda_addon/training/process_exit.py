@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How a process ended, in words, from its exit status on Linux, macOS or Windows."""
+"""Explanation of the exit status of a process on Linux, macOS or Windows."""
 
 import os
 from typing import NamedTuple
@@ -20,19 +20,19 @@ _WINDOWS_CRASHES = {
     0xC0000409: "aborted",
     0xE06D7363: "an exception of C++",
 }
-"""Exit statuses of Windows for a process that crashed."""
+"""Exit statuses of crashed processes on Windows."""
 _MISSING_DLL_STATUSES = {0xC0000135, 0xC0000139, 0xC0000142}
 _CONSOLE_CLOSED_STATUS = 0xC000013A
 _TERMINATED_STATUSES = {1, 15}
-"""Status of a process that the Task Manager, or `os.kill` of another Python, ends on Windows."""
+"""Exit statuses of a process that the Task Manager or `os.kill` terminates on Windows."""
 
 
 class ProcessExit(NamedTuple):
     """How a process ended.
 
     Attributes:
-        text: goes on after "The trainer".
-        is_machine_fault: whether it crashed or was ended from outside, so that the same may work later.
+        text: continues the sentence "The trainer …".
+        is_machine_fault: whether it crashed or was terminated, so that the same command may work later.
     """
 
     text: str
@@ -40,11 +40,11 @@ class ProcessExit(NamedTuple):
 
 
 def explain_exit_status(status: int | None, is_silent: bool) -> ProcessExit:
-    """Explain the status of a process that ended without a last message.
+    """Explain the exit status of a process that ended without a last message.
 
     Args:
-        status: its exit status, signed or unsigned; None where it is not known.
-        is_silent: whether it wrote nothing to stderr. A Python that fails by itself writes a traceback.
+        status: exit status, signed or unsigned; None where it is unknown.
+        is_silent: whether it wrote nothing to stderr, as a failing Python would.
     """
     if status is None:
         return ProcessExit("was ended before it was done" if is_silent else "ended before it was done", is_silent)

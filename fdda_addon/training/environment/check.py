@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Asks a Python whether it can train: its version, torch and what else the trainer imports, the device."""
+"""Check whether a Python can train: its version, torch and the other packages, the device."""
 
 import json
 import os
@@ -16,7 +16,7 @@ MIN_VERSION = (3, 11)
 TIMEOUT_SECONDS = 180.0
 """torch takes half a minute to load from a cold or remote disk."""
 
-# Runs in whatever the user named, an ancient Python too. Its last line is the answer; a library may print before it.
+# Runs in any Python, also an ancient one. The last line is the report; libraries may print before it.
 _PROBE_SCRIPT = """
 import json, sys
 answer = {"version": list(sys.version_info[:3]), "packages": {}, "broken": {}}
@@ -39,15 +39,15 @@ print(json.dumps(answer))
 
 
 def check(python: str, advice: str) -> CheckResult:
-    """Ask a Python whether it can train. Takes seconds: never while drawing.
+    """Check whether a Python can train. Takes seconds, so never call it while drawing.
 
     Args:
         python: path of the interpreter.
-        advice: what to do when it cannot, ending the sentence.
+        advice: end of the error message, what to do.
     """
     command = [python, "-c", _PROBE_SCRIPT, *PACKAGES]
     try:
-        # -c imports from the current folder; the trainer finds its modules in ours.
+        # -c imports from the current folder, where the trainer's modules are.
         result = subprocess.run(
             command,
             stdin=subprocess.DEVNULL,

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What panels, operators and the command line say of the trainer's Python."""
+"""Result of a check of the trainer's Python, for panels, operators and the command line."""
 
 from typing import NamedTuple
 
 
 class CheckResult(NamedTuple):
-    """What is known of a Python, or how something ended.
+    """Result of a check, or of an operation on the environment.
 
     Attributes:
-        level: 'INFO' all is well, 'WARNING' it works but should be seen to, 'ERROR' it does not work: the levels of an
-            operator's report.
-        message: one sentence; where it is not well, what to do.
-        details: lines for those who want to know more.
+        level: 'INFO', 'WARNING' (works, but needs attention) or 'ERROR' (does not work), as in operator reports.
+        message: one sentence; for a problem, with what to do.
+        details: further lines.
     """
 
     level: str

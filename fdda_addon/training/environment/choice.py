@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which Python trains, and who chose it."""
+"""Choice of the Python that trains."""
 
 import enum
 import os
@@ -13,14 +13,14 @@ from .check_result import CheckResult
 from .folder import environment_python, interpreter_path
 
 PYTHON_VARIABLE = "FDDA_TRAINER_PYTHON"
-"""Environment variable: the Python that has torch, when the preferences name none."""
+"""Environment variable with the Python that has torch, used where the preferences name none."""
 
 preferred_python: Callable[[], str] | None = None
-"""What the preferences name, an interpreter or the folder of a virtual environment; `preferences` puts it here."""
+"""Returns the interpreter or virtual environment of the preferences; set by `preferences`."""
 
 
 class Origin(enum.Enum):
-    """Who chose the trainer's Python; the value says what to do when it is the wrong one."""
+    """Where the choice of the trainer's Python comes from; the value is advice for a wrong choice."""
 
     PREFERENCES = "choose another Python in the add-on's preferences, or leave that field empty"
     VARIABLE = f"set {PYTHON_VARIABLE} to a Python that has torch"
@@ -31,17 +31,17 @@ class Origin(enum.Enum):
 
 
 class TrainerPython(NamedTuple):
-    """The interpreter that runs the trainer, and who chose it."""
+    """The interpreter that runs the trainer, and where its choice comes from."""
 
     path: str
     origin: Origin
 
 
 def select_python() -> TrainerPython:
-    """The Python that runs the trainer.
+    """Select the Python that runs the trainer.
 
-    The first of: what the preferences name, the environment variable, the add-on's own environment, and the Python
-    that runs this. Blender says where the own environment lies: where bpy cannot be imported, nobody made one.
+    The first of: the preferences, the environment variable, the add-on's environment, and this Python. The add-on's
+    environment exists only where bpy can be imported.
     """
     if preferred_python is not None and (preferred := preferred_python()):
         folder = Path(preferred)
@@ -55,7 +55,7 @@ def select_python() -> TrainerPython:
 
 
 def check_trainer_python(python: TrainerPython | None = None) -> CheckResult:
-    """Ask the Python that runs the trainer whether it can train. Takes seconds: never while drawing."""
+    """Check the Python that runs the trainer. Takes seconds, so never call it while drawing."""
     from .check import check
 
     python = python or select_python()

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Finds a Python that the trainer's environment can be made from.
+"""Search for Python interpreters from which the training environment can be created.
 
-A name proves nothing: it may start a version manager's shim for a Python that was not selected, or a Python without its
-venv module. So every candidate is run.
+Every candidate is run, because a name may be a version manager's shim, or a Python without its venv module.
 """
 
 import contextlib
@@ -22,7 +21,7 @@ TIMEOUT_SECONDS = 30.0
 # Newest first, but those that Blender itself has before the one between.
 PREFERRED_VERSIONS = ("3.13", "3.11", "3.12")
 NO_DOWNLOAD_ENVIRONMENT = {"PYTHON_MANAGER_AUTOMATIC_INSTALL": "false"}
-"""Keeps the launcher `py` from installing a Python that it does not find."""
+"""Environment that keeps the launcher `py` from installing a missing Python."""
 
 _PROBE_SCRIPT = """
 import json, sys
@@ -38,7 +37,13 @@ print(json.dumps([list(sys.version_info[:2]), sys.maxsize > 2**32, missing, sys.
 
 @dataclass(frozen=True)
 class Interpreter:
-    """A Python that runs: its path, version, and what it lacks to make an environment, empty for nothing."""
+    """A working Python.
+
+    Attributes:
+        path: of the executable.
+        version: major and minor version.
+        problem: why no environment can be created from it; empty for none.
+    """
 
     path: str
     version: tuple[int, int]
@@ -49,10 +54,10 @@ class Interpreter:
 
 
 def find_interpreters(candidates: Iterator[list[str]] | None = None) -> Iterator[Interpreter]:
-    """The Pythons of this machine that run, each once, Blender's own first.
+    """Yield the working interpreters of this machine, each once, Blender's own first.
 
     Args:
-        candidates: command lines to try, the usual places when left out.
+        candidates: command lines to try; `default_candidates` by default.
     """
     seen = set()
     for command in default_candidates() if candidates is None else candidates:
@@ -63,7 +68,7 @@ def find_interpreters(candidates: Iterator[list[str]] | None = None) -> Iterator
 
 
 def query_interpreter(command: list[str]) -> Interpreter | None:
-    """What a command line starts; None when that is no Python."""
+    """Run a command line; return its interpreter, or None where it is no Python."""
     try:
         result = subprocess.run(
             [*command, "-I", "-c", _PROBE_SCRIPT],
@@ -89,7 +94,7 @@ def query_interpreter(command: list[str]) -> Interpreter | None:
 
 
 def default_candidates() -> Iterator[list[str]]:
-    """Command lines that may start a Python: Blender's own, those on the path, those of installers."""
+    """Yield command lines that may start a Python: Blender's own, those on PATH, those of installers."""
     if sys.executable:
         yield [sys.executable]
     yield from _windows_candidates() if os.name == "nt" else _unix_candidates()
@@ -115,7 +120,7 @@ def _unix_candidates() -> Iterator[list[str]]:
 
 
 def _windows_candidates() -> Iterator[list[str]]:
-    """Those that the registry lists, of the launcher, of python.org, uv and pyenv-win in their folders, on the path."""
+    """Yield interpreters of the registry, python.org, uv, pyenv-win and the launcher, then those on PATH."""
     home = Path.home()
     local = Path(os.environ.get("LOCALAPPDATA") or home / "AppData/Local")
     roaming = Path(os.environ.get("APPDATA") or home / "AppData/Roaming")
@@ -146,7 +151,7 @@ def _windows_candidates() -> Iterator[list[str]]:
 
 
 def _registry_interpreters(version: str) -> Iterator[Path]:
-    """Pythons of a version that installers have registered (PEP 514), of python.org and of others."""
+    """Yield interpreters of a version in the registry (PEP 514)."""
     import winreg
 
     for root in (winreg.HKEY_CURRENT_USER, winreg.HKEY_LOCAL_MACHINE):
@@ -170,7 +175,7 @@ def _subkeys(root: int, key: str) -> list[str]:
 
 
 def _find_on_path(name: str) -> str:
-    """The program of a name on the path, empty for none. Windows itself would look in the current folder first."""
+    """Find a program on PATH; empty for none. Windows would search the current folder first."""
     for folder in map(Path, filter(None, os.environ.get("PATH", "").split(os.pathsep))):
         path = folder / name
         if folder.is_absolute() and path.is_file() and not _is_store_app(path):
@@ -179,8 +184,8 @@ def _find_on_path(name: str) -> str:
 
 
 def _is_store_app(path: Path) -> bool:
-    """Whether a program is Microsoft Store's. Its python.exe opens the shop where no Python is installed.
+    """Return whether a program is an app of the Microsoft Store, whose python.exe may only open the store.
 
-    One that is installed keeps to itself what it writes to AppData, and with it the environment that it makes there.
+    An installed one redirects its writes to AppData, and with them an environment in there.
     """
     return "windowsapps" in (part.lower() for part in path.parts)

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Options for every process that the add-on starts, on all systems."""
+"""Options for all processes that the add-on starts."""
 
 import os
 import subprocess
 
 UTF8_OUTPUT = {"PYTHONIOENCODING": "utf-8:backslashreplace"}
-"""Environment of a Python whose output is read here: on Windows a pipe has the code page of the country otherwise."""
+"""Environment of a Python whose output is read; without it pipes on Windows use the local code page."""
 
 
 def popen_options(*, own_session: bool = False) -> dict:
-    """Options of `subprocess` that keep Windows from opening a console window.
+    """Return options of `subprocess` that open no console window on Windows.
 
     Args:
-        own_session: Ctrl-C in the terminal of this process is not for that one, nor does it end with the terminal.
+        own_session: isolate the process from Ctrl-C in this terminal and from closing the terminal.
     """
     if os.name != "nt":
         return {"start_new_session": own_session}
@@ -21,6 +21,6 @@ def popen_options(*, own_session: bool = False) -> dict:
 
 
 def clean_environment() -> dict[str, str]:
-    """This process's environment without what would lead another Python to wrong modules."""
+    """Return this process's environment without variables that change the imports of another Python."""
     wrong = {"PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP", "VIRTUAL_ENV", "__PYVENV_LAUNCHER__"}
     return {name: value for name, value in os.environ.items() if name not in wrong} | UTF8_OUTPUT
