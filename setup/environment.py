@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Makes a virtual environment with the pinned requirements, for the Python that runs this.
+"""Creation of a virtual environment with the pinned requirements, for the running Python.
 
 On Windows `py -3.13 setup\\environment.py make .venv everything` starts it, elsewhere `setup/environment`, which finds
 the Python.
@@ -47,7 +47,7 @@ UV_SETTINGS = {
 
 
 class SetupError(Exception):
-    """The environment cannot be made; the text says what to do about it."""
+    """The environment cannot be created; the message says what to do."""
 
 
 def program(folder: Path, name: str) -> Path:
@@ -56,12 +56,12 @@ def program(folder: Path, name: str) -> Path:
 
 
 def pins() -> Path:
-    """The file that pins every package for the Python that runs this."""
+    """Return the file with pinned versions for the running Python."""
     return ROOT / "requirements" / "python-{}.{}.txt".format(*sys.version_info)
 
 
 def check_python() -> None:
-    """Refuse a Python that no Blender LTS line runs on.
+    """Check that a Blender LTS line has the version of the running Python.
 
     Raises:
         SetupError: naming the versions to start this with.
@@ -75,14 +75,14 @@ def check_python() -> None:
 
 
 def fingerprint(contents: str) -> str:
-    """What an environment depends on: when any of it changes, the environment is made anew."""
+    """Compute the fingerprint of an environment; when it changes, the environment is created again."""
     digest = hashlib.sha256(repr((contents, CONTENTS[contents], sys.version, sys.base_prefix)).encode())
     digest.update(pins().read_bytes())
     return digest.hexdigest()
 
 
 def is_current(folder: Path, contents: str, python: str = "") -> bool:
-    """Whether `folder` is complete, and made by the Python that runs this: by `python`, where one was asked for."""
+    """Return whether `folder` is complete and was created by the running Python, or by `python` where given."""
     if not program(folder, "python").exists() or (python and os.path.realpath(sys.executable) != python):
         return False
     stamp = folder / STAMP
@@ -90,7 +90,7 @@ def is_current(folder: Path, contents: str, python: str = "") -> bool:
 
 
 def check_own(folder: Path) -> None:
-    """Refuse to make an environment anew that lies elsewhere: `venv --clear` empties what a link leads to.
+    """Check that an environment is no link, because `venv --clear` would empty the linked folder.
 
     Raises:
         SetupError: the folder is a link or a junction, as in a second working tree that shares an environment.
@@ -106,7 +106,7 @@ def check_own(folder: Path) -> None:
 
 
 def check_system_libraries(listing: Path = SYSTEM_LIBRARIES) -> None:
-    """Ask before hundreds of megabytes are fetched, not after; elsewhere than on Linux the wheels bring all they load.
+    """Check for system libraries before the download; wheels for other systems than Linux include them.
 
     Raises:
         SetupError: naming the Debian packages of all the libraries that cannot be loaded.
@@ -128,7 +128,7 @@ def check_system_libraries(listing: Path = SYSTEM_LIBRARIES) -> None:
 
 
 def uv_environment(python: Path) -> dict[str, str]:
-    """The environment for uv: the settings of pip where uv has none of its own."""
+    """Return the environment variables for uv, with pip's settings where uv has none."""
     environment = {"UV_PYTHON_DOWNLOADS": "never"}
     listing = subprocess.run([python, "-m", "pip", "config", "list"], capture_output=True, text=True, check=False)
     for line in listing.stdout.splitlines():
@@ -143,7 +143,7 @@ def uv_environment(python: Path) -> dict[str, str]:
 
 
 def run(*command: str | Path, why: str, env: dict[str, str] | None = None) -> None:
-    """Run one step; its own output stays on the terminal.
+    """Run one step with its output on the terminal.
 
     Raises:
         SetupError: with `why`, when the step fails.
@@ -153,7 +153,7 @@ def run(*command: str | Path, why: str, env: dict[str, str] | None = None) -> No
 
 
 def lock(file: IO[str]) -> None:
-    """Wait until no other process has `file` locked, and lock it until it is closed."""
+    """Wait for the lock of `file`, and hold it until the file is closed."""
     if os.name != "nt":
         import fcntl
 
@@ -171,7 +171,7 @@ def lock(file: IO[str]) -> None:
 
 
 def make(folder: Path, contents: str) -> None:
-    """Make `folder` a complete environment for the Python that runs this.
+    """Create a complete environment in `folder` for the running Python.
 
     Raises:
         SetupError: a library is missing or a step failed; `folder` then has no stamp.

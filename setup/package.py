@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Builds dist/fdda_addon-VERSION.zip, the extension that Blender installs, for one platform or for all.
+"""Building of dist/fdda_addon-VERSION.zip, the extension for Blender, for one platform or all.
 
 On Linux there is a second one, dist/fdda_addon-VERSION-python3.14.zip: Blender as distributions build it runs on the
 system's Python, and all Pythons together would be too large a zip.
@@ -50,18 +50,18 @@ __all__ = ["register", "unregister"]
 
 
 class PackageError(Exception):
-    """The extension cannot be built; the text says what to do about it."""
+    """The extension cannot be built; the message says what to do."""
 
 
 def this_platform() -> str:
-    """Blender's name of the platform that runs this."""
+    """Return Blender's name of the current platform."""
     system = {"darwin": "macos"}.get(platform.system().lower(), platform.system().lower())
     machine = {"x86_64": "x64", "amd64": "x64", "aarch64": "arm64"}.get(platform.machine().lower(), platform.machine())
     return f"{system}-{machine}"
 
 
 def asked_platforms(names: list[str]) -> list[str]:
-    """The platforms to build for: those named, all of them, or the one that runs this.
+    """Return the platforms to build for: the named ones, all, or the current one.
 
     Raises:
         PackageError: there are no wheels for one of them.
@@ -76,12 +76,12 @@ def asked_platforms(names: list[str]) -> list[str]:
 
 
 def builds(name: str) -> list[tuple[str, ...]]:
-    """The Pythons of each zip for a platform: Blender's own, and on Linux that of distributions."""
+    """Return the Python versions of each zip of a platform: Blender's own, and on Linux that of distributions."""
     return [PYTHONS, *((python,) for python in SYSTEM_PYTHONS if name.startswith("linux"))]
 
 
 def fetch_wheels(name: str, pythons: tuple[str, ...]) -> list[Path]:
-    """The onnxruntime wheels for a platform and Pythons, as pinned; pip fetches those that dist/wheels does not have.
+    """Return the pinned onnxruntime wheels of a platform; pip downloads those that are not in dist/wheels.
 
     Its dependencies are left out: numpy is Blender's, and playing a model needs no other.
     """
@@ -100,7 +100,7 @@ def fetch_wheels(name: str, pythons: tuple[str, ...]) -> list[Path]:
 
 
 def stage(name: str, wheels: list[Path]) -> None:
-    """Lay out the extension for a platform in dist/stage."""
+    """Copy the files of the extension for a platform to dist/stage."""
     shutil.rmtree(STAGE, ignore_errors=True)
     for folder in ("fdda_addon", "trainer", "requirements"):
         shutil.copytree(ROOT / folder, STAGE / folder, ignore=shutil.ignore_patterns("__pycache__"))
@@ -118,7 +118,7 @@ def stage(name: str, wheels: list[Path]) -> None:
 
 
 def build(package: Path) -> None:
-    """Build the zip from dist/stage and have it checked, by the extension tool of the bpy wheel.
+    """Build and validate the zip from dist/stage with the extension tool of the bpy wheel.
 
     Raises:
         PackageError: it is too large.

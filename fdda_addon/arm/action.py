@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The action `arm_drive`: reach, flex, fist, spread, and twenty frames beyond the range of motion."""
+"""The action `arm_drive`: reach, flex, fist, spread, and twenty frames outside of the range of motion."""
 
 import math
 from contextlib import contextmanager
@@ -10,7 +10,7 @@ from .joints import ACTION, FINGERS, JOINTS
 
 FRAMES = 250
 # From here on the pose is outside the range of motion.
-BEYOND_FROM = 231
+BEYOND_START_FRAME = 231
 
 Pose = dict[str, tuple[float, float, float]]
 
@@ -35,8 +35,8 @@ def _arm(shoulder=(0.0, 0.0, 0.0), elbow=0.0, wrist=(0.0, 0.0)) -> Pose:
     return {"shoulder": shoulder, "elbow": (elbow, 0.0, 0.0), "wrist": (wrist[0], 0.0, wrist[1])}
 
 
-def _beyond(amount: float) -> Pose:
-    """Off the elbow's axis, metacarpals at 2.5 times their range when `amount` is 1; at 0 just outside everywhere."""
+def _beyond_range(amount: float) -> Pose:
+    """Return a pose outside of the range: at `amount` 1 off the elbow's axis, metacarpals at 2.5 times their range."""
     pose = _arm((70, 20, 30), 141 + 19 * amount, (60, -20)) | _hand(0.5 + 0.4 * amount, 10, 0, (10, 10, 40))
     pose["elbow"] = (141 + 19 * amount, 4 + 30 * amount, -4 - 40 * amount)
     for i, name in enumerate(FINGERS):
@@ -66,15 +66,15 @@ KEYS: dict[int, Pose] = {
     204: _arm((0, 20, -35), 45, (20, -25)) | _hand(-0.05, 14, 14, (-10, 18, 0)),
     216: _arm((30, 10, 0), 90, (-10, 0)) | _hand(0.15, -5, 4, (5, 0, 20)),
     230: _arm((70, 20, 30), 139, (60, -20)) | _hand(0.5, 10, 0, (10, 10, 40)),
-    BEYOND_FROM: _beyond(0.0),
-    240: _beyond(1.0),
-    FRAMES: _beyond(0.6),
+    BEYOND_START_FRAME: _beyond_range(0.0),
+    240: _beyond_range(1.0),
+    FRAMES: _beyond_range(0.6),
 }
 
 
 @contextmanager
-def _plain_keyframes():
-    """New keys as Bezier with clamped handles, whatever the user prefers: nothing leaves the range of its two keys."""
+def _add_bezier_keyframes():
+    """Insert Bezier keys with clamped handles, independent of preferences, so that curves stay between their keys."""
     edit = bpy.context.preferences.edit
     names = ("keyframe_new_interpolation_type", "keyframe_new_handle_type")
     before = [getattr(edit, name) for name in names]
@@ -87,13 +87,13 @@ def _plain_keyframes():
 
 
 def assign_drive_action(rig: bpy.types.Object):
-    """Gives `rig` the action and the current scene its frame range; the pose is left at frame 1."""
+    """Assign the action to `rig` and its frame range to the current scene, and show frame 1."""
     action = bpy.data.actions.new(ACTION)
     rig.animation_data_create().action = action
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, FRAMES
     bones = rig.pose.bones
-    with _plain_keyframes():
+    with _add_bezier_keyframes():
         for frame, pose in KEYS.items():
             for joint in JOINTS:
                 bone = bones[joint.name]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The biceps at full contraction, as offsets from the rest shape."""
+"""The contracted biceps as offsets from the rest positions."""
 
 import numpy as np
 
@@ -9,13 +9,13 @@ PEAK = {1: 0.036, 2: 0.028, 3: 0.022}
 
 
 def _bump(x: np.ndarray, top: float, rise: float, fall: float) -> np.ndarray:
-    """1 at `top`, a bell of half-width `rise` before it and `fall` after it."""
+    """Evaluate a bell curve: 1 at `top`, with half-width `rise` before it and `fall` after it."""
     s = (x - top) / np.where(x < top, rise, fall)
     return np.exp(-0.5 * s * s)
 
 
 def biceps_offsets(points: np.ndarray, normals: np.ndarray, peak: float) -> np.ndarray:
-    """(n, 3) offsets in metres from rest `points` (n, 3), with unit outward `normals` (n, 3), in arm space.
+    """Compute (n, 3) offsets in metres from (n, 3) rest `points` with unit outward `normals`, in arm space.
 
     The muscle shortens: it peaks past the middle of the upper arm, at `peak` metres, falls off steeply towards the
     elbow into its tendon, thins out at both ends, and a furrow parts its two heads. The triceps opposite is drawn flat.

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The quads of the webs, the fingers and the thumb, grown out of the tube."""
+"""Quads of the webs, the fingers and the thumb, extruded from the tube."""
 
 import numpy as np
 
-from .field import frame_along, smooth_curve
+from .field import axes_along, cubic_curve
 from .joints import FINGERS, joint
-from .quads import DIVISIONS, Collector, Grid, Seat
+from .quads import DIVISIONS, Grid, GridBuilder, SheetPosition
 from .tube import Tube
 
 # Rings of density 1 as parts along the three free bones (1.0 is the second bone's head), close at the joints; the first
@@ -19,11 +19,11 @@ _FINGER_RADIUS, _THUMB_RADIUS = 0.0085, 0.0125
 _THUMB_CORNERS = np.array(
     [[(0.584, -0.036, 0.004), (0.586, -0.038, -0.034)], [(0.622, -0.046, -0.008), (0.622, -0.030, -0.022)]]
 )
-_THUMB_ASKEW = 0.3
+_THUMB_LOOP_OFFSET = 0.3
 
 
-def grow_fingers(quads: Collector, tube: Tube, last: list[int]):
-    """Webs between the fingers at the tube's last ring, and the four fingers."""
+def grow_fingers(quads: GridBuilder, tube: Tube, last: list[int]):
+    """Add the webs between the fingers at the tube's last ring, and the four fingers."""
     d = tube.divisions
     # Down the sides of each finger, from the back to the palm; the outer sides are the tube's own.
     radial = {1: [last[tube.side(j)] for j in range(d.side)] + [last[tube.palm(0)]]}
@@ -39,8 +39,8 @@ def grow_fingers(quads: Collector, tube: Tube, last: list[int]):
         _grow(quads, name, loop, (d.finger, d.side), (DIVISIONS[1].finger, DIVISIONS[1].side), d.finger_rings)
 
 
-def _lay_web(quads: Collector, tube: Tube, last: list[int], k: int) -> list[list[int]]:
-    """The web between fingers k and k + 1, as lines from the back to the palm."""
+def _lay_web(quads: GridBuilder, tube: Tube, last: list[int], k: int) -> list[list[int]]:
+    """Add the web between fingers k and k + 1, as lines from the back to the palm."""
     d, g = tube.divisions, DIVISIONS[1]
     start = tube.finger_start(k) + d.finger
     lines = []
@@ -50,16 +50,16 @@ def _lay_web(quads: Collector, tube: Tube, last: list[int], k: int) -> list[list
         for j in range(1, d.side):
             t = j / d.side
             point = quads.points[top] * (1 - t) + quads.points[bottom] * t
-            seat = Seat(f"web_{k}", i * g.web / d.web, j * g.side / d.side)
-            line.append(quads.vertex(point, seat, -1, tube.finger_of(start + i)))
+            sheet_position = SheetPosition(f"web_{k}", i * g.web / d.web, j * g.side / d.side)
+            line.append(quads.vertex(point, sheet_position, -1, tube.finger_of(start + i)))
         lines.append([*line, bottom])
     quads.sheets[f"web_{k}"] = lines
     quads.patch(lines[::-1])
     return lines
 
 
-def grow_thumb(quads: Collector, tube: Tube, rings: list[list[int]]):
-    """The thumb, out of the opening in the tube's side."""
+def grow_thumb(quads: GridBuilder, tube: Tube, rings: list[list[int]]):
+    """Add the thumb at the opening in the tube's side."""
     d, n = tube.divisions, tube.divisions.thumb_root
 
     def at(r: int, j: int) -> int:
@@ -81,7 +81,7 @@ def grow_thumb(quads: Collector, tube: Tube, rings: list[list[int]]):
 
 
 def _finger_rings(name: str, number: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(point on the axis, unit axis) of rings given in the numbers of density 1."""
+    """Compute axis point and unit axis of rings, indexed as in density 1."""
     thumb = name == "thumb"
     bones = [joint(f"{name}_{i}") for i in ((0, 1, 2) if thumb else (1, 2, 3))]
     heads = np.array([*(bone.head for bone in bones), bones[-1].tail])
@@ -89,7 +89,7 @@ def _finger_rings(name: str, number: np.ndarray) -> list[tuple[np.ndarray, np.nd
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     parts = np.array(_THUMB_RINGS if thumb else _FINGER_RINGS)
     rings = []
-    for part in smooth_curve(number, np.arange(len(parts), dtype=float), parts[:, None])[:, 0]:
+    for part in cubic_curve(number, np.arange(len(parts), dtype=float), parts[:, None])[:, 0]:
         i = min(int(part), 2)
         # Near a joint the ring turns from one bone to the next, half way at the joint itself.
         nearest = int(np.clip(round(part), 0, 3))
@@ -108,7 +108,7 @@ def _box_outline(columns: int, sides: int) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def _grow(quads: Collector, name: str, loop: list[int], shape: tuple[int, int], guide: tuple[int, int], count: int):
+def _grow(quads: GridBuilder, name: str, loop: list[int], shape: tuple[int, int], guide: tuple[int, int], count: int):
     """A digit of `count` rings out of `loop`, which runs around it as a box outline of `shape` (columns, sides) does.
 
     guide: that shape at density 1. The tip is closed with a patch of that shape.
@@ -124,10 +124,10 @@ def _grow(quads: Collector, name: str, loop: list[int], shape: tuple[int, int], 
 
     def ring_points(i: int, radius: float) -> np.ndarray:
         point, axis = rings[i]
-        return point + outline @ frame_along(axis, up)[1:] * radius
+        return point + outline @ axes_along(axis, up)[1:] * radius
 
     radius = _THUMB_RADIUS if digit == 0 else _FINGER_RADIUS
-    askew = round(_THUMB_ASKEW * count) if digit == 0 else 0
+    askew = round(_THUMB_LOOP_OFFSET * count) if digit == 0 else 0
     root, straight = np.array([quads.points[i] for i in loop]), ring_points(askew, radius)
     sheet = [loop]
     for i, (middle, axis) in enumerate(rings):
@@ -138,15 +138,15 @@ def _grow(quads: Collector, name: str, loop: list[int], shape: tuple[int, int], 
         hold = float(np.clip(5.0 * (i - askew - 0.5) / count, 0.0, 1.0)) * (0.6 if i == count - 1 else 1.0)
         ring = []
         for j, point in enumerate(points):
-            seat = Seat(name, float(number[i]), float(around[j]))
-            ring.append(quads.vertex(point, seat, digit, max(digit, 1), (middle, axis, hold)))
+            sheet_position = SheetPosition(name, float(number[i]), float(around[j]))
+            ring.append(quads.vertex(point, sheet_position, digit, max(digit, 1), (middle, axis, hold)))
         quads.band(sheet[-1], ring)
         sheet.append(ring)
     quads.sheets[name] = sheet
     _close_tip(quads, name, digit, sheet[-1], shape, guide, rings[-1][1])
 
 
-def _close_tip(quads: Collector, name, digit, last, shape, guide, axis):
+def _close_tip(quads: GridBuilder, name, digit, last, shape, guide, axis):
     columns, sides = shape
     rows = [last[: columns + 1]]
     for j in range(1, sides):
@@ -155,8 +155,8 @@ def _close_tip(quads: Collector, name, digit, last, shape, guide, axis):
         for i in range(1, columns):
             t = i / columns
             point = quads.points[left] * (1 - t) + quads.points[right] * t + axis * 0.004
-            seat = Seat(f"{name}_tip", j * guide[1] / sides, i * guide[0] / columns)
-            row.append(quads.vertex(point, seat, digit, max(digit, 1)))
+            sheet_position = SheetPosition(f"{name}_tip", j * guide[1] / sides, i * guide[0] / columns)
+            row.append(quads.vertex(point, sheet_position, digit, max(digit, 1)))
         rows.append([*row, right])
     rows.append(last[columns + sides : 2 * columns + sides + 1][::-1])
     quads.sheets[f"{name}_tip"] = rows
@@ -164,11 +164,11 @@ def _close_tip(quads: Collector, name, digit, last, shape, guide, axis):
 
 
 def nail_faces(grid: Grid) -> np.ndarray:
-    """(f,) bool: the back of each digit over its last two rings of density 1."""
-    on_nail = np.zeros(len(grid.seats), bool)
-    for i, seat in enumerate(grid.seats):
-        if seat.sheet in ("thumb", *FINGERS):
-            rings = len(_THUMB_RINGS if seat.sheet == "thumb" else _FINGER_RINGS) - 1
-            columns = DIVISIONS[1].side if seat.sheet == "thumb" else DIVISIONS[1].finger
-            on_nail[i] = seat.row > rings - 2.01 and seat.column < columns + 0.01
+    """Return which faces are nails, (f,) bool: the back of each digit over its last two rings of density 1."""
+    on_nail = np.zeros(len(grid.sheet_positions), bool)
+    for i, sheet_position in enumerate(grid.sheet_positions):
+        if sheet_position.sheet in ("thumb", *FINGERS):
+            rings = len(_THUMB_RINGS if sheet_position.sheet == "thumb" else _FINGER_RINGS) - 1
+            columns = DIVISIONS[1].side if sheet_position.sheet == "thumb" else DIVISIONS[1].finger
+            on_nail[i] = sheet_position.row > rings - 2.01 and sheet_position.column < columns + 0.01
     return on_nail[grid.faces].all(axis=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A surface as the zero level of a field: lofts and ellipsoids, joined and carved smoothly.
+"""Signed distance fields: lofts and ellipsoids, joined and subtracted with smooth blends.
 
 Every form answers `distance(points)`: (n, 3) float64 points in metres to (n,) float64 metres, negative inside. The
 answers are first-order distances: exact in sign, and close to the truth near the surface, which is where they are read.
@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 
-class Form(Protocol):
+class Solid(Protocol):
     """A solid with a bounding sphere."""
 
     center: np.ndarray
@@ -20,7 +20,7 @@ class Form(Protocol):
     def distance(self, points: np.ndarray) -> np.ndarray: ...
 
 
-def frame_along(axis, up) -> np.ndarray:
+def axes_along(axis, up) -> np.ndarray:
     """(3, 3) rows: unit `axis`, the side axis, and `up` made square to `axis`. side = up x axis."""
     a = np.asarray(axis, float)
     a = a / np.linalg.norm(a)
@@ -30,8 +30,8 @@ def frame_along(axis, up) -> np.ndarray:
     return np.stack([a, np.cross(u, a), u])
 
 
-def smooth_curve(at: np.ndarray, knots: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Cubic through (k,) rising `knots` and (k, c) `values`, read at (n,) places, held constant past the ends.
+def cubic_curve(at: np.ndarray, knots: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Evaluate a cubic curve through (k,) ascending `knots` and (k, c) `values` at (n,) positions, with constant ends.
 
     Monotone between knots (slopes after Fritsch and Butland, 1984), so a limb does not bulge where no station says so.
     """
@@ -55,16 +55,16 @@ def smooth_curve(at: np.ndarray, knots: np.ndarray, values: np.ndarray) -> np.nd
 
 
 class Ellipsoid:
-    """center (3,), radii (3,) along the rows of `frame` (3, 3), metres."""
+    """center (3,), radii (3,) along the rows of `axes` (3, 3), metres."""
 
-    def __init__(self, center, radii, frame=None):
+    def __init__(self, center, radii, axes=None):
         self.center = np.asarray(center, float)
         self.radii = np.asarray(radii, float)
-        self.frame = np.eye(3) if frame is None else frame
+        self.axes = np.eye(3) if axes is None else axes
         self.reach = float(self.radii.max())
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        local = (points - self.center) @ self.frame.T / self.radii
+        local = (points - self.center) @ self.axes.T / self.radii
         k0 = np.sqrt(np.einsum("ij,ij->i", local, local))
         scaled = local / self.radii
         k1 = np.sqrt(np.einsum("ij,ij->i", scaled, scaled))
@@ -72,7 +72,7 @@ class Ellipsoid:
 
 
 class HalfSpace:
-    """Everything on the side of `point` (3,) that `outward` (3,) looks away from."""
+    """The half-space behind `point` (3,), opposite of the direction `outward` (3,)."""
 
     def __init__(self, point, outward):
         self.center = np.asarray(point, float)
@@ -91,20 +91,20 @@ class Loft:
     in from the first and last station. power: 2 is an ellipse, more is boxier.
     """
 
-    def __init__(self, origin, frame, stations, caps=(0.01, 0.01), power=2.0):
+    def __init__(self, origin, axes, stations, caps=(0.01, 0.01), power=2.0):
         self.origin = np.asarray(origin, float)
-        self.frame = np.asarray(frame, float)
+        self.axes = np.asarray(axes, float)
         self.stations = np.asarray(stations, float)
         self.caps = caps
         self.power = power
         first, last = self.stations[0, 0], self.stations[-1, 0]
-        self.center = self.origin + self.frame[0] * (first + last) / 2
+        self.center = self.origin + self.axes[0] * (first + last) / 2
         self.reach = float((last - first) / 2 + np.abs(self.stations[:, 1:]).max() * 1.5)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        local = (points - self.origin) @ self.frame.T
+        local = (points - self.origin) @ self.axes.T
         knots = self.stations[:, 0]
-        section = smooth_curve(local[:, 0], knots, self.stations[:, 1:])
+        section = cubic_curve(local[:, 0], knots, self.stations[:, 1:])
         side, up = local[:, 1] - section[:, 0], local[:, 2] - section[:, 1]
         half_side = np.where(side > 0, section[:, 2], section[:, 3])
         half_up = np.where(up > 0, section[:, 4], section[:, 5])
@@ -127,38 +127,38 @@ class Loft:
 
 @dataclass(frozen=True)
 class Stroke:
-    """One form added to what is there (or cut out of it), with a fillet of about `blend` metres."""
+    """One solid that is added or subtracted, with a smooth blend of about `blend` metres."""
 
-    form: Form
+    form: Solid
     blend: float
     carve: bool = False
 
 
-def _merged(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
-    """Smooth minimum (quadratic) of two distances."""
+def _smooth_minimum(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
+    """Compute the quadratic smooth minimum of two distances."""
     h = np.maximum(k - np.abs(a - b), 0.0) / k
     return np.minimum(a, b) - h * h * k * 0.25
 
 
 class Field:
-    """Strokes laid one after the other. The first must reach everything that is asked."""
+    """Signed distance field of strokes in order; the first one must cover all evaluated points."""
 
     def __init__(self, strokes: list[Stroke]):
         self.strokes = strokes
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """(n,) float64 metres for (n, 3) points."""
-        return self._distance(points, self._near(points))
+        """Compute the (n,) float64 signed distances of (n, 3) points, metres."""
+        return self._distance(points, self._points_near_strokes(points))
 
     def distance_and_gradient(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) metres and (n, 3) gradient, by differences along the corners of a tetrahedron of 0.1 mm."""
-        step, near = 1e-4, self._near(points)
+        """Compute (n,) distances in metres and (n, 3) gradients, from differences at a tetrahedron of 0.1 mm."""
+        step, near = 1e-4, self._points_near_strokes(points)
         corners = np.array([[1.0, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]])
         values = np.array([self._distance(points + corner * step, near) for corner in corners])
         return values.mean(axis=0), values.T @ corners / (4 * step)
 
-    def _near(self, points: np.ndarray) -> list[np.ndarray]:
-        """For each stroke, the points that it may matter to: those near its form."""
+    def _points_near_strokes(self, points: np.ndarray) -> list[np.ndarray]:
+        """Return for each stroke the points near its solid."""
         near = []
         for stroke in self.strokes:
             offset = points - stroke.form.center
@@ -170,5 +170,9 @@ class Field:
         result = np.full(len(points), 1.0)
         for stroke, index in zip(self.strokes, near, strict=True):
             here, there = result[index], stroke.form.distance(points[index])
-            result[index] = -_merged(-here, there, stroke.blend) if stroke.carve else _merged(here, there, stroke.blend)
+            result[index] = (
+                -_smooth_minimum(-here, there, stroke.blend)
+                if stroke.carve
+                else _smooth_minimum(here, there, stroke.blend)
+            )
         return result

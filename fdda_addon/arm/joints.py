@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The joints of the arm: names, parents, rest pose and range of motion. No bpy.
+"""The joints of the arm: names, parents, rest pose and range of motion, without bpy.
 
 A left arm in a T-pose: shoulder at the origin, arm along +X, palm down (-Z), thumb and elbow crease to the front (-Y),
 the forearm half way between pronation and supination. Lengths in metres, angles in degrees.
@@ -76,7 +76,7 @@ THUMB_LENGTHS = (0.0450, 0.0325, 0.0270)
 THUMB_HEADINGS = (43.0, 33.0, 30.0)
 THUMB_DIPS = (21.0, 17.0, 17.0)
 # The thumb's pad faces across the palm: its bend direction is turned this much about its own axis, degrees.
-THUMB_TURN = 62.0
+THUMB_ROTATION = 62.0
 
 _METACARPAL = ((-20.0, 20.0), (-20.0, 20.0), (-20.0, 20.0))
 _FINGER_LIMITS = (
@@ -93,18 +93,18 @@ _THUMB_LIMITS = (
 
 
 def heading_vector(heading: float, dip: float) -> np.ndarray:
-    """(3,) unit vector in armature space: +X turned towards the thumb (-Y) and down (-Z), degrees."""
+    """Return a (3,) unit vector in armature space: +X rotated towards the thumb (-Y) and down (-Z), degrees."""
     a, b = math.radians(heading), math.radians(dip)
     return np.array([math.cos(a) * math.cos(b), -math.sin(a) * math.cos(b), -math.sin(b)])
 
 
-def across(axis: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """(3,) unit vector at right angles to the unit vector `axis`, as near to `towards` as it can be."""
+def perpendicular(axis: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """Return the (3,) unit vector perpendicular to the unit vector `axis` and nearest to `towards`."""
     flat = towards - axis * float(np.dot(axis, towards))
     return flat / np.linalg.norm(flat)
 
 
-def _turned(vector: np.ndarray, axis: np.ndarray, degrees: float) -> np.ndarray:
+def _rotated(vector: np.ndarray, axis: np.ndarray, degrees: float) -> np.ndarray:
     a = math.radians(degrees)
     return vector * math.cos(a) + np.cross(axis, vector) * math.sin(a)
 
@@ -112,7 +112,7 @@ def _turned(vector: np.ndarray, axis: np.ndarray, degrees: float) -> np.ndarray:
 def _joint(name, parent, head, tail, towards, limits) -> Joint:
     head, tail = np.asarray(head, float), np.asarray(tail, float)
     axis = (tail - head) / np.linalg.norm(tail - head)
-    bend = across(axis, np.asarray(towards, float))
+    bend = perpendicular(axis, np.asarray(towards, float))
     return Joint(name, parent, tuple(head.tolist()), tuple(tail.tolist()), tuple(bend.tolist()), limits)
 
 
@@ -133,10 +133,10 @@ def _thumb_joints() -> list[Joint]:
     head, parent = np.array(THUMB_BASE), "wrist"
     for i, length in enumerate(THUMB_LENGTHS):
         axis = heading_vector(THUMB_HEADINGS[i], THUMB_DIPS[i])
-        down = across(axis, np.array([0.0, 0.0, -1.0]))
+        down = perpendicular(axis, np.array([0.0, 0.0, -1.0]))
         tail = head + axis * length
         name = f"thumb_{i}"
-        joints.append(_joint(name, parent, head, tail, _turned(down, axis, THUMB_TURN), _THUMB_LIMITS[i]))
+        joints.append(_joint(name, parent, head, tail, _rotated(down, axis, THUMB_ROTATION), _THUMB_LIMITS[i]))
         head, parent = tail, name
     return joints
 
@@ -160,5 +160,5 @@ JOINT_INDEX: dict[str, int] = {name: i for i, name in enumerate(JOINT_NAMES)}
 
 
 def joint(name: str) -> Joint:
-    """The joint called `name`; KeyError when the arm has none of that name."""
+    """Return the joint with this name; raise KeyError where there is none."""
     return JOINTS[JOINT_INDEX[name]]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Quads in sheets: how a grid is divided, collected, and seeded from a coarser one."""
+"""Quad grids in sheets: subdivision, construction, and interpolation from a coarser grid."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Divisions:
-    """How many faces there are.
+    """Numbers of faces in each direction.
 
     finger, web, side: across a finger, a web, and the side of the hand. rings: along the arm to the elbow, on to the
     wrist, on to the webs. finger_rings, thumb_rings: along a finger from the webs, along the thumb. thumb_root: along
@@ -34,7 +34,7 @@ DIVISIONS = {
 
 
 @dataclass(frozen=True)
-class Seat:
+class SheetPosition:
     """Where a vertex sits in a sheet, counted in the faces of density 1."""
 
     sheet: str
@@ -51,7 +51,7 @@ class Grid:
     column: (n,) int, in the palm the finger 1..4 in whose columns a vertex runs.
     plane_point, plane_normal (n, 3), plane_hold (n,) 0..1: the plane of a vertex's ring, and how firmly it keeps to it.
     loose: (n,) bool, to be drawn out between its neighbors before anything else.
-    seats: n of them. sheets: vertices of each sheet, (rows, columns) int, -1 where it has a hole.
+    sheet_positions: n of them. sheets: vertices of each sheet, (rows, columns) int, -1 where it has a hole.
     """
 
     points: np.ndarray
@@ -62,12 +62,12 @@ class Grid:
     plane_normal: np.ndarray
     plane_hold: np.ndarray
     loose: np.ndarray
-    seats: list[Seat]
+    sheet_positions: list[SheetPosition]
     sheets: dict[str, np.ndarray]
 
 
-class Collector:
-    """Vertices and faces while a grid is being laid out."""
+class GridBuilder:
+    """Builder that collects the vertices and faces of a grid."""
 
     def __init__(self):
         self.points: list[np.ndarray] = []
@@ -75,14 +75,16 @@ class Collector:
         self.marks: list[tuple[int, int]] = []
         self.planes: list[tuple[np.ndarray, np.ndarray, float]] = []
         self.loose: list[bool] = []
-        self.seats: list[Seat] = []
+        self.sheet_positions: list[SheetPosition] = []
         self.sheets: dict[str, list[list[int]]] = {}
 
-    def vertex(self, point, seat: Seat, digit: int, column: int, plane=None, loose: bool = False) -> int:
+    def vertex(
+        self, point, sheet_position: SheetPosition, digit: int, column: int, plane=None, loose: bool = False
+    ) -> int:
         """plane: (point, normal, hold); None for a vertex that is in no ring."""
         point = np.asarray(point, float)
         self.points.append(point)
-        self.seats.append(seat)
+        self.sheet_positions.append(sheet_position)
         self.marks.append((digit, column))
         self.planes.append(plane if plane is not None else (point, np.array([1.0, 0.0, 0.0]), 0.0))
         self.loose.append(loose)
@@ -102,7 +104,7 @@ class Collector:
                 self.faces.append((a[i], b[i], b[i + 1], a[i + 1]))
 
     def grid(self) -> Grid:
-        """What was collected, without the vertices that no face uses: the tube's, under the thumb."""
+        """Return the grid without unused vertices, which the tube has under the thumb."""
         used, faces = np.unique(np.array(self.faces), return_inverse=True)
         number = np.full(len(self.points) + 1, -1)
         number[used] = np.arange(len(used))
@@ -117,16 +119,16 @@ class Collector:
             plane_normal=np.array(plane_normals)[used],
             plane_hold=np.array(holds)[used],
             loose=np.array(self.loose)[used],
-            seats=[self.seats[i] for i in used],
+            sheet_positions=[self.sheet_positions[i] for i in used],
             sheets={name: number[np.array(rows)] for name, rows in self.sheets.items()},
         )
 
 
-def seeded_points(grid: Grid, guide: Grid, guide_points: np.ndarray) -> np.ndarray:
-    """(n, 3) float64: the points of `grid` laid between those of the guide, a grid of density 1, sheet by sheet."""
+def interpolate_guide_points(grid: Grid, guide: Grid, guide_points: np.ndarray) -> np.ndarray:
+    """Interpolate the (n, 3) float64 points of `grid` between those of a guide grid of density 1, sheet by sheet."""
     points = grid.points.copy()
-    names = np.array([seat.sheet for seat in grid.seats])
-    places = np.array([(seat.row, seat.column) for seat in grid.seats])
+    names = np.array([sheet_position.sheet for sheet_position in grid.sheet_positions])
+    places = np.array([(sheet_position.row, sheet_position.column) for sheet_position in grid.sheet_positions])
     for name, vertices in guide.sheets.items():
         mine = np.flatnonzero(names == name)
         sheet = guide_points[vertices]

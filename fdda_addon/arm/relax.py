@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draws a grid of quads onto the surface of a field, evenly spread, its rings kept in their planes."""
+"""Relaxation of a quad grid on the surface of a field; rings stay in their planes."""
 
 import numpy as np
 
@@ -7,8 +7,8 @@ from .field import Field
 from .quads import Grid
 
 
-def neighbor_table(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(count, k) int neighbors along edges, rows filled up with the vertex itself, and (count,) how many are real."""
+def build_neighbor_table(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return (count, k) neighbor indices along edges, padded with the vertex itself, and their (count,) numbers."""
     edges = np.concatenate([faces[:, [i, (i + 1) % 4]] for i in range(4)])
     edges = np.unique(np.sort(edges, axis=1), axis=0)
     both = np.concatenate([edges, edges[:, ::-1]])
@@ -20,13 +20,13 @@ def neighbor_table(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarra
     return table, valence
 
 
-def draw_out(grid: Grid) -> np.ndarray:
-    """(n, 3) float64: the grid's points, the loose ones moved to the middle of their neighbors, like a soap film.
+def smooth_loose_points(grid: Grid) -> np.ndarray:
+    """Return the (n, 3) float64 points with loose ones at the mean of their neighbors.
 
     From there the surface is reached without folds.
     """
     x = grid.points.copy()
-    table, valence = neighbor_table(grid.faces, len(x))
+    table, valence = build_neighbor_table(grid.faces, len(x))
     loose = np.flatnonzero(grid.loose)
     near, count = table[loose], valence[loose, None]
     spare = table.shape[1] - count
@@ -36,12 +36,12 @@ def draw_out(grid: Grid) -> np.ndarray:
 
 
 def relax(points: np.ndarray, grid: Grid, field: Field, rounds: int) -> np.ndarray:
-    """(n, 3) float64 on the field's surface, from `points`: `rounds` of smoothing along it and stepping back onto it.
+    """Smooth `points` along the field's surface for a number of rounds, and project them back; (n, 3) float64.
 
     The step is Newton's, inside the vertex's plane as far as the plane holds it, at most 6 mm long.
     """
     x = points.copy()
-    table, valence = neighbor_table(grid.faces, len(x))
+    table, valence = build_neighbor_table(grid.faces, len(x))
     spare = table.shape[1] - valence
     normal, hold = grid.plane_normal, grid.plane_hold[:, None]
     outward = np.zeros_like(x)

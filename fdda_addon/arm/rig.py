@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The arm in the scene: mesh, armature, range of motion and the three layers of deformation."""
+"""The arm as Blender objects: mesh, armature, range of motion and three deformers."""
 
 import math
 
@@ -19,14 +19,14 @@ _NAIL = ((0.82, 0.50, 0.40, 1.0), 0.35)
 
 
 def build_arm(density: int = 1) -> tuple[bpy.types.Object, bpy.types.Object]:
-    """Adds the arm and its rig to the current scene: (mesh object, armature object).
+    """Add the arm and its rig to the current scene; return mesh object and armature object.
 
     Layers: hard skinning through an Armature modifier, the biceps shape key raised by a driver, Corrective Smooth. The
     action `arm_drive` is assigned and the scene's range set to it. ValueError for a density other than 1, 2 or 3.
     """
     surface = sculpt_arm(density)
     rig = _armature_object()
-    _limit_motion(rig)
+    _set_range_of_motion(rig)
     arm = _mesh_object(surface)
     arm.parent = rig
     _add_skinning(arm, rig, surface.joints)
@@ -65,8 +65,8 @@ def _armature_object() -> bpy.types.Object:
     return rig
 
 
-def _limit_motion(rig: bpy.types.Object):
-    """Range of motion as IK limits and lock flags: neither clamps posing by hand, so an action may go beyond."""
+def _set_range_of_motion(rig: bpy.types.Object):
+    """Set the range of motion as IK limits and locks, which do not clamp posing, so an action may exceed it."""
     for joint in JOINTS:
         bone = rig.pose.bones[joint.name]
         bone.rotation_mode = ROTATION_MODE

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The form of the arm: its muscles, bones under the skin, palm and fingers, as strokes of a field. Metres.
+"""The shape of the arm as strokes of a field: muscles, bones under the skin, palm and fingers; metres.
 
 Arm space (see `joints`): +X along the arm, +Z the back of the hand, -Y the elbow crease and the thumb.
 """
@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from .field import Ellipsoid, Field, HalfSpace, Loft, Stroke, frame_along
+from .field import Ellipsoid, Field, HalfSpace, Loft, Stroke, axes_along
 from .joints import FINGERS, HAND, joint
 
 _X, _Z = np.array([1.0, 0, 0]), np.array([0.0, 0, 1.0])
@@ -35,21 +35,21 @@ _LIMB = [
 ]
 
 
-def _spindle(start, end, width: float, thickness: float, out) -> Ellipsoid:
+def _spindle_muscle(start, end, width: float, thickness: float, out) -> Ellipsoid:
     """A round form from `start` to `end`: half as wide as `width`, half as thick as `thickness` along `out`."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     radii = (np.linalg.norm(end - start) / 2, width, thickness)
-    return Ellipsoid((start + end) / 2, radii, frame_along(end - start, out))
+    return Ellipsoid((start + end) / 2, radii, axes_along(end - start, out))
 
 
-def _belly(start, end, width: float, thickness: float, out, peak: float = 0.45, ends=(0.30, 0.25)) -> Loft:
+def _muscle_belly(start, end, width: float, thickness: float, out, peak: float = 0.45, ends=(0.30, 0.25)) -> Loft:
     """A muscle from `start` to `end`, thickest at the part `peak` of its length, thinner by `ends` at its ends."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     length = float(np.linalg.norm(end - start))
     shape = [(0.0, ends[0]), (peak * 0.5, 0.5 * (1 + ends[0])), (peak, 1.0)]
     shape += [(peak + (1 - peak) * 0.5, 0.5 * (1 + ends[1])), (1.0, ends[1])]
     stations = [(t * length, 0, 0, width * r, width * r, thickness * r, thickness * r) for t, r in shape]
-    return Loft(start, frame_along(end - start, out), stations, caps=(0.012, 0.012))
+    return Loft(start, axes_along(end - start, out), stations, caps=(0.012, 0.012))
 
 
 def _ball(center, *radii) -> Ellipsoid:
@@ -59,21 +59,27 @@ def _ball(center, *radii) -> Ellipsoid:
 def _upper_arm() -> list[Stroke]:
     return [
         # Deltoid: front, middle and rear heads run together at its insertion half way down the outer side.
-        Stroke(_belly((-0.040, -0.034, 0.020), (0.150, -0.006, 0.034), 0.025, 0.026, (0, -1, 0.8), 0.40), 0.018),
-        Stroke(_belly((-0.045, 0.000, 0.032), (0.160, 0.000, 0.034), 0.030, 0.028, (0, 0, 1), 0.38), 0.018),
-        Stroke(_belly((-0.040, 0.034, 0.020), (0.150, 0.008, 0.034), 0.025, 0.026, (0, 1, 0.8), 0.40), 0.018),
+        Stroke(_muscle_belly((-0.040, -0.034, 0.020), (0.150, -0.006, 0.034), 0.025, 0.026, (0, -1, 0.8), 0.40), 0.018),
+        Stroke(_muscle_belly((-0.045, 0.000, 0.032), (0.160, 0.000, 0.034), 0.030, 0.028, (0, 0, 1), 0.38), 0.018),
+        Stroke(_muscle_belly((-0.040, 0.034, 0.020), (0.150, 0.008, 0.034), 0.025, 0.026, (0, 1, 0.8), 0.40), 0.018),
         # Biceps: long head above, short head below, one tendon.
-        Stroke(_belly((0.010, -0.022, 0.010), (0.290, -0.022, 0.000), 0.021, 0.027, (0, -1, 0.12), 0.55), 0.008),
-        Stroke(_belly((0.010, -0.016, -0.018), (0.285, -0.020, -0.006), 0.021, 0.027, (0, -1, -0.30), 0.57), 0.008),
+        Stroke(_muscle_belly((0.010, -0.022, 0.010), (0.290, -0.022, 0.000), 0.021, 0.027, (0, -1, 0.12), 0.55), 0.008),
+        Stroke(
+            _muscle_belly((0.010, -0.016, -0.018), (0.285, -0.020, -0.006), 0.021, 0.027, (0, -1, -0.30), 0.57), 0.008
+        ),
         # Triceps: lateral head above, long head below, medial head near the elbow.
-        Stroke(_belly((0.020, 0.022, 0.012), (0.250, 0.018, 0.016), 0.024, 0.030, (0, 1, 0.55), 0.48), 0.008),
-        Stroke(_belly((0.000, 0.018, -0.018), (0.260, 0.018, -0.014), 0.026, 0.033, (0, 1, -0.55), 0.50), 0.008),
-        Stroke(_belly((0.150, 0.016, -0.016), (0.300, 0.014, -0.018), 0.020, 0.023, (0, 0.5, -1), 0.5), 0.010),
+        Stroke(_muscle_belly((0.020, 0.022, 0.012), (0.250, 0.018, 0.016), 0.024, 0.030, (0, 1, 0.55), 0.48), 0.008),
+        Stroke(_muscle_belly((0.000, 0.018, -0.018), (0.260, 0.018, -0.014), 0.026, 0.033, (0, 1, -0.55), 0.50), 0.008),
+        Stroke(_muscle_belly((0.150, 0.016, -0.016), (0.300, 0.014, -0.018), 0.020, 0.023, (0, 0.5, -1), 0.5), 0.010),
         # Brachialis shows on both sides under the biceps.
-        Stroke(_belly((0.130, -0.004, 0.020), (0.300, -0.014, 0.014), 0.018, 0.024, (0, -0.35, 1), 0.5), 0.008),
-        Stroke(_belly((0.150, -0.006, -0.020), (0.295, -0.014, -0.014), 0.017, 0.023, (0, -0.35, -1), 0.5), 0.008),
+        Stroke(_muscle_belly((0.130, -0.004, 0.020), (0.300, -0.014, 0.014), 0.018, 0.024, (0, -0.35, 1), 0.5), 0.008),
+        Stroke(
+            _muscle_belly((0.150, -0.006, -0.020), (0.295, -0.014, -0.014), 0.017, 0.023, (0, -0.35, -1), 0.5), 0.008
+        ),
         # The furrow below the deltoid's point, between biceps and triceps, inside and outside.
-        Stroke(_belly((0.060, 0.002, -0.051), (0.230, 0.000, -0.045), 0.006, 0.005, (0, 0, 1)), 0.012, carve=True),
+        Stroke(
+            _muscle_belly((0.060, 0.002, -0.051), (0.230, 0.000, -0.045), 0.006, 0.005, (0, 0, 1)), 0.012, carve=True
+        ),
     ]
 
 
@@ -83,37 +89,47 @@ def _elbow_and_forearm() -> list[Stroke]:
         Stroke(_ball((0.289, 0.004, -0.036), 0.016, 0.013, 0.010), 0.016),
         Stroke(_ball((0.293, 0.006, 0.033), 0.015, 0.012, 0.010), 0.016),
         # Brachioradialis and the radial wrist extensors, from above the elbow to the thumb side.
-        Stroke(_belly((0.215, -0.004, 0.026), (0.490, -0.024, 0.002), 0.022, 0.026, (0, -0.75, 1), 0.46), 0.010),
+        Stroke(_muscle_belly((0.215, -0.004, 0.026), (0.490, -0.024, 0.002), 0.022, 0.026, (0, -0.75, 1), 0.46), 0.010),
         # Finger extensors on the back, ulnar extensor beside the edge of the ulna.
-        Stroke(_belly((0.270, 0.010, 0.024), (0.520, 0.004, 0.008), 0.020, 0.022, (0, 0.15, 1), 0.38), 0.009),
-        Stroke(_belly((0.290, 0.020, 0.014), (0.515, 0.020, 0.006), 0.015, 0.020, (0, 0.9, 0.8), 0.38), 0.009),
+        Stroke(_muscle_belly((0.270, 0.010, 0.024), (0.520, 0.004, 0.008), 0.020, 0.022, (0, 0.15, 1), 0.38), 0.009),
+        Stroke(_muscle_belly((0.290, 0.020, 0.014), (0.515, 0.020, 0.006), 0.015, 0.020, (0, 0.9, 0.8), 0.38), 0.009),
         # Flexors on the inner side, ulnar flexor along the back edge.
-        Stroke(_belly((0.265, -0.006, -0.022), (0.520, -0.010, -0.008), 0.028, 0.026, (0, -0.35, -1), 0.38), 0.010),
-        Stroke(_belly((0.275, 0.012, -0.022), (0.520, 0.020, -0.004), 0.018, 0.023, (0, 0.8, -1), 0.38), 0.010),
+        Stroke(
+            _muscle_belly((0.265, -0.006, -0.022), (0.520, -0.010, -0.008), 0.028, 0.026, (0, -0.35, -1), 0.38), 0.010
+        ),
+        Stroke(_muscle_belly((0.275, 0.012, -0.022), (0.520, 0.020, -0.004), 0.018, 0.023, (0, 0.8, -1), 0.38), 0.010),
         # The crease before the elbow, between the masses on both sides.
-        Stroke(_spindle((0.275, -0.047, 0.002), (0.350, -0.050, 0.000), 0.012, 0.010, (0, 1, 0)), 0.016, carve=True),
+        Stroke(
+            _spindle_muscle((0.275, -0.047, 0.002), (0.350, -0.050, 0.000), 0.012, 0.010, (0, 1, 0)), 0.016, carve=True
+        ),
         # Heads of the ulna and the radius; the two tendons that stand out before the wrist.
         Stroke(_ball((0.541, 0.0185, 0.0115), 0.013, 0.0090, 0.0085), 0.010),
         Stroke(_ball((0.552, -0.0205, 0.0000), 0.018, 0.0095, 0.0120), 0.012),
-        Stroke(_spindle((0.490, -0.0035, -0.0190), (0.575, -0.0030, -0.0160), 0.0030, 0.0045, (0, 0, -1)), 0.008),
+        Stroke(
+            _spindle_muscle((0.490, -0.0035, -0.0190), (0.575, -0.0030, -0.0160), 0.0030, 0.0045, (0, 0, -1)), 0.008
+        ),
     ]
 
 
 def _palm() -> list[Stroke]:
     strokes = [
         # Hypothenar along the little finger's side, thenar at the root of the thumb.
-        Stroke(_spindle((0.570, 0.020, -0.009), (0.645, 0.033, -0.007), 0.014, 0.013, (0, 0.4, -1)), 0.010),
-        Stroke(_spindle((0.558, -0.008, -0.011), (0.618, -0.045, -0.023), 0.0165, 0.0140, (0.2, -0.1, -1)), 0.010),
+        Stroke(_spindle_muscle((0.570, 0.020, -0.009), (0.645, 0.033, -0.007), 0.014, 0.013, (0, 0.4, -1)), 0.010),
+        Stroke(
+            _spindle_muscle((0.558, -0.008, -0.011), (0.618, -0.045, -0.023), 0.0165, 0.0140, (0.2, -0.1, -1)), 0.010
+        ),
         # The first interosseous fills the fork between thumb and index.
-        Stroke(_spindle((0.590, -0.022, -0.003), (0.645, -0.039, -0.004), 0.010, 0.012, (0, -1, 0)), 0.012),
+        Stroke(_spindle_muscle((0.590, -0.022, -0.003), (0.645, -0.039, -0.004), 0.010, 0.012, (0, -1, 0)), 0.012),
     ]
     for name in FINGERS:
         knuckle = np.array(HAND[name].knuckle)
         base = np.array(HAND[name].base)
         size = 0.88 if name == "pinky" else 1.0
-        along = frame_along(knuckle - base, _Z)
+        along = axes_along(knuckle - base, _Z)
         # Metacarpal with its tendon, its head, and the pad under it.
-        strokes.append(Stroke(_spindle(base, knuckle + along[0] * 0.006, 0.0062 * size, 0.0142 * size, _Z), 0.008))
+        strokes.append(
+            Stroke(_spindle_muscle(base, knuckle + along[0] * 0.006, 0.0062 * size, 0.0142 * size, _Z), 0.008)
+        )
         strokes.append(
             Stroke(Ellipsoid(knuckle + _Z * 0.0050 * size, np.array((0.0120, 0.0078, 0.0108)) * size, along), 0.005)
         )
@@ -123,19 +139,19 @@ def _palm() -> list[Stroke]:
     for a, b in pairwise(FINGERS):
         ends = [np.array(HAND[name].knuckle) for name in (a, b)]
         middle = sum(ends) / 2 + _X * (0.0085 if b != "pinky" else 0.0110) - _Z * 0.0030
-        strokes.append(Stroke(Ellipsoid(middle, (0.0085, 0.0080, 0.0070), frame_along((1, 0, -0.25), _Z)), 0.006))
+        strokes.append(Stroke(Ellipsoid(middle, (0.0085, 0.0080, 0.0070), axes_along((1, 0, -0.25), _Z)), 0.006))
     # The hollow of the palm.
     strokes.append(Stroke(_ball((0.612, 0.004, -0.0290), 0.030, 0.017, 0.0140), 0.010, carve=True))
     return strokes
 
 
 def _finger_form(name: str) -> list[Stroke]:
-    """The free finger as a loft along its first phalanx, the center line bending with the bones."""
+    """Return the free part of a finger as a loft along its first phalanx, bent with the bones."""
     bones = [joint(f"{name}_{i}") for i in (1, 2, 3)]
     heads = [np.array(bone.head) for bone in bones] + [np.array(bones[-1].tail)]
-    frame = frame_along(heads[1] - heads[0], _Z)
-    along = [(point - heads[0]) @ frame[0] for point in heads]
-    up = [(point - heads[0]) @ frame[2] for point in heads]
+    axes = axes_along(heads[1] - heads[0], _Z)
+    along = [(point - heads[0]) @ axes[0] for point in heads]
+    up = [(point - heads[0]) @ axes[2] for point in heads]
     tip = along[3] + 0.0035
     size = {"index": 1.0, "middle": 1.02, "ring": 0.96, "pinky": 0.84}[name]
 
@@ -158,15 +174,15 @@ def _finger_form(name: str) -> list[Stroke]:
         ((tip, up[3]), 6.9, 4.8, 6.4),
     ]
     stations = [(s, 0.0, u, *(np.array((w, w, b, p)) * size * 1e-3)) for (s, u), w, b, p in profile]
-    return [Stroke(Loft(heads[0], frame, stations, caps=(0.010, 0.0095 * size), power=2.1), 0.0055)]
+    return [Stroke(Loft(heads[0], axes, stations, caps=(0.010, 0.0095 * size), power=2.1), 0.0055)]
 
 
 def _thumb_form() -> list[Stroke]:
     bones = [joint(f"thumb_{i}") for i in range(3)]
     heads = [np.array(bone.head) for bone in bones] + [np.array(bones[-1].tail)]
-    frame = frame_along(heads[3] - heads[1], -np.array(bones[1].bend))
+    axes = axes_along(heads[3] - heads[1], -np.array(bones[1].bend))
     origin = heads[1]
-    flat = [(point - origin) @ frame.T for point in heads]
+    flat = [(point - origin) @ axes.T for point in heads]
     tip = flat[3][0] + 0.003
 
     def at(i: int, part: float) -> np.ndarray:
@@ -185,12 +201,12 @@ def _thumb_form() -> list[Stroke]:
         (np.array([tip, flat[3][1], flat[3][2]]), 8.4, 5.2, 7.4),
     ]
     stations = [(p[0], p[1], p[2], *(np.array((w, w, b, d)) * 1e-3)) for p, w, b, d in profile]
-    return [Stroke(Loft(origin, frame, stations, caps=(0.008, 0.012), power=2.1), 0.011)]
+    return [Stroke(Loft(origin, axes, stations, caps=(0.008, 0.012), power=2.1), 0.011)]
 
 
 def arm_field() -> Field:
-    """The whole arm, shoulder to finger tips; at the shoulder it is cut, the edge rounded."""
-    limb = Loft((0, 0, 0), frame_along(_X, _Z), _LIMB, caps=(0.030, 0.010), power=2.2)
+    """Return the field of the arm, cut at the shoulder with a rounded edge."""
+    limb = Loft((0, 0, 0), axes_along(_X, _Z), _LIMB, caps=(0.030, 0.010), power=2.2)
     cut = Stroke(HalfSpace((-0.034, 0, 0), (1, 0, 0)), 0.040, carve=True)
     strokes = [Stroke(limb, 0.01), *_upper_arm(), cut, *_elbow_and_forearm(), *_palm(), *_thumb_form()]
     for name in FINGERS:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which bone each vertex of the arm follows: one, with weight 1.0."""
+"""Skin weights of the arm: one bone per vertex, with weight 1.0."""
 
 import numpy as np
 
@@ -7,16 +7,16 @@ from .joints import FINGERS, JOINT_INDEX, UPPER_ARM_LENGTH, WRIST_X, joint
 from .quads import Grid
 
 
-def _beyond(points: np.ndarray, before: str, after: str) -> np.ndarray:
-    """(n,) bool: past the plane that halves the angle between two bones at their common joint."""
+def _past_joint_plane(points: np.ndarray, before: str, after: str) -> np.ndarray:
+    """Return which points are past the bisector plane of two bones at their common joint, (n,) bool."""
     first, second = joint(before), joint(after)
     axes = [np.array(bone.tail) - np.array(bone.head) for bone in (first, second)]
     normal = sum(axis / np.linalg.norm(axis) for axis in axes)
     return (points - np.array(second.head)) @ normal > 0.0
 
 
-def _from_bone(points: np.ndarray, name: str, start: float = 0.0) -> np.ndarray:
-    """(n,) metres to the bone's segment, of which the first part `start` (0..1) is left out."""
+def _distance_to_bone(points: np.ndarray, name: str, start: float = 0.0) -> np.ndarray:
+    """Compute (n,) distances in metres to a bone's segment without its first part `start` (0..1)."""
     head, tail = np.array(joint(name).head), np.array(joint(name).tail)
     head = head + (tail - head) * start
     axis = tail - head
@@ -25,7 +25,7 @@ def _from_bone(points: np.ndarray, name: str, start: float = 0.0) -> np.ndarray:
 
 
 def main_joints(points: np.ndarray, grid: Grid) -> np.ndarray:
-    """(n,) int32 index into `JOINTS` for the rest points (n, 3), metres.
+    """Return the (n,) int32 index into `JOINTS` of (n, 3) rest points, metres.
 
     Fingers are cut at their joints, by chain: no vertex of a finger follows another one. The palm goes to the
     metacarpals by column, the ball of the thumb to the thumb's.
@@ -38,18 +38,20 @@ def main_joints(points: np.ndarray, grid: Grid) -> np.ndarray:
         chain = in_hand & np.where(grid.digit >= 0, grid.digit == k, grid.column == k)
         for i in range(4):
             before = "wrist" if i == 0 else f"{name}_{i - 1}"
-            chain = chain & (_beyond(points, before, f"{name}_{i}") | (i < 2) & (grid.digit == k))
+            chain = chain & (_past_joint_plane(points, before, f"{name}_{i}") | (i < 2) & (grid.digit == k))
             result[chain] = JOINT_INDEX[f"{name}_{i}"]
     thumb = grid.digit == 0
     # The ball of the thumb: nearer to its metacarpal than to the others, and not behind the joint that it turns about.
     ball = in_hand & (grid.digit < 0) & (grid.column <= 2) & (result != JOINT_INDEX["index_1"])
-    to_index = np.minimum(_from_bone(points, "index_0"), _from_bone(points, "middle_0"))
-    ball &= _beyond(points, "wrist", "thumb_0")
-    ball &= _from_bone(points, "thumb_0", 0.25) < 0.95 * np.minimum(to_index, _from_bone(points, "wrist") + 0.002)
+    to_index = np.minimum(_distance_to_bone(points, "index_0"), _distance_to_bone(points, "middle_0"))
+    ball &= _past_joint_plane(points, "wrist", "thumb_0")
+    ball &= _distance_to_bone(points, "thumb_0", 0.25) < 0.95 * np.minimum(
+        to_index, _distance_to_bone(points, "wrist") + 0.002
+    )
     result[thumb | ball] = JOINT_INDEX["thumb_0"]
     # Its web stays with the metacarpal.
-    thumb &= _from_bone(points, "thumb_1") < _from_bone(points, "index_0") - 0.003
+    thumb &= _distance_to_bone(points, "thumb_1") < _distance_to_bone(points, "index_0") - 0.003
     for i in (1, 2):
-        thumb = thumb & _beyond(points, f"thumb_{i - 1}", f"thumb_{i}")
+        thumb = thumb & _past_joint_plane(points, f"thumb_{i - 1}", f"thumb_{i}")
         result[thumb] = JOINT_INDEX[f"thumb_{i}"]
     return result

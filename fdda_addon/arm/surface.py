@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The arm as arrays: rest points, quads, the bone of each vertex, the biceps. No bpy."""
+"""The arm as arrays: rest positions, quads, bone of each vertex, biceps; without bpy."""
 
 from dataclasses import dataclass, replace
 
@@ -8,8 +8,8 @@ import numpy as np
 from .biceps import PEAK, biceps_offsets
 from .digits import nail_faces
 from .grid import build_grid
-from .quads import seeded_points
-from .relax import draw_out, relax
+from .quads import interpolate_guide_points
+from .relax import relax, smooth_loose_points
 from .sculpt import arm_field
 from .skin import main_joints
 
@@ -30,13 +30,13 @@ class Surface:
 
 
 def sculpt_arm(density: int) -> Surface:
-    """The arm at density 1, 2 or 3 (about 1,450, 10,000 and 50,000 vertices); ValueError for any other."""
+    """Make the arm at density 1, 2 or 3 (about 1,450, 10,000 and 50,000 vertices); raise ValueError for others."""
     grid = build_grid(density)
     field = arm_field()
     guide = build_grid(1)
-    points = relax(draw_out(guide), guide, field, _GUIDE_ROUNDS)
+    points = relax(smooth_loose_points(guide), guide, field, _GUIDE_ROUNDS)
     if density > 1:
-        seeds = seeded_points(grid, guide, points)
+        seeds = interpolate_guide_points(grid, guide, points)
         # The guide has found where every ring belongs.
         points = relax(seeds, replace(grid, plane_point=seeds), field, _FINE_ROUNDS)
     _, normals = field.distance_and_gradient(points)

@@ -10,9 +10,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from .field import smooth_curve
+from .field import cubic_curve
 from .joints import FINGERS, HAND, UPPER_ARM_LENGTH, WRIST_X, joint
-from .quads import DIVISIONS, Collector, Divisions, Seat
+from .quads import DIVISIONS, Divisions, GridBuilder, SheetPosition
 
 # x and the spacing of rings wanted there, metres: close at the elbow, the wrist and in the hand.
 _SPACING = np.array(
@@ -36,7 +36,7 @@ _GUIDE_ROOT, _GUIDE_KNUCKLES = 29, 34
 
 
 class Tube:
-    """Addresses and rings for one density, and where they lie in those of density 1."""
+    """Addresses and rings of one density, and their positions in density 1."""
 
     def __init__(self, divisions: Divisions):
         d = self.divisions = divisions
@@ -80,7 +80,7 @@ class Tube:
     def _guide_rings(self) -> tuple[np.ndarray, int]:
         """(rings + 1,) ring in density 1 of every ring, and the ring where the thumb's root begins."""
         d, g = self.divisions, DIVISIONS[1]
-        mine, guide = _marks(d.rings), _marks(g.rings)
+        mine, guide = _landmark_rings(d.rings), _landmark_rings(g.rings)
         rings = np.interp(np.arange(mine[-1] + 1), mine, guide)
         root = int(np.argmin(np.abs(rings - _GUIDE_ROOT)))
         mine = np.insert(mine, 3, (root, root + d.thumb_root))
@@ -88,20 +88,20 @@ class Tube:
         return np.interp(np.arange(mine[-1] + 1), mine, guide), root
 
 
-def _marks(rings: tuple[int, int, int]) -> np.ndarray:
-    """Ring numbers of start, elbow, wrist and webs; elbow and wrist lie half way between two rings."""
+def _landmark_rings(rings: tuple[int, int, int]) -> np.ndarray:
+    """Return the ring indices of start, elbow, wrist and webs; elbow and wrist are between two rings."""
     to_elbow, to_wrist, to_web = rings
     return np.array([0.0, to_elbow - 0.5, to_elbow + to_wrist - 0.5, to_elbow + to_wrist + to_web])
 
 
-def _ring_places(ring: np.ndarray) -> np.ndarray:
-    """x of rings given in the numbers of density 1."""
+def _ring_positions(ring: np.ndarray) -> np.ndarray:
+    """Compute x of rings, indexed as in density 1."""
     fine = np.linspace(_START_X, _END_X, 4001)
     density = 1.0 / np.interp(fine, _SPACING[:, 0], _SPACING[:, 1])
     count = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(fine))])
     at = np.interp([_START_X, UPPER_ARM_LENGTH, WRIST_X, _END_X], fine, count)
     # A smooth map from ring number to count keeps neighboring spacings alike across the joints.
-    return np.interp(smooth_curve(ring, _marks(DIVISIONS[1].rings), at[:, None])[:, 0], count, fine)
+    return np.interp(cubic_curve(ring, _landmark_rings(DIVISIONS[1].rings), at[:, None])[:, 0], count, fine)
 
 
 def _hand_columns(tube: Tube) -> np.ndarray:
@@ -126,7 +126,11 @@ def _hand_x(ring: float, x: float, y: np.ndarray) -> np.ndarray:
     Past the wrist the rings bend, so that one runs over the knuckles and the last one through the webs; both fall back
     to the little finger.
     """
-    wrist, knuckles, webs = _marks(DIVISIONS[1].rings)[2], _GUIDE_KNUCKLES, _marks(DIVISIONS[1].rings)[3]
+    wrist, knuckles, webs = (
+        _landmark_rings(DIVISIONS[1].rings)[2],
+        _GUIDE_KNUCKLES,
+        _landmark_rings(DIVISIONS[1].rings)[3],
+    )
     if ring <= wrist:
         return np.full(len(y), x)
     knuckle_x = np.interp(y, *np.array([HAND[name].knuckle[1::-1] for name in FINGERS]).T)
@@ -155,14 +159,14 @@ def _outlines(tube: Tube) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([np.cos(angle), np.sin(angle)], axis=1), hand
 
 
-def lay_tube(quads: Collector, tube: Tube) -> list[list[int]]:
-    """The vertices of the tube, ring by ring, and its faces but those under the thumb. Closes the shoulder."""
+def lay_tube(quads: GridBuilder, tube: Tube) -> list[list[int]]:
+    """Add vertices and faces of the tube, without those under the thumb, and close the shoulder."""
     d = tube.divisions
     circle, hand = _outlines(tube)
     axis = np.array([1.0, 0.0, 0.0])
     fingers = [tube.finger_of(address) for address in range(tube.around)]
     rings = []
-    for number, x in enumerate(_ring_places(tube.guide_ring)):
+    for number, x in enumerate(_ring_positions(tube.guide_ring)):
         in_hand = float(np.clip((x - WRIST_X) / (_END_X - WRIST_X), 0.0, 1.0))
         spread = in_hand * in_hand * (3 - 2 * in_hand)
         radius = 0.045 if x < 0.4 else 0.03
@@ -174,12 +178,12 @@ def lay_tube(quads: Collector, tube: Tube) -> list[list[int]]:
         ring = []
         for address in range(tube.around):
             point = np.array([ring_x[address], *place[address]])
-            seat = Seat("tube", float(tube.guide_ring[number]), float(tube.guide_column[address]))
+            sheet_position = SheetPosition("tube", float(tube.guide_ring[number]), float(tube.guide_column[address]))
             loose = 0.566 < x < 0.650 and point[1] < -0.005
             # In the hand the rings are left freer: they find their way between wrist, thumb and webs.
             free = np.clip((x - 0.565) / 0.03, 0.0, 1.0) * (0.95 if point[1] < 0.0 and x < 0.64 else 0.6)
             hold = 0.0 if edge > 0.0 else 1.0 - float(free)
-            ring.append(quads.vertex(point, seat, -1, fingers[address], (point, axis, hold), loose))
+            ring.append(quads.vertex(point, sheet_position, -1, fingers[address], (point, axis, hold), loose))
         rings.append(ring)
     quads.sheets["tube"] = rings
     root = range(tube.root, tube.root + d.thumb_root)
@@ -189,8 +193,8 @@ def lay_tube(quads: Collector, tube: Tube) -> list[list[int]]:
     return rings
 
 
-def _close_shoulder(quads: Collector, tube: Tube, first: list[int]):
-    """The end of the arm: the columns of the back sewn to those of the palm."""
+def _close_shoulder(quads: GridBuilder, tube: Tube, first: list[int]):
+    """Close the shoulder by joining the columns of the back to those of the palm."""
     d = tube.divisions
     rows = [first[: tube.top + 1]]
     for j in range(1, d.side):
@@ -199,8 +203,8 @@ def _close_shoulder(quads: Collector, tube: Tube, first: list[int]):
         for column in range(1, tube.top):
             t = column / tube.top
             point = quads.points[left] * (1 - t) + quads.points[right] * t
-            seat = Seat("shoulder", j * DIVISIONS[1].side / d.side, float(tube.guide_column[column]))
-            row.append(quads.vertex(point, seat, -1, tube.finger_of(column)))
+            sheet_position = SheetPosition("shoulder", j * DIVISIONS[1].side / d.side, float(tube.guide_column[column]))
+            row.append(quads.vertex(point, sheet_position, -1, tube.finger_of(column)))
         rows.append([*row, right])
     rows.append([first[tube.palm(column)] for column in range(tube.top + 1)])
     quads.sheets["shoulder"] = rows
