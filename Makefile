@@ -97,7 +97,7 @@ characters: .venv  ## record, train, bind and compare every kind of character on
 pictures: demo  ## make the README's pictures again, from those of the demo
 	.venv/bin/python docs/pictures/make_pictures.py out/demo/pictures
 
-map: .venv  ## draw the floors of the code again, for docs/development.md
+map: .venv  ## draw the layers of the code again, for docs/development.md
 	.venv/bin/python docs/pictures/make_map.py docs/pictures/map.svg
 
 fixtures:  ## build the rigs in blend_fixtures again, with the oldest Blender under test

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The pages name files and functions that exist; that for developers names every room, thread, timer and handler."""
+"""The pages name files and functions that exist; that for developers names every package, thread, timer and handler."""
 
 import ast
 import re
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from .floors import ADDON, FLOORS, ROOT, module_of, room_of
+from .layers import ADDON, LAYERS, ROOT, module_of, package_of
 
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 DEVELOPMENT = (ROOT / "docs" / "development.md").read_text(encoding="utf-8")
@@ -63,16 +63,16 @@ def test_the_path_of_a_pose_is_named_by_functions():
     assert len(re.findall(rf"`{PATH}\.py`\s+\(`", chapter("The path of a pose"))) > 25
 
 
-def test_every_room_is_on_the_page_and_in_the_picture():
-    rooms = [room for floor in FLOORS for room in floor]
-    assert [room for room in rooms if f"`{room}`" not in chapter("Layers")] == []
+def test_every_package_is_on_the_page_and_in_the_picture():
+    packages = [package for layer in LAYERS for package in layer]
+    assert [package for package in packages if f"`{package}`" not in chapter("Layers")] == []
     drawn = re.findall(r"<!-- (.+?) -->", MAP)
-    assert [room for room in rooms if room not in drawn] == [], "draw it again: make map"
+    assert [package for package in packages if package not in drawn] == [], "draw it again: make map"
 
 
-def test_every_room_that_the_page_names_is_on_a_floor():
+def test_every_package_that_the_page_names_is_in_a_layer():
     named = re.findall(r"`([\w.]+)`", "".join(re.findall(r"^\| (`[^|]+) \|", chapter("Layers"), re.MULTILINE)))
-    assert [name for name in named if room_of(name) != name] == []
+    assert [name for name in named if package_of(name) != name] == []
 
 
 def test_every_thread_timer_and_handler_is_in_the_table():

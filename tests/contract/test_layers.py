@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from .. import systems
-from .floors import ADDON, FLOORS, ROOT, import_graph, imported_names, module_of, room_graph
+from .layers import ADDON, LAYERS, ROOT, import_graph, imported_names, module_of, package_graph
 
 STANDARD = sys.stdlib_module_names
 BLENDER = {"bpy", "bpy_extras", "mathutils", "bmesh", "gpu", "gpu_extras", "blf", "idprop", "pxr"}
@@ -106,18 +106,18 @@ def test_the_examples_need_nothing_of_ours():
     assert foreign_imports("examples", {"numpy", "onnxruntime", "bpy"}) == []
 
 
-def test_every_file_of_the_addon_is_in_a_room():
-    rooms = {room for floor in FLOORS for room in floor}
-    assert set(room_graph()) == rooms
+def test_every_file_of_the_addon_is_in_a_package():
+    packages = {package for layer in LAYERS for package in layer}
+    assert set(package_graph()) == packages
 
 
 def test_imports_in_the_addon_point_down():
-    floor_of = {room: number for number, floor in enumerate(FLOORS) for room in floor}
+    layer_of = {package: number for number, layer in enumerate(LAYERS) for package in layer}
     wrong = [
-        f"{room} imports from {other}, which is not below it"
-        for room, imported in room_graph().items()
+        f"{package} imports from {other}, which is not below it"
+        for package, imported in package_graph().items()
         for other in imported
-        if floor_of[other] <= floor_of[room]
+        if layer_of[other] <= layer_of[package]
     ]
     assert wrong == []
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The floors of fdda_addon, and who imports whom, read from the code. docs/development.md draws it."""
+"""The layers of fdda_addon and its import graph, read from the code. docs/development.md shows them."""
 
 import ast
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 ADDON = ROOT / "fdda_addon"
 
-FLOORS: tuple[tuple[str, ...], ...] = (
+LAYERS: tuple[tuple[str, ...], ...] = (
     ("__init__", "__main__"),
     ("cli",),
     ("registration",),
@@ -25,22 +25,24 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("core.recording",),
     ("core",),
 )
-"""From the top down. A file imports from its own room and from floors below, not from another room of its floor."""
+"""From the top down. A file imports from its own package and lower layers, not from other packages of its layer."""
 
 
-def room_of(name: str) -> str:
-    """The room of a dotted name below fdda_addon: "core.recording" for "core.recording.index", "__init__" for ""."""
-    rooms = [room for floor in FLOORS for room in floor]
-    return max((room for room in rooms if f"{name}.".startswith(f"{room}.")), key=len, default=name or "__init__")
+def package_of(name: str) -> str:
+    """Return the package of a name below fdda_addon: "core.recording" for "core.recording.index", "__init__" for ""."""
+    packages = [package for layer in LAYERS for package in layer]
+    return max(
+        (package for package in packages if f"{name}.".startswith(f"{package}.")), key=len, default=name or "__init__"
+    )
 
 
 def module_of(file: Path) -> str:
-    """The dotted name of a file below the repository, "fdda_addon.core.rig"; of a package that of its folder."""
+    """Return the dotted name of a file, "fdda_addon.core.rig"; for `__init__.py` that of its folder."""
     return ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
 def imported_names(file: Path) -> Iterator[str]:
-    """Absolute dotted names of everything that a file imports, relative imports resolved, inside functions as well."""
+    """Yield the absolute dotted names of everything that a file imports, also inside functions."""
     package = list(file.relative_to(ROOT).with_suffix("").parts[:-1])
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -53,7 +55,7 @@ def imported_names(file: Path) -> Iterator[str]:
 
 
 def import_graph(folder: str) -> dict[str, set[str]]:
-    """The modules of a folder, each with those of the folder that it imports."""
+    """Return the modules of a folder, each with the modules of the folder that it imports."""
     files = {module_of(file): file for file in (ROOT / folder).rglob("*.py")}
     graph: dict[str, set[str]] = {}
     for module, file in files.items():
@@ -62,14 +64,14 @@ def import_graph(folder: str) -> dict[str, set[str]]:
     return graph
 
 
-def room_graph() -> dict[str, set[str]]:
-    """The rooms of fdda_addon, each with those that it imports from."""
-    graph: dict[str, set[str]] = {room: set() for floor in FLOORS for room in floor}
+def package_graph() -> dict[str, set[str]]:
+    """Return the packages of fdda_addon, each with the packages that it imports from."""
+    graph: dict[str, set[str]] = {package: set() for layer in LAYERS for package in layer}
     for module, imported in import_graph("fdda_addon").items():
-        room = _room(module)
-        graph.setdefault(room, set()).update({_room(name) for name in imported} - {room})
+        package = _package(module)
+        graph.setdefault(package, set()).update({_package(name) for name in imported} - {package})
     return graph
 
 
-def _room(module: str) -> str:
-    return room_of(module.removeprefix("fdda_addon").lstrip("."))
+def _package(module: str) -> str:
+    return package_of(module.removeprefix("fdda_addon").lstrip("."))
