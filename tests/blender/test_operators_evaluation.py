@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operators of the section Evaluation: figures, colors and markers are those of the evaluation itself."""
+"""The operators of the section Compare with Rig: figures, colors and markers are those of the evaluation itself."""
 
 import bpy
 import numpy as np

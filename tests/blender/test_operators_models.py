@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operators of the section Models: several for a mesh, packed into the file, checked against the rig."""
+"""The operators of the section Model Library: several models of a mesh, packed and checked."""
 
 import shutil
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operators of the section Playback, blocking as without a window: bind, switch, measure, find a file, unbind."""
+"""The operators of the section Model, without a window: bind, switch, measure, find a file, unbind."""
 
 import shutil
 

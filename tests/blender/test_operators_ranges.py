@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The range of motion of many bones at once: set, copied, mirrored, of a person, forgotten."""
+"""Rotation limits of many bones at once: set, copied, mirrored, of a person, cleared."""
 
 import math
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What random poses move, chosen in the sidebar: control bones in each way, and controls beside them."""
+"""The bones and extra inputs of random poses, chosen in the sidebar."""
 
 from pathlib import Path
 

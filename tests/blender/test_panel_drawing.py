@@ -100,7 +100,8 @@ def test_a_section_of_a_rig(rig: SceneRig, name: str):
     checks.check_now(rig)
     drawn = draw(name)
     assert drawn
-    fields = [text for kind, text, is_open in drawn if kind == "field" and is_open and text]
+    # Without the buttons X, Y and Z of the active bone.
+    fields = [text for kind, text, is_open in drawn if kind == "field" and is_open and len(text) > 1]
     assert len(fields) <= MAX_OPEN_FIELDS, fields
 
 
