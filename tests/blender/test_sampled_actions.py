@@ -90,7 +90,7 @@ def test_what_stands_still_beside_the_rest_pose_stays_there(figure):
         "spine: turns X 43.0 to 43.0° (stands still away from rest, has no range), turns Y -11.5 to 11.5°"
     ]
     channels = sampled(figure)
-    assert _format_channels(list(channels), True) == "fixed  -11…11°  fixed"
+    assert _format_channels(list(channels), True) == "locked  ±11°  locked"
     assert ranges(channels, "spine") == {
         ("rotation", 0): (0.75, 0.75),
         ("rotation", 1): pytest.approx((-0.2, 0.2)),
