@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The time range of an Alembic file: what Blender shows of a cache, but says to no script.
+"""Time range of an Alembic file, which Blender does not expose to Python.
 
 Only the container is read, Ogawa, which Alembic has written by default since 2013: "Ogawa", a byte that says whether
 the file is complete, two bytes of version, and the position of the root group. A group is a number of children and
@@ -20,13 +20,13 @@ IS_DATA = 1 << 63
 MAX_CHILDREN, MAX_BYTES = 64, 1 << 20
 """The root group has six children, and a table of time samplings has a few numbers for each rate."""
 ACYCLIC = 1e30
-"""Seconds of a cycle where each sample has a time of its own: Alembic writes a number larger than any time."""
+"""Seconds of a cycle above which Alembic stores a time for each sample."""
 
 
 def time_range(path: Path) -> tuple[float, float] | None:
-    """First and last second of what moves in an Alembic file.
+    """Read the first and last second of the animation in an Alembic file.
 
-    None where the file is of another container (HDF5), is no Alembic file, is damaged, or holds nothing that moves.
+    None where the file has another container (HDF5), is no Alembic file, is damaged, or has no animation.
 
     Raises:
         OSError: it cannot be opened.
@@ -39,7 +39,7 @@ def time_range(path: Path) -> tuple[float, float] | None:
 
 
 def _time_samplings(file: BinaryIO) -> bytes:
-    """The table of time samplings; ValueError or struct.error where there is none."""
+    """Read the table of time samplings; raise ValueError or struct.error where there is none."""
     head = file.read(16)
     if head[:5] != SIGNATURE:
         raise ValueError("another container")
@@ -63,7 +63,7 @@ def _time_range(table: bytes) -> tuple[float, float] | None:
         samples, cycle, count = struct.unpack_from("<IdI", table, offset)
         times = struct.unpack_from(f"<{count}d", table, offset + 16)
         offset += 16 + 8 * count
-        # One sample is what does not move; Alembic begins each table with it.
+        # A single sample is static; each table begins with one.
         if samples > 1 and times:
             last = times[min(samples, count) - 1] if cycle > ACYCLIC else 0.0
             if cycle <= ACYCLIC:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Makes a page for browsers of the manual: of as much Markdown as that uses."""
+"""Conversion of the manual to an HTML page, for the subset of Markdown that it uses."""
 
 import html
 import re
@@ -13,18 +13,18 @@ _BLOCK = r"^(#{1,6} |\||    |<img|- |\d+\. )"
 
 
 def anchor(heading: str) -> str:
-    """The name under which pages link to a heading."""
+    """Return the anchor of a heading."""
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
 def page(text: str, folder: str) -> str:
-    """A page of Markdown text; relative links and pictures lead into a folder, an address."""
+    """Convert Markdown text to a page; relative links and images are resolved against the URL `folder`."""
     body = "\n".join(_block(block, folder) for block in _blocks(text))
     return f'<!doctype html><meta charset="utf-8"><title>FDDA</title><style>{STYLE}</style>\n{body}\n'
 
 
 def _blocks(text: str) -> list[list[str]]:
-    """Groups of lines: a heading, a table, a list, code, or a paragraph."""
+    """Split lines into blocks: heading, table, list, code or paragraph."""
     blocks: list[list[str]] = [[]]
     for line in text.splitlines():
         own = re.match(_BLOCK, line)
@@ -76,7 +76,7 @@ def _list(lines: list[str], folder: str) -> str:
 
 
 def _inline(text: str, folder: str) -> str:
-    """Code, bold, italic, links and pictures."""
+    """Convert code, bold, italic, links and images."""
     kept: list[str] = []
 
     def keep(made: str) -> str:

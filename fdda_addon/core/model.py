@@ -31,7 +31,8 @@ LIMITS_KEY = "limits"
 OBJECT_KEY = "object"
 """Key of `ModelInfo.training`."""
 MAX_BYTES = 768 << 20
-MAX_METADATA_LENGTH = 16 << 20  # letters
+MAX_METADATA_LENGTH = 16 << 20
+"""Characters of the metadata."""
 CHECKSUM_KEY = "fdda_checksum"
 """Metadata property with the SHA-256 of the graph."""
 
@@ -59,17 +60,16 @@ class ModelInfo:
     """The metadata property `fdda` of a model.
 
     Attributes:
-        joints: the joints that `pose_matrices` lists, every parent before its children.
+        joints: of the input `pose_matrices`, every parent before its children.
         rest_matrices: (J, 4, 4) float32, mesh-object space, mesh units.
         vertex_count: of the mesh.
-        fingerprint: of the rig that was recorded.
+        fingerprint: of the recorded rig.
         partitions: in ascending order of their main joints, the order of the output `confidence`.
         feature_low, feature_high: (J, 12) float32, range of the joint features (core.features) in training.
-        controls: the inputs beside the joints, with the ranges that they had in training.
-        held_out_mm: error over the poses that were held out of the training, in mm, by the names of
-            `metrics.ErrorStatistics`.
+        controls: inputs beside the joints, with their ranges in training.
+        held_out_mm: error over the held-out poses, mm, by the names of `metrics.ErrorStatistics`.
         parity_mm: largest difference between ONNX Runtime and PyTorch, in mm.
-        constant_bytes: of the graph, all of which a call reads; 0 where nobody knows.
+        constant_bytes: size of the constants of the graph; 0 where unknown.
         training: settings and seed of the training.
         metres_per_unit: length of one unit of mesh-object space, as in `Rig`.
     """
@@ -93,7 +93,7 @@ class ModelInfo:
         return tuple(joint.name for joint in self.joints)
 
     def partitions_of(self, rig: Rig) -> tuple[Partition, ...]:
-        """The partitions of the model, with their vertices in a rig that has the weights of its linear skinning."""
+        """Make the partitions of the model for a rig with the skin weights of its linear skinning."""
         return make_partitions(
             rig,
             {p.joint: p.influencing for p in self.partitions},
@@ -103,29 +103,29 @@ class ModelInfo:
         )
 
     def budget(self) -> Budget:
-        """What its graph may cost."""
+        """Compute the budget of its graph."""
         partitions = [(p.vertices, p.basis, len(p.influencing) + len(p.controls)) for p in self.partitions]
         return compute_budget(len(self.joints), len(self.controls), partitions, self.training)
 
     @property
     def limits(self) -> tuple[Channel, ...]:
-        """The range of motion that random poses were drawn from; empty where there were none, or nobody knows."""
+        """Channels of the random poses with their range of motion; empty where there were none or they are unknown."""
         return tuple(Channel.from_json(channel) for channel in self.training.get(LIMITS_KEY, ()))
 
     @property
     def trained_poses(self) -> int:
-        """How many poses the recording had that the model was trained on, held-out ones included; 0 if nobody knows."""
+        """Number of poses of the recording, with held-out ones; 0 where unknown."""
         counts = [self.training.get(f"{part}_poses") for part in ("training", "validation", "held_out")]
         return sum(counts) if all(type(count) is int for count in counts) else 0
 
     @property
     def object_name(self) -> str:
-        """Name of the mesh object that was recorded; empty where nobody knows."""
+        """Name of the recorded mesh object; empty where unknown."""
         name = self.training.get(OBJECT_KEY, "")
         return name if isinstance(name, str) else ""
 
     def to_json(self) -> str:
-        """The text of the metadata property."""
+        """Return the text of the metadata property."""
         value = {
             "version": VERSION,
             "joints": [asdict(joint) for joint in self.joints],
@@ -214,13 +214,13 @@ def _read_info(value: dict) -> ModelInfo:
 
 
 def read_model(path: Path) -> tuple[ModelInfo, bytes]:
-    """Read and check a model without executing it.
+    """Read and check a model without running it.
 
     Returns:
-        What it says of itself, and the bytes that were checked: only those are executed, whatever the file is by then.
+        Its metadata and the checked bytes; only these bytes may be run, because the file may change.
 
     Raises:
-        ModelError: no file, or as `check_model`.
+        ModelError: the file cannot be read, or as `check_model`.
     """
     try:
         data = read_input(path, MAX_BYTES)
@@ -232,15 +232,15 @@ def read_model(path: Path) -> tuple[ModelInfo, bytes]:
 
 
 def check_model(data: bytes, name: Path | str) -> ModelInfo:
-    """Check the bytes of a model without executing them.
+    """Check the bytes of a model without running it.
 
     Args:
         data: the bytes.
-        name: what errors call the model.
+        name: of the model in messages.
 
     Raises:
-        ModelError: no ONNX file, not a model of ours, damaged, or one that asks for more than a model may: other
-            inputs and operators than train writes, external data, more memory or work than its metadata explains.
+        ModelError: no ONNX file, no model of this add-on, damaged, or with inputs, operators, external data, memory or
+            computation that a model does not need.
     """
     if len(data) > MAX_BYTES:
         raise ModelError(f"'{name}' is larger than {MAX_BYTES >> 20} MB and cannot be a model.")
@@ -275,11 +275,12 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
 
 
 def read_skin(data: bytes, info: ModelInfo, name: Path | str) -> tuple[np.ndarray, np.ndarray] | None:
-    """The fitted skin weights of a model's linear skinning; None where it has those of the rig.
+    """Read the fitted skin weights of a model; None where it uses those of the rig.
 
     Args:
-        data: the bytes of a model that `check_model` has passed, and `info` what it gave.
-        name: what errors call the model.
+        data: bytes of a model that `check_model` has checked.
+        info: its metadata.
+        name: of the model in messages.
 
     Returns:
         (V, I) int32 joints and (V, I) float32 weights, each row summing to 1.
@@ -297,15 +298,15 @@ def read_skin(data: bytes, info: ModelInfo, name: Path | str) -> tuple[np.ndarra
 
 
 def read_model_info(path: Path) -> ModelInfo:
-    """What a model says of itself; raises as `read_model`."""
+    """Read the metadata of a model; raises as `read_model`."""
     return read_model(path)[0]
 
 
 def check_rig(path: Path, info: ModelInfo, rig: Rig) -> None:
-    """Fail when a model was trained for another rig.
+    """Check that a model was trained for this rig.
 
     Raises:
-        ModelError: says in what they differ.
+        ModelError: the rigs differ.
     """
     found = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
     if found:

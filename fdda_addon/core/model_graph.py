@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Whether the graph of a model is one that `train` writes, of a size that its metadata explains.
+"""Check of a model's graph: operators that `train` writes, and a cost that its metadata explains.
 
-What a graph may cost to load and to run is bounded before any runtime sees it. The bounds leave room for other ways to
-write the same deformation: they are several times the largest known cost.
+The cost of loading and running a graph is bounded before a runtime loads it. The bounds are several times the largest
+known cost, to permit other graphs for the same deformation.
 """
 
 from collections.abc import Sequence
@@ -14,15 +14,15 @@ from .onnx_cost import GraphCost, Shape, compute_graph_cost
 from .onnx_file import ITEM_BYTES, OnnxContents
 
 INPUT_ITEM_NAMES = {3: "joints", 1: "controls"}
-"""What the first number of an input's shape counts, by how many there are."""
+"""Names of what the first dimension of an input counts, by rank of the shape."""
 COST_FACTOR = 8
-"""How many times the budget a graph may cost."""
+"""Largest cost of a graph, as a multiple of its budget."""
 FREE_ELEMENTS = 1 << 16
-"""Elements that need no explanation."""
+"""Number of elements that every graph may have."""
 MAX_NODES = 20_000
 BASE_NODES, NODES_PER_PARTITION = 256, 32
 BATCH_POSES = 32
-"""Poses for which the work is measured too: more poses may not cost more than so many times one."""
+"""Number of poses for which the cost is computed again, because it must not grow faster than the poses."""
 DEFAULT_HIDDEN_UNITS = [128, 128]
 MAX_HIDDEN_LAYERS = 16
 MAX_LAYER_UNITS = 1 << 16
@@ -30,11 +30,11 @@ MAX_LAYER_UNITS = 1 << 16
 
 @dataclass(frozen=True)
 class Budget:
-    """What the metadata of a model explains, elements for one pose.
+    """Numbers of elements that the metadata of a model explains, for one pose.
 
     Attributes:
-        values: of the values of all nodes.
-        constants: of the constants.
+        values: elements of the outputs of all nodes.
+        constants: elements of the constants.
     """
 
     values: int
@@ -42,7 +42,7 @@ class Budget:
 
 
 def compute_budget(joints: int, controls: int, partitions: Sequence[tuple[int, int, int]], training: dict) -> Budget:
-    """What there is to compute and to keep for a character.
+    """Compute the budget of a character's model.
 
     Args:
         joints, controls: how many.
@@ -53,7 +53,7 @@ def compute_budget(joints: int, controls: int, partitions: Sequence[tuple[int, i
         ValueError: the settings are none; a clause about the model.
     """
     vertices, shapes, seen = map(list, zip(*partitions, strict=True))
-    # Joints as their parents see them, and as main joints see them.
+    # Joints relative to their parents, and relative to main joints.
     features = 16 * joints + 3 * controls + 3 * sum(seen)
     widths = [(FEATURES_PER_JOINT + 3) * max(seen), *_read_hidden_units(training), max(shapes)]
     network = sum(one * other for one, other in pairwise(widths))
@@ -65,7 +65,7 @@ def compute_budget(joints: int, controls: int, partitions: Sequence[tuple[int, i
 
 
 def _read_hidden_units(training: dict) -> list[int]:
-    """Units of the hidden layers of its networks."""
+    """Read the numbers of units of the hidden layers."""
     units = training.get("hidden", DEFAULT_HIDDEN_UNITS)
     if not isinstance(units, list) or len(units) > MAX_HIDDEN_LAYERS:
         raise ValueError("its networks have hidden layers that are none")
@@ -75,11 +75,11 @@ def _read_hidden_units(training: dict) -> list[int]:
 
 
 def check_inputs_and_outputs(contents: OnnxContents, inputs: dict[str, Shape], outputs: dict[str, Shape]) -> None:
-    """Fail where a graph does not take and give what its metadata says.
+    """Check that inputs and outputs of a graph match its metadata.
 
     Args:
         contents: of the file.
-        inputs, outputs: their shapes without the poses; an output may be missing, but not the first.
+        inputs, outputs: shapes without the dimension of poses, by name; only the first output is required.
 
     Raises:
         ValueError: a clause about the graph.
@@ -93,13 +93,13 @@ def check_inputs_and_outputs(contents: OnnxContents, inputs: dict[str, Shape], o
 
 
 def check_graph(contents: OnnxContents, budget: Budget, size: int, outputs: dict[str, Shape]) -> None:
-    """Fail where a graph is none that `train` writes, or costs more than its metadata explains.
+    """Check that a graph has only what `train` writes, and costs no more than its metadata explains.
 
     Args:
         contents: of the file.
         budget: by its metadata.
-        size: of the file, bytes.
-        outputs: shapes that the outputs have for one pose, without the poses.
+        size: of the file in bytes.
+        outputs: shapes of the outputs without the dimension of poses, by name.
 
     Raises:
         ValueError: a clause about the graph.
@@ -128,7 +128,7 @@ def _check_cost(cost: GraphCost, budget: Budget, size: int, poses: int) -> None:
         raise ValueError(
             f"it computes {cost.elements} numbers for {poses} poses, more than its joints, vertices and shapes explain"
         )
-    # A constant is used once for each pose and axis.
+    # A constant is used once per pose and axis.
     if cost.products > COST_FACTOR * poses * (size + 64 * (budget.values + FREE_ELEMENTS)):
         raise ValueError(f"it multiplies {cost.products} numbers for {poses} poses, more than its size explains")
     if cost.folded > 2 * size + FREE_ELEMENTS:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What it takes to run a graph, found without running it: the shapes of all its values, node by node.
+"""Cost of running a graph, from shape inference without running it.
 
-`SHAPE_RULES` is the list of the operators that a model may have: those that `train` writes. An exporter that needs
-another adds it here, with the rule of its shape (https://onnx.ai/onnx/operators/).
+`SHAPE_RULES` has the operators that a model may use, which are those that `train` writes. An exporter that needs
+another operator adds it with the rule for its shape (https://onnx.ai/onnx/operators/).
 """
 
 import math
@@ -13,18 +13,18 @@ from .onnx_file import INT64, ITEM_BYTES, OnnxConstant, OnnxContents, OnnxNode
 
 Shape = tuple[int, ...]
 MAX_ELEMENTS = 1 << 40
-"""No value has so many elements."""
+"""Largest number of elements of a value."""
 
 
 @dataclass
 class GraphCost:
-    """What running a graph takes.
+    """Cost of running a graph.
 
     Attributes:
-        elements: of all values that nodes give.
-        products: multiplications of matrix products.
-        folded: elements that follow from constants alone, made when the graph is loaded.
-        shapes: of the values, by name.
+        elements: number of elements of all outputs of nodes.
+        products: number of multiplications in matrix products.
+        folded: number of elements computed from constants alone, when the graph is loaded.
+        shapes: shapes of the values, by name.
     """
 
     elements: int
@@ -35,7 +35,7 @@ class GraphCost:
 
 @dataclass
 class _NodeCall:
-    """A node with what is known of its inputs: their shapes, and which of them are constants."""
+    """A node with the shapes of its inputs, and its constant inputs."""
 
     node: OnnxNode
     shapes: list[Shape]
@@ -48,7 +48,7 @@ class _NodeCall:
         return value
 
     def integers(self, number: int) -> tuple[int, ...]:
-        """The elements of an input that must be a short constant."""
+        """Read the elements of an input that must be a short constant."""
         if number >= len(self.constants) or self.constants[number] is None:
             raise ValueError(f"a {self.node.operator} whose sizes are no constants")
         return self.constants[number].integers()
@@ -201,15 +201,15 @@ SHAPE_RULES: dict[str, Callable[[_NodeCall], list[Shape]]] = {
 OPERATORS = tuple(SHAPE_RULES)
 MATRIX_PRODUCT_OPERATORS = ("MatMul", "MatMulInteger", "Gemm")
 CONSTANT_INPUT_OPERATORS = ("Cast", "DequantizeLinear")
-"""Operators whose inputs may all be constants; of others the result would be the constant."""
+"""Operators whose inputs may all be constants; results of other operators would be stored as constants."""
 
 
 def compute_graph_cost(contents: OnnxContents, poses: int) -> GraphCost:
-    """Follow the shapes of all values of a graph.
+    """Infer the shapes of all values of a graph, and add up its cost.
 
     Args:
         contents: of a file, its inputs with the number of poses as their first dimension.
-        poses: how many.
+        poses: number of poses.
 
     Raises:
         ValueError: an operator is not one of `OPERATORS`, or values do not fit; the text is a clause about the graph.
@@ -260,5 +260,5 @@ def _add_node(node: OnnxNode, constants: dict[str, OnnxConstant], known: set[str
 
 
 def constant_elements(contents: OnnxContents) -> int:
-    """Elements of the constants of a graph; of indices none."""
+    """Count the elements of the constants of a graph, without indices."""
     return sum(math.prod(c.shape) for c in contents.constants.values() if c.type != INT64)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Looks into an ONNX file before anything executes it.
+"""Reading of the content of an untrusted ONNX file without running it.
 
-A model may come from anyone. ONNX Runtime would open external data files and load custom operators while it reads a
-model, and the `onnx` package is not at hand inside Blender, so the few protobuf fields that matter are read here
+ONNX Runtime opens external data files and loads custom operators while it reads a model, and Blender has no `onnx`
+package. So the few relevant protobuf fields are read here
 (https://onnx.ai/onnx/repo-docs/IR.html, onnx.proto; wire format: https://protobuf.dev/programming-guides/encoding/).
 """
 
@@ -12,29 +12,29 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 ITEM_BYTES = {1: 4, 2: 1, 3: 1, 6: 4, 7: 8, 10: 2}
-"""Bytes of an element by ONNX's number of its type: float, uint8, int8, int32, int64, float16."""
+"""Bytes per element by ONNX data type: float, uint8, int8, int32, int64, float16."""
 INT64 = 7
 MAX_DIMENSIONS = 8
 MAX_CONSTANT_INTEGERS = 1 << 16
-"""Of a constant that is read: the longest has the sizes of all partitions."""
+"""Largest number of elements of a constant that is read; the longest has the sizes of all partitions."""
 MAX_ATTRIBUTE_LENGTH = 16
 STANDARD_DOMAINS = ("", "ai.onnx")
 SUPPORTED_OPSETS = range(13, 24)
-"""Versions in which the operators of models mean the same."""
+"""Versions in which the operators of models are the same."""
 MAX_DEPTH = 8
-"""Deepest nesting of subgraphs that is followed."""
+"""Deepest nesting of subgraphs that is read."""
 
 
 @dataclass(frozen=True)
 class OnnxConstant:
-    """A constant of a graph: its type as ONNX numbers it, its dimensions, and its bytes."""
+    """A constant of a graph: its ONNX data type, shape and bytes."""
 
     type: int
     shape: tuple[int, ...]
     data: memoryview
 
     def integers(self) -> tuple[int, ...]:
-        """The elements of a short constant of int64; ValueError where it is long or of another type."""
+        """Return the elements of a short int64 constant; raise ValueError for other constants."""
         if self.type != INT64 or math.prod(self.shape) > MAX_CONSTANT_INTEGERS:
             raise ValueError("a shape is no list of whole numbers")
         size = ITEM_BYTES[INT64]
@@ -46,7 +46,7 @@ class OnnxConstant:
 
 @dataclass(frozen=True)
 class OnnxNode:
-    """A node of a graph. Attributes are whole numbers, lists of them, or None for what is neither."""
+    """A node of a graph. Attributes are integers, tuples of integers, or None for other types."""
 
     operator: str
     inputs: tuple[str, ...]
@@ -56,14 +56,14 @@ class OnnxNode:
 
 @dataclass
 class OnnxContents:
-    """What an ONNX file declares.
+    """Content of an ONNX file.
 
     Attributes:
         inputs, outputs: name to shape; a dimension is an int, or a str where it is dynamic.
         metadata: the metadata properties.
         custom_operators: operators outside the standard domains, "domain::name".
-        external_files: files that tensors refer to; "" for one that says its data lies outside and not where.
-        nodes, constants: of the graph itself, in their order and by name.
+        external_files: files of external tensors; "" where the file is not named.
+        nodes, constants: of the main graph, in their order and by name.
         unsupported: clauses about what `train` never writes: graphs inside of nodes, tensors in other forms.
         checksum: SHA-256 of the graph, hexadecimal.
     """
@@ -81,10 +81,10 @@ class OnnxContents:
 
 
 def read_onnx(data: bytes) -> OnnxContents:
-    """Read what the bytes of a file declare, without executing it.
+    """Read the content of an ONNX file from its bytes, without running it.
 
     Raises:
-        ValueError: they are not those of an ONNX file.
+        ValueError: the bytes are no ONNX file.
     """
     contents, digest = OnnxContents(), hashlib.sha256()
     try:
@@ -113,7 +113,7 @@ def read_onnx(data: bytes) -> OnnxContents:
 
 
 def _fields(data: memoryview) -> Iterator[tuple[int, memoryview | int]]:
-    """Field numbers and raw values of one protobuf message."""
+    """Yield field numbers and raw values of a protobuf message."""
     position, end = 0, len(data)
     while position < end:
         key, position = _varint(data, position)
@@ -128,7 +128,7 @@ def _fields(data: memoryview) -> Iterator[tuple[int, memoryview | int]]:
             value, position = data[position : position + size], position + size
         else:
             raise ValueError("not an ONNX file")
-        # Readers cut a longer key to 32 bits, which would hide a field from this one.
+        # Other readers cut a longer key to 32 bits, which would hide a field from this reader.
         if position > end or key >> 32:
             raise ValueError("not an ONNX file")
         yield key >> 3, value
@@ -217,14 +217,14 @@ def _read_attribute(data: memoryview, contents: OnnxContents, depth: int) -> tup
 
 
 def _to_signed(value: int) -> int:
-    """A number of 64 bits as protobuf writes it."""
+    """Convert a 64-bit varint to a signed integer."""
     if not isinstance(value, int):
         raise TypeError("text where a number belongs")
     return value - (1 << 64) if value >> 63 else value
 
 
 def _read_integers(value: int | memoryview) -> list[int]:
-    """One of a list of numbers, or all of them in one piece."""
+    """Read one integer, or a packed list of integers."""
     if isinstance(value, int):
         return [_to_signed(value)]
     found, position = [], 0
@@ -247,7 +247,7 @@ def _read_tensor(data: memoryview, contents: OnnxContents) -> tuple[str, OnnxCon
         elif number == 9:
             content.append(value)
         elif number in (3, 4, 5, 6, 7, 10, 11):
-            # A segment, or elements one by one: train writes neither.
+            # Segments and typed element fields, which train does not write.
             is_unsupported = True
         if number == 13:
             is_external = True

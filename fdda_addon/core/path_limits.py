@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Paths that Windows or Blender would refuse, cut, or take for another file: refused before the work."""
+"""Checks of output paths that Windows or Blender would refuse, truncate or map to another file."""
 
 import os
 import re
@@ -11,22 +11,22 @@ from .errors import OutputError
 MAX_NAME_BYTES = 255
 MAX_WINDOWS_PATH_LENGTH = 259
 MAX_BLENDER_PATH_BYTES = 1023
-"""Blender cuts longer paths without a word, and what is left names another file."""
+"""Blender silently truncates longer paths, which may name another file."""
 EXTENDED_PATH_PREFIX = "\\\\?\\"
-"""Begins paths whose length Windows does not limit."""
+"""Prefix of paths whose length Windows does not limit."""
 _DEVICE_NAME = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.IGNORECASE | re.DOTALL)
 _FORBIDDEN_CHARACTER = re.compile(r'[<>:"|?*\x00-\x1f]')
 
 
 def check_path(path: Path, *files: Path) -> None:
-    """Fail where files could not be written because of the length of their paths, or of a name in one.
+    """Check that paths are short enough and have valid names.
 
     Args:
-        path: what the user named, a file or a folder.
-        files: what is written there, with the names that they have meanwhile.
+        path: file or folder that the user named.
+        files: files that are written there, with temporary ones.
 
     Raises:
-        OutputError: says why.
+        OutputError: a path is too long or has an invalid name.
     """
     if limit := path_length_problem(max((file.absolute() for file in files), key=lambda file: len(os.fsencode(file)))):
         raise OutputError(f"Cannot write '{path}': {limit}; choose a shorter folder.")
@@ -39,7 +39,7 @@ def check_path(path: Path, *files: Path) -> None:
 
 
 def path_length_problem(path: Path) -> str:
-    """Words where an absolute path is longer than Blender, or the system, takes; empty where it is not."""
+    """Describe why an absolute path is too long for Blender or the system; empty where it is not."""
     text = str(path)
     if (size := len(os.fsencode(text))) > MAX_BLENDER_PATH_BYTES:
         return f"it needs a path of {size:,} bytes, and Blender takes {MAX_BLENDER_PATH_BYTES:,}"
@@ -50,7 +50,7 @@ def path_length_problem(path: Path) -> str:
 
 
 def windows_name_problem(path: PurePath) -> str:
-    """Words for the first name in an absolute path that Windows gives another meaning; empty where there is none."""
+    """Describe the first name in an absolute path that is invalid on Windows; empty for none."""
     for name in PureWindowsPath(path).parts[1:]:
         if _DEVICE_NAME.fullmatch(name):
             return f"'{name}' is the name of a device on Windows"
@@ -62,7 +62,7 @@ def windows_name_problem(path: PurePath) -> str:
 
 
 def comparable_path(path: Path) -> str:
-    """A text that is the same for two paths of one file; where letter case makes no difference, it makes none here."""
+    """Return a text that is equal for two paths of one file, in lower case where the system ignores case."""
     place = os.path.realpath(path)
     return place.casefold() if sys.platform in ("win32", "darwin") else place
 
@@ -72,11 +72,11 @@ def is_windows() -> bool:
 
 
 def supports_long_windows_paths() -> bool:
-    """Whether Windows takes long paths from this process: the system is set so, and the program declares it."""
+    """Return whether Windows permits long paths, which system and program must enable."""
     import ctypes
 
     try:
         return bool(ctypes.WinDLL("ntdll").RtlAreLongPathsEnabled() & 0xFF)
     except AttributeError:
-        # Older than Windows 10, version 1607.
+        # Windows before version 1607 of Windows 10.
         return False

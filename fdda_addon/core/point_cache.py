@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Point caches: files of format .pc2, the positions of a mesh frame by frame, that most 3D programs read.
+"""Point caches: .pc2 files with the positions of a mesh by frame, which most 3D programs read.
 
 Little-endian: the text "POINTCACHE2" and a zero, int32 version, int32 points, float32 first frame, float32 frames a
 sample, int32 samples; then float32 x, y, z of each point, sample by sample.
@@ -21,7 +21,7 @@ HEADER = struct.Struct("<12siiffi")
 
 @dataclass(frozen=True)
 class PointCache:
-    """A point cache that was read.
+    """Content of a point cache.
 
     Attributes:
         start: frame of the first sample.
@@ -35,27 +35,27 @@ class PointCache:
 
 
 class PointCacheWriter:
-    """Writes a point cache, one sample a frame, in as many pieces as one likes."""
+    """Writes a point cache with one sample per frame, in several parts."""
 
     def __init__(self, file: BinaryIO, points: int, start: int, samples: int):
         """Args:
-        file: empty, open for writing.
-        points: of a sample.
+        file: an empty file, open for writing.
+        points: number of points of a sample.
         start: frame of the first sample.
-        samples: how many there will be.
+        samples: number of samples.
         """
         self._file, self._points, self._missing = file, points, samples
         file.write(HEADER.pack(SIGNATURE, VERSION, points, start, 1.0, samples))
 
     def append(self, positions: np.ndarray) -> None:
-        """Write samples: (N, points, 3), mesh units. ValueError when they are of another shape or too many."""
+        """Write (N, points, 3) samples, mesh units; raise ValueError for another shape or too many samples."""
         if positions.shape[1:] != (self._points, 3) or len(positions) > self._missing:
             raise ValueError(f"samples of shape {positions.shape} where {self._missing} of {self._points} points fit")
         self._missing -= len(positions)
         self._file.write(np.ascontiguousarray(positions, "<f4").data)
 
     def finish(self) -> None:
-        """ValueError when samples are missing."""
+        """Raise ValueError where samples are missing."""
         if self._missing:
             raise ValueError(f"{self._missing} samples are missing")
 
@@ -64,7 +64,7 @@ def read_point_cache(path: Path) -> PointCache:
     """Open a point cache.
 
     Raises:
-        PointCacheError: it cannot be read, is of another format, or its size is not what its header says.
+        PointCacheError: it cannot be read, is of another format, or its size contradicts its header.
     """
     try:
         with open(path, "rb") as file:

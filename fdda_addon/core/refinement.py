@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Chooses the poses that a model should see more of: near those where it errs, and where the recording is thin."""
+"""Choice of poses to add to a recording: near large errors of a model, and where recorded poses are sparse."""
 
 from dataclasses import dataclass
 
@@ -8,16 +8,16 @@ import numpy as np
 from .poses import Channel
 
 SPARSE_CHOICE_RATIO = 1 / 3
-"""Part of the choices that go where the recorded poses are few, the others go where the error is large."""
+"""Ratio of the choices by sparsity of recorded poses; the others are chosen by error."""
 JITTER_RATIO = 0.15
-"""Standard deviation around a chosen pose, as a part of half the range of motion."""
+"""Standard deviation around a chosen probe, as a ratio of half the range of motion."""
 WORST_PROBE_RATIO = 0.1
-"""The error that a partition is weighed by is its mean over this part of the probes, the worst."""
+"""The weight of a partition is its mean error over this ratio of the worst probes."""
 
 
 @dataclass(frozen=True)
 class Probes:
-    """M poses on which a model was compared with its rig.
+    """M poses in which a model was compared with its rig.
 
     Attributes:
         values: (M, C) float64, of the channels, radians or metres.
@@ -31,7 +31,7 @@ class Probes:
 
 
 def nearest_recorded_distances(points: np.ndarray, recorded: np.ndarray) -> np.ndarray:
-    """Distance of each point to the nearest recorded one, each feature in units of its spread in the recording.
+    """Compute the distance of each point to the nearest recorded one, in units of each feature's standard deviation.
 
     Args:
         points: (M, F). recorded: (N, F).
@@ -55,10 +55,10 @@ def choose_poses(
     base: np.ndarray,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Make poses that help a model most.
+    """Choose poses that improve a model.
 
-    Each pose serves as many partitions as it can: partition after partition, in a random order that prefers those
-    with large errors, sets its channels as in one of its probes, unless another has set one of them; a channel that no
+    Each pose combines probes for several partitions. In a random order that prefers large errors, each partition sets
+    its channels to those of one of its probes, unless another partition has set one of them; a channel that no
     partition sets stays as in `base`.
 
     Args:
@@ -66,7 +66,7 @@ def choose_poses(
         channels: C channels with their ranges.
         channels_by_partition: for each of P partitions, indices of the channels that influence it.
         base: (n, C) random poses to start from.
-        rng: makes the choices.
+        rng: random generator.
 
     Returns:
         (n, C) float64, inside the ranges.
@@ -78,7 +78,7 @@ def choose_poses(
     poses = base.copy()
     for pose in poses:
         is_free = np.ones(len(channels), bool)
-        # Exponential races: the order of a draw without replacement, with these weights.
+        # Weighted random order without replacement (Efraimidis and Spirakis, 2006).
         for partition in np.argsort(rng.exponential(size=len(weights)) / np.maximum(weights, 1e-12)):
             channel_indices = channels_by_partition[partition]
             if not len(channel_indices) or not is_free[channel_indices].all():
@@ -92,6 +92,6 @@ def choose_poses(
 
 
 def _to_probabilities(scores: np.ndarray) -> np.ndarray:
-    """(M, P) scores to probabilities over the M probes: the squares, so that the worst are chosen most."""
+    """Convert (M, P) scores to probabilities over the M probes, proportional to their squares."""
     squared = np.square(scores, dtype=np.float64) + 1e-30
     return squared / squared.sum(axis=0)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report of a training, `report.json` beside its model (docs/formats.md): its names, and reading what has them.
+"""The report of a training, `report.json` beside its model (docs/formats.md): its keys, reading and writing.
 
-The trainer writes it, its page and the sidebar show it.
+The trainer writes it; its page and the sidebar show it.
 """
 
 import enum
@@ -16,9 +16,9 @@ REPORT_JSON, REPORT_HTML = "report.json", "report.html"
 CHECKPOINT_SUFFIX = ".checkpoint.npz"
 FORMAT, VERSION = "fdda-report", 1
 MAX_BYTES = 1 << 27
-"""Fifty times the report of 100 partitions and 1000 epochs."""
+"""Fifty times the size of a report of 100 partitions and 1000 epochs."""
 MAX_ABSOLUTE_VALUE = 1e300
-"""No number of a report is larger: it can be shown."""
+"""Largest absolute value of a number in a report."""
 
 
 class Verdict(enum.Enum):
@@ -88,16 +88,16 @@ _REPORT = {
     "repeatability?": {"poses": [int], "distance_mm": _ERRORS, "linear_mm": float},
     "goal?": {"goal": float, "p999": float, "verdict": Verdict},
 }
-"""Keys and the kinds of their values; `?` ends one that may be missing, and further keys may come."""
+"""Keys and types of their values; `?` marks an optional key, and further keys are permitted."""
 
 
 def report_path(model: Path) -> Path:
-    """Where the report of a model lies."""
+    """Return the path of a model's report."""
     return model.with_name(REPORT_JSON)
 
 
 def page_path(model: Path) -> Path:
-    """Where the page made of the report of a model lies."""
+    """Return the path of the page of a model's report."""
     return model.with_name(REPORT_HTML)
 
 
@@ -107,7 +107,7 @@ def checkpoint_path(model: Path) -> Path:
 
 
 def write_report(path: Path, report: dict) -> None:
-    """Write a report; `format` and `version` come first.
+    """Write a report with `format` and `version`.
 
     Raises:
         ValueError: it is not what `read_report` takes; a bug.
@@ -117,7 +117,7 @@ def write_report(path: Path, report: dict) -> None:
 
 
 def report_text(report: dict) -> str:
-    """What `write_report` writes; raises its ValueError."""
+    """Return the text that `write_report` writes; raises its ValueError."""
     _check_value(report, _REPORT, "")
     return to_json_text({"format": FORMAT, "version": VERSION, **report})
 
@@ -129,7 +129,7 @@ def read_report(path: Path) -> dict:
         It, with all keys of docs/formats.md and values of their kinds.
 
     Raises:
-        TrainingError: there is none that can be read, or it is none of this version, or damaged.
+        TrainingError: it cannot be read, is of another version, or damaged.
     """
     try:
         report = json.loads(read_input(path, MAX_BYTES))

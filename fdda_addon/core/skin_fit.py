@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fitted skin weights: what is known of a fit, and the weights as text for a model's metadata.
+"""Fitted skin weights: the report of a fit, and the weights as text for a model's metadata.
 
 docs/formats.md describes both.
 """
@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 KINDS = ("hard", "smooth")
-"""One joint a vertex, or at most `INFLUENCES`."""
+"""Kinds of fits: one joint per vertex, or at most `INFLUENCES`."""
 INFLUENCES = 4
 MAX_INFLUENCES = 64
 
@@ -22,7 +22,7 @@ class FitReport:
     """Distances of linear skinning from the rig over poses and vertices, mm.
 
     Attributes:
-        rms_mm, max_mm: by "rig" for its own weights and "fitted".
+        rms_mm, max_mm: by "rig" for the rig's own weights, and "fitted".
     """
 
     rms_mm: dict[str, float]
@@ -34,13 +34,13 @@ class FitReport:
 
 @dataclass(frozen=True)
 class SkinFit:
-    """How skin weights were fitted, and what that brought.
+    """How skin weights were fitted, and the errors before and after.
 
     Attributes:
         kind: one of `KINDS`.
-        poses: number of poses that were evaluated for it.
-        held_out: on half of the poses, which the weights were not fitted to.
-        training: on the others.
+        poses: number of evaluated poses.
+        held_out: errors on half of the poses, which were held out.
+        training: errors on the other half.
     """
 
     kind: str
@@ -49,12 +49,12 @@ class SkinFit:
     training: FitReport
 
     def to_json(self) -> dict:
-        """What `recording.json` and messages say of it."""
+        """Return the JSON for `recording.json` and messages."""
         return {"kind": self.kind, "poses": self.poses, **asdict(self.held_out), "training": asdict(self.training)}
 
     @staticmethod
     def from_json(value: dict) -> "SkinFit":
-        """Read what `to_json` gave.
+        """Read the JSON of `to_json`.
 
         Raises:
             KeyError, TypeError, ValueError: it is damaged.
@@ -64,7 +64,7 @@ class SkinFit:
         return SkinFit(value["kind"], value["poses"], _read_fit_report(value), _read_fit_report(value["training"]))
 
     def sentence(self) -> str:
-        """The gain, for people."""
+        """Describe the errors before and after the fit."""
         held_out, training = self.poses // 2, self.poses - self.poses // 2
         return (
             f"Linear skinning with fitted weights ({self.kind}), mm: {self.held_out.words('fitted')} on {held_out} "
@@ -82,7 +82,7 @@ def _read_fit_report(value: dict) -> FitReport:
 
 
 def are_skin_weights(joints: np.ndarray, weights: np.ndarray, joint_count: int) -> bool:
-    """Whether (V, I) joints exist and their (V, I) weights are not negative and sum to 1 in each row."""
+    """Return whether (V, I) joint indices are valid and (V, I) weights are not negative and sum to 1 in each row."""
     return bool(
         np.isfinite(weights).all()
         and (weights >= 0).all()
@@ -93,7 +93,7 @@ def are_skin_weights(joints: np.ndarray, weights: np.ndarray, joint_count: int) 
 
 
 def skin_to_text(joints: np.ndarray, weights: np.ndarray) -> str:
-    """(V, I) int32 joints and (V, I) float32 weights as JSON."""
+    """Encode (V, I) int32 joints and (V, I) float32 weights as JSON."""
     value = {
         "influences": joints.shape[1],
         "joints": base64.b64encode(joints.astype("<i4").tobytes()).decode("ascii"),
@@ -103,10 +103,10 @@ def skin_to_text(joints: np.ndarray, weights: np.ndarray) -> str:
 
 
 def skin_from_text(text: str, vertex_count: int, joint_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Read what `skin_to_text` gave: (V, I) int32 joints and (V, I) float32 weights.
+    """Decode the text of `skin_to_text` to (V, I) int32 joints and (V, I) float32 weights.
 
     Raises:
-        ValueError: it is damaged, or not for so many vertices and joints; the text is a clause about the model.
+        ValueError: it is damaged, or for other numbers of vertices and joints; the message is a clause about the model.
     """
     try:
         if len(text) > 2 * (-(-4 * vertex_count * MAX_INFLUENCES // 3) * 4) + (1 << 20):

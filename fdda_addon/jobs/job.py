@@ -40,19 +40,19 @@ STAGE_LABELS = {
 
 @dataclass
 class JobState:
-    """A job as panels draw it, under way or ended.
+    """State of a running or ended job, for panels.
 
     Attributes:
-        verb: which job, the name in the operator's bl_idname ("record").
-        title: what it does, for people ("Recording").
-        subject: session_uid of the object that it is about, 0 for none.
+        verb: name of the job in the operator's bl_idname ("record").
+        title: label of the job ("Recording").
+        subject: session_uid of its object, 0 for none.
         works_on: `CHARACTER` or `ENVIRONMENT`.
         can_cancel: whether it can be cancelled.
         changes_scene: it changes the scene and gives it back when it ends.
         is_running: under way.
         cancel_requested: the user wants it to end.
-        part: name of the object that it works on now, of several; empty for one.
-        stage, done, total: how far it is; total is 0 as long as nothing is known, and done counts seconds then.
+        part: name of the current one of several objects; empty for one object.
+        stage, done, total: progress; where it is unknown, total is 0 and done counts seconds.
         started, ended: `time.monotonic` seconds.
         outcome: how it ended, a sentence; empty while it runs.
         outcome_level: 'INFO', 'WARNING' (cancelled) or 'ERROR'.
@@ -84,12 +84,12 @@ class JobState:
 
     @property
     def fraction(self) -> float:
-        """Part of the stage that is done, 0 to 1."""
+        """Completed ratio of the stage, 0 to 1."""
         return self.done / self.total if self.total else 0.0
 
     @property
     def remaining_seconds(self) -> float | None:
-        """How long the stage will still take at its speed so far, None when that cannot be said."""
+        """Estimated remaining time of the stage; None where unknown."""
         began, first = self._stage_start
         if self.done <= first or not self.is_running:
             return None
@@ -97,7 +97,7 @@ class JobState:
 
     @property
     def sentence(self) -> str:
-        """How far it is: "212 of 1,000 poses"."""
+        """Progress as text: "212 of 1,000 poses"."""
         stage, of_mesh, mesh = self.stage.partition(" of '")
         unit = STAGE_UNITS.get(stage, stage) + of_mesh + mesh
         if not self.stage:
@@ -113,16 +113,16 @@ class JobState:
 
     @property
     def is_finishing(self) -> bool:
-        """Whether all of the last stage is done."""
+        """Whether the last stage is complete."""
         return 0 < self.total == self.done and self.stage.partition(" of '")[0] not in STAGE_LABELS
 
     def begin_object(self, name: str) -> None:
-        """Note that the work on another of several objects begins."""
+        """Start the work on another object."""
         self.part, self.stage, self.done, self.total = name, "", 0, 0
         self.curves.clear()
 
     def show(self, progress: Progress) -> None:
-        """Note how far the job is."""
+        """Update the progress."""
         if progress.stage != self.stage:
             self.stage, self._stage_start = progress.stage, (time.monotonic(), progress.done)
         self.done, self.total = progress.done, progress.total
@@ -135,24 +135,24 @@ _running: "dict[str, JobRunner]" = {}
 
 
 def current(works_on: str = CHARACTER) -> JobState | None:
-    """The job that runs, None when there is none."""
+    """Return the state of the running job; None where there is none."""
     run = _running.get(works_on)
     return run.state if run else None
 
 
 def state_of(verb: str) -> JobState | None:
-    """The job of this verb that runs or was the last to run in this session, None when there was none."""
+    """Return the state of the last job of a verb in this session; None where there was none."""
     return _states.get(verb)
 
 
 def request_cancel(works_on: str = CHARACTER) -> None:
-    """Ask the job to end; what it has kept stays."""
+    """Request the cancellation of the job."""
     if state := current(works_on):
         state.cancel_requested = True
 
 
 def stop(reason: str, works_on: str = CHARACTER) -> None:
-    """End the job now, if one runs: its generator is closed, so what it borrowed is given back and its process ends.
+    """Stop the running job now: its generator is closed, which restores the scene and ends its process.
 
     Args:
         reason: the sentence that panels show.
@@ -167,7 +167,7 @@ def stop(reason: str, works_on: str = CHARACTER) -> None:
 
 
 class JobRunner:
-    """A job under way: its state, its generator, and what is said at its end."""
+    """Runner of a job: its state, its generator, and its outcome."""
 
     def __init__(
         self,
@@ -177,14 +177,14 @@ class JobRunner:
         cancelled: Callable[[], str],
         ends_itself: bool = False,
     ):
-        """Begin it.
+        """Register the job.
 
         Args:
             state: of the job.
             steps: the generator.
-            finish: what remains to do with its result; returns the outcome. FDDAErrors are the outcome as well.
-            cancelled: the outcome when it was cancelled and has no result.
-            ends_itself: `steps` watches `state.cancel_requested` and ends soon; otherwise it is closed.
+            finish: processes the result and returns the outcome; an FDDAError is an outcome, too.
+            cancelled: returns the outcome of a canceled job without a result.
+            ends_itself: `steps` checks `state.cancel_requested` and ends soon; otherwise it is closed.
         """
         self.state, self.steps = state, steps
         self.result: object = None
@@ -194,10 +194,9 @@ class JobRunner:
         _running[state.works_on] = self
 
     def work(self, seconds: float) -> bool:
-        """Work for about so long, or until the job waits; returns whether it has ended. Its state says how.
+        """Run for some seconds, or until the job waits; return whether it has ended.
 
-        What is no error for the user propagates: Ctrl-C or a bug. What was borrowed is given back all the same, and
-        another job may begin.
+        Ctrl-C and bugs propagate. The scene is restored even then, and another job may start.
         """
         title = self.state.title
         try:
@@ -221,7 +220,7 @@ class JobRunner:
         return True
 
     def advance(self, seconds: float) -> bool:
-        """Work for about so long, or until the job waits; returns whether it is done."""
+        """Iterate for some seconds, or until the job waits; return whether the generator has ended."""
         until = time.monotonic() + seconds
         self.is_waiting = False
         while True:
@@ -240,15 +239,15 @@ class JobRunner:
                 return False
 
     def close(self) -> None:
-        """End the generator where it is.
+        """Close the generator.
 
         Raises:
-            FDDAError: what it still had to do failed.
+            FDDAError: its cleanup failed.
         """
         self.steps.close()
 
     def end(self, outcome: str, level: str) -> None:
-        """Note how the job ended; another may begin."""
+        """Store the outcome, so that another job may start."""
         state = self.state
         state.is_running, state.ended, state.outcome, state.outcome_level = False, time.monotonic(), outcome, level
         if _running.get(state.works_on) is self:
@@ -257,7 +256,7 @@ class JobRunner:
 
 
 def redraw() -> None:
-    """Draw the sidebars and the preferences again, and have them look again at what they show."""
+    """Redraw sidebars and preferences, and clear cached values."""
     draw_cache.clear()
     for window in getattr(bpy.context.window_manager, "windows", ()):
         for area in window.screen.areas:
@@ -275,7 +274,7 @@ def _stop(reason: str, works_on: str = CHARACTER) -> None:
 @persistent
 def _on_load(*_: object) -> None:
     _stop("another file was opened")
-    # What ended is about objects of the file that is left.
+    # States refer to objects of the previous file.
     _states.clear()
 
 
@@ -289,6 +288,6 @@ HANDLERS = {"load_pre": _on_load, "undo_pre": _on_undo, "redo_pre": _on_undo}
 
 
 def unregister() -> None:
-    """End all jobs. Blender does this when it is closed."""
+    """Stop all jobs, also when Blender quits."""
     for works_on in (CHARACTER, ENVIRONMENT):
         _stop("the add-on was disabled", works_on)

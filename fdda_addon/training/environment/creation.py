@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Makes the add-on's own training environment: a virtual environment with the pinned packages, and a log of it."""
+"""Installation of the training environment: a virtual environment with pinned packages, and a log."""
 
 import os
 import re
@@ -33,20 +33,20 @@ from .interpreters import Interpreter, find_interpreters, query_interpreter
 from .subprocesses import clean_environment, popen_options
 
 MIN_FREE_GB = 9 if sys.platform.startswith("linux") else 2
-"""Free space to begin with: the packages and the downloads, which lie there at the same time. On Linux with CUDA."""
+"""Free disk space for packages and downloads; on Linux with CUDA."""
 TEMPORARY_FOLDER_NAME = "fdda-12345678"
-"""Such is the name of the folder for temporary files on Windows."""
+"""Example of the name of the temporary folder on Windows."""
 MIN_PIP_WITH_RAW_PROGRESS = (24, 1)
 
 
 class EnvironmentCreation:
-    """The creation of an environment; `steps` does it, `cancel` ends it from another thread.
+    """Installation of an environment by `steps`, which `cancel` ends from another thread.
 
     Args:
-        folder: of the environment; what is there is removed first.
-        log: file that gets what the steps print, written anew.
-        wheels: folder of wheels to install from; the package index of pip's settings when left out.
-        base: path of the Python to make it from; a suitable one is looked for when left out.
+        folder: of the environment, which is removed first.
+        log: file for the output of all steps.
+        wheels: folder of wheels; the package index of pip's settings by default.
+        base: path of the Python to use; a suitable one is searched by default.
     """
 
     def __init__(self, folder: Path, log: Path, wheels: Path | None = None, base: str = ""):
@@ -58,10 +58,10 @@ class EnvironmentCreation:
         self._has_changed_folder = False
 
     def steps(self) -> Iterator[Progress | CheckResult]:
-        """Make the environment; yields how far it is, and last the answer of its Python.
+        """Install the environment; yield progress, and last the result of the check.
 
         Raises:
-            TrainerEnvironmentError: it cannot be made, and nothing is left of it. Also when the user cancelled.
+            TrainerEnvironmentError: the installation failed or was canceled, and the folder was removed.
         """
         try:
             yield from self._steps()
@@ -96,7 +96,7 @@ class EnvironmentCreation:
         yield result
 
     def cancel(self) -> None:
-        """End it soon. From any thread."""
+        """End the installation soon; thread-safe."""
         with self._lock:
             self._cancelled = True
             if self._process is not None:
@@ -122,7 +122,7 @@ class EnvironmentCreation:
             raise TrainerEnvironmentError(f"'{self.wheels}' is no folder; choose the folder that holds the packages.")
 
     def _check_wheels(self, interpreter: Interpreter, log: IO[str]) -> None:
-        """Before what is there is removed: pip would find a missing wheel late, and call it a conflict of versions."""
+        """Check for missing wheels first, which pip would report late and as a conflict of versions."""
         pinned = [
             line
             for line in requirements_file(interpreter.version).read_text(encoding="utf-8").splitlines()
@@ -151,7 +151,7 @@ class EnvironmentCreation:
             )
 
     def _find_interpreters(self, log: IO[str]) -> list[Interpreter]:
-        """The Pythons that may make it, the best first."""
+        """Find suitable interpreters, the best first."""
         if self.base:
             queried = query_interpreter([self.base])
             if queried is None:
@@ -167,7 +167,7 @@ class EnvironmentCreation:
         return suitable
 
     def _create_venv(self, interpreters: list[Interpreter], log: IO[str]) -> Iterator[Progress]:
-        """Make the virtual environment from the first Python that can; returns that Python."""
+        """Create the virtual environment with the first interpreter that can; return that interpreter."""
         for interpreter in interpreters:
             yield Progress(f"making it from {interpreter}", 0, 0)
             command = [interpreter.path, "-I", "-m", "venv", "--clear", str(self.folder)]
@@ -189,7 +189,7 @@ class EnvironmentCreation:
 
     @contextmanager
     def _temporary(self) -> Iterator[Path]:
-        """A folder for gigabytes, more than a /tmp in memory holds. On Windows a short path counts for more."""
+        """Make a temporary folder on the disk, because /tmp may be in memory; on Windows with a short path."""
         if os.name == "nt":
             path = Path(tempfile.mkdtemp(prefix=TEMPORARY_FOLDER_NAME[:-8]))
         else:
@@ -202,7 +202,7 @@ class EnvironmentCreation:
 
     def _install_with(self, temporary: Path, interpreter: Interpreter, log: IO[str]) -> Iterator[Progress]:
         packages = site_packages(self.folder, interpreter.version)
-        # The folder itself, found through a .pth file: paths in site-packages would be 18 letters longer.
+        # A .pth file imports from the folder itself, because paths in site-packages are 18 characters longer.
         (packages / "fdda.pth").write_text(os.path.relpath(self.folder, packages) + "\n", encoding="ascii")
         pip = [str(interpreter_path(self.folder)), "-I", "-m", "pip"]
         command = [*pip, "install", "--no-input", "--disable-pip-version-check", "--no-cache-dir"]
@@ -225,7 +225,7 @@ class EnvironmentCreation:
     def _pip_environment(self, temporary: Path) -> dict[str, str]:
         environment = clean_environment()
         if self.wheels is not None:
-            # That folder and no other: pip's settings may name more.
+            # Ignore pip's settings, which may add other sources.
             environment = {name: value for name, value in environment.items() if not name.startswith("PIP_")}
             environment["PIP_CONFIG_FILE"] = os.devnull
         return environment | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
@@ -239,7 +239,7 @@ class EnvironmentCreation:
         return result
 
     def _run(self, command: list[str], log: IO[str], environment: dict[str, str] | None = None) -> Iterator[Progress]:
-        """Run one step; returns its exit status. Not in the folder itself: Windows would not let that be removed."""
+        """Run one step outside of the folder, which Windows could not remove otherwise; return its exit status."""
         log.write(f"$ {subprocess.list2cmdline(command)}\n")
         self._last_lines = []
         with self._lock:
@@ -272,7 +272,7 @@ class EnvironmentCreation:
         return status
 
     def _log_line(self, line: str, log: IO[str]) -> Iterator[Progress]:
-        """Put a line that a step printed into the log, and yield what it says of the progress."""
+        """Write an output line to the log, and yield its progress."""
         if match := re.fullmatch(r"Progress (\d+) of (\d+)", line):
             done, total = (int(number) // 1_000_000 for number in match.groups())
             yield Progress(self._last_lines[-1] if self._last_lines else "downloading", done, total)
@@ -283,7 +283,7 @@ class EnvironmentCreation:
             yield Progress(line, 0, 0)
 
     def _error_line(self) -> str:
-        """The line that says best why a step failed: pip's last error, but not the one that points to its manual."""
+        """Return the line that explains a failure best: pip's last error without a link to its manual."""
         errors = [line for line in self._last_lines if re.match("error:", line, re.IGNORECASE) and "http" not in line]
         return (errors or self._last_lines or ["it said nothing"])[-1].removeprefix("ERROR: ").rstrip(".")
 
@@ -295,7 +295,7 @@ class EnvironmentCreation:
 
 @contextmanager
 def _open_log(log: Path) -> Iterator[IO[str]]:
-    """The log, opened to be written anew."""
+    """Open the log for writing."""
     try:
         file = log.open("w", encoding="utf-8")
     except OSError as error:
@@ -307,11 +307,11 @@ def _open_log(log: Path) -> Iterator[IO[str]]:
 
 
 def _kill(process: subprocess.Popen) -> None:
-    """End a step and what it started."""
+    """Kill a step and its child processes."""
     if process.poll() is not None:
         return
     if os.name == "nt":
-        # The module venv starts a Python of its own, which would go on.
+        # The module venv starts another Python, which would continue.
         subprocess.run(
             ["taskkill", "/F", "/T", "/PID", str(process.pid)], capture_output=True, check=False, **popen_options()
         )

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Where the add-on's own training environment lies, and what state it is in.
+"""The folder of the add-on's training environment, and its state.
 
-It is complete when its mark is there, and the mark is written last: whatever was interrupted is recognized. Blender
-leaves the folder alone when it updates the extension and removes it when it uninstalls the extension.
+A completion marker is written last, so that an interrupted installation is recognized. Blender keeps the folder when it
+updates the extension, and removes it when it uninstalls the extension.
 """
 
 import enum
@@ -18,7 +18,7 @@ from ...core.path_limits import MAX_WINDOWS_PATH_LENGTH
 EXTENSION = __package__.rpartition(".fdda_addon")[0]
 """The extension's module, "bl_ext.REPOSITORY.fdda"; empty where the add-on was imported and not installed."""
 PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "scipy", "matplotlib")
-"""What the trainer imports."""
+"""Packages that the trainer imports."""
 COMPLETION_MARKER = "fdda-complete"
 MAX_WHEEL_PATH_LENGTH = 126
 """Letters of the longest path in the wheels for Windows: a license in the dist-info of torch 2.15.0.
@@ -26,12 +26,12 @@ MAX_WHEEL_PATH_LENGTH = 126
 In the folder where they are installed: `find . -printf '%P\\n' | awk '{print length}' | sort -n | tail -1`.
 """
 PIP_TARGET = "/pip-target-12345678/lib/python"
-"""Where pip first puts the packages in the folder for temporary files."""
+"""Subfolder of the temporary folder into which pip installs first."""
 ROOT = Path(__file__).parents[3]
-"""What holds the packages `fdda_addon` and `trainer`: the checkout, or the installed extension."""
+"""Folder with the packages `fdda_addon` and `trainer`: the checkout, or the installed extension."""
 REQUIREMENTS = ROOT / "requirements"
 PINNED_REQUIREMENTS = {(3, 11): "python-3.11.txt", (3, 12): "python-3.11.txt", (3, 13): "python-3.13.txt"}
-"""Versions of Python that an environment can be made from, and the file of pinned versions for each."""
+"""Versions of Python for an environment, each with its file of pinned versions."""
 OFFLINE = (
     "Blender's online access is off: allow it in Preferences > System > Network, choose a folder under Offline "
     "Packages, or choose an existing Python that has torch"
@@ -43,16 +43,16 @@ class FolderState(enum.Enum):
 
     MISSING = "missing"
     INCOMPLETE = "incomplete"
-    """Its creation was interrupted."""
+    """Its installation was interrupted."""
     BROKEN = "broken"
-    """Its Python is gone, or what that was made from."""
+    """Its Python, or the base of it, is missing."""
     OUTDATED = "outdated"
-    """It was made with other versions than this add-on asks for; it can train all the same."""
+    """It has other package versions than this add-on requires, but can train."""
     READY = "ready"
 
 
 def user_folder() -> Path:
-    """The folder of the add-on's own files for this user."""
+    """Return the folder of the add-on's files for this user."""
     import bpy
 
     if EXTENSION.startswith("bl_ext."):
@@ -61,7 +61,7 @@ def user_folder() -> Path:
 
 
 def environment_folder() -> Path:
-    """The folder of the environment. Blender removes it with the extension, so it lies nowhere else.
+    """Return the folder of the environment, in the folder that Blender removes with the extension.
 
     On Windows it has 91 letters beside the name of the user's folder, which may have 33: see `MAX_WHEEL_PATH_LENGTH`.
     """
@@ -69,11 +69,11 @@ def environment_folder() -> Path:
 
 
 def excess_path_length(folder: Path, temporary: Path) -> int:
-    """How many letters the paths of an environment would be too long for Windows, 0 for none.
+    """Return by how many characters paths of an environment exceed the limit of Windows, 0 for none.
 
     Args:
         folder: of the environment.
-        temporary: the folder for temporary files while it is made.
+        temporary: folder for temporary files during the installation.
     """
     longest = max(len(str(folder)), len(str(temporary)) + len(PIP_TARGET)) + 1 + MAX_WHEEL_PATH_LENGTH
     return max(0, longest - MAX_WINDOWS_PATH_LENGTH)
@@ -93,12 +93,12 @@ def has_path_limit() -> bool:
 
 
 def log_path() -> Path:
-    """What the last creation printed."""
+    """Return the path of the log of the last installation."""
     return user_folder() / "trainer.log"
 
 
 def interpreter_path(folder: Path) -> Path:
-    """The interpreter of a virtual environment, or of one of conda's, which has it elsewhere on Windows."""
+    """Return the interpreter of a virtual environment or of a conda environment."""
     if os.name != "nt":
         return folder / "bin/python"
     conda_python, python = folder / "python.exe", folder / "Scripts/python.exe"
@@ -106,7 +106,7 @@ def interpreter_path(folder: Path) -> Path:
 
 
 def site_packages(folder: Path, version: tuple[int, int]) -> Path:
-    """The folder of a virtual environment that its Python of a version imports from."""
+    """Return the site-packages folder of a virtual environment for a version of Python."""
     return folder / ("Lib" if os.name == "nt" else f"lib/python{version[0]}.{version[1]}") / "site-packages"
 
 
@@ -116,14 +116,14 @@ def requirements_file(version: tuple[int, int]) -> Path:
 
 
 def creation_obstacle(wheels: str) -> str:
-    """Why the environment cannot be created now, empty when it can; `wheels` is the folder to install from, if any."""
+    """Return why the environment cannot be created now, empty where it can; `wheels`: folder of packages."""
     import bpy
 
     return "" if wheels or bpy.app.online_access else OFFLINE
 
 
 def folder_state(folder: Path) -> FolderState:
-    """The state of the environment in a folder, from its files alone."""
+    """Read the state of an environment from its files."""
     if not folder.is_dir():
         return FolderState.MISSING
     try:
@@ -139,7 +139,7 @@ def folder_state(folder: Path) -> FolderState:
 
 
 def environment_python() -> str | None:
-    """The Python of the add-on's own environment, None when there is none that is complete."""
+    """Return the Python of the add-on's environment; None where it is missing or incomplete."""
     folder = environment_folder()
     complete = folder_state(folder) not in (FolderState.MISSING, FolderState.INCOMPLETE)
     return str(interpreter_path(folder)) if complete else None
@@ -153,7 +153,7 @@ def write_completion_marker(folder: Path, version: tuple[int, int]) -> None:
 
 
 def remove_environment(folder: Path) -> None:
-    """Remove an environment, its mark first: a removal that is interrupted leaves it incomplete.
+    """Remove an environment, its marker first, so that an interrupted removal leaves it incomplete.
 
     Raises:
         TrainerEnvironmentError: something cannot be removed.
@@ -162,7 +162,7 @@ def remove_environment(folder: Path) -> None:
 
     try:
         (folder / COMPLETION_MARKER).unlink(missing_ok=True)
-        # On Windows a virus scanner may hold what was just written.
+        # On Windows a virus scanner may have new files open.
         for pause in (0.2, 1, 3) if os.name == "nt" else ():
             shutil.rmtree(folder, ignore_errors=True)
             if not folder.is_dir():
@@ -179,10 +179,10 @@ def remove_environment(folder: Path) -> None:
 
 @contextmanager
 def creation_lock(folder: Path) -> Iterator[None]:
-    """Keep other Blenders from making or removing the environment meanwhile; the claim ends with the process.
+    """Lock the environment against installation and removal by other processes; the lock ends with the process.
 
     Raises:
-        TrainerEnvironmentError: another one is at it, or the folder cannot be written.
+        TrainerEnvironmentError: another process holds the lock, or the folder cannot be written.
     """
     lock = folder.with_name(folder.name + ".lock")
     try:
