@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Makes Blender know the classes, properties and handlers of the add-on, and forget them.
+"""Registers and unregisters the classes, properties and handlers of the add-on.
 
-A package of Blender classes lists its modules in `MODULES`, and they their classes in `CLASSES`. A module with handlers
-lists them in `HANDLERS`; all are in the one table of `handler_table`.
+A package of Blender classes lists its modules in `MODULES`, and each module lists its classes in `CLASSES`. A module
+with handlers lists them in `HANDLERS`; `handler_table` returns all of them.
 """
 
 import atexit
@@ -16,7 +16,7 @@ _is_registered = False
 
 
 def register() -> None:
-    """Register all of the add-on; a second call does nothing."""
+    """Register the add-on; do nothing if it is registered."""
     global _is_registered
     if _is_registered:
         return
@@ -32,12 +32,12 @@ def register() -> None:
     handlers.register()
     _is_registered = True
     if not bpy.app.binary_path:
-        # Blender itself disables its add-ons before it ends; here, at its exit, nothing of it is left.
+        # Blender disables its add-ons before it quits, but the `bpy` module does not.
         atexit.register(unregister)
 
 
 def is_registered() -> bool:
-    """Whether Blender knows the add-on."""
+    """Return whether the add-on is registered."""
     return _is_registered
 
 
@@ -51,7 +51,7 @@ def unregister() -> None:
 
     atexit.unregister(unregister)
     _is_registered = False
-    # Left registered they hang the 4.5 module at its exit.
+    # Handlers that stay registered hang the `bpy` module of 4.5 at its exit.
     for name, handler in handler_table():
         listed = getattr(bpy.app.handlers, name)
         if handler in listed:
@@ -62,7 +62,7 @@ def unregister() -> None:
 
 
 def handler_table() -> list[tuple[str, Callable[..., None]]]:
-    """All handlers of the add-on: name of the list in `bpy.app.handlers` and function, in the order of the calls."""
+    """Return the handlers of the add-on: name of the list in `bpy.app.handlers` and function, in calling order."""
     from .evaluation import side_by_side
     from .jobs import job
     from .operators import training
@@ -70,13 +70,13 @@ def handler_table() -> list[tuple[str, Callable[..., None]]]:
     from .runtime import handlers
     from .scene import stored_paths
 
-    # After a save paths are put back before models are looked for.
+    # After a save, paths are restored before models are loaded.
     modules = (stored_paths, job, checks, handlers, side_by_side, training)
     return [entry for module in modules for entry in module.HANDLERS.items()]
 
 
 def _register_package(package: ModuleType) -> None:
-    """Register the classes of all modules in their order, each followed by what the module registers itself."""
+    """Register the classes of all modules in their order, and call the `register` of each module after its classes."""
     for module in _modules(package):
         for cls in module.CLASSES:
             bpy.utils.register_class(cls)

@@ -21,12 +21,12 @@ DriverInput = tuple[str, bpy.types.ID | None, str]
 
 
 def playback_input(driven: bpy.types.Object) -> DriverInput:
-    """Give the variable that runs the models of an object; it comes first among the variables."""
+    """Return the variable that runs the models of an object; it has to be the first variable."""
     return "SINGLE_PROP", driven, PLAYBACK_PROPERTY
 
 
 def pose_inputs(buffer: bpy.types.Object, scene_rig: SceneRig, controls: Iterable[Control]) -> list[DriverInput]:
-    """Give the variables whose datablocks a player reads (`evaluated_inputs`).
+    """Return the variables whose datablocks a player reads (`evaluated_inputs`).
 
     Args:
         buffer: the position buffer.
@@ -43,7 +43,7 @@ def pose_inputs(buffer: bpy.types.Object, scene_rig: SceneRig, controls: Iterabl
 
 
 def dependency_inputs(scene_rig: SceneRig, joint_names: Iterable[str]) -> list[DriverInput]:
-    """Give the variables that only add dependencies: mode, strength, and the joints of the model.
+    """Return the variables that only add dependencies: mode, strength, and the joints of the model.
 
     Blender evaluates a bone after its parents, so the last bone of each chain is enough.
     """
@@ -71,7 +71,12 @@ def set_driver_inputs(driven: bpy.types.Object, inputs: list[DriverInput]) -> No
 
 
 def evaluated_inputs(driven: bpy.types.Object, count: int) -> list[bpy.types.ID | None]:
-    """Give the datablocks of the first `count` variables after the playback property, evaluated as `driven` is."""
+    """Return the evaluated datablocks of the first `count` variables after the playback property.
+
+    Args:
+        driven: the evaluated object with the driver.
+        count: number of variables.
+    """
     variables = driven.animation_data.drivers[0].driver.variables
     return [variable.targets[0].id for variable in variables[1 : 1 + count]]
 

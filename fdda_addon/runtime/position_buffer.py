@@ -26,7 +26,7 @@ def create_buffer(mesh_object: bpy.types.Object) -> bpy.types.Object:
 
 
 def is_buffer(scene_object: bpy.types.Object) -> bool:
-    """Tell whether an object is a position buffer of this session."""
+    """Return whether an object is a position buffer of this session."""
     return scene_object.is_runtime_data and BUFFER_KEY in scene_object
 
 
