@@ -169,24 +169,26 @@ def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
     stack = read_stack(mesh_object)
     for name in (m.name for m in mesh_object.modifiers if m.show_viewport):
         modifier = mesh_object.modifiers[name]
-        what = f"Modifier '{name}' of '{mesh_object.name}'"
+        subject = f"Modifier '{name}' of '{mesh_object.name}'"
         if name in stack.replaced + stack.misplaced and (verb := time_dependence(modifier)):
             raise RigError(
-                f"{what} {verb}, so its result does not follow from the pose; switch it off in the viewport, or "
+                f"{subject} {verb}, so its result does not follow from the pose; switch it off in the viewport, or "
                 "remove it."
             )
         if _is_unbound(modifier):
-            raise RigError(f"{what} is not bound, so it does nothing; bind it first, or switch it off in the viewport.")
+            raise RigError(
+                f"{subject} is not bound, so it does nothing; bind it first, or switch it off in the viewport."
+            )
     for name in stack.misplaced:
-        what = f"Modifier '{name}' of '{mesh_object.name}' changes the topology of the mesh"
+        subject = f"Modifier '{name}' of '{mesh_object.name}' changes the topology of the mesh"
         if mesh_object.modifiers[name].type in NEEDS_ORIGINAL_MESH:
             raise RigError(
-                f"{what}, and Blender lets nothing that plays a model stand before it; switch it off in the viewport, "
-                "or apply it."
+                f"{subject}, and Blender lets nothing that plays a model stand before it; switch it off in the "
+                "viewport, or apply it."
             )
         raise RigError(
-            f"{what} before '{stack.replaced[-1]}', which a model replaces, so its vertices cannot be followed; move "
-            "it to the end of the modifiers, switch it off in the viewport, or apply it."
+            f"{subject} before '{stack.replaced[-1]}', which a model replaces, so its vertices cannot be followed; "
+            "move it to the end of the modifiers, switch it off in the viewport, or apply it."
         )
     return stack
 

@@ -129,10 +129,10 @@ def _free_channels(bone: bpy.types.PoseBone) -> Iterator[tuple[str, str, Ranges]
             "rotation_euler",
             {axis: (r.low, r.high) for axis, r in enumerate(rotation_ranges(bone)) if r.moves},
         )
-    others = [(SCALE, bone.lock_scale, scale_ranges(bone))]
+    other_channels = [(SCALE, bone.lock_scale, scale_ranges(bone))]
     if not (bone.parent and bone.bone.use_connect):
-        others.insert(0, (LOCATION, bone.lock_location, location_ranges(bone)))
-    for kind, locks, ranges in others:
+        other_channels.insert(0, (LOCATION, bone.lock_location, location_ranges(bone)))
+    for kind, locks, ranges in other_channels:
         if not _is_replaced(bone, kind):
             yield kind, kind, {axis: ranges.get(axis) for axis in range(3) if not locks[axis]}
 

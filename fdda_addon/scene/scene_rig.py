@@ -37,8 +37,8 @@ def find_rig(name: str = "") -> SceneRig:
     if name:
         named = bpy.context.scene.objects.get(name)
         if named is None or named.type != "MESH":
-            known = ", ".join(f"'{o.name}'" for o in meshes) or "none"
-            raise RigError(f"The scene has no mesh object '{name}'; its mesh objects: {known}.")
+            names = ", ".join(f"'{o.name}'" for o in meshes) or "none"
+            raise RigError(f"The scene has no mesh object '{name}'; its mesh objects: {names}.")
         meshes = [named]
     if not meshes:
         raise RigError("The scene has no mesh; open a file with a character that an armature deforms.")
@@ -48,8 +48,8 @@ def find_rig(name: str = "") -> SceneRig:
     if not rigged:
         if parented := [sentence for o in meshes if (sentence := parenting_message(o))]:
             raise RigError(parented[0])
-        what = f"'{name}' has no" if name else f"None of the {len(meshes)} meshes of the scene has an"
-        raise RigError(f"{what} Armature modifier with an armature; add one, or choose another object.")
+        subject = f"'{name}' has no" if name else f"None of the {len(meshes)} meshes of the scene has an"
+        raise RigError(f"{subject} Armature modifier with an armature; add one, or choose another object.")
     if len(rigged) > 1:
         names = ", ".join(f"'{o.name}'" for o in rigged)
         raise RigError(f"{len(rigged)} meshes have an Armature modifier ({names}); choose one with --object.")
