@@ -12,7 +12,7 @@ from fdda_addon.core.poses import Margin
 from fdda_addon.core.recording.index import ACTION, MIRRORED, RANDOM, REFINED, Source
 from fdda_addon.core.recording.reader import Recording, read_recording
 from trainer.config import TrainingConfig
-from trainer.data import BLOCK_FRAMES, Split, split_recording
+from trainer.data import BLOCK_FRAMES, PartitionData, Split, prepare, split_recording
 
 from .chain import write_chain
 
@@ -116,3 +116,12 @@ def test_poses_that_did_not_come_to_rest_are_in_no_part_unless_they_are_asked_fo
     assert sum(len(getattr(all_of_them, part)) for part in PARTS) == 30
     with pytest.raises(TrainingError, match="Only 4 of the 30 poses of the recording came to rest and training takes"):
         split_recording(replace(source, info=replace(info, unsettled=tuple(range(26)))), CONFIG)
+
+
+def test_features_are_standardised_by_the_training_poses_alone():
+    features = np.random.default_rng(0).normal(size=(40, 2)).astype(np.float32)
+    features[30:] += 10
+    found = Split(np.arange(30), np.arange(30, 35), np.arange(35, 40))
+    prepared = prepare(PartitionData("a", features, lambda: np.zeros((40, 5, 3), np.float32), 5), found, 0.1, 0)
+    np.testing.assert_allclose(prepared.feature_mean, features[:30].mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(prepared.feature_scale, features[:30].std(axis=0), atol=1e-5)

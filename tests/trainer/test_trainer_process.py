@@ -2,6 +2,7 @@
 """The command line of the trainer: messages, exit statuses, and what is left behind when it does not finish."""
 
 import errno
+import io
 import json
 import os
 import shutil
@@ -42,6 +43,13 @@ def test_messages_from_start_to_finish(recording, tmp_path, capsys):
     joints = [m.values["joint"] for m in messages if m.type is MessageType.PARTITION_FINISHED]
     assert joints == ["bone_0", "bone_1", "bone_2"]
     assert messages[-1].type is MessageType.FINISHED and messages[-1].values["model"] == str(model)
+
+
+def test_a_message_leaves_the_process_at_once(monkeypatch):
+    sent = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(sent, encoding="utf-8"))
+    MessageLines().say(MessageType.LOG, text="half way")
+    assert Message.decode(sent.getvalue().decode()).values == {"text": "half way"}
 
 
 def test_text_for_a_person(recording, tmp_path, capsys):
