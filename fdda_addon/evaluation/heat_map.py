@@ -116,7 +116,7 @@ def errors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
     if last is None:
         return None
     pose = last.pose_at(bpy.context.scene.frame_current) if last.name else view.pose
-    return last.vertex_errors(view.way, view.statistic, pose)
+    return last.vertex_errors(view.deformation, view.statistic, pose)
 
 
 def fitting_range_mm(mesh_object: bpy.types.Object) -> float:
@@ -186,7 +186,7 @@ def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:
     if last is None:
         return [], None
     errors = errors_of(mesh_object)
-    method = "skinning" if view.way == "linear" else "model"
+    method = "skinning" if view.deformation == "linear" else "model"
     description = _describe_errors(last, view.statistic, context.scene.frame_current, view.pose)
     if errors is None:
         return [f"{mesh_object.name}, {method}: {description}"], None

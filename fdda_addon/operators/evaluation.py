@@ -239,7 +239,7 @@ class FDDA_OT_show_rig(ModelOperator, bpy.types.Operator):
     bl_description = "Show the rig together with the model, next to it or over it as a wireframe"
     bl_options = {"REGISTER", "UNDO"}
 
-    way: bpy.props.EnumProperty(
+    placement: bpy.props.EnumProperty(
         name="Show the Rig",
         description="Where to show the rig",
         items=(
@@ -266,10 +266,10 @@ class FDDA_OT_show_rig(ModelOperator, bpy.types.Operator):
             if scene_rig.mesh_object.mode == "EDIT":
                 raise RigError(f"'{scene_rig.mesh_object.name}' is in edit mode; leave it first.")
         for scene_rig in rigs:
-            side_by_side.show(scene_rig.mesh_object, self.way, self.distance)
+            side_by_side.show(scene_rig.mesh_object, self.placement, self.distance)
         names = " and ".join(f"'{rig.mesh_object.name}'" for rig in rigs)
         results = {"NONE": "is shown alone", "BESIDE": "has its rig beside it", "OVERLAY": "has its rig over it"}
-        return f"{names} {results[self.way]}."
+        return f"{names} {results[self.placement]}."
 
 
 class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):

@@ -84,9 +84,9 @@ def _draw_side_by_side(layout: bpy.types.UILayout, context: bpy.types.Context, s
     column.label(text="Show the Rig")
     row = column.row(align=True)
     shown = side_by_side.display_mode(scene_rig.mesh_object)
-    for way, text in (("NONE", "Off"), ("BESIDE", "Beside"), ("OVERLAY", "Overlay")):
-        button = row.operator("fdda.show_rig", text=text, depress=shown == way)
-        button.way = way
+    for placement, text in (("NONE", "Off"), ("BESIDE", "Beside"), ("OVERLAY", "Overlay")):
+        button = row.operator("fdda.show_rig", text=text, depress=shown == placement)
+        button.placement = placement
         if mesh_count(context):
             button.all_meshes = True
 
@@ -169,7 +169,7 @@ def _draw_colors(
     if shown != "ERRORS" or last is None:
         return
     column = body.column(align=True)
-    column.row(align=True).prop(view, "way", expand=True)
+    column.row(align=True).prop(view, "deformation", expand=True)
     column.row(align=True).prop(view, "statistic", expand=True)
     if view.statistic == "pose" and not last.name and view.pose < 0:
         draw_wrapped(body, context, "Click a pose below to see its errors.", "INFO")

@@ -35,7 +35,7 @@ class FDDA_PG_view(bpy.types.PropertyGroup):
         name="Poses", description="Number of random poses", default=SIDEBAR_EVALUATION_POSES, min=1, soft_max=1000
     )
     seed: IntProperty(name="Seed", description="Random seed of the poses", default=EVALUATION_SEED, min=0)
-    way: EnumProperty(
+    deformation: EnumProperty(
         name="Error Of",
         description="Deformation whose error to show",
         items=(

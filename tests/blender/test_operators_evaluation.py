@@ -27,7 +27,7 @@ def active(bound):
 @pytest.fixture
 def view():
     view = bpy.context.window_manager.fdda_view
-    for name in ("way", "statistic", "range_mm", "pose"):
+    for name in ("deformation", "statistic", "range_mm", "pose"):
         view.property_unset(name)
     return view
 
@@ -81,7 +81,7 @@ def test_colors_are_those_of_the_report(active, evaluated_action, view):
     view.range_mm = 10.0
     bpy.ops.fdda.color_mesh()
     np.testing.assert_array_equal(heat_map.colors_of(active), heat_colors(errors["fdda"].mean(axis=0)))
-    view.way, view.statistic, view.range_mm = "linear", "max", 2.0
+    view.deformation, view.statistic, view.range_mm = "linear", "max", 2.0
     np.testing.assert_array_equal(heat_map.colors_of(active), heat_colors(errors["linear"].max(axis=0), 0.002))
     assert bpy.ops.fdda.fit_color_range() == {"FINISHED"}
     expected = np.percentile(errors["linear"].max(axis=0), 99.5) * 1000

@@ -45,7 +45,7 @@ def test_beside_is_the_rig_to_the_side_in_every_pose(active, scale, turned):
         active.rotation_euler, active.scale = armature_of(active).rotation_euler, (scale,) * 3
     bpy.context.view_layer.update()
     width = np.ptp(world(active)[:, 0])
-    assert bpy.ops.fdda.show_rig(way="BESIDE") == {"FINISHED"}
+    assert bpy.ops.fdda.show_rig(placement="BESIDE") == {"FINISHED"}
     other = side_by_side.find(active)
     for angle in (1.3, 0.2):
         pose(angle=angle)
@@ -53,7 +53,7 @@ def test_beside_is_the_rig_to_the_side_in_every_pose(active, scale, turned):
         # The box around the character, in its own axes, is a little wider where it is turned.
         assert width < apart[0, 0] < 2 * width
         np.testing.assert_allclose(apart, np.tile([apart[0, 0], 0, 0], (len(apart), 1)), atol=2e-5)
-    bpy.ops.fdda.show_rig(way="BESIDE", distance=3.0)
+    bpy.ops.fdda.show_rig(placement="BESIDE", distance=3.0)
     bpy.context.view_layer.update()
     assert len(comparisons()) == 1
     apart = world(side_by_side.find(active)) - rig_world(active)
@@ -61,7 +61,7 @@ def test_beside_is_the_rig_to_the_side_in_every_pose(active, scale, turned):
 
 
 def test_overlay_is_the_rig_as_a_wireframe_where_it_is(active, elbow):
-    bpy.ops.fdda.show_rig(way="OVERLAY")
+    bpy.ops.fdda.show_rig(placement="OVERLAY")
     other = side_by_side.find(active)
     pose(angle=0.8)
     np.testing.assert_allclose(world(other), rig_world(active), atol=1e-6)
@@ -76,17 +76,17 @@ def test_off_leaves_nothing(active):
 
     before = counts()
     for way in ("BESIDE", "OVERLAY", "NONE"):
-        bpy.ops.fdda.show_rig(way=way)
+        bpy.ops.fdda.show_rig(placement=way)
     assert before == counts()
     assert side_by_side.display_mode(active) == "NONE" and not comparisons()
-    bpy.ops.fdda.show_rig(way="BESIDE")
+    bpy.ops.fdda.show_rig(placement="BESIDE")
     bpy.ops.fdda.unbind()
     assert not comparisons()
     refused(bpy.ops.fdda.show_rig, "No model is bound")
 
 
 def test_it_is_no_character(active):
-    bpy.ops.fdda.show_rig(way="BESIDE")
+    bpy.ops.fdda.show_rig(placement="BESIDE")
     assert find_rig().mesh_object == active and [rig.mesh_object for rig in find_rigs()] == [active]
     bpy.context.view_layer.objects.active = armature_of(active)
     assert rigs_of_active_armature(bpy.context) == []
@@ -94,7 +94,7 @@ def test_it_is_no_character(active):
 
 def test_no_file_has_it_and_it_stays_in_view(active, elbow, tmp_path):
     bpy.ops.fdda.pack_model()
-    bpy.ops.fdda.show_rig(way="BESIDE")
+    bpy.ops.fdda.show_rig(placement="BESIDE")
     name, links = side_by_side.find(active).name, len(bpy.context.scene.collection.objects)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     assert side_by_side.find(active).name == name
@@ -111,7 +111,7 @@ def test_no_file_has_it_and_it_stays_in_view(active, elbow, tmp_path):
 
 def test_undo_takes_it_back_and_redo_brings_it(active, elbow):
     bpy.ops.ed.undo_push(message="bound")
-    bpy.ops.fdda.show_rig(way="BESIDE")
+    bpy.ops.fdda.show_rig(placement="BESIDE")
     bpy.ops.ed.undo_push(message="beside")
     pose(angle=0.4)
     bpy.ops.ed.undo_push(message="posed")
@@ -133,14 +133,14 @@ def test_undo_takes_it_back_and_redo_brings_it(active, elbow):
 
 
 def test_it_goes_with_the_character(active):
-    bpy.ops.fdda.show_rig(way="OVERLAY")
+    bpy.ops.fdda.show_rig(placement="OVERLAY")
     bpy.data.objects.remove(active)
     bpy.context.view_layer.update()
     assert not comparisons()
 
 
 def test_jobs_do_not_evaluate_it(active, tmp_path):
-    bpy.ops.fdda.show_rig(way="BESIDE")
+    bpy.ops.fdda.show_rig(placement="BESIDE")
     other = side_by_side.find(active)
     with hidden_comparisons():
         assert other.hide_viewport
@@ -154,7 +154,7 @@ def test_jobs_do_not_evaluate_it(active, tmp_path):
 
 def test_of_an_override(pair):
     for mesh_object in pair:
-        bpy.ops.fdda.show_rig(object=mesh_object.name, way="BESIDE")
+        bpy.ops.fdda.show_rig(object=mesh_object.name, placement="BESIDE")
     bpy.context.view_layer.update()
     for mesh_object in pair:
         apart = world(side_by_side.find(mesh_object)) - rig_world(mesh_object)

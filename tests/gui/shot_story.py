@@ -104,7 +104,7 @@ def show_the_rig_beside(folder: Path) -> Iterator[float]:
     """Press Beside: the rig stands to the side, and moves as the action plays."""
     side = part("evaluation.side_by_side")
     yield from sidebar.open_section("evaluation")
-    yield from sidebar.push("fdda.show_rig(way='BESIDE')", across=0.5)
+    yield from sidebar.push("fdda.show_rig(placement='BESIDE')", across=0.5)
     yield from until(lambda: side.find(arm()) is not None, 5, "the button shows no rig")
     look_at(arm(), 1.8)
     yield 0.5
@@ -125,12 +125,12 @@ def show_the_rig_over_it(folder: Path) -> Iterator[float]:
     """Press Overlay, and Off."""
     side = part("evaluation.side_by_side")
     bpy.context.scene.frame_set(FRAME)
-    yield from sidebar.push("fdda.show_rig(way='OVERLAY')", across=0.85)
+    yield from sidebar.push("fdda.show_rig(placement='OVERLAY')", across=0.85)
     yield from until(lambda: side.display_mode(arm()) == "OVERLAY", 5, "the button shows no overlay")
     look_at(arm())
     yield 0.5
     yield from picture(folder / "overlay.png")
-    yield from sidebar.push("fdda.show_rig(way='NONE')", across=0.15)
+    yield from sidebar.push("fdda.show_rig(placement='NONE')", across=0.15)
     yield from until(lambda: side.find(arm()) is None, 5, "the button leaves the rig there")
 
 
