@@ -70,7 +70,8 @@ class ModelOperator(RigOperator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
-            self.report({"INFO"}, self.apply(context))
+            if message := self.apply(context):
+                self.report({"INFO"}, message)
         except FDDAError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
