@@ -3,6 +3,7 @@
 
 import os
 import re
+import subprocess
 import sys
 import tempfile
 import time
@@ -13,6 +14,7 @@ import pytest
 from fdda_addon.core.errors import TRY_AGAIN
 from fdda_addon.core.messages import Message, MessageType
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
+from fdda_addon.training.process import trainer_command
 
 from .conftest import run
 from .stand_ins import say, stand_in_trainer
@@ -56,6 +58,15 @@ def test_a_python_that_finds_no_trainer(train, tmp_path, monkeypatch):
     assert re.match(
         r"The trainer ended with status 1 before it was done \(.*trainer.*\); no model was written", train()
     )
+
+
+def test_a_trainer_in_the_current_folder_is_not_run(tmp_path):
+    (tmp_path / "trainer").mkdir()
+    for name in ("__init__", "__main__"):
+        (tmp_path / "trainer" / f"{name}.py").write_text("raise SystemExit('another trainer')")
+    command, environment = trainer_command(["--help"])
+    result = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 0 and "usage: " in result.stdout, result.stderr
 
 
 def test_a_python_that_is_not_there(train, monkeypatch):

@@ -1,17 +1,24 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The command line: statuses, options, what each verb prints, and the files that it makes."""
 
+import errno
 import io
+import os
 import shutil
 
 import bpy
 import pytest
 
 import fdda_addon
+from fdda_addon.cli import build_arm
+from fdda_addon.cli.folders import mesh_folders
 from fdda_addon.cli.main import VERBS
 from fdda_addon.cli.progress import ProgressPrinter
+from fdda_addon.core.errors import TRY_AGAIN, OutputError
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.runtime import model_files, registry
+from fdda_addon.scene import blend_file
+from fdda_addon.scene.scene_rig import SceneRig
 
 from .conftest import assert_plays, evaluated, pose, run
 from .refusals import files, save_elbow
@@ -67,6 +74,17 @@ def test_wrong_usage(arguments, capfd, tmp_path, monkeypatch):
     assert captured.err.strip() and not captured.out
     assert "Traceback" not in captured.err
     assert files(tmp_path) == {}
+
+
+def test_a_full_disk_is_no_fault_of_the_user(tmp_path, monkeypatch, capfd):
+    """A farm tries again what ends with this status."""
+
+    def fail(_options: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(build_arm, "run", fail)
+    assert run("build-arm", tmp_path / "arm.blend") == TRY_AGAIN == 75
+    assert capfd.readouterr().err.startswith("Error: No space left on device")
 
 
 def test_train_passes_its_options_on(elbow, tmp_path, capfd):
@@ -179,6 +197,22 @@ def test_a_bound_file_plays_when_it_is_opened(elbow, tmp_path, capfd):
     first = assert_plays(mesh_object, elbow.model)
     pose(angle=1.7)
     assert abs(assert_plays(mesh_object, elbow.model) - first).max() > 0.01
+
+
+def test_folders_of_meshes_differ_in_more_than_letter_case(tmp_path):
+    rigs = [SceneRig(bpy.data.objects.new(name, bpy.data.meshes.new(name)), None) for name in ("Arm", "arm.", "ARM")]
+    assert [path.name for _, path in mesh_folders(rigs[:2], tmp_path)] == ["Arm", "arm_"]
+    with pytest.raises(OutputError, match="'Arm' and 'ARM' would both be recorded into"):
+        mesh_folders(rigs, tmp_path)
+
+
+def test_a_bound_file_that_cannot_be_saved_leaves_no_copy_of_the_model(elbow, tmp_path, monkeypatch):
+    def fail(_path: object) -> None:
+        raise OutputError("There is no room.")
+
+    monkeypatch.setattr(blend_file, "save_copy", fail)
+    assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend") == 1
+    assert files(tmp_path) == {}
 
 
 def test_a_model_in_the_folder_or_below_stays_where_it_is(elbow, tmp_path, monkeypatch):

@@ -5,11 +5,14 @@ import threading
 from collections import Counter
 
 import bpy
+import numpy as np
 import pytest
 
 from fdda_addon.runtime import evaluation_threads, playback
+from fdda_addon.runtime.player import Player
+from fdda_addon.scene.controls import ControlReader
 
-from .conftest import assert_plays, pose
+from .conftest import ELBOW_RIG, assert_plays, pose
 
 MOST_POSES = 2000
 
@@ -35,6 +38,37 @@ def test_python_knows_the_threads_that_evaluate(bound, elbow, monkeypatch):
         pytest.skip("Blender evaluates on one thread here")
     assert remembered == calls
     assert_plays(bound, elbow.model)
+
+
+def test_a_player_is_locked_while_it_reads(bound, monkeypatch):
+    """A render may evaluate it on another thread while the window does."""
+    read_pose, locked = Player.read_pose, []
+
+    def noted(player: Player, *evaluated: object) -> bool:
+        locked.append(player.lock.locked())
+        return read_pose(player, *evaluated)
+
+    monkeypatch.setattr(Player, "read_pose", noted)
+    pose(angle=0.5)
+    assert locked and all(locked)
+
+
+def test_a_control_alone_is_played(bound, monkeypatch):
+    """A pose that has not changed runs no model, unless a control has."""
+    values, played, run_model = [], [], Player.run_model
+
+    def noted(player: Player) -> None:
+        played.append(player.new_inputs.controls.tolist())
+        player.new_inputs = player.new_inputs._replace(controls=np.zeros(0, np.float32))
+        run_model(player)
+
+    monkeypatch.setattr(ControlReader, "values", lambda *_: np.array(values, np.float32))
+    monkeypatch.setattr(Player, "run_model", noted)
+    for value in (1.0, 1.0, 2.0):
+        values[:] = [value]
+        bpy.data.objects[ELBOW_RIG].update_tag(refresh={"DATA"})
+        bpy.context.view_layer.update()
+    assert played == [[1.0], [2.0]]
 
 
 def test_states_of_threads_that_end_are_few(monkeypatch):

@@ -7,6 +7,7 @@ import re
 import bpy
 import numpy as np
 import pytest
+from mathutils import Matrix
 
 from fdda_addon.core.errors import RecordingError, RigError
 from fdda_addon.core.poses import sample_pose
@@ -112,6 +113,14 @@ def test_objects_with_different_transforms(fresh, tmp_path):
 
 def test_influences_of_the_elbow(fresh, tmp_path):
     """The upper half is smoothed by the bend below, and neither sees the shoulder turn."""
+    recording = recorded(fresh, tmp_path / "r", poses=3)
+    assert [(p.joint, p.influencing) for p in recording.partitions] == [(0, (1,)), (1, (1,))]
+
+
+def test_rounding_far_from_the_origin_is_no_influence(fresh, tmp_path):
+    away = Matrix.Translation((1000, 0, 0))
+    fresh.mesh_object.data.transform(away)
+    fresh.armature_object.data.transform(away)
     recording = recorded(fresh, tmp_path / "r", poses=3)
     assert [(p.joint, p.influencing) for p in recording.partitions] == [(0, (1,)), (1, (1,))]
 

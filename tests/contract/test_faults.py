@@ -2,6 +2,7 @@
 """The table of seeded faults fits the code: each fault can be seeded, and names test files that exist."""
 
 import ast
+import re
 
 import pytest
 
@@ -26,3 +27,11 @@ def test_the_tests_that_catch_a_fault_exist(fault: Fault):
 
 def test_each_fault_has_an_id_of_its_own():
     assert len({fault.id for fault in FAULTS}) == len(FAULTS)
+
+
+def test_the_page_for_developers_lists_each_fault():
+    page = (ROOT / "docs" / "development.md").read_text(encoding="utf-8")
+    rows = re.findall(
+        r"^\| `([\w-]+)` \| .* \| `([\w/.]+)` \| \d+ \|$", page.partition("### Seeded faults")[2], re.MULTILINE
+    )
+    assert rows == [(fault.id, fault.tests[0]) for fault in FAULTS]
