@@ -108,7 +108,7 @@ def test_what_changes_with_time_is_named(build, loose_model, tmp_path):
 @pytest.mark.parametrize("build", [build for build in CASES if build not in HELD], ids=lambda build: build.__name__)
 def test_what_no_analysis_names_is_found_by_holding_a_pose(build, tmp_path, monkeypatch):
     """The same characters, where keys, drivers and modifiers are not looked at."""
-    for analysis in ("time_inputs", "_modifiers_in_time"):
+    for analysis in ("time_inputs", "_time_modifiers"):
         monkeypatch.setattr(time_inputs, analysis, lambda *_: ())
     rig = character(build)
     before = scene_state(rig)
