@@ -30,7 +30,7 @@ def test_a_joint_that_flips(poses):
     assert re.match(
         r"Vertices of '(upper|lower)' jump up to \d\d mm between similar poses, 'lower' on the two sides of 180 "
         r"degrees \(\d+ pairs?, such as poses \d+ and \d+\); [12] more partitions? jumps? too, and no network follows "
-        "a jump: keep its turn below 180 degrees",
+        "a jump: keep its rotation below 180 degrees",
         text,
     )
 

@@ -164,7 +164,7 @@ HASHES = {"topology": "a", "rest_positions": "b", "skin_weights": "c"}
             ("low", float("-inf")), ("high", float("nan")), ("high", "1"), ("low", 2), ("axis", 3), ("axis", True),
             ("kind", "twist"), ("bone", 7), ("bone", ""), ("bone", "b" * 5000), ("low", None),
         )],
-        (("limits", {}), "no list"),
+        (("limits", {}), "not a list"),
         (("limits", [{"bone": "upper"}]), "is damaged"),
         (("limits", [[]]), "is damaged"),
         (("seed", -1), "its seed is -1"),

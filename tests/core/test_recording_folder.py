@@ -111,7 +111,7 @@ def test_every_array_is_removed(tmp_path):
     assert not path.exists()
 
 
-LEFT_OVER = ("recording.lock", f".fdda-{'a1' * 6}.json", ".4711-recording.json")
+LEFT_OVER = ("recording.lock", f".fdda-{'a1' * 6}.json")
 
 
 def test_what_a_first_write_left_that_was_killed_stops_nobody(tmp_path):
