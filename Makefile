@@ -104,9 +104,10 @@ fixtures:  ## build the rigs in blend_fixtures again, with the oldest Blender un
 	@$(MAKE) .venv-line LINE=4.5
 	.venv-4.5/bin/python blend_fixtures/make_fixtures.py
 
-lint: .venv  ## ruff's checks and formatting
+lint: .venv  ## ruff's checks and formatting, and words that the field does not use
 	.venv/bin/ruff check
 	.venv/bin/ruff format --check
+	.venv/bin/python setup/retired_words.py
 
 package: .venv  ## dist/fdda_addon-VERSION.zip, to install in Blender (PLATFORM=all: all platforms)
 	.venv/bin/python setup/package.py $(PLATFORM)
