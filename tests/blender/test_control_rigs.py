@@ -30,7 +30,7 @@ class Character:
     model: Path
 
 
-@pytest.fixture(scope="module", params=["BASIC_HUMAN", "HORSE"])
+@pytest.fixture(scope="module", params=["BASIC_HUMAN", pytest.param("HORSE", marks=pytest.mark.slow)])
 def character(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Character:
     folder = tmp_path_factory.mktemp(request.param.lower())
     files = Character(folder / "rig.blend", folder / "recording", folder / "model.onnx")

@@ -198,6 +198,7 @@ def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bound
 
 
+@pytest.mark.slow
 def test_the_first_frame_of_a_dense_mesh_comes_within_a_second(dense):
     command = [sys.executable, str(ROOT / "benchmarks" / "measure.py"), "cold-start", str(dense)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
