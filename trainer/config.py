@@ -5,7 +5,7 @@ import argparse
 import math
 from dataclasses import asdict, dataclass, fields
 
-from fdda_addon.core.defaults import EPOCHS, GOAL_MM, TOLERANCE_MM
+from fdda_addon.core.defaults import EPOCHS, TOLERANCE_MM
 from fdda_addon.core.errors import TrainingError
 
 ACTIVATIONS = ("silu", "gelu", "tanh", "relu")
@@ -50,7 +50,7 @@ class TrainingConfig:
     averaging: float = 0.99
     validation_fraction: float = 0.05
     held_out_fraction: float = 0.1
-    goal_mm: float = GOAL_MM
+    goal_mm: float = 0.0
     patience: int = 0
     include_unsettled: bool = False
 

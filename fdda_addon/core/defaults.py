@@ -24,10 +24,6 @@ REPEATABILITY_POSES = 10
 TOLERANCE_MM = 0.04
 """What the basis shapes may leave, over the whole mesh."""
 EPOCHS = 200
-GOAL_MM = 0.0
-"""What 99.9 % of the held-out vertices are to be within; 0 for no goal."""
-SUGGESTED_GOAL_MM = 0.5
-"""The goal that the sidebar suggests when a user turns it on."""
 
 EVALUATION_POSES, SIDEBAR_EVALUATION_POSES = 200, 100
 """Numbers of random poses on which a model is compared; fewer in the sidebar, where the user waits."""

@@ -17,7 +17,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..core.defaults import EPOCHS, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD, SUGGESTED_GOAL_MM, TOLERANCE_MM
+from ..core.defaults import EPOCHS, MARGIN, MIN_PARTITION_VERTICES, POSES, SPREAD, TOLERANCE_MM
 from ..core.errors import OutputError
 from ..scene.scene_rig import SceneRig, armature_of
 from ..scene.stored_paths import resolve_path
@@ -186,7 +186,7 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
     goal_mm: FloatProperty(
         name="Goal (mm)",
         description="Error that 99.9 % of the vertices in unseen poses shall stay below",
-        default=SUGGESTED_GOAL_MM,
+        default=0.5,
         min=0.001,
         soft_max=10.0,
         precision=2,

@@ -105,22 +105,22 @@ class TestFolder:
         return cached_content(rig, recording_folder(rig.mesh_object)).state
 
     def test_what_the_section_says_follows_folder_settings_and_rig(self, saved):
-        assert self.get(saved) is FolderState.FREE
+        assert self.look(saved) is FolderState.FREE
         bpy.ops.fdda.record()
-        assert self.get(saved) is FolderState.COMPLETE
+        assert self.look(saved) is FolderState.COMPLETE
         index = recording_folder(saved.mesh_object) / "recording.json"
         values = json.loads(index.read_text())
         index.write_text(json.dumps(values | {"complete": 3}))
-        assert self.get(saved) is FolderState.INCOMPLETE
+        assert self.look(saved) is FolderState.INCOMPLETE
         saved.mesh_object.fdda.settings.seed = 1
-        assert self.get(saved) is FolderState.OTHER
+        assert self.look(saved) is FolderState.OTHER
         saved.mesh_object.fdda.settings.seed = 0
         bpy.data.actions["elbow_wave"].fdda.record = True
-        assert self.get(saved) is FolderState.OTHER
+        assert self.look(saved) is FolderState.OTHER
         bpy.data.actions["elbow_wave"].fdda.record = False
-        assert self.get(saved) is FolderState.INCOMPLETE
+        assert self.look(saved) is FolderState.INCOMPLETE
         bpy.ops.fdda.set_limit(bone="upper", axis="X", low=-1, high=1)
-        assert self.get(saved) is FolderState.OTHER
+        assert self.look(saved) is FolderState.OTHER
 
     def test_the_settings_belong_to_the_character_and_are_saved(self, saved, tmp_path):
         settings = saved.mesh_object.fdda.settings

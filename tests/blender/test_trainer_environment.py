@@ -114,7 +114,7 @@ def test_one_that_another_python_hides_says_so(user: Path, wheels: Path, monkeyp
     monkeypatch.setenv(choice.PYTHON_VARIABLE, sys.executable)
     assert create(wheels=str(wheels)) == {"FINISHED"}
     assert session.check_result is None and session.notice.level == "WARNING"
-    assert "FDDA_TRAINER_PYTHON names another Python, which is used in its place" in session.notice.message
+    assert "FDDA_TRAINER_PYTHON names another Python, which is used instead" in session.notice.message
 
 
 def test_a_wheel_that_is_missing(own: Path, wheels: Path, tmp_path: Path):
@@ -228,7 +228,7 @@ def test_cancelled_it_ends_at_once_and_leaves_nothing(user: Path, wheels: Path):
     wait_for(lambda: run.work(0), 10)
     assert process is None or process.poll() is not None
     assert current(ENVIRONMENT) is None and run.state.outcome == session.notice.message
-    assert session.notice.level == "WARNING" and "was cancelled; nothing is left of it" in session.notice.message
+    assert session.notice.level == "WARNING" and "was canceled; nothing is left of it" in session.notice.message
     assert session.environment_state() is FolderState.MISSING
     assert not bpy.ops.fdda.cancel_trainer_environment.poll()
 
@@ -236,7 +236,7 @@ def test_cancelled_it_ends_at_once_and_leaves_nothing(user: Path, wheels: Path):
 def test_cancelled_before_it_begins_it_leaves_what_is_there(own: Path, wheels: Path):
     job = EnvironmentCreation(own, folder.log_path(), wheels, sys.executable)
     job.cancel()
-    with pytest.raises(TrainerEnvironmentError, match="was cancelled; what was there stays"):
+    with pytest.raises(TrainerEnvironmentError, match="was canceled; what was there stays"):
         list(job.steps())
     assert session.environment_state() is FolderState.READY
 

@@ -18,7 +18,7 @@ def test_blender_reads_them_without_numpy():
 
 def test_no_setting_states_them_again():
     """A number beside `default=` of a setting with a default here would go its own way."""
-    names = "poses|spread|min_partition_vertices|tolerance_mm|epochs|goal_mm|markers"
+    names = "poses|spread|min_partition_vertices|tolerance_mm|epochs|markers"
     stated = re.compile(
         rf"^\s*(?:{names}): \w+(?:Property\((?:[^()]|\([^()]*\))*?default)? ?= ?([1-9]|0\.0*[1-9])", re.MULTILINE
     )
