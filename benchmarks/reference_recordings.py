@@ -25,11 +25,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from fdda_addon.core.partition import Partition
 from trainer.config import TrainingConfig, add_options, config_from_arguments
-from trainer.data import PartitionData, PreparedPartition, prepare, split_poses
-from trainer.inputs import Inputs, make_inputs
-from trainer.joint_fit import make_surroundings
+from trainer.data import PartitionData, PreparedPartition, prepare_partition
+from trainer.inputs import NetworkInputs, make_inputs
+from trainer.joint_fit import make_joint_regression
 from trainer.loop import train
-from trainer.model import Network
+from trainer.networks import Network
+from trainer.splitting import split_poses
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "seed_arm"
 TRAINING_POSES = 700
@@ -117,7 +118,7 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
     for place in range(1, len(names)):
         poses[:, place] = poses[:, parents[place]] @ poses[:, place]
     own = Partition(names.index(name), tuple(names.index(joint) for joint in joints), np.zeros(0, np.int32))
-    inputs: Inputs = make_inputs(parents, points, [own])
+    inputs: NetworkInputs = make_inputs(parents, points, [own])
     features = inputs.features(poses.astype(np.float32), np.tile(np.eye(4, dtype=np.float32), (len(names), 1, 1)))
     residuals = residuals * np.float32(CM)
     data = PartitionData(
@@ -126,7 +127,7 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
         lambda: residuals,
         residuals.shape[1],
         # The rest pose is not known: the identity stands in for it.
-        lambda: make_surroundings(parents, own, poses, np.zeros(3)),
+        lambda: make_joint_regression(parents, own, poses, np.zeros(3)),
     )
     return ReferencePartition(data, own.joint, poses)
 
@@ -160,7 +161,7 @@ def run(folder: Path, config: TrainingConfig, choose: bool, listed: bool) -> dic
     else:
         measured, trained_on = np.arange(TRAINING_POSES, poses), np.arange(TRAINING_POSES)
     split = split_poses(trained_on, config.validation_fraction, config.seed)
-    prepared = [prepare(partition.data, split, config.tolerance_mm, config.seed) for partition in every]
+    prepared = [prepare_partition(partition.data, split, config.tolerance_mm, config.seed) for partition in every]
     result = train(prepared, split, config)
     rows = []
     for partition, ready, network in zip(every, prepared, result.networks, strict=True):
@@ -169,7 +170,7 @@ def run(folder: Path, config: TrainingConfig, choose: bool, listed: bool) -> dic
         rows.append(
             {
                 "partition": ready.name,
-                "shapes": len(ready.basis.shapes),
+                "shapes": len(ready.basis.components),
                 "linear_mean": linear,
                 "mean": mean,
                 "max": largest,

@@ -18,12 +18,14 @@ from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import skin_matrices
 from trainer.confidence import measure_training_range
 from trainer.config import TrainingConfig
-from trainer.data import partitions_of, prepare, split_poses
-from trainer.deformation import Deformation, is_sheared
-from trainer.delta_fit import find_deltas
-from trainer.export import Measured, build_model, measure, write_model
-from trainer.inputs import Inputs, inputs_of_rig, middles
-from trainer.loop import Curves, train
+from trainer.curves import Curves
+from trainer.data import partition_data, prepare_partition
+from trainer.export import PositionErrors, build_model, measure, write_model
+from trainer.inputs import NetworkInputs, inputs_of_rig, partition_centers
+from trainer.loop import train
+from trainer.splitting import split_poses
+from trainer.surface_frame_fit import select_surface_frames
+from trainer.trained_model import TrainedModel, is_sheared
 
 
 @dataclass(frozen=True)
@@ -33,13 +35,13 @@ class Material:
     Attributes:
         whole: the training recording.
         training, held_out: both recordings, cut down to the partitions.
-        inputs: what their networks see besides deltas, which follow from the split.
+        inputs: what their networks see besides surface_frames, which follow from the split.
     """
 
     whole: Recording
     training: Recording
     held_out: Recording
-    inputs: Inputs
+    inputs: NetworkInputs
 
 
 def cut(recording: Recording, names: tuple[str, ...]) -> Recording:
@@ -85,8 +87,8 @@ def read_material(training: Path, held_out: Path, names: tuple[str, ...]) -> Mat
             "record it with another --seed."
         )
     small = cut(whole, names)
-    # The neighbors' middles are those of the whole mesh: the networks see what they see when all partitions train.
-    inputs = inputs_of_rig(whole.rig, middles(whole.rig, whole.partitions), small.partitions)
+    # The centers of neighbors are those of the whole mesh, as when all partitions train.
+    inputs = inputs_of_rig(whole.rig, partition_centers(whole.rig, whole.partitions), small.partitions)
     return Material(whole, small, cut(other, names), inputs)
 
 
@@ -96,17 +98,17 @@ def train_once(material: Material, config: TrainingConfig, model_path: Path) -> 
     wall, processor = time.perf_counter(), time.process_time()
     split = split_poses(np.arange(len(recording.pose_matrices)), config.validation_fraction, config.seed)
     # Chosen among those of all partitions, as when all of them train.
-    deltas = find_deltas(material.whole, split, config.tolerance_mm)
-    own = np.isin(deltas.seen_from, [partition.joint for partition in recording.partitions])
-    inputs = material.inputs.with_deltas(deltas.chosen(own), recording.partitions)
-    data = partitions_of(recording, recording.partitions, inputs)
-    prepared = [prepare(partition, split, config.tolerance_mm, config.seed) for partition in data]
+    surface_frames = select_surface_frames(material.whole, split, config.tolerance_mm)
+    own = np.isin(surface_frames.main_joints, [partition.joint for partition in recording.partitions])
+    inputs = material.inputs.with_surface_frames(surface_frames.subset(own), recording.partitions)
+    data = partition_data(recording, recording.partitions, inputs)
+    prepared = [prepare_partition(partition, split, config.tolerance_mm, config.seed) for partition in data]
     trained = train(prepared, split, config, torch.device("cpu"))
     seconds = {"processor": time.process_time() - processor, "wall": time.perf_counter() - wall}
     poses, controls = (np.array(a[split.training]) for a in (recording.pose_matrices, recording.controls))
     seen = inputs.features(poses, recording.rig.rest_matrices, controls)
     training_range = measure_training_range(seen, recording.rig, recording.partitions)
-    deformation = Deformation(
+    trained_model = TrainedModel(
         recording.rig,
         recording.partitions,
         inputs,
@@ -116,9 +118,9 @@ def train_once(material: Material, config: TrainingConfig, model_path: Path) -> 
         config.activation,
         is_sheared(recording.pose_matrices),
     )
-    exported = build_model(recording, deformation, split.validation, config.to_json())
+    exported = build_model(recording, trained_model, split.validation, config.to_json())
     held_out = measure(
-        exported.session, material.held_out, deformation, np.arange(len(material.held_out.pose_matrices))
+        exported.session, material.held_out, trained_model, np.arange(len(material.held_out.pose_matrices))
     )
     with atomic_write(model_path) as temporary:
         write_model(temporary, exported.content)
@@ -130,25 +132,27 @@ def train_once(material: Material, config: TrainingConfig, model_path: Path) -> 
             prepared[n].name: {
                 "basis_left": {
                     "validation": float(prepared[n].validation_truncation.mean()) * 1000,
-                    "held_out": _basis_left(deformation, n, material.held_out),
+                    "held_out": _basis_left(trained_model, n, material.held_out),
                 },
-                **_partition(deformation, n, exported.held_out, held_out, curves),
+                **_partition(trained_model, n, exported.held_out, held_out, curves),
             }
             for n, curves in enumerate(trained.curves)
         },
     }
 
 
-def _partition(deformation: Deformation, number: int, validation: Measured, held_out: Measured, curves: Curves) -> dict:
-    vertices = deformation.partitions[number].vertices
+def _partition(
+    trained_model: TrainedModel, number: int, validation: PositionErrors, held_out: PositionErrors, curves: Curves
+) -> dict:
+    vertices = trained_model.partitions[number].vertices
 
     def errors(distances: np.ndarray) -> dict:
         return error_statistics(distances[:, vertices]).to_json()
 
     return {
         "vertices": len(vertices),
-        "features": len(deformation.prepared[number].columns),
-        "basis": deformation.shape_counts()[number],
+        "features": len(trained_model.prepared[number].columns),
+        "basis": trained_model.component_counts()[number],
         "validation": errors(validation.fdda),
         "validation_linear": errors(validation.linear),
         "held_out": errors(held_out.fdda),
@@ -161,9 +165,9 @@ def _partition(deformation: Deformation, number: int, validation: Measured, held
     }
 
 
-def _basis_left(deformation: Deformation, number: int, recording: Recording) -> float:
+def _basis_left(trained_model: TrainedModel, number: int, recording: Recording) -> float:
     """Mean distance that the basis leaves where its best coefficients are known, mm: what a perfect network leaves."""
-    partition, prepared = deformation.partitions[number], deformation.prepared[number]
+    partition, prepared = trained_model.partitions[number], trained_model.prepared[number]
     skin = skin_matrices(recording.pose_matrices, recording.rig.rest_matrices).astype(np.float64)
     fitted = prepared.fit.offsets(skin) @ np.linalg.inv(skin[:, partition.joint, :3, :3]).transpose(0, 2, 1)
     learned = (recording.residuals[:, partition.vertices] - fitted).reshape(len(skin), -1).astype(np.float32)

@@ -14,42 +14,42 @@ from fdda_addon.core.temporary import check_temporary_folder
 from fdda_addon.core.terminal import escape_unencodable_output
 
 if __name__ == "__main__":
-    # Before the rest is imported: until `main` a request to stop would end in a traceback.
+    # Before the other imports: a request to stop before `main` would end in a traceback.
     exit_on_stop_signal()
 
-from .announcements import Announcer, MessageLines, Text
 from .config import add_options, config_from_arguments
 from .outputs import check_training_outputs
-from .process import StopRequest, missing_package, run_announced
+from .process import StopRequest, missing_package, run_with_messages
+from .progress import JsonMessageSink, MessageSink, TextMessageSink
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Train as the arguments say; returns the exit status."""
+    """Run the command line; returns the exit status."""
     escape_unencodable_output()
     options = _parser().parse_args(arguments)
-    announcer: Announcer = MessageLines() if options.messages else Text()
+    sink: MessageSink = JsonMessageSink() if options.messages else TextMessageSink()
     stop = StopRequest()
-    return run_announced(lambda: _train(options, announcer, stop), announcer)
+    return run_with_messages(lambda: _train(options, sink, stop), sink)
 
 
-def _train(options: argparse.Namespace, announcer: Announcer, stop: StopRequest) -> None:
+def _train(options: argparse.Namespace, sink: MessageSink, stop: StopRequest) -> None:
     config = config_from_arguments(options)
     check_temporary_folder()  # torch fails without one
     try:
         from fdda_addon.core.recording.folder import recordings_in
 
-        from .several import check_several, train_models
+        from .batch import check_batch, train_models
 
-        # What is wrong with the files is said before torch is loaded, which takes seconds.
+        # Files are checked before torch is loaded, which takes seconds.
         if recordings := recordings_in(options.recording):
-            check_several(recordings, options.model, options.overwrite)
+            check_batch(recordings, options.model, options.overwrite)
         else:
             check_training_outputs(options.model, options.overwrite)
-        with stop.at_once(announcer):
+        with stop.exit_immediately(sink):
             from .training import train_model
     except ModuleNotFoundError as error:
         raise missing_package("Training", error) from error
-    settings = (config, announcer, stop, options.warm_start, options.strict, options.overwrite)
+    settings = (config, sink, stop, options.warm_start, options.strict, options.overwrite)
     if recordings:
         train_models(recordings, options.model, *settings)
     else:
@@ -59,12 +59,12 @@ def _train(options: argparse.Namespace, announcer: Announcer, stop: StopRequest)
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("trainer", description="Train a model from a recording.")
     parser.add_argument(
-        "recording", type=Path, help="folder that record made, or one with a recording for each of several meshes"
+        "recording", type=Path, help="folder that record wrote, or a folder with a recording for each of several meshes"
     )
     parser.add_argument(
         "model",
         type=Path,
-        help="the .onnx file to write, its report beside it; a folder for the models of several meshes",
+        help="the .onnx file to write, with its report beside it; a folder for the models of several meshes",
     )
     parser.add_argument(
         "--messages", action="store_true", help="JSON messages on stdout, for a program, in place of text"
@@ -72,10 +72,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--warm-start", action="store_true", help="start from the checkpoint of the model, on a recording that grew"
     )
-    parser.add_argument("--strict", action="store_true", help="let warnings about the recording be errors")
-    parser.add_argument(
-        "--overwrite", action="store_true", help="write over files of another kind; without it that is refused"
-    )
+    parser.add_argument("--strict", action="store_true", help="treat warnings about the recording as errors")
+    parser.add_argument("--overwrite", action="store_true", help="overwrite files of another kind")
     add_options(parser)
     return parser
 

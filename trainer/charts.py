@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Charts of the report as inline SVG; colors come from the page's style sheet."""
+"""Charts of the report as inline SVG; colors are in the page's style sheet."""
 
 import math
 from collections.abc import Sequence
@@ -7,16 +7,24 @@ from html import escape
 
 import numpy as np
 
-SMALLEST = 1e-12
-"""Where a logarithmic axis begins at the earliest, mm."""
+MIN_AXIS_MM = 1e-12
+"""Lower bound of the start of a logarithmic axis, mm."""
 CURVE_POINTS = 120
-"""A curve with more epochs is thinned out to this many points."""
+"""Maximum number of points of a curve; longer ones are sampled."""
 
 
 def learning_curves(
     training: Sequence[float], validation: Sequence[float], worst: Sequence[float], low: float, high: float
 ) -> str:
-    """Small chart of one partition: errors by epoch, logarithmic between `low` and `high` mm; `worst` may be empty."""
+    """Draw the learning curves of one partition.
+
+    Args:
+        training, validation, worst: errors by epoch, mm; empty for a constant partition.
+        low, high: limits of the logarithmic axis, mm.
+
+    Returns:
+        SVG.
+    """
     width, height, left, bottom = 230, 110, 38, 16
     if not validation:
         return (
@@ -44,38 +52,55 @@ def error_bars(
     fdda: Sequence[float],
     linear: Sequence[float],
     p999: Sequence[float],
-    largest: Sequence[float],
+    maxima: Sequence[float],
 ) -> str:
-    """Mean error of each partition, of model and linear skinning, the model's p99.9 and largest; logarithmic, mm."""
+    """Draw the errors of each partition as bars on a logarithmic axis.
+
+    Args:
+        names: of the partitions.
+        fdda, linear: mean errors of model and linear skinning, mm.
+        p999, maxima: 99.9th percentiles and maxima of the model's errors, mm.
+
+    Returns:
+        SVG.
+    """
     row, left, right, top = 20, 130, 16, 24
     width, height = 880, top + row * len(names) + 8
-    positive = [value for value in (*fdda, *linear, *largest) if value > 0] or [1.0]
+    positive = [value for value in (*fdda, *linear, *maxima) if value > 0] or [1.0]
     low, high = _decades(positive)
     x = _log_axis(low, high, left, width - right)
     parts = []
     for value in _powers(low, high):
         parts.append(f'<line class="grid" x1="{x(value):.1f}" x2="{x(value):.1f}" y1="{top - 6}" y2="{height - 4}"/>')
         parts.append(f'<text class="tick" x="{x(value):.1f}" y="{top - 11}" text-anchor="middle">{value:g} mm</text>')
-    for number, name in enumerate(names):
-        middle = top + row * number + row / 2
-        parts.append(f'<text class="label" x="{left - 8}" y="{middle + 4}" text-anchor="end">{escape(name)}</text>')
-        for kind, value, thick in (("linear", linear[number], 12), ("fdda", fdda[number], 6)):
+    for index, name in enumerate(names):
+        center = top + row * index + row / 2
+        parts.append(f'<text class="label" x="{left - 8}" y="{center + 4}" text-anchor="end">{escape(name)}</text>')
+        for kind, value, thickness in (("linear", linear[index], 12), ("fdda", fdda[index], 6)):
             end = x(value) if value > 0 else left
             parts.append(
-                f'<rect class="bar {kind}" x="{left}" y="{middle - thick / 2}" height="{thick}" rx="1.5" '
+                f'<rect class="bar {kind}" x="{left}" y="{center - thickness / 2}" height="{thickness}" rx="1.5" '
                 f'width="{max(0.0, end - left):.1f}"><title>{escape(name)}: {value:.4f} mm</title></rect>'
             )
-        for value, what, half in ((p999[number], "99.9 %", 3), (largest[number], "largest", 6)):
+        for value, label, half in ((p999[index], "99.9 %", 3), (maxima[index], "largest", 6)):
             if value > 0:
                 parts.append(
-                    f'<line class="most" x1="{x(value):.1f}" x2="{x(value):.1f}" y1="{middle - half}" '
-                    f'y2="{middle + half}"><title>{what}: {value:.3f} mm</title></line>'
+                    f'<line class="most" x1="{x(value):.1f}" x2="{x(value):.1f}" y1="{center - half}" '
+                    f'y2="{center + half}"><title>{label}: {value:.3f} mm</title></line>'
                 )
     return f'<svg viewBox="0 0 {width} {height}" role="img">{"".join(parts)}</svg>'
 
 
 def histogram(edges: Sequence[float], fdda: Sequence[int], linear: Sequence[int]) -> str:
-    """How many vertices have which error: model and linear skinning over one logarithmic axis, mm."""
+    """Draw a histogram of vertex errors on a logarithmic axis.
+
+    Args:
+        edges: of the bins, mm.
+        fdda, linear: counts of model and linear skinning.
+
+    Returns:
+        SVG.
+    """
     width, height, left, bottom, top = 880, 240, 46, 30, 10
     counts = np.array([fdda, linear], float)
     used = np.flatnonzero(counts.sum(axis=0))
@@ -83,13 +108,13 @@ def histogram(edges: Sequence[float], fdda: Sequence[int], linear: Sequence[int]
     bounds = np.log10(np.array([edges[1] ** 2 / edges[2], *edges[1:]]))
     low, high = math.floor(bounds[used[0]]), math.ceil(bounds[used[-1] + 1])
     share = counts / counts.sum(axis=1, keepdims=True) * 100
-    most = share.max()
+    max_share = share.max()
 
     def x(value: float) -> float:
         return left + (value - low) / (high - low) * (width - left - 8)
 
     def y(value: float) -> float:
-        return height - bottom - value / most * (height - bottom - top)
+        return height - bottom - value / max_share * (height - bottom - top)
 
     parts = []
     for power in range(low, high + 1):
@@ -98,26 +123,26 @@ def histogram(edges: Sequence[float], fdda: Sequence[int], linear: Sequence[int]
             f'<text class="tick" x="{x(power):.1f}" y="{height - 12}" text-anchor="middle">{10.0**power:g} mm</text>'
         )
         parts.append(label)
-    for value in (0, most / 2, most):
+    for value in (0, max_share / 2, max_share):
         parts.append(f'<text class="tick" x="{left - 6}" y="{y(value) + 4:.1f}" text-anchor="end">{value:.1f} %</text>')
     for name, values in (("linear", share[1]), ("fdda", share[0])):
         points = [f"{x(max(low, bounds[used[0]])):.1f},{y(0):.1f}"]
-        for number in range(used[0], used[-1] + 1):
-            for bound in (bounds[number], bounds[number + 1]):
-                points.append(f"{x(max(low, bound)):.1f},{y(values[number]):.1f}")
+        for index in range(used[0], used[-1] + 1):
+            for bound in (bounds[index], bounds[index + 1]):
+                points.append(f"{x(max(low, bound)):.1f},{y(values[index]):.1f}")
         points.append(f"{x(bounds[used[-1] + 1]):.1f},{y(0):.1f}")
         parts.append(f'<polygon class="area {name}" points="{" ".join(points)}"/>')
     return f'<svg viewBox="0 0 {width} {height}" role="img">{"".join(parts)}</svg>'
 
 
 def curve_limits(curves: Sequence[Sequence[float]]) -> tuple[float, float]:
-    """Common limits of all learning curves, whole powers of ten, mm."""
+    """Return common limits of all learning curves, powers of ten, mm."""
     values = [value for curve in curves for value in curve if value > 0]
     return _decades(values or [1.0])
 
 
 def _decades(values: Sequence[float]) -> tuple[float, float]:
-    low, high = (math.log10(max(value, SMALLEST)) for value in (min(values), max(values)))
+    low, high = (math.log10(max(value, MIN_AXIS_MM)) for value in (min(values), max(values)))
     low, high = math.floor(low), math.ceil(high)
     return 10.0**low, 10.0 ** max(high, low + 1)
 
@@ -127,14 +152,14 @@ def _powers(low: float, high: float) -> list[float]:
 
 
 def _log_axis(low: float, high: float, start: float, end: float):
-    """A function from a value to its place between `start` (low) and `end` (high)."""
+    """Return a function that maps a value to a position between `start` (low) and `end` (high)."""
     span = math.log10(high / low)
 
-    def place(value: float) -> float:
-        part = math.log10(max(value, low) / low) / span
-        return start + min(1.0, part) * (end - start)
+    def position(value: float) -> float:
+        fraction = math.log10(max(value, low) / low) / span
+        return start + min(1.0, fraction) * (end - start)
 
-    return place
+    return position
 
 
 def _grid_lines(low: float, high: float, y, left: float, right: float) -> str:

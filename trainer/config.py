@@ -17,23 +17,21 @@ class TrainingConfig:
 
     Attributes:
         seed: of the split, the initial weights, the order of the poses and the dropout.
-        tolerance_mm: there are as many basis shapes as it takes to bring the rms error of the training residuals, over
-            poses and all vertices, to this.
-        hidden: units of each hidden layer of a partition's network.
-        activation: between the layers, one of `ACTIVATIONS`.
+        tolerance_mm: rms distance over training poses and all vertices that the components may leave, mm.
+        hidden: units of each hidden layer of a network.
+        activation: of the hidden layers, one of `ACTIVATIONS`.
         epochs: passes over the training poses.
-        batch_size: poses a step.
-        learning_rate: highest of the one-cycle schedule.
+        batch_size: poses per step.
+        learning_rate: maximum of the one-cycle schedule.
         weight_decay: of AdamW, decoupled.
-        dropout: part of the hidden units that is dropped in a step.
-        l1, l2: factors of the sums of absolute and squared weights in the loss.
-        averaging: part of the average of the weights that one step replaces is 1 - averaging; 0 takes the weights
-            themselves.
-        validation_fraction: part of the poses that is kept from the training to choose the best weights.
-        held_out_fraction: part of the poses that is kept from training and choice to measure the error on.
-        goal_mm: what 99.9 % of the held-out vertices are to be within, 0 for no goal.
-        patience: stop when no partition has improved for so many epochs; 0 trains to the end.
-        include_unsettled: use poses in which the target did not come to rest as well.
+        dropout: probability of a hidden unit to be dropped in a step.
+        l1, l2: factors of the sums of absolute and of squared weights in the loss.
+        averaging: decay of the exponential moving average of the weights; 0 for no average.
+        validation_fraction: part of the poses that selects the best weights and does not train.
+        held_out_fraction: part of the poses that measures the error, and neither trains nor selects weights.
+        goal_mm: distance that 99.9 % of the held-out vertices should not exceed, mm; 0 for no goal.
+        patience: epochs without improvement of any partition after which the training stops; 0 for all epochs.
+        include_unsettled: also use poses in which the target did not come to rest.
     """
 
     seed: int = 0
@@ -74,23 +72,23 @@ class TrainingConfig:
             "patience": self.patience >= 0,
             "include_unsettled": isinstance(self.include_unsettled, bool),
         }
-        for name, good in checks.items():
+        for name, is_valid in checks.items():
             value = getattr(self, name)
-            if not good or (isinstance(value, float) and not math.isfinite(value)):
+            if not is_valid or (isinstance(value, float) and not math.isfinite(value)):
                 raise TrainingError(f"The training setting {name} cannot be {value!r}; see python -m trainer --help.")
 
     @staticmethod
     def from_mapping(values: dict) -> "TrainingConfig":
-        """Make settings from names and values; what is left out keeps its default.
+        """Make settings from names and values; missing settings keep their defaults.
 
         Raises:
             TrainingError: a name is unknown or a value is impossible.
         """
-        known = {field.name for field in fields(TrainingConfig)}
-        if unknown := sorted(set(values) - known):
+        names = {field.name for field in fields(TrainingConfig)}
+        if unknown := sorted(set(values) - names):
             raise TrainingError(
                 f"Unknown training {'setting' if len(unknown) == 1 else 'settings'} {', '.join(unknown)}; "
-                f"known are {', '.join(sorted(known))}."
+                f"known are {', '.join(sorted(names))}."
             )
         values = dict(values)
         if "hidden" in values:
@@ -98,39 +96,40 @@ class TrainingConfig:
         return TrainingConfig(**values)
 
     def to_json(self) -> dict:
+        """Convert to JSON."""
         return {**asdict(self), "hidden": list(self.hidden)}
 
 
 HELP = {
     "seed": "of the split, the initial weights and the order of the poses",
-    "tolerance_mm": "rms error that the basis shapes may leave over the whole mesh, in mm",
+    "tolerance_mm": "rms error that the components may leave over the whole mesh, in mm",
     "hidden": "units of each hidden layer",
-    "activation": "between the layers",
+    "activation": "of the hidden layers",
     "epochs": "passes over the training poses",
-    "batch_size": "poses a step",
-    "learning_rate": "highest of the one-cycle schedule",
+    "batch_size": "poses per step",
+    "learning_rate": "maximum of the one-cycle schedule",
     "weight_decay": "of AdamW",
-    "dropout": "part of the hidden units that is dropped in a step",
+    "dropout": "probability of a hidden unit to be dropped in a step",
     "l1": "factor of the sum of absolute weights in the loss",
     "l2": "factor of the sum of squared weights in the loss",
-    "averaging": "how slowly the average of the weights moves, 0 for no average",
-    "validation_fraction": "part of the poses that is kept from the training to choose the best weights",
-    "held_out_fraction": "part of the poses that is kept from all of it to measure the error on",
-    "goal_mm": "what 99.9 %% of the held-out vertices are to be within, in mm; 0 for no goal",
-    "patience": "stop after so many epochs without improvement, 0 for never",
-    "include_unsettled": "use the poses in which the target did not come to rest as well",
+    "averaging": "decay of the moving average of the weights, 0 for no average",
+    "validation_fraction": "part of the poses that selects the best weights and does not train",
+    "held_out_fraction": "part of the poses that measures the error, and neither trains nor selects weights",
+    "goal_mm": "distance that 99.9 %% of the held-out vertices should not exceed, in mm; 0 for no goal",
+    "patience": "epochs without improvement after which the training stops, 0 for never",
+    "include_unsettled": "also use poses in which the target did not come to rest",
 }
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Give a parser one option for each setting, `--batch-size` for `batch_size`."""
+    """Add an option for each setting to a parser, `--batch-size` for `batch_size`."""
     group = parser.add_argument_group("training settings")
     for field in fields(TrainingConfig):
         if isinstance(field.default, bool):
             group.add_argument(f"--{field.name.replace('_', '-')}", action="store_true", help=HELP[field.name])
             continue
         kind = {"hidden": int, "activation": str}.get(field.name, type(field.default))
-        shown = " ".join(map(str, field.default)) if field.name == "hidden" else field.default
+        default = " ".join(map(str, field.default)) if field.name == "hidden" else field.default
         group.add_argument(
             f"--{field.name.replace('_', '-')}",
             type=kind,
@@ -138,12 +137,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             nargs="+" if field.name == "hidden" else None,
             choices=ACTIVATIONS if field.name == "activation" else None,
             metavar=None if field.name == "activation" else "N" if kind is int else "X",
-            help=f"{HELP[field.name]} (default: {shown})",
+            help=f"{HELP[field.name]} (default: {default})",
         )
 
 
 def config_from_arguments(arguments: argparse.Namespace) -> TrainingConfig:
-    """Settings from the options that `add_options` made.
+    """Make settings from the options that `add_options` added.
 
     Raises:
         TrainingError: a value is impossible.

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The model's ONNX graph: from pose matrices and controls to positions and confidence, in standard operators.
 
-At one pose a frame the graph costs most of a microsecond a node, whatever the node does, and the time to read its
-constants once: hence few nodes, products with matrices of ones and zeros in place of gathers, and little padding.
-docs/experiments.md has the measurements. In the modules of the graph: N poses, J joints, C controls, Q pairs of joints,
-F features, D deltas, P partitions, K basis shapes, V vertices.
+For one pose a frame the graph takes most of a microsecond per node, whatever the node does, and the time to read its
+constants once. Hence few nodes, products with matrices of ones and zeros in place of gathers, and little padding.
+docs/experiments.md has the measurements. Dimensions in the modules of the graph: N poses, J joints, C controls, Q pairs
+of joints, F features, D surface frames, P partitions, K components, V vertices.
 """
 
 import onnx
@@ -12,30 +12,30 @@ from onnx import TensorProto, helper
 
 from fdda_addon.core.model import CONFIDENCE_OUTPUT, CONTROLS_INPUT, POSE_INPUT, POSITIONS_OUTPUT
 
-from .deformation import Deformation
+from .graph_builder import GraphBuilder
 from .network_nodes import add_networks
-from .nodes import Graph
-from .playback_nodes import add_playback
 from .pose_nodes import add_features, add_range
+from .skinning_nodes import add_skinning
+from .trained_model import TrainedModel
 
 OPSET = 17
 IR_VERSION = 8
-"""Old enough for ONNX Runtime 1.17."""
+"""Supported by ONNX Runtime 1.17 and later."""
 
 
-def build_graph(deformation: Deformation) -> onnx.ModelProto:
-    """Build the model, without metadata."""
-    graph = Graph()
-    features = add_features(graph, deformation)
-    clamped, outside = add_range(graph, features, deformation)
-    coefficients = add_networks(graph, features, clamped, deformation)
-    add_playback(graph, features, coefficients, outside, deformation)
-    inputs = [helper.make_tensor_value_info(POSE_INPUT, TensorProto.FLOAT, ["N", len(deformation.rig.joints), 4, 4])]
-    if count := deformation.inputs.control_count:
+def build_graph(trained_model: TrainedModel) -> onnx.ModelProto:
+    """Build the ONNX model of a trained model, without metadata."""
+    graph = GraphBuilder()
+    features = add_features(graph, trained_model)
+    clamped, outside = add_range(graph, features, trained_model)
+    coefficients = add_networks(graph, features, clamped, trained_model)
+    add_skinning(graph, features, coefficients, outside, trained_model)
+    inputs = [helper.make_tensor_value_info(POSE_INPUT, TensorProto.FLOAT, ["N", len(trained_model.rig.joints), 4, 4])]
+    if count := trained_model.inputs.control_count:
         inputs.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", count]))
     outputs = [
-        helper.make_tensor_value_info(POSITIONS_OUTPUT, TensorProto.FLOAT, ["N", deformation.rig.vertex_count, 3]),
-        helper.make_tensor_value_info(CONFIDENCE_OUTPUT, TensorProto.FLOAT, ["N", len(deformation.partitions)]),
+        helper.make_tensor_value_info(POSITIONS_OUTPUT, TensorProto.FLOAT, ["N", trained_model.rig.vertex_count, 3]),
+        helper.make_tensor_value_info(CONFIDENCE_OUTPUT, TensorProto.FLOAT, ["N", len(trained_model.partitions)]),
     ]
     proto = helper.make_graph(graph.nodes, "deformation", inputs, outputs, graph.constants)
     model = helper.make_model(proto, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="fdda")

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What each network sees: its joints relative to their parents, its controls, where its neighbors are, and deltas.
+"""The input features of the networks: joint transforms, controls, positions of other partitions, and surface frames.
 
-A smoothed surface depends on where the surface around it is. From the parent-relative transforms a network would have
-to multiply its way to that; so it is also given the middle of the partitions around it, seen from its main joint, and
-where the rig smooths, how some vertices stand out of the smoothed surface (`deltas`).
-docs/experiments.md has the errors with and without.
+A smoothed surface depends on where the surface around it is. From parent-relative transforms a network would have to
+learn the product of several of them. So it also takes the centers of nearby partitions in the space of its main joint
+and, where the rig smooths, surface frames (`surface_frames`). docs/experiments.md has the errors with and without.
 """
 
 from collections.abc import Sequence
@@ -16,26 +15,26 @@ from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import STATIC_JOINT, Rig
 
-from .deltas import FEATURES_PER_DELTA, NO_DELTAS, Deltas
+from .surface_frames import FEATURES_PER_SURFACE_FRAME, NO_SURFACE_FRAMES, SurfaceFrameFeatures
 
 FEATURES_PER_PAIR = 3
 
 
 @dataclass(frozen=True)
-class Inputs:
-    """All features that networks see, F = 12 J + C + 3 Q + 3 D of them in a row, and which of them each network sees.
+class NetworkInputs:
+    """All input features, F = 12 J + C + 3 Q + 3 D in a row, and the features of each network.
 
-    First the J joints relative to their parents (`core.features`); then the C controls, each in its own unit; then Q
-    points y of joints b as seen from joints a, P_a^-1 P_b y, in mesh units; then D deltas, in mesh units.
+    In this order: J transforms of joints relative to their parents (`core.features`); C controls, each in its own unit;
+    Q points y of joints b in the space of joints a, P_a^-1 P_b y, in mesh units; D surface frames, in mesh units.
 
     Attributes:
         parents: (J,) int32, parent of each joint, -1 for a root.
         control_count: C.
-        points: (M, 3) float32, points that move with joints, each in its joint's own frame, mesh units.
+        points: (M, 3) float32, points that move with joints, in the space of their joints, mesh units.
         point_joints: (M,) int64, their joints b.
-        pair_references, pair_points: (Q,) int64, joints a and points y of each pair.
-        columns: for each partition, (F_p,) int64 indices of the features that its network is offered.
-        deltas: D of them.
+        pair_references, pair_points: (Q,) int64, joints a and indices of points y.
+        columns: for each partition, (F_p,) int64 indices of the features that are offered to its network.
+        surface_frames: D of them.
     """
 
     parents: np.ndarray
@@ -45,53 +44,59 @@ class Inputs:
     pair_references: np.ndarray
     pair_points: np.ndarray
     columns: tuple[np.ndarray, ...]
-    deltas: Deltas = NO_DELTAS
+    surface_frames: SurfaceFrameFeatures = NO_SURFACE_FRAMES
 
     @property
-    def joint_columns(self) -> int:
-        """12 J, where the controls begin."""
+    def control_start(self) -> int:
+        """12 J, the first column of the controls."""
         return len(self.parents) * FEATURES_PER_JOINT
 
     @property
-    def own_columns(self) -> int:
-        """12 J + C, where the pairs begin; they follow from what stands before them."""
-        return self.joint_columns + self.control_count
+    def pair_start(self) -> int:
+        """12 J + C, the first column of the pairs, which are functions of the joints."""
+        return self.control_start + self.control_count
 
     @property
-    def first_delta(self) -> int:
-        """12 J + C + 3 Q, where the deltas begin; they follow from the poses, too."""
-        return self.own_columns + FEATURES_PER_PAIR * len(self.pair_points)
+    def surface_frame_start(self) -> int:
+        """12 J + C + 3 Q, the first column of the surface frames, which are functions of the joints too."""
+        return self.pair_start + FEATURES_PER_PAIR * len(self.pair_points)
 
     @property
-    def size(self) -> int:
+    def feature_count(self) -> int:
         """F."""
-        return self.first_delta + FEATURES_PER_DELTA * len(self.deltas)
+        return self.surface_frame_start + FEATURES_PER_SURFACE_FRAME * len(self.surface_frames)
 
-    def are_lengths(self) -> np.ndarray:
-        """(F,) bool, the features that are in the unit of length of mesh-object space."""
-        number = np.arange(self.size)
-        return (number >= self.own_columns) | ((number < self.joint_columns) & (number % 4 == 3))
+    def length_mask(self) -> np.ndarray:
+        """Return (F,) bool, which features are lengths in mesh units."""
+        index = np.arange(self.feature_count)
+        return (index >= self.pair_start) | ((index < self.control_start) & (index % 4 == 3))
 
-    def with_deltas(self, deltas: Deltas, partitions: Sequence[Partition]) -> "Inputs":
-        """The same, and each network is offered the deltas that its main joint sees."""
+    def with_surface_frames(
+        self, surface_frames: SurfaceFrameFeatures, partitions: Sequence[Partition]
+    ) -> "NetworkInputs":
+        """Add surface frames, and offer each network those of its own partition."""
         columns = []
-        for partition, own in zip(partitions, self.columns, strict=True):
-            seen = np.flatnonzero(deltas.seen_from == partition.joint)
-            columns.append(np.concatenate([own, *(_columns(self.first_delta, d, FEATURES_PER_DELTA) for d in seen)]))
-        return replace(self, columns=tuple(columns), deltas=deltas)
+        for partition, partition_columns in zip(partitions, self.columns, strict=True):
+            indices = np.flatnonzero(surface_frames.main_joints == partition.joint)
+            added = [_columns(self.surface_frame_start, index, FEATURES_PER_SURFACE_FRAME) for index in indices]
+            columns.append(np.concatenate([partition_columns, *added]))
+        return replace(self, columns=tuple(columns), surface_frames=surface_frames)
 
     def features(
         self, pose_matrices: np.ndarray, rest_matrices: np.ndarray, controls: np.ndarray | None = None
     ) -> np.ndarray:
-        """What there is to see of poses.
+        """Compute the features of poses.
 
         Args:
             pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
             rest_matrices: (J, 4, 4), mesh-object space, mesh units.
-            controls: (N, C) values; may be left out where C is 0.
+            controls: (N, C) values; None where C is 0.
 
         Returns:
             (N, F) float32.
+
+        Raises:
+            ValueError: the controls have another shape.
         """
         values, shape = controls, (len(pose_matrices), self.control_count)
         if values is None:
@@ -100,22 +105,25 @@ class Inputs:
             raise ValueError(f"values of controls are {values.shape} and should be {shape}")
         joints = joint_features(pose_matrices, rest_matrices, self.parents).reshape(len(pose_matrices), -1)
         poses = pose_matrices.astype(np.float64)
-        moved = poses[:, self.point_joints]
-        there = np.einsum("nmab,mb->nma", moved[:, :, :3, :3], self.points) + moved[:, :, :3, 3]
-        apart = there[:, self.pair_points] - poses[:, :, :3, 3][:, self.pair_references]
-        seen = np.einsum("nqab,nqb->nqa", np.linalg.inv(poses[:, :, :3, :3])[:, self.pair_references], apart)
-        parts = [joints, values.astype(np.float32), seen.reshape(len(poses), -1).astype(np.float32)]
-        return np.concatenate([*parts, self.deltas.seen(pose_matrices)], axis=1)
+        point_poses = poses[:, self.point_joints]
+        points = np.einsum("nmab,mb->nma", point_poses[:, :, :3, :3], self.points) + point_poses[:, :, :3, 3]
+        offsets = points[:, self.pair_points] - poses[:, :, :3, 3][:, self.pair_references]
+        local = np.einsum("nqab,nqb->nqa", np.linalg.inv(poses[:, :, :3, :3])[:, self.pair_references], offsets)
+        parts = [joints, values.astype(np.float32), local.reshape(len(poses), -1).astype(np.float32)]
+        return np.concatenate([*parts, self.surface_frames.evaluate(pose_matrices)], axis=1)
 
 
-def inputs_of_rig(rig: Rig, points: np.ndarray, partitions: Sequence[Partition]) -> Inputs:
-    """Choose what the networks of a rig see; `points` and `partitions` as in `make_inputs`."""
-    return make_inputs(rig.parents, points, partitions, len(rig.controls), unmoved_joints(rig))
+def inputs_of_rig(rig: Rig, points: np.ndarray, partitions: Sequence[Partition]) -> NetworkInputs:
+    """Choose the inputs of a rig's networks; `points` and `partitions` as in `make_inputs`."""
+    return make_inputs(rig.parents, points, partitions, len(rig.controls), static_joints(rig))
 
 
-def inputs_with_deltas(rig: Rig, partitions: Sequence[Partition], deltas: Deltas) -> Inputs:
-    """Choose what the networks of a rig see, the middles of its partitions and some deltas among it."""
-    return inputs_of_rig(rig, middles(rig, partitions), partitions).with_deltas(deltas, partitions)
+def inputs_with_surface_frames(
+    rig: Rig, partitions: Sequence[Partition], surface_frames: SurfaceFrameFeatures
+) -> NetworkInputs:
+    """Choose the inputs of a rig's networks, with the centers of its partitions and surface frames."""
+    inputs = inputs_of_rig(rig, partition_centers(rig, partitions), partitions)
+    return inputs.with_surface_frames(surface_frames, partitions)
 
 
 def make_inputs(
@@ -123,71 +131,76 @@ def make_inputs(
     points: np.ndarray,
     partitions: Sequence[Partition],
     control_count: int = 0,
-    unmoved: frozenset[int] = frozenset(),
-) -> Inputs:
-    """Choose what the networks see.
+    static: frozenset[int] = frozenset(),
+) -> NetworkInputs:
+    """Choose the inputs of the networks.
 
-    A joint is seen from the main joint when every joint that moves one against the other influences the partition,
-    and when there are at least two of these: one alone is seen relative to its parent already.
+    A partition takes the points of another joint when every moving joint on the path between the two influences it, and
+    there are at least two of these: a single one is covered by its transform relative to its parent.
 
     Args:
         parents: (J,) parent index of each joint, -1 for a root.
-        points: (J, S, 3) some of each joint, in its own frame, mesh units; `middles` makes one each of a rig.
-        partitions: with their main joints, and the joints and controls that influence them.
+        points: (J, S, 3) S points of each joint, in its space, mesh units; see `partition_centers`.
+        partitions: with their main joints, influencing joints and controls.
         control_count: C.
-        unmoved: joints that never move.
+        static: joints that never move.
     """
-    references, seen, columns = [], [], []
-    each, first_control = points.shape[1], len(parents) * FEATURES_PER_JOINT
+    references, pair_points, columns = [], [], []
+    points_per_joint, control_start = points.shape[1], len(parents) * FEATURES_PER_JOINT
     for partition in partitions:
-        own = [_columns(0, joint, FEATURES_PER_JOINT) for joint in partition.influencing]
-        own += [_columns(first_control, control, 1) for control in partition.controls]
+        partition_columns = [_columns(0, joint, FEATURES_PER_JOINT) for joint in partition.influencing]
+        partition_columns += [_columns(control_start, control, 1) for control in partition.controls]
         for joint in range(len(parents)):
-            between = joints_between(parents, partition.joint, joint) - unmoved
-            if len(between) >= 2 and between <= set(partition.influencing):
-                for point in range(joint * each, (joint + 1) * each):
-                    own.append(_columns(first_control + control_count, len(seen), FEATURES_PER_PAIR))
+            path = joints_on_path(parents, partition.joint, joint) - static
+            if len(path) >= 2 and path <= set(partition.influencing):
+                for point in range(joint * points_per_joint, (joint + 1) * points_per_joint):
+                    pair_columns = _columns(control_start + control_count, len(pair_points), FEATURES_PER_PAIR)
+                    partition_columns.append(pair_columns)
                     references.append(partition.joint)
-                    seen.append(point)
-        columns.append(np.concatenate([*own, np.zeros(0, np.int64)]))
-    return Inputs(
+                    pair_points.append(point)
+        columns.append(np.concatenate([*partition_columns, np.zeros(0, np.int64)]))
+    return NetworkInputs(
         parents,
         control_count,
         points.reshape(-1, 3).astype(np.float32),
-        np.repeat(np.arange(len(parents)), each),
+        np.repeat(np.arange(len(parents)), points_per_joint),
         np.array(references, np.int64),
-        np.array(seen, np.int64),
+        np.array(pair_points, np.int64),
         tuple(columns),
     )
 
 
-def middles(rig: Rig, partitions: Sequence[Partition]) -> np.ndarray:
-    """(J, 1, 3) float64 middle of each joint's partition, in its own frame, mesh units; 0 for one without vertices."""
+def partition_centers(rig: Rig, partitions: Sequence[Partition]) -> np.ndarray:
+    """Compute the center of each joint's partition.
+
+    Returns:
+        (J, 1, 3) float64, in the space of the joint, mesh units; 0 for a joint without vertices.
+    """
     points = np.zeros((len(rig.joints), 1, 3))
     for partition in partitions:
-        middle = np.append(rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64), 1)
-        points[partition.joint, 0] = (np.linalg.inv(rig.rest_matrices[partition.joint].astype(np.float64)) @ middle)[:3]
+        center = np.append(rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64), 1)
+        points[partition.joint, 0] = (np.linalg.inv(rig.rest_matrices[partition.joint].astype(np.float64)) @ center)[:3]
     return points
 
 
-def unmoved_joints(rig: Rig) -> frozenset[int]:
-    """The joints of a rig that never move: they influence nothing, and hide nothing that does."""
-    return frozenset(number for number, joint in enumerate(rig.joints) if joint.name == STATIC_JOINT)
+def static_joints(rig: Rig) -> frozenset[int]:
+    """Return the joints of a rig that never move; they influence nothing."""
+    return frozenset(index for index, joint in enumerate(rig.joints) if joint.name == STATIC_JOINT)
 
 
-def _columns(start: int, number: int, width: int) -> np.ndarray:
-    return start + number * width + np.arange(width)
+def _columns(start: int, index: int, width: int) -> np.ndarray:
+    return start + index * width + np.arange(width)
 
 
-def joints_between(parents: np.ndarray, first: int, second: int) -> set[int]:
-    """The joints whose parent-relative transforms make up that of one joint relative to another.
+def joints_on_path(parents: np.ndarray, first: int, second: int) -> set[int]:
+    """Return the joints whose parent-relative transforms compose the transform of one joint relative to another.
 
-    Where no joint is above both, these are all from either up to its root.
+    Without a common ancestor, these are all joints from either one up to its root.
     """
-    return set(_upwards(parents, first)) ^ set(_upwards(parents, second))
+    return set(_chain_to_root(parents, first)) ^ set(_chain_to_root(parents, second))
 
 
-def _upwards(parents: np.ndarray, joint: int) -> list[int]:
+def _chain_to_root(parents: np.ndarray, joint: int) -> list[int]:
     chain = []
     while joint >= 0:
         chain.append(joint)

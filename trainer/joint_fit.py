@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the joints around a partition say of its residuals without a network: skinning to them, fitted.
+"""Linear regression of a partition's residuals on the transforms of nearby joints.
 
-Most of what smoothing does near a joint is that vertices follow the joints on both sides, each by its part. That is
-linear in the poses of these joints, so a least squares fit finds it, and the networks learn what is left: a fraction of
-the residual, and a smooth one. How much of delta mush can be had in this way: Le and Lewis, Direct Delta Mush Skinning
-and Variants, 2019. Of a rig that preserves volume, most is linear in the joints' turn matrices besides (`turns`).
+Most of what smoothing does near a joint is that vertices follow the joints on both sides in part. That is linear in the
+joints' transforms, so least squares finds it, and the networks learn the remainder: a fraction of the residual, and a
+smooth one. How much of delta mush is linear in this sense: Le and Lewis, Direct Delta Mush Skinning and Variants, 2019.
+For a rig that preserves volume the regression also takes half-rotation features (`half_rotations`).
 """
 
 from dataclasses import dataclass, replace
@@ -14,187 +14,195 @@ import numpy as np
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
 
-from .inputs import joints_between, unmoved_joints
+from .inputs import joints_on_path, static_joints
 
 RIDGE = 1e-6
-"""Added to the mean squares of the rows: joints that move alike share the fit, and no factor grows large."""
+"""Ridge as a part of the number of poses: joints that move alike share the fit, and no factor becomes large."""
 MAX_PRUNING_LOSS = 0.01
-"""Joints are left out, the least useful first, while the error grows by no larger part than this over that of all."""
-EQUATIONS = 4
-"""Poses give at least so many equations for each number of the joints around a partition: with few all is explained."""
-RANK = 1e-5
-"""Directions that are smaller than this part of the largest are none."""
-BLOCK_FLOATS = 1 << 22
-"""Residuals are fitted in blocks of so many coordinates."""
+"""Joints are removed, the least useful first, while the error grows by at most this part over that of all joints."""
+MIN_EQUATIONS_PER_UNKNOWN = 4
+"""Least ratio of equations to unknowns of a vertex: with few equations the regression explains everything."""
+MIN_SINGULAR_VALUE_RATIO = 1e-5
+"""Directions with singular values below this part of the largest are ignored."""
+BLOCK_ELEMENTS = 1 << 22
+"""Residuals are fitted in blocks of at most this many coordinates."""
 
 
 @dataclass(frozen=True)
 class JointFit:
-    """The fitted part of the residuals of a partition: vertex v moves by sum_j S_j u_vj, S_j the skin matrices.
+    """The fitted part of the residuals of a partition: vertex v moves by sum_j S_j u_vj, with skin matrices S_j.
 
-    Moving all joints together moves nothing: the last numbers of all u_vj of a vertex sum to zero.
+    A common motion of all joints moves nothing: the last elements of a vertex's u_vj sum to zero.
 
     Attributes:
-        joints: (Jf,) int64, the main joint first; none where nothing is known of the joints. J + j, behind all others,
-            stands for the turn matrix of joint j, in place of its skin matrix.
-        factors: (4 Jf, Vp) float32, u_vj: three mesh units and a number, joint by joint; the number is 0 for turns.
+        joints: (Jf,) int64, indices into the regression matrices, the main joint first; may be empty. Index J + j is
+            the half-rotation matrix of joint j.
+        factors: (4 Jf, Vp) float32, the u_vj joint by joint: three elements in mesh units and one without unit, which
+            is 0 for half-rotation matrices.
     """
 
     joints: np.ndarray
     factors: np.ndarray
 
     def offsets(self, matrices: np.ndarray) -> np.ndarray:
-        """Matrices as in `make_surroundings` to (N, Vp, 3) offsets from linear skinning, mesh-object space, mesh
-        units."""
+        """Compute the offsets of the vertices from linear skinning.
+
+        Args:
+            matrices: (N, J, 3, 4) or (N, 2 J, 3, 4), as in `make_joint_regression`.
+
+        Returns:
+            (N, Vp, 3) float64, mesh-object space, mesh units.
+        """
         rows = matrices[:, self.joints, :3].transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1)
         return (rows.astype(np.float64) @ self.factors).transpose(0, 2, 1)
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """The joints around a partition as its main joint sees them.
+class JointRegression:
+    """The regressors of a partition's local residuals.
 
     Attributes:
-        joints: (Jf,) int64, the main joint first, turns last, as in `JointFit`.
-        center: (3,) float64, middle of the partition at rest, mesh-object space, mesh units.
-        rows: (N, 3, 4 Jf) float64, R_m^-1 S_j of each joint; the last column of each says how the center moves, which
-            keeps the fit well conditioned far away from the origin.
-        metres_per_unit: as in `Rig`: the ridge weighs lengths as mesh units, whatever they are in.
+        joints: (Jf,) int64, the main joint first, half-rotation matrices last, as in `JointFit`.
+        center: (3,) float64, center of the partition at rest, mesh-object space, mesh units.
+        design: (N, 3, 4 Jf) float64, R_m^-1 S_j of each joint. The last column of each joint is the motion of the
+            center, which keeps the regression well conditioned far from the origin.
+        metres_per_unit: as in `Rig`; makes the ridge independent of the mesh unit.
     """
 
     joints: np.ndarray
     center: np.ndarray
-    rows: np.ndarray
+    design: np.ndarray
     metres_per_unit: float = 1.0
 
-    def alone(self) -> "Surroundings":
-        """The main joint alone, seen from which nothing moves."""
-        return Surroundings(self.joints[:1], self.center, self.rows[:, :, :4], self.metres_per_unit)
+    def main_joint_only(self) -> "JointRegression":
+        """Return the regression on the main joint alone, in whose space it never moves."""
+        return JointRegression(self.joints[:1], self.center, self.design[:, :, :4], self.metres_per_unit)
 
-    def rows_of(self, joints: np.ndarray) -> np.ndarray:
-        """(N, 3, 4 n) float64 rows of some of the joints, in the order given."""
-        places = np.argsort(self.joints)[np.searchsorted(np.sort(self.joints), joints)]
-        return self.rows[:, :, (4 * places[:, None] + np.arange(4)).ravel()]
+    def design_of(self, joints: np.ndarray) -> np.ndarray:
+        """Return the (N, 3, 4 n) float64 columns of n of the joints, in the given order."""
+        indices = np.argsort(self.joints)[np.searchsorted(np.sort(self.joints), joints)]
+        return self.design[:, :, (4 * indices[:, None] + np.arange(4)).ravel()]
 
-    def are_determined(self) -> bool:
-        """Whether there are poses enough for a fit to say something of others."""
-        poses, _, width = self.rows.shape
-        return EQUATIONS * width <= 3 * poses
+    def is_determined(self) -> bool:
+        """Return whether there are enough poses for the fit to generalize."""
+        poses, _, width = self.design.shape
+        return MIN_EQUATIONS_PER_UNKNOWN * width <= 3 * poses
 
-    def directions(self) -> np.ndarray:
-        """(3 N, r) float64, an orthonormal basis of what the joints explain of the local residuals of a vertex."""
-        flat = self.rows.reshape(-1, self.rows.shape[2])
+    def column_space(self) -> np.ndarray:
+        """Return a (3 N, r) float64 orthonormal basis of what the joints explain of a vertex's local residuals."""
+        flat = self.design.reshape(-1, self.design.shape[2])
         flat = flat / np.maximum(np.linalg.norm(flat, axis=0), np.finfo(np.float64).tiny)
-        left, sizes, _ = np.linalg.svd(flat, full_matrices=False)
-        return left[:, sizes > RANK * sizes[0]]
+        left_vectors, singular_values, _ = np.linalg.svd(flat, full_matrices=False)
+        return left_vectors[:, singular_values > MIN_SINGULAR_VALUE_RATIO * singular_values[0]]
 
     def fit(self, residuals: np.ndarray, training: np.ndarray) -> tuple[JointFit, np.ndarray]:
-        """Fit local residuals.
+        """Fit local residuals by ridge regression, and remove joints that hardly help.
 
         Args:
             residuals: (N, Vp, 3) float32 local residuals, mesh units.
             training: indices of the poses to fit.
 
         Returns:
-            The fit, and (N, Vp, 3) float32: what it leaves of the residuals of all poses.
+            The fit, and (N, Vp, 3) float32, what it leaves of the residuals of all poses, mesh units.
         """
-        width = self.rows.shape[2]
-        products, moments = np.zeros((width, width)), np.zeros((width, residuals.shape[1]))
+        width = self.design.shape[2]
+        gram, moments = np.zeros((width, width)), np.zeros((width, residuals.shape[1]))
         total = 0.0
-        step = max(1, BLOCK_FLOATS // residuals[0].size)
+        step = max(1, BLOCK_ELEMENTS // residuals[0].size)
         for start in range(0, len(training), step):
             poses = training[start : start + step]
-            rows = self.rows[poses].reshape(-1, width)
-            products += rows.T @ rows
-            wanted = residuals[poses].transpose(0, 2, 1).reshape(len(rows), -1).astype(np.float64)
-            moments += rows.T @ wanted
-            total += (wanted**2).sum()
+            rows = self.design[poses].reshape(-1, width)
+            gram += rows.T @ rows
+            values = residuals[poses].transpose(0, 2, 1).reshape(len(rows), -1).astype(np.float64)
+            moments += rows.T @ values
+            total += (values**2).sum()
         ridge = np.ones(width)
         ridge[3::4] /= self.metres_per_unit**2
-        products += RIDGE * len(training) * np.diag(ridge)
-        kept = _useful(products, moments, total)
-        columns = (4 * kept[:, None] + np.arange(4)).ravel()
-        solved = np.linalg.solve(products[np.ix_(columns, columns)], moments[columns])
-        left = np.empty_like(residuals)
+        gram += RIDGE * len(training) * np.diag(ridge)
+        selected = _select_joints(gram, moments, total)
+        columns = (4 * selected[:, None] + np.arange(4)).ravel()
+        solution = np.linalg.solve(gram[np.ix_(columns, columns)], moments[columns])
+        remaining = np.empty_like(residuals)
         for start in range(0, len(residuals), step):
             poses = slice(start, start + step)
-            left[poses] = residuals[poses] - (self.rows[poses][:, :, columns] @ solved).transpose(0, 2, 1)
-        return JointFit(self.joints[kept], self._factors(solved.reshape(len(kept), 4, -1))), left
+            remaining[poses] = residuals[poses] - (self.design[poses][:, :, columns] @ solution).transpose(0, 2, 1)
+        return JointFit(self.joints[selected], self._factors(solution.reshape(len(selected), 4, -1))), remaining
 
-    def _factors(self, solved: np.ndarray) -> np.ndarray:
-        """(Jf, 4, Vp) for the rows as they are to (4 Jf, Vp) for skin matrices."""
-        factors, parts = solved.copy(), solved[:, 3]
+    def _factors(self, solution: np.ndarray) -> np.ndarray:
+        """Convert factors (Jf, 4, Vp) of the design matrix to factors (4 Jf, Vp) of the skin matrices."""
+        factors, last_elements = solution.copy(), solution[:, 3]
         factors[0, 3] = 0
-        factors[1:, :3] += self.center[:, None] * parts[1:, None]
-        together = parts[1:].sum(axis=0)
-        factors[0, :3] -= self.center[:, None] * together
-        factors[0, 3] -= together
-        return factors.reshape(-1, solved.shape[2]).astype(np.float32)
+        factors[1:, :3] += self.center[:, None] * last_elements[1:, None]
+        total = last_elements[1:].sum(axis=0)
+        factors[0, :3] -= self.center[:, None] * total
+        factors[0, 3] -= total
+        return factors.reshape(-1, solution.shape[2]).astype(np.float32)
 
 
-def _useful(products: np.ndarray, moments: np.ndarray, total: float) -> np.ndarray:
-    """Which joints to fit to: ascending indices, the first always among them.
+def _select_joints(gram: np.ndarray, moments: np.ndarray, total: float) -> np.ndarray:
+    """Select the joints to fit to by backward elimination.
 
     Args:
-        products, moments: (4 Jf, 4 Jf) and (4 Jf, Vp) of the normal equations, the ridge included.
+        gram, moments: (4 Jf, 4 Jf) and (4 Jf, Vp) of the normal equations, the ridge included.
         total: sum of the squared residuals.
+
+    Returns:
+        Ascending indices; the first joint is always selected.
     """
-    kept = np.arange(len(products) // 4)
-    inverse, gram = np.linalg.inv(products), moments @ moments.T
-    left = total - (inverse * gram).sum()
-    allowed = left * (1 + MAX_PRUNING_LOSS) ** 2
-    while len(kept) > 1:
-        # What leaving out joint j adds: the trace of u_j' C_jj^-1 u_j, with C the inverse and u = C times the moments.
-        by_joint = inverse.reshape(-1, len(kept), 4)
-        own = np.einsum("iaib->iab", inverse.reshape(len(kept), 4, len(kept), 4))
-        outer = np.einsum("iaw,wib->iab", (inverse @ gram).reshape(len(kept), 4, -1), by_joint)
-        added = np.trace(np.linalg.solve(own, outer), axis1=1, axis2=2)
-        least = 1 + int(added[1:].argmin())
-        left += added[least]
-        if left > allowed:
+    selected = np.arange(len(gram) // 4)
+    inverse, moment_gram = np.linalg.inv(gram), moments @ moments.T
+    error = total - (inverse * moment_gram).sum()
+    max_error = error * (1 + MAX_PRUNING_LOSS) ** 2
+    while len(selected) > 1:
+        # Removing joint j adds the trace of u_j' C_jj^-1 u_j, with C the inverse and u = C times the moments.
+        by_joint = inverse.reshape(-1, len(selected), 4)
+        diagonal = np.einsum("iaib->iab", inverse.reshape(len(selected), 4, len(selected), 4))
+        outer = np.einsum("iaw,wib->iab", (inverse @ moment_gram).reshape(len(selected), 4, -1), by_joint)
+        added = np.trace(np.linalg.solve(diagonal, outer), axis1=1, axis2=2)
+        worst = 1 + int(added[1:].argmin())
+        error += added[worst]
+        if error > max_error:
             break
-        gone = 4 * least + np.arange(4)
-        inverse = inverse - inverse[:, gone] @ np.linalg.solve(own[least], inverse[gone])
-        inverse, gram = (np.delete(np.delete(array, gone, 0), gone, 1) for array in (inverse, gram))
-        kept = np.delete(kept, least)
-    return kept
+        removed = 4 * worst + np.arange(4)
+        inverse = inverse - inverse[:, removed] @ np.linalg.solve(diagonal[worst], inverse[removed])
+        inverse, moment_gram = (np.delete(np.delete(array, removed, 0), removed, 1) for array in (inverse, moment_gram))
+        selected = np.delete(selected, worst)
+    return selected
 
 
-def surroundings_of_rig(rig: Rig, partition: Partition, matrices: np.ndarray) -> Surroundings:
-    """The joints around a partition of a rig; `matrices` as in `make_surroundings`."""
+def joint_regression(rig: Rig, partition: Partition, matrices: np.ndarray) -> JointRegression:
+    """Make the regression of a rig's partition; `matrices` as in `make_joint_regression`."""
     center = rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
-    surroundings = make_surroundings(rig.parents, partition, matrices, center, unmoved_joints(rig))
-    return replace(surroundings, metres_per_unit=rig.metres_per_unit)
+    regression = make_joint_regression(rig.parents, partition, matrices, center, static_joints(rig))
+    return replace(regression, metres_per_unit=rig.metres_per_unit)
 
 
-def make_surroundings(
+def make_joint_regression(
     parents: np.ndarray,
     partition: Partition,
     matrices: np.ndarray,
     center: np.ndarray,
-    unmoved: frozenset[int] = frozenset(),
-) -> Surroundings:
-    """The joints that may move a partition's residuals: those that only influencing joints move against the main one.
+    static: frozenset[int] = frozenset(),
+) -> JointRegression:
+    """Make the regression on the joints that only influencing joints move relative to the main joint.
 
     Args:
         parents: (J,) parent index of each joint, -1 for a root.
-        partition: with its main joint and the influencing ones.
-        matrices: (N, J, 3, 4) skin matrices of all poses, mesh units, or (N, 2 J, 3, 4) with turn matrices behind them
-            (`turns.fit_matrices`); any fixed matrices may stand in for the rest pose, the fit takes them up.
-        center: (3,) middle of the partition where all skin matrices are the identity, mesh units.
-        unmoved: joints that never move.
+        partition: with its main joint and the influencing joints.
+        matrices: (N, J, 3, 4) skin matrices of all poses, mesh units, or (N, 2 J, 3, 4) followed by half-rotation
+            matrices (`half_rotations.regression_matrices`). The rest pose may be any fixed pose.
+        center: (3,) center of the partition where all skin matrices are the identity, mesh units.
+        static: joints that never move.
     """
     influencing, main, count = set(partition.influencing), partition.joint, len(parents)
-    between = [joints_between(parents, main, joint) for joint in range(count)]
-    # A turn is seen where the joint's parent is, and turns with the joint.
-    between += [{joint} | (between[parent] if parent >= 0 else {-1}) for joint, parent in enumerate(parents.tolist())]
-    others = [
-        number for number in range(matrices.shape[1]) if number != main and between[number] - unmoved <= influencing
-    ]
+    paths = [joints_on_path(parents, main, joint) for joint in range(count)]
+    # A half rotation is in the space of the joint's parent, and depends on the joint.
+    paths += [{joint} | (paths[parent] if parent >= 0 else {-1}) for joint, parent in enumerate(parents.tolist())]
+    others = [index for index in range(matrices.shape[1]) if index != main and paths[index] - static <= influencing]
     joints = np.array([main, *others], np.int64)
-    moves_along = (joints < count)[:, None]
-    apart = matrices[:, joints, :3].astype(np.float64)
-    apart[:, :, :, 3] -= moves_along * matrices[:, main, None, :3, 3]
-    relative = np.linalg.inv(matrices[:, main, None, :3, :3].astype(np.float64)) @ apart
-    relative[:, :, :, 3] += moves_along * (relative[:, :, :, :3] @ center - center)
-    return Surroundings(joints, center, relative.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1))
+    is_skin = (joints < count)[:, None]
+    relative = matrices[:, joints, :3].astype(np.float64)
+    relative[:, :, :, 3] -= is_skin * matrices[:, main, None, :3, 3]
+    local = np.linalg.inv(matrices[:, main, None, :3, :3].astype(np.float64)) @ relative
+    local[:, :, :, 3] += is_skin * (local[:, :, :, :3] @ center - center)
+    return JointRegression(joints, center, local.transpose(0, 2, 1, 3).reshape(len(matrices), 3, -1))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The part of the graph that evaluates the networks, all at once.
+"""Graph nodes that evaluate all networks at once.
 
-Networks differ in what they see and in how many shapes they have; in one product for all, each would be padded to the
-largest. So first and last layers are cut into pieces of the same size: a network has as many as it needs, and what the
-pieces of a first layer come to is summed. What the first layer would standardize is in its weights, as its bias is; the
-last layer's is in the mean residual.
+Networks differ in their numbers of inputs and outputs; in one batched product all would be padded to the largest. So
+the first and last layers are cut into chunks of equal size, as many for a network as it needs, and the outputs of the
+first layer's chunks are summed. The standardization of the features is folded into the weights and bias of the first
+layer, and the last bias into the mean residual.
 """
 
 from collections.abc import Sequence
@@ -14,131 +14,146 @@ import numpy as np
 
 from fdda_addon.core.model import CONFIDENCE_OUTPUT
 
-from .deformation import Deformation
-from .nodes import Graph
+from .graph_builder import GraphBuilder
 from .pose_nodes import VECTOR, Features
+from .trained_model import TrainedModel
 
-PIECE_FLOATS, CUT_FLOATS = 800, 15_000
-"""A piece costs as much time as reading so many constants, and so much more do the nodes that put pieces together."""
+CHUNK_COST, SPLIT_COST = 800, 15_000
+"""Time of a chunk, and of the nodes that combine chunks, as the number of constants that are read in the same time."""
 
 
 @dataclass(frozen=True)
 class Coefficients:
-    """What the networks say, times the confidence.
+    """The coefficients of all partitions, scaled by the confidence.
 
     Attributes:
-        name: (N, ·) coefficients without the last bias, mesh units.
-        first: by partition that has shapes, where its first one is; the others follow.
+        name: of the (N, ·) coefficients without the last bias, mesh units.
+        first: by index of each partition with components, position of its first coefficient; the others follow.
     """
 
     name: str
     first: dict[int, int]
 
 
-def add_networks(graph: Graph, features: Features, clamped: str, deformation: Deformation) -> Coefficients | None:
-    """Evaluate the networks, if there are any.
+def add_networks(
+    graph: GraphBuilder, features: Features, clamped: str, trained_model: TrainedModel
+) -> Coefficients | None:
+    """Add the nodes that evaluate the networks.
 
     Args:
-        clamped: (N, B, 3) features.
+        graph: to add the nodes to.
+        features: layout of the features.
+        clamped: name of the (N, B, 3) features.
+        trained_model: to export.
+
+    Returns:
+        The coefficients; None where no partition has components.
     """
-    learned = [n for n, count in enumerate(deformation.shape_counts()) if count]
+    learned = [index for index, count in enumerate(trained_model.component_counts()) if count]
     if not learned:
         return None
-    networks = [deformation.networks[n] for n in learned]
-    first = [_first_layer(features, deformation, n) for n in learned]
+    networks = [trained_model.networks[index] for index in learned]
+    first = [_first_layer(features, trained_model, index) for index in learned]
     hidden = [np.stack(layers) for layers in zip(*(network.weights[1:-1] for network in networks), strict=True)]
     biases = [np.stack(layers)[:, None] for layers in zip(*(network.biases[1:-1] for network in networks), strict=True)]
     values = _add_first_layer(graph, clamped, first)
-    values = _activation(graph, values, deformation.activation, "hidden_0")
+    values = _add_activation(graph, values, trained_model.activation, "hidden_0")
     for layer, (weights, bias) in enumerate(zip(hidden, biases, strict=True), 1):
         values = graph.add("MatMul", [values, graph.floats(f"weights_{layer}", weights)], f"product_{layer}")
         values = graph.add("Add", [values, graph.floats(f"biases_{layer}", bias)], f"layer_{layer}")
-        values = _activation(graph, values, deformation.activation, f"hidden_{layer}")
-    return _add_last_layer(graph, values, {n: deformation.networks[n].weights[-1] for n in learned})
+        values = _add_activation(graph, values, trained_model.activation, f"hidden_{layer}")
+    return _add_last_layer(graph, values, {index: trained_model.networks[index].weights[-1] for index in learned})
 
 
-def _piece_size(sizes: Sequence[int], width: int, joint: int) -> int:
-    """How large to make the pieces, so that a frame takes least time.
+def _chunk_size(sizes: Sequence[int], width: int, combine_cost: int) -> int:
+    """Choose the chunk size that takes the least time per frame.
 
     Args:
-        sizes: of the layers.
-        width: numbers for each unit of size.
-        joint: numbers that a piece takes to be put together with others.
+        sizes: number of inputs or outputs of each network's layer.
+        width: constants per input or output.
+        combine_cost: constants per chunk that combine it with others.
     """
 
     def cost(size: int) -> int:
-        pieces = sum(-(-own // size) for own in sizes)
-        together = CUT_FLOATS + pieces * joint if pieces > len(sizes) else 0
-        return pieces * (size * width + PIECE_FLOATS) + together
+        count = sum(-(-layer_size // size) for layer_size in sizes)
+        combining = SPLIT_COST + count * combine_cost if count > len(sizes) else 0
+        return count * (size * width + CHUNK_COST) + combining
 
     return min(range(1, max(sizes) + 1), key=cost)
 
 
-def _pieces(sizes: Sequence[int], size: int) -> list[tuple[int, slice]]:
-    """The pieces of layers: whose they are, and which part."""
-    return [(n, slice(start, start + size)) for n, own in enumerate(sizes) for start in range(0, own, size)]
+def _chunks(sizes: Sequence[int], size: int) -> list[tuple[int, slice]]:
+    """Cut layers into chunks; returns the index of the network and the slice of its layer for each chunk."""
+    return [(n, slice(start, start + size)) for n, length in enumerate(sizes) for start in range(0, length, size)]
 
 
-def _add_first_layer(graph: Graph, clamped: str, layers: list[tuple[np.ndarray, np.ndarray]]) -> str:
-    """(L, N, H) what first layers, as `_first_layer` gives them, say of (N, B, 3) features."""
+def _add_first_layer(graph: GraphBuilder, clamped: str, layers: list[tuple[np.ndarray, np.ndarray]]) -> str:
+    """Add the first layers, given as from `_first_layer`; returns (L, N, H) values before the activation."""
     sizes, units = [len(vectors) for vectors, _ in layers], layers[0][1].shape[2]
-    size = _piece_size(sizes, VECTOR * units, len(layers))
-    pieces = _pieces(sizes, size)
-    seen, weights = np.zeros((len(pieces), size), np.int64), np.zeros((len(pieces), size, VECTOR, units))
-    owners = np.zeros((len(layers), len(pieces)))
-    for number, (n, part) in enumerate(pieces):
-        vectors, own = (array[part] for array in layers[n])
-        seen[number, : len(vectors)], weights[number, : len(vectors)] = vectors, own
-        owners[n, number] = 1
-    weights = graph.floats("weights_0", weights.reshape(len(pieces), -1, units))
-    values = graph.add("Gather", [clamped, graph.integers("vectors_of_pieces", seen)], "seen", axis=1)
-    values = graph.reshape(values, [0, len(pieces), VECTOR * size], "seen_rows")
+    size = _chunk_size(sizes, VECTOR * units, len(layers))
+    chunks = _chunks(sizes, size)
+    inputs, weights = np.zeros((len(chunks), size), np.int64), np.zeros((len(chunks), size, VECTOR, units))
+    owners = np.zeros((len(layers), len(chunks)))
+    for index, (network, part) in enumerate(chunks):
+        vectors, chunk_weights = (array[part] for array in layers[network])
+        inputs[index, : len(vectors)], weights[index, : len(vectors)] = vectors, chunk_weights
+        owners[network, index] = 1
+    weights = graph.floats("weights_0", weights.reshape(len(chunks), -1, units))
+    values = graph.add("Gather", [clamped, graph.integers("chunk_vectors", inputs)], "chunk_features", axis=1)
+    values = graph.reshape(values, [0, len(chunks), VECTOR * size], "chunk_rows")
     values = graph.add("Transpose", [values], "inputs", perm=[1, 0, 2])
     values = graph.add("MatMul", [values, weights], "layer_0")
-    if len(pieces) > len(layers):
-        values = graph.reshape(values, [len(pieces), -1], "layer_pieces")
+    if len(chunks) > len(layers):
+        values = graph.reshape(values, [len(chunks), -1], "layer_chunks")
         values = graph.add("MatMul", [graph.floats("owners", owners), values], "layer_sums")
         values = graph.reshape(values, [len(layers), -1, units], "summed_layer")
     return values
 
 
-def _add_last_layer(graph: Graph, values: str, layers: dict[int, np.ndarray]) -> Coefficients:
-    """(L, N, H) values of hidden units to coefficients; `layers` has the weights of the output layer by partition."""
+def _add_last_layer(graph: GraphBuilder, values: str, layers: dict[int, np.ndarray]) -> Coefficients:
+    """Add the last layers.
+
+    Args:
+        graph: to add the nodes to.
+        values: name of the (L, N, H) values of the hidden units.
+        layers: by partition index, (H, K) weights.
+    """
     sizes, units = [weights.shape[1] for weights in layers.values()], next(iter(layers.values())).shape[0]
-    size = _piece_size(sizes, units, units)
-    pieces, partitions = _pieces(sizes, size), list(layers)
-    owners, weights = [n for n, _ in pieces], np.zeros((len(pieces), units, size))
-    for number, (n, part) in enumerate(pieces):
-        own = layers[partitions[n]][:, part]
-        weights[number, :, : own.shape[1]] = own
-    if len(pieces) > len(layers):
-        values = graph.add("Gather", [values, graph.integers("piece_owners", owners)], "hidden_of_pieces", axis=0)
-    values = graph.add("MatMul", [values, graph.floats("output_weights", weights)], "coefficients_by_piece")
+    size = _chunk_size(sizes, units, units)
+    chunks, partitions = _chunks(sizes, size), list(layers)
+    owners, weights = [network for network, _ in chunks], np.zeros((len(chunks), units, size))
+    for index, (network, part) in enumerate(chunks):
+        chunk_weights = layers[partitions[network]][:, part]
+        weights[index, :, : chunk_weights.shape[1]] = chunk_weights
+    if len(chunks) > len(layers):
+        values = graph.add("Gather", [values, graph.integers("chunk_owners", owners)], "chunk_hidden", axis=0)
+    values = graph.add("MatMul", [values, graph.floats("output_weights", weights)], "coefficients_by_chunk")
     values = graph.add("Transpose", [values], "coefficients", perm=[1, 0, 2])
-    confidence = graph.integers("confidence_of_pieces", np.array([[partitions[n]] for n in owners]))
-    confidence = graph.add("Gather", [CONFIDENCE_OUTPUT, confidence], "confidence_by_piece", axis=1)
+    confidence = graph.integers("chunk_partitions", np.array([[partitions[network]] for network in owners]))
+    confidence = graph.add("Gather", [CONFIDENCE_OUTPUT, confidence], "chunk_confidence", axis=1)
     values = graph.add("Mul", [values, confidence], "scaled_coefficients")
-    name = graph.reshape(values, [0, len(pieces) * size], "coefficient_row")
+    name = graph.reshape(values, [0, len(chunks) * size], "coefficient_row")
     return Coefficients(name, {partition: size * owners.index(n) for n, partition in enumerate(layers)})
 
 
-def _first_layer(features: Features, deformation: Deformation, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """The vectors that a network sees, and its first layer for these as they are, not standardized.
+def _first_layer(features: Features, trained_model: TrainedModel, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Fold the standardization of the features into the first layer of a network.
 
     Returns:
-        (Bn,) int64 vectors, the last of them ones; (Bn, 3, H) float64 weights, in which the bias is that of a one.
+        (Bn,) int64 indices of the vectors that are its inputs, the last one `Features.one`; (Bn, 3, H) float64 weights,
+        with the bias as the weight of a constant 1.
     """
-    prepared, network = deformation.prepared[n], deformation.networks[n]
-    place = features.place[deformation.seen_columns(n)]
-    vectors, which = np.unique(place // VECTOR, return_inverse=True)
+    prepared, network = trained_model.prepared[index], trained_model.networks[index]
+    position = features.position[trained_model.feature_columns(index)]
+    vectors, slots = np.unique(position // VECTOR, return_inverse=True)
     scaled = network.weights[0].astype(np.float64) / prepared.feature_scale[:, None]
-    weight = np.zeros((len(vectors) + 1, VECTOR, scaled.shape[1]))
-    weight[which, place % VECTOR] = scaled
-    weight[-1, -1] = network.biases[0] - prepared.feature_mean.astype(np.float64) @ scaled
-    return np.append(vectors, features.one), weight
+    weights = np.zeros((len(vectors) + 1, VECTOR, scaled.shape[1]))
+    weights[slots, position % VECTOR] = scaled
+    weights[-1, -1] = network.biases[0] - prepared.feature_mean.astype(np.float64) @ scaled
+    return np.append(vectors, features.one), weights
 
 
-def _activation(graph: Graph, value: str, activation: str, output: str) -> str:
+def _add_activation(graph: GraphBuilder, value: str, activation: str, output: str) -> str:
     if activation == "silu":
         return graph.add("Mul", [value, graph.add("Sigmoid", [value], f"{output}_sigmoid")], output)
     if activation == "gelu":

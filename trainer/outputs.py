@@ -9,14 +9,18 @@ from fdda_addon.core.report import checkpoint_path, page_path, report_path
 
 
 def training_outputs(model: Path) -> tuple[Path, Path, Path, Path]:
-    """The model, its checkpoint, and the report as JSON and as a page."""
+    """Return the paths of the model, its checkpoint, and its report as JSON and as a page."""
     return model, checkpoint_path(model), report_path(model), page_path(model)
 
 
 def check_training_outputs(model: Path, overwrite: bool) -> None:
-    """Fail before the training when they cannot be written; `overwrite` as in `core.output.check_outputs`.
+    """Check before a training that its files can be written.
+
+    Args:
+        model: path of the model.
+        overwrite: as in `core.output.check_outputs`.
 
     Raises:
-        OutputError: says which and why.
+        OutputError: a file cannot be written.
     """
     check_outputs(zip(training_outputs(model), (MODEL, CHECKPOINT, REPORT, PAGE), strict=True), overwrite=overwrite)

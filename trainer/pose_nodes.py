@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The part of the graph that looks at the pose: features, their range, and confidence.
+"""Graph nodes that compute the features of a pose, clamp them to the training range, and compute the confidence.
 
-Every three features are one vector as a frame sees it, R^-1 (d - t): the columns of a joint's matrix as the joint sees
-them that its parent carries along, and the points of other joints as a main joint sees them. So all are one gather of
-frames, one of vectors and a product. Where no recorded bone is sheared the columns of R are orthogonal, whatever the
-scale, and R^-1 is its transpose, each row divided by its squared length: a third of the nodes of an inverse. Deltas
-(`delta_nodes`) come behind them; turn matrices, where residuals are fitted to them, follow from what their parents see.
+Each three features are one vector in the space of a joint or of a carried joint, R^-1 (d - t). The vectors are columns
+of a joint's matrix in the space of the joint as its parent carries it along, and points in the space of a main joint.
+So all of them take one gather of spaces, two of points, and a product. Where no recorded bone is sheared, the columns
+of R are orthogonal, and R^-1 is its transpose with each row divided by its squared length: a third of the nodes of an
+inverse. Surface frames (`surface_frame_nodes`) follow; half-rotation matrices are computed from the same vectors.
 """
 
 from dataclasses import dataclass
@@ -15,17 +15,17 @@ import numpy as np
 from fdda_addon.core.features import FEATURES_PER_JOINT
 from fdda_addon.core.model import CONFIDENCE_OUTPUT, CONTROLS_INPUT, POSE_INPUT
 
-from .deformation import Deformation
-from .delta_nodes import add_deltas
-from .deltas import SMALLEST
-from .nodes import Graph
-from .turn_nodes import add_turns
+from .graph_builder import GraphBuilder
+from .half_rotation_nodes import add_half_rotations
+from .surface_frame_nodes import add_surface_frames
+from .surface_frames import MIN_SQUARED_LENGTH
+from .trained_model import TrainedModel
 
 VECTOR = 3
-"""Features are gathered by so many."""
-COLUMNS, ZERO, WHOLE, INVERSE = 4, 4, 5, 6
-"""Rows of the table for a frame: four for its columns, each thrice; a zero; its columns one after the other; and its
-transpose."""
+"""Elements of a vector; features are gathered as vectors."""
+COLUMNS, ZERO_ROW, MATRIX_ROW, TRANSPOSE_ROW = 4, 4, 5, 6
+"""Rows of the table for a space: four with one column each, repeated three times; a zero row; the matrix column by
+column; and its transpose, where no bone is sheared."""
 
 
 @dataclass(frozen=True)
@@ -33,43 +33,45 @@ class Features:
     """The features in the graph.
 
     Attributes:
-        name: (N, B, 3), of the controls first, then of the joints, then a zero, then of the pairs, then the deltas.
-        own: how many of the B vectors are of controls and joints, with the zero; the others follow from these.
+        name: of the (N, B, 3) vectors: controls, joints, a zero vector, pairs, surface frames.
+        direct_count: number of vectors of controls and joints with the zero vector, B'; the others are functions of
+            them.
         size: 3 B.
-        place: (F,) int64, where each feature of `Inputs` is among the 3 B; -1 where it is not needed.
-        table: (N, ·, 12), in which also the poses are, and the turns, by columns of three numbers.
-        pose_rows: (2 J,) int64, where the poses are in it, and behind them the turns; -1 where there is none.
+        position: (F,) int64, position of each feature of `NetworkInputs` among the 3 B; -1 where it is not needed.
+        table: name of (N, ·, 12) matrices column by column, with pose matrices and half-rotation matrices among them.
+        pose_rows: (2 J,) int64, rows of the table with the pose matrices, then with the half-rotation matrices; -1 for
+            matrices that are not in the table.
     """
 
     name: str
-    own: int
+    direct_count: int
     size: int
-    place: np.ndarray
+    position: np.ndarray
     table: str
     pose_rows: np.ndarray
 
     @property
     def one(self) -> int:
-        """Which of the vectors is clamped to ones: a constant among what changes, for biases."""
-        return self.own - 1
+        """Index of the vector that is clamped to ones: a constant for biases."""
+        return self.direct_count - 1
 
     def bound(self, values: np.ndarray) -> np.ndarray:
-        """(F,) bounds of the range in the order of the graph, (B, 3) float64."""
+        """Convert (F,) bounds of the range to the order of the graph, (B, 3) float64."""
         ordered = np.zeros(self.size)
-        ordered[self.place[self.place >= 0]] = values[self.place >= 0]
+        ordered[self.position[self.position >= 0]] = values[self.position >= 0]
         ordered = ordered.reshape(-1, VECTOR)
         ordered[self.one] = 1
         return ordered
 
 
 @dataclass(frozen=True)
-class _Frames:
-    """Frames from which or of which something is seen: joints carried by their parents, points, and joints.
+class _Spaces:
+    """The stacked matrices of all spaces: carried joints, points, joints.
 
     Attributes:
-        joints: (Ju,) those whose features are needed, the first Ju frames.
-        points: (M,) indices of the points that are seen; the next M frames stand on them.
-        first_joint: where the frames of all J joints begin.
+        joints: (Ju,) joints whose features are needed; the first Ju spaces are these as their parents carry them along.
+        points: (M,) indices of the points that are needed; the next M spaces have them as origins.
+        first_joint: index of the first of the J spaces of the joints themselves.
     """
 
     joints: np.ndarray
@@ -77,130 +79,140 @@ class _Frames:
     first_joint: int
 
 
-def add_features(graph: Graph, deformation: Deformation) -> Features:
-    """Add the features that networks or confidence look at."""
-    inputs, joints = deformation.inputs, _joints_needed(deformation)
+def add_features(graph: GraphBuilder, trained_model: TrainedModel) -> Features:
+    """Add the nodes that compute the features of the networks and of the confidence."""
+    inputs, joints = trained_model.inputs, _needed_joints(trained_model)
     points = np.unique(inputs.pair_points)
-    frames = _Frames(joints, points, len(joints) + len(points))
-    stack = _add_frames(graph, deformation, frames)
-    seen_from, there, origin = _vectors(deformation, frames)
-    rows = INVERSE + (not deformation.sheared)
-    flat = graph.reshape(stack, [0, frames.first_joint + len(inputs.parents), 16], "flat_frames")
+    spaces = _Spaces(joints, points, len(joints) + len(points))
+    stack = _add_spaces(graph, trained_model, spaces)
+    vector_spaces, ends, origins = _vector_indices(trained_model, spaces)
+    rows = _rows_per_space(trained_model)
+    flat = graph.reshape(stack, [0, spaces.first_joint + len(inputs.parents), 16], "flat_spaces")
     table = graph.add("MatMul", [flat, graph.floats("table_picks", _table_picks(rows))], "table_rows")
     table = graph.reshape(table, [0, -1, 12], "table")
-    source = _inverses(graph, flat) if deformation.sheared else table
-    turned = graph.add("Gather", [source, graph.integers("seen_from", seen_from)], "frames_of_vectors", axis=1)
-    ends = [graph.add("Gather", [table, graph.integers("vector_there", there)], "vectors_there", axis=1)]
-    ends.append(graph.add("Gather", [table, graph.integers("vector_origin", origin)], "vectors_origin", axis=1))
-    apart = graph.add("Sub", ends, "apart")
+    source = _add_inverses(graph, flat) if trained_model.sheared else table
+    inverses = graph.add("Gather", [source, graph.integers("vector_spaces", vector_spaces)], "vector_inverses", axis=1)
+    bounds = [graph.add("Gather", [table, graph.integers("vector_ends", ends)], "ends", axis=1)]
+    bounds.append(graph.add("Gather", [table, graph.integers("vector_origins", origins)], "origins", axis=1))
+    offsets = graph.add("Sub", bounds, "offsets")
     sums = graph.floats("row_sums", np.kron(np.eye(3), np.ones((4, 1))))
-    name = graph.add("MatMul", [graph.add("Mul", [turned, apart], "terms"), sums], "vectors")
-    if not deformation.sheared:
-        squared = graph.add("Mul", [turned, turned], "frames_squared")
-        name = graph.add("Div", [name, graph.add("MatMul", [squared, sums], "lengths")], "seen_vectors")
-    table, pose_rows = _add_turns(graph, deformation, frames, name, table)
-    place, before = np.full(inputs.size, -1, np.int64), []
+    name = graph.add("MatMul", [graph.add("Mul", [inverses, offsets], "terms"), sums], "vectors")
+    if not trained_model.sheared:
+        squared = graph.add("Mul", [inverses, inverses], "inverses_squared")
+        name = graph.add("Div", [name, graph.add("MatMul", [squared, sums], "lengths")], "local_vectors")
+    table, pose_rows = _add_half_rotations(graph, trained_model, spaces, name, table)
+    position, leading = np.full(inputs.feature_count, -1, np.int64), []
     if count := inputs.control_count:
-        # Three times, to fill vectors; only the first is looked at.
-        thrice = graph.add("Concat", [CONTROLS_INPUT] * VECTOR, "controls_thrice", axis=1)
-        before.append(graph.reshape(thrice, [0, count, VECTOR], "controls_in_vectors"))
-        place[inputs.joint_columns : inputs.own_columns] = np.arange(count)
-    behind = [add_deltas(graph, inputs.deltas)] if len(inputs.deltas) else []
-    name = graph.join([*before, name, *behind], "features", axis=1)
-    own, by_column = count + COLUMNS * len(joints) + 1, np.arange(FEATURES_PER_JOINT).reshape(VECTOR, COLUMNS).T.ravel()
-    place[(FEATURES_PER_JOINT * joints[:, None] + by_column).ravel()] = np.arange(VECTOR * count, VECTOR * (own - 1))
-    size = VECTOR * own + inputs.size - inputs.own_columns
-    place[inputs.own_columns :] = np.arange(VECTOR * own, size)
-    return Features(name, own, size, place, table, pose_rows)
+        # Repeated to fill a vector; only the first element is used.
+        repeated = graph.add("Concat", [CONTROLS_INPUT] * VECTOR, "controls_repeated", axis=1)
+        leading.append(graph.reshape(repeated, [0, count, VECTOR], "control_vectors"))
+        position[inputs.control_start : inputs.pair_start] = np.arange(count)
+    trailing = [add_surface_frames(graph, inputs.surface_frames)] if len(inputs.surface_frames) else []
+    name = graph.join([*leading, name, *trailing], "features", axis=1)
+    direct_count = count + COLUMNS * len(joints) + 1
+    by_column = np.arange(FEATURES_PER_JOINT).reshape(VECTOR, COLUMNS).T.ravel()
+    joint_positions = np.arange(VECTOR * count, VECTOR * (direct_count - 1))
+    position[(FEATURES_PER_JOINT * joints[:, None] + by_column).ravel()] = joint_positions
+    size = VECTOR * direct_count + inputs.feature_count - inputs.pair_start
+    position[inputs.pair_start :] = np.arange(VECTOR * direct_count, size)
+    return Features(name, direct_count, size, position, table, pose_rows)
 
 
-def _joints_needed(deformation: Deformation) -> np.ndarray:
-    """(Ju,) joints that some network sees, that count for some partition's confidence, or whose turns are needed."""
-    inputs = deformation.inputs
-    needed = deformation.training_range.counts[:, : inputs.joint_columns].any(axis=0)
-    for number in range(len(deformation.partitions)):
-        columns = deformation.seen_columns(number)
-        needed[columns[columns < inputs.joint_columns]] = True
-    needed.reshape(-1, FEATURES_PER_JOINT)[deformation.turns()] = True
+def _rows_per_space(trained_model: TrainedModel) -> int:
+    return TRANSPOSE_ROW + (not trained_model.sheared)
+
+
+def _needed_joints(trained_model: TrainedModel) -> np.ndarray:
+    """Return (Ju,) joints that a network, a partition's confidence or a half-rotation matrix depends on."""
+    inputs = trained_model.inputs
+    needed = trained_model.training_range.counts[:, : inputs.control_start].any(axis=0)
+    for index in range(len(trained_model.partitions)):
+        columns = trained_model.feature_columns(index)
+        needed[columns[columns < inputs.control_start]] = True
+    needed.reshape(-1, FEATURES_PER_JOINT)[trained_model.half_rotation_joints()] = True
     joints = np.flatnonzero(needed.reshape(-1, FEATURES_PER_JOINT).any(axis=1))
-    # Something has to be there to be looked at.
+    # An empty gather is not possible.
     return joints if len(joints) else np.zeros(1, np.int64)
 
 
-def _add_frames(graph: Graph, deformation: Deformation, frames: _Frames) -> str:
-    """(N, Ju + M + J, 4, 4) frames: Q_j = P_p B_p^-1 B_j, the joint carried along by its parent; points; all joints."""
-    rig, inputs = deformation.rig, deformation.inputs
-    parents, rest = rig.parents[frames.joints], rig.rest_matrices.astype(np.float64)
-    above, is_root = np.maximum(parents, 0), (parents < 0)[:, None, None]
-    to_child = np.where(is_root, 0, np.linalg.inv(rest[above]) @ rest[frames.joints])
-    at_points = np.tile(np.eye(4), (len(frames.points), 1, 1))
-    at_points[:, :3, 3] = inputs.points[frames.points]
-    sources = np.concatenate([above, inputs.point_joints[frames.points]]).astype(np.int64)
-    moved = graph.add("Gather", [POSE_INPUT, graph.integers("frame_joints", sources)], "frame_poses", axis=1)
-    places = graph.floats("frame_places", np.concatenate([to_child, at_points]))
-    moved = graph.add("MatMul", [moved, places], "moved")
+def _add_spaces(graph: GraphBuilder, trained_model: TrainedModel, spaces: _Spaces) -> str:
+    """Add the (N, Ju + M + J, 4, 4) matrices of the spaces; a carried joint is Q_j = P_p B_p^-1 B_j."""
+    rig, inputs = trained_model.rig, trained_model.inputs
+    parents, rest = rig.parents[spaces.joints], rig.rest_matrices.astype(np.float64)
+    safe_parents, is_root = np.maximum(parents, 0), (parents < 0)[:, None, None]
+    to_child = np.where(is_root, 0, np.linalg.inv(rest[safe_parents]) @ rest[spaces.joints])
+    to_points = np.tile(np.eye(4), (len(spaces.points), 1, 1))
+    to_points[:, :3, 3] = inputs.points[spaces.points]
+    sources = np.concatenate([safe_parents, inputs.point_joints[spaces.points]]).astype(np.int64)
+    moved = graph.add("Gather", [POSE_INPUT, graph.integers("space_joints", sources)], "space_poses", axis=1)
+    offsets = graph.floats("space_offsets", np.concatenate([to_child, to_points]))
+    moved = graph.add("MatMul", [moved, offsets], "moved")
     if is_root.any():
-        roots = np.concatenate([np.where(is_root, rest[frames.joints], 0), 0 * at_points])
-        moved = graph.add("Add", [moved, graph.floats("frames_of_roots", roots)], "carried")
-    return graph.add("Concat", [moved, POSE_INPUT], "frames", axis=1)
+        roots = np.concatenate([np.where(is_root, rest[spaces.joints], 0), 0 * to_points])
+        moved = graph.add("Add", [moved, graph.floats("root_spaces", roots)], "carried")
+    return graph.add("Concat", [moved, POSE_INPUT], "spaces", axis=1)
 
 
 def _table_picks(rows: int) -> np.ndarray:
-    """(16, 12 rows) that picks what the table holds of a matrix; three times as the three rows of a product want it."""
+    """Return the (16, 12 rows) matrix of ones and zeros that converts a flat matrix to its rows of the table."""
     picks = np.zeros((16, rows, VECTOR, 4))
     for row, inner in np.ndindex(VECTOR, 3):
         for column in range(COLUMNS):
             picks[4 * inner + column, column, row, inner] = 1
-        if rows > INVERSE:
-            picks[4 * inner + row, INVERSE, row, inner] = 1
-            # Behind each row, from the 1 in the corner of the matrix: no length is zero.
-            picks[-1, INVERSE, row, 3] = np.sqrt(SMALLEST)
+        if rows > TRANSPOSE_ROW:
+            picks[4 * inner + row, TRANSPOSE_ROW, row, inner] = 1
+            # From the 1 in the corner of the matrix, as a fourth element: no length is zero.
+            picks[-1, TRANSPOSE_ROW, row, 3] = np.sqrt(MIN_SQUARED_LENGTH)
     for column, row in np.ndindex(COLUMNS, 3):
-        picks.reshape(16, rows, -1)[4 * row + column, WHOLE, 3 * column + row] = 1
+        picks.reshape(16, rows, -1)[4 * row + column, MATRIX_ROW, 3 * column + row] = 1
     return picks.reshape(16, -1)
 
 
-def _vectors(deformation: Deformation, frames: _Frames) -> tuple[np.ndarray, ...]:
-    """Of each vector where the inverse of the frame is that sees it, and in the table where it ends and begins.
+def _vector_indices(trained_model: TrainedModel, spaces: _Spaces) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rows that make up each vector.
 
-    The inverses of sheared frames are a table of their own, one row each.
+    Returns:
+        Rows of the inverse of its space, in the table or, where bones are sheared, among the inverses; rows of its end
+        and of its origin in the table.
     """
-    inputs, rows = deformation.inputs, INVERSE + (not deformation.sheared)
-    carried, itself = np.arange(len(frames.joints)), frames.first_joint + frames.joints
+    inputs, rows = trained_model.inputs, _rows_per_space(trained_model)
+    carried, posed = np.arange(len(spaces.joints)), spaces.first_joint + spaces.joints
     columns = np.arange(COLUMNS)
-    # Directions begin nowhere, the place of a joint at that of the joint carried along.
-    origin = np.where(columns == COLUMNS - 1, rows * carried[:, None] + COLUMNS - 1, ZERO).ravel()
-    references = frames.first_joint + inputs.pair_references
-    points = len(frames.joints) + np.searchsorted(frames.points, inputs.pair_points)
-    # Behind the joints a vector that is zero, whatever sees it.
-    seen_from = np.concatenate([np.repeat(carried, COLUMNS), carried[:1], references])
+    # Axes have no origin; a joint's translation is relative to the carried joint.
+    origins = np.where(columns == COLUMNS - 1, rows * carried[:, None] + COLUMNS - 1, ZERO_ROW).ravel()
+    references = spaces.first_joint + inputs.pair_references
+    points = len(spaces.joints) + np.searchsorted(spaces.points, inputs.pair_points)
+    # The zero vector after the joints may be in any space.
+    vector_spaces = np.concatenate([np.repeat(carried, COLUMNS), carried[:1], references])
     return (
-        seen_from if deformation.sheared else rows * seen_from + INVERSE,
-        np.concatenate([(rows * itself[:, None] + columns).ravel(), [ZERO], rows * points + COLUMNS - 1]),
-        np.concatenate([origin, [ZERO], rows * references + COLUMNS - 1]),
+        vector_spaces if trained_model.sheared else rows * vector_spaces + TRANSPOSE_ROW,
+        np.concatenate([(rows * posed[:, None] + columns).ravel(), [ZERO_ROW], rows * points + COLUMNS - 1]),
+        np.concatenate([origins, [ZERO_ROW], rows * references + COLUMNS - 1]),
     )
 
 
-def _add_turns(
-    graph: Graph, deformation: Deformation, frames: _Frames, vectors: str, table: str
+def _add_half_rotations(
+    graph: GraphBuilder, trained_model: TrainedModel, spaces: _Spaces, vectors: str, table: str
 ) -> tuple[str, np.ndarray]:
-    """Put the turn matrices that are needed behind the table; its name, and `Features.pose_rows`."""
-    joints, turned = len(deformation.rig.joints), deformation.turns()
-    rows = INVERSE + (not deformation.sheared)
-    pose_rows = np.append(rows * (frames.first_joint + np.arange(joints)) + WHOLE, np.full(joints, -1))
-    if len(turned):
-        pose_rows[joints + turned] = rows * (frames.first_joint + joints) + np.arange(len(turned))
-        carried = np.searchsorted(frames.joints, turned)[:, None]
-        against = np.append(
-            COLUMNS * carried + np.arange(3), np.full_like(carried, COLUMNS * len(frames.joints)), axis=1
-        )
-        table = add_turns(graph, vectors, against, table, COLUMNS * (rows * carried + WHOLE) + np.arange(3))
+    """Append the needed half-rotation matrices to the table; returns its name, and `Features.pose_rows`."""
+    joint_count, half_rotations = len(trained_model.rig.joints), trained_model.half_rotation_joints()
+    rows = _rows_per_space(trained_model)
+    matrix_rows = rows * (spaces.first_joint + np.arange(joint_count)) + MATRIX_ROW
+    pose_rows = np.append(matrix_rows, np.full(joint_count, -1))
+    if len(half_rotations):
+        appended = rows * (spaces.first_joint + joint_count) + np.arange(len(half_rotations))
+        pose_rows[joint_count + half_rotations] = appended
+        carried = np.searchsorted(spaces.joints, half_rotations)[:, None]
+        zero_vector = np.full_like(carried, COLUMNS * len(spaces.joints))
+        rotation_columns = np.append(COLUMNS * carried + np.arange(3), zero_vector, axis=1)
+        carried_columns = COLUMNS * (rows * carried + MATRIX_ROW) + np.arange(3)
+        table = add_half_rotations(graph, vectors, rotation_columns, table, carried_columns)
     return table, pose_rows
 
 
-def _inverses(graph: Graph, flat: str) -> str:
-    """(N, G, 16) to (N, G, 12): inverses of the upper left 3x3, row by row with a zero behind each row."""
-    # Adjugate: differences of two products of elements each. A product with ones and zeros is exact.
+def _add_inverses(graph: GraphBuilder, flat: str) -> str:
+    """Invert the upper left 3x3 of (N, G, 16) matrices; returns (N, G, 12), row by row, each followed by a zero."""
+    # The adjugate consists of differences of two products. A product with ones and zeros is exact.
     picks, signs = np.zeros((16, 39)), np.zeros((18, 12))
     for i, j in np.ndindex(3, 3):
         rows, columns = ((j + 1) % 3, (j + 2) % 3), ((i + 1) % 3, (i + 2) % 3)
@@ -216,29 +228,31 @@ def _inverses(graph: Graph, flat: str) -> str:
     adjugate = graph.add("MatMul", [products, graph.floats("minor_signs", signs)], "adjugate")
     expansion = graph.add("Mul", [graph.slice(adjugate, 0, 3, 2, "adjugate_row"), column], "expansion")
     determinant = graph.add("ReduceSum", [expansion, graph.integers("last_axis", [2])], "determinant", keepdims=1)
-    safe = graph.add("Add", [determinant, graph.floats("smallest", SMALLEST)], "safe_determinant")
+    safe = graph.add("Add", [determinant, graph.floats("smallest", MIN_SQUARED_LENGTH)], "safe_determinant")
     return graph.add("Div", [adjugate, safe], "inverses")
 
 
-def add_range(graph: Graph, features: Features, deformation: Deformation) -> tuple[str, str]:
+def add_range(graph: GraphBuilder, features: Features, trained_model: TrainedModel) -> tuple[str, str]:
     """Clamp the features to the training range, and add the output `confidence`.
 
     Returns:
-        (N, B, 3) features, clamped, and (N, 3 own) squares of how far the own ones are outside; those of `Features.one`
-        are ones.
+        Name of the (N, B, 3) clamped features; name of (N, 3 B') squared distances of the direct features from the
+        range, where the elements of `Features.one` are 1.
     """
-    training_range, size = deformation.training_range, VECTOR * features.own
-    raised = graph.add("Max", [features.name, graph.floats("range_low", features.bound(training_range.low))], "raised")
-    clamped = graph.add("Min", [raised, graph.floats("range_high", features.bound(training_range.high))], "clamped")
+    training_range, size = trained_model.training_range, VECTOR * features.direct_count
+    low, high = (features.bound(values) for values in (training_range.low, training_range.high))
+    raised = graph.add("Max", [features.name, graph.floats("range_low", low)], "raised")
+    clamped = graph.add("Min", [raised, graph.floats("range_high", high)], "clamped")
     outside = graph.add("Sub", [features.name, clamped], "outside")
     if features.size > size:
-        outside = graph.slice(outside, 0, features.own, 1, "own_outside")
+        outside = graph.slice(outside, 0, features.direct_count, 1, "direct_outside")
     outside = graph.reshape(outside, [0, size], "outside_row")
     squared = graph.add("Mul", [outside, outside], "outside_squared")
     counts = np.zeros((size, len(training_range.counts)))
-    own = features.place[: len(training_range.width)]
-    counts[own[own >= 0]] = (training_range.counts / training_range.width.astype(np.float64) ** 2).T[own >= 0]
-    left = [squared, graph.floats("counts", counts), graph.floats("full_confidence", np.ones(1))]
-    root = graph.add("Relu", [graph.add("Gemm", left, "confidence_left", alpha=-1.0)], "confidence_root")
+    position = features.position[: len(training_range.width)]
+    scaled_counts = (training_range.counts / training_range.width.astype(np.float64) ** 2).T
+    counts[position[position >= 0]] = scaled_counts[position >= 0]
+    terms = [squared, graph.floats("counts", counts), graph.floats("full_confidence", np.ones(1))]
+    root = graph.add("Relu", [graph.add("Gemm", terms, "confidence_base", alpha=-1.0)], "confidence_root")
     graph.add("Mul", [root, root], CONFIDENCE_OUTPUT)
     return clamped, squared

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report of a training: `report.json` and the page made of it."""
+"""The report of a training: `report.json`, and the page that is made from it."""
 
 from __future__ import annotations
 
@@ -18,62 +18,62 @@ from fdda_addon.core.output import check_outputs, write_text
 from fdda_addon.core.report import page_path, read_report
 from fdda_addon.core.terminal import escape_unencodable_output
 
-from .page import render_html
-from .report_file import check_drawable, read_evaluation
+from .report_page import render_html
+from .report_validation import check_drawable, read_evaluation
 
-if TYPE_CHECKING:  # The page can be written again where torch is not installed.
+if TYPE_CHECKING:  # The page can be written where torch is not installed.
     from fdda_addon.core.recording.reader import Recording
 
-    from .deformation import Deformation
-    from .export import Exported, Measured
-    from .loop import Curves
-    from .worst import Worst
+    from .curves import Curves
+    from .error_analysis import ErrorAnalysis
+    from .export import ExportedModel, PositionErrors
+    from .trained_model import TrainedModel
 
 HISTOGRAM_EDGES_MM = np.concatenate([[0.0], np.geomspace(1e-4, 1e3, 71)])
-"""Ten bins a decade; the first one holds everything below a ten-thousandth of a millimetre."""
+"""Bin edges of the histogram, mm: ten bins per decade; the first bin holds all errors below 0.0001 mm."""
 
 
 def make_report(
     recording: Recording,
-    deformation: Deformation,
-    exported: Exported,
-    on_training: Measured,
+    trained_model: TrainedModel,
+    exported: ExportedModel,
+    on_training: PositionErrors,
     surface: dict,
     curves: Sequence[Curves],
     model_name: str,
-    worst: Sequence[Worst],
+    analyses: Sequence[ErrorAnalysis],
 ) -> dict:
-    """What `report.json` holds (`core.report`). docs/formats.md describes the keys; errors are in mm.
+    """Make the content of `report.json`; docs/formats.md describes the keys. Errors are in mm.
 
     Args:
-        recording, deformation, exported, curves: of the training.
+        recording, trained_model, exported, curves: of the training.
         on_training: errors on a sample of the training poses.
         surface: `normals` and `edges` of held-out poses.
         model_name: file name of the model.
-        worst: of each partition.
+        analyses: of the largest errors of each partition.
     """
     names, controls = recording.rig.joint_names, [control.name for control in recording.rig.controls]
     held_out = exported.held_out
     partitions = []
-    for partition, prepared, curve, largest in zip(
-        deformation.partitions, deformation.prepared, curves, worst, strict=True
+    for partition, prepared, curve, analysis in zip(
+        trained_model.partitions, trained_model.prepared, curves, analyses, strict=True
     ):
-        own = partition.vertices
+        vertices = partition.vertices
         partitions.append(
             {
                 "joint": names[partition.joint],
-                "vertices": len(own),
+                "vertices": len(vertices),
                 "influencing": [names[joint] for joint in partition.influencing],
-                **({"controls": [controls[n] for n in partition.controls]} if partition.controls else {}),
+                **({"controls": [controls[control] for control in partition.controls]} if partition.controls else {}),
                 **({"merged": [names[joint] for joint in partition.merged]} if partition.merged else {}),
                 "features": len(prepared.columns),
-                "basis": len(prepared.basis.shapes),
-                "truncation": prepared.basis.truncation * prepared.mm_per_unit,
-                "training": error_statistics(on_training.fdda[:, own]).to_json(),
-                "held_out": error_statistics(held_out.fdda[:, own]).to_json(),
-                "linear": error_statistics(held_out.linear[:, own]).to_json(),
-                "histogram": _histogram(held_out.fdda[:, own]),
-                "worst": largest.to_json(),
+                "basis": len(prepared.basis.components),
+                "truncation": prepared.basis.truncation_rms * prepared.mm_per_unit,
+                "training": error_statistics(on_training.fdda[:, vertices]).to_json(),
+                "held_out": error_statistics(held_out.fdda[:, vertices]).to_json(),
+                "linear": error_statistics(held_out.linear[:, vertices]).to_json(),
+                "histogram": _histogram(held_out.fdda[:, vertices]),
+                "largest_errors": analysis.to_json(),
                 "curve": {
                     "training": [round(value, 6) for value in curve.training_mm],
                     "validation": [round(value, 6) for value in curve.validation_mm],
@@ -115,13 +115,13 @@ def _histogram(errors: np.ndarray) -> list[int]:
 
 
 def write_html(report: dict, path: Path, pictures: Sequence[Path] = (), evaluation: dict | None = None) -> None:
-    """Write the page of a report; again, with pictures and figures that came later.
+    """Write the page of a report. It may be written again with pictures and an evaluation.
 
     Args:
-        report: what `report.json` holds.
+        report: content of `report.json`.
         path: of the page.
         pictures: PNG or JPEG files to show.
-        evaluation: what `evaluate --json` wrote.
+        evaluation: content of the JSON that `evaluate` wrote; None without one.
 
     Raises:
         OutputError: the page cannot be written.
@@ -130,7 +130,7 @@ def write_html(report: dict, path: Path, pictures: Sequence[Path] = (), evaluati
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write the page again: `python -m trainer.report REPORT.json`; returns the exit status."""
+    """Run `python -m trainer.report REPORT.json`, which writes the page again; returns the exit status."""
     escape_unencodable_output()
     parser = argparse.ArgumentParser("trainer.report", description="Write the page of a training report again.")
     parser.add_argument("report", type=Path, help="report.json; the page is written beside it")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Fits skin weights to poses that `record` has evaluated: `python -m trainer.skin_fit FOLDER hard|smooth`.
 
-FOLDER is one that `core.recording.fit_folder` wrote; the fitted weights are written into it. Speaks in messages, and
-exits as `python -m trainer` does.
+FOLDER is written by `core.recording.fit_folder`; the fitted weights are written into it. Messages and exit status are
+those of `python -m trainer`.
 """
 
 import argparse
@@ -11,29 +11,29 @@ from pathlib import Path
 
 from fdda_addon.core.terminal import escape_unencodable_output
 
-from .announcements import Announcer, MessageLines
-from .process import StopRequest, missing_package, run_announced
+from .process import StopRequest, missing_package, run_with_messages
+from .progress import JsonMessageSink, MessageSink
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Fit as the arguments say; returns the exit status."""
+    """Run the command line; returns the exit status."""
     escape_unencodable_output()
     parser = argparse.ArgumentParser("trainer.skin_fit", description="Fit skin weights to the poses in a folder.")
     parser.add_argument("folder", type=Path, help="folder that record made")
-    parser.add_argument("kind", choices=("hard", "smooth"), help="one joint a vertex, or at most four")
-    parser.add_argument("--metres-per-unit", type=float, default=1.0, help="length of a unit of the mesh")
+    parser.add_argument("kind", choices=("hard", "smooth"), help="one joint per vertex, or at most four")
+    parser.add_argument("--metres-per-unit", type=float, default=1.0, help="length of a mesh unit in meters")
     options = parser.parse_args(arguments)
-    announcer, stop = MessageLines(), StopRequest()
-    return run_announced(lambda: _fit(options, announcer, stop), announcer)
+    sink, stop = JsonMessageSink(), StopRequest()
+    return run_with_messages(lambda: _fit(options, sink, stop), sink)
 
 
-def _fit(options: argparse.Namespace, announcer: Announcer, stop: StopRequest) -> None:
+def _fit(options: argparse.Namespace, sink: MessageSink, stop: StopRequest) -> None:
     try:
-        with stop.at_once(announcer):
-            from .fitted_skin import fit_folder
+        with stop.exit_immediately(sink):
+            from .skin_fit_job import fit_folder
     except ModuleNotFoundError as error:
         raise missing_package("Fitting skin weights", error) from error
-    fit_folder(options.folder, options.kind, announcer, stop, options.metres_per_unit)
+    fit_folder(options.folder, options.kind, sink, stop, options.metres_per_unit)
 
 
 if __name__ == "__main__":

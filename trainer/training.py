@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One training, from the recording to the files that it leaves."""
+"""One training, from the recording to the files that it writes."""
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,106 +11,117 @@ import torch
 
 from fdda_addon.core.checks.recording import check_recording
 from fdda_addon.core.checks.warning import RecordingWarning, refuse
-from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.output import atomic_write_all
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.recording.estimate import training_size_sentence
 from fdda_addon.core.recording.reader import Recording, read_recording
-from fdda_addon.core.report import checkpoint_path, report_text
+from fdda_addon.core.report import report_text
 from fdda_addon.core.rig import STATIC_JOINT_LABEL
 
-from . import report
-from .announcements import Announcer
-from .borders import better_borders, partition_of
-from .checkpoint import Checkpoint, initial_networks, read_checkpoint, write_checkpoint
+from .checkpoint import write_checkpoint
 from .confidence import measure_training_range
 from .config import TrainingConfig
-from .data import PreparedPartition, Split, held_back_digest, partitions_of, prepare_together, split_recording
-from .deformation import Deformation, is_sheared
-from .delta_fit import find_deltas
+from .data import PreparedPartition, partition_data, prepare_partitions
+from .error_analysis import analyze_errors
 from .export import build_model, measure, measure_surface, write_model
 from .goal import GoalResult, evaluate_goal
-from .inputs import Inputs, inputs_with_deltas
-from .loop import Trained, choose_device, train
+from .gravity import drop_gravity_input
+from .half_rotations import half_rotations_help
+from .inputs import NetworkInputs, inputs_with_surface_frames
+from .loop import TrainingResult, choose_device, train
 from .outputs import check_training_outputs, training_outputs
-from .page import render_html
+from .partition_refinement import partition_indices, refine_partitions
 from .process import Cancelled
-from .sagging import without_needless_down
-from .turns import turns_help
-from .worst import find_worst
-
-WARM_EPOCHS, WARM_RATE = 0.5, 0.3
-"""A warm start takes this part of the epochs and of the learning rate: most is learned already."""
+from .progress import MessageSink
+from .report import make_report
+from .report_page import render_html
+from .splitting import Split, holdout_fingerprint, split_recording
+from .surface_frame_fit import select_surface_frames
+from .trained_model import TrainedModel, is_sheared
+from .warm_start import initial_networks, read_initial_checkpoint, warm_start_config
 
 
 def train_model(
     recording_path: Path,
     model_path: Path,
     config: TrainingConfig,
-    announcer: Announcer,
+    sink: MessageSink,
     should_stop: Callable[[], bool] = lambda: False,
     warm_start: bool = False,
     strict: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Train a model, and write it with its report and its checkpoint beside it.
+    """Train a model, and write it with its checkpoint and its report beside it.
 
     Args:
         recording_path: folder of a complete recording.
-        model_path: the .onnx file; it and the report are written when everything else is done.
+        model_path: the .onnx file. All files are written at the end.
         config: the settings.
-        announcer: told everything from `STARTED` to `FINISHED`; not told of errors.
-        should_stop: asked often; nothing has been written when it is heeded.
+        sink: receives the messages from `STARTED` to `FINISHED`, but no errors.
+        should_stop: called often; nothing has been written when it stops the training.
         warm_start: start from the checkpoint of the model, on a recording that may have grown since.
-        strict: warnings about the recording are errors.
-        overwrite: write over files of another kind.
+        strict: treat warnings about the recording as errors.
+        overwrite: overwrite files of another kind.
 
     Raises:
-        Cancelled: `should_stop` said so.
-        FDDAError: the recording, the settings or the output path are no good.
+        Cancelled: `should_stop` returned True.
+        FDDAError: the recording, the settings or the output path cannot be used.
     """
     started = time.perf_counter()
     check_training_outputs(model_path, overwrite)
     recording = read_recording(recording_path)
     split = split_recording(recording, config)
-    held_back = held_back_digest(recording, split)
-    checkpoint = _initial_checkpoint(model_path, recording, held_back, config) if warm_start else None
+    holdout = holdout_fingerprint(recording, split)
+    checkpoint = read_initial_checkpoint(model_path, recording, holdout, config) if warm_start else None
     device = choose_device()
-    announcer.say(
+    sink.send(
         MessageType.STARTED,
         partitions=len(recording.partitions),
         poses=len(recording.pose_matrices),
         vertices=recording.rig.vertex_count,
         device=str(device),
     )
-    announcer.say(MessageType.LOG, text=training_size_sentence(recording))
-    warnings = _check(recording, announcer, strict)
+    sink.send(MessageType.LOG, text=training_size_sentence(recording))
+    warnings = _check(recording, sink, strict)
     _check_stop(should_stop)
-    recording = without_needless_down(recording, split)
-    # What is gone on with goes on to see the same.
-    deltas = checkpoint.deltas if checkpoint else find_deltas(recording, split, config.tolerance_mm, should_stop)
-    if len(deltas):
-        announcer.say(MessageType.LOG, text=f"The rig smooths: networks see the deltas of {len(deltas)} vertices.")
-    # Deltas say what turns would, and more.
-    turns = not len(deltas) and turns_help(recording, split.training, should_stop)
-    if turns:
-        announcer.say(MessageType.LOG, text="The rig blends rotations: residuals are fitted to turns of joints, too.")
+    recording = drop_gravity_input(recording, split)
+    # A warm start keeps the inputs of the checkpoint.
+    surface_frames = (
+        checkpoint.surface_frames
+        if checkpoint
+        else select_surface_frames(recording, split, config.tolerance_mm, should_stop)
+    )
+    if len(surface_frames):
+        sink.send(
+            MessageType.LOG,
+            text=f"The rig smooths: networks take surface frames of {len(surface_frames)} vertices as inputs.",
+        )
+    # Surface frames make half-rotation features unnecessary.
+    use_half_rotations = not len(surface_frames) and half_rotations_help(recording, split.training, should_stop)
+    if use_half_rotations:
+        sink.send(
+            MessageType.LOG, text="The rig blends rotations: residuals are fitted to half-rotation features, too."
+        )
     if checkpoint:
-        partitions = checkpoint.cut(recording.partitions)
+        partitions = checkpoint.reassign(recording.partitions)
     else:
-        partitions = better_borders(recording, split, turns, config.tolerance_mm, config.hidden[-1], should_stop)
-    if moved := int((partition_of(partitions) != partition_of(recording.partitions)).sum()):
-        announcer.say(MessageType.LOG, text=f"Borders moved: {moved} vertices count to the partition beside their own.")
-    inputs = inputs_with_deltas(recording.rig, partitions, deltas)
-    prepared = _prepare(recording, partitions, inputs, turns, split, config, announcer, should_stop)
-    seen = [columns[partition.columns] for columns, partition in zip(inputs.columns, prepared, strict=True)]
-    trained = train(
+        partitions = refine_partitions(
+            recording, split, use_half_rotations, config.tolerance_mm, config.hidden[-1], should_stop
+        )
+    if reassigned := int((partition_indices(partitions) != partition_indices(recording.partitions)).sum()):
+        sink.send(
+            MessageType.LOG, text=f"Partitions refined: {reassigned} vertices are reassigned to a neighbor partition."
+        )
+    inputs = inputs_with_surface_frames(recording.rig, partitions, surface_frames)
+    prepared = _prepare(recording, partitions, inputs, use_half_rotations, split, config, sink, should_stop)
+    columns = [offered[partition.columns] for offered, partition in zip(inputs.columns, prepared, strict=True)]
+    result = train(
         prepared,
         split,
-        _shorter(config) if checkpoint else config,
+        warm_start_config(config) if checkpoint else config,
         device,
-        lambda p: announcer.say(
+        lambda p: sink.send(
             MessageType.PROGRESS,
             epoch=p.epoch,
             epochs=p.epochs,
@@ -119,11 +129,11 @@ def train_model(
             validation_mm=round(p.validation_mm, 6),
         ),
         should_stop,
-        initial_networks(checkpoint, prepared, seen) if checkpoint else None,
+        initial_networks(checkpoint, prepared, columns) if checkpoint else None,
     )
-    deformation = _deformation(recording, partitions, inputs, split, prepared, trained, config)
+    trained_model = _trained_model(recording, partitions, inputs, split, prepared, result, config)
     _check_stop(should_stop)
-    settings = {
+    training_info = {
         **config.to_json(),
         "torch": str(torch.__version__),
         "onnxruntime": onnxruntime.__version__,
@@ -132,69 +142,69 @@ def train_model(
         "validation_poses": len(split.validation),
         "held_out_poses": len(split.held_out),
         "warm_start": warm_start,
-        "sheared": deformation.sheared,
+        "sheared": trained_model.sheared,
     }
-    announcer.say(MessageType.LOG, text=f"Exporting the model, and measuring it on {len(split.held_out)} poses.")
-    exported = build_model(recording, deformation, split.held_out, settings)
+    sink.send(MessageType.LOG, text=f"Exporting the model, and measuring it on {len(split.held_out)} poses.")
+    exported = build_model(recording, trained_model, split.held_out, training_info)
     _check_stop(should_stop)
     sample = split.training[:: max(1, len(split.training) // len(split.held_out))]
-    on_training = measure(exported.session, recording, deformation, sample)
-    surface = measure_surface(exported.session, recording, deformation, split.held_out)
-    worst = find_worst(recording, deformation, split, exported.held_out.fdda, on_training.fdda)
-    content = report.make_report(
-        recording, deformation, exported, on_training, surface, trained.curves, model_path.name, worst
+    on_training = measure(exported.session, recording, trained_model, sample)
+    surface = measure_surface(exported.session, recording, trained_model, split.held_out)
+    analyses = analyze_errors(recording, trained_model, split, exported.held_out.fdda, on_training.fdda)
+    report = make_report(
+        recording, trained_model, exported, on_training, surface, result.curves, model_path.name, analyses
     )
-    # Not in the model: the same recording and settings give the same bytes.
-    content["training"] = {**content["training"], "seconds": round(time.perf_counter() - started, 2)}
+    # Times are not in the model, so that equal recordings and settings give equal files.
+    report["training"] = {**report["training"], "seconds": round(time.perf_counter() - started, 2)}
     if recording.info.repeatability:
-        content["repeatability"] = recording.info.repeatability.to_json()
-    content["warnings"] = [warning.to_json() for warning in warnings]
+        report["repeatability"] = recording.info.repeatability.to_json()
+    report["warnings"] = [warning.to_json() for warning in warnings]
     poses, p999 = len(recording.pose_matrices), exported.info.held_out_mm["p999"]
     history = [*(checkpoint.history if checkpoint else ()), {"poses": poses, "p999": p999}]
     goal_result = None
     if config.goal_mm:
-        training_p999 = content["fdda"]["training"]["p999"]
+        training_p999 = report["fdda"]["training"]["p999"]
         goal_result = evaluate_goal(config.goal_mm, history, training_p999, recording_path, model_path)
-        content["goal"] = goal_result.to_json()
-    page = render_html(content)
+        report["goal"] = goal_result.to_json()
+    page = render_html(report)
     _check_stop(should_stop)
-    # From here on nothing stops: the model and what lies beside it belong together.
+    # From here on the training cannot be stopped: model, checkpoint and report belong together.
     with atomic_write_all(*training_outputs(model_path)) as (model, checkpoint_file, report_file, page_file):
         write_model(model, exported.content)
-        write_checkpoint(checkpoint_file, deformation, held_back, config.hidden, history)
-        report_file.write_text(report_text(content), encoding="utf-8")
+        write_checkpoint(checkpoint_file, trained_model, holdout, config.hidden, history)
+        report_file.write_text(report_text(report), encoding="utf-8")
         page_file.write_text(page, encoding="utf-8", errors="backslashreplace")
-    _announce_end(announcer, model_path, content, goal_result, time.perf_counter() - started)
+    _send_end(sink, model_path, report, goal_result, time.perf_counter() - started)
 
 
-def _check(recording: Recording, announcer: Announcer, strict: bool) -> list[RecordingWarning]:
-    """Look at the recording, and announce what is suspicious about it.
+def _check(recording: Recording, sink: MessageSink, strict: bool) -> list[RecordingWarning]:
+    """Check the recording, and send its warnings.
 
     Raises:
-        RecordingError: something is, and `strict` says that it is an error.
+        RecordingError: there are warnings, and `strict` is set.
     """
     warnings = check_recording(recording)
     for warning in warnings:
-        announcer.say(MessageType.WARNING, **warning.to_json())
+        sink.send(MessageType.WARNING, **warning.to_json())
     if strict:
         refuse(warnings)
     return warnings
 
 
-def _announce_end(
-    announcer: Announcer, model_path: Path, content: dict, goal_result: GoalResult | None, seconds: float
+def _send_end(
+    sink: MessageSink, model_path: Path, report: dict, goal_result: GoalResult | None, seconds: float
 ) -> None:
-    for partition in content["partitions"]:
-        announcer.say(
+    for partition in report["partitions"]:
+        sink.send(
             MessageType.PARTITION_FINISHED,
             joint=partition["joint"] or STATIC_JOINT_LABEL,
             basis=partition["basis"],
             held_out_mm=partition["held_out"]["mean"],
         )
     if goal_result:
-        announcer.say(MessageType.LOG, text=goal_result.text)
-    held_out = content["fdda"]["held_out"]
-    announcer.say(
+        sink.send(MessageType.LOG, text=goal_result.text)
+    held_out = report["fdda"]["held_out"]
+    sink.send(
         MessageType.FINISHED,
         model=str(model_path),
         seconds=round(seconds, 2),
@@ -204,57 +214,22 @@ def _announce_end(
     )
 
 
-def _initial_checkpoint(model_path: Path, recording: Recording, held_back: str, config: TrainingConfig) -> Checkpoint:
-    """Read the checkpoint to start from.
-
-    Raises:
-        TrainingError: there is none, or it is of another rig, other controls, other networks or another split.
-    """
-    path = checkpoint_path(model_path)
-    checkpoint = read_checkpoint(path)
-    if checkpoint.fingerprint != recording.rig.fingerprint:
-        raise TrainingError(f"The checkpoint '{path}' is of another rig; train without --warm-start.")
-    if checkpoint.controls != tuple(control.name for control in recording.rig.controls):
-        raise TrainingError(f"The checkpoint '{path}' is of other controls; train without --warm-start.")
-    if not checkpoint.deltas.may_be_of(recording.rig):
-        raise TrainingError(f"The checkpoint '{path}' is damaged; train without --warm-start.")
-    if checkpoint.held_back != held_back:
-        raise TrainingError(
-            f"The checkpoint '{path}' is of another recording or seed, and may have been trained on poses that are "
-            "held out now; train with the same, or without --warm-start."
-        )
-    if (checkpoint.hidden, checkpoint.activation) != (config.hidden, config.activation):
-        raise TrainingError(
-            f"The checkpoint '{path}' is of networks --hidden {' '.join(map(str, checkpoint.hidden))} --activation "
-            f"{checkpoint.activation}; train with the same, or without --warm-start."
-        )
-    return checkpoint
-
-
-def _shorter(config: TrainingConfig) -> TrainingConfig:
-    return replace(
-        config,
-        epochs=max(1, round(config.epochs * WARM_EPOCHS)),
-        learning_rate=config.learning_rate * WARM_RATE,
-    )
-
-
 def _prepare(
     recording: Recording,
     partitions: tuple[Partition, ...],
-    inputs: Inputs,
-    turns: bool,
+    inputs: NetworkInputs,
+    use_half_rotations: bool,
     split: Split,
     config: TrainingConfig,
-    announcer: Announcer,
+    sink: MessageSink,
     should_stop: Callable[[], bool],
 ) -> list[PreparedPartition]:
     def announce(done: int) -> None:
-        announcer.say(MessageType.PREPARING, done=done, total=len(recording.partitions))
+        sink.send(MessageType.PREPARING, done=done, total=len(recording.partitions))
         _check_stop(should_stop)
 
-    return prepare_together(
-        partitions_of(recording, partitions, inputs, turns),
+    return prepare_partitions(
+        partition_data(recording, partitions, inputs, use_half_rotations),
         split,
         config.tolerance_mm,
         config.seed,
@@ -264,24 +239,24 @@ def _prepare(
     )
 
 
-def _deformation(
+def _trained_model(
     recording: Recording,
     partitions: tuple[Partition, ...],
-    inputs: Inputs,
+    inputs: NetworkInputs,
     split: Split,
     prepared: list[PreparedPartition],
-    trained: Trained,
+    result: TrainingResult,
     config: TrainingConfig,
-) -> Deformation:
+) -> TrainedModel:
     rig = recording.rig
     matrices, controls = (np.array(array[split.training]) for array in (recording.pose_matrices, recording.controls))
     features = inputs.features(matrices, rig.rest_matrices, controls)
-    return Deformation(
+    return TrainedModel(
         rig,
         partitions,
         inputs,
         tuple(prepared),
-        trained.networks,
+        result.networks,
         measure_training_range(features, rig, partitions),
         config.activation,
         is_sheared(recording.pose_matrices),

@@ -29,7 +29,7 @@ class Silent:
     def __init__(self) -> None:
         self.has_trained = False
 
-    def say(self, kind, **_) -> None:
+    def send(self, kind, **_) -> None:
         self.has_trained |= kind.name in ("PROGRESS", "PREPARING")
 
 
@@ -54,11 +54,11 @@ def run(folder: Path, seed: int, first: int, end: int) -> None:
 
 
 def _train(recording: Path, model: Path) -> None:
-    announcer = Silent()
+    sink = Silent()
     try:
-        train_model(recording, model, CONFIG, announcer)
+        train_model(recording, model, CONFIG, sink)
     except BaseException:
-        if announcer.has_trained:
+        if sink.has_trained:
             raise ShortfallError("it is refused after the training has begun") from None
         if left := [path.name for path in model.parent.iterdir()]:
             raise ShortfallError(f"it is refused and leaves {left}") from None

@@ -22,7 +22,7 @@ REPEATABILITY_POSES = 10
 """Number of poses that a simulated target reaches a second time, from another direction."""
 
 TOLERANCE_MM = 0.04
-"""What the basis shapes may leave, over the whole mesh."""
+"""What the components may leave, over the whole mesh."""
 EPOCHS = 200
 
 EVALUATION_POSES, SIDEBAR_EVALUATION_POSES = 200, 100

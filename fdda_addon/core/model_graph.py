@@ -46,7 +46,7 @@ def compute_budget(joints: int, controls: int, partitions: Sequence[tuple[int, i
 
     Args:
         joints, controls: how many.
-        partitions: of each the vertices, the basis shapes, and the joints and controls that influence it.
+        partitions: of each the vertices, the components, and the joints and controls that influence it.
         training: settings of the training, as the metadata has them.
 
     Raises:

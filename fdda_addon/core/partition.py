@@ -52,7 +52,7 @@ def make_partitions(
     influencing: dict[int, tuple[int, ...]] | None = None,
     controls: dict[int, tuple[int, ...]] | None = None,
     merged: dict[int, int] | None = None,
-    taken: dict[int, Sequence[int]] | None = None,
+    reassigned: dict[int, Sequence[int]] | None = None,
 ) -> tuple[Partition, ...]:
     """Partition the mesh by main joint, in ascending order of the joints.
 
@@ -61,7 +61,7 @@ def make_partitions(
         influencing: influencing joints by main joint; none for all partitions when left out.
         controls: influencing controls by main joint; none for all partitions when left out.
         merged: by main joint of a merged partition, the main joint of the partition that takes its vertices.
-        taken: by main joint the vertices of other partitions that count to its own.
+        reassigned: by main joint, vertices with another main joint that belong to its partition.
     """
     main = main_joints(rig.skin_joints, rig.skin_weights)
     influencing, controls, merged = influencing or {}, controls or {}, merged or {}
@@ -69,7 +69,7 @@ def make_partitions(
     for joint, other in sorted(merged.items()):
         main[main == joint] = other
         merged_joints.setdefault(other, []).append(joint)
-    for joint, vertices in (taken or {}).items():
+    for joint, vertices in (reassigned or {}).items():
         main[list(vertices)] = joint
     return tuple(
         Partition(

@@ -52,18 +52,18 @@ _PARTITION = {
     "held_out": _ERRORS,
     "linear": _ERRORS,
     "histogram": [int],
-    "worst?": {
+    "largest_errors": {
         "poses": int,
         "vertices": int,
-        "shapes": float,
-        "border": _OrNull(float),
+        "truncation": float,
+        "boundary": _OrNull(float),
         "joint": str,
         "extreme": float,
         "distance": float,
-        "training": float,
+        "generalization": float,
         "cause": str,
     },
-    "curve": {"training": [float], "validation": [float], "worst?": [float], "best_epoch": int},
+    "curve": {"training": [float], "validation": [float], "worst": [float], "best_epoch": int},
 }
 _REPORT = {
     "unit": str,

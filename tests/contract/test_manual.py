@@ -21,7 +21,7 @@ INTERFACE = [
     *(ADDON / "panels").glob("*.py"),
     *(ADDON / "operators").glob("*.py"),
     *sorted((ADDON / "properties").glob("*.py")),
-    ROOT / "trainer" / "page.py",
+    ROOT / "trainer" / "report_page.py",
 ]
 SENTENCES = list(ADDON.rglob("*.py"))
 TOLD_ELSEWHERE = {"bold"}

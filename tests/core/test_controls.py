@@ -76,7 +76,7 @@ def test_a_model_says_its_controls():
         controls=(SMILE, FIST),
         partitions=(
             ModelPartition(0, (), 1, 0),
-            ModelPartition(2, (1,), 3, 17, controls=(0, 1), merged=(1,), taken=(0, 2)),
+            ModelPartition(2, (1,), 3, 17, controls=(0, 1), merged=(1,), reassigned=(0, 2)),
         ),
     )
     again = ModelInfo.from_json(info.to_json())

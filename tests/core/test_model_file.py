@@ -159,10 +159,19 @@ PARTITION = {"joint": 0, "influencing": [], "vertices": 4, "basis": 1}
         ({"partitions": [{**PARTITION, "joint": 3}]}, "none of its joints"),
         ({"partitions": [{**PARTITION, "influencing": [9]}]}, "none of its joints"),
         ({"vertices": 5}, "the partitions do not add up to the vertices"),
-        ({"partitions": [{**PARTITION, "taken": [4]}]}, "a vertex that is none of its vertices, or another's"),
-        ({"partitions": [{**PARTITION, "taken": [-1]}]}, "a vertex that is none of its vertices, or another's"),
-        ({"partitions": [{**PARTITION, "taken": [1, 1]}]}, "a vertex that is none of its vertices, or another's"),
-        ({"partitions": [{**PARTITION, "taken": 1}]}, "its metadata cannot be read"),
+        (
+            {"partitions": [{**PARTITION, "reassigned": [4]}]},
+            "a reassigned vertex that is none of its vertices, or another's",
+        ),
+        (
+            {"partitions": [{**PARTITION, "reassigned": [-1]}]},
+            "a reassigned vertex that is none of its vertices, or another's",
+        ),
+        (
+            {"partitions": [{**PARTITION, "reassigned": [1, 1]}]},
+            "a reassigned vertex that is none of its vertices, or another's",
+        ),
+        ({"partitions": [{**PARTITION, "reassigned": 1}]}, "its metadata cannot be read"),
         ({"rest_matrices": [[float("nan")] * 16] * 3}, "its rest pose holds values that are not numbers"),
         ({"rest_matrices": [[0.0] * 16] * 2}, "cannot reshape"),
     ],

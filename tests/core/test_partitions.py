@@ -34,9 +34,9 @@ def test_influencing_joints_may_be_left_out():
 def test_a_partition_may_have_taken_vertices():
     rig = make_rig()
     first, second, *others = partitions_of(rig)
-    taken = second.vertices[:2].tolist()
-    cut = make_partitions(rig, INFLUENCING, taken={first.joint: taken})
-    assert cut[0].vertices.tolist() == sorted([*first.vertices.tolist(), *taken])
+    reassigned = second.vertices[:2].tolist()
+    cut = make_partitions(rig, INFLUENCING, reassigned={first.joint: reassigned})
+    assert cut[0].vertices.tolist() == sorted([*first.vertices.tolist(), *reassigned])
     assert cut[1].vertices.tolist() == second.vertices[2:].tolist()
     assert [p.vertices.tolist() for p in cut[2:]] == [p.vertices.tolist() for p in others]
 

@@ -39,7 +39,11 @@ REPORT = {
             "held_out": ERRORS,
             "linear": ERRORS,
             "histogram": [3],
-            "curve": {"training": [1.0, 0.5], "validation": [1.0, 0.6], "best_epoch": 2},
+            "largest_errors": {
+                **{"poses": 1, "vertices": 1, "truncation": 0.5, "boundary": None, "joint": "", "extreme": 1.0},
+                **{"distance": 1.0, "generalization": 1.0, "cause": "none"},
+            },
+            "curve": {"training": [1.0, 0.5], "validation": [1.0, 0.6], "worst": [2.0, 1.0], "best_epoch": 2},
         }
     ],
     "warnings": [{"name": "flips", "text": "It jumps."}],

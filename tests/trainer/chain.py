@@ -24,7 +24,7 @@ def rotation(axis: int, angle: float) -> np.ndarray:
 
 
 def chain_rig(joints: int = 3, vertices: int = 90, seed: int = 0) -> Rig:
-    """A tube of one metre along z, smoothly skinned to a chain of joints in an order unlike that of the vertices."""
+    """A tube of one meter along z, smoothly skinned to a chain of joints in an order unlike that of the vertices."""
     rng = np.random.default_rng(seed)
     rest = np.stack([np.eye(4)] * joints)
     rest[:, 2, 3] = np.arange(joints) / joints
@@ -72,7 +72,7 @@ def pose_chain(rig: Rig, angles: np.ndarray) -> np.ndarray:
 
 
 def chain_residuals(rig: Rig, angles: np.ndarray) -> np.ndarray:
-    """(N, V, 3) float32 local residuals: bulges of some millimetres that grow with the bends beside a vertex."""
+    """(N, V, 3) float32 local residuals: bulges of some millimeters that grow with the bends beside a vertex."""
     position = rig.rest_positions[:, 2] * len(rig.joints)
     residuals = np.zeros((len(angles), rig.vertex_count, 3), np.float32)
     for joint in range(1, len(rig.joints)):
@@ -97,7 +97,7 @@ def write_chain(path: Path, poses: int = 120, complete: int | None = None, joint
 
 
 def chain_info(poses: int, seed: int = 0) -> RecordingInfo:
-    """What a recording of random poses says of itself."""
+    """Make the index of a recording of random poses."""
     limits = (Channel("bone_1", "rotation", 0, -LIMIT, LIMIT),)
     sampling = Sampling(seed, 1.0, limits, (Source("random", poses),))
     return RecordingInfo(poses, 0, "chain.blend", "chain", "5.2.0", sampling)

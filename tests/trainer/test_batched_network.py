@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The batched network and its loop: padding changes nothing, training learns, and a seed decides everything."""
+"""The batched network and its loop: padding has no effect, training converges, and the seed determines the result."""
 
 from dataclasses import replace
 
@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from trainer.config import TrainingConfig
-from trainer.data import PartitionData, prepare, split_poses
+from trainer.data import PartitionData, prepare_partition
 from trainer.loop import _Loop, train
-from trainer.model import ACTIVATIONS, PartitionNetworks
+from trainer.networks import ACTIVATION_FUNCTIONS, PartitionNetworks
 from trainer.process import Cancelled
+from trainer.splitting import split_poses
 
 from .chain import chain_angles
 
@@ -19,7 +20,7 @@ CONFIG = TrainingConfig(epochs=30, hidden=(16, 16), batch_size=16, tolerance_mm=
 
 
 def partition(inputs: int, vertices: int, seed: int, poses: int = 150) -> PartitionData:
-    """Residuals of some millimetres that depend smoothly on the features."""
+    """Residuals of some millimeters that depend smoothly on the features."""
     features = np.sin(chain_angles(poses, inputs + 1, seed)[:, 1:, 0]).astype(np.float32)
     rng = np.random.default_rng(seed)
     values = np.tanh(features @ rng.normal(size=(inputs, 4))) @ rng.normal(size=(4, 3 * vertices)) * 0.002
@@ -29,11 +30,11 @@ def partition(inputs: int, vertices: int, seed: int, poses: int = 150) -> Partit
 
 def learn(partitions, config=CONFIG, **options):
     split = split_poses(np.arange(len(partitions[0].features)), config.validation_fraction, config.seed)
-    prepared = [prepare(p, split, config.tolerance_mm, config.seed) for p in partitions]
+    prepared = [prepare_partition(p, split, config.tolerance_mm, config.seed) for p in partitions]
     return prepared, train(prepared, split, config, torch.device("cpu"), **options)
 
 
-@pytest.mark.parametrize("activation", sorted(ACTIVATIONS))
+@pytest.mark.parametrize("activation", sorted(ACTIVATION_FUNCTIONS))
 def test_padding_changes_no_output(activation):
     generator = torch.Generator().manual_seed(0)
     model = PartitionNetworks([3, 7], [5, 2], (8, 6), activation, 0.0, generator)
@@ -45,7 +46,7 @@ def test_padding_changes_no_output(activation):
         weight = model.weights[layer][0][:3] if layer == 0 else model.weights[layer][0]
         values = values @ weight + model.biases[layer][0]
         if layer < 2:
-            values = ACTIVATIONS[activation](values)
+            values = ACTIVATION_FUNCTIONS[activation](values)
     torch.testing.assert_close(outputs[0], values)
     assert outputs[1, :, 2:].abs().max() == 0
 
@@ -64,7 +65,7 @@ def test_training_learns_every_partition():
         assert min(curve.validation_mm) < 0.15 * data.residual_rms * 1000
         assert curve.validation_mm[curve.best_epoch - 1] == min(curve.validation_mm)
         assert [w.shape[0] for w in network.weights] == [data.inputs.shape[1], 16, 16]
-        assert network.weights[-1].shape[1] == len(data.basis.shapes)
+        assert network.weights[-1].shape[1] == len(data.basis.components)
 
 
 def test_returned_weights_are_those_of_the_best_epoch():
@@ -91,7 +92,7 @@ def test_a_partition_without_inputs_keeps_its_mean():
     still = PartitionData("still", np.zeros((150, 0), np.float32), partition(2, 6, 4).read_residuals, 6)
     constant = PartitionData("constant", np.ones((150, 12), np.float32), partition(2, 6, 4).read_residuals, 6)
     prepared, trained = learn([still, partition(2, 6, 5), constant])
-    assert [len(p.basis.shapes) > 0 for p in prepared] == [False, True, False]
+    assert [len(p.basis.components) > 0 for p in prepared] == [False, True, False]
     assert trained.curves[0].validation_mm == []
     assert trained.networks[2].biases[-1].shape == (0,)
 
@@ -105,51 +106,51 @@ def test_penalties_shrink_the_weights():
     assert size(l2=1e-2) < 0.9 * size()
 
 
-def test_inputs_that_say_nothing_are_found_out(monkeypatch):
-    said = partition(4, 12, 8, poses=200)
-    needless = np.random.default_rng(9).normal(size=(200, 80)).astype(np.float32)
-    crowded = replace(said, features=np.concatenate([said.features, needless], axis=1))
+def test_irrelevant_inputs_are_suppressed(monkeypatch):
+    relevant = partition(4, 12, 8, poses=200)
+    noise_features = np.random.default_rng(9).normal(size=(200, 80)).astype(np.float32)
+    with_noise = replace(relevant, features=np.concatenate([relevant.features, noise_features], axis=1))
     config = replace(CONFIG, validation_fraction=0.3, weight_decay=0.2)
 
     def error() -> float:
-        return min(learn([crowded], config)[1].curves[0].validation_mm)
+        return min(learn([with_noise], config)[1].curves[0].validation_mm)
 
-    weighed = error()
-    monkeypatch.setattr("trainer.loop.WEIGHED_AFTER", ())
-    assert weighed < 0.7 * error()
+    rescaled = error()
+    monkeypatch.setattr("trainer.loop.RELEVANCE_EPOCH_FRACTIONS", ())
+    assert rescaled < 0.7 * error()
 
 
-def test_weighing_inputs_changes_no_best_answer(monkeypatch):
+def test_rescaling_inputs_keeps_the_best_outputs(monkeypatch):
     partitions = [partition(3, 10, 2), partition(5, 7, 1)]
     config = replace(CONFIG, epochs=3, averaging=0)
     before = learn(partitions, config)[1]
     loop_run = _Loop.run
 
-    def run_and_weigh(loop: _Loop, *arguments) -> None:
+    def run_and_rescale(loop: _Loop, *arguments) -> None:
         loop_run(loop, *arguments)
-        loop.weigh_inputs()
+        loop.rescale_inputs_by_relevance()
 
-    monkeypatch.setattr(_Loop, "run", run_and_weigh)
+    monkeypatch.setattr(_Loop, "run", run_and_rescale)
     prepared, after = learn(partitions, config)
     for data, one, other in zip(prepared, before.networks, after.networks, strict=True):
-        expected, given = (network.coefficients(data.inputs, "silu") for network in (one, other))
-        np.testing.assert_allclose(given, expected, atol=1e-5 * np.abs(expected).max())
+        expected, actual = (network.coefficients(data.inputs, "silu") for network in (one, other))
+        np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 
-def test_a_training_from_networks_starts_with_their_answers():
+def test_a_warm_start_keeps_the_outputs():
     partitions = [partition(3, 10, 2), partition(5, 7, 1)]
     prepared, first = learn(partitions)
     still = replace(CONFIG, epochs=10, learning_rate=1e-12, averaging=0)
     again = learn(partitions, still, initial=first.networks)[1]
-    for curve, begun in zip(again.curves, first.curves, strict=True):
-        np.testing.assert_allclose(curve.validation_mm, min(begun.validation_mm), rtol=1e-3)
+    for curve, first_curve in zip(again.curves, first.curves, strict=True):
+        np.testing.assert_allclose(curve.validation_mm, min(first_curve.validation_mm), rtol=1e-3)
     for data, one, other in zip(prepared, first.networks, again.networks, strict=True):
-        expected, given = (network.coefficients(data.inputs, "silu") for network in (one, other))
-        np.testing.assert_allclose(given, expected, atol=1e-5 * np.abs(expected).max())
+        expected, actual = (network.coefficients(data.inputs, "silu") for network in (one, other))
+        np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 
 def test_patience_stops_early():
-    seen = []
+    epochs = []
     config = TrainingConfig(epochs=60, hidden=(8,), batch_size=16, learning_rate=1e-9, averaging=0, patience=3)
     noise = PartitionData(
         "noise",
@@ -157,17 +158,17 @@ def test_patience_stops_early():
         lambda: np.random.default_rng(1).normal(size=(60, 4, 3)).astype(np.float32),
         4,
     )
-    learn([noise], config, progress=seen.append)
-    assert len(seen) < 60
+    learn([noise], config, on_epoch=epochs.append)
+    assert len(epochs) < 60
 
 
-def test_a_request_to_stop_is_heeded():
-    asked = []
+def test_a_stop_request_cancels_the_training():
+    calls = []
 
     def stop() -> bool:
-        asked.append(True)
-        return len(asked) > 5
+        calls.append(True)
+        return len(calls) > 5
 
     with pytest.raises(Cancelled):
         learn([partition(2, 5, 7)], should_stop=stop)
-    assert len(asked) == 6
+    assert len(calls) == 6

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Controls: residuals that no joint tells of are learned from them, and the model asks for their values."""
+"""Controls: the model takes their values as inputs, and learns residuals that depend on them."""
 
 import json
 import shutil
@@ -23,8 +23,8 @@ from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
 from trainer.confidence import measure_training_range
 from trainer.config import TrainingConfig
-from trainer.data import split_recording
-from trainer.inputs import inputs_of_rig, middles
+from trainer.inputs import inputs_of_rig, partition_centers
+from trainer.splitting import split_recording
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import QUICK, run_page
@@ -49,7 +49,7 @@ def controlled_poses(poses: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def controlled_residuals(rig: Rig, angles: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(N, V, 3): as the chain's above the first joint, and centimetres of the controls."""
+    """(N, V, 3): as the chain's above the first joint, and centimeters that depend on the controls."""
     position = rig.rest_positions[:, 2] * 3
     residuals = chain_residuals(rig, angles)
     first = make_partitions(rig)[0].vertices
@@ -97,7 +97,7 @@ def test_the_error_is_small_with_the_controls_and_large_without(network, model):
     assert 0.5 < report["fdda"]["held_out"]["mean"] / (error.mean() * 1000) < 2
 
 
-def test_the_graph_asks_for_controls_only_where_there_are_any(model, trained):
+def test_the_graph_has_the_controls_input_only_with_controls(model, trained):
     def inputs(path: Path) -> dict[str, list]:
         return {
             i.name: [d.dim_value or d.dim_param for d in i.type.tensor_type.shape.dim]
@@ -129,18 +129,18 @@ def test_the_report_names_controls(model):
 
 
 def confidence_of(network: Network, control: int, values: np.ndarray) -> np.ndarray:
-    """(N, 3) confidence in the rest pose as one control moves; the others stay at their middles."""
+    """(N, 3) confidence in the rest pose as one control moves; the others stay at their centers."""
     controls = np.tile(np.float32([0.5, 0, 0.5]), (len(values), 1))
     controls[:, control] = values
     return network.confidence(np.tile(network.info.rest_matrices, (len(values), 1, 1, 1)), controls)
 
 
-def test_trust_fades_beyond_the_range_of_a_control(network):
+def test_confidence_fades_beyond_the_range_of_a_control(network):
     confidence = confidence_of(network, 0, np.linspace(0, 8, 80))
     assert (confidence[:10, 1:] == 1).all() and (confidence[-1, 1:] == 0).all()
     assert (np.diff(confidence[:, 1:], axis=0) <= 0).all() and np.abs(np.diff(confidence, axis=0)).max() < 0.05
     assert (confidence[:, 0] == 1).all(), "the first partition does not follow this control"
-    # What is left far outside is linear skinning.
+    # Far outside the range only linear skinning remains.
     rest = network.info.rest_matrices[None]
     far = network.positions(rest, np.float32([[50, 0, 0.5]]))[0]
     rig = controlled_rig()
@@ -148,16 +148,16 @@ def test_trust_fades_beyond_the_range_of_a_control(network):
     np.testing.assert_allclose(far[others], rig.rest_positions[others], atol=1e-6)
 
 
-def test_a_control_that_never_moved_takes_trust_only_when_it_moves(network):
+def test_a_control_that_never_moved_lowers_confidence_only_when_it_moves(network):
     confidence = confidence_of(network, 2, np.float32([0.5, 0.7, 1.5, 5]))
     assert (confidence[0] == 1).all()
-    assert (np.diff(confidence, axis=0) < 0).all() and (confidence[-1] == 0).all(), "nobody knows what it moves"
+    assert (np.diff(confidence, axis=0) < 0).all() and (confidence[-1] == 0).all(), "its effect is unknown"
 
 
-def test_a_control_that_was_watched_and_stood_still_counts_where_it_influences():
+def test_a_constant_control_with_a_range_counts_where_it_influences():
     rig = controlled_rig(BULGE)
     partitions = make_partitions(rig, INFLUENCING, {1: (0,)})
-    inputs = inputs_of_rig(rig, middles(rig, partitions), partitions)
+    inputs = inputs_of_rig(rig, partition_centers(rig, partitions), partitions)
     poses, still = pose_chain(rig, chain_angles(20, 3, 0)), np.full((20, 1), 0.25)
     own = measure_training_range(inputs.features(poses, rig.rest_matrices, still), rig, partitions)
     assert own.controls == (replace(BULGE, low=0.25, high=0.25),)
@@ -192,7 +192,7 @@ def test_the_code_of_the_page_on_models_plays_it(model):
     assert run_page("Model", model.parent).startswith("['bone_0', 'bone_1', 'bone_2'] (2, 90, 3) [1. ")
 
 
-def test_a_model_without_controls_looks_at_none(trained):
+def test_a_model_without_controls_ignores_controls(trained):
     network = Network(trained / "model.onnx")
     rest = network.info.rest_matrices[None]
     alone = network.positions(rest).copy()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Names that are not ASCII, on a terminal that is nothing else; and file names that are not even UTF-8."""
+"""Names that are not ASCII on an ASCII terminal, and file names that are not UTF-8."""
 
 import os
 import subprocess
@@ -21,7 +21,7 @@ ASCII = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C", "PYTHONUTF8":
 
 @pytest.fixture
 def recording(tmp_path):
-    """A recording of a chain with names from all over the world."""
+    """A recording of a chain with names in several scripts."""
     rig = chain_rig(2)
     rig = replace(rig, joints=(Joint("Wurzel ß", -1), Joint("前腕.L", 0)))
     angles = chain_angles(60, 2, 0)
@@ -37,7 +37,7 @@ def trainer(*arguments) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=REPOSITORY, env=ASCII, capture_output=True, check=False)
 
 
-def test_a_training_on_a_terminal_that_knows_ascii_only(recording, tmp_path):
+def test_a_training_on_an_ascii_terminal(recording, tmp_path):
     model = tmp_path / "modèle.onnx"
     done = trainer("trainer", recording, model, "--epochs", "2", "--hidden", "8")
     assert done.returncode == 0, done.stderr
@@ -48,7 +48,7 @@ def test_a_training_on_a_terminal_that_knows_ascii_only(recording, tmp_path):
 
 
 @pytest.mark.skipif(systems.WINDOWS, reason="On Windows every file name is text.")
-def test_a_file_name_that_is_no_text(recording, tmp_path):
+def test_a_file_name_that_is_not_utf_8(recording, tmp_path):
     model = os.fsencode(tmp_path) + b"/m\xff.onnx"
     done = trainer("trainer", recording, model, "--epochs", "2", "--hidden", "8")
     assert done.returncode == 0, done.stderr

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a training says of the error that was asked for."""
+"""The verdict of a training on its accuracy goal."""
 
 from pathlib import Path
 
@@ -30,13 +30,13 @@ def test_verdict(errors, verdict):
     assert goal_result(*errors).verdict is verdict
 
 
-def test_a_miss_says_how_to_go_on():
+def test_a_miss_gives_advice():
     text = goal_result(0.8).text
     assert "within 0.8 mm and the goal is 0.5 mm" in text
     assert "record RIG.blend recording --refine arm.onnx" in text and "--warm-start" in text
 
 
-def test_the_end_says_what_limits():
+def test_exhaustion_names_the_limit():
     assert "500 more poses brought it there from 0.9 mm" in goal_result(0.9, 0.89, 0.88).text
     assert "Narrow the range of motion" in goal_result(0.9, 0.89, 0.88).text
     assert (

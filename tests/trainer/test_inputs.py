@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a network sees of the joints."""
+"""The inputs of the networks that depend on joints."""
 
 import numpy as np
 import pytest
@@ -7,12 +7,12 @@ import pytest
 from fdda_addon.core.features import joint_features
 from fdda_addon.core.partition import Partition, make_partitions
 from fdda_addon.core.skinning import skin_matrices
-from trainer.inputs import make_inputs, middles
+from trainer.inputs import make_inputs, partition_centers
 
 from .chain import chain_angles, chain_rig, pose_chain
 
 PARENTS = np.array([-1, 0, 1, 1, 3])
-"""0 carries 1, which carries 2 and 3; 3 carries 4."""
+"""0 is the parent of 1, 1 of 2 and 3, 3 of 4."""
 
 
 def partition(joint: int, *influencing: int) -> Partition:
@@ -24,23 +24,23 @@ def pairs(*partitions: Partition) -> list[tuple[int, int]]:
     return list(zip(inputs.pair_references.tolist(), inputs.pair_points.tolist(), strict=True))
 
 
-def test_siblings_and_grandchildren_are_seen_from_the_main_joint():
+def test_pairs_include_siblings_and_grandchildren():
     assert pairs(partition(2, 2, 3, 4)) == [(2, 3), (2, 4)]
     assert pairs(partition(0, 1, 3), partition(4, 3, 4)) == [(0, 3), (4, 1)]
 
 
-def test_a_joint_that_does_not_influence_hides_what_lies_behind_it():
+def test_pairs_need_an_influencing_path():
     assert pairs(partition(2, 2, 4)) == []
 
 
-def test_a_network_is_offered_its_joints_and_its_pairs():
+def test_columns_of_joints_and_pairs():
     inputs = make_inputs(PARENTS, np.zeros((5, 1, 3)), [partition(2, 2, 3, 4), partition(0, 1, 3), partition(1)])
     assert inputs.columns[0].tolist() == [*range(24, 60), *range(60, 66)]
     assert inputs.columns[1].tolist() == [*range(12, 24), *range(36, 48), *range(66, 69)]
     assert inputs.columns[2].tolist() == []
 
 
-def test_controls_stand_between_joints_and_pairs():
+def test_controls_are_between_joints_and_pairs():
     own = [Partition(2, (2, 3, 4), np.zeros(0, np.int32), (0, 2)), Partition(1, (), np.zeros(0, np.int32), (1,))]
     inputs = make_inputs(PARENTS, np.zeros((5, 1, 3)), own, control_count=3)
     assert inputs.columns[0].tolist() == [*range(24, 60), 60, 62, *range(63, 69)]
@@ -53,16 +53,16 @@ def test_controls_stand_between_joints_and_pairs():
         inputs.features(poses, np.tile(np.eye(4), (5, 1, 1)))
 
 
-def test_a_pair_is_the_middle_of_a_partition_seen_from_a_joint():
+def test_a_pair_is_the_center_of_a_partition_in_the_space_of_a_joint():
     rig = chain_rig(4)
     partitions = make_partitions(rig)
-    inputs = make_inputs(rig.parents, middles(rig, partitions), [partition(1, 1, 2, 3)])
+    inputs = make_inputs(rig.parents, partition_centers(rig, partitions), [partition(1, 1, 2, 3)])
     assert list(zip(inputs.pair_references, inputs.pair_points, strict=True)) == [(1, 3)]
     poses = pose_chain(rig, chain_angles(5, 4, 0))
     features = inputs.features(poses, rig.rest_matrices)
     joints = joint_features(poses, rig.rest_matrices, rig.parents)
     np.testing.assert_array_equal(features[:, :48], joints.reshape(5, -1))
-    middle = np.append(rig.rest_positions[partitions[3].vertices].mean(axis=0), 1)
-    carried = skin_matrices(poses, rig.rest_matrices)[:, 3] @ middle
+    center = np.append(rig.rest_positions[partitions[3].vertices].mean(axis=0), 1)
+    carried = skin_matrices(poses, rig.rest_matrices)[:, 3] @ center
     expected = np.linalg.solve(poses[:, 1], carried[:, :, None])[:, :3, 0]
     np.testing.assert_allclose(features[:, 48:], expected, atol=1e-5)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The fitted part of the residuals: it finds skinning where there is skinning, and nothing else moves it."""
+"""The joint regression: it recovers smooth skinning, and ignores a common motion of the joints."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ import pytest
 from fdda_addon.core.partition import Partition, make_partitions
 from fdda_addon.core.rig import Joint, Rig
 from fdda_addon.core.skinning import LinearSkinning, skin_matrices
-from trainer.joint_fit import surroundings_of_rig
+from trainer.joint_fit import joint_regression
 
 from .chain import chain_angles, chain_rig, pose_chain, rotation
 
@@ -18,7 +18,7 @@ INFLUENCING = {joint: tuple(j for j in (joint, joint + 1) if 0 < j < JOINTS) for
 
 
 def hard(rig: Rig) -> Rig:
-    """The same rig, every vertex on one joint."""
+    """The rig with each vertex on one joint."""
     heaviest = rig.skin_weights == rig.skin_weights.max(axis=1, keepdims=True)
     heaviest[:, 1] &= ~heaviest[:, 0]
     return replace(rig, skin_weights=heaviest.astype(np.float32))
@@ -31,7 +31,7 @@ def smooth() -> Rig:
 
 @pytest.fixture(scope="module")
 def poses(smooth) -> np.ndarray:
-    """(320, J, 4, 4); the chain stands far away from the origin."""
+    """(320, J, 4, 4); the chain is far away from the origin."""
     there = np.eye(4, dtype=np.float32)
     there[:3, 3] = 7, -5, 3
     return there @ pose_chain(smooth, chain_angles(320, JOINTS, seed=4))
@@ -41,22 +41,22 @@ TRAINING = np.arange(300)
 
 
 @pytest.mark.parametrize("joint", range(JOINTS))
-def test_skinning_to_the_joints_around_is_found(smooth, poses, joint):
-    """The true rig is smoothly skinned, linear skinning hard: nothing is left for a network, on unseen poses too."""
+def test_smooth_skinning_is_recovered(smooth, poses, joint):
+    """The true rig has smooth weights, linear skinning hard ones: nothing remains to learn, on unseen poses too."""
     rig = hard(smooth)
     partition = make_partitions(rig, INFLUENCING)[joint]
     skinning = LinearSkinning(rig)
     truth = LinearSkinning(smooth).positions(poses)
     residuals = skinning.local_residuals(poses, truth)[:, partition.vertices]
     skin = skin_matrices(poses, rig.rest_matrices)
-    fit, left = surroundings_of_rig(rig, partition, skin).fit(residuals, TRAINING)
+    fit, left = joint_regression(rig, partition, skin).fit(residuals, TRAINING)
     assert np.abs(residuals).max() > 5e-3 and np.abs(left).max() < 1e-4
     fitted = skinning.positions(poses)[:, partition.vertices] + fit.offsets(skin)
     np.testing.assert_allclose(fitted, truth[:, partition.vertices], atol=1e-4)
 
 
-def test_joints_that_say_nothing_are_left_out(smooth, poses):
-    """The last joint is offered and moves, and the residual of the first follows the second alone."""
+def test_irrelevant_joints_are_removed(smooth, poses):
+    """The last joint is a regressor and moves, but the residual of the first depends on the second alone."""
     rig = hard(smooth)
     partition = make_partitions(rig, {0: (1, 2, 3)})[0]
     skin = skin_matrices(poses, rig.rest_matrices)
@@ -64,9 +64,9 @@ def test_joints_that_say_nothing_are_left_out(smooth, poses):
         :, partition.vertices
     ]
     noise = np.random.default_rng(1).normal(0, 1e-3, residuals.shape).astype(np.float32)
-    surroundings = surroundings_of_rig(rig, partition, skin)
-    assert surroundings.joints.tolist() == [0, 1, 2, 3]
-    fit, left = surroundings.fit(residuals + noise, TRAINING)
+    regression = joint_regression(rig, partition, skin)
+    assert regression.joints.tolist() == [0, 1, 2, 3]
+    fit, left = regression.fit(residuals + noise, TRAINING)
     assert fit.joints.tolist() == [0, 1]
     assert np.abs(left - noise).max() < 1e-3 < np.abs(residuals).max() / 5
 
@@ -76,21 +76,21 @@ def random_residuals(rig: Rig, partition: Partition, count: int) -> np.ndarray:
     return np.random.default_rng(0).normal(0.01, 0.004, size).astype(np.float32)
 
 
-def test_what_is_left_and_the_offsets_make_up_the_residuals(smooth, poses):
+def test_offsets_and_remainder_sum_to_the_residuals(smooth, poses):
     partition = make_partitions(smooth, INFLUENCING)[1]
     skin = skin_matrices(poses, smooth.rest_matrices)
     residuals = random_residuals(smooth, partition, len(poses))
-    fit, left = surroundings_of_rig(smooth, partition, skin).fit(residuals, TRAINING)
+    fit, left = joint_regression(smooth, partition, skin).fit(residuals, TRAINING)
     inverse = np.linalg.inv(skin[:, partition.joint, :3, :3].astype(np.float64))
     offsets = np.einsum("nab,nvb->nva", inverse, fit.offsets(skin))
     np.testing.assert_allclose(offsets + left, residuals, atol=1e-5)
     assert (left[TRAINING] ** 2).mean() < 0.3 * (residuals[TRAINING] ** 2).mean(), "not even the mean was fitted"
 
 
-def test_moving_the_whole_character_turns_the_offsets_along(smooth, poses):
+def test_offsets_rotate_with_the_character(smooth, poses):
     partition = make_partitions(smooth, INFLUENCING)[1]
     skin = skin_matrices(poses, smooth.rest_matrices)
-    fit, _ = surroundings_of_rig(smooth, partition, skin).fit(random_residuals(smooth, partition, len(poses)), TRAINING)
+    fit, _ = joint_regression(smooth, partition, skin).fit(random_residuals(smooth, partition, len(poses)), TRAINING)
     moved = rotation(1, 0.8)
     moved[:3, 3] = 3, 20, -1
     expected = fit.offsets(skin) @ moved[:3, :3].T
@@ -103,7 +103,7 @@ def test_joints_that_only_influencing_joints_move():
     skin = np.tile(np.eye(4, dtype=np.float32), (2, 5, 1, 1))
 
     def around(joint: int, *influencing: int) -> list[int]:
-        return surroundings_of_rig(rig, Partition(joint, influencing, np.arange(3)), skin).joints.tolist()
+        return joint_regression(rig, Partition(joint, influencing, np.arange(3)), skin).joints.tolist()
 
     assert around(2, 2, 3) == [2, 1, 3]
     assert around(2, 2, 4) == [2, 1], "joint 3 hides joint 4"
@@ -111,22 +111,22 @@ def test_joints_that_only_influencing_joints_move():
     assert around(0) == [0]
 
 
-def test_alone_the_main_joint_says_the_mean(smooth, poses):
+def test_the_main_joint_alone_fits_the_mean(smooth, poses):
     partition = make_partitions(smooth, INFLUENCING)[2]
     skin = skin_matrices(poses, smooth.rest_matrices)
     residuals = random_residuals(smooth, partition, len(poses))
-    fit, left = surroundings_of_rig(smooth, partition, skin).alone().fit(residuals, TRAINING)
+    fit, left = joint_regression(smooth, partition, skin).main_joint_only().fit(residuals, TRAINING)
     assert fit.joints.tolist() == [2]
     np.testing.assert_allclose(left, residuals - residuals[TRAINING].mean(axis=0), atol=1e-6)
 
 
-def test_joints_that_never_moved_give_nothing_large(smooth):
-    """All joints say the same then; one of them moves later."""
+def test_joints_that_never_moved_get_small_factors(smooth):
+    """All regressors are then equal; one of the joints moves later."""
     partition = make_partitions(smooth, INFLUENCING)[1]
     still = pose_chain(smooth, np.zeros((30, JOINTS, 2)))
     skin = skin_matrices(still, smooth.rest_matrices)
     residuals = random_residuals(smooth, partition, 30)
-    fit, _ = surroundings_of_rig(smooth, partition, skin).fit(residuals, np.arange(30))
+    fit, _ = joint_regression(smooth, partition, skin).fit(residuals, np.arange(30))
     assert np.abs(fit.factors).max() < 0.1
     bent = skin_matrices(pose_chain(smooth, np.full((1, JOINTS, 2), 0.5)), smooth.rest_matrices)
     assert np.abs(fit.offsets(bent)).max() < 0.1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Whatever unit a character is built in, and wherever its mesh lies: the same model, within rounding."""
+"""The model does not depend on the unit and the place of the character, within rounding."""
 
 import json
 from dataclasses import replace
@@ -15,27 +15,28 @@ from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.report import report_path
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
-from trainer.data import partitions_of, prepare, split_recording
-from trainer.inputs import inputs_of_rig, middles
+from trainer.data import partition_data, prepare_partition
+from trainer.inputs import inputs_of_rig, partition_centers
+from trainer.splitting import split_recording
 
 from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_chain
 from .conftest import QUICK
 
 JOINTS, POSES = 4, 160
-METRES = "metres"
+METRES = "meters"
 WAYS = {
     METRES: (1.0, 0.0),
-    "centimetres": (100.0, 0.0),
-    "millimetres": (1000.0, 0.0),
-    "kilometres": (0.001, 0.0),
-    "100 metres away": (1.0, 100.0),
-    "millimetres, 100 metres away": (1000.0, 100.0),
+    "centimeters": (100.0, 0.0),
+    "millimeters": (1000.0, 0.0),
+    "kilometers": (0.001, 0.0),
+    "100 meters away": (1.0, 100.0),
+    "millimeters, 100 meters away": (1000.0, 100.0),
 }
 OTHERS = [name for name in WAYS if name != METRES]
 
 
 def write(path, per_metre: float, away: float) -> None:
-    """A recording of the chain in another unit, so many to the metre, so many metres from the origin."""
+    """A recording of the chain in another unit, at a distance from the origin in meters."""
     rig = chain_rig(JOINTS)
     angles = chain_angles(POSES, JOINTS, seed=3)
     matrices, residuals = pose_chain(rig, angles).astype(np.float64), chain_residuals(rig, angles)
@@ -71,36 +72,36 @@ def trained(tmp_path_factory) -> dict:
 def prepared(recording) -> list:
     config = TrainingConfig(seed=0)
     rig, split = recording.rig, split_recording(recording, config)
-    inputs = inputs_of_rig(rig, middles(rig, recording.partitions), recording.partitions)
-    partitions = partitions_of(recording, recording.partitions, inputs)
-    return [prepare(p, split, config.tolerance_mm, config.seed, rig.metres_per_unit) for p in partitions]
+    inputs = inputs_of_rig(rig, partition_centers(rig, recording.partitions), recording.partitions)
+    partitions = partition_data(recording, recording.partitions, inputs)
+    return [prepare_partition(p, split, config.tolerance_mm, config.seed, rig.metres_per_unit) for p in partitions]
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_networks_see_the_same(trained, name):
-    """Not the rounding of what stands still, and all that moves, however small its number is."""
-    for own, metres in zip(*(prepared(trained[n][0]) for n in (name, METRES)), strict=True):
-        assert own.columns.tolist() == metres.columns.tolist()
-        assert own.fit.joints.tolist() == metres.fit.joints.tolist()
-        assert abs(len(own.basis.shapes) - len(metres.basis.shapes)) <= 1
+def test_networks_have_the_same_inputs(trained, name):
+    """Rounding of constant features is no input; small features that vary are."""
+    for own, meters in zip(*(prepared(trained[n][0]) for n in (name, METRES)), strict=True):
+        assert own.columns.tolist() == meters.columns.tolist()
+        assert own.fit.joints.tolist() == meters.fit.joints.tolist()
+        assert abs(len(own.basis.components) - len(meters.basis.components)) <= 1
 
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_models_are_as_good(trained, name):
-    own, metres = (trained[n][1] for n in (name, METRES))
+    own, meters = (trained[n][1] for n in (name, METRES))
     # One step of float32, mm: positions far from the origin are no more exact than that.
     step = 1000 * float(np.spacing(np.float32(WAYS[name][1])))
     for way in ("fdda", "linear"):
-        for statistic, value in metres[way]["held_out"].items():
+        for statistic, value in meters[way]["held_out"].items():
             assert own[way]["held_out"][statistic] == pytest.approx(value, rel=0.1, abs=step), (way, statistic)
 
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_the_same_counts_as_locked(trained, name):
-    """What the confidence is taken for: ranges in true metres agree."""
-    (_, _, own), (_, _, metres) = trained[name], trained[METRES]
+    """What the confidence is taken for: ranges in true meters agree."""
+    (_, _, own), (_, _, meters) = trained[name], trained[METRES]
     per_metre, _ = WAYS[name]
-    for mine, theirs in ((own.feature_low, metres.feature_low), (own.feature_high, metres.feature_high)):
+    for mine, theirs in ((own.feature_low, meters.feature_low), (own.feature_high, meters.feature_high)):
         mine = mine.copy()
         mine[:, 3::4] /= per_metre
         assert np.abs(mine - theirs)[1:].max() < 2e-4
@@ -108,5 +109,5 @@ def test_the_same_counts_as_locked(trained, name):
 
 @pytest.mark.parametrize("name", WAYS)
 def test_nothing_is_suspicious(trained, name):
-    own, metres = ({warning.name for warning in check_recording(trained[n][0])} for n in (name, METRES))
-    assert own == metres
+    own, meters = ({warning.name for warning in check_recording(trained[n][0])} for n in (name, METRES))
+    assert own == meters

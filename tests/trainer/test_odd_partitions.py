@@ -16,8 +16,8 @@ from fdda_addon.core.rig import STATIC_JOINT, Joint, Rig
 from fdda_addon.core.skinning import LinearSkinning, skin_matrices
 from fdda_addon.runtime.network import Network
 from trainer.__main__ import main
-from trainer.inputs import inputs_of_rig, joints_between, middles
-from trainer.joint_fit import surroundings_of_rig
+from trainer.inputs import inputs_of_rig, joints_on_path, partition_centers
+from trainer.joint_fit import joint_regression
 
 from .chain import chain_angles, chain_info, chain_rig, pose_chain
 from .conftest import QUICK, run_page
@@ -110,18 +110,18 @@ def test_trust_is_one_where_nothing_moves_that_did_not(model):
 def test_what_follows_no_bone_sees_the_joints_that_influence_it():
     rig = odd_rig()
     partitions = odd_partitions(rig)
-    inputs = inputs_of_rig(rig, middles(rig, partitions), partitions)
+    inputs = inputs_of_rig(rig, partition_centers(rig, partitions), partitions)
     seen = [(a, b) for a, b in zip(inputs.pair_references.tolist(), inputs.pair_points.tolist(), strict=True)]
     assert (UNMOVED_JOINT, 1) in seen, "two joints move the second bone against what follows none"
     assert (1, UNMOVED_JOINT) in seen and (2, UNMOVED_JOINT) not in seen, "the root does not influence the third"
     skin = skin_matrices(odd_poses(rig, 3, 0), rig.rest_matrices)
-    assert surroundings_of_rig(rig, partitions[3], skin).joints.tolist() == [UNMOVED_JOINT, 0, 1]
-    assert surroundings_of_rig(rig, partitions[0], skin).joints.tolist() == [0, 1, UNMOVED_JOINT]
-    assert surroundings_of_rig(rig, partitions[2], skin).joints.tolist() == [2, 1, 3]
+    assert joint_regression(rig, partitions[3], skin).joints.tolist() == [UNMOVED_JOINT, 0, 1]
+    assert joint_regression(rig, partitions[0], skin).joints.tolist() == [0, 1, UNMOVED_JOINT]
+    assert joint_regression(rig, partitions[2], skin).joints.tolist() == [2, 1, 3]
 
 
 def test_between_two_roots_are_all_joints_up_to_both():
     parents = np.array([-1, 0, 1, -1, 3])
-    assert joints_between(parents, 2, 4) == joints_between(parents, 4, 2) == {0, 1, 2, 3, 4}
-    assert joints_between(parents, 0, 3) == {0, 3} and joints_between(parents, 1, 3) == {0, 1, 3}
-    assert joints_between(parents, 2, 0) == {1, 2}
+    assert joints_on_path(parents, 2, 4) == joints_on_path(parents, 4, 2) == {0, 1, 2, 3, 4}
+    assert joints_on_path(parents, 0, 3) == {0, 3} and joints_on_path(parents, 1, 3) == {0, 1, 3}
+    assert joints_on_path(parents, 2, 0) == {1, 2}

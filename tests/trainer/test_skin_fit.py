@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fitted skin weights: what made the poses is found again, the constraints hold, and bad weights become better."""
+"""Fitted skin weights: the true weights are recovered, the constraints hold, and poor weights improve."""
 
 import json
 import subprocess
@@ -18,9 +18,9 @@ from fdda_addon.core.recording.writer import array_header
 from fdda_addon.core.rig import Fingerprint, Joint, Rig
 from fdda_addon.core.skin_fit import SkinFit
 from fdda_addon.core.skinning import LinearSkinning
-from trainer.fitted_skin import fit_folder, measure
 from trainer.process import Cancelled
 from trainer.skin_fit import main
+from trainer.skin_fit_job import fit_folder, measure
 from trainer.skin_solver import SkinSolver, simplex_weights
 
 from .. import systems
@@ -31,12 +31,12 @@ JOINTS, VERTICES, POSES = 24, 300, 40
 
 
 class Silent:
-    def say(self, kind: MessageType, **values) -> None:
+    def send(self, kind: MessageType, **values) -> None:
         pass
 
 
 def random_poses(rng: np.random.Generator, heads: np.ndarray, poses: int = POSES) -> np.ndarray:
-    """(poses, J, 4, 4) float32: each joint turned and moved by itself, and all of them far away together."""
+    """(poses, J, 4, 4) float32: each joint rotated and moved independently, and all of them far away."""
     matrices = np.empty((poses, len(heads), 4, 4))
     for pose in matrices:
         root = rng.normal(0, 5, 3)
@@ -81,7 +81,7 @@ def posed(rig: Rig, seed: int = 1, noise: float = 0.0, poses: int = POSES) -> Fi
 
 
 def fitted(poses: FitPoses, kind: str) -> Rig:
-    """The rig with the weights that the solver finds."""
+    """The rig with the fitted weights."""
     joints, weights = np.zeros((VERTICES, 4), np.int32), np.zeros((VERTICES, 4), np.float32)
     for block, *found in SkinSolver(poses).fit(kind):
         joints[block], weights[block] = found
@@ -103,12 +103,12 @@ def write(folder: Path, poses: FitPoses) -> Path:
 
 
 @pytest.mark.parametrize("influences", [2, 4])
-def test_smooth_weights_are_found_again(influences):
+def test_smooth_weights_are_recovered(influences):
     rig = random_rig(influences)
     assert np.abs(dense(fitted(posed(rig), "smooth")) - dense(rig)).max() < 1e-3
 
 
-def test_rigid_labels_are_found_again():
+def test_rigid_weights_are_recovered():
     labels = np.random.default_rng(5).integers(0, JOINTS, VERTICES)
     found = fitted(posed(with_one_joint(random_rig(1), labels), noise=0.01), "hard")
     np.testing.assert_array_equal(found.skin_joints[:, 0], labels)
@@ -116,7 +116,7 @@ def test_rigid_labels_are_found_again():
 
 
 @pytest.mark.parametrize("kind", ["hard", "smooth"])
-def test_constraints_hold_where_nothing_fits(kind):
+def test_constraints_hold_for_random_positions(kind):
     rig = fitted(posed(random_rig(4), noise=0.3), kind)
     assert (rig.skin_weights >= 0).all() and (rig.skin_weights > 0).sum(axis=1).max() <= (1 if kind == "hard" else 4)
     np.testing.assert_allclose(rig.skin_weights.sum(axis=1), 1, atol=1e-6)
@@ -125,15 +125,15 @@ def test_constraints_hold_where_nothing_fits(kind):
     assert all(len(set(row)) == len(row) for row in used)
 
 
-def test_noise_brings_no_joints():
-    """Each joint can take a little off of any noise; none but the true one takes off enough."""
+def test_noise_adds_no_joints():
+    """Each joint explains a little of any noise, but only the true one explains enough."""
     labels = np.random.default_rng(5).integers(0, JOINTS, VERTICES)
     found = fitted(posed(with_one_joint(random_rig(1), labels), noise=0.05), "smooth")
     assert (found.skin_weights > 0).sum(axis=1).mean() < 1.02
     np.testing.assert_array_equal(found.skin_joints[:, 0], labels)
 
 
-def test_five_joints_are_told_by_the_best_four():
+def test_five_joints_are_approximated_by_the_best_four():
     """A fit with four joints is no worse than the best four of the five that made the poses."""
     rig = random_rig(4)
     rig = replace(
@@ -147,7 +147,7 @@ def test_five_joints_are_told_by_the_best_four():
     assert gain.rms_mm["fitted"] < 0.8 * gain.rms_mm["rig"]
 
 
-def test_weights_of_a_simplex_are_the_best():
+def test_simplex_weights_are_optimal():
     """The conditions of Karush, Kuhn and Tucker: equal slopes where there is a weight, steeper ones elsewhere."""
     rng = np.random.default_rng(3)
     factors = rng.normal(size=(50, 6, 8)) + rng.normal(size=(50, 1, 8))
@@ -165,7 +165,7 @@ def test_weights_of_a_simplex_are_the_best():
 
 
 @pytest.mark.parametrize("kind", ["hard", "smooth"])
-def test_of_joints_that_never_move_apart_the_own_or_the_nearest_is_taken(kind):
+def test_ties_prefer_the_rig_s_joint_then_the_nearest(kind):
     rig = with_one_joint(random_rig(1), np.full(VERTICES, 2))
     rest = rig.rest_matrices.copy()
     rest[:6, :3, 3] = [[0, 0, 9], [0, 0, 8], [0, 0, 7], [0, 0, 0], [0, 9, 0], [0, 8, 0]]
@@ -179,7 +179,7 @@ def test_of_joints_that_never_move_apart_the_own_or_the_nearest_is_taken(kind):
     np.testing.assert_allclose(found.skin_weights[:, 0], 1, atol=1e-4)
 
 
-def test_what_stays_follows_the_joint_that_never_moves():
+def test_static_vertices_follow_the_static_joint():
     poses = posed(random_rig(4))
     rest = poses.rig.rest_matrices.copy()
     rest[7] = np.eye(4)
@@ -190,7 +190,7 @@ def test_what_stays_follows_the_joint_that_never_moves():
 
 
 @pytest.mark.parametrize("kind", ["hard", "smooth"])
-def test_the_process_says_what_the_fit_brings(kind, tmp_path, capsys):
+def test_the_process_reports_the_errors(kind, tmp_path, capsys):
     poses = posed(random_rig(2), noise=0.002)
     assert main([str(write(tmp_path, poses)), kind]) == 0
     messages = [Message.decode(line) for line in capsys.readouterr().out.splitlines()]
@@ -207,11 +207,11 @@ def test_the_process_says_what_the_fit_brings(kind, tmp_path, capsys):
         np.testing.assert_allclose(gain.rms_mm["fitted"], 1000 * np.sqrt((apart**2).mean()), rtol=1e-4)
         np.testing.assert_allclose(gain.max_mm["fitted"], 1000 * apart.max(), rtol=1e-4)
     if kind == "smooth":
-        # The noise, √3 · 2 mm, is what is left; a little more where it was not fitted to.
+        # The noise, √3 · 2 mm, remains; a little more on held-out poses.
         assert 3.3 < fit.training.rms_mm["fitted"] < fit.held_out.rms_mm["fitted"] < 4
 
 
-def test_a_fit_that_is_asked_to_stop_writes_nothing(tmp_path):
+def test_a_stopped_fit_writes_nothing(tmp_path):
     write(tmp_path, posed(random_rig(2)))
     before = set(tmp_path.iterdir())
     with pytest.raises(Cancelled):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which poses train, which choose the weights and which measure the error: random poses, and frames of animation."""
+"""The split into training, validation and held-out poses, of random poses and of frames."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,8 @@ from fdda_addon.core.poses import Margin
 from fdda_addon.core.recording.index import ACTION, MIRRORED, RANDOM, REFINED, Source
 from fdda_addon.core.recording.reader import Recording, read_recording
 from trainer.config import TrainingConfig
-from trainer.data import BLOCK_FRAMES, PartitionData, Split, prepare, split_recording
+from trainer.data import PartitionData, prepare_partition
+from trainer.splitting import BLOCK_FRAMES, Split, split_recording
 
 from .chain import write_chain
 
@@ -28,7 +29,7 @@ def source(tmp_path_factory) -> Recording:
 
 
 def split(source: Recording, *sources: Source, config: TrainingConfig = CONFIG) -> Split:
-    """How a recording of these sources is split; each pose in exactly one part."""
+    """Split a recording of some sources; each pose is in exactly one part."""
     sampling = replace(source.info.sampling, sources=sources)
     found = split_recording(replace(source, info=replace(source.info, sampling=sampling)), config)
     poses = np.concatenate([getattr(found, part) for part in PARTS])
@@ -37,7 +38,7 @@ def split(source: Recording, *sources: Source, config: TrainingConfig = CONFIG) 
 
 
 def part_of(found: Split, poses: int) -> np.ndarray:
-    """(poses,) number of the part that each pose is in."""
+    """Return (poses,) the index of the part of each pose."""
     parts = np.empty(poses, int)
     for number, part in enumerate(PARTS):
         parts[getattr(found, part)] = number
@@ -51,7 +52,7 @@ def test_random_poses_are_split_one_by_one(source):
     assert np.array_equal(found.validation, np.sort(order[20:30]))
 
 
-def test_frames_are_held_back_in_blocks(source):
+def test_frames_are_split_in_blocks(source):
     found = split(source, Source(ACTION, 400, "walk", (1, 1)))
     blocks = part_of(found, 400).reshape(-1, BLOCK_FRAMES)
     assert (blocks == blocks[:, :1]).all()
@@ -106,7 +107,7 @@ def test_too_few_poses_are_refused(source):
         split(source, Source(RANDOM, 4), Source(ACTION, 5, "nod", (1, 1)), Source(REFINED, 50, "model.onnx"))
 
 
-def test_poses_that_did_not_come_to_rest_are_in_no_part_unless_they_are_asked_for(source):
+def test_unsettled_poses_are_left_out_unless_included(source):
     sampling = replace(source.info.sampling, sources=(Source(RANDOM, 30),))
     info = replace(source.info, sampling=sampling, unsettled=tuple(range(0, 30, 3)))
     found = split_recording(replace(source, info=info), CONFIG)
@@ -118,10 +119,11 @@ def test_poses_that_did_not_come_to_rest_are_in_no_part_unless_they_are_asked_fo
         split_recording(replace(source, info=replace(info, unsettled=tuple(range(26)))), CONFIG)
 
 
-def test_features_are_standardised_by_the_training_poses_alone():
+def test_features_are_standardized_by_the_training_poses_alone():
     features = np.random.default_rng(0).normal(size=(40, 2)).astype(np.float32)
     features[30:] += 10
-    found = Split(np.arange(30), np.arange(30, 35), np.arange(35, 40))
-    prepared = prepare(PartitionData("a", features, lambda: np.zeros((40, 5, 3), np.float32), 5), found, 0.1, 0)
+    split = Split(np.arange(30), np.arange(30, 35), np.arange(35, 40))
+    data = PartitionData("a", features, lambda: np.zeros((40, 5, 3), np.float32), 5)
+    prepared = prepare_partition(data, split, 0.1, 0)
     np.testing.assert_allclose(prepared.feature_mean, features[:30].mean(axis=0), atol=1e-5)
     np.testing.assert_allclose(prepared.feature_scale, features[:30].std(axis=0), atol=1e-5)

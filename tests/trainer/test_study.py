@@ -16,9 +16,9 @@ from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.runtime.network import Network
 from trainer.config import TrainingConfig
-from trainer.data import split_poses
-from trainer.delta_fit import find_deltas
-from trainer.inputs import inputs_of_rig, middles
+from trainer.inputs import inputs_of_rig, partition_centers
+from trainer.splitting import split_poses
+from trainer.surface_frame_fit import select_surface_frames
 
 from .chain import write_chain
 from .tube import write_tube
@@ -73,17 +73,17 @@ def test_every_configuration_is_trained_with_every_seed(result):
     assert result["poses"] == {"training": 120, "held_out": 40}
 
 
-def test_networks_see_deltas_where_the_rig_smooths(tmp_path):
+def test_networks_see_surface_frames_where_the_rig_smooths(tmp_path):
     tube = write_tube(tmp_path / "tube")
     names = ("bone_1",)
     small = cut(tube, names)
-    inputs = inputs_of_rig(tube.rig, middles(tube.rig, tube.partitions), small.partitions)
+    inputs = inputs_of_rig(tube.rig, partition_centers(tube.rig, tube.partitions), small.partitions)
     model = tmp_path / "tube.onnx"
     train_once(Material(tube, small, small, inputs), TrainingConfig(epochs=1, hidden=(8, 8)), model)
     seen = next(info for info in onnx.load(model).graph.initializer if info.name == "own_axes").dims
     split = split_poses(np.arange(len(tube.pose_matrices)), 0.05, 0)
-    of_all = find_deltas(tube, split, TrainingConfig().tolerance_mm)
-    assert seen[0] == (of_all.seen_from == 1).sum() < len(of_all)
+    of_all = select_surface_frames(tube, split, TrainingConfig().tolerance_mm)
+    assert seen[0] == (of_all.main_joints == 1).sum() < len(of_all)
 
 
 def test_the_learning_rate_is_the_one_of_the_least_validation_error(studied, result):
@@ -110,7 +110,7 @@ def test_the_errors_are_those_of_the_model_on_the_held_out_poses(studied, result
 
 def test_the_networks_see_what_they_see_when_all_partitions_train(recording, held_out):
     whole = read_recording(recording)
-    inputs = inputs_of_rig(whole.rig, middles(whole.rig, whole.partitions), whole.partitions)
+    inputs = inputs_of_rig(whole.rig, partition_centers(whole.rig, whole.partitions), whole.partitions)
     features = inputs.features(whole.pose_matrices, whole.rig.rest_matrices)
     material = read_material(recording, held_out, NAMES)
     own = material.inputs.features(material.training.pose_matrices, material.training.rig.rest_matrices)

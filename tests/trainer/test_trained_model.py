@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The exported model: it plays what was trained, fades outside the training range, and says what it is."""
+"""The exported model: it agrees with the training, fades outside the training range, and has metadata."""
 
 import json
 
@@ -15,9 +15,9 @@ from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearSkinning
 from trainer.__main__ import main
-from trainer.borders import partition_of
 from trainer.config import ACTIVATIONS, TrainingConfig
-from trainer.data import split_recording
+from trainer.partition_refinement import partition_indices
+from trainer.splitting import split_recording
 
 from .chain import LIMIT, chain_angles, chain_residuals, pose_chain, write_chain
 
@@ -65,28 +65,28 @@ def test_moving_the_character_as_a_whole_moves_the_mesh(session, rig):
     poses = pose_chain(rig, chain_angles(4, 3, seed=6))
     shift = np.float32([0.5, -2, 1])
     moved = poses.copy()
-    # The root's own transform is outside the range, so the chain hangs on a root that only linear skinning knows.
+    # The root's own transform is outside the range, so the chain gets a root that only linear skinning uses.
     moved[:, :, :3, 3] += shift
     linear = LinearSkinning(rig)
     np.testing.assert_allclose(linear.positions(moved), linear.positions(poses) + shift, atol=1e-5)
 
 
-def test_trust_is_one_inside_the_range_and_the_recorded_poses_are(session, recording):
+def test_confidence_is_one_in_recorded_poses(session, recording):
     confidence = play(session, np.array(read_recording(recording).pose_matrices))[1]
     assert (confidence == 1).all()
 
 
-def test_trust_fades_outside(session, rig):
+def test_confidence_fades_outside(session, rig):
     angles = np.zeros((40, 3, 2))
     angles[:, 1, 0] = np.linspace(LIMIT, LIMIT * 3, 40)
     confidence = play(session, pose_chain(rig, angles))[1]
     assert confidence[0].min() == 1
-    assert (np.diff(confidence, axis=0) <= 1e-6).all(), "confidence grows again on the way out"
+    assert (np.diff(confidence, axis=0) <= 1e-6).all(), "confidence increases with the distance"
     assert 0 < confidence[-1, :2].max() < 0.99
     assert np.abs(np.diff(confidence, axis=0)).max() < 0.05, "the fade is a jump"
 
 
-def test_far_outside_linear_skinning_is_left(session, rig, trained):
+def test_far_outside_only_linear_skinning_remains(session, rig, trained):
     poses = pose_chain(rig, np.zeros((3, 3, 2)))
     poses[:, 1:, :3, :3] *= np.float32([1, 5, 50])[:, None, None, None]
     positions, confidence = play(session, poses)
@@ -100,7 +100,7 @@ def test_far_outside_linear_skinning_is_left(session, rig, trained):
         np.testing.assert_allclose(positions[2, vertices], linear[2, vertices], atol=1e-4)
 
 
-def test_a_locked_axis_that_turns_lowers_the_confidence(session, rig):
+def test_a_locked_axis_that_rotates_lowers_the_confidence(session, rig):
     angles = np.zeros((3, 3, 2))
     angles[1:, 2, 1] = 0.5, 1.5
     confidence = play(session, pose_chain(rig, angles))[1]
@@ -117,7 +117,7 @@ def test_beyond_the_range_it_is_never_worse_than_linear_skinning(session, rig, r
     assert distances(positions, truth).mean() <= distances(skinning.positions(poses), truth).mean()
 
 
-def test_a_joint_scaled_to_nothing_gives_numbers(session, rig):
+def test_a_joint_scaled_to_zero_gives_finite_positions(session, rig):
     poses = pose_chain(rig, chain_angles(2, 3, seed=1))
     poses[1, 1, :3, :3] = 0
     positions, confidence = play(session, poses)
@@ -170,7 +170,7 @@ def test_every_activation_and_any_depth_exports(tmp_path, recording, activation)
     assert read_model_info(model).parity_mm < 1e-2
 
 
-def test_a_rig_of_one_joint_has_nothing_to_learn_and_plays(tmp_path):
+def test_a_rig_of_one_joint_is_exported(tmp_path):
     rig = write_chain(tmp_path / "one", poses=12, joints=1)
     model = tmp_path / "m.onnx"
     assert main([str(tmp_path / "one"), str(model), "--epochs", "1"]) == 0
@@ -180,7 +180,7 @@ def test_a_rig_of_one_joint_has_nothing_to_learn_and_plays(tmp_path):
     assert confidence.tolist() == [[1.0]]
 
 
-def test_report_says_what_shading_shows(report, recording, session, trained):
+def test_the_report_has_the_surface_errors(report, recording, session, trained):
     source = read_recording(recording)
     normals, edges = report["normals"], report["edges"]
     assert 0 < normals["fdda"]["mean"] < normals["linear"]["mean"] < normals["linear"]["p99"]
@@ -188,7 +188,7 @@ def test_report_says_what_shading_shows(report, recording, session, trained):
     skinning, split = LinearSkinning(source.rig), split_recording(source, TrainingConfig())
     triangles = source.rig.face_vertices.reshape(-1, 3)
     pairs = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    number = partition_of(read_model_info(trained / "model.onnx").partitions_of(source.rig))
+    number = partition_indices(read_model_info(trained / "model.onnx").partitions_of(source.rig))
     crossing = number[pairs[:, 0]] != number[pairs[:, 1]]
     rest = np.linalg.norm(np.subtract(*source.rig.rest_positions[pairs.T]), axis=1)
     errors = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line of the trainer: messages, exit statuses, and what is left behind when it does not finish."""
+"""The command line of the trainer: messages, exit statuses, and the files of unfinished trainings."""
 
 import errno
 import io
@@ -15,8 +15,8 @@ import pytest
 
 from fdda_addon.core.messages import STOP_FILE_VARIABLE, Message, MessageType
 from trainer.__main__ import main
-from trainer.announcements import MessageLines
-from trainer.process import run_announced
+from trainer.process import run_with_messages
+from trainer.progress import JsonMessageSink
 
 from .chain import write_chain
 from .conftest import QUICK, REPOSITORY, start_trainer
@@ -48,7 +48,7 @@ def test_messages_from_start_to_finish(recording, tmp_path, capsys):
 def test_a_message_leaves_the_process_at_once(monkeypatch):
     sent = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(sent, encoding="utf-8"))
-    MessageLines().say(MessageType.LOG, text="half way")
+    JsonMessageSink().send(MessageType.LOG, text="half way")
     assert Message.decode(sent.getvalue().decode()).values == {"text": "half way"}
 
 
@@ -193,7 +193,7 @@ def test_a_request_to_stop_leaves_nothing(recording, tmp_path, monkeypatch, requ
     assert list(folder.iterdir()) == []
 
 
-def test_a_request_that_was_there_first(recording, tmp_path, monkeypatch, capsys):
+def test_a_stop_request_before_the_start(recording, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv(STOP_FILE_VARIABLE, str(recording))
     assert main([str(recording), str(tmp_path / "m.onnx"), "--messages"]) == 130
     assert decode(capsys.readouterr().out)[-1] == Message(MessageType.CANCELLED)
@@ -219,11 +219,11 @@ FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "x")
         (KeyError("x"), 1, "The trainer stopped on an error of its own (KeyError('x')); please report it."),
     ],
 )
-def test_errors_that_end_the_work(error, status, text, capsys):
+def test_errors_of_the_machine(error, status, text, capsys):
     def work():
         raise error
 
-    assert run_announced(work, MessageLines()) == status
+    assert run_with_messages(work, JsonMessageSink()) == status
     out, err = capsys.readouterr()
     values = Message.decode(out).values
     assert text in values["text"] and values.get("try_again", False) is (status == 75)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Vertices come back in the order of the mesh, whatever partitions they are in, and large meshes in blocks."""
+"""Vertices are reordered to mesh order for any partitions, in blocks for large meshes."""
 
 import numpy as np
 import onnx
@@ -7,22 +7,22 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper
 
-from trainer.nodes import Graph
+from trainer.graph_builder import GraphBuilder
 from trainer.vertex_order import VertexOrder, vertex_order
 
 
 def in_strips(vertices: int, strip: int, partitions: int) -> list[np.ndarray]:
-    """Partitions of strips of neighbors by turns."""
+    """Assign strips of adjacent vertices to partitions in turn."""
     owner = np.arange(vertices) // strip % partitions
     return [np.flatnonzero(owner == number) for number in range(partitions)]
 
 
 def played(order: VertexOrder, poses: int) -> np.ndarray:
-    """(poses, V, 3) what the graph makes of positions that say which vertex of which pose they are of."""
-    graph, columns = Graph(), np.concatenate(order.columns)
+    """(poses, V, 3) the graph's output for positions that encode their vertex and pose."""
+    graph, columns = GraphBuilder(), np.concatenate(order.columns)
     order.add(graph, "joined", "positions")
     values = [helper.make_tensor_value_info("joined", TensorProto.FLOAT, ["N", len(columns), 3])]
-    result = [helper.make_tensor_value_info("positions", TensorProto.FLOAT, ["N", order.vertices, 3])]
+    result = [helper.make_tensor_value_info("positions", TensorProto.FLOAT, ["N", order.vertex_count, 3])]
     proto = helper.make_graph(graph.nodes, "order", values, result, graph.constants)
     model = helper.make_model(proto, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     onnx.checker.check_model(model)
@@ -35,7 +35,7 @@ def played(order: VertexOrder, poses: int) -> np.ndarray:
     ("vertices", "strip", "partitions"),
     [(5, 1, 2), (90, 7, 3), (9_960, 61, 22), (50_001, 500, 7), (40_000, 40_000, 1), (20_000, 1, 9), (32_768, 64, 4)],
 )
-def test_vertices_come_back_in_order(vertices, strip, partitions):
+def test_vertices_are_in_mesh_order(vertices, strip, partitions):
     order = vertex_order(in_strips(vertices, strip, partitions))
     expected = np.arange(vertices)[:, None] + np.arange(3) * 0.25
     for pose, positions in enumerate(played(order, 2)):
@@ -46,13 +46,13 @@ def test_every_vertex_has_one_column():
     order = vertex_order(in_strips(50_001, 500, 7))
     columns = np.concatenate(order.columns)
     np.testing.assert_array_equal(np.sort(columns[columns >= 0]), np.arange(50_001))
-    assert (columns < 0).sum() < 7 * order.size
+    assert (columns < 0).sum() < 7 * order.block_size
 
 
 @pytest.mark.parametrize(("strip", "blocks"), [(500, True), (1, False), (100_000, True)])
-def test_blocks_only_where_neighbors_are_of_one_partition(strip, blocks):
-    assert (vertex_order(in_strips(50_000, strip, 5)).size > 1) == blocks
+def test_blocks_only_where_strips_are_long(strip, blocks):
+    assert (vertex_order(in_strips(50_000, strip, 5)).block_size > 1) == blocks
 
 
 def test_few_vertices_are_gathered_one_by_one():
-    assert vertex_order(in_strips(300, 30, 3)).size == 1
+    assert vertex_order(in_strips(300, 30, 3)).block_size == 1

@@ -13,10 +13,12 @@ from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.report import checkpoint_path
 from trainer.__main__ import main
-from trainer.checkpoint import initial_networks, read_checkpoint
+from trainer.checkpoint import read_checkpoint
 from trainer.config import TrainingConfig
-from trainer.data import partitions_of, prepare, split_recording
-from trainer.inputs import inputs_with_deltas
+from trainer.data import partition_data, prepare_partition
+from trainer.inputs import inputs_with_surface_frames
+from trainer.splitting import split_recording
+from trainer.warm_start import initial_networks
 
 from .. import systems
 from .chain import chain_angles, chain_residuals, pose_chain, write_chain
@@ -49,14 +51,14 @@ def model(trained, tmp_path):
 def prepared_of(path, config, checkpoint):
     recording = read_recording(path)
     split = split_recording(recording, config)
-    partitions = checkpoint.cut(recording.partitions)
-    inputs = inputs_with_deltas(recording.rig, partitions, checkpoint.deltas)
-    data = partitions_of(recording, partitions, inputs)
-    prepared = [prepare(p, split, config.tolerance_mm, config.seed) for p in data]
+    partitions = checkpoint.reassign(recording.partitions)
+    inputs = inputs_with_surface_frames(recording.rig, partitions, checkpoint.surface_frames)
+    data = partition_data(recording, partitions, inputs)
+    prepared = [prepare_partition(p, split, config.tolerance_mm, config.seed) for p in data]
     return split, prepared, [c[p.columns] for c, p in zip(inputs.columns, prepared, strict=True)]
 
 
-def test_networks_start_with_nearly_the_answers_they_gave(recording, trained, grown):
+def test_networks_start_with_nearly_their_former_outputs(recording, trained, grown):
     config = TrainingConfig(tolerance_mm=1e-4)
     checkpoint = read_checkpoint(checkpoint_path(trained / "model.onnx"))
     _, prepared, columns = prepared_of(grown, config, checkpoint)
@@ -70,19 +72,19 @@ def test_networks_start_with_nearly_the_answers_they_gave(recording, trained, gr
         old = before.network.coefficients(
             ((features - before.feature_mean) / before.feature_scale).astype(np.float32), checkpoint.activation
         )
-        expected = old @ before.basis_shapes + before.basis_mean
+        expected = old @ before.basis_components + before.basis_mean
         answered = now.basis.residuals(network.coefficients(now.inputs, checkpoint.activation))
-        # Not quite the same: the linear fit that comes before is another one, and so are the shapes of what it leaves.
+        # Not exactly: the linear fit and the components are computed from other poses.
         assert np.linalg.norm(answered - expected) < 0.05 * np.linalg.norm(expected)
         compared += 1
     assert compared >= 2
 
 
-def test_training_goes_on_and_does_not_start_again(grown, model, trained):
+def test_a_warm_start_continues_the_training(grown, model, trained):
     first = json.loads((trained / "report.json").read_text())["fdda"]["held_out"]["mean"]
     assert main([str(grown), str(model), *QUICK, "--epochs", "12", "--warm-start"]) == 0
     report = json.loads((model.parent / "report.json").read_text())
-    # Six epochs: from random weights they leave several times the error.
+    # Six epochs from random weights leave several times the error.
     assert report["fdda"]["held_out"]["mean"] < 1.5 * first
     assert main([str(grown), str(model), *QUICK, "--epochs", "6"]) == 0
     cold = json.loads((model.parent / "report.json").read_text())
@@ -93,7 +95,7 @@ def test_training_goes_on_and_does_not_start_again(grown, model, trained):
     assert [entry["poses"] for entry in history] == [120 + GROWN] * 2
 
 
-def test_refined_poses_train_and_what_was_held_out_stays_so(recording, grown):
+def test_refined_poses_train_and_held_out_poses_stay(recording, grown):
     config = TrainingConfig()
     before, after = split_recording(read_recording(recording), config), split_recording(read_recording(grown), config)
     assert np.array_equal(before.held_out, after.held_out) and np.array_equal(before.validation, after.validation)
@@ -112,14 +114,14 @@ def test_there_must_be_a_checkpoint(recording, tmp_path, capsys):
     assert "There is no checkpoint" in refused(capsys, recording, tmp_path / "m.onnx")
 
 
-def test_a_checkpoint_of_other_networks_or_rigs_is_refused(recording, model, tmp_path, capsys):
+def test_a_checkpoint_of_other_network_or_rig_is_refused(recording, model, tmp_path, capsys):
     assert "is of networks --hidden 24 24 --activation silu" in refused(capsys, recording, model, "--hidden", "8")
     write_chain(tmp_path / "other", joints=4)
     assert "is of another rig" in refused(capsys, tmp_path / "other", model)
 
 
 @pytest.mark.parametrize("options", [["--seed", "1"], ["--held-out-fraction", "0.2"], ["--validation-fraction", "0.2"]])
-def test_poses_that_were_trained_on_are_never_held_out(recording, model, capsys, options):
+def test_training_poses_never_become_held_out(recording, model, capsys, options):
     assert "may have been trained on poses that are held out now" in refused(capsys, recording, model, *QUICK, *options)
 
 
@@ -129,7 +131,7 @@ def test_another_recording_of_the_rig_is_refused(model, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "damage", ["cut", "text", "packed", "shapes", "nan", "types", pytest.param("pipe", marks=systems.named_pipes)]
+    "damage", ["cut", "text", "packed", "sizes", "nan", "types", pytest.param("pipe", marks=systems.named_pipes)]
 )
 def test_a_damaged_checkpoint_is_refused(recording, model, capsys, damage):
     path = checkpoint_path(model)
@@ -149,7 +151,7 @@ def test_a_damaged_checkpoint_is_refused(recording, model, capsys, damage):
     else:
         with np.load(path) as arrays:
             content = dict(arrays)
-        changed = {"shapes": content["1/weight_1"][1:], "nan": content["1/weight_1"] * np.nan, "types": np.array("x")}
+        changed = {"sizes": content["1/weight_1"][1:], "nan": content["1/weight_1"] * np.nan, "types": np.array("x")}
         content["1/weight_1"] = changed[damage]
         np.savez(path, **content)
     before = model.read_bytes()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Warnings about a recording are announced and reported, and end the training where they are errors."""
+"""Warnings about a recording are sent and reported, and end a strict training."""
 
 import json
 import shutil
@@ -16,7 +16,7 @@ from .conftest import QUICK
 
 @pytest.fixture(scope="module")
 def suspicious(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The chain's recording, in which 30 of 120 poses repeat one another, one of them with other residuals."""
+    """The chain's recording, with 30 repeated poses of 120, one of them with other residuals."""
     path = shutil.copytree(recording, tmp_path_factory.mktemp("suspicious") / "recording")
     for name in ("pose_matrices", "residuals"):
         array = np.load(path / f"{name}.npy", mmap_mode="r+")
@@ -30,7 +30,7 @@ def suspicious(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 WARNINGS = ["duplicate-poses", "hidden-inputs"]
 
 
-def test_warnings_are_announced_before_the_training_and_reported(suspicious, tmp_path, capsys):
+def test_warnings_are_sent_before_the_training_and_reported(suspicious, tmp_path, capsys):
     assert main([str(suspicious), str(tmp_path / "m.onnx"), "--messages", *QUICK[2:], "--epochs", "2"]) == 0
     messages = [Message.decode(line) for line in capsys.readouterr().out.splitlines()]
     kinds = [MessageType.STARTED, MessageType.LOG, *[MessageType.WARNING] * 2, MessageType.PREPARING]

@@ -16,7 +16,7 @@ ITERATIONS, FACTOR = 6, 0.5
 
 
 def tube(per_metre: float = 1.0, away: float = 0.0) -> Rig:
-    """A tube of one metre along z with bulges, of rings of quads, each ring on one joint."""
+    """A tube of one meter along z with bulges, of rings of quads, each ring on one joint."""
     height, angle = np.meshgrid(np.linspace(0, 1, RINGS), np.arange(AROUND) * 2 * np.pi / AROUND, indexing="ij")
     radius = 0.08 + 0.015 * np.sin(9 * height) * np.cos(3 * angle)
     positions = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=2).reshape(-1, 3)
@@ -43,7 +43,7 @@ def tube(per_metre: float = 1.0, away: float = 0.0) -> Rig:
 
 
 def smoothed(rig: Rig, positions: np.ndarray) -> np.ndarray:
-    """Positions (V, 3) smoothed as Blender's Corrective Smooth does it, simply: towards the mean of those beside."""
+    """Smooth positions (V, 3) as Blender's Corrective Smooth does in its simple mode."""
     faces = rig.face_vertices.reshape(-1, 4)
     edges = np.concatenate([faces[:, [i, (i + 1) % 4]] for i in range(4)])
     beside = np.zeros((len(positions), len(positions)))
@@ -67,7 +67,7 @@ def corner_frames(rig: Rig, positions: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def delta_mush(rig: Rig, skinned: np.ndarray) -> np.ndarray:
-    """(N, V, 3) skinned positions to those that delta mush makes of them."""
+    """(N, V, 3) positions with delta mush, from skinned ones."""
     rest = rig.rest_positions.astype(np.float64)
     frames, _ = corner_frames(rig, smoothed(rig, rest))
     deltas = np.einsum("cab,ca->cb", frames, (rest - smoothed(rig, rest))[rig.face_vertices])

@@ -11,31 +11,36 @@ from fdda_addon.core.messages import MessageType
 from fdda_addon.core.output import check_folder_writable
 from fdda_addon.core.recording.index import read_index
 
-from .announcements import Announcer
 from .config import TrainingConfig
 from .outputs import check_training_outputs, training_outputs
+from .progress import MessageSink
 
 
-class _OneOfSeveral:
-    """Announces the end of a training as that of one model of several."""
+class _BatchItemSink:
+    """Sends the end of each training as `MODEL_FINISHED`, and records its values."""
 
-    def __init__(self, announcer: Announcer):
-        self._announcer = announcer
+    def __init__(self, sink: MessageSink):
+        self._sink = sink
         self.finished: list[dict] = []
 
-    def say(self, kind: MessageType, **values) -> None:
+    def send(self, kind: MessageType, **values) -> None:
         if kind is MessageType.FINISHED:
             kind = MessageType.MODEL_FINISHED
             self.finished.append(values)
-        self._announcer.say(kind, **values)
+        self._sink.send(kind, **values)
 
 
-def check_several(recordings: list[Path], folder: Path, overwrite: bool = False) -> None:
-    """Fail before the first training, which may take long; torch is not needed to see it.
+def check_batch(recordings: list[Path], folder: Path, overwrite: bool = False) -> None:
+    """Check recordings and outputs before the first training. Does not need torch.
+
+    Args:
+        recordings: folders.
+        folder: of the models.
+        overwrite: as in `check_training_outputs`.
 
     Raises:
-        RecordingError: a recording is not complete.
-        OutputError: the folder is none, or cannot be written, or one of the models as `check_training_outputs`.
+        RecordingError: a recording is incomplete.
+        OutputError: the path is the name of a model, or a file cannot be written.
     """
     if folder.suffix == ".onnx":
         raise OutputError(
@@ -64,38 +69,42 @@ def train_models(
     recordings: list[Path],
     folder: Path,
     config: TrainingConfig,
-    announcer: Announcer,
+    sink: MessageSink,
     should_stop: Callable[[], bool] = lambda: False,
     warm_start: bool = False,
     strict: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Train a model on each recording, in a folder of its own: FOLDER/NAME/NAME.onnx, by the name of its recording.
+    """Train a model on each recording. Finished models stay when a later training fails.
 
-    All but `recordings` and `folder` as for `train_model`. Models that are finished stay when a later one fails.
+    Args:
+        recordings: folders of complete recordings.
+        folder: of the models; that of recording NAME is FOLDER/NAME/NAME.onnx.
+        config, sink, should_stop, warm_start, strict, overwrite: as in `train_model`.
 
     Raises:
-        Cancelled: `should_stop` said so.
-        FDDAError: as `check_several`, and as `train_model`.
+        Cancelled: `should_stop` returned True.
+        FDDAError: as in `check_batch` and `train_model`.
     """
     from .training import train_model
 
     started = time.perf_counter()
-    check_several(recordings, folder, overwrite)
-    each = _OneOfSeveral(announcer)
+    check_batch(recordings, folder, overwrite)
+    item_sink = _BatchItemSink(sink)
     for recording in recordings:
         model = _model_path(recording, folder)
         model.parent.mkdir(parents=True, exist_ok=True)
         try:
-            train_model(recording, model, config, each, should_stop, warm_start, strict, overwrite)
+            train_model(recording, model, config, item_sink, should_stop, warm_start, strict, overwrite)
         finally:
-            for empty in (model.parent, folder):
+            # Only empty folders can be removed.
+            for created in (model.parent, folder):
                 with suppress(OSError):
-                    empty.rmdir()
-    announcer.say(
+                    created.rmdir()
+    sink.send(
         MessageType.FINISHED,
         model=str(folder),
         models=len(recordings),
         seconds=round(time.perf_counter() - started, 2),
-        **{key: max(values[key] for values in each.finished) for key in ("held_out_mm", "held_out_p999_mm")},
+        **{key: max(values[key] for values in item_sink.finished) for key in ("held_out_mm", "held_out_p999_mm")},
     )

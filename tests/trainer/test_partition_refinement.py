@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Borders of partitions move to where fewer numbers say the same, and everything that asks for partitions follows."""
+"""Partition refinement makes the model smaller, and export, checkpoint and report use the refined partitions."""
 
 import json
 from dataclasses import replace
@@ -15,13 +15,14 @@ from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.report import checkpoint_path
 from fdda_addon.core.skinning import LinearSkinning
-from trainer import borders, training
+from trainer import partition_refinement, training
 from trainer.__main__ import main
-from trainer.borders import better_borders, partition_of, recut
 from trainer.checkpoint import read_checkpoint
 from trainer.config import TrainingConfig
-from trainer.data import residuals_of, split_recording
+from trainer.data import residuals_of
+from trainer.partition_refinement import partition_indices, reassign_vertices, refine_partitions
 from trainer.process import Cancelled
+from trainer.splitting import split_recording
 
 from .chain import chain_angles, chain_info, pose_chain
 from .conftest import QUICK
@@ -29,11 +30,11 @@ from .tube import AROUND, INFLUENCING, JOINTS, RINGS, tube, write_tube
 
 POSES, WAVES = 200, 4
 ODD = np.arange(RINGS // JOINTS, RINGS // JOINTS + 3)
-"""Rings that are weighted to the middle joint, and do as those of the first one do."""
+"""Rings with weights on the middle joint whose residuals follow the first joint."""
 
 
 def write_odd(path: Path, per_metre: float = 1.0, away: float = 0.0) -> Recording:
-    """A tube in which the surface around the first joint reaches further than its weights."""
+    """Write a tube where the first joint deforms vertices beyond its weights."""
     plain, rig, angles = tube(), tube(per_metre, away), chain_angles(POSES, JOINTS, seed=3, reach=1.5)
     matrices, skinning = pose_chain(plain, angles), LinearSkinning(plain)
     ring = np.arange(plain.vertex_count) // AROUND
@@ -45,7 +46,7 @@ def write_odd(path: Path, per_metre: float = 1.0, away: float = 0.0) -> Recordin
         sines = np.sin(bend[:, None] * np.arange(3, 3 + WAVES))
         own = follows == joint
         residuals[:, own] = 0.004 * np.einsum("nk,kva->nva", sines, waves[joint][:, own])
-    cut = recut(make_partitions(plain), follows)
+    cut = reassign_vertices(make_partitions(plain), follows)
     positions = LinearSkinning(plain, cut).complex_positions(matrices, residuals)
     matrices = matrices.astype(np.float64)
     matrices[:, :, :3, 3] = per_metre * (matrices[:, :, :3, 3] + away)
@@ -56,7 +57,7 @@ def write_odd(path: Path, per_metre: float = 1.0, away: float = 0.0) -> Recordin
 
 
 def moved(recording: Recording, tolerance_mm: float = 0.2) -> tuple[Partition, ...]:
-    return better_borders(recording, split_recording(recording, TrainingConfig()), False, tolerance_mm, 24)
+    return refine_partitions(recording, split_recording(recording, TrainingConfig()), False, tolerance_mm, 24)
 
 
 def odd_vertices() -> np.ndarray:
@@ -92,7 +93,7 @@ def test_where_weights_say_it_well_nothing_moves(tmp_path):
 
 
 def test_for_too_little_nothing_moves(odd, monkeypatch):
-    monkeypatch.setattr(borders, "NEEDED", 0.5)
+    monkeypatch.setattr(partition_refinement, "MAX_SIZE_RATIO", 0.5)
     assert moved(odd) is odd.partitions
 
 
@@ -100,13 +101,13 @@ def test_without_faces_or_beside_nothing_that_learns_nothing_moves(odd):
     none = np.zeros(0, np.int32)
     assert moved(replace(odd, rig=replace(odd.rig, face_starts=none, face_vertices=none))) is odd.partitions
     deaf = tuple(replace(p, influencing=()) if p.joint == 1 else p for p in odd.partitions)
-    assert np.array_equal(partition_of(moved(replace(odd, partitions=deaf))), partition_of(odd.partitions))
+    assert np.array_equal(partition_indices(moved(replace(odd, partitions=deaf))), partition_indices(odd.partitions))
 
 
-@pytest.mark.parametrize(("limit", "most"), [("MOST_POSES", 8), ("MOST_FLOATS", 8 * 3 * RINGS * AROUND)])
-def test_few_poses_say_nothing(odd, monkeypatch, limit, most):
-    monkeypatch.setattr(borders, limit, most)
-    assert np.array_equal(partition_of(moved(odd)), partition_of(odd.partitions))
+@pytest.mark.parametrize(("limit", "most"), [("MAX_POSES", 8), ("MAX_ELEMENTS", 8 * 3 * RINGS * AROUND)])
+def test_few_poses_refine_nothing(odd, monkeypatch, limit, most):
+    monkeypatch.setattr(partition_refinement, limit, most)
+    assert np.array_equal(partition_indices(moved(odd)), partition_indices(odd.partitions))
 
 
 def test_a_partition_keeps_some_vertices(odd):
@@ -139,35 +140,35 @@ def test_residuals_are_seen_from_the_partition_that_they_count_to(odd):
 
 def test_a_model_says_whose_vertices_it_took(odd, trained):
     info = read_model_info(trained)
-    assert [p.taken for p in info.partitions] == [tuple(odd_vertices().tolist()), (), ()]
+    assert [p.reassigned for p in info.partitions] == [tuple(odd_vertices().tolist()), (), ()]
     assert [len(p.vertices) for p in info.partitions_of(odd.rig)] == [p.vertices for p in info.partitions]
     for ours, theirs in zip(info.partitions_of(odd.rig), moved(odd), strict=True):
         assert np.array_equal(ours.vertices, theirs.vertices)
 
 
 def test_it_takes_fewer_numbers_for_no_larger_error(odd, trained, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(borders, "MOST_ROUNDS", 0)
+    monkeypatch.setattr(partition_refinement, "MAX_ROUNDS", 0)
     plain = tmp_path / "plain" / "tube.onnx"
     plain.parent.mkdir()
     assert main([str(odd.path), str(plain), *QUICK, "--tolerance-mm", "0.2"]) == 0
-    assert "Borders moved" not in capsys.readouterr().out
+    assert "Partitions refined" not in capsys.readouterr().out
     before, now = (json.loads((model.parent / "report.json").read_text()) for model in (plain, trained))
     numbers = [sum(p["vertices"] * p["basis"] for p in report["partitions"]) for report in (before, now)]
     assert numbers[1] < 0.9 * numbers[0] and now["model_bytes"] < before["model_bytes"]
     assert now["fdda"]["held_out"]["mean"] < before["fdda"]["held_out"]["mean"]
-    assert all(p.taken == () for p in read_model_info(plain).partitions)
+    assert all(p.reassigned == () for p in read_model_info(plain).partitions)
 
 
-def test_a_training_goes_on_with_the_same_borders(odd, trained, tmp_path, monkeypatch, capsys):
+def test_a_warm_start_keeps_the_partitions(odd, trained, tmp_path, monkeypatch, capsys):
     checkpoint = read_checkpoint(checkpoint_path(trained))
-    assert np.array_equal(checkpoint.partition_of, partition_of(moved(odd)))
+    assert np.array_equal(checkpoint.partition_indices, partition_indices(moved(odd)))
     before = json.loads((trained.parent / "report.json").read_text())["fdda"]["held_out"]["mean"]
     model = tmp_path / "tube.onnx"
     checkpoint_path(model).write_bytes(checkpoint_path(trained).read_bytes())
-    monkeypatch.setattr(training, "better_borders", None)
+    monkeypatch.setattr(training, "refine_partitions", None)
     assert main([str(odd.path), str(model), *QUICK, "--tolerance-mm", "0.2", "--epochs", "2", "--warm-start"]) == 0
-    assert "Borders moved: 36 vertices count to the partition beside their own." in capsys.readouterr().out
-    assert read_model_info(model).partitions[0].taken == tuple(odd_vertices().tolist())
+    assert "Partitions refined: 36 vertices are reassigned to a neighbor partition." in capsys.readouterr().out
+    assert read_model_info(model).partitions[0].reassigned == tuple(odd_vertices().tolist())
     after = json.loads((tmp_path / "report.json").read_text())["fdda"]["held_out"]["mean"]
     assert after < 1.5 * before
 
@@ -193,18 +194,18 @@ def changed_checkpoint(trained: Path, path: Path, **changes) -> Path:
 )
 def test_damaged_borders_are_refused(trained, tmp_path, change):
     with np.load(checkpoint_path(trained)) as arrays:
-        own = arrays["partition_of"]
+        own = arrays["partition_indices"]
     with pytest.raises(TrainingError, match="its arrays contradict each other"):
-        read_checkpoint(changed_checkpoint(trained, tmp_path / "bad.npz", partition_of=change(own)))
+        read_checkpoint(changed_checkpoint(trained, tmp_path / "bad.npz", partition_indices=change(own)))
 
 
-def test_borders_of_another_mesh_are_refused(odd, trained):
+def test_partitions_of_another_mesh_are_refused(odd, trained):
     checkpoint = read_checkpoint(checkpoint_path(trained))
     with pytest.raises(TrainingError, match="is of other partitions; train without --warm-start"):
-        checkpoint.cut(odd.partitions[:2])
+        checkpoint.reassign(odd.partitions[:2])
 
 
-def test_it_can_be_stopped(odd):
+def test_a_stop_request_cancels_the_refinement(odd):
     split = split_recording(odd, TrainingConfig())
     with pytest.raises(Cancelled):
-        better_borders(odd, split, False, 0.2, 24, lambda: True)
+        refine_partitions(odd, split, False, 0.2, 24, lambda: True)

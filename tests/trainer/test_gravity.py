@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Of a surface from a file or a simulation, training finds out whether it depends on which way is down."""
+"""The training detects whether a surface from a file or a simulation depends on gravity."""
 
 from pathlib import Path
 
@@ -10,8 +10,8 @@ from fdda_addon.core.partition import assume_nearby_influences, make_partitions
 from fdda_addon.core.recording.index import RecordingInfo, Sampling, Source
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.target import FRAMES, POSE, SIMULATION, RecordedTarget
-from trainer.data import Split
-from trainer.sagging import without_needless_down
+from trainer.gravity import drop_gravity_input
+from trainer.splitting import Split
 
 from .chain import LIMIT, chain_residuals, chain_rig, pose_chain
 
@@ -20,7 +20,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 
 def of_chain(follows: str, sag: float) -> Recording:
-    """A chain that bends and turns as a whole, and whose surface sags by so many metres."""
+    """A chain that bends and rotates as a whole, and whose surface sags by some meters."""
     rig = chain_rig(joints=4)
     angles = np.random.default_rng(0).uniform(-LIMIT, LIMIT, (POSES, 4, 2))
     matrices = pose_chain(rig, angles)
@@ -42,13 +42,13 @@ def split() -> Split:
 
 
 @pytest.mark.parametrize("follows", [FRAMES, SIMULATION])
-def test_a_surface_that_does_not_sag_is_not_told_which_way_is_down(follows):
-    found = without_needless_down(of_chain(follows, sag=0.0), split())
+def test_without_sag_the_gravity_input_is_dropped(follows):
+    found = drop_gravity_input(of_chain(follows, sag=0.0), split())
     assert [partition.influencing for partition in found.partitions] == [(1,), (1, 2), (1, 2, 3), (1, 2, 3)]
 
 
 @pytest.mark.parametrize("follows", [FRAMES, SIMULATION])
-def test_a_surface_that_sags_is_told(follows):
+def test_with_sag_the_gravity_input_stays(follows):
     recording = of_chain(follows, sag=0.01)
     assert [partition.influencing for partition in recording.partitions] == [
         (0, 1),
@@ -56,21 +56,21 @@ def test_a_surface_that_sags_is_told(follows):
         (0, 1, 2, 3),
         (0, 1, 2, 3),
     ]
-    assert without_needless_down(recording, split()) is recording
+    assert drop_gravity_input(recording, split()) is recording
 
 
-def test_what_follows_the_pose_at_once_keeps_the_influences_that_were_found():
+def test_a_target_that_follows_the_pose_keeps_its_influences():
     recording = of_chain(POSE, sag=0.0)
-    assert without_needless_down(recording, split()) is recording
+    assert drop_gravity_input(recording, split()) is recording
 
 
-def test_poses_that_are_held_out_do_not_matter():
+def test_held_out_poses_are_not_used():
     recording = of_chain(FRAMES, sag=0.0)
     recording.residuals[split().held_out] = np.nan
-    assert without_needless_down(recording, split()) is not recording
+    assert drop_gravity_input(recording, split()) is not recording
 
 
-def test_roots_that_move_against_each_other_stay():
+def test_several_roots_stay():
     rig = chain_rig(joints=2)
     apart = type(rig)(
         tuple(type(joint)(joint.name, -1) for joint in rig.joints), rig.rest_positions, rig.rest_matrices,

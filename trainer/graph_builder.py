@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Nodes and constants of an ONNX graph that is being built."""
+"""Builds the nodes and constants of an ONNX graph."""
 
 import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
 
-class Graph:
-    """Nodes and constants, named as they are added."""
+class GraphBuilder:
+    """Collects nodes and constants; each method returns the name of what it added."""
 
     def __init__(self):
         self.nodes: list[onnx.NodeProto] = []
@@ -18,25 +18,28 @@ class Graph:
         return name
 
     def floats(self, name: str, value: np.ndarray) -> str:
+        """Add a float32 constant."""
         return self._constant(name, np.asarray(value, np.float32))
 
     def integers(self, name: str, value: np.ndarray) -> str:
+        """Add an int64 constant."""
         return self._constant(name, np.asarray(value, np.int64))
 
     def short_integers(self, name: str, value: np.ndarray) -> str:
-        """For long indices: a frame reads them all."""
+        """Add an int32 constant, for large index arrays: each frame reads all of them."""
         return self._constant(name, np.asarray(value, np.int32))
 
     def add(self, operator: str, inputs: list[str], output: str, **attributes) -> str:
+        """Add a node with one output."""
         self.nodes.append(helper.make_node(operator, inputs, [output], name=output, **attributes))
         return output
 
     def join(self, values: list[str], output: str, axis: int) -> str:
-        """Concat; a single value is itself."""
+        """Concatenate values; a single one needs no node."""
         return self.add("Concat", values, output, axis=axis) if len(values) > 1 else values[0]
 
     def split(self, value: str, sizes: list[int], outputs: list[str], axis: int) -> list[str]:
-        """Split; a single part is the value itself."""
+        """Split a value; a single part needs no node."""
         if len(sizes) == 1:
             return [value]
         inputs = [value, self.integers(f"{outputs[0]}_sizes", sizes)]
@@ -44,8 +47,10 @@ class Graph:
         return outputs
 
     def slice(self, value: str, start: int, end: int, axis: int, output: str) -> str:
+        """Take the elements from `start` to before `end` along an axis."""
         bounds = (self.integers(f"{output}_{key}", [v]) for key, v in (("start", start), ("end", end), ("axis", axis)))
         return self.add("Slice", [value, *bounds], output)
 
     def reshape(self, value: str, shape: list[int], output: str) -> str:
+        """Reshape a value; 0 keeps a dimension, -1 infers it."""
         return self.add("Reshape", [value, self.integers(f"{output}_shape", shape)], output)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Turn matrices: found where a rig blends rotations, asked of no other, and the graph has them as the reference."""
+"""Half-rotation features: used where a rig blends rotations and nowhere else; the graph computes the same."""
 
 import json
 from dataclasses import replace
@@ -16,19 +16,19 @@ from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 from fdda_addon.core.rig import Rig
 from fdda_addon.core.skinning import LinearSkinning, skin_matrices
-from trainer import playback_nodes
+from trainer import skinning_nodes
 from trainer.__main__ import main
 from trainer.config import TrainingConfig
-from trainer.data import split_recording
-from trainer.deformation import Deformation
 from trainer.graph import build_graph
-from trainer.joint_fit import JointFit, surroundings_of_rig
+from trainer.half_rotations import half_rotation_matrices, half_rotations_help, regression_matrices
+from trainer.joint_fit import JointFit, joint_regression
 from trainer.process import Cancelled
-from trainer.turns import fit_matrices, turn_matrices, turns_help
+from trainer.splitting import split_recording
+from trainer.trained_model import TrainedModel
 
 from .chain import chain_angles, chain_info, chain_rig, pose_chain, rotation, write_chain
 from .conftest import QUICK
-from .test_graph import agrees, constant_bytes, keep_deformation
+from .test_graph import check_agreement, constant_bytes, keep_trained_model
 from .tube import write_tube
 
 POSES, REACH = 160, 1.8
@@ -54,7 +54,7 @@ def blend_rotations(rig: Rig, pose_matrices: np.ndarray) -> np.ndarray:
 
 
 def product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Of quaternions (..., 4), the scalar first."""
+    """Multiply quaternions (..., 4), the scalar first."""
     scalar = first[..., 0] * second[..., 0] - (first[..., 1:] * second[..., 1:]).sum(axis=-1)
     vector = first[..., :1] * second[..., 1:] + second[..., :1] * first[..., 1:]
     return np.append(scalar[..., None], vector + np.cross(first[..., 1:], second[..., 1:]), axis=-1)
@@ -89,20 +89,20 @@ def recording(tmp_path_factory) -> Recording:
 
 @pytest.fixture(scope="module")
 def trained(recording, tmp_path_factory) -> tuple:
-    """The deformation and the path of its model."""
+    """The trained model, and the path of its file."""
     path = tmp_path_factory.mktemp("models") / "volume.onnx"
     with pytest.MonkeyPatch.context() as monkeypatch:
-        made = keep_deformation(monkeypatch)
+        made = keep_trained_model(monkeypatch)
         assert main([str(recording.path), str(path), *QUICK]) == 0
     return made[0], path
 
 
 def helpful(recording: Recording) -> bool:
-    return turns_help(recording, split_recording(recording, TrainingConfig()).training)
+    return half_rotations_help(recording, split_recording(recording, TrainingConfig()).training)
 
 
 def pose_second(rig: Rig, matrix: np.ndarray) -> np.ndarray:
-    """(1, J, 4, 4) pose matrices in which the second joint has a transform against where the first carries it."""
+    """(1, J, 4, 4) pose matrices with a transform of the second joint relative to the first."""
     rest = rig.rest_matrices.astype(np.float64)
     poses = rest.copy()
     poses[0] = rotation(1, 0.4) @ rest[0]
@@ -112,46 +112,46 @@ def pose_second(rig: Rig, matrix: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degrees", [-120, -60, 1, 30, 90, 120])
-def test_a_turn_goes_with_the_sine_of_half_the_angle(degrees):
+def test_a_half_rotation_is_proportional_to_the_sine_of_half_the_angle(degrees):
     rig, angle = chain_rig(), np.radians(degrees)
     poses = pose_second(rig, rotation(0, angle))
-    found = turn_matrices(poses, rig)[0]
+    found = half_rotation_matrices(poses, rig)[0]
     about = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]])
     carried = poses[0, 0, :3, :3] @ np.linalg.inv(rig.rest_matrices[0, :3, :3])
     rest = rig.rest_matrices[1, :3, :3]
     for size, tolerance in ((np.sin(angle) / (2 + np.cos(angle)), 1e-6), (0.687 * np.sin(angle / 2), 0.03)):
         expected = carried @ rest @ (size * about) @ np.linalg.inv(rest)
         np.testing.assert_allclose(found[1], expected, atol=tolerance * max(abs(size), 1e-3))
-    # A root turns against nothing, and the third joint not against the second.
+    # A root has no half rotation, and the third joint does not rotate relative to the second.
     assert not found[0].any() and np.abs(found[2]).max() < 1e-6
 
 
-def test_turns_go_along_with_the_character():
+def test_half_rotations_rotate_with_the_character():
     rig = chain_rig()
     poses = pose_chain(rig, chain_angles(5, 3, seed=3)).astype(np.float64)
     whole = rotation(0, 0.7) @ rotation(2, -1.9)
     whole[:3, 3] = 30, -20, 10
-    moved = fit_matrices((whole @ poses).astype(np.float32), rig, turns=True)[:, 3:]
-    expected = whole[:3, :3] @ fit_matrices(poses.astype(np.float32), rig, turns=True)[:, 3:]
+    moved = regression_matrices((whole @ poses).astype(np.float32), rig, use_half_rotations=True)[:, 3:]
+    expected = whole[:3, :3] @ regression_matrices(poses.astype(np.float32), rig, use_half_rotations=True)[:, 3:]
     np.testing.assert_allclose(moved, expected, atol=1e-5)
     assert not moved[..., 3].any() and np.abs(moved).max() > 0.1
 
 
 @pytest.mark.parametrize("matrix", [rotation(0, np.pi), np.diag([100, 100, 100, 1]), np.diag([-1, -1, -1, 1])])
-def test_no_pose_makes_a_turn_large(matrix):
-    """Half a turn round, a joint at a hundred times its size, and a mirrored one, whose divisor would be nothing."""
+def test_half_rotations_are_bounded(matrix):
+    """180 degrees, a joint at a hundred times its size, and a mirrored one, whose divisor would be 0."""
     rig = chain_rig()
-    assert np.abs(turn_matrices(pose_second(rig, matrix), rig)).max() < 1e-4
+    assert np.abs(half_rotation_matrices(pose_second(rig, matrix), rig)).max() < 1e-4
 
 
-def test_they_say_most_of_what_preserving_volume_leaves(recording):
+def test_they_explain_most_of_the_residuals_of_preserved_volume(recording):
     split = split_recording(recording, TrainingConfig())
     for partition in recording.partitions:
         residuals, left = recording.residuals[:, partition.vertices], []
-        for turns in (False, True):
-            matrices = fit_matrices(recording.pose_matrices, recording.rig, turns)
-            surroundings = surroundings_of_rig(recording.rig, partition, matrices)
-            fit, rest = surroundings.fit(residuals, split.training)
+        for use_half_rotations in (False, True):
+            matrices = regression_matrices(recording.pose_matrices, recording.rig, use_half_rotations)
+            regression = joint_regression(recording.rig, partition, matrices)
+            fit, rest = regression.fit(residuals, split.training)
             left.append(float((rest[split.held_out].astype(np.float64) ** 2).mean()))
             offsets = fit.offsets(matrices) @ np.linalg.inv(matrices[:, partition.joint, :, :3]).transpose(0, 2, 1)
             np.testing.assert_allclose(residuals - offsets, rest, atol=1e-5)
@@ -165,72 +165,72 @@ def test_units_and_place_change_nothing(tmp_path, recording, per_metre, away):
     assert helpful(recording) and helpful(other)
     joints = []
     for each in (recording, other):
-        matrices = fit_matrices(each.pose_matrices, each.rig, turns=True)
+        matrices = regression_matrices(each.pose_matrices, each.rig, use_half_rotations=True)
         partition = each.partitions[1]
-        surroundings = surroundings_of_rig(each.rig, partition, matrices)
-        joints.append(surroundings.fit(each.residuals[:, partition.vertices], np.arange(POSES))[0].joints.tolist())
+        regression = joint_regression(each.rig, partition, matrices)
+        joints.append(regression.fit(each.residuals[:, partition.vertices], np.arange(POSES))[0].joints.tolist())
     assert joints[0] == joints[1]
 
 
-def test_a_rig_that_mixes_matrices_has_none(tmp_path):
-    """Bulges that grow with the bend, skinning alone, and delta mush, which has deltas in place of turns."""
+def test_a_rig_that_blends_matrices_has_none(tmp_path):
+    """Bulges that grow with the bend, skinning alone, and delta mush, which has surface frames instead."""
     write_chain(tmp_path / "chain")
     bulges = read_recording(tmp_path / "chain")
     assert not helpful(bulges) and not helpful(replace(bulges, residuals=0 * bulges.residuals))
     write_tube(tmp_path / "tube")
     assert main([str(tmp_path / "tube"), str(tmp_path / "tube.onnx"), *QUICK]) == 0
     names = {node.name for node in onnx.load(tmp_path / "tube.onnx").graph.node}
-    assert "seen_deltas" in names and "turn_matrices" not in names
+    assert "surface_frame_features" in names and "half_rotation_matrices" not in names
 
 
-def test_the_search_stops_when_it_is_told(recording):
+def test_a_stop_request_cancels_the_measurement(recording):
     with pytest.raises(Cancelled):
-        turns_help(recording, np.arange(POSES), should_stop=lambda: True)
+        half_rotations_help(recording, np.arange(POSES), should_stop=lambda: True)
 
 
-def without_turns(deformation: Deformation) -> Deformation:
-    """The same deformation, fitted to the skin matrices alone."""
+def without_half_rotations(trained_model: TrainedModel) -> TrainedModel:
+    """The trained model fitted to the skin matrices alone."""
     prepared = []
-    for own in deformation.prepared:
-        count = int((own.fit.joints < len(deformation.rig.joints)).sum())
+    for own in trained_model.prepared:
+        count = int((own.fit.joints < len(trained_model.rig.joints)).sum())
         prepared.append(replace(own, fit=JointFit(own.fit.joints[:count], own.fit.factors[: 4 * count])))
-    return replace(deformation, prepared=tuple(prepared))
+    return replace(trained_model, prepared=tuple(prepared))
 
 
-def test_the_training_says_so_and_goes_on_with_them(recording, trained, capsys):
-    deformation, path = trained
-    assert deformation.turns().tolist() == [1, 2] and read_model_info(path).parity_mm < 1e-2
+def test_a_warm_start_keeps_half_rotations(recording, trained, capsys):
+    trained_model, path = trained
+    assert trained_model.half_rotation_joints().tolist() == [1, 2] and read_model_info(path).parity_mm < 1e-2
     assert main([str(recording.path), str(path), *QUICK, "--warm-start"]) == 0
     assert "The rig blends rotations" in capsys.readouterr().out
     report = json.loads((path.parent / "report.json").read_text())
     assert report["fdda"]["held_out"]["mean"] < 0.1 * report["linear"]["held_out"]["mean"]
 
 
-def test_they_cost_thirteen_nodes_and_three_numbers_a_vertex(trained, monkeypatch):
-    deformation = trained[0]
-    monkeypatch.setattr(playback_nodes, "PADDING_FLOATS", 0)
-    graph, plain = (build_graph(each) for each in (deformation, without_turns(deformation)))
+def test_they_cost_thirteen_nodes_and_three_parameters_per_vertex(trained, monkeypatch):
+    trained_model = trained[0]
+    monkeypatch.setattr(skinning_nodes, "MAX_PADDING_ELEMENTS", 0)
+    graph, plain = (build_graph(each) for each in (trained_model, without_half_rotations(trained_model)))
     assert len(graph.graph.node) == len(plain.graph.node) + 13
-    turns = [(int((own.fit.joints >= 3).sum()), own.vertices) for own in deformation.prepared]
+    turns = [(int((own.fit.joints >= 3).sum()), own.vertex_count) for own in trained_model.prepared]
     numbers = 3 * sum(count * vertices for count, vertices in turns)
     assert 4 * numbers < constant_bytes(graph) - constant_bytes(plain) < 4 * numbers + 2_000
 
 
 @pytest.mark.parametrize("sheared", [False, True])
-def test_the_graph_plays_them(trained, sheared):
-    deformation = replace(trained[0], sheared=sheared)
-    poses = pose_chain(deformation.rig, chain_angles(20, 3, seed=5, reach=1.2 * REACH))
-    agrees(deformation, poses)
+def test_the_graph_agrees_with_pytorch(trained, sheared):
+    trained_model = replace(trained[0], sheared=sheared)
+    poses = pose_chain(trained_model.rig, chain_angles(20, 3, seed=5, reach=1.2 * REACH))
+    check_agreement(trained_model, poses)
     poses[:, 1:] = poses[:, 1:] @ np.diag([1.1, 0.9, 1.05, 1]).astype(np.float32)
-    agrees(deformation, poses)
-    # Mirrored: what is divided by would be less than nothing.
-    agrees(deformation, pose_second(deformation.rig, np.diag([-3, -3, -3, 1])))
+    check_agreement(trained_model, poses)
+    # Mirrored: the divisor would be negative.
+    check_agreement(trained_model, pose_second(trained_model.rig, np.diag([-3, -3, -3, 1])))
 
 
-def test_bones_that_are_sheared_turn_as_well(tmp_path, monkeypatch):
+def test_sheared_bones_have_half_rotations(tmp_path, monkeypatch):
     squash = rotation(0, 0.7) @ np.diag([1, 1, 0.6, 1]) @ rotation(0, -0.7)
-    made = keep_deformation(monkeypatch)
+    made = keep_trained_model(monkeypatch)
     sheared = write_volume(tmp_path / "volume", squash=squash)
     assert main([str(sheared.path), str(tmp_path / "model.onnx"), *QUICK]) == 0
-    assert made[0].sheared and len(made[0].turns())
+    assert made[0].sheared and len(made[0].half_rotation_joints())
     assert read_model_info(tmp_path / "model.onnx").parity_mm < 1e-2

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks what a page is made of, which may be from anyone: a report, and the JSON that `evaluate` writes.
+"""Validates the files that a report page is made from: a report, and the JSON that `evaluate` writes.
 
-`core.report` sees to it that what the page shows as a number is a number: only text, which the page escapes, could hold
-a tag. Here is what else has to be true of the numbers, so that they can be drawn.
+The files may be damaged or hostile. `core.report` checks the types, so that only text, which the page escapes, can hold
+HTML. This module checks that the numbers can be drawn.
 """
 
 import json
@@ -13,45 +13,46 @@ from pathlib import Path
 from fdda_addon.core.errors import TrainingError, os_error_text
 from fdda_addon.core.input_file import read_input
 
-from .charts import SMALLEST
+from .charts import MIN_AXIS_MM
 
 MAX_BYTES = 256 << 20
-LARGEST = 1e12
+MAX_EDGE_MM = 1e12
+"""Maximum bin edge of the histogram, mm."""
 STATISTICS = ("mean", "rms", "p99", "p999", "max")
 
 
 def check_drawable(report: dict, path: Path) -> None:
-    """Fail where the numbers of a report, all of them numbers, cannot be drawn.
+    """Check that the numbers of a report can be drawn.
 
     Args:
-        report: what `core.report.read_report` gave.
-        path: of it.
+        report: as from `core.report.read_report`.
+        path: of the report.
 
     Raises:
-        TrainingError: says what is wrong with them.
+        TrainingError: they cannot.
     """
     histogram = report["histogram"]
     edges, counts = histogram["edges"], (histogram["fdda"], histogram["linear"])
     problems = {
         "it has no partitions": not report["partitions"],
-        "its histogram has not as many counts as edges": not all(len(edges) == len(own) + 1 > 3 for own in counts),
-        "its histogram counts nothing": not all(min(own, default=0) >= 0 and any(own) for own in counts),
+        "its histogram has not as many counts as edges": not all(len(edges) == len(bins) + 1 > 3 for bins in counts),
+        "its histogram counts nothing": not all(min(bins, default=0) >= 0 and any(bins) for bins in counts),
         "the edges of its histogram do not ascend": not all(low < high for low, high in pairwise(edges))
-        or not all(SMALLEST <= edge <= LARGEST for edge in edges[1:]),
+        or not all(MIN_AXIS_MM <= edge <= MAX_EDGE_MM for edge in edges[1:]),
         "a curve is empty": any(
             bool(p["curve"]["training"]) != bool(p["curve"]["validation"]) for p in report["partitions"]
         ),
         "it has normals without edges": bool(report.get("normals")) and not report.get("edges"),
     }
-    if found := [problem for problem, is_there in problems.items() if is_there]:
-        raise TrainingError(f"The report '{path}' is damaged: {found[0]}; train again.")
+    if present := [problem for problem, is_present in problems.items() if is_present]:
+        raise TrainingError(f"The report '{path}' is damaged: {present[0]}; train again.")
 
 
 def read_evaluation(path: Path) -> dict:
-    """Read what `evaluate --json` wrote, as far as the page shows it.
+    """Read the JSON that `evaluate` wrote, and check the values that the page shows.
 
     Raises:
-        TrainingError: it is something else, or damaged.
+        TrainingError: the file is damaged, or of another kind.
     """
     try:
         evaluation = json.loads(read_input(path, MAX_BYTES))

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The analysis of the largest errors finds the cause that the test makes."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from trainer.__main__ import main
+from trainer.error_analysis import _cause
+from trainer.error_causes import CAUSES, COMPONENTS, EXTREMES, NONE, POSES, STEEP
+from trainer.report_page import render_html
+
+from .chain import write_chain
+
+
+def train_chain(folder: Path, poses: int, *options: str) -> list[dict]:
+    write_chain(folder / "chain", poses)
+    assert main([str(folder / "chain"), str(folder / "chain.onnx"), *options]) == 0
+    report = json.loads((folder / "report.json").read_text())
+    return report["partitions"]
+
+
+def test_too_few_components(tmp_path):
+    """With a tolerance of two millimeters nearly all of the error is what no component represents."""
+    partitions = train_chain(tmp_path, 200, "--epochs", "60", "--tolerance-mm", "2")
+    analyses = [p["largest_errors"] for p in partitions if p["held_out"]["max"] > 1]
+    assert analyses and all(a["truncation"] > 0.8 and a["cause"] == COMPONENTS for a in analyses)
+
+
+def test_too_few_poses(tmp_path):
+    """Thirty poses and many epochs: training poses are right, the others are not."""
+    partitions = train_chain(tmp_path, 30, "--epochs", "300", "--tolerance-mm", "0.001", "--held-out-fraction", "0.4")
+    analysis = max(partitions, key=lambda p: p["held_out"]["max"])["largest_errors"]
+    assert analysis["generalization"] > 1.5 and analysis["cause"] in (POSES, EXTREMES)
+
+
+@pytest.mark.parametrize(
+    ("truncation", "distance", "generalization", "cause"),
+    [
+        (0.9, 3.0, 3.0, COMPONENTS),
+        (0.1, 1.0, 3.0, POSES),
+        (0.1, 3.0, 3.0, EXTREMES),
+        (0.1, 3.0, 1.0, EXTREMES),
+        (0.1, 1.0, 1.0, STEEP),
+        (0.4, 1.0, 1.0, NONE),
+    ],
+)
+def test_causes(truncation, distance, generalization, cause):
+    assert _cause(truncation, distance, generalization) == cause and cause in CAUSES
+
+
+def test_the_page_shows_the_analysis(report):
+    page = render_html(report)
+    assert "The largest errors" in page
+    for partition in report["partitions"]:
+        assert partition["largest_errors"]["vertices"] <= partition["vertices"]
+        curve = partition["curve"]
+        assert len(curve["worst"]) == len(curve["validation"])
+        assert all(worst >= mean for worst, mean in zip(curve["worst"], curve["validation"], strict=True))

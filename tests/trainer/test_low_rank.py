@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Low-rank factors of large partitions: fewer parameters, the same positions, at any place and in any unit."""
+
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+
+from fdda_addon.core.partition import Partition, make_partitions
+from fdda_addon.core.recording.writer import RecordingWriter
+from fdda_addon.core.rig import Rig
+from fdda_addon.core.skinning import LinearSkinning, skin_matrices
+from trainer import low_rank
+from trainer.__main__ import main
+from trainer.basis import make_basis
+from trainer.graph import build_graph
+from trainer.joint_fit import JointFit, JointRegression, joint_regression
+from trainer.low_rank import TOLERANCE_RATIO, LowRankFactors, may_factorize
+from trainer.trained_model import TrainedModel
+
+from .chain import chain_angles, chain_info, chain_rig, pose_chain
+from .conftest import QUICK
+from .test_graph import check_agreement, keep_trained_model, run_graph
+
+JOINTS, VERTICES, POSES = 3, 6_000, 120
+INFLUENCING = {0: (1,), 1: (1, 2), 2: (2,)}
+TOLERANCE = 4e-5
+TRAINING = np.arange(POSES)
+ONES = np.ones(POSES)
+
+
+def sliding(rig: Rig, angles: np.ndarray) -> np.ndarray:
+    """(N, V, 3) float32 local residuals, bulges that slide with the bends, which need many components."""
+    place = rig.rest_positions[:, 2] * JOINTS
+    residuals = np.zeros((len(angles), rig.vertex_count, 3))
+    for joint in range(1, JOINTS):
+        bend, twist = angles[:, joint, :1], angles[:, joint, 1:]
+        bulge = np.exp(-(((place - joint - 0.5 * bend) / 0.3) ** 2)) * 0.02
+        residuals[:, :, 0] += bulge * bend**2
+        residuals[:, :, 1] += bulge * np.sin(twist) * np.cos(7 * place + twist)
+    return residuals.astype(np.float32)
+
+
+class Prepared:
+    """A partition of the tube, fitted, with its basis.
+
+    Args:
+        away: how far the tube stands from the origin, meters.
+        per_metre: mesh units.
+    """
+
+    def __init__(self, away: float = 0.0, per_metre: float = 1.0, still: bool = False):
+        rig, angles = chain_rig(JOINTS, VERTICES), chain_angles(POSES, JOINTS, 0)
+        residuals = sliding(rig, angles) * (not still)
+        there = np.eye(4)
+        there[:3, 3] = away
+        self.rig, poses = moved(rig, there, per_metre), there @ pose_chain(rig, angles)
+        poses[..., :3, 3] *= per_metre
+        self.partition: Partition = make_partitions(self.rig, INFLUENCING)[1]
+        self.skin = skin_matrices(poses, self.rig.rest_matrices)
+        self.regression: JointRegression = joint_regression(self.rig, self.partition, self.skin)
+        own = residuals[:, self.partition.vertices] * np.float32(per_metre)
+        self.tolerance = TOLERANCE * per_metre
+        self.fit, left = self.regression.fit(own, TRAINING)
+        left = left.reshape(POSES, -1)
+        self.basis = make_basis(left, self.tolerance, np.random.default_rng(0))
+        self.coefficients = self.basis.coefficients(left)
+
+    def factorize(self, weights: np.ndarray = ONES) -> LowRankFactors | None:
+        arguments = self.fit, self.basis, self.coefficients, self.regression, TRAINING, weights, self.tolerance
+        return low_rank.factorize(*arguments)
+
+    def offsets(self, of: "Prepared | LowRankFactors") -> np.ndarray:
+        """(N, Vp, 3) offsets from linear skinning as the main joint sees them, mesh units."""
+        turned = np.linalg.inv(self.skin[:, self.partition.joint, :3, :3].astype(np.float64))
+        fitted = of.fit.offsets(self.skin) @ turned.transpose(0, 2, 1)
+        return fitted + of.basis.residuals(of.coefficients).reshape(fitted.shape)
+
+
+def moved(rig: Rig, there: np.ndarray, per_metre: float) -> Rig:
+    rest = there @ rig.rest_matrices
+    rest[:, :3, 3] *= per_metre
+    positions = (rig.rest_positions + there[:3, 3]) * per_metre
+    return replace(
+        rig,
+        rest_positions=positions.astype(np.float32),
+        rest_matrices=rest.astype(np.float32),
+        metres_per_unit=1 / per_metre,
+    )
+
+
+@pytest.fixture(scope="module")
+def prepared() -> Prepared:
+    return Prepared()
+
+
+def rms(error: np.ndarray) -> float:
+    return float(np.sqrt((error**2).sum(axis=2).mean()))
+
+
+@pytest.mark.parametrize("away, per_metre", [(0, 1), (100, 1), (0, 1000), (100, 1000)])
+def test_factors_give_the_same_offsets_with_fewer_parameters(away, per_metre):
+    prepared = Prepared(away, per_metre)
+    factors = prepared.factorize()
+    row_count = len(prepared.fit.factors) + 3 * len(prepared.basis.components)
+    # The rank does not depend on place and unit.
+    assert len(factors.vertex_factors) == len(Prepared().factorize().vertex_factors) < row_count / 2
+    error = rms(prepared.offsets(factors) - prepared.offsets(prepared)) / per_metre
+    # Rounding to float32 100 m away is larger than the error of the factors.
+    assert 0 < error < TOLERANCE_RATIO * TOLERANCE + away * 2e-7
+    assert factors.error_rms / per_metre <= TOLERANCE_RATIO * TOLERANCE
+    if not away:
+        assert error == pytest.approx(factors.error_rms / per_metre, rel=0.02)
+
+
+def test_fit_and_basis_are_in_the_span_of_the_factors(prepared):
+    factors = prepared.factorize()
+    count, vertices = len(factors.basis.components), len(prepared.partition.vertices)
+    np.testing.assert_allclose(
+        factors.vertex_factors @ factors.vertex_factors.T, np.eye(len(factors.vertex_factors)), atol=1e-5
+    )
+    np.testing.assert_allclose(factors.basis.components @ factors.basis.components.T, np.eye(count), atol=1e-5)
+    for parameters in (
+        factors.fit.factors,
+        factors.basis.mean.reshape(vertices, 3).T,
+        *factors.basis.components.reshape(count, vertices, 3).transpose(0, 2, 1),
+    ):
+        np.testing.assert_allclose(
+            parameters @ factors.vertex_factors.T @ factors.vertex_factors,
+            parameters,
+            atol=1e-5 * np.abs(parameters).max(),
+        )
+    # A common motion of all joints still moves nothing.
+    np.testing.assert_allclose(factors.fit.factors.reshape(-1, 4, vertices)[:, 3].sum(axis=0), 0, atol=1e-6)
+
+
+def test_the_basis_has_the_error_of_the_factors(prepared):
+    factors = prepared.factorize()
+    assert factors.basis.truncation_rms == pytest.approx(np.hypot(prepared.basis.truncation_rms, factors.error_rms))
+    assert len(factors.basis.error_by_count) == len(factors.basis.components) + 1
+
+
+def test_a_lower_pose_weight_lowers_the_rank(prepared):
+    weights = np.where(TRAINING < 2, 1.0, 1e-9)
+    assert len(prepared.factorize(weights).vertex_factors) < len(prepared.factorize().vertex_factors)
+
+
+def test_zero_residuals_have_rank_zero():
+    still = Prepared(still=True)
+    # More joints than the residuals need.
+    factors = np.zeros((12, len(still.partition.vertices)), np.float32)
+    still.fit = JointFit(np.arange(3)[[1, 0, 2]], factors)
+    factors = still.factorize()
+    assert factors.vertex_factors.shape == (0, len(still.partition.vertices)) and len(factors.basis.components) == 0
+    assert not still.offsets(factors).any() and factors.coefficients.shape == (POSES, 0)
+
+
+def test_small_partitions_are_not_factorized(prepared):
+    few = slice(0, 100)
+    fit = replace(prepared.fit, factors=prepared.fit.factors[:, few])
+    basis = replace(prepared.basis, mean=prepared.basis.mean[:300], components=prepared.basis.components[:, :300])
+    assert may_factorize(prepared.fit, prepared.basis)
+    assert not may_factorize(fit, basis)
+    # Without joints.
+    assert not may_factorize(JointFit(np.zeros(0, np.int64), prepared.fit.factors[:0]), prepared.basis)
+
+
+def test_independent_parameters_are_not_factorized(prepared):
+    rng = np.random.default_rng(0)
+    other = Prepared()
+    other.fit = replace(other.fit, factors=rng.normal(0, 0.1, other.fit.factors.shape).astype(np.float32))
+    count = len(other.basis.components)
+    shapes = np.linalg.qr(rng.normal(0, 1, (3 * len(other.partition.vertices), count)))[0]
+    other.basis = replace(other.basis, components=shapes.T.astype(np.float32))
+    other.coefficients = rng.normal(0, 1, other.coefficients.shape).astype(np.float32)
+    assert other.factorize() is None
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> TrainedModel:
+    rig, angles = chain_rig(JOINTS, VERTICES), chain_angles(POSES, JOINTS, 0)
+    path = tmp_path_factory.mktemp("low_rank")
+    with RecordingWriter(path / "recording", rig, make_partitions(rig, INFLUENCING), chain_info(POSES)) as writer:
+        writer.append(pose_chain(rig, angles), sliding(rig, angles))
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        made = keep_trained_model(monkeypatch)
+        assert main([str(path / "recording"), str(path / "model.onnx"), *QUICK]) == 0
+    return made[0]
+
+
+def test_the_graph_agrees_with_pytorch(trained):
+    assert all(own.vertex_factors is not None for own in trained.prepared)
+    graph = build_graph(trained).graph
+    sizes = {constant.name: onnx.numpy_helper.to_array(constant).shape for constant in graph.initializer}
+    factorized = [number for number in range(JOINTS) if f"left_factor_{number}" in sizes]
+    assert factorized == list(range(JOINTS))
+    for number in factorized:
+        rows, columns = sizes[f"left_factor_{number}"]
+        assert sizes[f"matrix_{number}"][0] == columns < rows
+    assert (check_agreement(trained, pose_chain(trained.rig, chain_angles(20, JOINTS, 5) * [1, 0])) > 0).all()
+
+
+def test_the_graph_agrees_far_away_and_beyond_the_range(trained):
+    poses = pose_chain(trained.rig, chain_angles(20, JOINTS, 5, reach=1.2))
+    there = np.eye(4)
+    there[:3, 3] = 60, -70, 40
+    confidence = check_agreement(trained, (there @ poses).astype(np.float32), tolerance=1e-4)
+    assert (confidence < 1).any()
+    folded = pose_chain(trained.rig, np.full((1, JOINTS, 2), 3.0))
+    positions, confidence = run_graph(trained, folded)
+    middle = trained.partitions[1].vertices
+    assert confidence[0, 1] == 0
+    linear = LinearSkinning(trained.rig).positions(folded)
+    np.testing.assert_allclose(positions[:, middle], linear[:, middle], atol=1e-6)

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Learning curves of a training."""
+
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Curves:
+    """Errors of one partition by epoch, as rms distances over vertices, mm.
+
+    Attributes:
+        training_mm: mean over the training poses, with the current weights.
+        validation_mm: mean over the validation poses, with the averaged weights.
+        worst_mm: maximum over the validation poses, with the averaged weights.
+        best_epoch: of the lowest `validation_mm`; 1 is the first.
+    """
+
+    training_mm: list[float] = field(default_factory=list)
+    validation_mm: list[float] = field(default_factory=list)
+    worst_mm: list[float] = field(default_factory=list)
+    best_epoch: int = 0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Errors after an epoch, 1 is the first: means of the curves weighted by vertices, mm."""
+
+    epoch: int
+    epochs: int
+    training_mm: float
+    validation_mm: float

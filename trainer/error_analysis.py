@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Analyzes the largest errors of each partition, to report what would lower them."""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from fdda_addon.core.features import FEATURES_PER_JOINT, joint_features
+from fdda_addon.core.partition import Partition
+from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.refinement import nearest_recorded_distances
+
+from .data import PreparedPartition, residuals_of
+from .error_causes import COMPONENTS, EXTREMES, NONE, POSES, STEEP
+from .half_rotations import regression_matrices
+from .splitting import Split
+from .trained_model import TrainedModel
+
+ANALYZED_FRACTION = 5e-3
+"""Part of a partition's held-out errors that is analyzed, the largest ones, at least one."""
+MAX_TRAINING_POSES = 2000
+"""Maximum number of training poses among which the nearest is searched."""
+MIN_TRUNCATION_FRACTION = 0.5
+"""Components are the cause where they leave at least this part of the squared error."""
+MIN_GENERALIZATION_RATIO = 1.5
+"""Poses are the cause where held-out errors are at least this many times the training errors."""
+MIN_DISTANCE_RATIO = 1.5
+"""The poses are extreme where the nearest training pose is at least this many times as far as usual."""
+MIN_SPREAD_RATIO = 1e-3
+"""Features that spread less than this part of the largest spread are ignored."""
+
+
+@dataclass(frozen=True)
+class ErrorAnalysis:
+    """The largest held-out errors of one partition.
+
+    Attributes:
+        poses, vertices: numbers of different poses and vertices that have them.
+        truncation: part of their squares that the components do not represent.
+        boundary: how much more often they are at vertices with an edge to another partition; None where no vertex has
+            one, or the mesh has no faces.
+        joint: name of the influencing joint or control that is furthest from its mean in these poses; empty without
+            any.
+        extreme: distance of this joint from its mean, over the mean distance in all held-out poses.
+        distance: to the nearest training pose, over the median of all held-out poses.
+        generalization: 99.9th percentile of the held-out errors over that of the training errors.
+        cause: key of `error_causes.CAUSES`.
+    """
+
+    poses: int
+    vertices: int
+    truncation: float
+    boundary: float | None
+    joint: str
+    extreme: float
+    distance: float
+    generalization: float
+    cause: str
+
+    def to_json(self) -> dict:
+        """Convert to JSON."""
+        return asdict(self)
+
+
+def analyze_errors(
+    recording: Recording, trained_model: TrainedModel, split: Split, held_out: np.ndarray, on_training: np.ndarray
+) -> list[ErrorAnalysis]:
+    """Analyze the largest errors of each partition.
+
+    Args:
+        recording: that was trained on.
+        trained_model: the result of the training.
+        split: of the poses.
+        held_out: (n, V) float32 distances of the held-out poses, meters.
+        on_training: (m, V) float32 distances of some training poses, meters.
+    """
+    rig = recording.rig
+    training = split.training[:: max(1, len(split.training) // MAX_TRAINING_POSES)]
+    held_out_features, training_features = (
+        joint_features(np.array(recording.pose_matrices[poses]), rig.rest_matrices, rig.parents)
+        for poses in (split.held_out, training)
+    )
+    is_boundary = _boundary_mask(recording, trained_model)
+    analyses = []
+    for partition, prepared in zip(trained_model.partitions, trained_model.prepared, strict=True):
+        errors = held_out[:, partition.vertices].astype(np.float64)
+        count = max(1, round(errors.size * ANALYZED_FRACTION))
+        largest = np.argpartition(errors.ravel(), -count)[-count:]
+        poses, vertices = np.unravel_index(largest, errors.shape)
+        values, training_values = (
+            _influencing_values(recording, partition, features, rows)
+            for features, rows in ((held_out_features, split.held_out), (training_features, training))
+        )
+        nearest = nearest_recorded_distances(values, training_values) if values.shape[1] else np.zeros(len(values))
+        distance = _ratio(float(nearest[poses].mean()), float(np.median(nearest)))
+        joint, extreme = _most_extreme_joint(recording, partition, values, training_values, poses)
+        truncation = _truncation_fraction(recording, partition, prepared, split.held_out, poses, vertices, errors)
+        percentiles = (float(np.percentile(e, 99.9)) for e in (errors, on_training[:, partition.vertices]))
+        generalization = _ratio(*percentiles)
+        boundary = None
+        if is_boundary is not None and is_boundary[partition.vertices].any():
+            is_at_boundary = is_boundary[partition.vertices]
+            boundary = _ratio(float(is_at_boundary[vertices].mean()), float(is_at_boundary.mean()))
+        cause = _cause(truncation, distance, generalization)
+        counts = len(np.unique(poses)), len(np.unique(vertices))
+        analyses.append(ErrorAnalysis(*counts, truncation, boundary, joint, extreme, distance, generalization, cause))
+    return analyses
+
+
+def _influencing_values(
+    recording: Recording, partition: Partition, features: np.ndarray, poses: np.ndarray
+) -> np.ndarray:
+    """Return (n, f) features of the joints and controls that influence a partition; `features` (n, J, 12)."""
+    joints = features[:, list(partition.influencing)].reshape(len(features), -1)
+    return np.concatenate([joints, np.array(recording.controls[poses])[:, list(partition.controls)]], axis=1)
+
+
+def _cause(truncation: float, distance: float, generalization: float) -> str:
+    if truncation >= MIN_TRUNCATION_FRACTION:
+        return COMPONENTS
+    is_extreme = distance >= MIN_DISTANCE_RATIO
+    if generalization >= MIN_GENERALIZATION_RATIO:
+        return EXTREMES if is_extreme else POSES
+    return EXTREMES if is_extreme else STEEP if truncation < MIN_TRUNCATION_FRACTION / 2 else NONE
+
+
+def _ratio(value: float, reference: float) -> float:
+    return value / reference if reference > 0 else 1.0
+
+
+def _boundary_mask(recording: Recording, trained_model: TrainedModel) -> np.ndarray | None:
+    """Return (V,) bool, the vertices with an edge to another partition; None without faces."""
+    starts, corners = recording.rig.face_starts, recording.rig.face_vertices
+    if not len(starts):
+        return None
+    owner = np.zeros(recording.rig.vertex_count, np.int64)
+    for index, partition in enumerate(trained_model.partitions):
+        owner[partition.vertices] = index
+    ends = np.append(starts[1:], len(corners))
+    following = np.arange(len(corners)) + 1
+    following[ends - 1] = starts
+    crosses = owner[corners] != owner[corners[following]]
+    is_boundary = np.zeros(len(owner), bool)
+    is_boundary[corners[crosses]] = is_boundary[corners[following][crosses]] = True
+    return is_boundary
+
+
+def _most_extreme_joint(
+    recording: Recording, partition: Partition, values: np.ndarray, training_values: np.ndarray, poses: np.ndarray
+) -> tuple[str, float]:
+    """Find the joint or control that is furthest from its mean in the analyzed poses.
+
+    Args:
+        recording, partition: that the values are of.
+        values: (n, f) of the held-out poses, as from `_influencing_values`.
+        training_values: (m, f) of training poses.
+        poses: indices of the analyzed poses among the n.
+
+    Returns:
+        Its name, and its distance from the mean over the mean distance in all n poses.
+    """
+    names = [recording.rig.joint_names[joint] for joint in partition.influencing]
+    widths = [FEATURES_PER_JOINT] * len(names) + [1] * len(partition.controls)
+    names += [recording.rig.controls[control].name for control in partition.controls]
+    spread = training_values.std(axis=0, dtype=np.float64)
+    is_used = spread > spread.max(initial=0) * MIN_SPREAD_RATIO
+    squares = np.zeros(values.shape)
+    offsets = (values - training_values.mean(axis=0, dtype=np.float64))[:, is_used]
+    squares[:, is_used] = (offsets / spread[is_used]) ** 2
+    best, parts = ("", 1.0), np.split(squares, np.cumsum(widths), axis=1)
+    for name, columns in zip(names, parts[:-1], strict=True):
+        distances = np.sqrt(columns.sum(axis=1))
+        extreme = _ratio(float(distances[poses].mean()), float(distances.mean()))
+        best = max(best, (name, extreme), key=lambda pair: pair[1])
+    return best
+
+
+def _truncation_fraction(
+    recording: Recording,
+    partition: Partition,
+    prepared: PreparedPartition,
+    held_out: np.ndarray,
+    poses: np.ndarray,
+    vertices: np.ndarray,
+    errors: np.ndarray,
+) -> float:
+    """Return the part of the squared errors that fit and components do not represent.
+
+    Args:
+        recording, partition, prepared: of the training.
+        held_out: indices of the n held-out poses.
+        poses, vertices: indices of the analyzed errors.
+        errors: (n, Vp) distances, meters.
+    """
+    unique_poses, rows = np.unique(poses, return_inverse=True)
+    pose_indices = held_out[unique_poses]
+    remaining = residuals_of(recording, partition, pose_indices).astype(np.float64)
+    if len(prepared.fit.joints):
+        use_half_rotations = prepared.fit.joints.max() >= len(recording.rig.joints)
+        pose_matrices = np.array(recording.pose_matrices[pose_indices])
+        matrices = regression_matrices(pose_matrices, recording.rig, use_half_rotations)
+        to_local = np.linalg.inv(matrices[:, prepared.fit.joints[0], :, :3].astype(np.float64))
+        remaining -= prepared.fit.offsets(matrices) @ to_local.transpose(0, 2, 1)
+    remaining -= prepared.basis.residuals(prepared.coefficients[pose_indices]).reshape(remaining.shape)
+    distances = np.linalg.norm(remaining, axis=2)[rows, vertices] * recording.rig.metres_per_unit
+    return min(1.0, _ratio(float((distances**2).sum()), float((errors[poses, vertices] ** 2).sum())))

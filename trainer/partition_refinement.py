@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Reassigns vertices between neighboring partitions where that reduces the size of the model.
+
+Each vertex starts in the partition of its main joint, whichever joint its residual follows. Near a boundary the
+components of the neighboring partition may represent it better: what moves together there belongs to one basis, and
+both partitions need fewer components. The refinement alternates between computing bases and reassigning vertices, as in
+subspace clustering (Bradley and Mangasarian, k-Plane Clustering, 2000). A partition keeps its main joint, space and
+inputs.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+
+from fdda_addon.core.defaults import MIN_PARTITION_VERTICES
+from fdda_addon.core.partition import Partition
+from fdda_addon.core.recording.reader import Recording
+from fdda_addon.core.surface import Surface
+
+from .basis import FINE_TOLERANCE_FACTOR, allocate_components, make_basis
+from .data import MARGIN_POSE_WEIGHT, residuals_of
+from .half_rotations import regression_matrices
+from .joint_fit import MIN_SINGULAR_VALUE_RATIO, joint_regression
+from .process import Cancelled
+from .splitting import Split
+
+MAX_POSES = 300
+"""Maximum number of training poses that are evaluated."""
+MAX_ELEMENTS = 1 << 26
+"""Fewer poses are evaluated where their residuals would have more coordinates than this."""
+MAX_ROUNDS = 8
+MAX_ROUND_SIZE_RATIO, MAX_SIZE_RATIO = 0.98, 0.9
+"""Size over the size before, at most: for another round, and for all rounds together. Where the painted weights are
+nearly as good, partitions stay as they are, and rounding does not decide."""
+REASSIGNMENT_EDGES = 2
+"""Distance in edges within which a round reassigns vertices across a boundary."""
+COMPONENT_COST = 0.25
+"""Cost of a component for a vertex, as a part of the squared residual that the last components remove. At 1, vertices
+with nearly no residual move for the cost alone, and boundaries are ragged. At 0, partitions with many components absorb
+vertices that need few."""
+MIN_LEVERAGE_DIVISOR = 0.1
+"""Lower bound of 1 - leverage of a pose, for poses that no other pose resembles."""
+
+
+@dataclass(frozen=True)
+class _Bases:
+    """Bases of the partitions in their current state.
+
+    Attributes:
+        coefficients: by partition index, (n, K) float32, mesh units.
+        gain: squared residual that one more model parameter removes where it removes most, square mesh units.
+        size: parameters of the partitions' matrices, without the factors of the joint fit, and of the output layers.
+    """
+
+    coefficients: dict[int, np.ndarray]
+    gain: float
+    size: int
+
+
+class _Refinement:
+    """The state of a refinement: the partition of each vertex, and what the nearby joints leave of the residuals.
+
+    Attributes:
+        owner: (V,) int64, partition index of each vertex.
+    """
+
+    def __init__(self, recording: Recording, split: Split, use_half_rotations: bool, tolerance: float, units: int):
+        """Fit the joints and start from the partitions of the recording.
+
+        Args:
+            recording, split, use_half_rotations: as in `refine_partitions`.
+            tolerance, units: as in `allocate_components`.
+        """
+        rig, self._recording, self._partitions = recording.rig, recording, recording.partitions
+        max_poses = min(MAX_POSES, MAX_ELEMENTS // (3 * rig.vertex_count))
+        sample = np.unique(np.linspace(0, len(split.training) - 1, max_poses).astype(np.int64))
+        self._poses, self._pose_weights = split.training[sample], split.weights(MARGIN_POSE_WEIGHT)[sample]
+        self._tolerance, self._units = tolerance, units
+        matrices = regression_matrices(np.array(recording.pose_matrices[self._poses]), rig, use_half_rotations)
+        self._column_spaces = {}
+        for index, partition in enumerate(self._partitions):
+            regression = joint_regression(rig, partition, matrices)
+            # A partition without inputs neither gains nor loses vertices.
+            if (partition.influencing or partition.controls) and regression.is_determined():
+                self._column_spaces[index] = regression.column_space().astype(np.float32)
+        self._refinable = list(self._column_spaces)
+        self.owner = self._initial_owner = partition_indices(self._partitions)
+        edges, size = Surface(rig.face_starts, rig.face_vertices).edges, (rig.vertex_count,) * 2
+        adjacency = sparse.coo_array((np.ones(len(edges)), edges.T), size)
+        self._adjacency = (adjacency + adjacency.T + sparse.eye_array(rig.vertex_count)).tocsr()
+        self._unexplained = np.zeros((len(self._poses), rig.vertex_count, 3), np.float32)
+        for index in self._refinable:
+            vertices = self._partitions[index].vertices
+            self._unexplained[:, vertices] = self._unexplained_by(index, vertices)
+
+    def _unexplained_by(self, index: int, vertices: np.ndarray) -> np.ndarray:
+        """Remove what a partition's joints explain from the residuals of vertices.
+
+        Returns:
+            (n, v, 3) float32, in the space of the partition's main joint, mesh units.
+        """
+        partition, pose_count = replace(self._partitions[index], vertices=vertices), len(self._poses)
+        residuals = residuals_of(self._recording, partition, self._poses)
+        flat = residuals.transpose(0, 2, 1).reshape(3 * pose_count, len(vertices))
+        column_space = self._column_spaces[index]
+        unexplained = flat - column_space @ (column_space.T @ flat)
+        return unexplained.reshape(pose_count, 3, len(vertices)).transpose(0, 2, 1)
+
+    def bases(self) -> _Bases:
+        """Compute the bases of the partitions in their current state."""
+        bases, coefficients, size, rig = [], {}, 0, self._recording.rig
+        vertices_of = [np.flatnonzero(self.owner == index) for index in self._refinable]
+        for vertices in vertices_of:
+            unexplained = np.ascontiguousarray(self._unexplained[:, vertices]).reshape(len(self._poses), -1)
+            tolerance = self._tolerance / FINE_TOLERANCE_FACTOR
+            bases.append(make_basis(unexplained, tolerance, np.random.default_rng(0), self._pose_weights))
+        vertex_counts = [len(vertices) for vertices in vertices_of]
+        errors = [basis.error_by_count for basis in bases]
+        counts = allocate_components(errors, vertex_counts, self._tolerance, self._units)
+        gain = 0.0
+        for index, vertices, basis, count in zip(self._refinable, vertices_of, bases, counts, strict=True):
+            unexplained = self._unexplained[:, vertices].reshape(len(self._poses), -1)
+            coefficients[index] = basis.truncated(count).coefficients(unexplained)
+            joint_count = len(np.unique(rig.skin_joints[vertices][rig.skin_weights[vertices] > 0]))
+            size += len(vertices) * (3 * count + 4 * joint_count) + self._units * count
+            if count + 1 < len(basis.error_by_count):
+                removed = len(vertices) * (basis.error_by_count[count] ** 2 - basis.error_by_count[count + 1] ** 2)
+                gain = max(gain, float(removed) / (3 * len(vertices) + self._units))
+        return _Bases(coefficients, gain, size)
+
+    def reassign(self, bases: _Bases, should_stop: Callable[[], bool]) -> None:
+        """Assign each vertex near a boundary to the partition with the lowest cost.
+
+        Raises:
+            Cancelled: `should_stop` returned True.
+        """
+        vertex_count = len(self.owner)
+        coordinates = np.arange(vertex_count), self.owner
+        reachable = sparse.coo_array(
+            (np.ones(vertex_count), coordinates), (vertex_count, len(self._partitions))
+        ).tocsr()
+        for _ in range(REASSIGNMENT_EDGES):
+            reachable = self._adjacency @ reachable
+        is_contested = (np.diff(reachable.indptr) > 1) & np.isin(self.owner, self._refinable)
+        reachable = reachable.tocsc()
+        min_cost, owner = np.full(vertex_count, np.inf), self.owner.copy()
+        for index in self._refinable:
+            if should_stop():
+                raise Cancelled
+            vertices = np.sort(reachable.indices[reachable.indptr[index] : reachable.indptr[index + 1]])
+            vertices = vertices[is_contested[vertices]]
+            cost = self._costs(index, vertices, bases)
+            is_cheaper = cost < min_cost[vertices]
+            min_cost[vertices[is_cheaper]], owner[vertices[is_cheaper]] = cost[is_cheaper], index
+        for index in self._refinable:
+            initial = self._initial_owner == index
+            if (initial & (owner == index)).sum() < min(MIN_PARTITION_VERTICES, initial.sum()):
+                owner[initial] = index
+        is_moved, self.owner = owner != self.owner, owner
+        for index in np.unique(owner[is_moved]).tolist():
+            added = np.flatnonzero(is_moved & (owner == index))
+            self._unexplained[:, added] = self._unexplained_by(index, added)
+
+    def _costs(self, index: int, vertices: np.ndarray, bases: _Bases) -> np.ndarray:
+        """Return (v,) costs of vertices in a partition, square mesh units: residual, and a price for its components."""
+        is_own = self.owner[vertices] == index
+        unexplained = np.empty((len(self._poses), len(vertices), 3), np.float32)
+        unexplained[:, is_own] = self._unexplained[:, vertices[is_own]]
+        unexplained[:, ~is_own] = self._unexplained_by(index, vertices[~is_own])
+        roots = np.sqrt(self._pose_weights)[:, None]
+        coefficients = bases.coefficients[index]
+        left_vectors, singular_values, _ = np.linalg.svd(
+            np.append(coefficients, np.ones_like(roots), axis=1) * roots, full_matrices=False
+        )
+        left_vectors = left_vectors[:, singular_values > MIN_SINGULAR_VALUE_RATIO * singular_values[0]]
+        values = unexplained.reshape(len(unexplained), 3 * len(vertices)) * roots
+        errors = values - left_vectors @ (left_vectors.T @ values)
+        # Leave-one-out error: a pose with a component of its own is no evidence for the vertex.
+        errors /= np.maximum(1 - (left_vectors**2).sum(axis=1), MIN_LEVERAGE_DIVISOR)[:, None]
+        squares = (errors.reshape(unexplained.shape) ** 2).sum(axis=(0, 2)) / self._pose_weights.sum()
+        return squares + COMPONENT_COST * bases.gain * 3 * coefficients.shape[1]
+
+
+def refine_partitions(
+    recording: Recording,
+    split: Split,
+    use_half_rotations: bool,
+    tolerance_mm: float,
+    units: int,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> tuple[Partition, ...]:
+    """Reassign vertices between neighboring partitions so that the model has fewer parameters.
+
+    Rounds go on while each leaves at most `MAX_ROUND_SIZE_RATIO` of the size. The partitions stay unchanged when more
+    than `MAX_SIZE_RATIO` of the size remains, and for a mesh without faces.
+
+    Args:
+        recording: of the rig.
+        split: of its poses; only training poses are evaluated.
+        use_half_rotations: whether residuals are fitted to half-rotation matrices.
+        tolerance_mm: as in `TrainingConfig`.
+        units: of the last hidden layer.
+        should_stop: called often.
+
+    Raises:
+        Cancelled: `should_stop` returned True.
+    """
+    rig = recording.rig
+    if len(recording.partitions) < 2 or not len(rig.face_starts):
+        return recording.partitions
+    tolerance = tolerance_mm / (1000 * rig.metres_per_unit)
+    refinement = _Refinement(recording, split, use_half_rotations, tolerance, units + 1)
+    bases, owner = refinement.bases(), refinement.owner
+    initial_size = best_size = bases.size
+    for _ in range(MAX_ROUNDS):
+        refinement.reassign(bases, should_stop)
+        bases = refinement.bases()
+        if bases.size >= MAX_ROUND_SIZE_RATIO * best_size:
+            break
+        best_size, owner = bases.size, refinement.owner
+    if best_size < MAX_SIZE_RATIO * initial_size:
+        return reassign_vertices(recording.partitions, owner)
+    return recording.partitions
+
+
+def reassign_vertices(partitions: tuple[Partition, ...], owner: np.ndarray) -> tuple[Partition, ...]:
+    """Return the partitions with other vertices; `owner` (V,) is the partition index of each vertex."""
+    return tuple(
+        replace(partition, vertices=np.flatnonzero(owner == index).astype(np.int32))
+        for index, partition in enumerate(partitions)
+    )
+
+
+def partition_indices(partitions: tuple[Partition, ...]) -> np.ndarray:
+    """Return (V,) int64, the partition index of each vertex."""
+    owner = np.empty(sum(len(partition.vertices) for partition in partitions), np.int64)
+    for index, partition in enumerate(partitions):
+        owner[partition.vertices] = index
+    return owner

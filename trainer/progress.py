@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Sends the progress of the trainer: as JSON messages for the add-on, or as text for a person."""
+
+import sys
+from typing import Protocol
+
+from fdda_addon.core.messages import WARNING_LINE, Message, MessageType
+
+FINISHED_LINE = "Wrote '{model}': held-out error {held_out_mm:.4f} mm, {seconds:.1f} s."
+LINES = {
+    MessageType.STARTED: "Training {partitions} partitions, {vertices} vertices, {poses} poses, on {device}.",
+    MessageType.PARTITION_FINISHED: "  {joint}: {basis} components, held-out error {held_out_mm:.4f} mm",
+    MessageType.LOG: "{text}",
+    MessageType.WARNING: WARNING_LINE,
+    MessageType.MODEL_FINISHED: FINISHED_LINE,
+    MessageType.FINISHED: FINISHED_LINE,
+    MessageType.CANCELLED: "Cancelled; nothing was written.",
+}
+LINE_INTERVAL = 0.1
+"""Part of the epochs between lines of progress where the output is no terminal."""
+BAR_WIDTH = 30
+"""Characters of the progress bar."""
+
+
+class MessageSink(Protocol):
+    """Receives the messages of one training, in order."""
+
+    def send(self, kind: MessageType, **values) -> None:
+        """Send a message; `core.messages` has the keys of each type."""
+
+
+class JsonMessageSink:
+    """Writes messages as JSON lines to stdout."""
+
+    def send(self, kind: MessageType, **values) -> None:
+        """Send a message."""
+        print(Message(kind, values).encode(), flush=True)
+
+
+class TextMessageSink:
+    """Writes readable lines to stdout; a terminal shows progress on one line. Failures go to stderr elsewhere."""
+
+    def __init__(self):
+        self.is_terminal = sys.stdout.isatty()
+        self.has_open_line = False
+        self.last_shown_epoch = 0.0
+
+    def send(self, kind: MessageType, **values) -> None:
+        """Send a message."""
+        if kind is MessageType.PROGRESS:
+            self._show_progress(**values)
+            return
+        if self.has_open_line:
+            print()
+            self.has_open_line = False
+        if line := LINES.get(kind):
+            print(line.format(**values), flush=True)
+
+    def _show_progress(self, epoch: int, epochs: int, validation_mm: float, **_: float) -> None:
+        if self.is_terminal:
+            filled = round(BAR_WIDTH * epoch / epochs)
+            bar = "#" * filled + "." * (BAR_WIDTH - filled)
+            print(f"\r[{bar}] epoch {epoch}/{epochs}, validation {validation_mm:.4f} mm ", end="", flush=True)
+            self.has_open_line = True
+        elif epoch == epochs or epoch >= self.last_shown_epoch + LINE_INTERVAL * epochs:
+            self.last_shown_epoch = epoch
+            print(f"epoch {epoch}/{epochs}, validation {validation_mm:.4f} mm", flush=True)
