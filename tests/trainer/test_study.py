@@ -80,7 +80,7 @@ def test_networks_see_surface_frames_where_the_rig_smooths(tmp_path):
     inputs = inputs_of_rig(tube.rig, partition_centers(tube.rig, tube.partitions), small.partitions)
     model = tmp_path / "tube.onnx"
     train_once(Material(tube, small, small, inputs), TrainingConfig(epochs=1, hidden=(8, 8)), model)
-    seen = next(info for info in onnx.load(model).graph.initializer if info.name == "own_axes").dims
+    seen = next(info for info in onnx.load(model).graph.initializer if info.name == "main_joint_axes").dims
     split = split_poses(np.arange(len(tube.pose_matrices)), 0.05, 0)
     of_all = select_surface_frames(tube, split, TrainingConfig().tolerance_mm)
     assert seen[0] == (of_all.main_joints == 1).sum() < len(of_all)
