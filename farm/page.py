@@ -36,7 +36,7 @@ NOTHING = '<td class="soft">&ndash;</td>'
 
 
 def render_page(report: dict, pictures: dict[str, list[tuple[str, bytes]]]) -> str:
-    """The page.
+    """Return the page as HTML.
 
     Args:
         report: what `report.json` holds.

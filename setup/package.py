@@ -131,8 +131,10 @@ def build(package: Path) -> None:
 
 
 def check_size(package: Path) -> None:
-    """Raises:
-    PackageError: the zip is too large.
+    """Check that a zip is not too large.
+
+    Raises:
+        PackageError: it is.
     """
     size = package.stat().st_size / 1e6
     if size > LARGEST_MB:

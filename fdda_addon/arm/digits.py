@@ -109,7 +109,7 @@ def _box_outline(columns: int, sides: int) -> np.ndarray:
 
 
 def _grow(quads: GridBuilder, name: str, loop: list[int], shape: tuple[int, int], guide: tuple[int, int], count: int):
-    """A digit of `count` rings out of `loop`, which runs around it as a box outline of `shape` (columns, sides) does.
+    """Make a digit of `count` rings out of `loop`, which runs around it like a box outline of `shape`: columns, sides.
 
     guide: that shape at density 1. The tip is closed with a patch of that shape.
     """

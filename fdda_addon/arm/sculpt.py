@@ -36,14 +36,14 @@ _LIMB = [
 
 
 def _spindle_muscle(start, end, width: float, thickness: float, out) -> Ellipsoid:
-    """A round form from `start` to `end`: half as wide as `width`, half as thick as `thickness` along `out`."""
+    """Make a round form from `start` to `end`: half as wide as `width`, half as thick as `thickness` along `out`."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     radii = (np.linalg.norm(end - start) / 2, width, thickness)
     return Ellipsoid((start + end) / 2, radii, axes_along(end - start, out))
 
 
 def _muscle_belly(start, end, width: float, thickness: float, out, peak: float = 0.45, ends=(0.30, 0.25)) -> Loft:
-    """A muscle from `start` to `end`, thickest at the part `peak` of its length, thinner by `ends` at its ends."""
+    """Make a muscle from `start` to `end`, thickest at the part `peak` of its length, thinner by `ends` at its ends."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     length = float(np.linalg.norm(end - start))
     shape = [(0.0, ends[0]), (peak * 0.5, 0.5 * (1 + ends[0])), (peak, 1.0)]

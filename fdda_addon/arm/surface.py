@@ -19,8 +19,15 @@ _GUIDE_ROUNDS, _FINE_ROUNDS = 45, 11
 
 @dataclass(frozen=True)
 class Surface:
-    """points (v, 3) float64, metres, arm space; faces (f, 4) int32, outward; joints (v,) int32 into `JOINTS`;
-    biceps (v, 3) float64, offsets at full contraction, metres; nails (f,) bool, the faces of the nails."""
+    """The surface of the arm.
+
+    Attributes:
+        points: (v, 3) float64, metres, arm space.
+        faces: (f, 4) int32, outward.
+        joints: (v,) int32 into `JOINTS`.
+        biceps: (v, 3) float64, offsets at full contraction, metres.
+        nails: (f,) bool, the faces of the nails.
+    """
 
     points: np.ndarray
     faces: np.ndarray

@@ -50,21 +50,21 @@ class Tube:
         return (k - 1) * (self.divisions.finger + self.divisions.web)
 
     def palm(self, column: int) -> int:
-        """The address on the palm under a column of the back."""
+        """Return the address on the palm under a column of the back."""
         return 2 * self.top + self.divisions.side - column
 
     def side(self, j: int) -> int:
-        """The address j = 0 (back) .. divisions.side (palm) down the thumb's side."""
+        """Return the address j = 0 (back) .. divisions.side (palm) down the thumb's side."""
         return 0 if j == 0 else self.around - j
 
     def column_of(self, address: int) -> int:
-        """The column of the back, 0..top, over or at an address; the sides belong to the nearest."""
+        """Return the column of the back, 0..top, over or at an address; the sides belong to the nearest."""
         if address <= self.top:
             return address
         return int(np.clip(self.palm(address), 0, self.top))
 
     def finger_of(self, address: int) -> int:
-        """The finger 1..4 in whose columns an address runs, a web's being shared."""
+        """Return the finger 1..4 in whose columns an address runs, a web's being shared."""
         d = self.divisions
         block, inside = divmod(self.column_of(address), d.finger + d.web)
         return min(block + 1 + (inside - d.finger > d.web / 2), 4)
@@ -121,7 +121,7 @@ def _hand_columns(tube: Tube) -> np.ndarray:
 
 
 def _hand_x(ring: float, x: float, y: np.ndarray) -> np.ndarray:
-    """x of one ring, `ring` in the numbers of density 1, at the side places y.
+    """Return x of one ring, `ring` in the numbers of density 1, at the side places y.
 
     Past the wrist the rings bend, so that one runs over the knuckles and the last one through the webs; both fall back
     to the little finger.

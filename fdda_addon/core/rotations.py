@@ -92,7 +92,8 @@ def _normalized(quaternions: np.ndarray) -> np.ndarray:
 def _mean(unit: np.ndarray) -> np.ndarray:
     """Compute the mean rotation, (4,), independent of the signs of the quaternions.
 
-    Source: Markley et al., Averaging Quaternions, 2007."""
+    Source: Markley et al., Averaging Quaternions, 2007.
+    """
     return np.linalg.eigh(unit.T @ unit)[1][:, -1]
 
 

@@ -108,7 +108,8 @@ class PosePlan:
     def show_poses_again(self, player: ClipPlayer, pose_indices: Collection[int]) -> Iterator[int]:
         """Set poses again from another direction; yield the index.
 
-        Random poses are reached through another random pose, frames of clips by playing the clip backwards."""
+        Random poses are reached through another random pose, frames of clips by playing the clip backwards.
+        """
         if self.pose_setter.settler:
             set_pose = self._make_setter(self._channels)
             with self.pose_setter.prepared():

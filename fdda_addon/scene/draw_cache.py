@@ -20,7 +20,7 @@ _expires_at = 0.0
 
 
 def draw_cached(function: Callable) -> Callable:
-    """Decorator: cache the results of a function by its arguments, which must be hashable; None is not cached."""
+    """Cache the results of a function by its arguments, which must be hashable; None is not cached."""
     values: dict[tuple, object] = {}
     _caches.append(values)
 

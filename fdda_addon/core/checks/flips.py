@@ -136,7 +136,8 @@ def _half_turn_pairs(
 def _quaternions(features: np.ndarray) -> np.ndarray:
     """Convert (n, 12) features of a joint to (n, 4) rotation quaternions with w >= 0.
 
-    Source: Bar-Itzhack, New Method for Extracting the Quaternion from a Rotation Matrix, 2000."""
+    Source: Bar-Itzhack, New Method for Extracting the Quaternion from a Rotation Matrix, 2000.
+    """
     matrices = features.reshape(-1, 3, 4)[:, :, :3].astype(np.float64)
     u, _, v = np.linalg.svd(matrices)
     r = u @ v * np.linalg.det(u @ v)[:, None, None]

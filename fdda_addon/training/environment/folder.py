@@ -111,7 +111,7 @@ def site_packages(folder: Path, version: tuple[int, int]) -> Path:
 
 
 def requirements_file(version: tuple[int, int]) -> Path:
-    """The file that pins every package for a version of Python that `PINNED_REQUIREMENTS` has."""
+    """Return the file that pins every package for a version of Python that `PINNED_REQUIREMENTS` has."""
     return REQUIREMENTS / PINNED_REQUIREMENTS[version]
 
 
