@@ -109,7 +109,7 @@ def first_failure(folder: Path, tests: Sequence[str]) -> str:
         ValueError: pytest could not run the tests.
     """
     python = folder / ".venv" / "bin" / "python"
-    command = [str(python), "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+    command = [str(python), "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests]
     command.append(f"--basetemp={folder / 'out' / 'tests'}")
     environment = {
         **os.environ,

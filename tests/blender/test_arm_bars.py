@@ -12,7 +12,7 @@ from benchmarks import demo
 
 from .conftest import assert_plays
 
-pytestmark = pytest.mark.one_blender_version
+pytestmark = [pytest.mark.one_blender_version, pytest.mark.slow]
 
 MEAN_BAR, P999_BAR, MAX_BAR = 0.012, 0.03, 0.15
 """Held-out errors of the model as parts of linear skinning's."""

@@ -36,7 +36,7 @@ def make_cache(path: Path, mesh_object: bpy.types.Object) -> None:
     scene.frame_set(1)
 
 
-@pytest.mark.parametrize("suffix", ["abc", "pc2"])
+@pytest.mark.parametrize("suffix", ["abc", pytest.param("pc2", marks=pytest.mark.slow)])
 def test_a_cache_is_learned_from_files_alone(suffix, tmp_path):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh_object, _ = build_elbow()

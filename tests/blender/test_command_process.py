@@ -110,6 +110,7 @@ def complete(path: Path) -> int:
         return -1
 
 
+@pytest.mark.slow
 def test_an_interrupted_recording_resumes(elbow, tmp_path):
     """Stopped by Ctrl-C in the middle and continued, it is the recording that was never stopped, byte for byte."""
     poses = 20 * BATCH_POSES

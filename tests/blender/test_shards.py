@@ -62,7 +62,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize("case", CASES)
 def test_shards_are_the_recording_of_one_run(tmp_path, case, count):
     build, settings = CASES[case]

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.stress_playback import MAX_DIFFERENCE_M, OPERATION_WEIGHTS, PlaybackStress
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_whatever_is_done_at_random(bound, elbow, tmp_path, seed):
     bpy.context.scene.frame_set(1)
     outcome = PlaybackStress(bound, elbow.model, 6, tmp_path, seed).run(250)

@@ -110,6 +110,7 @@ def test_without_any_it_is_the_python_that_runs_this():
     assert choice.select_python() == (sys.executable, Origin.THIS)
 
 
+@pytest.mark.slow
 def test_one_that_another_python_hides_says_so(user: Path, wheels: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv(choice.PYTHON_VARIABLE, sys.executable)
     assert create(wheels=str(wheels)) == {"FINISHED"}
@@ -127,6 +128,7 @@ def test_a_wheel_that_is_missing(own: Path, wheels: Path, tmp_path: Path):
     assert session.notice.message == text
 
 
+@pytest.mark.slow
 def test_a_wheel_of_a_package_that_those_need_is_missing(user: Path, wheels: Path, tmp_path: Path):
     shutil.copytree(wheels, tmp_path / "fewer")
     write_wheel(tmp_path / "fewer", "onnx", requires="fdda-nowhere")

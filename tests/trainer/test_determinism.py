@@ -8,7 +8,9 @@ import pytest
 from .conftest import start_trainer
 
 
-@pytest.mark.parametrize("options", [(), ("--dropout", "0.1")], ids=["as it is", "dropout"])
+@pytest.mark.parametrize(
+    "options", [(), pytest.param(("--dropout", "0.1"), marks=pytest.mark.slow)], ids=["as it is", "dropout"]
+)
 def test_the_same_bytes_in_two_processes(recording, tmp_path: Path, options):
     found = {}
     for name, seed in (("first", 3), ("second", 3), ("other", 4)):
