@@ -90,7 +90,7 @@ def _write(folder: Path, random: np.random.Generator, out: Path) -> int:
     files = _files(folder / PLACE)
     ended, said = _run(*arguments)
     if ended == 0:
-        if not kind.is_of(out):
+        if not kind.matches(out):
             raise ShortfallError(f"it is done, and '{out}' is not {kind.name}")
     elif _files(folder / PLACE) != files:
         raise ShortfallError(f"it is refused ({said[:300]}) and leaves something")

@@ -100,7 +100,8 @@ def with_deformation(model: Path, deformation: dict) -> Path:
 
     import onnx
 
-    loaded, path = onnx.load(model), model.with_name(f"other_{model.name}")
+    # Processes that run tests side by side share the folder.
+    loaded, path = onnx.load(model), model.with_name(f"other_{os.getpid()}_{model.name}")
     (prop,) = (prop for prop in loaded.metadata_props if prop.key == METADATA_KEY)
     info = json.loads(prop.value)
     info["fingerprint"]["deformation"] = deformation
