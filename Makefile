@@ -59,8 +59,10 @@ test-windows: .venv  ## the tests in Python for Windows under Wine, as root on D
 	.venv/bin/python setup/package.py windows-x64
 	.venv/bin/python tests/windows/run.py $(LINE)
 
-test-all: test test-slow test-farm test-examples test-gui soak  ## every test on both LTS lines, with a Blender with a window (1.5 hours)
+test-all: test test-slow test-examples test-farm  ## every test on both LTS lines, the soak, and the window last
 	@$(MAKE) test-line LINE=$(OTHER_LINE) MARKS=
+	@$(MAKE) soak
+	@$(MAKE) test-gui
 
 # What differs between versions of Blender; empty for all tests.
 test-line: MARKS = -m "not slow and not one_blender_version"

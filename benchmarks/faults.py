@@ -176,7 +176,7 @@ def main() -> int:
     faults = [fault for fault in faults if not options.only or fault.id in options.only]
     options.out.mkdir(parents=True, exist_ok=True)
     outcomes = []
-    with tempfile.TemporaryDirectory(prefix="fdda-faults-") as temporary:
+    with tempfile.TemporaryDirectory(prefix="seeded-") as temporary:
         folder = Path(temporary)
         copy_checkout(folder)
         if test := first_failure(folder, sorted({test for fault in faults for test in fault.tests})):

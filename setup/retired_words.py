@@ -35,7 +35,8 @@ def files() -> list[Path]:
     """Return the files that people write, without this one."""
     pages = [path for path in ROOT.glob("*.md")]
     below = (path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*")))
-    return [path for path in [*pages, *below] if path.suffix in SUFFIXES and path != Path(__file__).resolve()]
+    found = (path for path in [*pages, *below] if path.suffix in SUFFIXES and path != Path(__file__).resolve())
+    return [path for path in found if "node_modules" not in path.parts]
 
 
 def find(text: str) -> list[tuple[int, str, str]]:
@@ -52,7 +53,6 @@ def main() -> int:
     lines = [
         f"{path.relative_to(ROOT)}:{line}: '{word}': write {replacement}"
         for path in files()
-        if "node_modules" not in path.parts
         for line, word, replacement in find(path.read_text(encoding="utf-8"))
     ]
     print("\n".join(lines), end="\n" if lines else "")
