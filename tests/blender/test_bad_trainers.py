@@ -3,6 +3,7 @@
 
 import os
 import re
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -191,9 +192,12 @@ def test_nobody_waits_for_a_trainer_that_is_silent(tmp_path, monkeypatch):
         messages = training.messages(wait=False)
         seen = first_of(messages)
         assert seen.type is MessageType.STARTED
-        start = time.monotonic()
-        assert [next(messages) for _ in range(100)] == [None] * 100
-        assert time.monotonic() - start < 0.05
+        seconds = []
+        for _ in range(100):
+            start = time.monotonic()
+            assert next(messages) is None
+            seconds.append(time.monotonic() - start)
+        assert statistics.median(seconds) < 0.0005  # Other processes may delay some of them.
         monkeypatch.setattr(process, "KILL_AFTER_SECONDS", 0.5)
         training.cancel()
         assert first_of(messages) is None
