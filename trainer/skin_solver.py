@@ -44,11 +44,7 @@ class SkinSolver:
         self._poses = poses
         rig = poses.rig
         self._pose_count, self._joint_count = len(poses.pose_matrices), len(rig.joints)
-        # Relative to the center of the mesh, at rest and in each pose, so that squares keep their digits.
-        self._center = rig.rest_positions.mean(axis=0, dtype=np.float64)
-        self._pose_centers = np.array([positions.mean(axis=0, dtype=np.float64) for positions in poses.positions])
         skin = skin_matrices(poses.pose_matrices, rig.rest_matrices)[:, :, :3].astype(np.float64)
-        skin[:, :, :, 3] += skin[:, :, :, :3] @ self._center - self._pose_centers[:, None]
         self._rows = np.ascontiguousarray(
             skin.transpose(0, 2, 1, 3).reshape(3 * self._pose_count, 4 * self._joint_count)
         )
@@ -57,7 +53,7 @@ class SkinSolver:
         self._blocks = np.ascontiguousarray(blocks).reshape(self._joint_count, self._joint_count, 16)
         self._size = max(rig.size, 1e-9)
         self.tie = self._pose_count * (TIE_RATIO * self._size) ** 2
-        self._heads = rig.rest_matrices[:, :3, 3].astype(np.float64) - self._center
+        self._heads = rig.rest_matrices[:, :3, 3].astype(np.float64)
 
     def fit(self, kind: str) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
         """Fit all vertices, block by block.
@@ -81,7 +77,7 @@ class _Block:
     """A block of B vertices, their moments with all joints, and the errors of single joints.
 
     Attributes:
-        rest: (B, 4) float64, homogeneous rest positions relative to the center of the mesh, mesh units.
+        rest: (B, 4) float64, homogeneous rest positions, mesh units.
         moments: (4 J, B), products of the skin matrices with the recorded positions, square mesh units.
         linear: (B, J), products of each joint's skinned position with the recorded positions, square mesh units.
         squares: (B,), squared recorded positions, square mesh units.
@@ -92,10 +88,9 @@ class _Block:
     def __init__(self, solver: SkinSolver, vertices: slice):
         self._solver = solver
         poses, rig = solver._poses, solver._poses.rig
-        rest = rig.rest_positions[vertices].astype(np.float64) - solver._center
+        rest = rig.rest_positions[vertices].astype(np.float64)
         self.rest = np.concatenate([rest, np.ones((len(rest), 1))], axis=1)
-        recorded = poses.positions[:, vertices].astype(np.float64) - solver._pose_centers[:, None]
-        recorded = recorded.transpose(0, 2, 1).reshape(-1, len(rest))
+        recorded = poses.positions[:, vertices].astype(np.float64).transpose(0, 2, 1).reshape(-1, len(rest))
         self.moments = solver._rows.T @ recorded
         self.squares = (recorded**2).sum(axis=0)
         self.linear = self._by_joint(self.moments)

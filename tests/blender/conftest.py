@@ -2,7 +2,7 @@
 """The elbow, recorded, trained and bound once for all tests; and what the tests measure with."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -107,6 +107,21 @@ def with_deformation(model: Path, deformation: dict) -> Path:
     info["fingerprint"]["deformation"] = deformation
     prop.value = json.dumps(info)
     onnx.save(loaded, path)
+    return path
+
+
+def write_edited(model: Path, path: Path, edit: Callable) -> Path:
+    """Write a model that `edit` has changed in place, with the checksum of its changed weights, to a path."""
+    import onnx
+
+    from fdda_addon.core.model import CHECKSUM_KEY
+    from fdda_addon.core.onnx_file import read_onnx
+
+    proto = onnx.load(model)
+    edit(proto)
+    for checksum in (prop for prop in proto.metadata_props if prop.key == CHECKSUM_KEY):
+        checksum.value = read_onnx(proto.SerializeToString()).checksum
+    path.write_bytes(proto.SerializeToString())
     return path
 
 

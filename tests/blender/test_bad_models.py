@@ -5,18 +5,17 @@ import json
 
 import bpy
 import numpy as np
-import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from fdda_addon.core.errors import FDDAError
-from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY
+from fdda_addon.core.model import METADATA_KEY
 from fdda_addon.core.onnx_file import read_onnx
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import find_rig
 
 from .. import systems
-from .conftest import run
+from .conftest import run, write_edited
 from .refusals import save_elbow
 
 
@@ -115,18 +114,6 @@ def test_a_truncated_model(refusal, verb, elbow, tmp_path, part):
     assert f"'{path}' is not a model" in refusal(*verb(elbow.rig, path))
 
 
-def edited(elbow, tmp_path, change) -> "object":
-    """The elbow's model with something changed, and signed as if that were right."""
-    model = onnx.load(elbow.model)
-    change(model)
-    for prop in model.metadata_props:
-        if prop.key == CHECKSUM_KEY:
-            prop.value = read_onnx(model.SerializeToString()).checksum
-    path = tmp_path / "m.onnx"
-    path.write_bytes(model.SerializeToString())
-    return path
-
-
 def add_input(model) -> None:
     model.graph.input.append(helper.make_tensor_value_info("controls", TensorProto.FLOAT, ["N", 3]))
 
@@ -171,7 +158,7 @@ def of_version_2(model) -> None:
     ],
 )
 def test_onnx_files_that_are_refused_unopened(refusal, verb, elbow, tmp_path, change, words):
-    path = edited(elbow, tmp_path, change)
+    path = write_edited(elbow.model, tmp_path / "m.onnx", change)
     text = refusal(*verb(elbow.rig, path))
     assert str(path) in text and words in text
 
@@ -190,13 +177,13 @@ def of_doubles(model) -> None:
 
 @pytest.mark.parametrize("change", [of_an_unknown_operator, with_a_loop])
 def test_graphs_that_are_refused_before_onnx_runtime_sees_them(refusal, verb, elbow, tmp_path, change):
-    path = edited(elbow, tmp_path, change)
+    path = write_edited(elbow.model, tmp_path / "m.onnx", change)
     text = refusal(*verb(elbow.rig, path))
     assert text.startswith(f"The model '{path}' is refused: ") and text.endswith("; give one that train made.")
 
 
 def test_what_onnx_runtime_refuses(refusal, verb, elbow, tmp_path):
-    path = edited(elbow, tmp_path, of_doubles)
+    path = write_edited(elbow.model, tmp_path / "m.onnx", of_doubles)
     text = refusal(*verb(elbow.rig, path))
     assert text.startswith(f"ONNX Runtime refuses the model '{path}' (") and text.endswith("); train it again.")
 
@@ -219,7 +206,7 @@ def answer_nan(model) -> None:
 
 
 def test_a_model_that_answers_no_numbers(refusal, elbow, tmp_path):
-    path = edited(elbow, tmp_path, answer_nan)
+    path = write_edited(elbow.model, tmp_path / "m.onnx", answer_nan)
     text = refusal("evaluate", elbow.rig, path, "--json", tmp_path / "e.json", "--poses", 2)
     assert f"The model '{path}' gives positions that are not numbers (held-out poses, pose 0)" in text
 
@@ -248,7 +235,7 @@ def answer_nan_when_straight(model) -> None:
 def test_a_model_that_plays_no_numbers_says_so(bound, elbow, tmp_path, change, capsys):
     armature = bpy.data.objects["elbow_rig"]
     armature.animation_data_clear()
-    bind(find_rig(), edited(elbow, tmp_path, change))
+    bind(find_rig(), write_edited(elbow.model, tmp_path / "m.onnx", change))
     said = []
     for angle in (0.8, -0.8, 0.8):
         armature.pose.bones["lower"].rotation_euler[0] = angle
@@ -267,14 +254,14 @@ def answer_fewer(model) -> None:
 
 
 def test_a_model_that_answers_another_shape(refusal, verb, elbow, tmp_path):
-    path = edited(elbow, tmp_path, answer_fewer)
+    path = write_edited(elbow.model, tmp_path / "m.onnx", answer_fewer)
     assert "is refused: its output 'positions' comes out as (1, 7, 3), not as (1, 300, 3)" in refusal(
         *verb(elbow.rig, path)
     )
 
 
 def test_a_refused_model_leaves_a_bound_object_as_it_is(bound, elbow, tmp_path):
-    path = edited(elbow, tmp_path, add_custom_operator)
+    path = write_edited(elbow.model, tmp_path / "m.onnx", add_custom_operator)
     with pytest.raises(FDDAError, match="custom operators"):
         bind(find_rig(), path)
     assert bound.fdda.is_bound and bound.fdda.mode == "FDDA"

@@ -11,14 +11,13 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
-from fdda_addon.core.model import CHECKSUM_KEY, CONTROLS_INPUT, METADATA_KEY
-from fdda_addon.core.onnx_file import read_onnx
+from fdda_addon.core.model import CONTROLS_INPUT, METADATA_KEY
 from fdda_addon.runtime import registry
 from fdda_addon.runtime.binding import bind
 from fdda_addon.runtime.player import Player
 from fdda_addon.scene.scene_rig import find_rig
 
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose, write_edited
 from .test_player_batch import crowd_of
 
 
@@ -85,17 +84,15 @@ def test_what_nobody_expected_harms_one_character(bound, elbow, monkeypatch, whe
 
 def with_control(model: Path, owner: str, path: str) -> Path:
     """A model beside another that has a control, which moves nothing."""
-    loaded, changed = onnx.load(model), model.with_name("controlled.onnx")
-    loaded.graph.input.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", 1]))
-    for prop in loaded.metadata_props:
-        if prop.key == METADATA_KEY:
-            info = json.loads(prop.value)
-            info["controls"] = [{"owner": owner, "path": path, "low": 0.0, "high": 1.0}]
-            prop.value = json.dumps(info)
-        elif prop.key == CHECKSUM_KEY:
-            prop.value = read_onnx(loaded.SerializeToString()).checksum
-    onnx.save(loaded, changed)
-    return changed
+
+    def add_control(proto: onnx.ModelProto) -> None:
+        proto.graph.input.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", 1]))
+        (metadata,) = (prop for prop in proto.metadata_props if prop.key == METADATA_KEY)
+        info = json.loads(metadata.value)
+        info["controls"] = [{"owner": owner, "path": path, "low": 0.0, "high": 1.0}]
+        metadata.value = json.dumps(info)
+
+    return write_edited(model, model.with_name("controlled.onnx"), add_control)
 
 
 def armature_object() -> bpy.types.Object:

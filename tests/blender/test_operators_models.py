@@ -2,23 +2,26 @@
 """The operators of the section Model Library: several models of a mesh, packed and checked."""
 
 import shutil
+from pathlib import Path
 
 import bpy
+import numpy as np
 import pytest
 
 from fdda_addon.core.errors import ModelError
 from fdda_addon.models.entries import bound_entry, format_file_size
 from fdda_addon.runtime import packed_model
+from fdda_addon.runtime.binding import bind
 
 from .. import systems
-from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose
+from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose, write_edited
 from .test_operators_playback import refused
 
 
 @pytest.fixture
 def second(elbow, tmp_path):
     """Another model of the elbow: the same, under another name, outside the folder of its file."""
-    return shutil.copy(elbow.model, tmp_path / "second.onnx")
+    return Path(shutil.copy(elbow.model, tmp_path / "second.onnx"))
 
 
 @pytest.fixture
@@ -256,11 +259,8 @@ def test_a_listed_path_out_of_the_folder_is_not_followed(bound, elbow, second):
 
 def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_path):
     """The file under a bound model is replaced, as a training does."""
-    import numpy as np
     import onnx
 
-    from fdda_addon.core.model import CHECKSUM_KEY
-    from fdda_addon.core.onnx_file import read_onnx
     from fdda_addon.evaluation import last_evaluation
     from fdda_addon.models import model_list
 
@@ -270,13 +270,13 @@ def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_pa
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
     pose(angle=1.3)
     before = assert_plays(bound, path)
-    model = onnx.load(path)
-    node = next(node for node in model.graph.node if "positions" in node.output)
-    node.output[0] = "before"
-    model.graph.node.append(onnx.helper.make_node("Add", ["before", "before"], ["positions"]))
-    (checksum,) = (prop for prop in model.metadata_props if prop.key == CHECKSUM_KEY)
-    checksum.value = read_onnx(model.SerializeToString()).checksum
-    onnx.save(model, path)
+
+    def double(proto: onnx.ModelProto) -> None:
+        node = next(node for node in proto.graph.node if "positions" in node.output)
+        node.output[0] = "before"
+        proto.graph.node.append(onnx.helper.make_node("Add", ["before", "before"], ["positions"]))
+
+    write_edited(path, path, double)
     model_list.add_model(bound, path)
     bpy.context.view_layer.update()
     after = assert_plays(bound, path)
@@ -303,3 +303,22 @@ def test_what_the_section_says_of_the_models(bound, elbow):
 
 def test_megabytes():
     assert [format_file_size(count) for count in (2_340, 1_340_169)] == ["2.3 kB", "1.3 MB"]
+
+
+def test_a_model_of_equal_size_that_replaces_another_plays(rig, second, tmp_path):
+    from onnx import numpy_helper
+
+    def negate(proto) -> None:
+        """Negate the largest array."""
+        tensor = max(proto.graph.initializer, key=lambda tensor: len(tensor.raw_data))
+        tensor.CopyFrom(numpy_helper.from_array(-numpy_helper.to_array(tensor), tensor.name))
+
+    path = write_edited(second, tmp_path / "m.onnx", lambda proto: None)
+    size = path.stat().st_size
+    bind(rig, path)
+    pose(angle=1.3)
+    before = assert_plays(rig.mesh_object, path)
+    assert write_edited(path, path, negate).stat().st_size == size
+    bind(rig, path)
+    bpy.context.view_layer.update()
+    assert np.abs(assert_plays(rig.mesh_object, path) - before).max() > 1e-3

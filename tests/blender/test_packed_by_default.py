@@ -108,6 +108,17 @@ def test_a_trusted_folder_is_followed_and_no_other(bound, elbow, model, tmp_path
 
 
 @systems.symbolic_links
+def test_a_link_out_of_the_folder_of_the_file_is_not_followed(bound, elbow, model, tmp_path):
+    (tmp_path / "shots").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shots" / "shot.blend"))
+    (tmp_path / "shots" / "way_out.onnx").symlink_to(model)
+    model_files._chosen_paths.clear()
+    bound.fdda.model = "//way_out.onnx"
+    with pytest.raises(ModelError, match="lies outside the folder of"):
+        model_files.model_path(bound)
+
+
+@systems.symbolic_links
 def test_a_link_out_of_a_trusted_folder_is_not_followed(elbow, tmp_path, monkeypatch):
     trusted = tmp_path / "trusted"
     trusted.mkdir()

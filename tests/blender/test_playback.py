@@ -51,6 +51,14 @@ def test_each_bone_of_a_chain(bound, elbow):
     assert all(np.abs(after - before).max() > 1e-2 for before, after in pairwise(shown))
 
 
+def test_the_mesh_moves_away_from_its_armature(bound, elbow):
+    pose(angle=0.8)
+    before = assert_plays(bound, elbow.model)
+    bound.location = (0.1, 0.2, 0.3)
+    bpy.context.view_layer.update()
+    assert np.abs(assert_plays(bound, elbow.model) - before).max() > 0.05
+
+
 def test_playing_differs_from_the_rig(bound, elbow):
     pose(angle=1.9)
     playing = evaluated(bound)

@@ -46,10 +46,10 @@ def random_poses(rng: np.random.Generator, heads: np.ndarray, poses: int = POSES
     return matrices.astype(np.float32)
 
 
-def random_rig(influences: int, seed: int = 0) -> Rig:
-    """A cloud of vertices, skinned to joints anywhere."""
+def random_rig(influences: int, seed: int = 0, away: float = 0.0) -> Rig:
+    """A cloud of vertices, `away` from the origin, skinned to joints anywhere in it."""
     rng = np.random.default_rng(seed)
-    heads = rng.uniform(-1, 1, (JOINTS, 3))
+    heads = rng.uniform(-1, 1, (JOINTS, 3)) + away
     rest = np.stack([np.eye(4)] * JOINTS)
     rest[:, :3, 3] = heads
     skin_joints = np.stack([rng.permutation(JOINTS)[:4] for _ in range(VERTICES)]).astype(np.int32)
@@ -57,7 +57,7 @@ def random_rig(influences: int, seed: int = 0) -> Rig:
     weights[:, influences:] = 0
     weights[: VERTICES // 3, 1:] = 0
     weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
-    positions = rng.uniform(-1, 1, (VERTICES, 3)).astype(np.float32)
+    positions = (rng.uniform(-1, 1, (VERTICES, 3)) + away).astype(np.float32)
     joints = tuple(Joint(str(number), number - 1) for number in range(JOINTS))
     return Rig(joints, positions, rest.astype(np.float32), skin_joints, weights, Fingerprint("", "", ""))
 
@@ -102,9 +102,9 @@ def write(folder: Path, poses: FitPoses) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("influences", [2, 4])
-def test_smooth_weights_are_recovered(influences):
-    rig = random_rig(influences)
+@pytest.mark.parametrize(("influences", "away"), [(2, 0), (4, 0), (4, 1000)])
+def test_smooth_weights_are_recovered(influences, away):
+    rig = random_rig(influences, away=away)
     assert np.abs(dense(fitted(posed(rig), "smooth")) - dense(rig)).max() < 1e-3
 
 
