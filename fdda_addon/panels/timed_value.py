@@ -19,7 +19,7 @@ class TimedValue:
 
     def __init__(self, compute: Callable[[bpy.types.Object], object], seconds: float):
         """Args:
-        compute: returns the value. It is called outside of drawing, and not while a job borrows the scene.
+        compute: returns the value. It is called outside of drawing, and not while a job changes the scene.
         seconds: from a `get` to the computation, and so the shortest time between two computations.
         """
         self._compute, self._seconds = compute, seconds
@@ -50,7 +50,7 @@ class TimedValue:
 
     def _tick(self) -> None:
         job = current()
-        if job is not None and job.borrows_scene:
+        if job is not None and job.changes_scene:
             return
         objects = {o.session_uid: o for o in bpy.data.objects if o.session_uid in self._requested}
         before = dict(self._values)

@@ -11,7 +11,7 @@ import pytest
 from fdda_addon.core.recording.folder import FolderState
 from fdda_addon.jobs import job
 from fdda_addon.jobs.job import JobRunner, JobState
-from fdda_addon.panels import checks, curves
+from fdda_addon.panels import checks, curves, playback
 from fdda_addon.panels.recording import cached_content
 from fdda_addon.panels.section import format_duration, panel_rig
 from fdda_addon.panels.training import _read_report
@@ -237,3 +237,16 @@ def test_the_worst_frames_are_those_of_the_last_of_several_evaluations():
         return LastEvaluation("", "m", 0, 0, {"fdda": errors, "linear": errors}, {}, (), ())
 
     assert [_worst_poses(evaluation(worst), 2)[0][0] for worst in (1, 2, 0)] == [1, 2, 0]
+
+
+@pytest.mark.parametrize("changes_scene", [True, False])
+def test_timed_values_are_computed_beside_a_job_unless_the_job_changes_the_scene(fresh, monkeypatch, changes_scene):
+    monkeypatch.setattr(playback._confidence_value, "_compute", lambda mesh_object: "computed")
+    playback._confidence_value.get(fresh.mesh_object)
+    job_runner = JobRunner(JobState("count", "Counting", changes_scene=changes_scene), iter(()), str, str)
+    try:
+        playback._confidence_value._tick()
+        assert playback._confidence_value.get(fresh.mesh_object) == (None if changes_scene else "computed")
+    finally:
+        job_runner.end("", "INFO")
+        playback._confidence_value.stop()
