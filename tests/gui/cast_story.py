@@ -121,7 +121,7 @@ def cancel_all_in_one(folder: Path) -> Iterator[float]:
     bpy.ops.wm.read_homefile(app_template="", load_ui=False)
     yield 0.5
     bpy.ops.fdda.add_sample_arm(density="1")
-    # ESC cancels while the scene is borrowed: so many that it still is when the picture is taken.
+    # ESC cancels while the job changes the scene, so it needs many poses to still run when the picture is taken.
     arm().fdda.settings.poses = 10_000
     bpy.ops.wm.save_as_mainfile(filepath=str(own / BLEND))
     before, job = shape(), part("jobs.job")
@@ -137,7 +137,7 @@ def cancel_all_in_one(folder: Path) -> Iterator[float]:
     yield from press("Escape")
     yield from until(lambda: not job.state_of("build_model").is_running, 20, "ESC does not end it")
     said = job.state_of("build_model").outcome
-    check("Cancelled" in said, f"it says '{said}'")
+    check("Canceled" in said, f"it says '{said}'")
     check(not arm().fdda.is_bound and np.allclose(shape(), before, atol=1e-6), "the arm is not as before")
 
 

@@ -32,7 +32,7 @@ def give_the_arm_flesh(folder: Path) -> Iterator[float]:
 
 
 def choose_the_target(folder: Path) -> Iterator[float]:
-    """Click the field Target, type the name of the copy; how long poses are held is set below it."""
+    """Click the field Learn from Object, type the name of the copy; how long poses are held is set below it."""
     settings = arm().fdda.settings
     settings.poses, settings.epochs = POSES, EPOCHS
     yield from sidebar.open_section("recording")

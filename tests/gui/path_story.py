@@ -110,15 +110,17 @@ def measure_the_rig(_folder: Path) -> Iterator[float]:
 
 
 def show_a_random_pose(_folder: Path) -> Iterator[float]:
-    """Look at a random pose."""
+    """Type 2 into the field Preview Pose: the second random pose is shown."""
     rest = shape()
     yield from sidebar.open_section("poses")
-    yield from sidebar.push("fdda.preview_pose", across=0.45)
+    x, y = yield from sidebar.find("fdda.preview_pose", across=0.25)
+    yield from click(x, y, times=2)
+    yield from press("ctrl+a", "2", "Return")
     yield 0.3
     shown = arm().evaluated_get(bpy.context.evaluated_depsgraph_get()).data
     moved = np.empty_like(rest)
     shown.attributes["position"].data.foreach_get("vector", moved.reshape(-1))
-    check(distance_mm(moved, rest) > 1, "the button shows no other pose")
+    check(distance_mm(moved, rest) > 1, "the field shows no other pose")
 
 
 def choose_what_moves(folder: Path) -> Iterator[float]:
@@ -165,7 +167,7 @@ def record(folder: Path) -> Iterator[float]:
 
 
 def check_the_trainer(_folder: Path) -> Iterator[float]:
-    """Press Check: the trainer's Python has torch."""
+    """Press Check Setup: the trainer's Python has torch."""
     session = part("training.environment.session")
     yield from sidebar.open_section("training")
     yield from sidebar.push("fdda.check_trainer", across=0.2)

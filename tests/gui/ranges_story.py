@@ -85,7 +85,8 @@ def _ring(head: tuple, tail: tuple, t: float) -> Iterator[tuple]:
 
 
 def mirror_and_copy_ranges(folder: Path) -> Iterator[float]:
-    """Another range for one forearm: press Mirror, and the other has it; press Copy, and the upper arm has it too."""
+    """Limit one forearm: press Mirror to Other Side, and the other forearm has its limits; press Copy to Selected, and
+    the upper arm has them too."""
     compatibility = part("scene.compatibility")
     bones, session = bpy.data.objects["figure_rig"].pose.bones, bpy.context.window_manager.fdda
     left, right, upper = bones["forearm.L"], bones["forearm.R"], bones["upper_arm.L"]

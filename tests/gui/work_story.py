@@ -78,7 +78,7 @@ def save_into_another_folder(folder: Path) -> Iterator[float]:
 
 
 def select_bones_in_the_list(folder: Path) -> Iterator[float]:
-    """Tick bones in the list of joints: they are selected in the view. Give them one range, and mirror nothing."""
+    """Check bones in the list: they are selected in the view. Give them the same limits."""
     compatibility = part("scene.compatibility")
     bones = armature().pose.bones
     for bone in bones:
@@ -101,7 +101,7 @@ def select_bones_in_the_list(folder: Path) -> Iterator[float]:
 
 
 def switch_all_meshes_in_pose_mode(folder: Path) -> Iterator[float]:
-    """A second mesh on the armature, pose mode: Rig and FDDA switch both, no mesh is selected."""
+    """A second mesh on the armature, pose mode: Rig, Skinning and Model switch both, no mesh is selected."""
     sleeve = arm().copy()
     sleeve.name = "sleeve"
     sleeve.data = arm().data.copy()
@@ -176,8 +176,8 @@ def search_finds_the_buttons(folder: Path) -> Iterator[float]:
 def read_the_manual(_folder: Path) -> Iterator[float]:
     """The page that the help buttons open has an anchor for each section."""
     page = part("operators.help").manual_file().read_text(encoding="utf-8")
-    names = ("rig", "poses", "recording", "training", "playback", "evaluation", "models")
-    missing = [name for name in names if f'id="{name}"' not in page]
+    headings = [getattr(bpy.types, f"FDDA_PT_{name}").bl_label for name in sidebar.SECTIONS]
+    missing = [heading for heading in headings if f'id="{part("core.manual_page").anchor(heading)}"' not in page]
     check(not missing, f"the manual has no section {missing}")
     yield 0.1
 
@@ -218,7 +218,7 @@ def close_the_file_while_it_trains(folder: Path) -> Iterator[float]:
     yield from sidebar.open_section("training")
     yield from sidebar.push("fdda.cancel", across=0.3)
     yield from until(lambda: job.current() is None, 30, "Cancel does not end it")
-    check(not (work / "long" / "arm.onnx").exists(), "a cancelled training has written a model")
+    check(not (work / "long" / "arm.onnx").exists(), "a canceled training has written a model")
 
 
 def make_a_model_in_one_go(folder: Path) -> Iterator[float]:
