@@ -47,13 +47,17 @@ BLENDER = (
     "refinement",
     "packed_by_default",
     "playback",
+    "playback_of_edits",
     "playing_state",
+    "animated_mode",
     "linked_files",
     "extension",
     "renders",
     "render_evaluations",
 )
-BLENDER_4_5 = ("recording", "command_process", "playback", "linked_files", "extension", "renders")
+BLENDER_4_5 = (
+    "recording", "command_process", "playback", "playback_of_edits", "linked_files", "extension", "renders",
+)  # fmt: skip
 SMALL = {
     "core": ("tests/core/test_output.py", "tests/core/test_recording_writer.py", "tests/core/test_recording_lock.py"),
     "blender": ("tests/blender/test_playback.py", "-k", "strength"),
