@@ -104,13 +104,13 @@ def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: fl
     return np.clip((low + high) / 2 + (high - low) / 2 * offsets, low, high)
 
 
-def scale_ranges(channels: tuple[Channel, ...], factor: float) -> tuple[Channel, ...]:
-    """Scale the ranges of channels by a factor around their centers."""
-    scaled = []
+def widen_ranges(channels: tuple[Channel, ...], factor: float) -> tuple[Channel, ...]:
+    """Widen the ranges of channels by a factor, around their centers."""
+    widened = []
     for channel in channels:
         center, half = (channel.low + channel.high) / 2, (channel.high - channel.low) / 2 * factor
-        scaled.append(replace(channel, low=center - half, high=center + half))
-    return tuple(scaled)
+        widened.append(replace(channel, low=center - half, high=center + half))
+    return tuple(widened)
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def make_margin(channels: tuple[Channel, ...], locked: tuple[Channel, ...], fact
     if factor == 1 or not count:
         return None
     scaled_channels = []
-    for channel, scaled in zip(channels, scale_ranges(channels, factor), strict=True):
+    for channel, scaled in zip(channels, widen_ranges(channels, factor), strict=True):
         if channel.kind == CONTROL:
             scaled = channel
         elif channel.kind == SCALE:

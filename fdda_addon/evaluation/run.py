@@ -13,7 +13,7 @@ from ..core.errors import FDDAError, RigError
 from ..core.mask import Mask
 from ..core.metrics import ErrorStatistics, distances, error_statistics
 from ..core.partition import Partition
-from ..core.poses import Channel, sample_pose, scale_ranges
+from ..core.poses import Channel, sample_pose, widen_ranges
 from ..core.progress import Progress
 from ..core.skinning import LinearSkinning
 from ..core.surface import Surface, SurfaceComparison, SurfaceErrors, surface_errors, surface_json
@@ -208,7 +208,7 @@ def evaluate(
         scaled_ranges = []
         for scale_index, factor in enumerate(settings.range_scales, 1):
             first = FIRST_HELD_OUT_INDEX * (1 + scale_index)
-            poses = _random_poses(scene_rig, scale_ranges(channels, factor), settings.seed, first, extra, pose_setter)
+            poses = _random_poses(scene_rig, widen_ranges(channels, factor), settings.seed, first, extra, pose_setter)
             scaled_ranges.append((yield from comparison.compare(f"{factor:g} times the range", poses)))
         named = []
         for pose in settings.named:

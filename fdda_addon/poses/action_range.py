@@ -39,7 +39,7 @@ MAX_CACHE_BYTES = 64_000_000
 CONTINUOUS_ANGLES_PREFERENCE = 0.9
 """Euler angles that are continuous over frames are used unless others have ranges narrower by this factor."""
 
-Ranges = dict[tuple[str, str, int], tuple[float, float]]
+ChannelRanges = dict[tuple[str, str, int], tuple[float, float]]
 """Lowest and highest value by bone, kind and axis."""
 
 Curves = dict[str, dict[int, bpy.types.FCurve]]
@@ -57,7 +57,7 @@ class _Measurement:
     """
 
     content: tuple | None
-    ranges: Ranges
+    ranges: ChannelRanges
     rotations: dict[str, np.ndarray]
 
 
@@ -71,7 +71,7 @@ def action_frames(action: bpy.types.Action) -> range:
     return range(first, last + 1)
 
 
-def measured_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action]) -> Ranges:
+def measured_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action]) -> ChannelRanges:
     """Measure the ranges in which actions move the bones of an armature, at all whole frames.
 
     Args:
@@ -86,7 +86,7 @@ def measured_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.typ
     return moving_ranges(keyed_ranges(armature_object, actions))
 
 
-def moving_ranges(keyed: Ranges) -> Ranges:
+def moving_ranges(keyed: ChannelRanges) -> ChannelRanges:
     """Select from the ranges of `keyed_ranges` those that `measured_ranges` returns."""
     return {key: bounds for key, bounds in keyed.items() if key[1] != ROTATION_VECTOR and has_width(bounds)}
 
@@ -96,13 +96,13 @@ def has_width(bounds: tuple[float, float]) -> bool:
     return bounds[1] - bounds[0] > RANGE_TOLERANCE
 
 
-def keyed_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action]) -> Ranges:
+def keyed_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.Action]) -> ChannelRanges:
     """Measure ranges as `measured_ranges` does, with those of constant channels and of `ROTATION_VECTOR`s.
 
     Bones that are keyed as quaternions or axis angles have rotation vectors besides their Euler angles. Euler angles
     wrap, and have wide ranges near gimbal lock; the ranges of rotation vectors are about as wide as the motion.
     """
-    ranges: Ranges = {}
+    ranges: ChannelRanges = {}
     rotations: dict[str, list[np.ndarray]] = {}
     for measurement in [_measure(armature_object, action) for action in actions]:
         for key, (low, high) in measurement.ranges.items():
@@ -120,7 +120,7 @@ def keyed_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.types.
     return ranges
 
 
-def _ranges_by_axis(bone: str, kind: str, values: np.ndarray) -> Ranges:
+def _ranges_by_axis(bone: str, kind: str, values: np.ndarray) -> ChannelRanges:
     """Return the ranges of (n, 3) values of a bone."""
     bounds = zip(values.min(axis=0).tolist(), values.max(axis=0).tolist(), strict=True)
     return {(bone, kind, axis): low_high for axis, low_high in enumerate(bounds)}

@@ -15,11 +15,11 @@ X, Y, Z = Vector((1, 0, 0)), Vector((0, 1, 0)), Vector((0, 0, 1))
 """Axes of a character that stands along Z and faces -Y; X points to its left."""
 
 AxisRange = tuple[Vector, float, float]
-Ranges = tuple[AxisRange, AxisRange, tuple[float, float]]
+BodyPartRanges = tuple[AxisRange, AxisRange, tuple[float, float]]
 """Ranges in degrees about two directions of the body, and about the bone itself, for the left side."""
 
-_SPINE: Ranges = ((X, -10, 20), (Y, -12, 12), (-12, 12))
-RANGES: tuple[tuple[str, Ranges], ...] = (
+_SPINE: BodyPartRanges = ((X, -10, 20), (Y, -12, 12), (-12, 12))
+RANGES: tuple[tuple[str, BodyPartRanges], ...] = (
     (r"hips?|pelvis|torso", ((X, -20, 20), (Y, -15, 15), (-20, 20))),
     (r"spine\d*|chest|upperchest|abdomen|waist", _SPINE),
     (r"neck\d*", ((X, -20, 20), (Y, -15, 15), (-25, 25))),
@@ -43,7 +43,7 @@ _SIDE = re.compile(r"(?P<before>^|[^a-z])(?P<side>left|right|l|r)(?=$|[^a-z])|^(
 _LETTERS = {"l": "left", "r": "right"}
 
 
-def body_part_of(name: str) -> tuple[Ranges | None, str]:
+def body_part_of(name: str) -> tuple[BodyPartRanges | None, str]:
     """Find the body part of a bone by its name.
 
     Returns:
@@ -78,7 +78,7 @@ def human_ranges(armature_object: bpy.types.Object, bone: bpy.types.Bone) -> lis
     return [(math.radians(low), math.radians(high)) for low, high in _about_bone_axes(matrix, ranges)]
 
 
-def _about_bone_axes(matrix: Matrix, ranges: Ranges) -> list[tuple[float, float]]:
+def _about_bone_axes(matrix: Matrix, ranges: BodyPartRanges) -> list[tuple[float, float]]:
     """Assign ranges about directions of the body to the axes of a bone, given its matrix in world space."""
     bone_axes = matrix.transposed()
     (first, *first_range), (second, *second_range), twist = ranges

@@ -11,10 +11,11 @@ from ..core.errors import RigError
 from ..core.poses import LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE
 from ..scene.scene_rig import SceneRig
 from ..scene.unit import metres_per_unit
-from .action_range import Ranges, has_width, keyed_ranges, moving_ranges
+from .action_range import ChannelRanges, has_width, keyed_ranges, moving_ranges
 from .motion_range import (
     AXES,
     DEFAULT,
+    LIMIT_CONSTRAINT_TYPES,
     enforced_range,
     ensure_range_constraint,
     find_local_limit,
@@ -29,7 +30,6 @@ DEFAULT_MARGIN = 0.1
 MAX_WIDENING = 1.5
 """Ratio of the ranges of Euler angles to those of rotation vectors above which a motion is near gimbal lock."""
 
-CONSTRAINT_TYPES = {ROTATION: "LIMIT_ROTATION", LOCATION: "LIMIT_LOCATION", SCALE: "LIMIT_SCALE"}
 WIDE_NOTE = "; wider than it rotates, as it comes near gimbal lock: sample the action itself, not these ranges"
 _VERBS_AND_UNITS = {ROTATION: ("turns", "°", 1), LOCATION: ("moves", " mm", 1), SCALE: ("scales", "", 2)}
 """Verb, unit and number of digits by kind of channel."""
@@ -100,7 +100,7 @@ def set_limits_from_actions(
         ]
         for kind in (ROTATION, LOCATION, SCALE):
             settable = [limit for limit in limits if limit.kind == kind and not limit.reason_unset]
-            has_constraint = find_local_limit(bone, CONSTRAINT_TYPES[kind]) is not None
+            has_constraint = find_local_limit(bone, LIMIT_CONSTRAINT_TYPES[kind]) is not None
             if kind == ROTATION and not has_ik and not has_constraint and _fit_ik_limits(settable):
                 for limit in settable:
                     set_rotation_range(bone, limit.axis, limit.low, limit.high)
@@ -112,7 +112,7 @@ def set_limits_from_actions(
     return tuple(all_limits)
 
 
-def _bones_near_gimbal_lock(keyed: Ranges) -> set[str]:
+def _bones_near_gimbal_lock(keyed: ChannelRanges) -> set[str]:
     """Find the bones whose ranges of Euler angles allow much larger rotations than the actions have."""
     widths: dict[tuple[str, str], float] = {}
     for (bone, kind, _), (low, high) in keyed.items():
@@ -144,7 +144,7 @@ def _measured_limit(
         return MeasuredLimit(bone.name, kind, axis, *bounds, "locked, left so")
     if kind == LOCATION and bone.bone.use_connect:
         return MeasuredLimit(bone.name, kind, axis, *bounds, "connected, cannot move")
-    enforced_low, enforced_high = enforced_range(bone, CONSTRAINT_TYPES[kind], axis)
+    enforced_low, enforced_high = enforced_range(bone, LIMIT_CONSTRAINT_TYPES[kind], axis)
     low, high = max(low, enforced_low), min(high, enforced_high)
     if not low < high:
         return MeasuredLimit(bone.name, kind, axis, *bounds, "held by its limit, left so")
@@ -157,7 +157,7 @@ def _fit_ik_limits(limits: list[MeasuredLimit]) -> bool:
 
 
 def _set_range_constraint(bone: bpy.types.PoseBone, kind: str, limits: list[MeasuredLimit]) -> None:
-    constraint = ensure_range_constraint(bone, CONSTRAINT_TYPES[kind])
+    constraint = ensure_range_constraint(bone, LIMIT_CONSTRAINT_TYPES[kind])
     for limit in limits:
         set_constraint_limit(constraint, limit.axis, limit.low, limit.high)
     if kind == ROTATION:

@@ -10,12 +10,15 @@ from dataclasses import dataclass
 import bpy
 
 from ..core.errors import RigError
-from ..core.poses import DEFAULT_RANGE
+from ..core.poses import DEFAULT_RANGE, LOCATION, ROTATION, SCALE
 
 AXES = "xyz"
 RANGE_NAME = "FDDA Range"
 """Name of the constraints that store a range without enforcing it."""
 CONSTRAINT, IK, DEFAULT = "CONSTRAINT", "IK", "DEFAULT"
+"""Where a range is stored: in a Limit constraint, as IK limits, or nowhere, so that the default range applies."""
+LIMIT_CONSTRAINT_TYPES = {ROTATION: "LIMIT_ROTATION", LOCATION: "LIMIT_LOCATION", SCALE: "LIMIT_SCALE"}
+"""Type of the constraint that limits each kind of channel."""
 
 
 @dataclass(frozen=True)

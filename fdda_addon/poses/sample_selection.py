@@ -15,9 +15,6 @@ from .clip import find_action
 SELECTED, COLLECTION, ACTION, BONE = "selected", "collection:", "action:", "bone:"
 """The forms of an entry: the selected bones, a bone collection, the bones that an action keys, a bone."""
 
-Measured = dict[tuple[str, str, int], tuple[float, float]]
-"""Ranges by bone, kind and axis."""
-
 
 @dataclass(frozen=True)
 class SampleSelection:

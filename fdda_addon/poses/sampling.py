@@ -13,18 +13,18 @@ from ..core.poses import CONTROL, KINDS, LOCATION, RANGE_TOLERANCE, ROTATION, RO
 from ..core.rig import Rig
 from ..scene.controls import is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
-from .action_range import has_width
+from .action_range import ChannelRanges, has_width
 from .bone_channels import control_name, ranges_by_control
 from .motion_range import DEFAULT, RotationRange, location_ranges, rotation_ranges, scale_ranges
-from .sample_selection import DEFAULT_SELECTION, Measured, SampleSelection, select_bones
+from .sample_selection import DEFAULT_SELECTION, SampleSelection, select_bones
 
 LIMIT_CONSTRAINTS = {"LIMIT_ROTATION", "LIMIT_LOCATION", "LIMIT_SCALE", "LIMIT_DISTANCE"}
-Ranges = dict[str, tuple[float, float]]
+ControlRanges = dict[str, tuple[float, float]]
 """Ranges by the names of controls."""
 
 
 def choose(
-    scene_rig: SceneRig, texts: Iterable[str], find_controls: Callable[[Ranges], Iterable[Control]]
+    scene_rig: SceneRig, texts: Iterable[str], find_controls: Callable[[ControlRanges], Iterable[Control]]
 ) -> SampleSelection:
     """Parse the user's selection of bones and controls.
 
@@ -49,7 +49,7 @@ def choose(
     return selection
 
 
-def sampled_numbers(scene_rig: SceneRig, selection: SampleSelection) -> Ranges:
+def sampled_numbers(scene_rig: SceneRig, selection: SampleSelection) -> ControlRanges:
     """Return the ranges of the sampled numbers of bones by the names of controls."""
     return ranges_by_control(scene_rig.armature_object, _bone_channels(scene_rig.armature_object, selection, set()))
 
@@ -180,7 +180,7 @@ def selected_channels(armature_object: bpy.types.Object, selection: SampleSelect
     Bones that are selected by an action have only the channels that the action keys, in its ranges, narrowed by the
     limits of the bone. A channel that is keyed at a constant value other than that of the rest pose has this value.
     """
-    measured: dict[str, Measured] = {}
+    measured: dict[str, ChannelRanges] = {}
     for key, bounds in selection.measured:
         measured.setdefault(key[0], {})[key] = bounds
     channels = []
@@ -195,7 +195,7 @@ def selected_channels(armature_object: bpy.types.Object, selection: SampleSelect
     return tuple(channels)
 
 
-def _selected_rotation_channels(bone: bpy.types.PoseBone, keyed: Measured, by_action: bool) -> list[Channel]:
+def _selected_rotation_channels(bone: bpy.types.PoseBone, keyed: ChannelRanges, by_action: bool) -> list[Channel]:
     limits = rotation_ranges(bone)
     vectors = {key[2]: bounds for key, bounds in keyed.items() if key[1] == ROTATION_VECTOR}
     if vectors and _are_free(limits):
@@ -214,7 +214,9 @@ def _selected_rotation_channels(bone: bpy.types.PoseBone, keyed: Measured, by_ac
     return _changing(_rotation_channels(bone, ranges))
 
 
-def _selected_location_and_scale_channels(bone: bpy.types.PoseBone, keyed: Measured, by_action: bool) -> list[Channel]:
+def _selected_location_and_scale_channels(
+    bone: bpy.types.PoseBone, keyed: ChannelRanges, by_action: bool
+) -> list[Channel]:
     channels = {} if by_action else {(c.kind, c.axis): c for c in _location_and_scale_channels(bone)}
     limits, locks = _location_and_scale_ranges(bone), {LOCATION: bone.lock_location, SCALE: bone.lock_scale}
     for (name, kind, axis), bounds in keyed.items():

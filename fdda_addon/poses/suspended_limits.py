@@ -6,11 +6,8 @@ from typing import Self
 import bpy
 import numpy as np
 
-from ..core.poses import LOCATION, ROTATION, SCALE, Channel
-from .motion_range import AXES
-
-CONSTRAINT_TYPES = {ROTATION: "LIMIT_ROTATION", LOCATION: "LIMIT_LOCATION", SCALE: "LIMIT_SCALE"}
-"""Types of constraints by kind of channel."""
+from ..core.poses import Channel
+from .motion_range import AXES, LIMIT_CONSTRAINT_TYPES
 
 
 class SuspendedLimits:
@@ -26,8 +23,8 @@ class SuspendedLimits:
         indices: dict[tuple[str, str], list[int]] = {}
         """Indices of channels by the name of the bone and the type of the constraint."""
         for index, channel in enumerate(channels):
-            if channel.kind in CONSTRAINT_TYPES:
-                indices.setdefault((channel.name, CONSTRAINT_TYPES[channel.kind]), []).append(index)
+            if channel.kind in LIMIT_CONSTRAINT_TYPES:
+                indices.setdefault((channel.name, LIMIT_CONSTRAINT_TYPES[channel.kind]), []).append(index)
         self._limits = [
             (constraint, limited, *_bounds(constraint, [channels[index].axis for index in limited]))
             for (name, constraint_type), limited in indices.items()

@@ -16,7 +16,7 @@ from ..core.recording.target import POSE
 from ..core.rig import Rig
 from ..poses.clip import find_clips
 from ..poses.sample_selection import SampleSelection, select_bones
-from ..poses.sampling import Ranges, choose, locked_channels, sampled_channels, sampled_numbers
+from ..poses.sampling import ControlRanges, choose, locked_channels, sampled_channels, sampled_numbers
 from ..rig.dependencies import read_dependencies
 from ..rig.pose_setter import NO_TARGET, TargetSettings
 from ..rig.reading import read_rig
@@ -106,7 +106,7 @@ def read_sample_selection(
     """
     dependencies = read_dependencies(scene_rig, find_actions(settings))
 
-    def find_controls(sampled: Ranges) -> Iterator[Control]:
+    def find_controls(sampled: ControlRanges) -> Iterator[Control]:
         yield from dependencies.controls
         yield from parse_controls(scene_rig, settings.controls, sampled)
 

@@ -17,7 +17,7 @@ from ..core.errors import RigError
 from ..scene.node_groups import GeometryEffect, find_time_node, geometry_effect
 from ..scene.scene_rig import MODIFIER_NAME, SceneRig, armature_modifier
 
-PLAYBACK_KEY = "fdda_playback"
+PLAYBACK_GROUP_KEY = "fdda_playback_group"
 """Custom property of the node group of FDDA modifiers."""
 
 DEFORMING = {
@@ -81,7 +81,7 @@ def is_fdda_modifier(modifier: bpy.types.Modifier) -> bool:
     """Return whether a modifier is an FDDA modifier, which is never part of the rig."""
     if modifier.type != "NODES":
         return False
-    return modifier.name == MODIFIER_NAME if modifier.node_group is None else PLAYBACK_KEY in modifier.node_group
+    return modifier.name == MODIFIER_NAME if modifier.node_group is None else PLAYBACK_GROUP_KEY in modifier.node_group
 
 
 def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:

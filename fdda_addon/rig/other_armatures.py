@@ -17,7 +17,7 @@ _COPY_CONSTRAINTS = {"COPY_LOCATION": LOCATION, "COPY_ROTATION": ROTATION, "COPY
 _FOUR_COMPONENT_MODES = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
 _VERBS = {ROTATION: "turn", LOCATION: "move", SCALE: "scale"}
 
-Ranges = dict[int, tuple[float, float] | None]
+AxisRanges = dict[int, tuple[float, float] | None]
 """Ranges of free channels by axis; None for a channel without a range."""
 
 
@@ -118,7 +118,7 @@ def _varies(bounds: tuple[float, float] | None) -> bool:
     return bounds is None or bounds[0] < bounds[1]
 
 
-def _free_channels(bone: bpy.types.PoseBone) -> Iterator[tuple[str, str, Ranges]]:
+def _free_channels(bone: bpy.types.PoseBone) -> Iterator[tuple[str, str, AxisRanges]]:
     """Yield kind, property and ranges of the channels that are free to move a bone."""
     if bone.rotation_mode in _FOUR_COMPONENT_MODES:
         if not all(bone.lock_rotation) and not _is_replaced(bone, ROTATION):

@@ -7,7 +7,7 @@ different positions.
 
 import bpy
 
-from ..rig.modifier_stack import PLAYBACK_KEY
+from ..rig.modifier_stack import PLAYBACK_GROUP_KEY
 from ..scene.compatibility import node_input, set_node_input
 from ..scene.scene_rig import MODIFIER_NAME
 
@@ -43,12 +43,12 @@ def add_modifier(mesh_object: bpy.types.Object, index: int) -> bpy.types.NodesMo
 
 def find_modifier(mesh_object: bpy.types.Object) -> bpy.types.NodesModifier | None:
     """Find the FDDA modifier of a mesh object; return None when it was removed."""
-    return next((modifier for modifier in mesh_object.modifiers if is_fdda_modifier(modifier)), None)
+    return next((modifier for modifier in mesh_object.modifiers if has_playback_group(modifier)), None)
 
 
-def is_fdda_modifier(modifier: bpy.types.Modifier) -> bool:
-    """Return whether a modifier is an FDDA modifier."""
-    return modifier.type == "NODES" and modifier.node_group is not None and PLAYBACK_KEY in modifier.node_group
+def has_playback_group(modifier: bpy.types.Modifier) -> bool:
+    """Return whether a modifier is an FDDA modifier that still has its node group."""
+    return modifier.type == "NODES" and modifier.node_group is not None and PLAYBACK_GROUP_KEY in modifier.node_group
 
 
 def is_from_library(modifier: bpy.types.NodesModifier) -> bool:
@@ -70,7 +70,7 @@ def set_buffer(modifier: bpy.types.NodesModifier, buffer: bpy.types.Object | Non
 
 def used_buffers() -> set[bpy.types.Object]:
     """Return the position buffers that FDDA modifiers read."""
-    modifiers = (m for o in bpy.data.objects if o.type == "MESH" for m in o.modifiers if is_fdda_modifier(m))
+    modifiers = (m for o in bpy.data.objects if o.type == "MESH" for m in o.modifiers if has_playback_group(m))
     return {buffer for modifier in modifiers if (buffer := buffer_of(modifier)) is not None}
 
 
@@ -87,10 +87,10 @@ def _ensure_node_group() -> bpy.types.NodeTree:
     It leaves the mesh unchanged if the position buffer is missing or has another number of vertices.
     """
     for group in bpy.data.node_groups:
-        if PLAYBACK_KEY in group and group.library is None:
+        if PLAYBACK_GROUP_KEY in group and group.library is None:
             return group
     group = bpy.data.node_groups.new(GROUP_NAME, "GeometryNodeTree")
-    group[PLAYBACK_KEY] = True
+    group[PLAYBACK_GROUP_KEY] = True
     group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
     group.interface.new_socket("Positions", in_out="INPUT", socket_type="NodeSocketObject")
     group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")

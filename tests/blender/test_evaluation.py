@@ -10,7 +10,7 @@ import pytest
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.metrics import error_statistics
 from fdda_addon.core.model import read_model_info
-from fdda_addon.core.poses import sample_pose, scale_ranges
+from fdda_addon.core.poses import sample_pose, widen_ranges
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.evaluation.run import (
@@ -98,7 +98,7 @@ def test_figures_are_what_a_direct_computation_gives(report, rig, elbow):
     for partition, found in zip(LinearSkinning(read_rig(rig)).partitions, report["partitions"], strict=True):
         assert found["vertices"] == len(partition.vertices)
         assert found["fdda"]["mean"] == pytest.approx(1000 * fdda[:, partition.vertices].mean(), abs=2e-4)
-    assert scale_ranges(channels, 2)[0].high > channels[0].high
+    assert widen_ranges(channels, 2)[0].high > channels[0].high
 
 
 def evaluated_with(rig, elbow, **settings) -> Evaluation:

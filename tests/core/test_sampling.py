@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from fdda_addon.core.poses import Channel, Margin, bones_with_changed_range, make_margin, sample_pose, scale_ranges
+from fdda_addon.core.poses import Channel, Margin, bones_with_changed_range, make_margin, sample_pose, widen_ranges
 
 CHANNELS = (
     Channel("a", "rotation", 0, -1.0, 3.0),
@@ -65,7 +65,7 @@ def test_a_range_of_one_value_gives_that_value():
 
 
 def test_beyond_range_widens_about_the_middle():
-    widened = scale_ranges(CHANNELS, 2.5)
+    widened = widen_ranges(CHANNELS, 2.5)
     found = [(c.low, c.high) for c in widened]
     np.testing.assert_allclose(found, [(-4, 6), (0.0625, 0.6875), (-0.035, 0.015)], atol=1e-12)
     assert [(c.name, c.kind, c.axis) for c in widened] == [(c.name, c.kind, c.axis) for c in CHANNELS]
