@@ -30,7 +30,7 @@ def fit_folder(
 
     Args:
         folder: written by `FitPosesWriter`.
-        kind: one of `core.skin_fit.KINDS`.
+        kind: one of `core.skin_fit.FIT_KINDS`.
         sink: receives progress, and last the result.
         should_stop: called often; nothing has been written when it stops the fit.
         metres_per_unit: as in `Rig`.

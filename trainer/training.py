@@ -10,7 +10,7 @@ import onnxruntime
 import torch
 
 from fdda_addon.core.checks.recording import check_recording
-from fdda_addon.core.checks.warning import RecordingWarning, refuse
+from fdda_addon.core.checks.warning import RecordingWarning, raise_first_warning
 from fdda_addon.core.messages import MessageType
 from fdda_addon.core.output import atomic_write_all
 from fdda_addon.core.partition import Partition
@@ -187,7 +187,7 @@ def _check(recording: Recording, sink: MessageSink, strict: bool) -> list[Record
     for warning in warnings:
         sink.send(MessageType.WARNING, **warning.to_json())
     if strict:
-        refuse(warnings)
+        raise_first_warning(warnings)
     return warnings
 
 

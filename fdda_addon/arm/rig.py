@@ -6,7 +6,7 @@ import math
 import bpy
 import numpy as np
 
-from ..scene.arrays import COORDINATE, MATERIAL_INDEX, write
+from ..scene.arrays import COORDINATE_ELEMENT, MATERIAL_INDEX, write
 from .action import assign_drive_action
 from .joints import ARM_OBJECT, BICEPS_KEY, ELBOW_FLEXION, JOINT_NAMES, JOINTS, LOCKED, RIG_OBJECT, ROTATION_MODE
 from .surface import Surface, sculpt_arm
@@ -122,7 +122,7 @@ def _add_biceps(arm: bpy.types.Object, rig: bpy.types.Object, surface: Surface):
     basis = arm.shape_key_add(name="Basis", from_mix=False)
     key = arm.shape_key_add(name=BICEPS_KEY, from_mix=False)
     key.relative_key = basis
-    write(key.data, COORDINATE, (surface.points + surface.biceps).astype(np.float32))
+    write(key.data, COORDINATE_ELEMENT, (surface.points + surface.biceps).astype(np.float32))
     driver = key.driver_add("value").driver
     driver.type = "SCRIPTED"
     variable = driver.variables.new()

@@ -11,7 +11,7 @@ import numpy as np
 from ..core.errors import RigError
 from ..rig.modifier_stack import ModifierStack
 from ..runtime.binding import unbind
-from ..scene.arrays import COORDINATE, write
+from ..scene.arrays import COORDINATE_ELEMENT, write
 from ..scene.compatibility import animation_curves
 from ..scene.mesh import rest_positions
 from ..scene.stored_paths import stored_path
@@ -97,7 +97,7 @@ def play_shape_keys(mesh_object: bpy.types.Object, stack: ModifierStack, positio
     if mesh_object.parent_type in {"ARMATURE", "LATTICE"}:
         # Such a parent deforms an object that has no modifier for it.
         mesh_object.parent_type = "OBJECT"
-    write(mesh_object.shape_key_add(name=BASIS, from_mix=False).data, COORDINATE, rest)
+    write(mesh_object.shape_key_add(name=BASIS, from_mix=False).data, COORDINATE_ELEMENT, rest)
     keys = mesh_object.data.shape_keys
     keys.use_relative = False
     for eval_time, frame_positions in enumerate(positions, 1):
@@ -105,7 +105,7 @@ def play_shape_keys(mesh_object: bpy.types.Object, stack: ModifierStack, positio
         keys.eval_time, frame = eval_time, first + eval_time - 1
         key = mesh_object.shape_key_add(name=f"Frame {frame}", from_mix=False)
         key.interpolation = "KEY_LINEAR"
-        write(key.data, COORDINATE, np.ascontiguousarray(frame_positions, np.float32))
+        write(key.data, COORDINATE_ELEMENT, np.ascontiguousarray(frame_positions, np.float32))
         # Interpolation between only the first and the last frame would show rounding errors in long actions.
         keys.keyframe_insert("eval_time", frame=frame)
     for curve in animation_curves(keys.animation_data.action):

@@ -22,7 +22,7 @@ def run(options: argparse.Namespace) -> None:
         OutputError: the file cannot be written.
     """
     from ..core.checks.recording import check_recording
-    from ..core.checks.warning import refuse
+    from ..core.checks.warning import raise_first_warning
     from ..core.file_kind import WARNINGS
     from ..core.output import check_outputs, write_json
     from ..core.recording.reader import read_recording
@@ -38,6 +38,6 @@ def run(options: argparse.Namespace) -> None:
     if options.json:
         write_json(options.json, {"warnings": [warning.to_json() for warning in warnings]})
     if options.strict:
-        refuse(warnings)
+        raise_first_warning(warnings)
     if not warnings:
         print(f"{options.recording}: nothing suspicious was found")

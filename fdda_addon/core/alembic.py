@@ -23,7 +23,7 @@ ACYCLIC = 1e30
 """Seconds of a cycle above which Alembic stores a time for each sample."""
 
 
-def time_range(path: Path) -> tuple[float, float] | None:
+def read_time_range(path: Path) -> tuple[float, float] | None:
     """Read the first and last second of the animation in an Alembic file.
 
     None where the file has another container (HDF5), is no Alembic file, is damaged, or has no animation.

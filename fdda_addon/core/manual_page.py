@@ -12,12 +12,12 @@ STYLE = (
 _BLOCK = r"^(#{1,6} |\||    |<img|- |\d+\. )"
 
 
-def anchor(heading: str) -> str:
+def heading_anchor(heading: str) -> str:
     """Return the anchor of a heading."""
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
-def page(text: str, folder: str) -> str:
+def make_page(text: str, folder: str) -> str:
     """Convert Markdown text to a page; relative links and images are resolved against the URL `folder`."""
     body = "\n".join(_block(block, folder) for block in _blocks(text))
     return f'<!doctype html><meta charset="utf-8"><title>FDDA</title><style>{STYLE}</style>\n{body}\n'
@@ -47,7 +47,7 @@ def _block(lines: list[str], folder: str) -> str:
     if heading := re.match(r"(#{1,6}) (.*)", first):
         level = len(heading[1])
         text = _inline(" ".join([heading[2], *lines[1:]]), folder)
-        return f'<h{level} id="{anchor(heading[2])}">{text}</h{level}>'
+        return f'<h{level} id="{heading_anchor(heading[2])}">{text}</h{level}>'
     if first.startswith("|"):
         return _table(lines, folder)
     if first.startswith("    "):

@@ -15,11 +15,11 @@ class Mask:
 
     Attributes:
         weights: (V,) float32, 0 to 1.
-        partial: (n,) int64, ascending indices of the vertices with a weight below 1.
+        partial_vertices: (n,) int64, ascending indices of the vertices with a weight below 1.
     """
 
     weights: np.ndarray
-    partial: np.ndarray
+    partial_vertices: np.ndarray
 
     @staticmethod
     def from_weights(weights: np.ndarray) -> "Mask":
@@ -27,10 +27,12 @@ class Mask:
         weights = np.clip(np.asarray(weights, np.float32), 0, 1)
         return Mask(weights, np.flatnonzero(weights < 1))
 
-    def blended(self, linear: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    def blend(self, linear: np.ndarray, positions: np.ndarray) -> np.ndarray:
         """Blend (V, 3) float32 positions of one pose: `linear` where the weight is 0, `positions` where it is 1."""
-        blended, weights = positions.copy(), self.weights[self.partial][:, None]
-        blended[self.partial] = linear[self.partial] + weights * (positions[self.partial] - linear[self.partial])
+        blended, weights = positions.copy(), self.weights[self.partial_vertices][:, None]
+        blended[self.partial_vertices] = linear[self.partial_vertices] + weights * (
+            positions[self.partial_vertices] - linear[self.partial_vertices]
+        )
         return blended
 
     def __eq__(self, other: object) -> bool:
@@ -71,35 +73,35 @@ class SkinningBlend:
             (N, V, 3) float32, mesh-object space, mesh units; `positions` itself where it was overwritten.
         """
         if strengths.min() < 1:
-            linear = self._make_full_skinning().positions(pose_matrices)
+            linear = self._full_linear_skinning().positions(pose_matrices)
             factors = strengths.astype(np.float32)[:, None]
             if self.mask is not None:
                 factors = factors * self.mask.weights
             blended = strengths > 0
             linear[blended] += factors[blended][..., None] * (positions[blended] - linear[blended])
             return linear
-        if self.mask is not None and len(self.mask.partial):
-            partial = self.mask.partial
-            linear = self._make_partial_skinning().positions(pose_matrices)
-            weights = self.mask.weights[partial][:, None]
-            positions[:, partial] = linear + weights * (positions[:, partial] - linear)
+        if self.mask is not None and len(self.mask.partial_vertices):
+            partial_vertices = self.mask.partial_vertices
+            linear = self._partial_linear_skinning().positions(pose_matrices)
+            weights = self.mask.weights[partial_vertices][:, None]
+            positions[:, partial_vertices] = linear + weights * (positions[:, partial_vertices] - linear)
         return positions
 
-    def _make_full_skinning(self) -> LinearSkinning:
+    def _full_linear_skinning(self) -> LinearSkinning:
         if self._full_skinning is None:
             self._full_skinning = LinearSkinning(self._rig)
         return self._full_skinning
 
-    def _make_partial_skinning(self) -> LinearSkinning:
-        """Return linear skinning of the partial vertices alone, so that the cost follows their count."""
+    def _partial_linear_skinning(self) -> LinearSkinning:
+        """Return the linear skinning of the partial vertices alone, which costs less than that of all."""
         if self._partial_skinning is None:
-            rig, partial = self._rig, self.mask.partial
+            rig, partial_vertices = self._rig, self.mask.partial_vertices
             self._partial_skinning = LinearSkinning(
                 replace(
                     rig,
-                    rest_positions=rig.rest_positions[partial],
-                    skin_joints=rig.skin_joints[partial],
-                    skin_weights=rig.skin_weights[partial],
+                    rest_positions=rig.rest_positions[partial_vertices],
+                    skin_joints=rig.skin_joints[partial_vertices],
+                    skin_weights=rig.skin_weights[partial_vertices],
                 )
             )
         return self._partial_skinning

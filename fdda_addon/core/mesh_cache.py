@@ -12,7 +12,7 @@ _MDD_HEADER = struct.Struct(">ii")
 """Big-endian frame and point counts. Float32 follow: seconds of each frame, then x, y, z of each point by frame."""
 
 
-def mesh_cache_frames(path: Path) -> int:
+def read_frame_count(path: Path) -> int:
     """Return the number of frames in a .pc2 or .mdd file.
 
     Raises:

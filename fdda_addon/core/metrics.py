@@ -67,13 +67,13 @@ def heat_colors(errors: np.ndarray, max_error: float = HEAT_MAP_STOPS[-1][0]) ->
     return heat.astype(np.float32)
 
 
-def worst_poses(errors: np.ndarray, count: int, apart: int) -> list[int]:
+def worst_poses(errors: np.ndarray, count: int, min_index_distance: int) -> list[int]:
     """Find the poses with the largest error of a vertex, the worst first.
 
     Args:
         errors: (N, V) metres.
         count: most poses to return.
-        apart: smallest difference of two indices, so that one movement is not reported several times.
+        min_index_distance: smallest difference of two indices, so that one movement is not reported several times.
 
     Returns:
         Indices of poses; poses without error are left out.
@@ -83,6 +83,6 @@ def worst_poses(errors: np.ndarray, count: int, apart: int) -> list[int]:
     for index in np.argsort(-largest, kind="stable"):
         if len(chosen) == count or largest[index] < NO_ERROR_METRES:
             break
-        if all(abs(int(index) - other) >= apart for other in chosen):
+        if all(abs(int(index) - other) >= min_index_distance for other in chosen):
             chosen.append(int(index))
     return chosen

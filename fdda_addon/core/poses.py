@@ -8,7 +8,7 @@ import numpy as np
 from .defaults import SPREAD
 
 ROTATION, ROTATION_VECTOR, LOCATION, SCALE, CONTROL = "rotation", "rotation_vector", "location", "scale", "control"
-KINDS = (ROTATION, ROTATION_VECTOR, LOCATION, SCALE, CONTROL)
+CHANNEL_KINDS = (ROTATION, ROTATION_VECTOR, LOCATION, SCALE, CONTROL)
 """Kinds of channels."""
 DEFAULT_RANGE = (-np.pi / 4, np.pi / 4)
 """Range of a rotation axis that the rig neither limits nor locks, radians."""
@@ -71,7 +71,7 @@ class Channel:
         channel = Channel(values.pop("bone"), **values)
         if not isinstance(channel.name, str) or not 0 < len(channel.name) <= MAX_CHANNEL_NAME_LENGTH:
             raise ValueError(f"its range of motion is of a bone called {channel.name!r}")
-        if channel.kind not in KINDS or type(channel.axis) is not int or channel.axis not in range(3):
+        if channel.kind not in CHANNEL_KINDS or type(channel.axis) is not int or channel.axis not in range(3):
             raise ValueError(f"its range of motion of {channel.name!r} is of {channel.kind!r}, axis {channel.axis!r}")
         for end in (channel.low, channel.high):
             if type(end) not in (int, float) or not np.isfinite(float(end)):

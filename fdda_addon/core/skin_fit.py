@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-KINDS = ("hard", "smooth")
+FIT_KINDS = ("hard", "smooth")
 """Kinds of fits: one joint per vertex, or at most `INFLUENCES`."""
 INFLUENCES = 4
 MAX_INFLUENCES = 64
@@ -28,7 +28,7 @@ class FitReport:
     rms_mm: dict[str, float]
     max_mm: dict[str, float]
 
-    def words(self, way: str) -> str:
+    def format_errors(self, way: str) -> str:
         return f"{self.rms_mm[way]:.2f} rms and {self.max_mm[way]:.1f} max"
 
 
@@ -37,7 +37,7 @@ class SkinFit:
     """How skin weights were fitted, and the errors before and after.
 
     Attributes:
-        kind: one of `KINDS`.
+        kind: one of `FIT_KINDS`.
         poses: number of evaluated poses.
         held_out: errors on half of the poses, which were held out.
         training: errors on the other half.
@@ -59,7 +59,7 @@ class SkinFit:
         Raises:
             KeyError, TypeError, ValueError: it is damaged.
         """
-        if value["kind"] not in KINDS or type(value["poses"]) is not int or value["poses"] < 0:
+        if value["kind"] not in FIT_KINDS or type(value["poses"]) is not int or value["poses"] < 0:
             raise ValueError(f"skin weights were fitted {value['kind']!r} to {value['poses']!r} poses")
         return SkinFit(value["kind"], value["poses"], _read_fit_report(value), _read_fit_report(value["training"]))
 
@@ -67,10 +67,10 @@ class SkinFit:
         """Describe the errors before and after the fit."""
         held_out, training = self.poses // 2, self.poses - self.poses // 2
         return (
-            f"Linear skinning with fitted weights ({self.kind}), mm: {self.held_out.words('fitted')} on {held_out} "
-            f"held-out poses, {self.held_out.words('rig')} with the rig's own weights; "
-            f"{self.training.words('fitted')} on the {training} poses of the fit, {self.training.words('rig')} with "
-            "the rig's own."
+            f"Linear skinning with fitted weights ({self.kind}), mm: {self.held_out.format_errors('fitted')} on "
+            f"{held_out} held-out poses, {self.held_out.format_errors('rig')} with the rig's own weights; "
+            f"{self.training.format_errors('fitted')} on the {training} poses of the fit, "
+            f"{self.training.format_errors('rig')} with the rig's own."
         )
 
 

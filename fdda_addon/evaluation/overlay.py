@@ -11,7 +11,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 
 from ..core.metrics import NO_ERROR_COLOR, NO_ERROR_METRES, heat_colors
-from ..scene.arrays import TRIANGLE, VECTOR, read
+from ..scene.arrays import TRIANGLE_ELEMENT, VECTOR_ELEMENT, read
 from ..scene.mesh import mesh_positions
 
 DEPTH_OFFSET = 2e-5
@@ -105,7 +105,7 @@ def overlay_mesh(context: bpy.types.Context, mesh_object: bpy.types.Object, colo
     mesh = evaluated.data
     if evaluated.mode == "EDIT" or len(mesh.vertices) != len(colors):
         return None
-    positions, normals = mesh_positions(mesh), read(mesh.vertex_normals, VECTOR)
+    positions, normals = mesh_positions(mesh), read(mesh.vertex_normals, VECTOR_ELEMENT)
     return OverlayMesh(positions, normals, colors, _triangles_of(mesh_object, mesh), evaluated.matrix_world.copy())
 
 
@@ -115,7 +115,7 @@ def _triangles_of(mesh_object: bpy.types.Object, mesh: bpy.types.Mesh) -> gpu.ty
     cached = _triangles.get(mesh_object.session_uid)
     if cached is None or cached[0] != counts:
         mesh.calc_loop_triangles()
-        triangles = read(mesh.loop_triangles, TRIANGLE)
+        triangles = read(mesh.loop_triangles, TRIANGLE_ELEMENT)
         cached = _triangles[mesh_object.session_uid] = (counts, gpu.types.GPUIndexBuf(type="TRIS", seq=triangles))
     return cached[1]
 

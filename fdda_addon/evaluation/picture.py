@@ -17,7 +17,7 @@ from mathutils import Matrix
 from ..core.errors import OutputError
 from ..core.metrics import HEAT_MAP_STOPS, NO_ERROR_COLOR, heat_colors
 from ..core.output import atomic_write
-from ..scene.arrays import COLOR, LOOP_START, VERTEX_INDEX, write
+from ..scene.arrays import COLOR_ELEMENT, LOOP_START, VERTEX_INDEX, write
 from ..scene.blend_file import blender_path
 from ..scene.mesh import set_mesh_positions, topology
 
@@ -262,7 +262,7 @@ def _set_colors(mesh: bpy.types.Mesh, colors: np.ndarray) -> None:
     attribute = mesh.color_attributes.new("color", "FLOAT_COLOR", "POINT")
     rgba = np.ones((len(colors), 4), np.float32)
     rgba[:, :3] = _linear(colors)
-    write(attribute.data, COLOR, rgba)
+    write(attribute.data, COLOR_ELEMENT, rgba)
     mesh.color_attributes.active_color = attribute
 
 

@@ -328,7 +328,7 @@ class _Comparison:
             all_controls.append(controls)
             linear_positions = self._skinning.positions(pose_matrices[None])[0]
             if self._mask is not None:
-                model_positions = self._mask.blended(linear_positions, model_positions)
+                model_positions = self._mask.blend(linear_positions, model_positions)
             fdda.append(distances(model_positions, rig_positions, self._metres_per_unit))
             linear.append(distances(linear_positions, rig_positions, self._metres_per_unit))
             if self._surface:

@@ -29,7 +29,7 @@ class FDDA_OT_help(bpy.types.Operator):
         except (OSError, OutputError) as error:
             self.report({"ERROR"}, f"The manual cannot be opened ({error}).")
             return {"CANCELLED"}
-        address = path.as_uri() + (f"#{manual_page.anchor(self.section)}" if self.section else "")
+        address = path.as_uri() + (f"#{manual_page.heading_anchor(self.section)}" if self.section else "")
         try:
             bpy.ops.wm.url_open(url=address)
         except RuntimeError:
@@ -48,7 +48,7 @@ def manual_file() -> Path:
     text = MANUAL.read_text(encoding="utf-8")
     folder = Path(bpy.app.tempdir or tempfile.gettempdir())
     path = folder / "fdda_manual.html"
-    write_text(path, manual_page.page(text, MANUAL.parent.as_uri()))
+    write_text(path, manual_page.make_page(text, MANUAL.parent.as_uri()))
     return path
 
 

@@ -43,7 +43,7 @@ def last_check(scene_rig: SceneRig) -> "RigCheck | None":
 def check_now(scene_rig: SceneRig) -> "RigCheck":
     """Check a rig now. What has not changed is not read again."""
     from ..recording.plan import RecordingSettings
-    from ..recording.rig_check import check
+    from ..recording.rig_check import check_recordable_rig
 
     try:
         settings, problems = recording_settings(scene_rig), ()
@@ -52,7 +52,7 @@ def check_now(scene_rig: SceneRig) -> "RigCheck":
     uid, signature = scene_rig.mesh_object.session_uid, _change_signature(scene_rig)
     stored = _checks.get(uid)
     same_rest = stored is not None and stored[1][0] == signature[0] and not _is_mesh_changed(scene_rig)
-    result = stored[0].recheck(scene_rig, settings) if same_rest else check(scene_rig, settings)
+    result = stored[0].recheck(scene_rig, settings) if same_rest else check_recordable_rig(scene_rig, settings)
     result = replace(result, problems=result.problems + problems)
     _outdated.discard(uid)
     _changed_meshes.discard(scene_rig.mesh_object.data.name)

@@ -37,12 +37,12 @@ def read_content(rig: SceneRig) -> "tuple[Path, FolderContent] | str":
 def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
     """Return the content of a recording folder. Read it again after a change of the folder, the rig or the settings."""
     from ..core.recording.folder import read_folder
-    from ..core.recording.index import INDEX
+    from ..core.recording.index import INDEX_NAME
     from ..recording.plan import make_sampling
 
     check, settings = checks.last_check(rig), recording_settings(rig)
     try:
-        modified_ns = os.stat(path / INDEX).st_mtime_ns
+        modified_ns = os.stat(path / INDEX_NAME).st_mtime_ns
     except OSError:
         modified_ns = -1 if path.exists() else 0
     uid = rig.mesh_object.session_uid
@@ -114,7 +114,7 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         _draw_record(layout, context, "Resume", ready, resume=True)
     elif content.state is FolderState.COMPLETE:
         draw_wrapped(layout, context, f"{content.poses:,} poses recorded. Next: Train", "CHECKMARK")
-        for sentence in content.measured:
+        for sentence in content.measured_sentences:
             draw_wrapped(layout, context, sentence)
         if content.sentence:
             draw_wrapped(layout, context, content.sentence, "INFO")

@@ -18,7 +18,7 @@ from ..core.controls import ARMATURE, ARMATURE_OBJECT, MESH_OBJECT, SHAPE_KEYS, 
 from ..core.errors import RigError
 from ..core.poses import CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.rotations import euler_angles, rotation_vectors, total_range_width
-from ..scene.arrays import KEYFRAME, read
+from ..scene.arrays import KEYFRAME_ELEMENTS, read
 from ..scene.compatibility import curves_of
 from ..scene.controls import is_driven, is_number, make_control, owner_of
 from ..scene.scene_rig import SceneRig
@@ -157,7 +157,7 @@ def _keyframe_content(
                     return None
                 rotation_mode = armature_object.pose.bones[bone].rotation_mode
                 curve_settings.append((bone, rotation_mode, channel, index, len(points), curve.extrapolation))
-                for element in KEYFRAME:
+                for element in KEYFRAME_ELEMENTS:
                     digest.update(read(points, element))
     return frames, digest.digest(), tuple(curve_settings)
 

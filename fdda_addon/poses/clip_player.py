@@ -85,20 +85,14 @@ class ClipPlayer:
         if clip.is_mirrored:
             self._mirror.apply()
 
-    def frames(self, clip: Clip, first: int = 0) -> Iterator[None]:
-        """Show the frames of a clip, one for each iteration, from the index `first` on."""
-        for frame in clip.frames[first:]:
-            self.show(clip, frame)
-            yield
-
     @property
-    def shown(self) -> ClipFrame:
+    def current_clip_frame(self) -> ClipFrame:
         """Return the values of the frame that is shown."""
         bones = self._armature_object.pose.bones
         numbers = {(datablock, path): read_value(datablock, path) for datablock, path in self._numbers}
         return ClipFrame(tuple(read(bones, channel) for channel in POSE_CHANNELS), numbers)
 
-    def put(self, clip_frame: ClipFrame, frame: int) -> None:
+    def set_clip_frame(self, clip_frame: ClipFrame, frame: int) -> None:
         """Set the values of a shown frame at another frame of the scene, without animation."""
         self.stop()
         for channel, values in zip(POSE_CHANNELS, clip_frame.channels, strict=True):

@@ -19,7 +19,7 @@ BodyPartRanges = tuple[AxisRange, AxisRange, tuple[float, float]]
 """Ranges in degrees about two directions of the body, and about the bone itself, for the left side."""
 
 _SPINE: BodyPartRanges = ((X, -10, 20), (Y, -12, 12), (-12, 12))
-RANGES: tuple[tuple[str, BodyPartRanges], ...] = (
+RANGES_BY_NAME_PATTERN: tuple[tuple[str, BodyPartRanges], ...] = (
     (r"hips?|pelvis|torso", ((X, -20, 20), (Y, -15, 15), (-20, 20))),
     (r"spine\d*|chest|upperchest|abdomen|waist", _SPINE),
     (r"neck\d*", ((X, -20, 20), (Y, -15, 15), (-25, 25))),
@@ -57,7 +57,7 @@ def body_part_of(name: str) -> tuple[BodyPartRanges | None, str]:
         part_name = part_name[: match.start()] + part_name[match.end() :]
         side = _LETTERS.get(side.lower(), side.lower())
     letters = re.sub(r"[^a-z0-9]", "", part_name.lower())
-    ranges = next((ranges for pattern, ranges in RANGES if re.fullmatch(pattern, letters)), None)
+    ranges = next((ranges for pattern, ranges in RANGES_BY_NAME_PATTERN if re.fullmatch(pattern, letters)), None)
     return ranges, side
 
 

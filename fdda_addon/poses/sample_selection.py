@@ -12,7 +12,7 @@ from ..scene.scene_rig import SceneRig
 from .action_range import constant_controls, keyed_ranges, measured_controls
 from .clip import find_action
 
-SELECTED, COLLECTION, ACTION, BONE = "selected", "collection:", "action:", "bone:"
+SELECTED_BONES, COLLECTION_PREFIX, ACTION_PREFIX, BONE_PREFIX = "selected", "collection:", "action:", "bone:"
 """The forms of an entry: the selected bones, a bone collection, the bones that an action keys, a bone."""
 
 
@@ -24,16 +24,16 @@ class SampleSelection:
         bones: names of the selected bones; None for the default bones (`default_channels`).
         measured: ranges of what the selected actions key. Bones that are selected by an action move in these, within
             the limits of the rig. Other selected bones use them if they have no range of motion.
-        by_action: names of the bones that are selected by actions alone.
+        action_bones: names of the bones that are selected by actions alone.
         controls: the controls, listed by the user or keyed by the actions.
-        held: numbers that the actions key at a single value which differs from the current one.
+        constant_channels: numbers that the actions key at a single value which differs from the current one.
     """
 
     bones: frozenset[str] | None = None
     measured: tuple[tuple[tuple[str, str, int], tuple[float, float]], ...] = ()
-    by_action: frozenset[str] = frozenset()
+    action_bones: frozenset[str] = frozenset()
     controls: tuple[Control, ...] = ()
-    held: tuple[Channel, ...] = ()
+    constant_channels: tuple[Channel, ...] = ()
 
 
 DEFAULT_SELECTION = SampleSelection()
@@ -45,7 +45,7 @@ def select_bones(scene_rig: SceneRig, texts: Iterable[str]) -> SampleSelection:
 
     Args:
         scene_rig: the rig.
-        texts: as for `sampling.choose`.
+        texts: as for `sampling.parse_sample_selection`.
 
     Raises:
         RigError: there is no such collection, action or bone.
@@ -56,33 +56,33 @@ def select_bones(scene_rig: SceneRig, texts: Iterable[str]) -> SampleSelection:
     selected: set[str] = set()
     actions = []
     for text in texts:
-        if text.startswith(ACTION):
-            actions.append(find_action(text.removeprefix(ACTION)))
+        if text.startswith(ACTION_PREFIX):
+            actions.append(find_action(text.removeprefix(ACTION_PREFIX)))
         else:
             selected |= _bones_of(scene_rig, text)
     measured = keyed_ranges(scene_rig.armature_object, actions)
     keyed = {bone for bone, _, _ in measured}
-    controls, held = measured_controls(scene_rig, actions), constant_controls(scene_rig, actions)
+    controls, constant_channels = measured_controls(scene_rig, actions), constant_controls(scene_rig, actions)
     return SampleSelection(
-        frozenset(selected | keyed), tuple(measured.items()), frozenset(keyed - selected), controls, held
+        frozenset(selected | keyed), tuple(measured.items()), frozenset(keyed - selected), controls, constant_channels
     )
 
 
 def _bones_of(scene_rig: SceneRig, text: str) -> set[str]:
     armature_object = scene_rig.armature_object
     bones, data = armature_object.pose.bones, armature_object.data
-    if text == SELECTED:
+    if text == SELECTED_BONES:
         return {bone.name for bone in bones if is_selected(bone)}
-    if text.startswith(COLLECTION):
-        name = text.removeprefix(COLLECTION)
+    if text.startswith(COLLECTION_PREFIX):
+        name = text.removeprefix(COLLECTION_PREFIX)
         if name not in data.collections_all:
             names = ", ".join(f"'{c.name}'" for c in data.collections_all) or "none"
             raise RigError(f"'{armature_object.name}' has no bone collection '{name}'; its collections: {names}.")
         return {bone.name for bone in data.collections_all[name].bones_recursive}
-    name = text.removeprefix(BONE)
-    if not text.startswith(BONE) or name not in bones:
+    name = text.removeprefix(BONE_PREFIX)
+    if not text.startswith(BONE_PREFIX) or name not in bones:
         raise RigError(
-            f"'{text}' chooses nothing of '{armature_object.name}'; give {SELECTED}, {COLLECTION}NAME, {ACTION}NAME or "
-            f"{BONE}NAME of what is there."
+            f"'{text}' chooses nothing of '{armature_object.name}'; give {SELECTED_BONES}, {COLLECTION_PREFIX}NAME, "
+            f"{ACTION_PREFIX}NAME or {BONE_PREFIX}NAME of what is there."
         )
     return {name}

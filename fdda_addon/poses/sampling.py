@@ -9,7 +9,7 @@ import bpy
 from ..core.controls import Control
 from ..core.errors import RigError
 from ..core.model import ModelInfo
-from ..core.poses import CONTROL, KINDS, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
+from ..core.poses import CHANNEL_KINDS, CONTROL, LOCATION, RANGE_TOLERANCE, ROTATION, ROTATION_VECTOR, SCALE, Channel
 from ..core.rig import Rig
 from ..scene.controls import is_driven, is_number, owner_of
 from ..scene.scene_rig import SceneRig
@@ -23,7 +23,7 @@ ControlRanges = dict[str, tuple[float, float]]
 """Ranges by the names of controls."""
 
 
-def choose(
+def parse_sample_selection(
     scene_rig: SceneRig, texts: Iterable[str], find_controls: Callable[[ControlRanges], Iterable[Control]]
 ) -> SampleSelection:
     """Parse the user's selection of bones and controls.
@@ -43,7 +43,7 @@ def choose(
     controls = {control.name: control for control in selection.controls}
     controls |= {control.name: control for control in find_controls(sampled_numbers(scene_rig, selection))}
     selection = replace(selection, controls=tuple(controls.values()))
-    has_bones = selection.bones is None or selection.bones - selection.by_action
+    has_bones = selection.bones is None or selection.bones - selection.action_bones
     if not controls and not has_bones and not any(has_width(bounds) for _, bounds in selection.measured):
         raise RigError(f"Nothing is chosen to sample by {', '.join(texts)}; choose bones that an animator poses.")
     return selection
@@ -79,7 +79,7 @@ def sampled_channels(
         if control.name in controls and not is_driven(owner_of(scene_rig, control.owner), control.path)
     ]
     control_names = {control.name for control in selection.controls}
-    channels += [channel for channel in selection.held if channel.name not in control_names]
+    channels += [channel for channel in selection.constant_channels if channel.name not in control_names]
     if not channels:
         raise RigError(
             f"No bone of '{armature_object.name}' may be sampled: all {len(rig.joints)} are locked or moved by "
@@ -110,7 +110,7 @@ def model_channels(scene_rig: SceneRig, rig: Rig, info: ModelInfo) -> tuple[Chan
         if channel.kind == CONTROL:
             exists = is_number(owner_of(scene_rig, owner), path)
         else:
-            exists = channel.name in bones and channel.kind in KINDS
+            exists = channel.name in bones and channel.kind in CHANNEL_KINDS
         if not exists or channel.axis not in range(3):
             raise RigError(
                 f"'{scene_rig.armature_object.name}' lacks '{channel.name}', which the random poses of the model "
@@ -119,7 +119,7 @@ def model_channels(scene_rig: SceneRig, rig: Rig, info: ModelInfo) -> tuple[Chan
     return info.limits or sampled_channels(scene_rig, rig)
 
 
-def rig_states_channels(scene_rig: SceneRig, channels: tuple[Channel, ...]) -> bool:
+def rig_allows_ranges(scene_rig: SceneRig, channels: tuple[Channel, ...]) -> bool:
     """Return whether the limits and locks of a rig still allow the ranges of channels.
 
     The range of an action may be narrower than the limit of its bone.
@@ -187,7 +187,7 @@ def selected_channels(armature_object: bpy.types.Object, selection: SampleSelect
     for bone in armature_object.pose.bones:
         if bone.name not in selection.bones:
             continue
-        keyed, by_action = measured.get(bone.name, {}), bone.name in selection.by_action
+        keyed, by_action = measured.get(bone.name, {}), bone.name in selection.action_bones
         if not by_action:
             keyed = {key: bounds for key, bounds in keyed.items() if has_width(bounds)}
         channels += _selected_rotation_channels(bone, keyed, by_action)

@@ -203,7 +203,7 @@ class FDDA_PG_character(bpy.types.PropertyGroup):
 
 
 def fit_kind(settings: FDDA_PG_character) -> str:
-    """Return the kind of fitted skin weights (`core.skin_fit.KINDS`); empty for the weights of the rig."""
+    """Return the kind of fitted skin weights (`core.skin_fit.FIT_KINDS`); empty for the weights of the rig."""
     return "" if settings.fit_linear == "RIG" else settings.fit_linear.lower()
 
 

@@ -77,7 +77,7 @@ def copy_sampling_settings(settings: FDDA_PG_character, other: FDDA_PG_character
 
 
 def _sample_options(settings: FDDA_PG_character, actions: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the choice of bones in the syntax of `poses.sampling.choose`."""
+    """Return the choice of bones in the syntax of `poses.sampling.parse_sample_selection`."""
     if settings.sample == "COLLECTION":
         if not settings.bone_collection:
             raise RigError(

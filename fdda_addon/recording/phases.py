@@ -18,7 +18,7 @@ from ..core.rig import Rig
 from ..core.skin_fit import SkinFit
 from ..rig.reading import PoseEvaluator
 from ..rig.target import Target
-from ..rig.temporary_rig_state import Posed
+from ..rig.temporary_rig_state import PosedRig
 from ..scene.scene_rig import SceneRig
 
 
@@ -74,7 +74,7 @@ class MeshPlanned:
         return PoseEvaluator(self.scene_rig, rig, self.target)
 
     @property
-    def posed(self) -> Posed:
+    def posed_rig(self) -> PosedRig:
         """The argument for `temporary_rig_states`."""
         return self.scene_rig, self.rig, self.channels
 

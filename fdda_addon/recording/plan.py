@@ -16,7 +16,13 @@ from ..core.recording.target import POSE
 from ..core.rig import Rig
 from ..poses.clip import find_clips
 from ..poses.sample_selection import SampleSelection, select_bones
-from ..poses.sampling import ControlRanges, choose, locked_channels, sampled_channels, sampled_numbers
+from ..poses.sampling import (
+    ControlRanges,
+    locked_channels,
+    parse_sample_selection,
+    sampled_channels,
+    sampled_numbers,
+)
 from ..rig.dependencies import read_dependencies
 from ..rig.pose_setter import NO_TARGET, TargetSettings
 from ..rig.reading import read_rig
@@ -40,8 +46,9 @@ class RecordingSettings:
         influence_tolerance: a joint influences a residual that it changes by more than this ratio of the rig's size.
         resume: continue an interrupted recording.
         overwrite: replace a recording in the folder.
-        sample: which control bones the random poses move, as `sampling.choose` reads it; empty for those of the rig.
-        fit_linear: kind of the skin weights that are fitted (`core.skin_fit.KINDS`); empty for those of the rig.
+        sample: control bones that the random poses move, in the syntax of `sampling.parse_sample_selection`; empty for
+            the default bones.
+        fit_linear: kind of the skin weights that are fitted (`core.skin_fit.FIT_KINDS`); empty for those of the rig.
         controls: listed properties that are inputs beside the automatic ones, in the syntax of `parse_controls`.
         min_partition_vertices: partitions with fewer vertices are merged into others; 0 merges none.
         shard: number, from 1, and count of the shards, to record one of them; None for all poses.
@@ -78,10 +85,10 @@ def read_sampled_rig(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[
     Raises:
         RigError: the rig cannot be read, or has nothing to sample.
     """
-    choice, extra_joints = read_sample_selection(scene_rig, settings)
+    selection, extra_joints = read_sample_selection(scene_rig, settings)
     rig = read_rig(scene_rig, extra_joints, depends_on_time(scene_rig, settings))
-    channels = sampled_channels(scene_rig, rig, choice) if settings.poses else ()
-    return replace(rig, controls=choice.controls), channels
+    channels = sampled_channels(scene_rig, rig, selection) if settings.poses else ()
+    return replace(rig, controls=selection.controls), channels
 
 
 def depends_on_time(scene_rig: SceneRig, settings: RecordingSettings) -> bool:
@@ -110,8 +117,8 @@ def read_sample_selection(
         yield from dependencies.controls
         yield from parse_controls(scene_rig, settings.controls, sampled)
 
-    choice = choose(scene_rig, settings.sample, find_controls)
-    return choice, None if choice.bones is None else dependencies.bones
+    selection = parse_sample_selection(scene_rig, settings.sample, find_controls)
+    return selection, None if selection.bones is None else dependencies.bones
 
 
 def listed_controls(scene_rig: SceneRig, settings: RecordingSettings) -> tuple[Control, ...]:

@@ -21,7 +21,7 @@ from ..core.recording.reader import Recording, read_recording
 from ..core.refinement import Probes, choose_poses, nearest_recorded_distances
 from ..core.rig import Rig, rig_differences
 from ..core.skinning import LinearSkinning
-from ..poses.sampling import model_channels, rig_states_channels
+from ..poses.sampling import model_channels, rig_allows_ranges
 from ..rig.modifier_stack import check_evaluable
 from ..rig.reading import PoseEvaluator
 from ..rig.temporary_rig_state import temporary_rig_state
@@ -132,7 +132,7 @@ def _check_recording(scene_rig: SceneRig, recording: Recording, rig: Rig, channe
             f"'{recording.path}' has no random poses, so there is no range of motion to choose from; record with "
             "--poses."
         )
-    if recording.info.sampling.channels != channels or not rig_states_channels(scene_rig, channels):
+    if recording.info.sampling.channels != channels or not rig_allows_ranges(scene_rig, channels):
         raise RecordingError(
             f"The range of motion of the rig is not that of '{recording.path}' any more; record anew into another "
             "folder."

@@ -44,7 +44,7 @@ class RigCheck:
         return _check(scene_rig, settings, self)
 
 
-def check(scene_rig: SceneRig, settings: RecordingSettings = DEFAULT_SETTINGS) -> RigCheck:
+def check_recordable_rig(scene_rig: SceneRig, settings: RecordingSettings = DEFAULT_SETTINGS) -> RigCheck:
     """Check a rig; while a model plays, the rig's modifiers are disabled and not checked."""
     return _check(scene_rig, settings, None)
 
@@ -60,10 +60,10 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, previous: RigCheck 
             problems.append(str(error))
     try:
         result = replace(result, replaced_modifiers=tuple(m.name for m in deforming_modifiers(scene_rig.mesh_object)))
-        choice, extra_joints = read_sample_selection(scene_rig, settings)
+        selection, extra_joints = read_sample_selection(scene_rig, settings)
         if stack is not None and not settings.target.name:
             try:
-                check_time_inputs(scene_rig, choice.controls, stack, find_actions(settings))
+                check_time_inputs(scene_rig, selection.controls, stack, find_actions(settings))
             except RigError as error:
                 problems.append(str(error))
         include_static_joint = depends_on_time(scene_rig, settings)
@@ -76,10 +76,10 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, previous: RigCheck 
             rig = previous.rig
         else:
             rig = read_rig(scene_rig, *read_options)
-        if rig.controls != choice.controls:
-            rig = replace(rig, controls=choice.controls)
+        if rig.controls != selection.controls:
+            rig = replace(rig, controls=selection.controls)
         listed = listed_controls(scene_rig, settings)
-        automatic_controls = tuple(control for control in choice.controls if control not in listed)
+        automatic_controls = tuple(control for control in selection.controls if control not in listed)
         result = replace(
             result,
             rig=rig,
@@ -87,7 +87,7 @@ def _check(scene_rig: SceneRig, settings: RecordingSettings, previous: RigCheck 
             extra_joints=extra_joints,
             include_static_joint=include_static_joint,
         )
-        result = replace(result, channels=sampled_channels(scene_rig, rig, choice))
+        result = replace(result, channels=sampled_channels(scene_rig, rig, selection))
     except RigError as error:
         # A rig without channels to sample can still be recorded from actions alone.
         if str(error) not in problems and (result.rig is None or settings.poses):

@@ -15,7 +15,7 @@ from ..core.poses import sample_pose
 from ..core.progress import Progress
 from ..core.recording.estimate import check_disk_space, recording_bytes
 from ..core.recording.folder_check import check_recordable
-from ..core.recording.index import INDEX, RecordingInfo
+from ..core.recording.index import INDEX_NAME, RecordingInfo
 from ..core.recording.shard import Shard, shard_poses
 from ..core.recording.target import POSE
 from ..core.recording.writer import RecordingWriter
@@ -86,13 +86,13 @@ def record_meshes(rigs: Sequence[tuple[SceneRig, Path]], settings: RecordingSett
 def _record_planned(
     planned: list[MeshPlanned], settings: RecordingSettings, clips: tuple[Clip, ...], plan: PosePlan
 ) -> Iterator[Progress]:
-    meshes, posed = [mesh.scene_rig for mesh in planned], [mesh.posed for mesh in planned]
-    with temporary_rig_states(posed, clips) if settings.fit_linear else nullcontext() as player:
+    meshes, posed_rigs = [mesh.scene_rig for mesh in planned], [mesh.posed_rig for mesh in planned]
+    with temporary_rig_states(posed_rigs, clips) if settings.fit_linear else nullcontext() as player:
         fitted = yield from _run_phase(planned, lambda mesh: _fit_mesh_weights(mesh, settings, plan, player))
     for mesh_indices in group_into_passes(meshes):
         meshes_in_pass = [fitted[index] for index in mesh_indices]
-        others = [mesh for index, mesh in enumerate(posed) if index not in mesh_indices]
-        with temporary_rig_states([posed[index] for index in mesh_indices], clips, others) as player:
+        others = [mesh for index, mesh in enumerate(posed_rigs) if index not in mesh_indices]
+        with temporary_rig_states([posed_rigs[index] for index in mesh_indices], clips, others) as player:
             if plan.pose_setter.target:
                 yield from check_target_moves(meshes_in_pass[0], plan, player)
             check_follows_pose(meshes_in_pass, plan, player)
@@ -136,7 +136,7 @@ def _plan(
 
 def _previous_recording(path: Path, settings: RecordingSettings, is_one_of_several: bool) -> Path | None:
     """Return the recording that has weights and influences for the one at `path`; None where there is none."""
-    if settings.resume and (path / INDEX).exists():
+    if settings.resume and (path / INDEX_NAME).exists():
         return path
     if settings.influences is None:
         return None

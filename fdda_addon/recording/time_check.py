@@ -45,11 +45,11 @@ def check_follows_pose(meshes: Sequence[WeightsFitted], plan: PosePlan, player: 
         for number in {plan.total // 3, plan.total - 1}:
             with closing(plan.show_poses(player, {number})) as poses:
                 next(poses)
-                shown = player.shown
-                player.put(shown, frame)
+                clip_frame = player.current_clip_frame
+                player.set_clip_frame(clip_frame, frame)
                 first = [evaluator.evaluate() for evaluator in evaluators]
                 for other in sorted(others):
-                    player.put(shown, other)
+                    player.set_clip_frame(clip_frame, other)
                     for mesh, evaluator, before in zip(meshes, evaluators, first, strict=True):
                         _compare_surfaces(mesh, (frame, other), before, evaluator.evaluate())
     finally:

@@ -55,7 +55,7 @@ def fit_weights(rig: Rig, kind: str, poses: Iterator[None], count: int, evaluato
 
     Args:
         rig: with its own skin weights.
-        kind: one of `core.skin_fit.KINDS`.
+        kind: one of `core.skin_fit.FIT_KINDS`.
         poses: sets one pose per iteration.
         count: number of poses.
         evaluator: of the scene.

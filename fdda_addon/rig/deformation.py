@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import bpy
 
 from ..core.rig import Fingerprint
-from ..scene.arrays import COORDINATE, read
+from ..scene.arrays import COORDINATE_ELEMENT, read
 from ..scene.compatibility import node_input
 from ..scene.controls import owner_name
 from ..scene.scene_rig import SceneRig
@@ -89,10 +89,10 @@ def _read_shape_keys(mesh_object: bpy.types.Object) -> dict:
     for block in keys.key_blocks:
         if block == keys.reference_key:
             continue
-        positions = read(block.data, COORDINATE)
+        positions = read(block.data, COORDINATE_ELEMENT)
         relative = block.relative_key
         if relative.name not in relatives:
-            relatives[relative.name] = read(relative.data, COORDINATE)
+            relatives[relative.name] = read(relative.data, COORDINATE_ELEMENT)
         if (positions == relatives[relative.name]).all():
             # It moves no vertex.
             continue

@@ -20,16 +20,16 @@ from ..scene.scene_rig import MODIFIER_NAME, SceneRig, armature_modifier
 PLAYBACK_GROUP_KEY = "fdda_playback_group"
 """Custom property of the node group of FDDA modifiers."""
 
-DEFORMING = {
+DEFORMING_TYPES = {
     "ARMATURE", "CAST", "CLOTH", "CORRECTIVE_SMOOTH", "CURVE", "DISPLACE", "HOOK", "LAPLACIANDEFORM",
     "LAPLACIANSMOOTH", "LATTICE", "MESH_CACHE", "MESH_DEFORM", "MESH_SEQUENCE_CACHE", "SHRINKWRAP", "SIMPLE_DEFORM",
     "SMOOTH", "SOFT_BODY", "SURFACE_DEFORM", "WARP", "WAVE",
 }  # fmt: skip
-TOPOLOGY_CHANGING = {
+TOPOLOGY_CHANGING_TYPES = {
     "ARRAY", "BEVEL", "BOOLEAN", "BUILD", "DECIMATE", "EDGE_SPLIT", "EXPLODE", "MASK", "MIRROR", "MULTIRES",
     "PARTICLE_INSTANCE", "REMESH", "SCREW", "SKIN", "SOLIDIFY", "SUBSURF", "VOLUME_TO_MESH", "WELD", "WIREFRAME",
 }  # fmt: skip
-TIME_DEPENDENT = {
+TIME_DEPENDENT_TYPES = {
     "BUILD": "changes with time", "CLOTH": "is a simulation", "DYNAMIC_PAINT": "is a simulation",
     "EXPLODE": "is a simulation", "FLUID": "is a simulation", "MESH_CACHE": "plays a cache",
     "MESH_SEQUENCE_CACHE": "plays a cache", "OCEAN": "changes with time", "PARTICLE_INSTANCE": "is a simulation",
@@ -40,11 +40,11 @@ BIND_PROPERTIES = {
     "SURFACE_DEFORM": "is_bound",
 }  # fmt: skip
 """Modifiers that must be bound to a rest pose, and the property that tells whether they are."""
-INDIRECT = {
+INDIRECT_TYPES = {
     "DATA_TRANSFER", "TRIANGULATE", "VERTEX_WEIGHT_EDIT", "VERTEX_WEIGHT_MIX", "VERTEX_WEIGHT_PROXIMITY",
 }  # fmt: skip
 """Modifiers that move no vertices, but change the effect of later modifiers: they edit weights or edges."""
-NEEDS_ORIGINAL_MESH = {"MULTIRES", "SOFT_BODY"}
+ORIGINAL_MESH_TYPES = {"MULTIRES", "SOFT_BODY"}
 """Modifiers before which Blender allows no modifier that creates a mesh, such as the FDDA modifier, on or off."""
 
 
@@ -100,7 +100,7 @@ def read_stack(mesh_object: bpy.types.Object) -> ModifierStack:
         with _switched_off(mesh_object, [m for m in generating if m != modifiers[i]]):
             kinds[i] = _Kind.DEFORMS if _keeps_topology(mesh_object) else _Kind.GENERATES
     deforming = [i for i, kind in enumerate(kinds) if kind in {_Kind.DEFORMS, _Kind.UNSURE}]
-    need_original = [i for i, m in enumerate(modifiers) if m.type in NEEDS_ORIGINAL_MESH]
+    need_original = [i for i, m in enumerate(modifiers) if m.type in ORIGINAL_MESH_TYPES]
     # If all are off, all count, because the user may switch them on later.
     visible = [i for i in deforming if modifiers[i].show_viewport] or deforming
     last = max(visible + need_original, default=-1)
@@ -140,7 +140,7 @@ def recorded_modifiers(mesh_object: bpy.types.Object) -> list[bpy.types.Modifier
     index = _fdda_modifier_index(mesh_object)
     if index is None:
         index = read_stack(mesh_object).insert_index
-    candidates = [m for m in mesh_object.modifiers[:index] if _kind(m) is not _Kind.NEUTRAL or m.type in INDIRECT]
+    candidates = [m for m in mesh_object.modifiers[:index] if _kind(m) is not _Kind.NEUTRAL or m.type in INDIRECT_TYPES]
     binding = getattr(mesh_object, "fdda", None)
     if binding is None or not binding.is_playing:
         return [m for m in candidates if m.show_viewport]
@@ -181,7 +181,7 @@ def check_stack(mesh_object: bpy.types.Object) -> ModifierStack:
             )
     for name in stack.misplaced:
         subject = f"Modifier '{name}' of '{mesh_object.name}' changes the topology of the mesh"
-        if mesh_object.modifiers[name].type in NEEDS_ORIGINAL_MESH:
+        if mesh_object.modifiers[name].type in ORIGINAL_MESH_TYPES:
             raise RigError(
                 f"{subject}, and Blender lets nothing that plays a model stand before it; switch it off in the "
                 "viewport, or apply it."
@@ -271,9 +271,9 @@ def _kind(modifier: bpy.types.Modifier) -> _Kind:
     if modifier.type == "DYNAMIC_PAINT":
         surfaces = modifier.canvas_settings.canvas_surfaces if modifier.canvas_settings else ()
         return _Kind.DEFORMS if any(s.surface_type in {"DISPLACE", "WAVE"} for s in surfaces) else _Kind.NEUTRAL
-    if modifier.type in DEFORMING:
+    if modifier.type in DEFORMING_TYPES:
         return _Kind.DEFORMS
-    return _Kind.GENERATES if modifier.type in TOPOLOGY_CHANGING else _Kind.NEUTRAL
+    return _Kind.GENERATES if modifier.type in TOPOLOGY_CHANGING_TYPES else _Kind.NEUTRAL
 
 
 def time_dependence(modifier: bpy.types.Modifier) -> str:
@@ -283,7 +283,7 @@ def time_dependence(modifier: bpy.types.Modifier) -> str:
         return f"changes with time (node '{node.name}' of '{node.id_data.name}')" if node else ""
     if _kind(modifier) is _Kind.NEUTRAL:
         return ""
-    return TIME_DEPENDENT.get(modifier.type, "")
+    return TIME_DEPENDENT_TYPES.get(modifier.type, "")
 
 
 def _is_unbound(modifier: bpy.types.Modifier) -> bool:

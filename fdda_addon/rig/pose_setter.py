@@ -189,9 +189,9 @@ def show_frames_reversed(
         shown_frames = []
         for frame in clip.frames[: turning_index + 1]:
             player.show(clip, frame)
-            shown_frames.append(player.shown)
+            shown_frames.append(player.current_clip_frame)
         for step, index in enumerate(range(turning_index - 1, min(wanted) - 1, -1), 1):
-            player.put(shown_frames[index], clip.frames[turning_index] + step)
+            player.set_clip_frame(shown_frames[index], clip.frames[turning_index] + step)
             if index in wanted:
                 yield index
 
@@ -224,9 +224,9 @@ def _play_pre_roll(target: Target, player: ClipPlayer, clip: Clip, first_frame: 
     armature_object = target.scene_rig.armature_object
     bones = armature_object.pose.bones
     player.show(clip, clip.frames[0])
-    end_channels = player.shown.channels
+    end_channels = player.current_clip_frame.channels
     player.stop()
-    rest_channels = player.shown.channels
+    rest_channels = player.current_clip_frame.channels
     target.restart_simulations()
     for frame in range(first_frame, clip.frames[0]):
         fraction = (frame - first_frame) / (clip.frames[0] - first_frame)

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import bpy
 
-from ..core.alembic import time_range
+from ..core.alembic import read_time_range
 from ..core.errors import PointCacheError, RigError, os_error_text
-from ..core.mesh_cache import mesh_cache_frames
+from ..core.mesh_cache import read_frame_count
 from ..scene.node_groups import SIMULATION_NODES, find_time_node
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import resolve_path
-from .modifier_stack import TIME_DEPENDENT
+from .modifier_stack import TIME_DEPENDENT_TYPES
 from .sources import Sources
 from .time_inputs import time_inputs
 
@@ -77,8 +77,8 @@ def _modifier_caches(modifier: bpy.types.Modifier, description: str) -> Iterator
         if modifier.cache_file is None:
             raise RigError(f"{_capitalize(description)} has no cache file; choose one, or another target.")
         yield _file_cache(modifier.cache_file, description)
-    elif modifier.type in TIME_DEPENDENT:
-        is_simulation = TIME_DEPENDENT[modifier.type] == "is a simulation"
+    elif modifier.type in TIME_DEPENDENT_TYPES:
+        is_simulation = TIME_DEPENDENT_TYPES[modifier.type] == "is a simulation"
         yield Cache(description, scene.frame_start if is_simulation else None, None, is_simulation)
 
 
@@ -87,7 +87,7 @@ def _mesh_cache(modifier: bpy.types.MeshCacheModifier, description: str) -> Cach
     if modifier.time_mode != "FRAME" or modifier.play_mode != "SCENE":
         return Cache(description)
     try:
-        frames = mesh_cache_frames(path)
+        frames = read_frame_count(path)
     except PointCacheError as error:
         raise RigError(f"{_capitalize(description)} plays what cannot be read. {error}") from error
     return Cache(description, modifier.frame_start, modifier.frame_start + (frames - 1) / modifier.frame_scale)
@@ -110,7 +110,7 @@ def _file_cache(cache_file: bpy.types.CacheFile, description: str) -> Cache:
 def _file_frames(path: Path, fps: float) -> tuple[float, float] | None:
     """Read the first and last frame of a cache file; return None if they are unknown."""
     if path.suffix.lower() in ALEMBIC_SUFFIXES:
-        seconds = time_range(path)
+        seconds = read_time_range(path)
         return None if seconds is None else (seconds[0] * fps, seconds[1] * fps)
     if path.suffix.lower() in USD_SUFFIXES:
         return _usd_frames(path)

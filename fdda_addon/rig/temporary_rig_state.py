@@ -15,7 +15,7 @@ from ..scene.scene_rig import SceneRig
 from ..scene.temporary_state import temporary_pose
 from .modifier_stack import downstream_disabled
 
-Posed = tuple[SceneRig, Rig, tuple[Channel, ...]]
+PosedRig = tuple[SceneRig, Rig, tuple[Channel, ...]]
 """A rig, and the channels of the random poses that will be set."""
 
 
@@ -30,7 +30,7 @@ def temporary_rig_state(
 
 @contextmanager
 def temporary_rig_states(
-    rigs: Sequence[Posed], clips: tuple[Clip, ...] = (), beside: Sequence[Posed] = ()
+    rigs: Sequence[PosedRig], clips: tuple[Clip, ...] = (), beside: Sequence[PosedRig] = ()
 ) -> Iterator[ClipPlayer]:
     """Set rigs to the rest pose, without animation; restore modifiers, pose, controls, animation and frame afterwards.
 

@@ -14,7 +14,7 @@ from ..core.errors import FDDAError, ModelError, RigError
 from ..core.mask import SkinningBlend
 from ..core.rig import STATIC_JOINT
 from ..rig.reading import PoseReader, read_model_rig
-from ..scene.arrays import MUTE, write
+from ..scene.arrays import MUTE_ELEMENT, write
 from ..scene.controls import ControlReader
 from ..scene.mask import mask_key, read_mask
 from ..scene.mesh import set_mesh_positions
@@ -376,4 +376,4 @@ def _mute_shape_keys(mesh_object: bpy.types.Object) -> None:
     keys = mesh_object.data.shape_keys
     # A muted first key means that all were muted since they were copied, or that the user muted it.
     if keys is not None and not keys.key_blocks[0].mute and mesh_object.original.data.users == 1:
-        write(keys.key_blocks, MUTE, np.ones(len(keys.key_blocks), bool))
+        write(keys.key_blocks, MUTE_ELEMENT, np.ones(len(keys.key_blocks), bool))

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 import bpy
 import numpy as np
 
-from .arrays import KEYFRAME, read
+from .arrays import KEYFRAME_ELEMENTS, read
 from .compatibility import curves_of, curves_of_slot
 
 MIN_CHANGE = 1e-6
@@ -46,7 +46,7 @@ def changes_value(curve: bpy.types.FCurve) -> bool:
     points = curve.keyframe_points
     if len(points) < 2 and curve.extrapolation == "CONSTANT":
         return False
-    values = np.concatenate([read(points, element).reshape(len(points), -1)[:, 1] for element in KEYFRAME[:3]])
+    values = np.concatenate([read(points, element).reshape(len(points), -1)[:, 1] for element in KEYFRAME_ELEMENTS[:3]])
     return bool(len(points)) and float(np.ptp(values)) > MIN_CHANGE
 
 

@@ -30,18 +30,18 @@ class Element:
         return np.empty((count, *self.shape), self.dtype)
 
 
-COORDINATE = Element("co", np.float32, (3,))
+COORDINATE_ELEMENT = Element("co", np.float32, (3,))
 """Of vertices and of the points of shape keys; object space."""
-VECTOR = Element("vector", np.float32, (3,))
+VECTOR_ELEMENT = Element("vector", np.float32, (3,))
 """Of vector attributes and of vertex normals."""
-COLOR = Element("color", np.float32, (4,))
+COLOR_ELEMENT = Element("color", np.float32, (4,))
 """Of color attributes: linear RGBA."""
-MUTE = Element("mute", np.bool_)
+MUTE_ELEMENT = Element("mute", np.bool_)
 """Of shape keys."""
 LOOP_START = Element("loop_start", np.int32)
 VERTEX_INDEX = Element("vertex_index", np.int32)
 MATERIAL_INDEX = Element("material_index", np.int32)
-TRIANGLE = Element("vertices", np.int32, (3,))
+TRIANGLE_ELEMENT = Element("vertices", np.int32, (3,))
 """Of loop triangles."""
 POSE_MATRIX = Element("matrix", np.float32, (4, 4))
 """Of pose bones: armature space, column-major."""
@@ -55,7 +55,7 @@ POSE_CHANNELS = (
     Element("scale", np.float32, (3,)),
 )
 """Of pose bones: all properties that define a pose; angles in radians."""
-KEYFRAME = (
+KEYFRAME_ELEMENTS = (
     Element("co", np.float32, (2,)),
     Element("handle_left", np.float32, (2,)),
     Element("handle_right", np.float32, (2,)),

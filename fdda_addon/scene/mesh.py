@@ -5,7 +5,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import RigError
-from .arrays import COORDINATE, LOOP_START, VECTOR, VERTEX_INDEX, read, write
+from .arrays import COORDINATE_ELEMENT, LOOP_START, VECTOR_ELEMENT, VERTEX_INDEX, read, write
 
 
 def rest_positions(mesh: bpy.types.Mesh) -> np.ndarray:
@@ -15,7 +15,7 @@ def rest_positions(mesh: bpy.types.Mesh) -> np.ndarray:
         (V, 3) float32, mesh-object space, mesh units.
     """
     source = mesh.shape_keys.reference_key.data if mesh.shape_keys else mesh.vertices
-    return read(source, COORDINATE)
+    return read(source, COORDINATE_ELEMENT)
 
 
 def topology(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray]:
@@ -56,8 +56,8 @@ def mesh_positions(mesh: bpy.types.Mesh) -> np.ndarray:
     positions = mesh.attributes.get("position")
     if positions is None:
         # In edit mode a mesh has no attributes; its vertices are those before the edit.
-        return read(mesh.vertices, COORDINATE)
-    return read(positions.data, VECTOR)
+        return read(mesh.vertices, COORDINATE_ELEMENT)
+    return read(positions.data, VECTOR_ELEMENT)
 
 
 def set_mesh_positions(mesh: bpy.types.Mesh, positions: np.ndarray) -> None:
@@ -70,4 +70,4 @@ def set_mesh_positions(mesh: bpy.types.Mesh, positions: np.ndarray) -> None:
     if not len(positions):
         # A mesh without vertices has no such attribute.
         return
-    write(mesh.attributes["position"].data, VECTOR, positions)
+    write(mesh.attributes["position"].data, VECTOR_ELEMENT, positions)

@@ -12,7 +12,7 @@ from blend_fixtures.characters.base import tube
 from fdda_addon.core.errors import RigError
 from fdda_addon.evaluation.run import EvaluationSettings, evaluate
 from fdda_addon.recording.plan import RecordingSettings
-from fdda_addon.recording.rig_check import check
+from fdda_addon.recording.rig_check import check_recordable_rig
 from fdda_addon.recording.run import record
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
@@ -40,7 +40,7 @@ def assert_refused(rig: SceneRig, model: Path, recording: Path, sentence: str) -
         with pytest.raises(RigError) as error:
             refused()
         assert str(error.value) == sentence
-    assert sentence in check(rig).problems
+    assert sentence in check_recordable_rig(rig).problems
     assert_same_state(before, scene_state(rig))
     assert not recording.exists()
 

@@ -7,22 +7,30 @@ import numpy as np
 import pytest
 
 from fdda_addon.scene import arrays
-from fdda_addon.scene.arrays import COORDINATE, LOOP_START, POSE_CHANNELS, POSE_MATRIX, VECTOR, Element, Reader
+from fdda_addon.scene.arrays import (
+    COORDINATE_ELEMENT,
+    LOOP_START,
+    POSE_CHANNELS,
+    POSE_MATRIX,
+    VECTOR_ELEMENT,
+    Element,
+    Reader,
+)
 from fdda_addon.scene.mesh import mesh_positions, set_mesh_positions
 
 OWNERS = {
-    "MeshVertex": (COORDINATE,),
-    "ShapeKeyPoint": (COORDINATE,),
-    "FloatVectorAttributeValue": (VECTOR,),
-    "MeshNormalValue": (VECTOR,),
-    "FloatColorAttributeValue": (arrays.COLOR,),
-    "ShapeKey": (arrays.MUTE,),
+    "MeshVertex": (COORDINATE_ELEMENT,),
+    "ShapeKeyPoint": (COORDINATE_ELEMENT,),
+    "FloatVectorAttributeValue": (VECTOR_ELEMENT,),
+    "MeshNormalValue": (VECTOR_ELEMENT,),
+    "FloatColorAttributeValue": (arrays.COLOR_ELEMENT,),
+    "ShapeKey": (arrays.MUTE_ELEMENT,),
     "MeshPolygon": (LOOP_START, arrays.MATERIAL_INDEX),
     "MeshLoop": (arrays.VERTEX_INDEX,),
-    "MeshLoopTriangle": (arrays.TRIANGLE,),
+    "MeshLoopTriangle": (arrays.TRIANGLE_ELEMENT,),
     "PoseBone": (POSE_MATRIX, *POSE_CHANNELS),
     "Bone": (arrays.REST_MATRIX,),
-    "Keyframe": arrays.KEYFRAME,
+    "Keyframe": arrays.KEYFRAME_ELEMENTS,
 }
 """Whose elements have them."""
 KINDS = {"FLOAT": np.float32, "INT": np.int32, "ENUM": np.int32, "BOOLEAN": np.bool_}
@@ -50,8 +58,8 @@ def mesh() -> bpy.types.Mesh:
 
 def test_what_is_written_is_read(mesh):
     positions = np.arange(9, dtype=np.float32).reshape(3, 3)
-    arrays.write(mesh.vertices, COORDINATE, positions)
-    for found in (arrays.read(mesh.vertices, COORDINATE), mesh_positions(mesh)):
+    arrays.write(mesh.vertices, COORDINATE_ELEMENT, positions)
+    for found in (arrays.read(mesh.vertices, COORDINATE_ELEMENT), mesh_positions(mesh)):
         assert found.dtype == np.float32 and np.array_equal(found, positions)
     set_mesh_positions(mesh, -positions)
     assert [tuple(vertex.co) for vertex in mesh.vertices] == [tuple(row) for row in (-positions).tolist()]
@@ -69,14 +77,14 @@ def test_what_is_written_is_read(mesh):
     ],
 )
 def test_what_does_not_fit_is_named_and_not_written(mesh, values, named):
-    arrays.write(mesh.vertices, COORDINATE, np.ones((3, 3), np.float32))
+    arrays.write(mesh.vertices, COORDINATE_ELEMENT, np.ones((3, 3), np.float32))
     with pytest.raises(ValueError, match=rf"'co' of .*\[3\], MeshVertices.* is \(3,\) float32 each, .* is {named}"):
-        arrays.write(mesh.vertices, COORDINATE, values)
+        arrays.write(mesh.vertices, COORDINATE_ELEMENT, values)
     assert (mesh_positions(mesh) == 1).all()
 
 
 def test_a_reader_reads_into_its_memory_and_refuses_another(mesh):
-    reader = Reader(VECTOR, np.empty((3, 3), np.float32))
+    reader = Reader(VECTOR_ELEMENT, np.empty((3, 3), np.float32))
     set_mesh_positions(mesh, np.full((3, 3), 2, np.float32))
     reader.read(mesh.attributes["position"].data)
     assert (reader.values == 2).all()
@@ -84,7 +92,7 @@ def test_a_reader_reads_into_its_memory_and_refuses_another(mesh):
     with pytest.raises(ValueError, match=r"'vector' of .*\[4\], FloatVectorAttribute.* the array is \(3, 3\) float32"):
         reader.read(mesh.attributes["position"].data)
     with pytest.raises(ValueError, match=r"'vector' of the memory to read into is .* the array is \(3, 3\) float64"):
-        Reader(VECTOR, np.empty((3, 3)))
+        Reader(VECTOR_ELEMENT, np.empty((3, 3)))
 
 
 def test_a_property_that_is_not_there_is_a_bug(mesh):

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from fdda_addon.core.messages import MessageType
-from fdda_addon.core.recording.arrays import STREAMED, array_shapes
+from fdda_addon.core.recording.arrays import array_shapes
 from fdda_addon.training.process import trainer_python
 
 from .conftest import run
@@ -125,7 +125,7 @@ def test_recording_chapter_names_every_key_and_array(folder):
     keys = dotted(index) | {key for name in ("joints", "partitions") for key in index[name][0]}
     keys |= {key for name in ("limits", "sources") for key in index["sampling"][name][0]}
     assert [key for key in sorted(keys) if not named(text, key)] == []
-    assert [name for name in array_shapes(1, 1, 1, 1, 1, 3) if f"`{name}.npy`" not in text] == [] and STREAMED
+    assert [name for name in array_shapes(1, 1, 1, 1, 1, 3) if f"`{name}.npy`" not in text] == []
 
 
 def test_model_chapter_names_every_key(folder):

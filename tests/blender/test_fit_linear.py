@@ -251,6 +251,6 @@ def test_the_sidebar_fits_as_the_command_line_does(tmp_path):
     own = read_rig(rig)
     same = read_folder(tmp_path / "recording", own, index["sampling"], "hard")
     assert (same.state, same.sentence) == (FolderState.COMPLETE, "")
-    assert same.measured[0].startswith("Linear skinning with fitted weights (hard), mm: ")
+    assert same.measured_sentences[0].startswith("Linear skinning with fitted weights (hard), mm: ")
     other = read_folder(tmp_path / "recording", own, index["sampling"], "")
     assert other.sentence == "It was recorded with other settings than those above: linear skinning."

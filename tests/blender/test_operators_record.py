@@ -14,7 +14,7 @@ import pytest
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.poses import sample_pose
 from fdda_addon.core.recording.index import read_index
-from fdda_addon.core.recording.lock import LOCK
+from fdda_addon.core.recording.lock import LOCK_NAME
 from fdda_addon.core.recording.lock import _lock as lock_file
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.jobs import job
@@ -272,7 +272,7 @@ class TestRecording:
 
     def test_another_blender_is_recording_there(self, saved, tmp_path):
         recorded_folder(tmp_path).mkdir()
-        lock = recorded_folder(tmp_path) / LOCK
+        lock = recorded_folder(tmp_path) / LOCK_NAME
         lock.write_text(json.dumps({"pid": os.getppid(), "host": socket.gethostname()}))
         with lock.open("r+b") as held:
             # The system's lock is of the open file, so this is another's also in one process.
@@ -348,7 +348,7 @@ class TestTraining:
             "random",
             "refined",
         ]
-        assert not (recorded_folder(tmp_path) / LOCK).exists()
+        assert not (recorded_folder(tmp_path) / LOCK_NAME).exists()
         assert bpy.ops.fdda.train(warm_start=True) == {"FINISHED"}
         model = model_file(saved.mesh_object)
         assert read_model_info(model).training["warm_start"]

@@ -13,7 +13,7 @@ from fdda_addon.panels.poses import _format_channels
 from fdda_addon.poses.action_range import measured_ranges
 from fdda_addon.poses.measured_limits import WIDE_NOTE, describe_limits, set_limits_from_actions
 from fdda_addon.poses.sample_selection import select_bones
-from fdda_addon.poses.sampling import rig_states_channels, sampled_channels, selected_channels
+from fdda_addon.poses.sampling import rig_allows_ranges, sampled_channels, selected_channels
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene.armature import Poser
 from fdda_addon.scene.compatibility import curves_of
@@ -62,9 +62,9 @@ def test_limits_narrow_what_an_action_keys_and_add_nothing(figure):
         ("location", 0): pytest.approx((0, 0.01)),
         ("location", 1): pytest.approx((0, 0.05), abs=1e-3),
     }
-    assert rig_states_channels(figure, channels), "poses can be added to such a recording"
+    assert rig_allows_ranges(figure, channels), "poses can be added to such a recording"
     spine.constraints["Limit Rotation"].max_y = 0.2
-    assert not rig_states_channels(figure, channels)
+    assert not rig_allows_ranges(figure, channels)
     # Whoever is chosen by name too moves in all of its limits.
     both = ranges(sampled(figure, "bone:spine", f"action:{WAVE}"), "spine")
     assert both["scale", 0] == (0, 2) and both["rotation", 0] == (-1.5, 1.5)

@@ -10,7 +10,7 @@ import pytest
 
 from blend_fixtures.characters import targets
 from blend_fixtures.elbow import ACTION, FRAMES
-from fdda_addon.core.alembic import time_range
+from fdda_addon.core.alembic import read_time_range
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.rig import STATIC_JOINT
 from fdda_addon.scene.blend_file import save_copy
@@ -132,12 +132,12 @@ def test_a_model_of_a_cache_is_bound_evaluated_and_plays_without_it(tmp_path, ca
 def test_the_times_of_alembic_files(tmp_path):
     built(targets.target_alembic, tmp_path / "rig.blend")
     path = Path(bpy.data.cache_files[0].filepath)
-    assert np.allclose(np.array(time_range(path)) * 24, (1, FRAMES))
+    assert np.allclose(np.array(read_time_range(path)) * 24, (1, FRAMES))
     data = path.read_bytes()
     damaged = tmp_path / "damaged.abc"
     for cut in (b"", data[:4], data[:12], data[:200], b"Ogawa\xff\x00\x01" + b"\xff" * 64):
         damaged.write_bytes(cut)
-        assert time_range(damaged) is None
+        assert read_time_range(damaged) is None
 
 
 def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):

@@ -34,7 +34,7 @@ def test_a_blend_is_what_strength_times_weight_says(rig, positions, weights, str
     np.testing.assert_allclose(shown, expected, atol=1e-6)
     assert shown.dtype == np.float32
     if weights is not None and strengths.min() == 1:
-        np.testing.assert_allclose(Mask.from_weights(weights).blended(linear[0], positions[0]), expected[0], atol=1e-6)
+        np.testing.assert_allclose(Mask.from_weights(weights).blend(linear[0], positions[0]), expected[0], atol=1e-6)
 
 
 def test_where_a_mask_is_one_the_model_is_untouched(rig, positions):
@@ -63,5 +63,5 @@ def test_another_mask_takes_the_place_of_the_first(rig, positions):
 
 def test_weights_beyond_zero_and_one_are_brought_to_them():
     mask = Mask.from_weights([-1, 0.5, 3])
-    assert mask.weights.tolist() == [0, 0.5, 1] and mask.partial.tolist() == [0, 1]
+    assert mask.weights.tolist() == [0, 0.5, 1] and mask.partial_vertices.tolist() == [0, 1]
     assert mask == Mask.from_weights([0, 0.5, 1]) and mask != Mask.from_weights([0, 0.5, 0.5])

@@ -13,7 +13,7 @@ from fdda_addon.core.file_kind import EVALUATION, PICTURE
 from fdda_addon.core.output import check_folder_writable, check_outputs, check_writable
 from fdda_addon.core.path_limits import windows_name_problem
 from fdda_addon.core.recording.folder_check import check_recordable
-from fdda_addon.core.recording.index import INDEX
+from fdda_addon.core.recording.index import INDEX_NAME
 
 DEVICE, DROPPED = "is the name of a device on Windows", "ends in a dot or a blank, which Windows drops"
 PROBLEMS = {
@@ -102,7 +102,7 @@ def test_windows_says_whether_it_takes_long_paths():
 
 def test_a_path_that_blender_would_cut_is_refused_on_every_system(tmp_path):
     """Blender counts bytes, and writes to what is left of the path."""
-    folder = folder_of(1023 - len("/" + INDEX), tmp_path)
+    folder = folder_of(1023 - len("/" + INDEX_NAME), tmp_path)
     with pytest.raises(OutputError, match=r"it needs a path of 1,032 bytes, and Blender takes 1,023; choose a shorter"):
         check_recordable(folder, resume=False)
     with pytest.raises(OutputError, match="bytes, and Blender takes 1,023"):

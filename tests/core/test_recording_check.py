@@ -10,7 +10,7 @@ import pytest
 
 from fdda_addon.core.checks import residual_scan
 from fdda_addon.core.checks.recording import WARNING_NAMES, check_recording, compute_bone_lengths, merges_sentence
-from fdda_addon.core.checks.warning import RecordingWarning, counted, format_length, listed
+from fdda_addon.core.checks.warning import RecordingWarning, format_length, format_list, format_with_noun
 from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.index import Source
 from fdda_addon.core.recording.reader import Recording
@@ -216,11 +216,14 @@ def test_warnings_are_sentences():
     assert str(warning) == "Warning (flips): It jumps; limit it."
     assert warning.to_json() == {"name": "flips", "text": "It jumps; limit it."}
     assert (
-        listed(["a"]) == "'a'"
-        and listed(["a", "b"]) == "'a' and 'b'"
-        and listed([1, 2, 3, 4, 5]) == "1, 2, 3 and 2 more"
+        format_list(["a"]) == "'a'"
+        and format_list(["a", "b"]) == "'a' and 'b'"
+        and format_list([1, 2, 3, 4, 5]) == "1, 2, 3 and 2 more"
     )
-    assert counted([3], "pose") == "the pose 3" and counted(["a", "b"], "joint") == "the 2 joints 'a' and 'b'"
+    assert (
+        format_with_noun([3], "pose") == "the pose 3"
+        and format_with_noun(["a", "b"], "joint") == "the 2 joints 'a' and 'b'"
+    )
 
 
 def test_lengths_are_metres_in_any_unit(good):

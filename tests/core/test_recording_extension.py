@@ -8,7 +8,7 @@ import pytest
 
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.recording.extension import RecordingExtension
-from fdda_addon.core.recording.index import INDEX, REFINED, Source
+from fdda_addon.core.recording.index import INDEX_NAME, REFINED, Source
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
@@ -51,10 +51,10 @@ def test_arrays_stay_plain_npy_files(recording):
 
 
 def test_what_the_index_does_not_count_is_not_read_and_is_written_over(recording):
-    before = (recording / INDEX).read_bytes()
+    before = (recording / INDEX_NAME).read_bytes()
     extend(recording)
     # As if the machine had stopped between the arrays and the index.
-    (recording / INDEX).write_bytes(before)
+    (recording / INDEX_NAME).write_bytes(before)
     assert_holds(recording)
     extend(recording, 3, seed=8)
     assert_holds(recording, (3, 8))
@@ -70,10 +70,10 @@ def test_arrays_that_grew_without_a_header_are_read(recording):
 
 def test_a_header_that_promises_too_much_is_refused(recording):
     extend(recording)
-    index = json.loads((recording / INDEX).read_text())
+    index = json.loads((recording / INDEX_NAME).read_text())
     index["poses"] = index["complete"] = POSES
     index["sampling"]["sources"].pop()
-    (recording / INDEX).write_text(json.dumps(index))
+    (recording / INDEX_NAME).write_text(json.dumps(index))
     with open(recording / "residuals.npy", "r+b") as file:
         file.truncate((recording / "residuals.npy").stat().st_size - 4)
     with pytest.raises(RecordingError, match="truncated"):
@@ -81,9 +81,9 @@ def test_a_header_that_promises_too_much_is_refused(recording):
 
 
 def test_sources_must_add_up(recording):
-    index = json.loads((recording / INDEX).read_text())
+    index = json.loads((recording / INDEX_NAME).read_text())
     index["sampling"]["sources"][0]["poses"] -= 1
-    (recording / INDEX).write_text(json.dumps(index))
+    (recording / INDEX_NAME).write_text(json.dumps(index))
     with pytest.raises(RecordingError, match=f"its sources do not add up to its {POSES} poses"):
         read_recording(recording)
 

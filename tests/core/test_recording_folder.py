@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from fdda_addon.core.errors import OutputError, RecordingError
-from fdda_addon.core.recording.arrays import ARRAYS
+from fdda_addon.core.recording.arrays import ARRAY_NAMES
 from fdda_addon.core.recording.folder import FolderContent, FolderState, read_folder, remove_recording
-from fdda_addon.core.recording.lock import LOCK, RecordingLock
+from fdda_addon.core.recording.lock import LOCK_NAME, RecordingLock
 from fdda_addon.core.recording.target import STATISTICS, Repeatability
 from fdda_addon.core.recording.writer import RecordingWriter
 
@@ -28,7 +28,7 @@ def look(path: Path, **changes: object) -> FolderContent:
 
 def test_a_folder_that_is_not_there_or_empty_is_free(tmp_path):
     assert look(tmp_path / "none").state is look(tmp_path).state is FolderState.FREE
-    (tmp_path / LOCK).write_text("{}")
+    (tmp_path / LOCK_NAME).write_text("{}")
     assert look(tmp_path).state is FolderState.FREE
 
 
@@ -54,7 +54,7 @@ def test_what_was_measured_with_a_recording_is_said(tmp_path):
     repeatability = Repeatability((1, 2), dict.fromkeys(STATISTICS, 0.25), 5.0)
     index = json.loads((tmp_path / "r" / "recording.json").read_text())
     (tmp_path / "r" / "recording.json").write_text(json.dumps({**index, "repeatability": repeatability.to_json()}))
-    assert look(tmp_path / "r").measured == (repeatability.sentence(),)
+    assert look(tmp_path / "r").measured_sentences == (repeatability.sentence(),)
     assert "0.25 mm apart on average" in repeatability.sentence()
 
 
@@ -105,7 +105,7 @@ def test_every_array_is_removed(tmp_path):
     with RecordingWriter(path, recording.rig, recording.partitions, info) as writer:
         writer.append(recording.pose_matrices, recording.residuals, recording.controls)
     assert (path / "controls.npy").exists()
-    assert {file.stem for file in path.glob("*.npy")} <= set(ARRAYS)
+    assert {file.stem for file in path.glob("*.npy")} <= set(ARRAY_NAMES)
     (path / f".fdda-{'0' * 12}.json").touch()
     remove_recording(path)
     assert not path.exists()
@@ -148,4 +148,4 @@ def test_a_folder_that_cannot_be_removed_is_named(tmp_path):
     (tmp_path / "r" / "residuals.npy").mkdir()
     with pytest.raises(OutputError, match="Cannot remove the recording"):
         remove_recording(tmp_path / "r")
-    assert not (tmp_path / "r" / LOCK).exists()
+    assert not (tmp_path / "r" / LOCK_NAME).exists()

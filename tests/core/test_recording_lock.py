@@ -13,7 +13,7 @@ import pytest
 from fdda_addon.core.errors import OutputError, RecordingError
 from fdda_addon.core.recording.extension import RecordingExtension
 from fdda_addon.core.recording.index import read_index
-from fdda_addon.core.recording.lock import LOCK, RecordingLock
+from fdda_addon.core.recording.lock import LOCK_NAME, RecordingLock
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
@@ -81,21 +81,21 @@ def test_the_second_process_is_told_and_changes_nothing(other, tmp_path):
     with pytest.raises(RecordingError, match=rf"Another Blender \(process {other.owner}\) is recording into") as error:
         write(tmp_path)
     assert str(error.value).endswith("wait for it, or choose another folder.")
-    assert [path.name for path in tmp_path.iterdir()] == [LOCK]
+    assert [path.name for path in tmp_path.iterdir()] == [LOCK_NAME]
 
 
 def test_the_lock_of_a_process_that_is_gone_is_taken_over(other, tmp_path):
     other.kill()
     other.wait()
-    assert (tmp_path / LOCK).exists()
+    assert (tmp_path / LOCK_NAME).exists()
     with write(tmp_path):
-        assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
-    assert LOCK not in [path.name for path in tmp_path.iterdir()]
+        assert json.loads((tmp_path / LOCK_NAME).read_text())["pid"] == os.getpid()
+    assert LOCK_NAME not in [path.name for path in tmp_path.iterdir()]
 
 
 @systems.forks
 def test_of_several_takers_of_a_dead_lock_one_gets_it(tmp_path):
-    (tmp_path / LOCK).write_text("{}")
+    (tmp_path / LOCK_NAME).write_text("{}")
     command = [sys.executable, "-c", TAKERS, str(tmp_path)]
     takers = [
         subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(4)
@@ -116,14 +116,14 @@ OTHERS_LOCKS = {
 @pytest.mark.parametrize("text", OTHERS_LOCKS.values(), ids=OTHERS_LOCKS)
 def test_what_a_file_says_that_nobody_has_locked_stops_nobody(tmp_path, text):
     """Numbers of processes mean nothing in another container, or after a restart."""
-    (tmp_path / LOCK).write_text(text)
+    (tmp_path / LOCK_NAME).write_text(text)
     with write(tmp_path):
         pass
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"pid": "x", "host": 1}', "x" * 5000, "[" * 900])
 def test_a_lock_that_names_nobody_holds_all_the_same(other, tmp_path, text):
-    (tmp_path / LOCK).write_text(text)
+    (tmp_path / LOCK_NAME).write_text(text)
     with pytest.raises(RecordingError, match=r"^Another process is recording into"):
         write(tmp_path)
 
@@ -135,7 +135,7 @@ def test_a_lock_on_a_full_disk_holds(small_disk):
     with pytest.raises(RecordingError, match="This Blender is recording into"):
         RecordingLock(small_disk).acquire()
     lock.release()
-    assert not (small_disk / LOCK).exists()
+    assert not (small_disk / LOCK_NAME).exists()
 
 
 def test_one_process_does_not_write_a_recording_twice(tmp_path):
@@ -154,14 +154,14 @@ def test_an_extension_locks_too(tmp_path):
         pytest.raises(RecordingError, match="This Blender is recording into"),
     ):
         write(tmp_path / "r", resume=True)
-    assert not (tmp_path / "r" / LOCK).exists()
+    assert not (tmp_path / "r" / LOCK_NAME).exists()
 
 
 def test_a_lock_that_is_not_held_is_not_released(tmp_path):
-    (tmp_path / LOCK).write_text("somebody's")
+    (tmp_path / LOCK_NAME).write_text("somebody's")
     lock = RecordingLock(tmp_path)
     lock.release()
-    assert not lock.is_held and (tmp_path / LOCK).exists()
+    assert not lock.is_held and (tmp_path / LOCK_NAME).exists()
 
 
 @systems.symbolic_links
@@ -169,7 +169,7 @@ def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path):
     victim = tmp_path / "victim"
     victim.write_text("precious")
     (tmp_path / "r").mkdir()
-    (tmp_path / "r" / LOCK).symlink_to(victim)
+    (tmp_path / "r" / LOCK_NAME).symlink_to(victim)
     with pytest.raises(OutputError, match="Cannot write the recording"):
         write(tmp_path / "r")
     assert victim.read_text() == "precious" and victim.exists()
@@ -177,6 +177,6 @@ def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path):
 
 @systems.named_pipes
 def test_a_pipe_in_place_of_the_lock_blocks_nobody(tmp_path):
-    os.mkfifo(tmp_path / LOCK)
-    with pytest.raises(OutputError, match=rf"'{LOCK}' is not a regular file"):
+    os.mkfifo(tmp_path / LOCK_NAME)
+    with pytest.raises(OutputError, match=rf"'{LOCK_NAME}' is not a regular file"):
         write(tmp_path)

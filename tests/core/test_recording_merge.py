@@ -13,7 +13,7 @@ import pytest
 
 from fdda_addon.core.errors import OutputError, RecordingError
 from fdda_addon.core.recording import merge, writer
-from fdda_addon.core.recording.index import INDEX, read_index
+from fdda_addon.core.recording.index import INDEX_NAME, read_index
 from fdda_addon.core.recording.merge import merge_recordings
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.shard import Shard, shard_poses
@@ -119,8 +119,8 @@ def test_shards_of_other_recordings_are_refused(shards, tmp_path):
 
 
 def test_a_shard_that_is_incomplete_is_refused(shards, tmp_path):
-    index = json.loads((shards[2] / INDEX).read_text())
-    (shards[2] / INDEX).write_text(json.dumps({**index, "complete": 1}))
+    index = json.loads((shards[2] / INDEX_NAME).read_text())
+    (shards[2] / INDEX_NAME).write_text(json.dumps({**index, "complete": 1}))
     assert f"'{shards[2]}' is incomplete: 1 of 2 poses" in sentence(shards, tmp_path / "merged")
 
 
@@ -133,8 +133,8 @@ def test_a_shard_is_no_recording(shards):
 
 @pytest.mark.parametrize("shard", [{"first": 11, "of": 12}, {"first": -1, "of": 12}, {"first": "0", "of": 12}, {}, 5])
 def test_an_index_that_contradicts_itself_is_damaged(shards, shard):
-    index = json.loads((shards[2] / INDEX).read_text())
-    (shards[2] / INDEX).write_text(json.dumps({**index, "shard": shard}))
+    index = json.loads((shards[2] / INDEX_NAME).read_text())
+    (shards[2] / INDEX_NAME).write_text(json.dumps({**index, "shard": shard}))
     with pytest.raises(RecordingError, match="is damaged"):
         read_index(shards[2])
 

@@ -8,7 +8,7 @@ import numpy as np
 from ..recording.index import ACTION, MIRRORED, STRIP
 from ..recording.reader import Recording
 from ..skinning import skin_matrices
-from .warning import RecordingWarning, counted, format_length
+from .warning import RecordingWarning, format_length, format_with_noun
 
 _SOURCE_LABELS = {ACTION: "the action", STRIP: "the strip", MIRRORED: "the mirrored"}
 """Labels of the sources of frames in messages."""
@@ -107,8 +107,8 @@ def _check_collapsed(recording: Recording) -> list[RecordingWarning]:
     joints = np.flatnonzero(worst != 1)
     names = [rig.joints[used[i]].name for i in joints]
     text = (
-        f"{counted(names, 'joint')} {'has' if len(names) == 1 else 'have'} a scale near zero, huge or negative in "
-        f"{counted(collapsed_poses, 'pose')}, volumes by a factor of {worst[joints[0]]:.2g}: look for a constraint or "
-        "driver that sets it, limit it and record again."
+        f"{format_with_noun(names, 'joint')} {'has' if len(names) == 1 else 'have'} a scale near zero, huge or "
+        f"negative in {format_with_noun(collapsed_poses, 'pose')}, volumes by a factor of {worst[joints[0]]:.2g}: look "
+        "for a constraint or driver that sets it, limit it and record again."
     )
     return [RecordingWarning("degenerate-poses", text[0].upper() + text[1:])]

@@ -12,7 +12,7 @@ from .poses import check_poses
 from .residual_scan import ResidualScan, scan_residuals
 from .rest import check_rest
 from .target import check_target
-from .warning import RecordingWarning, counted, format_length, joint_name, listed
+from .warning import RecordingWarning, format_length, format_list, format_with_noun, joint_name
 
 WARNING_NAMES = (
     *("units", "axes", "large-residuals", "duplicate-poses", "hidden-inputs", "degenerate-poses", "flips"),
@@ -142,9 +142,9 @@ def _check_controls(recording: Recording) -> list[RecordingWarning]:
     dead = sorted([*idle, *still])
     if not dead:
         return []
-    kept = f", {listed([controls[c].name for c in dead if c in still])} of them always the same" if still else ""
+    kept = f", {format_list([controls[c].name for c in dead if c in still])} of them always the same" if still else ""
     text = (
-        f"{counted([controls[c].name for c in dead], 'control')} "
+        f"{format_with_noun([controls[c].name for c in dead], 'control')} "
         f"{'changes' if len(dead) == 1 else 'change'} nothing in this recording{kept}: leave "
         f"{'it' if len(dead) == 1 else 'them'} out, or give a wider range, and record again."
     )
@@ -168,8 +168,8 @@ def _check_joints(recording: Recording) -> list[RecordingWarning]:
     if not dead:
         return []
     text = (
-        f"{counted(dead, 'joint')} {'is sampled but moves' if len(dead) == 1 else 'are sampled but move'} no vertex: "
-        "lock all axes, or switch Deform off, so that poses are spent on what deforms the mesh."
+        f"{format_with_noun(dead, 'joint')} {'is sampled but moves' if len(dead) == 1 else 'are sampled but move'} no "
+        "vertex: lock all axes, or switch Deform off, so that poses are spent on what deforms the mesh."
     )
     return [RecordingWarning("dead-joints", text[0].upper() + text[1:])]
 
@@ -210,8 +210,8 @@ def _check_still_vertices(recording: Recording, scan: ResidualScan, moving: np.n
         return []
     names = [joint_name(rig, p.joint) for p in recording.partitions if still[p.vertices].any()]
     text = (
-        f"{int(still.sum())} of {rig.vertex_count} vertices never move, of {counted(names, 'partition')}: if they "
-        "should, weight them to joints that do, or give their joints a range of motion, and record again."
+        f"{int(still.sum())} of {rig.vertex_count} vertices never move, of {format_with_noun(names, 'partition')}: if "
+        "they should, weight them to joints that do, or give their joints a range of motion, and record again."
     )
     return [RecordingWarning("still-vertices", text)]
 
@@ -223,8 +223,8 @@ def _check_small_partitions(recording: Recording) -> list[RecordingWarning]:
     names = [joint_name(recording.rig, p.joint) for p in small]
     fewest = min(len(p.vertices) for p in small)
     text = (
-        f"{counted(names, 'partition')} {'has' if len(small) == 1 else 'have'} fewer than {MIN_PARTITION_VERTICES} "
-        f"vertices (the smallest {fewest}), and a network each: record with --min-partition-vertices "
-        f"{MIN_PARTITION_VERTICES} to merge them into others."
+        f"{format_with_noun(names, 'partition')} {'has' if len(small) == 1 else 'have'} fewer than "
+        f"{MIN_PARTITION_VERTICES} vertices (the smallest {fewest}), and a network each: record with "
+        f"--min-partition-vertices {MIN_PARTITION_VERTICES} to merge them into others."
     )
     return [RecordingWarning("small-partitions", text[0].upper() + text[1:])]

@@ -8,7 +8,7 @@ import numpy as np
 from ..recording.index import ACTION, STRIP, Source
 from ..recording.reader import Recording
 from ..skinning import LinearSkinning
-from .warning import RecordingWarning, format_length, listed
+from .warning import RecordingWarning, format_length, format_list
 
 MAX_DISTANCE_RATIO = 0.2
 """Largest distance between two approaches to a pose, as a ratio of the error of linear skinning."""
@@ -69,16 +69,16 @@ def _check_frames(recording: Recording, skinning: LinearSkinning) -> list[Record
     warnings = []
     if frozen:
         text = (
-            f"The target stands still in {len(frozen)} frames in which the rig moves: {listed(frozen)}: its cache ends "
-            "before, or begins after; record frames that it has."
+            f"The target stands still in {len(frozen)} frames in which the rig moves: {format_list(frozen)}: its cache "
+            "ends before, or begins after; record frames that it has."
         )
         warnings.append(RecordingWarning("frozen-frames", text))
     if jumps:
         jumps.sort(key=lambda jump: -jump[1])
         text = (
             f"The target jumps in {len(jumps)} frames, by up to {format_length(recording.rig, jumps[0][1])} from one "
-            f"frame to the next: {listed([name for name, _ in jumps])}: look at the simulation there, or leave these "
-            "frames out."
+            f"frame to the next: {format_list([name for name, _ in jumps])}: look at the simulation there, or leave "
+            "these frames out."
         )
         warnings.append(RecordingWarning("frame-jumps", text))
     return warnings
@@ -153,5 +153,5 @@ def unsettled_sentence(index: dict) -> str:
     frames = index["target"]["max_settle_frames"]
     return (
         f"{len(unsettled)} of {index['complete']} poses did not come to rest in {frames} frames: "
-        f"{listed(unsettled)}. A training leaves them out; more frames (--max-settle-frames) let them rest."
+        f"{format_list(unsettled)}. A training leaves them out; more frames (--max-settle-frames) let them rest."
     )

@@ -30,7 +30,7 @@ class RecordingWarning:
         return asdict(self)
 
 
-def refuse(warnings: Sequence[RecordingWarning]) -> None:
+def raise_first_warning(warnings: Sequence[RecordingWarning]) -> None:
     """Raise an error with the first warning and the names of the others.
 
     Raises:
@@ -43,7 +43,7 @@ def refuse(warnings: Sequence[RecordingWarning]) -> None:
     raise RecordingError(f"{warnings[0].text.removesuffix('.')} ({warnings[0].name}{more}).")
 
 
-def listed(names: Sequence[object], max_names: int = MAX_LISTED) -> str:
+def format_list(names: Sequence[object], max_names: int = MAX_LISTED) -> str:
     """Format the first names or numbers of a list: "'a', 'b', 'c' and 4 more"; strings are quoted."""
     shown = [f"'{name}'" if isinstance(name, str) else str(name) for name in names[:max_names]]
     if len(names) > max_names:
@@ -51,11 +51,11 @@ def listed(names: Sequence[object], max_names: int = MAX_LISTED) -> str:
     return f"{', '.join(shown[:-1])} and {shown[-1]}" if len(shown) > 1 else "".join(shown)
 
 
-def counted(names: Sequence[object], noun: str, plural: str = "") -> str:
+def format_with_noun(names: Sequence[object], noun: str, plural: str = "") -> str:
     """Format names with a noun: "the joint 'a'", "the 7 joints 'a', 'b', 'c' and 4 more"."""
     if len(names) == 1:
-        return f"the {noun} {listed(names)}"
-    return f"the {len(names)} {plural or noun + 's'} {listed(names)}"
+        return f"the {noun} {format_list(names)}"
+    return f"the {len(names)} {plural or noun + 's'} {format_list(names)}"
 
 
 def joint_name(rig: Rig, joint: int) -> str:

@@ -54,9 +54,9 @@ def array_shapes(
     }
 
 
-ARRAYS = tuple(array_shapes(1, 1, 1, 1, faces=1, corners=1, controls=1))
+ARRAY_NAMES = tuple(array_shapes(1, 1, 1, 1, faces=1, corners=1, controls=1))
 """Names of all arrays of a recording."""
-STREAMED = (POSE_MATRICES, "residuals", "controls")
+STREAMED_ARRAY_NAMES = (POSE_MATRICES, "residuals", "controls")
 """Names of the arrays with one row per pose."""
 
 
@@ -73,7 +73,7 @@ def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -
 
     Args:
         path: the file.
-        shape, dtype: expected; arrays in `STREAMED` may have more rows.
+        shape, dtype: expected; arrays in `STREAMED_ARRAY_NAMES` may have more rows.
         rows: number of rows that must exist and are mapped, at least one; all of `shape` by default.
 
     Raises:
@@ -83,7 +83,7 @@ def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -
         with open_input(path, follow=False) as file:
             found_shape, found_dtype = _read_header(file)
             # An interrupted extension may leave more poses than the index counts.
-            longer = path.stem in STREAMED and found_shape[:1] > shape[:1] and found_shape[1:] == shape[1:]
+            longer = path.stem in STREAMED_ARRAY_NAMES and found_shape[:1] > shape[:1] and found_shape[1:] == shape[1:]
             if not (found_shape == shape or longer) or found_dtype != np.dtype(dtype):
                 raise ValueError(f"it holds {found_shape} {found_dtype}, not {shape} {np.dtype(dtype)}")
             start, mapped = file.tell(), shape if rows is None else (rows, *shape[1:])

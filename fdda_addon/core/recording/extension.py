@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import BusyError, OutputError, RecordingError, os_error_text
 from ..input_file import open_input
-from .arrays import STREAMED, array_shapes, streamed_arrays
+from .arrays import STREAMED_ARRAY_NAMES, array_shapes, streamed_arrays
 from .index import REFINED, Source, read_index
 from .lock import RecordingLock
 from .reader import Recording
@@ -46,7 +46,7 @@ class RecordingExtension:
             shapes = array_shapes(
                 *(0, len(index["joints"]), index["vertices"], index["influences"]), controls=len(index["controls"])
             )
-            self._shapes = {name: shapes[name] for name in STREAMED if name in shapes}
+            self._shapes = {name: shapes[name] for name in STREAMED_ARRAY_NAMES if name in shapes}
             for streamed in self._shapes:
                 self._files[streamed] = open_input(self.path / f"{streamed}.npy", "r+b", follow=False)
         except OSError as error:

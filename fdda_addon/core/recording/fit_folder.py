@@ -30,7 +30,7 @@ ARRAY_SHAPES = {
     "parents": ("J",),
 }
 INTEGER_ARRAYS = ("skin_joints", "parents")
-STREAMED = ("pose_matrices", "positions")
+STREAMED_ARRAY_NAMES = ("pose_matrices", "positions")
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class FitPosesWriter:
         self._shapes = {"pose_matrices": (len(rig.joints), 4, 4), "positions": (rig.vertex_count, 3)}
         self._files = {}
         try:
-            for name in ARRAY_SHAPES.keys() - set(STREAMED):
+            for name in ARRAY_SHAPES.keys() - set(STREAMED_ARRAY_NAMES):
                 np.save(folder / f"{name}.npy", getattr(rig, name).astype(_dtype(name)), allow_pickle=False)
             for name, shape in self._shapes.items():
                 self._files[name] = open(folder / f"{name}.npy", "wb")  # noqa: SIM115 - __exit__

@@ -10,7 +10,7 @@ from pathlib import Path
 from ..errors import OutputError, RecordingError, os_error_text
 from ..rig import Fingerprint, Rig, read_joints, rig_differences
 from .folder_check import is_available, is_recording, remove_recording_files
-from .index import INDEX, REFINED, read_index, read_info
+from .index import INDEX_NAME, REFINED, read_index, read_info
 from .lock import RecordingLock
 from .writer import find_different_keys
 
@@ -41,7 +41,7 @@ class FolderContent:
         state: of the folder.
         complete, poses: number of complete poses and of all poses of the recording.
         sentence: describes a problem; may be empty.
-        measured: sentences about fitted weights and about the repeatability of the target.
+        measured_sentences: sentences about fitted weights and about the repeatability of the target.
         is_recording: the folder has a recording, possibly damaged, that can be removed.
     """
 
@@ -49,7 +49,7 @@ class FolderContent:
     complete: int = 0
     poses: int = 0
     sentence: str = ""
-    measured: tuple[str, ...] = ()
+    measured_sentences: tuple[str, ...] = ()
     is_recording: bool = False
 
 
@@ -69,7 +69,7 @@ def read_folder(
 
 
 def _read_content(path: Path, rig: Rig | None, sampling: dict | None, fit_linear: str | None) -> FolderContent:
-    if not os.path.exists(path / INDEX):
+    if not os.path.exists(path / INDEX_NAME):
         if not is_available(path):
             return FolderContent(FolderState.FOREIGN, sentence=f"'{path.name}' is not an empty folder; choose another.")
         return FolderContent(FolderState.FREE)
@@ -92,8 +92,8 @@ def _read_content(path: Path, rig: Rig | None, sampling: dict | None, fit_linear
     names = ", ".join(sorted({SETTING_LABELS.get(key.partition(".")[0], key) for key in found}))
     if counts[0] == counts[1]:
         sentence = f"It was recorded with other settings than those above: {names}." if found else ""
-        measured = tuple(part.sentence() for part in (fit, info.repeatability) if part)
-        return FolderContent(FolderState.COMPLETE, *counts, sentence, measured)
+        measured_sentences = tuple(part.sentence() for part in (fit, info.repeatability) if part)
+        return FolderContent(FolderState.COMPLETE, *counts, sentence, measured_sentences)
     if found:
         return FolderContent(
             FolderState.OTHER,
@@ -106,9 +106,9 @@ def _read_content(path: Path, rig: Rig | None, sampling: dict | None, fit_linear
 
 def recordings_in(folder: Path) -> list[Path]:
     """List the recordings in the subfolders of a folder; empty where the folder is a recording itself."""
-    if os.path.exists(folder / INDEX) or not os.path.isdir(folder):
+    if os.path.exists(folder / INDEX_NAME) or not os.path.isdir(folder):
         return []
-    return sorted(path for path in folder.iterdir() if os.path.isfile(path / INDEX))
+    return sorted(path for path in folder.iterdir() if os.path.isfile(path / INDEX_NAME))
 
 
 def _without_refined(sampling: dict) -> dict:
@@ -130,7 +130,7 @@ def remove_recording(path: Path) -> None:
         RecordingError: there is no recording, or another process writes it.
         OutputError: a file cannot be removed.
     """
-    if not os.path.exists(path / INDEX):
+    if not os.path.exists(path / INDEX_NAME):
         raise RecordingError(f"'{path}' holds no recording; there is nothing to remove.")
     lock = RecordingLock(path)
     try:

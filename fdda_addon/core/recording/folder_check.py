@@ -8,12 +8,14 @@ from ..errors import OutputError, RecordingError, os_error_text
 from ..file_kind import RECORDING
 from ..open_files import remove_file
 from ..output import check_folder_writable, is_temporary_name
-from .arrays import ARRAYS, STREAMED
-from .index import INDEX
-from .lock import LOCK, RecordingLock
+from .arrays import ARRAY_NAMES, STREAMED_ARRAY_NAMES
+from .index import INDEX_NAME
+from .lock import LOCK_NAME, RecordingLock
 from .reader import check_resumable
 
-RECORDING_FILES = tuple(f"{name}.npy" for name in sorted(ARRAYS, key=STREAMED.__contains__, reverse=True))
+RECORDING_FILES = tuple(
+    f"{name}.npy" for name in sorted(ARRAY_NAMES, key=STREAMED_ARRAY_NAMES.__contains__, reverse=True)
+)
 """File names of the arrays; first those that a training has open, which Windows refuses to remove."""
 
 
@@ -29,16 +31,16 @@ def check_recordable(path: Path, resume: bool, overwrite: bool = False) -> None:
         OutputError: the folder has other files, or cannot be written.
         RecordingError: there is a recording and neither is set, it is damaged, or another process writes it.
     """
-    check_folder_writable(path, (*RECORDING_FILES, INDEX))
+    check_folder_writable(path, (*RECORDING_FILES, INDEX_NAME))
     check_folder(path, resume, overwrite)
-    if os.path.lexists(path / LOCK):
+    if os.path.lexists(path / LOCK_NAME):
         lock = RecordingLock(path)
         try:
             lock.acquire()
         except OSError as error:
             raise OutputError(f"Cannot record into '{path}': {os_error_text(error)}; choose another.") from error
         lock.release()
-    if os.path.exists(path / INDEX) and not overwrite:
+    if os.path.exists(path / INDEX_NAME) and not overwrite:
         check_resumable(path)
 
 
@@ -49,11 +51,13 @@ def check_folder(path: Path, resume: bool, overwrite: bool = False) -> None:
         OutputError: the folder has other files.
         RecordingError: there is a recording, and neither `resume` nor `overwrite` is set.
     """
-    if not os.path.exists(path / INDEX):
+    if not os.path.exists(path / INDEX_NAME):
         if not is_available(path):
             raise OutputError(f"Cannot record into '{path}': it is not an empty folder; choose another.")
     elif overwrite and not is_recording(path):
-        raise OutputError(f"Cannot record into '{path}': its '{INDEX}' is of something else; choose another folder.")
+        raise OutputError(
+            f"Cannot record into '{path}': its '{INDEX_NAME}' is of something else; choose another folder."
+        )
     elif not resume and not overwrite:
         raise RecordingError(
             f"'{path}' holds a recording already; continue it with --resume, replace it with --overwrite, or choose "
@@ -65,17 +69,17 @@ def is_available(path: Path) -> bool:
     """Return whether a folder is missing, empty, or has only temporary files of an interruption."""
     if not os.path.exists(path):
         return True
-    return os.path.isdir(path) and all(name == LOCK or is_temporary_name(name) for name in os.listdir(path))
+    return os.path.isdir(path) and all(name == LOCK_NAME or is_temporary_name(name) for name in os.listdir(path))
 
 
 def is_recording(path: Path) -> bool:
     """Return whether a folder has a recording, possibly damaged, by the signature of its index or by its arrays."""
     try:
-        if RECORDING.matches(path / INDEX):
+        if RECORDING.matches(path / INDEX_NAME):
             return True
     except OSError:
         return False
-    return all(os.path.isfile(path / f"{name}.npy") for name in STREAMED[:2])
+    return all(os.path.isfile(path / f"{name}.npy") for name in STREAMED_ARRAY_NAMES[:2])
 
 
 def remove_temporary_files(path: Path) -> None:
@@ -99,4 +103,4 @@ def remove_recording_files(path: Path) -> None:
         remove_file(path / name)
     remove_temporary_files(path)
     # The index last, so that an interrupted removal still leaves a recognizable recording.
-    remove_file(path / INDEX)
+    remove_file(path / INDEX_NAME)

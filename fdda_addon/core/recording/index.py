@@ -19,7 +19,7 @@ from .target import RecordedTarget, Repeatability
 
 FORMAT = "fdda-recording"
 VERSION = 1
-INDEX = "recording.json"
+INDEX_NAME = "recording.json"
 MAX_INDEX_BYTES = 16 << 20
 MAX_INFLUENCES = 1000
 """Largest number of skin weights of a vertex."""
@@ -28,7 +28,7 @@ RANDOM, ACTION, STRIP, MIRRORED = "random", "action", "strip", "mirrored"
 previous source."""
 REFINED = "refined"
 """Kind of poses added where a model was worst. They do not represent the range of motion and are never held out."""
-KINDS = (RANDOM, ACTION, STRIP, MIRRORED, REFINED)
+SOURCE_KINDS = (RANDOM, ACTION, STRIP, MIRRORED, REFINED)
 
 
 @dataclass(frozen=True)
@@ -105,14 +105,14 @@ def read_index(path: Path) -> dict:
     Raises:
         RecordingError: it is missing, damaged, or of another version.
     """
-    index_path = path / INDEX
+    index_path = path / INDEX_NAME
     try:
         # Python reads NaN and infinity, which JSON does not have.
         constants: list[str] = []
         data = read_input(index_path, MAX_INDEX_BYTES, follow=False)
         index = json.loads(data, parse_constant=lambda name: constants.append(name) or float(name.lower()))
     except FileNotFoundError as error:
-        raise RecordingError(f"'{path}' is not a recording: it has no {INDEX}; make one with record.") from error
+        raise RecordingError(f"'{path}' is not a recording: it has no {INDEX_NAME}; make one with record.") from error
     except OSError as error:
         raise RecordingError(f"'{index_path}' cannot be read ({os_error_text(error)}); record again.") from error
     except (ValueError, RecursionError) as error:
@@ -204,7 +204,7 @@ def _read_sampling(value: dict) -> Sampling:
 
 def _read_source(value: dict) -> Source:
     source = Source(value["kind"], value["poses"], read_name(value["name"]), tuple(value["frames"]))
-    if source.kind not in KINDS:
+    if source.kind not in SOURCE_KINDS:
         raise ValueError(f"a source is of the kind {source.kind!r}")
     if type(source.poses) is not int or source.poses < 0:
         raise ValueError(f"a source has {source.poses!r} poses")

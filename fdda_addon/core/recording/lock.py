@@ -16,7 +16,7 @@ from pathlib import Path
 
 from ..errors import BusyError
 
-LOCK = "recording.lock"
+LOCK_NAME = "recording.lock"
 MAX_OWNER_BYTES = 1000
 _OPTIONAL_FLAGS = (getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
 _OPEN_FLAGS = os.O_RDWR | os.O_CREAT | sum(_OPTIONAL_FLAGS)
@@ -31,7 +31,7 @@ class RecordingLock:
 
     def __init__(self, folder: Path):
         self._folder = folder
-        self._path = folder.absolute() / LOCK
+        self._path = folder.absolute() / LOCK_NAME
         self._handle = -1
 
     @property
@@ -49,7 +49,7 @@ class RecordingLock:
             handle = os.open(self._path, _OPEN_FLAGS, 0o666)
             try:
                 if not stat.S_ISREG(os.fstat(handle).st_mode):
-                    raise OSError(errno.EINVAL, f"'{LOCK}' is not a regular file")
+                    raise OSError(errno.EINVAL, f"'{LOCK_NAME}' is not a regular file")
                 if not _lock(handle):
                     raise BusyError(
                         f"{self._owner(handle)} is recording into '{self._folder}'; wait for it, or choose another "

@@ -11,11 +11,11 @@ import numpy as np
 from ..errors import RecordingError
 from ..output import check_folder_writable
 from ..progress import Progress
-from .arrays import STREAMED, array_shapes, open_array
+from .arrays import STREAMED_ARRAY_NAMES, array_shapes, open_array
 from .estimate import check_disk_space, recording_bytes
 from .folder import recordings_in
 from .folder_check import RECORDING_FILES
-from .index import INDEX, read_index
+from .index import INDEX_NAME, read_index
 from .reader import Recording, open_recording
 from .writer import RecordingWriter, find_different_keys
 
@@ -45,7 +45,7 @@ def merge_recordings(shards: Sequence[Path], path: Path) -> Iterator[Progress]:
     names = _mesh_folders(shards)
     plans = [(path / name, _open_in_order([shard / name for shard in shards])) for name in names]
     for folder, _ in plans:
-        check_folder_writable(folder, (*RECORDING_FILES, INDEX))
+        check_folder_writable(folder, (*RECORDING_FILES, INDEX_NAME))
     check_disk_space(
         [
             (folder, recording_bytes(shards_in_order[0].rig, shards_in_order[0].info.shard.total))
@@ -114,7 +114,7 @@ def _check_same_recording(shards_in_order: Sequence[Recording]) -> None:
         if shard.info.shard.total != shards_in_order[0].info.shard.total:
             different.append("poses")
         if not different:
-            fixed = [name for name in array_shapes(0, 0, 0, 0, faces=1) if name not in STREAMED]
+            fixed = [name for name in array_shapes(0, 0, 0, 0, faces=1) if name not in STREAMED_ARRAY_NAMES]
             arrays = ([getattr(shard.rig, name) for shard in (shards_in_order[0], shard)] for name in fixed)
             different = [name for name, pair in zip(fixed, arrays, strict=True) if not np.array_equal(*pair)]
         if different:
@@ -128,7 +128,7 @@ def _merge(shards_in_order: Sequence[Recording], path: Path, stage: str) -> Iter
     first = shards_in_order[0]
     total = first.info.shard.total
     info = replace(first.info, poses=total, complete=0, shard=None, unsettled=())
-    with RecordingWriter(path, first.rig, first.partitions, info, resume=(path / INDEX).exists()) as writer:
+    with RecordingWriter(path, first.rig, first.partitions, info, resume=(path / INDEX_NAME).exists()) as writer:
         yield Progress(stage, writer.complete, total)
         for shard in shards_in_order:
             start = writer.complete - shard.info.shard.first
@@ -144,7 +144,7 @@ def _iterate_chunks(shard: Recording, start: int) -> Iterator[tuple[int, list[np
     Each chunk is mapped separately, because mapped pages count as memory of the process.
     """
     poses = shard.info.poses
-    rows = {name: getattr(shard, name).shape[1:] for name in STREAMED}
+    rows = {name: getattr(shard, name).shape[1:] for name in STREAMED_ARRAY_NAMES}
     count = max(1, COPY_CHUNK_BYTES // max(1, 4 * sum(math.prod(row) for row in rows.values())))
     for begin in range(start, poses, count):
         end = min(begin + count, poses)

@@ -17,7 +17,7 @@ from ..skin_fit import are_skin_weights
 from ..skinning import are_invertible
 from ..surface import are_faces
 from ..unit import read_unit
-from .arrays import MAX_VALUE, STREAMED, array_shapes, find_invalid_pose, open_array
+from .arrays import MAX_VALUE, STREAMED_ARRAY_NAMES, array_shapes, find_invalid_pose, open_array
 from .index import RecordingInfo, read_index, read_info
 
 CHECK_BLOCK_VERTICES = 1 << 16
@@ -63,7 +63,7 @@ def read_recording(path: Path) -> Recording:
         )
     if not poses:
         raise _incomplete_error(path, 0, 0)
-    for name in STREAMED:
+    for name in STREAMED_ARRAY_NAMES:
         check_poses(path, name, getattr(recording, name))
     if sum(source.poses for source in recording.info.sampling.sources) != poses:
         raise RecordingError(
@@ -98,7 +98,7 @@ def open_recording(path: Path) -> Recording:
     partitions = read_partitions(rig, index["partitions"])
     if [p.joint for p in partitions] != [p["joint"] for p in index["partitions"]]:
         raise RecordingError(f"The partitions of '{path}' contradict its skin weights; record again.")
-    return Recording(path, read_info(index), rig, partitions, *(arrays[name] for name in STREAMED))
+    return Recording(path, read_info(index), rig, partitions, *(arrays[name] for name in STREAMED_ARRAY_NAMES))
 
 
 def _incomplete_error(path: Path, complete: int, poses: int) -> RecordingError:
@@ -170,7 +170,7 @@ def check_resumable(path: Path) -> None:
     if not index["complete"]:
         return
     for name, (shape, dtype) in _array_shapes(index).items():
-        if name in STREAMED:
+        if name in STREAMED_ARRAY_NAMES:
             check_poses(path, name, open_array(path / f"{name}.npy", shape, dtype, index["complete"]))
         else:
             open_array(path / f"{name}.npy", shape, dtype)

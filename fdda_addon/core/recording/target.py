@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 from ..rig import read_name
 
-STATISTICS = ("mean", "rms", "p99", "p999", "max")
+STATISTIC_NAMES = ("mean", "rms", "p99", "p999", "max")
 POSE, FRAMES, SIMULATION = "pose", "frames", "simulation"
 """What a target depends on: the pose; the frame, as a cache does; or the pose and its history, as a simulation does."""
-FOLLOWS = (POSE, FRAMES, SIMULATION)
+FOLLOWS_VALUES = (POSE, FRAMES, SIMULATION)
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class RecordedTarget:
             value.get("max_settle_frames", 0),
             value.get("rest_threshold_mm", 0.0),
         )
-        if target.follows not in FOLLOWS:
+        if target.follows not in FOLLOWS_VALUES:
             raise ValueError(f"its target follows {target.follows!r}")
         for number in (target.pre_roll, target.max_settle_frames):
             if type(number) is not int or number < 0:
@@ -84,7 +84,7 @@ class Repeatability:
             poses: number of poses of the recording.
         """
         repeatability = Repeatability(
-            tuple(value["poses"]), {name: value["distance_mm"][name] for name in STATISTICS}, value["linear_mm"]
+            tuple(value["poses"]), {name: value["distance_mm"][name] for name in STATISTIC_NAMES}, value["linear_mm"]
         )
         if not repeatability.poses or not all(type(pose) is int and 0 <= pose < poses for pose in repeatability.poses):
             raise ValueError("its repeated poses are none of its poses")

@@ -19,9 +19,9 @@ from ..output import atomic_write, to_json_text
 from ..partition import Partition
 from ..rig import Rig, rest_matrices_match
 from ..unit import read_unit, unit_to_json
-from .arrays import ARRAYS, STREAMED, array_shapes, find_invalid_pose, open_array, streamed_arrays
+from .arrays import ARRAY_NAMES, STREAMED_ARRAY_NAMES, array_shapes, find_invalid_pose, open_array, streamed_arrays
 from .folder_check import check_folder, remove_recording_files, remove_temporary_files
-from .index import FORMAT, INDEX, VERSION, RecordingInfo, read_index
+from .index import FORMAT, INDEX_NAME, VERSION, RecordingInfo, read_index
 from .lock import RecordingLock
 from .reader import check_poses, partitions_to_json
 from .target import Repeatability
@@ -77,7 +77,7 @@ class RecordingWriter:
             check_folder(path, resume, overwrite)
             if overwrite:
                 remove_recording_files(path)
-            self._is_new = not os.path.exists(path / INDEX)
+            self._is_new = not os.path.exists(path / INDEX_NAME)
             remove_temporary_files(path)
             if not self._is_new:
                 self.complete = self._check_resumable()
@@ -121,7 +121,7 @@ class RecordingWriter:
             if not self.complete:
                 # The path may be a link, which must not be written through.
                 remove_file(path)
-            if name not in STREAMED:
+            if name not in STREAMED_ARRAY_NAMES:
                 array = getattr(self.rig, name).astype(dtype)
                 if not self.complete:
                     np.save(path, array, allow_pickle=False)
@@ -272,7 +272,7 @@ class RecordingWriter:
         """Remove a new recording without poses, and the folders that were created for it."""
         if not self._is_new or self.complete or not self._lock.is_held:
             return
-        for path in (self.path / INDEX, *(self.path / f"{name}.npy" for name in ARRAYS)):
+        for path in (self.path / INDEX_NAME, *(self.path / f"{name}.npy" for name in ARRAY_NAMES)):
             with contextlib.suppress(OSError):
                 remove_file(path)
         self._lock.release()
@@ -288,7 +288,7 @@ def write_index(path: Path, index: dict) -> None:
         OSError: it cannot be written.
     """
     try:
-        with atomic_write(path / INDEX, keep=False) as temporary:
+        with atomic_write(path / INDEX_NAME, keep=False) as temporary:
             temporary.write_text(to_json_text(index), encoding="utf-8")
     except OutputError as error:
         raise error.__cause__ from None
