@@ -9,7 +9,7 @@ import pytest
 
 from fdda_addon.core.errors import RigError
 from fdda_addon.recording.plan import RecordingSettings
-from fdda_addon.recording.rig_check import check
+from fdda_addon.recording.rig_check import check_recordable_rig
 from fdda_addon.recording.run import record
 from fdda_addon.scene.scene_rig import SceneRig
 
@@ -77,7 +77,7 @@ def lost_armature(rig: SceneRig) -> None:
 def test_a_rest_pose_without_size_or_place_is_refused(change, words, tmp_path):
     rig = fresh_elbow()
     change(rig)
-    (problem,) = check(rig).problems
+    (problem,) = check_recordable_rig(rig).problems
     assert problem.startswith(words)
     with pytest.raises(RigError) as error:
         drain(record(rig, tmp_path / "recording", RecordingSettings(poses=3)))

@@ -8,7 +8,7 @@ from blend_fixtures.characters import stacks
 from blend_fixtures.characters.base import drive, tube
 from fdda_addon.core.errors import RigError
 from fdda_addon.recording.plan import RecordingSettings
-from fdda_addon.recording.rig_check import check
+from fdda_addon.recording.rig_check import check_recordable_rig
 from fdda_addon.recording.run import record
 from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import find_rig
@@ -81,7 +81,7 @@ def test_what_no_model_can_stand_in_for_is_named(name, loose_model, tmp_path):
     assert_refused(rig, loose_model, tmp_path / "recording", sentence)
     # Switched off, nothing is wrong with it.
     rig.mesh_object.modifiers["It"].show_viewport = False
-    assert check(rig).problems == ()
+    assert check_recordable_rig(rig).problems == ()
     bind(rig, loose_model)
     assert_plays(rig.mesh_object, loose_model)
 

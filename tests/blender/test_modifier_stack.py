@@ -9,7 +9,7 @@ import pytest
 
 from blend_fixtures.characters import stacks
 from fdda_addon.evaluation.run import EvaluationSettings, evaluate
-from fdda_addon.recording.rig_check import check
+from fdda_addon.recording.rig_check import check_recordable_rig
 from fdda_addon.recording.run import record
 from fdda_addon.rig.modifier_stack import ModifierStack, read_stack
 from fdda_addon.runtime.binding import bind, unbind
@@ -36,7 +36,7 @@ def shown(rig: SceneRig) -> list[tuple]:
 @pytest.mark.parametrize("build", stacks.STACKS, ids=lambda build: build.__name__)
 def test_a_deforming_stack_is_recorded_and_played(build, loose_model, tmp_path):
     rig = character(build)
-    assert check(rig).problems == ()
+    assert check_recordable_rig(rig).problems == ()
     before, modifiers = scene_state(rig), shown(rig)
     assert np.linalg.norm(residuals(rig, tmp_path), axis=2).max() > MOVES
     assert_same_state(before, scene_state(rig))
@@ -167,7 +167,7 @@ def test_what_makes_vertices_in_time_after_the_rig_is_live(kind):
     rig = character(stacks.corrective_smooth)
     at(2, kind)(rig.mesh_object)
     assert read_stack(rig.mesh_object).downstream == ("It",)
-    assert check(rig).problems == ()
+    assert check_recordable_rig(rig).problems == ()
 
 
 @pytest.mark.parametrize(

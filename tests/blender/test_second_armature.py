@@ -11,7 +11,7 @@ from fdda_addon.core.errors import RigError
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.evaluation.run import EvaluationSettings, evaluate
 from fdda_addon.recording.plan import RecordingSettings
-from fdda_addon.recording.rig_check import check
+from fdda_addon.recording.rig_check import check_recordable_rig
 from fdda_addon.recording.run import record
 from fdda_addon.rig.reading import PoseEvaluator
 from fdda_addon.runtime.binding import bind
@@ -65,7 +65,7 @@ def move(bone: bpy.types.PoseBone) -> None:
 def test_what_a_model_is_not_told_is_named(build, loose_model, tmp_path):
     rig = character(build)
     before = scene_state(rig)
-    assert SENTENCES[build] in check(rig).problems
+    assert SENTENCES[build] in check_recordable_rig(rig).problems
     with pytest.raises(RigError) as error:
         drain(record(rig, tmp_path / "recording", FEW))
     assert str(error.value) == SENTENCES[build]
@@ -90,7 +90,7 @@ EXPECTED = {
 @pytest.mark.parametrize("build", EXPECTED, ids=lambda build: build.__name__)
 def test_what_a_model_is_told_is_recorded(build, tmp_path):
     rig = character(build)
-    assert check(rig).problems == ()
+    assert check_recordable_rig(rig).problems == ()
     drain(record(rig, tmp_path / "recording", RecordingSettings(poses=6, influence_poses=1)))
     recording = read_recording(tmp_path / "recording")
     names = {control.name for control in recording.rig.controls}

@@ -11,7 +11,7 @@ from blend_fixtures.characters.bones import NewBone, add_bones
 from fdda_addon.core.errors import RigError
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.recording.plan import RecordingSettings
-from fdda_addon.recording.rig_check import check
+from fdda_addon.recording.rig_check import check_recordable_rig
 from fdda_addon.recording.run import record
 from fdda_addon.rig import time_inputs
 from fdda_addon.rig.pose_setter import TargetSettings
@@ -141,7 +141,7 @@ def test_what_a_model_is_told_may_be_keyed(build, tmp_path):
     """It is a control, by itself or by its name, it is sampled, and it is keyed afterwards as before."""
     rig, (named, expected) = character(build), PLAYED[build]
     settings = RecordingSettings(poses=8, influence_poses=1, controls=named)
-    assert check(rig, settings).problems == ()
+    assert check_recordable_rig(rig, settings).problems == ()
     before = scene_state(rig)
     drain(record(rig, tmp_path / "recording", settings))
     assert_same_state(before, scene_state(rig))
@@ -194,7 +194,7 @@ def second_armature_on(flesh: bpy.types.Object) -> None:
 @pytest.mark.parametrize("build", in_time.HARMLESS, ids=lambda build: build.__name__)
 def test_what_follows_the_pose_is_recorded(build, tmp_path):
     rig = character(build)
-    assert check(rig).problems == ()
+    assert check_recordable_rig(rig).problems == ()
     drain(record(rig, tmp_path / "recording", FEW))
 
 

@@ -11,7 +11,7 @@ from fdda_addon.core.errors import OutputError, RecordingError
 from fdda_addon.core.recording.arrays import ARRAY_NAMES
 from fdda_addon.core.recording.folder import FolderContent, FolderState, read_folder, remove_recording
 from fdda_addon.core.recording.lock import LOCK_NAME, RecordingLock
-from fdda_addon.core.recording.target import STATISTICS, Repeatability
+from fdda_addon.core.recording.target import STATISTIC_NAMES, Repeatability
 from fdda_addon.core.recording.writer import RecordingWriter
 
 from .good_recording import good_recording
@@ -51,7 +51,7 @@ def test_a_recording_that_is_complete(tmp_path):
 
 def test_what_was_measured_with_a_recording_is_said(tmp_path):
     record_limb(tmp_path / "r", POSES)
-    repeatability = Repeatability((1, 2), dict.fromkeys(STATISTICS, 0.25), 5.0)
+    repeatability = Repeatability((1, 2), dict.fromkeys(STATISTIC_NAMES, 0.25), 5.0)
     index = json.loads((tmp_path / "r" / "recording.json").read_text())
     (tmp_path / "r" / "recording.json").write_text(json.dumps({**index, "repeatability": repeatability.to_json()}))
     assert look(tmp_path / "r").measured_sentences == (repeatability.sentence(),)
