@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A complete recording of the limb, and a folder on a disk that is nearly full."""
+"""Fixtures of the core tests: a recording of the limb, a recording without warnings, and a disk of 64 KiB."""
 
 import ctypes
 import os
@@ -15,40 +15,41 @@ from fdda_addon.core.recording.reader import Recording
 from .good_recording import good_recording
 from .limb import record_limb
 
-SMALL_DISK = 64 << 10
-"""Bytes on the disk of `small_disk`."""
+SMALL_DISK_BYTES = 64 << 10
+"""Size of the disk that the fixture `small_disk` mounts."""
 
 
 @pytest.fixture(scope="session")
-def _recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def _limb_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a complete recording of the limb, made once for all tests."""
     path = tmp_path_factory.mktemp("limb") / "recording"
     record_limb(path)
     return path
 
 
 @pytest.fixture
-def recording(_recorded: Path, tmp_path: Path) -> Path:
-    """Folder of a complete recording of the limb, to be damaged."""
-    return shutil.copytree(_recorded, tmp_path / "recording")
+def recording(_limb_recording: Path, tmp_path: Path) -> Path:
+    """Folder of a complete recording of the limb, a copy that the test may damage."""
+    return shutil.copytree(_limb_recording, tmp_path / "recording")
 
 
 @pytest.fixture
-def good() -> Recording:
-    """A recording without a warning."""
+def clean_recording() -> Recording:
+    """A recording in memory that causes no warning."""
     return good_recording()
 
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A folder on a disk of its own, of `SMALL_DISK` bytes."""
+    """Mount a disk of `SMALL_DISK_BYTES` in memory and yield its folder; skip the test where that is impossible."""
     if sys.platform == "win32":
-        pytest.skip("Windows makes no small disks in memory.")
+        pytest.skip("Windows cannot mount a small disk in memory.")
     folder = tmp_path / "small disk"
     folder.mkdir()
     libc = ctypes.CDLL(None, use_errno=True)
     if not hasattr(libc, "mount") or libc.mount(
-        b"tmpfs", os.fsencode(folder), b"tmpfs", 0, f"size={SMALL_DISK}".encode()
+        b"tmpfs", os.fsencode(folder), b"tmpfs", 0, f"size={SMALL_DISK_BYTES}".encode()
     ):
-        pytest.skip("Only root may mount a disk of its own; test_full_disk.py limits the size of files instead.")
+        pytest.skip("Only root may mount a disk; one test of test_full_disk.py limits the size of files instead.")
     yield folder
     libc.umount2(os.fsencode(folder), 2)

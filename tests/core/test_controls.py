@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Controls and merged partitions pass through recordings and models as they are."""
+"""Controls and merged partitions are written to recordings and models and read back unchanged."""
 
 from dataclasses import replace
 
@@ -19,34 +19,37 @@ from .tiny_model import tiny_info
 
 SMILE = Control("shape_keys", 'key_blocks["Smile"].value', 0.0, 1.0)
 FIST = Control("armature_object", 'pose.bones["hand.L"]["fist"]', -1.0, 1.0)
-POSES = 6
+POSE_COUNT = 6
 
 
-def values(count: int) -> np.ndarray:
+def control_values(count: int) -> np.ndarray:
+    """Return (count, 2) float32 values of `SMILE` and `FIST`."""
     return np.random.default_rng(3).uniform(-1, 1, (count, 2)).astype(np.float32)
 
 
 @pytest.fixture
-def controlled(tmp_path):
-    """A recording with two controls, of which the upper joint's partition has one, and a merged partition."""
+def controlled_recording(tmp_path):
+    """Folder of a recording with two controls and a merged partition; one partition depends on a control."""
     rig = replace(make_rig(), controls=(SMILE, FIST))
     partitions = make_partitions(rig, {0: (1,), 1: (2,)}, {1: (1,)}, {3: 1})
-    with RecordingWriter(tmp_path / "recording", rig, partitions, recording_info(POSES)) as writer:
-        writer.append(random_poses(POSES), random_residuals(POSES), values(POSES))
+    with RecordingWriter(tmp_path / "recording", rig, partitions, recording_info(POSE_COUNT)) as writer:
+        writer.append(random_poses(POSE_COUNT), random_residuals(POSE_COUNT), control_values(POSE_COUNT))
     return tmp_path / "recording"
 
 
-def test_controls_and_merged_partitions_are_read_back(controlled):
-    read = read_recording(controlled)
-    assert read.rig.controls == (SMILE, FIST)
-    assert np.array_equal(read.controls, values(POSES))
-    assert [(p.joint, p.influencing, p.controls, p.merged) for p in read.partitions] == [
+def test_controls_and_merged_partitions_are_read_back(controlled_recording):
+    read_back = read_recording(controlled_recording)
+    assert read_back.rig.controls == (SMILE, FIST)
+    assert np.array_equal(read_back.controls, control_values(POSE_COUNT))
+    assert [(p.joint, p.influencing, p.controls, p.merged) for p in read_back.partitions] == [
         (0, (1,), (), ()),
         (1, (2,), (1,), (3,)),
         (2, (), (), ()),
     ]
-    plain = make_partitions(make_rig())
-    assert sorted(read.partitions[1].vertices) == sorted([*plain[1].vertices, *plain[3].vertices])
+    unmerged_partitions = make_partitions(make_rig())
+    assert sorted(read_back.partitions[1].vertices) == sorted(
+        [*unmerged_partitions[1].vertices, *unmerged_partitions[3].vertices]
+    )
 
 
 def test_a_recording_without_controls_has_an_empty_array(recording):
@@ -54,24 +57,26 @@ def test_a_recording_without_controls_has_an_empty_array(recording):
     assert not (recording / "controls.npy").exists()
 
 
-def test_an_extension_appends_controls(controlled):
-    with RecordingExtension(read_recording(controlled), "model.onnx") as extension:
-        extension.append(random_poses(2), random_residuals(2), values(2))
-    assert np.array_equal(read_recording(controlled).controls, np.concatenate([values(POSES), values(2)]))
+def test_an_extension_appends_controls(controlled_recording):
+    with RecordingExtension(read_recording(controlled_recording), "model.onnx") as extension:
+        extension.append(random_poses(2), random_residuals(2), control_values(2))
+    assert np.array_equal(
+        read_recording(controlled_recording).controls, np.concatenate([control_values(POSE_COUNT), control_values(2)])
+    )
 
 
-def test_controls_that_are_missing_or_no_numbers_are_refused(controlled):
-    array = np.load(controlled / "controls.npy")
+def test_missing_and_non_finite_controls_are_refused(controlled_recording):
+    array = np.load(controlled_recording / "controls.npy")
     array[2] = np.nan
-    np.save(controlled / "controls.npy", array)
+    np.save(controlled_recording / "controls.npy", array)
     with pytest.raises(RecordingError, match=r"not numbers \(controls"):
-        read_recording(controlled)
-    (controlled / "controls.npy").unlink()
+        read_recording(controlled_recording)
+    (controlled_recording / "controls.npy").unlink()
     with pytest.raises(RecordingError, match=r"controls\.npy' cannot be used"):
-        read_recording(controlled)
+        read_recording(controlled_recording)
 
 
-def test_a_model_says_its_controls():
+def test_model_metadata_contains_controls():
     info = tiny_info(
         controls=(SMILE, FIST),
         partitions=(
@@ -79,17 +84,17 @@ def test_a_model_says_its_controls():
             ModelPartition(2, (1,), 3, 17, controls=(0, 1), merged=(1,), reassigned=(0, 2)),
         ),
     )
-    again = ModelInfo.from_json(info.to_json())
-    assert (again.controls, again.partitions) == (info.controls, info.partitions)
+    decoded_info = ModelInfo.from_json(info.to_json())
+    assert (decoded_info.controls, decoded_info.partitions) == (info.controls, info.partitions)
     assert "controls" not in tiny_info().to_json()
 
 
-def test_a_model_with_a_partition_of_an_unknown_control_is_refused():
+def test_model_with_an_unknown_control_in_a_partition_is_refused():
     info = tiny_info(partitions=(ModelPartition(0, (), 4, 0, controls=(0,)),))
     with pytest.raises(ValueError, match="a control that is none of its controls"):
         ModelInfo.from_json(info.to_json())
 
 
-def test_names_tell_controls_apart():
+def test_control_names_are_distinct():
     assert SMILE.name == 'shape_keys/key_blocks["Smile"].value'
     assert len({SMILE.name, FIST.name, *(c.name for c in CHANNELS)}) == 4

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The exit status of an error: a farm runs again what failed for a reason of the machine's, and nothing else."""
+"""Exit status of an error: a farm runs a job again only if the machine caused the failure."""
 
 import errno
 
@@ -19,46 +19,47 @@ from fdda_addon.core.errors import (
 from fdda_addon.core.output import atomic_write
 
 
-def caused_by(cause: BaseException) -> OutputError:
+def error_caused_by(cause: BaseException) -> OutputError:
+    """Return an error of the add-on whose `__cause__` is the given exception."""
     try:
         raise OutputError("It failed.") from cause
     except OutputError as error:
         return error
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ENOMEM, errno.ESTALE])
-def test_what_the_machine_caused_may_be_tried_again(number):
-    assert exit_status(caused_by(OSError(number, "text"))) == TRY_AGAIN
-    assert exit_status(caused_by(caused_by(OSError(number, "text")))) == TRY_AGAIN
+@pytest.mark.parametrize("error_code", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ENOMEM, errno.ESTALE])
+def test_failures_of_the_machine_may_be_tried_again(error_code):
+    assert exit_status(error_caused_by(OSError(error_code, "text"))) == TRY_AGAIN
+    assert exit_status(error_caused_by(error_caused_by(OSError(error_code, "text")))) == TRY_AGAIN
 
 
-@pytest.mark.parametrize("number", [32, 33, 39, 112, 1224, 1455])
-def test_what_windows_says_of_the_machine(number):
+@pytest.mark.parametrize("error_code", [32, 33, 39, 112, 1224, 1455])
+def test_windows_failures_of_the_machine_may_be_tried_again(error_code):
     error = OSError(errno.EINVAL, "in the language of the system")
-    error.winerror = number
-    assert exit_status(caused_by(error)) == TRY_AGAIN
+    error.winerror = error_code
+    assert exit_status(error_caused_by(error)) == TRY_AGAIN
     assert os_error_text(error) != error.strerror and os_error_text(error).isascii()
 
 
-def test_what_windows_says_is_not_quoted():
+def test_localized_windows_messages_are_not_quoted():
     error = PermissionError(errno.EACCES, "Zugriff verweigert")
     error.winerror = 5
-    assert os_error_text(error) == "Permission denied" and exit_status(caused_by(error)) == 1
+    assert os_error_text(error) == "Permission denied" and exit_status(error_caused_by(error)) == 1
     assert os_error_text(OSError(errno.EINVAL, "it is not a regular file")) == "it is not a regular file"
 
 
-@pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES, errno.EISDIR, errno.EROFS, errno.ENAMETOOLONG])
-def test_what_the_user_caused_will_never_work(number):
-    assert exit_status(caused_by(OSError(number, "text"))) == 1
+@pytest.mark.parametrize("error_code", [errno.ENOENT, errno.EACCES, errno.EISDIR, errno.EROFS, errno.ENAMETOOLONG])
+def test_failures_of_the_user_are_not_tried_again(error_code):
+    assert exit_status(error_caused_by(OSError(error_code, "text"))) == 1
 
 
-def test_errors_that_say_so_themselves():
+def test_exit_status_of_error_classes():
     assert [exit_status(kind("text")) for kind in (BusyError, DiskFullError, TrainingDiedError)] == [TRY_AGAIN] * 3
     assert exit_status(RigError("text")) == 1 and exit_status(WrongUsageError("text")) == 2
-    assert exit_status(caused_by(MemoryError())) == TRY_AGAIN
+    assert exit_status(error_caused_by(MemoryError())) == TRY_AGAIN
 
 
-def test_a_full_disk_through_the_writer_of_files(tmp_path):
+def test_full_disk_in_atomic_write_may_be_tried_again(tmp_path):
     with pytest.raises(OutputError) as failed, atomic_write(tmp_path / "a.json"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert exit_status(failed.value) == TRY_AGAIN and list(tmp_path.iterdir()) == []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Files are told by how they begin, and nothing else is written over."""
+"""The kind of a file is recognized from its first bytes; files of another kind are not overwritten."""
 
 import os
 
@@ -12,7 +12,7 @@ from fdda_addon.core.output import check_outputs, to_json_text
 from .. import systems
 from .tiny_model import tiny_model
 
-SAMPLES = {
+FILES_BY_KIND = {
     file_kind.BLEND: [b"BLENDER-v405", b"BLENDER17-01v0502", b"\x28\xb5\x2f\xfd\x00", b"\x1f\x8b\x08"],
     file_kind.MODEL: [tiny_model().SerializeToString()],
     file_kind.CHECKPOINT: [b"PK\x03\x04" + bytes(26) + b"about.npy" + bytes(9)],
@@ -30,7 +30,7 @@ SAMPLES = {
     file_kind.PICTURE: [b"\x89PNG\r\n\x1a\n"],
     file_kind.POINT_CACHE: [b"POINTCACHE2\0\x01\0\0\0"],
 }
-FOREIGN = [
+UNKNOWN_FILES = [
     b"a note\n",
     b'{"name": "package"}',
     to_json_text({"format": "fdda-recording", "version": 1}).encode(),
@@ -41,28 +41,30 @@ FOREIGN = [
 ]
 
 
-@pytest.mark.parametrize("kind", SAMPLES, ids=lambda kind: kind.name)
-def test_a_kind_knows_its_own_and_nothing_else(tmp_path, kind):
+@pytest.mark.parametrize("kind", FILES_BY_KIND, ids=lambda kind: kind.name)
+def test_a_kind_matches_only_its_own_files(tmp_path, kind):
     path = tmp_path / "file"
-    for other, samples in SAMPLES.items():
-        for sample in samples:
-            path.write_bytes(sample)
-            assert kind.matches(path) == (other is kind), (other.name, sample)
-    for sample in FOREIGN:
-        path.write_bytes(sample)
-        assert not kind.matches(path), sample
+    for other_kind, file_starts in FILES_BY_KIND.items():
+        for file_start in file_starts:
+            path.write_bytes(file_start)
+            assert kind.matches(path) == (other_kind is kind), (other_kind.name, file_start)
+    for file_start in UNKNOWN_FILES:
+        path.write_bytes(file_start)
+        assert not kind.matches(path), file_start
     path.write_bytes(b"")
     assert kind.matches(path)
 
 
-def test_what_is_of_the_kind_or_not_there_is_written(tmp_path):
-    old = tmp_path / "old.json"
-    old.write_text(to_json_text({"unit": "mm"}))
-    check_outputs({old: file_kind.EVALUATION, tmp_path / "new.png": file_kind.PICTURE}, [tmp_path / "rig.blend"])
+def test_files_of_the_kind_and_missing_files_may_be_written(tmp_path):
+    existing_file = tmp_path / "old.json"
+    existing_file.write_text(to_json_text({"unit": "mm"}))
+    check_outputs(
+        {existing_file: file_kind.EVALUATION, tmp_path / "new.png": file_kind.PICTURE}, [tmp_path / "rig.blend"]
+    )
 
 
 @systems.named_pipes
-def test_what_cannot_be_read_is_not_written_over(tmp_path):
+def test_unreadable_files_are_not_overwritten(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(OutputError, match="it is not a regular file"):
         check_outputs({tmp_path / "pipe": file_kind.MODEL}, overwrite=True)

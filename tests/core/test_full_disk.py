@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A disk that fills up: a sentence, and what was there before is still there."""
+"""A disk that becomes full: the error says so in a sentence, and existing files stay."""
 
 import os
 import subprocess
@@ -15,41 +15,45 @@ from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
 from .. import systems
-from .conftest import SMALL_DISK
+from .conftest import SMALL_DISK_BYTES
 from .limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
 
 ROOT = Path(__file__).resolve().parents[2]
-FULL = "No space left on device"
+FULL_DISK_ERROR = "No space left on device"
 
 
-def test_a_file_that_does_not_fit_leaves_the_old_one(small_disk):
+def test_a_file_that_does_not_fit_leaves_the_old_file(small_disk):
     path = small_disk / "report.json"
     path.write_text("old")
-    with pytest.raises(OutputError, match=f"Cannot write '{path}': {FULL}; nothing was changed"):
-        write_text(path, "x" * 2 * SMALL_DISK)
+    with pytest.raises(OutputError, match=f"Cannot write '{path}': {FULL_DISK_ERROR}; nothing was changed"):
+        write_text(path, "x" * 2 * SMALL_DISK_BYTES)
     assert path.read_text() == "old"
     assert [p.name for p in small_disk.iterdir()] == ["report.json"]
 
 
 def test_a_recording_that_does_not_fit_is_refused_before_the_first_pose(small_disk):
-    with pytest.raises(OutputError, match=rf"Cannot write the recording .*: {FULL}; make room or choose another"):
+    with pytest.raises(
+        OutputError, match=rf"Cannot write the recording .*: {FULL_DISK_ERROR}; make room or choose another"
+    ):
         record_limb(small_disk / "recording", poses=2000, complete=10)
     assert list(small_disk.iterdir()) == []
 
 
 @pytest.fixture
-def _unreserved(monkeypatch):
-    """As on a system that cannot reserve space for a file."""
+def _no_space_reservation(monkeypatch):
+    """Remove the function that reserves space for a file, which some systems lack."""
     monkeypatch.delattr(os, "posix_fallocate", raising=False)
 
 
-@pytest.mark.usefixtures("_unreserved")
-def test_a_disk_that_fills_up_while_recording_leaves_what_was_complete(small_disk, tmp_path):
+@pytest.mark.usefixtures("_no_space_reservation")
+def test_a_disk_that_fills_up_during_a_recording_leaves_complete_poses(small_disk, tmp_path):
     path, rig, poses = small_disk / "recording", make_rig(), 100
     matrices, residuals = random_poses(poses), random_residuals(poses)
     ballast = small_disk / "ballast"
     with (
-        pytest.raises(OutputError, match=rf"Cannot write the recording .*: {FULL}; 20 of 100 poses are complete, cont"),
+        pytest.raises(
+            OutputError, match=rf"Cannot write the recording .*: {FULL_DISK_ERROR}; 20 of 100 poses are complete, cont"
+        ),
         RecordingWriter(path, rig, partitions_of(rig), recording_info(poses)) as writer,
     ):
         writer.append(matrices[:20], residuals[:20])
@@ -57,7 +61,7 @@ def test_a_disk_that_fills_up_while_recording_leaves_what_was_complete(small_dis
         writer.append(matrices[20:90], residuals[20:90])
     assert read_index(path)["complete"] == 20
     ballast.unlink()
-    # Room again, though not for the whole of it: the poses that are there can be carried on elsewhere.
+    # There is space again, but not for the whole recording, so a copy on another disk is resumed.
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     for file in path.iterdir():
@@ -66,7 +70,7 @@ def test_a_disk_that_fills_up_while_recording_leaves_what_was_complete(small_dis
     assert (read_recording(elsewhere).residuals == residuals).all()
 
 
-LIMITED = """
+WRITE_WITH_SIZE_LIMIT = """
 import resource, sys
 from pathlib import Path
 from fdda_addon.core.errors import OutputError
@@ -74,18 +78,18 @@ from fdda_addon.core.output import write_text
 from tests.core.limb import record_limb
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 folder = Path(sys.argv[1])
-for job in (lambda: record_limb(folder / "recording", 500), lambda: write_text(folder / "old.txt", "x" * 30_000)):
+for write in (lambda: record_limb(folder / "recording", 500), lambda: write_text(folder / "old.txt", "x" * 30_000)):
     try:
-        job()
+        write()
     except OutputError as error:
         print(error)
 """
 
 
 @systems.file_size_limits
-def test_files_that_may_not_grow(tmp_path):
+def test_file_size_limit_is_reported(tmp_path):
     (tmp_path / "old.txt").write_text("old")
-    command = [sys.executable, "-c", LIMITED, str(tmp_path)]
+    command = [sys.executable, "-c", WRITE_WITH_SIZE_LIMIT, str(tmp_path)]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.stdout.splitlines() == [
         f"Cannot write the recording '{tmp_path}/recording': File too large; make room or choose another folder.",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Recordings made to harm whoever reads, resumes or extends them: one short sentence, before any work."""
+"""Recordings that would harm the process that reads, resumes or extends them are refused in one short sentence."""
 
 import json
 import os
@@ -17,71 +17,72 @@ from fdda_addon.core.recording.reader import check_resumable, read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 
 from .. import systems
-from .damage import array_file, edit, refused
+from .damage import assert_refused, edit_index, npy_bytes
 from .good_recording import good_recording
 from .limb import make_rig, partitions_of, random_poses, random_residuals, recording_info
 
-FILES = ("recording.json", "residuals.npy", "pose_matrices.npy", "rest_positions.npy", "skin_weights.npy")
-NO_FILE = "it is not a regular file"
+RECORDING_FILES = ("recording.json", "residuals.npy", "pose_matrices.npy", "rest_positions.npy", "skin_weights.npy")
+NOT_REGULAR_FILE_ERROR = "it is not a regular file"
 
 
 @pytest.fixture(autouse=True)
-def _patience():
-    """What blocks is a failure, not a test that never ends. Windows has no alarm, and nothing here that blocks."""
+def _time_limit():
+    """Fail a test that blocks for 20 seconds. Windows has no alarm signal, and no test blocks there."""
     if not hasattr(signal, "SIGALRM"):
         yield
         return
 
-    def give_up(*_):
-        raise TimeoutError("it blocks")
+    def fail_test(*_):
+        raise TimeoutError("The test blocks.")
 
-    previous = signal.signal(signal.SIGALRM, give_up)
+    previous_handler = signal.signal(signal.SIGALRM, fail_test)
     signal.alarm(20)
     yield
     signal.alarm(0)
-    signal.signal(signal.SIGALRM, previous)
+    signal.signal(signal.SIGALRM, previous_handler)
 
 
-def resume(path, complete=12):
+def resume_recording(path, complete=12):
+    """Return a writer that resumes the recording of the limb."""
     rig = make_rig()
     return RecordingWriter(path, rig, partitions_of(rig), recording_info(complete), resume=True)
 
 
 @systems.named_pipes
-@pytest.mark.parametrize("name", FILES)
-def test_a_pipe(recording, name):
+@pytest.mark.parametrize("name", RECORDING_FILES)
+def test_a_named_pipe_is_refused(recording, name):
     (recording / name).unlink()
     os.mkfifo(recording / name)
-    refused(recording, name, NO_FILE)
+    assert_refused(recording, name, NOT_REGULAR_FILE_ERROR)
     with pytest.raises(RecordingError):
-        resume(recording)
+        resume_recording(recording)
 
 
 @systems.symbolic_links
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", RECORDING_FILES)
 @pytest.mark.parametrize("target", ["/dev/zero", "/dev/stdin", "/etc/passwd", "another recording"])
-def test_a_link_out_of_the_folder(recording, tmp_path, name, target):
-    """Even to a good file: what is written into a recording that goes on would land there."""
+def test_a_link_to_another_folder_is_refused(recording, tmp_path, name, target):
+    """Links to valid files are refused too, because a resumed recording would write through them."""
     if target == "another recording":
         target = shutil.copytree(recording, tmp_path / "other") / name
     (recording / name).unlink()
     (recording / name).symlink_to(target)
-    refused(recording, name, "it is a link to another place")
+    assert_refused(recording, name, "it is a link to another place")
     with pytest.raises(RecordingError):
         check_recordable(recording, resume=True)
 
 
 @systems.symbolic_links
 @pytest.mark.parametrize("name", ["residuals.npy", "rest_positions.npy", "recording.json"])
-def test_a_resumed_recording_writes_through_no_link(recording, tmp_path, name):
-    """Where no pose is complete all arrays are written anew."""
+def test_resuming_does_not_write_through_links(recording, tmp_path, name):
+    """All arrays are written again if no pose is complete."""
     victim = tmp_path / "victim"
     victim.write_text("precious")
-    edit(recording, complete=0)
+    edit_index(recording, complete=0)
     if name != "recording.json":
         (recording / name).unlink()
         (recording / name).symlink_to(victim)
-        with resume(recording) as writer:
+        with resume_recording(recording) as writer:
             writer.append(random_poses(12), random_residuals(12))
         assert read_recording(recording).residuals.shape[0] == 12
     else:
@@ -90,14 +91,14 @@ def test_a_resumed_recording_writes_through_no_link(recording, tmp_path, name):
         (recording / name).unlink()
         (recording / name).symlink_to(victim)
         with pytest.raises(RecordingError):
-            resume(recording)
+            resume_recording(recording)
         assert victim.read_text() == text
         return
     assert victim.read_text() == "precious"
 
 
 @systems.symbolic_links
-def test_an_extension_writes_through_no_link(recording, tmp_path):
+def test_an_extension_does_not_write_through_links(recording, tmp_path):
     read = read_recording(recording)
     victim = shutil.move(recording / "residuals.npy", tmp_path / "victim.npy")
     before = (tmp_path / "victim.npy").read_bytes()
@@ -107,42 +108,42 @@ def test_an_extension_writes_through_no_link(recording, tmp_path):
     assert (tmp_path / "victim.npy").read_bytes() == before
 
 
-def flat(matrix):
+def flatten_axis(matrix):
     matrix[:3, 1] = 0
 
 
-def sheared(matrix):
+def make_axes_parallel(matrix):
     matrix[:3, 1] = matrix[:3, 0]
 
 
-def no_transform(matrix):
+def clear_last_row(matrix):
     matrix[3] = 0
 
 
-@pytest.mark.parametrize("damage", [flat, sheared, no_transform])
-def test_joints_that_have_shrunk_to_nothing(recording, damage):
+@pytest.mark.parametrize("damage", [flatten_axis, make_axes_parallel, clear_last_row])
+def test_degenerate_joint_matrices_are_refused(recording, damage):
     array = np.load(recording / "pose_matrices.npy")
     damage(array[7, 2])
     np.save(recording / "pose_matrices.npy", array)
-    refused(recording, "holds joints that have shrunk to nothing (pose_matrices, pose 7); record again.")
+    assert_refused(recording, "holds joints that have shrunk to nothing (pose_matrices, pose 7); record again.")
     with pytest.raises(RecordingError, match="shrunk to nothing"):
         check_resumable(recording)
     rest = np.load(recording / "rest_matrices.npy")
     damage(rest[2])
     np.save(recording / "rest_matrices.npy", rest)
-    refused(recording, "The rest pose or skin weights of")
+    assert_refused(recording, "The rest pose or skin weights of")
 
 
 @pytest.mark.parametrize("name", ["residuals", "pose_matrices", "rest_positions", "rest_matrices"])
-def test_numbers_that_overflow(recording, name):
+def test_huge_numbers_are_refused(recording, name):
     array = np.load(recording / f"{name}.npy")
     array.reshape(-1)[3] = 1e30
     np.save(recording / f"{name}.npy", array)
-    refused(recording, "beyond all bounds" if name in ("residuals", "pose_matrices") else "rest pose")
+    assert_refused(recording, "beyond all bounds" if name in ("residuals", "pose_matrices") else "rest pose")
 
 
-def test_what_no_training_takes_is_not_recorded(tmp_path):
-    """Or hours of recording would be refused afterwards."""
+def test_poses_that_training_refuses_are_not_recorded(tmp_path):
+    """Otherwise, training would refuse the recording only after hours of work."""
     recording = good_recording(4)
     matrices = recording.pose_matrices.copy()
     matrices[2, 1, :3, 0] = 0
@@ -151,16 +152,16 @@ def test_what_no_training_takes_is_not_recorded(tmp_path):
         writer.append(matrices, recording.residuals, recording.controls)
 
 
-LIMIT = {"bone": "upper", "kind": "rotation", "axis": 0, "low": -1.0, "high": 1.0}
-SOURCE = {"kind": "random", "poses": 12, "name": "", "frames": [0, 0]}
-MARGIN = {"factor": 2.0, "poses": 3, "limits": [LIMIT]}
-HASHES = {"topology": "a", "rest_positions": "b", "skin_weights": "c"}
+CHANNEL_LIMIT = {"bone": "upper", "kind": "rotation", "axis": 0, "low": -1.0, "high": 1.0}
+POSE_SOURCE = {"kind": "random", "poses": 12, "name": "", "frames": [0, 0]}
+MARGIN = {"factor": 2.0, "poses": 3, "limits": [CHANNEL_LIMIT]}
+FINGERPRINT_HASHES = {"topology": "a", "rest_positions": "b", "skin_weights": "c"}
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        *[(("limits", [{**LIMIT, key: value}]), "its range of motion") for key, value in (
+        *[(("limits", [{**CHANNEL_LIMIT, key: value}]), "its range of motion") for key, value in (
             ("low", float("-inf")), ("high", float("nan")), ("high", "1"), ("low", 2), ("axis", 3), ("axis", True),
             ("kind", "twist"), ("bone", 7), ("bone", ""), ("bone", "b" * 5000), ("low", None),
         )],
@@ -171,7 +172,7 @@ HASHES = {"topology": "a", "rest_positions": "b", "skin_weights": "c"}
         (("seed", True), "its seed is True"),
         (("spread", 0), "its spread is 0"),
         (("spread", float("inf")), "its spread is inf"),
-        *[(("sources", [{**SOURCE, key: value}]), words) for key, value, words in (
+        *[(("sources", [{**POSE_SOURCE, key: value}]), words) for key, value, words in (
             ("kind", "stolen", "of the kind 'stolen'"), ("kind", [], "of the kind []"), ("poses", -1, "-1 poses"),
             ("name", 5, "5 is not a name"), ("frames", [1], "has the frames (1,)"),
             ("frames", [0, "x"], "has the frames (0, 'x')"), ("name", "n" * 5000, "a name has 5000 characters"),
@@ -182,43 +183,49 @@ HASHES = {"topology": "a", "rest_positions": "b", "skin_weights": "c"}
             ("factor", float("nan"), "nan times"), ("factor", "2", "'2' times"),
             ("poses", -1, "its margin has -1 poses"),
             ("poses", 1.5, "has 1.5 poses"), ("poses", 10**6, "1000000 of its"), ("limits", {}, "are not a list"),
-            ("limits", [{**LIMIT, "axis": 7}], "its range of motion"),
+            ("limits", [{**CHANNEL_LIMIT, "axis": 7}], "its range of motion"),
         )],
         *[(("margin", value), "is damaged") for value in ([], None, 2, {}, {"factor": 2.0})],
         (("units", {"length": float("nan")}), "it holds NaN, which is no number"),
     ],
 )  # fmt: skip
-def test_a_sampling_that_is_none(recording, change, words):
-    """Each was found only when the model was written, after the training."""
+def test_an_invalid_sampling_is_refused(recording, change, words):
+    """Without this check, these errors would appear only after training, when the model is written."""
     key, value = change
     index = json.loads((recording / "recording.json").read_text())
     if key == "units":
-        edit(recording, units=value)
+        edit_index(recording, units=value)
     else:
-        edit(recording, sampling={**index["sampling"], key: value})
-    refused(recording, "recording.json' is damaged: ", words)
+        edit_index(recording, sampling={**index["sampling"], key: value})
+    assert_refused(recording, "recording.json' is damaged: ", words)
 
 
 @pytest.mark.parametrize("name", [7, None, [], {}, True, "n" * 5000])
-def test_a_joint_without_a_name(recording, name):
+def test_an_invalid_joint_name_is_refused(recording, name):
     index = json.loads((recording / "recording.json").read_text())
     index["joints"][1]["name"] = name
-    edit(recording, joints=index["joints"])
-    refused(recording, "recording.json' is damaged: ", "name")
+    edit_index(recording, joints=index["joints"])
+    assert_refused(recording, "recording.json' is damaged: ", "name")
 
 
 @pytest.mark.parametrize(
     "fingerprint",
-    [{}, [], {**HASHES, "topology": 7}, {**HASHES, "skin_weights": None}, {**HASHES, "topology": "a" * 10**6}],
+    [
+        {},
+        [],
+        {**FINGERPRINT_HASHES, "topology": 7},
+        {**FINGERPRINT_HASHES, "skin_weights": None},
+        {**FINGERPRINT_HASHES, "topology": "a" * 10**6},
+    ],
 )
-def test_a_fingerprint_that_is_none(recording, fingerprint):
+def test_an_invalid_fingerprint_is_refused(recording, fingerprint):
     index = json.loads((recording / "recording.json").read_text())
-    edit(recording, rig={**index["rig"], "fingerprint": fingerprint})
-    refused(recording, "recording.json' is damaged: ")
+    edit_index(recording, rig={**index["rig"], "fingerprint": fingerprint})
+    assert_refused(recording, "recording.json' is damaged: ")
 
 
-def test_sentences_are_of_a_readable_length_and_steer_no_terminal(recording):
-    edit(recording, version="\x1b[2J\n" + "x" * 10**6)
+def test_messages_are_short_and_escape_control_characters(recording):
+    edit_index(recording, version="\x1b[2J\n" + "x" * 10**6)
     with pytest.raises(RecordingError) as error:
         read_recording(recording)
     text = str(error.value)
@@ -227,10 +234,10 @@ def test_sentences_are_of_a_readable_length_and_steer_no_terminal(recording):
 
 
 @systems.sparse_files
-def test_a_recording_that_is_huge_and_hollow_takes_no_memory(recording):
-    """Sparse files cost nothing to make: 100 GB of skin weights that are none."""
+def test_a_huge_sparse_recording_is_refused_without_reading_it(recording):
+    """A sparse file of 100 GB takes no space on the disk: here skin weights, which would not fit into memory."""
     vertices = 1 << 31
-    edit(recording, vertices=vertices)
+    edit_index(recording, vertices=vertices)
     for name, shape, kind in (
         ("rest_positions", (vertices, 3), "<f4"),
         ("skin_joints", (vertices, 4), "<i4"),
@@ -239,12 +246,12 @@ def test_a_recording_that_is_huge_and_hollow_takes_no_memory(recording):
     ):
         header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n"
         path = recording / f"{name}.npy"
-        path.write_bytes(array_file(header))
+        path.write_bytes(npy_bytes(header))
         os.truncate(path, path.stat().st_size + 4 * int(np.prod(shape, dtype=object)))
-    refused(recording, "The rest pose or skin weights of")
+    assert_refused(recording, "The rest pose or skin weights of")
 
 
-def test_a_good_recording_passes(recording):
+def test_a_valid_recording_is_accepted(recording):
     check_resumable(recording)
     check_recordable(recording, resume=True)
     with pytest.raises(RecordingError, match="holds a recording already"):

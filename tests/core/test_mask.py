@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Masks: where a model counts, and what is shown elsewhere."""
+"""Masks: each vertex is blended between linear skinning and the model by its weight."""
 
 import numpy as np
 import pytest
@@ -7,9 +7,9 @@ import pytest
 from fdda_addon.core.mask import Mask, SkinningBlend
 from fdda_addon.core.skinning import LinearSkinning
 
-from .limb import VERTICES, make_rig, random_poses
+from .limb import VERTEX_COUNT, make_rig, random_poses
 
-WEIGHTS = np.linspace(0, 1, VERTICES).astype(np.float32)
+MASK_WEIGHTS = np.linspace(0, 1, VERTEX_COUNT).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -19,49 +19,53 @@ def rig():
 
 @pytest.fixture
 def positions() -> np.ndarray:
-    return np.random.default_rng(3).uniform(-1, 1, (5, VERTICES, 3)).astype(np.float32)
+    return np.random.default_rng(3).uniform(-1, 1, (5, VERTEX_COUNT, 3)).astype(np.float32)
 
 
-@pytest.mark.parametrize("weights", [None, WEIGHTS, np.zeros(VERTICES), np.ones(VERTICES), (WEIGHTS > 0.5) * 1.0])
+@pytest.mark.parametrize(
+    "weights", [None, MASK_WEIGHTS, np.zeros(VERTEX_COUNT), np.ones(VERTEX_COUNT), (MASK_WEIGHTS > 0.5) * 1.0]
+)
 @pytest.mark.parametrize("strengths", [[1, 1, 1, 1, 1], [0, 0, 0, 0, 0], [0, 0.25, 0.5, 1, 1]])
-def test_a_blend_is_what_strength_times_weight_says(rig, positions, weights, strengths):
+def test_positions_are_blended_by_strength_times_weight(rig, positions, weights, strengths):
     poses, strengths = random_poses(5), np.float32(strengths)
-    linear = LinearSkinning(rig).positions(poses)
-    each = np.ones(VERTICES) if weights is None else weights
-    expected = linear + (strengths[:, None] * each)[..., None] * (positions - linear)
+    linear_positions = LinearSkinning(rig).positions(poses)
+    vertex_weights = np.ones(VERTEX_COUNT) if weights is None else weights
+    expected = linear_positions + (strengths[:, None] * vertex_weights)[..., None] * (positions - linear_positions)
     blend = SkinningBlend(rig, None if weights is None else Mask.from_weights(weights))
-    shown = blend.apply(positions.copy(), poses, strengths)
-    np.testing.assert_allclose(shown, expected, atol=1e-6)
-    assert shown.dtype == np.float32
+    blended = blend.apply(positions.copy(), poses, strengths)
+    np.testing.assert_allclose(blended, expected, atol=1e-6)
+    assert blended.dtype == np.float32
     if weights is not None and strengths.min() == 1:
-        np.testing.assert_allclose(Mask.from_weights(weights).blend(linear[0], positions[0]), expected[0], atol=1e-6)
+        np.testing.assert_allclose(
+            Mask.from_weights(weights).blend(linear_positions[0], positions[0]), expected[0], atol=1e-6
+        )
 
 
-def test_where_a_mask_is_one_the_model_is_untouched(rig, positions):
-    weights = (np.arange(VERTICES) % 2).astype(np.float32)
-    shown = SkinningBlend(rig, Mask.from_weights(weights)).apply(
+def test_vertices_with_weight_one_keep_the_model_s_positions(rig, positions):
+    weights = (np.arange(VERTEX_COUNT) % 2).astype(np.float32)
+    blended = SkinningBlend(rig, Mask.from_weights(weights)).apply(
         positions.copy(), random_poses(5), np.ones(5, np.float32)
     )
-    assert (shown[:, 1::2] == positions[:, 1::2]).all() and (shown[:, ::2] != positions[:, ::2]).any()
+    assert (blended[:, 1::2] == positions[:, 1::2]).all() and (blended[:, ::2] != positions[:, ::2]).any()
 
 
-def test_positions_that_are_not_looked_at_may_be_anything(rig, positions):
-    """With a strength of 0 no model was executed, and its memory holds what it may."""
+def test_positions_with_strength_zero_may_be_invalid(rig, positions):
+    """With strength 0 the model does not run, so its output buffer may contain any values."""
     positions[0] = np.nan
     assert np.isfinite(SkinningBlend(rig).apply(positions, random_poses(5), np.float32([0, 1, 0.5, 1, 1]))).all()
 
 
-def test_another_mask_takes_the_place_of_the_first(rig, positions):
-    poses, ones = random_poses(5), np.ones(5, np.float32)
-    blend = SkinningBlend(rig, Mask.from_weights(WEIGHTS))
-    blend.apply(positions.copy(), poses, ones)
-    other = blend.with_mask(Mask.from_weights(1 - WEIGHTS))
-    expected = SkinningBlend(rig, Mask.from_weights(1 - WEIGHTS)).apply(positions.copy(), poses, ones)
-    assert (other.apply(positions.copy(), poses, ones) == expected).all()
-    assert (blend.with_mask(None).apply(positions.copy(), poses, ones) == positions).all()
+def test_with_mask_replaces_the_mask(rig, positions):
+    poses, full_strengths = random_poses(5), np.ones(5, np.float32)
+    blend = SkinningBlend(rig, Mask.from_weights(MASK_WEIGHTS))
+    blend.apply(positions.copy(), poses, full_strengths)
+    replaced = blend.with_mask(Mask.from_weights(1 - MASK_WEIGHTS))
+    expected = SkinningBlend(rig, Mask.from_weights(1 - MASK_WEIGHTS)).apply(positions.copy(), poses, full_strengths)
+    assert (replaced.apply(positions.copy(), poses, full_strengths) == expected).all()
+    assert (blend.with_mask(None).apply(positions.copy(), poses, full_strengths) == positions).all()
 
 
-def test_weights_beyond_zero_and_one_are_brought_to_them():
+def test_weights_are_clamped_to_zero_and_one():
     mask = Mask.from_weights([-1, 0.5, 3])
     assert mask.weights.tolist() == [0, 0.5, 1] and mask.partial_vertices.tolist() == [0, 1]
     assert mask == Mask.from_weights([0, 0.5, 1]) and mask != Mask.from_weights([0, 0.5, 0.5])

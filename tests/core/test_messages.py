@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Trainer messages: one line each way, and what is no message is refused."""
+"""Trainer messages: each is encoded as one line and decoded unchanged; other lines are refused."""
 
 import pytest
 
 from fdda_addon.core.messages import Message, MessageType
 
-SAMPLES = [
+SAMPLE_MESSAGES = [
     Message(MessageType.STARTED, {"partitions": 3, "poses": 100, "vertices": 90, "device": "cpu"}),
     Message(MessageType.PREPARING, {"done": 1, "total": 3}),
     Message(MessageType.PROGRESS, {"epoch": 1, "epochs": 200, "training_mm": 0.25, "validation_mm": 0.125}),
@@ -19,26 +19,26 @@ SAMPLES = [
 ]
 
 
-@pytest.mark.parametrize("message", SAMPLES, ids=lambda message: message.type.value)
-def test_round_trip(message):
+@pytest.mark.parametrize("message", SAMPLE_MESSAGES, ids=lambda message: message.type.value)
+def test_encoding_and_decoding_keep_a_message(message):
     line = message.encode()
     assert "\n" not in line
     assert Message.decode(line) == message
     assert Message.decode(line + "\n") == message
 
 
-def test_there_is_a_sample_of_each():
-    assert [message.type for message in SAMPLES] == list(MessageType)
+def test_every_type_has_a_sample_message():
+    assert [message.type for message in SAMPLE_MESSAGES] == list(MessageType)
 
 
-def test_last_messages():
-    last = {MessageType.FINISHED, MessageType.CANCELLED, MessageType.FAILED}
-    assert {kind for kind in MessageType if kind.is_last} == last
+def test_types_that_end_a_training():
+    last_types = {MessageType.FINISHED, MessageType.CANCELLED, MessageType.FAILED}
+    assert {kind for kind in MessageType if kind.is_last} == last_types
 
 
 @pytest.mark.parametrize(
     "line", ["", "hello", "{", "[]", "3", "null", "{}", '{"type": "lunch"}', '{"type": null}', '{"type": ["log"]}']
 )
-def test_what_is_no_message_is_refused(line):
+def test_invalid_lines_are_refused(line):
     with pytest.raises(ValueError):
         Message.decode(line)

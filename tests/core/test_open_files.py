@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Files that another program has open: waited for, and nothing is lost where waiting does not help."""
+"""Files that another program has open: the add-on waits for them, and loses nothing if they stay open."""
 
 import errno
 import os
@@ -22,12 +22,12 @@ from fdda_addon.core.recording.writer import RecordingWriter
 
 from .limb import make_rig, partitions_of, random_poses, random_residuals, record_limb, recording_info
 
-on_windows = pytest.mark.skipif(sys.platform != "win32", reason="elsewhere a file that is open can be replaced")
-READER = """
+windows_only = pytest.mark.skipif(sys.platform != "win32", reason="Only on Windows, an open file cannot be replaced.")
+READ_REPEATEDLY = """
 import sys, time
 from pathlib import Path
 files = [Path(name) for name in sys.argv[2:]]
-print("reads", flush=True)
+print("reading", flush=True)
 while True:
     for path in files:
         try:
@@ -41,14 +41,14 @@ while True:
 
 
 @pytest.fixture
-def read():
-    """Start processes that open files again and again, for so many seconds each time."""
+def start_reader():
+    """Yield a function that starts a process, which opens files repeatedly and holds each for some seconds."""
     processes = []
 
     def start(seconds: float, *paths: Path) -> subprocess.Popen:
-        command = [sys.executable, "-c", READER, str(seconds), *map(str, paths)]
+        command = [sys.executable, "-c", READ_REPEATEDLY, str(seconds), *map(str, paths)]
         processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
-        assert processes[-1].stdout.readline() == "reads\n"
+        assert processes[-1].stdout.readline() == "reading\n"
         return processes[-1]
 
     yield start
@@ -58,14 +58,14 @@ def read():
 
 
 @pytest.fixture
-def refused(monkeypatch):
-    """Refuse to rename to a path as Windows does, so many times; gives the function that says which and how often."""
-    left: dict[str, int] = {}
+def refuse_renames(monkeypatch):
+    """Let renames fail as on Windows; return a function that takes the number of failures for each file name."""
+    remaining_failures: dict[str, int] = {}
     rename = os.replace
 
     def replace(source: Path, target: Path) -> None:
-        if left.get(os.path.basename(target), 0) > 0:
-            left[os.path.basename(target)] -= 1
+        if remaining_failures.get(os.path.basename(target), 0) > 0:
+            remaining_failures[os.path.basename(target)] -= 1
             error = PermissionError(errno.EACCES, "Zugriff verweigert", str(source), None, str(target))
             error.winerror = 5
             raise error
@@ -74,107 +74,108 @@ def refused(monkeypatch):
     monkeypatch.setattr(os, "replace", replace)
     monkeypatch.setattr(open_files, "RETRY_SECONDS", 0.3)
     monkeypatch.setattr(open_files, "MAX_PAUSE_SECONDS", 0.01)
-    return left.update
+    return remaining_failures.update
 
 
-def contents(folder: Path) -> dict[str, str]:
+def file_texts(folder: Path) -> dict[str, str]:
+    """Return the text of each file of the folder by its name."""
     return {path.name: path.read_text() for path in sorted(folder.iterdir())}
 
 
-def test_what_is_open_for_a_moment_is_waited_for(tmp_path, refused, monkeypatch):
+def test_a_file_that_is_open_briefly_is_replaced(tmp_path, refuse_renames, monkeypatch):
     monkeypatch.setattr(open_files, "RETRY_SECONDS", 30)
     write_text(tmp_path / "a", "old")
-    refused({"a": 5})
+    refuse_renames({"a": 5})
     write_text(tmp_path / "a", "new")
-    assert contents(tmp_path) == {"a": "new"}
+    assert file_texts(tmp_path) == {"a": "new"}
 
 
-@pytest.mark.parametrize("number", range(3))
-def test_what_stays_open_is_not_replaced_and_what_was_made_is_kept(tmp_path, refused, number):
+@pytest.mark.parametrize("open_index", range(3))
+def test_a_file_that_stays_open_is_not_replaced_and_new_files_are_kept(tmp_path, refuse_renames, open_index):
     paths = [tmp_path / name for name in ("a", "b", "c")]
     for path in paths[:2]:
         path.write_text("old")
-    refused({paths[number].name: 10**9})
-    with pytest.raises(OutputError) as failed, atomic_write_all(*paths) as temporaries:
+    refuse_renames({paths[open_index].name: 10**9})
+    with pytest.raises(OutputError) as error, atomic_write_all(*paths) as temporaries:
         for temporary in temporaries:
             temporary.write_text("new")
-    assert str(failed.value) == (
-        f"Cannot write '{paths[number]}': another program has it open; nothing was changed, and what was made is kept "
-        f"as 'new-a', 'new-b', 'new-c'; close what has '{paths[number].name}' open, and rename them."
+    assert str(error.value) == (
+        f"Cannot write '{paths[open_index]}': another program has it open; nothing was changed, and what was made is "
+        f"kept as 'new-a', 'new-b', 'new-c'; close what has '{paths[open_index].name}' open, and rename them."
     )
-    assert exit_status(failed.value) == TRY_AGAIN
-    assert contents(tmp_path) == {"a": "old", "b": "old", "new-a": "new", "new-b": "new", "new-c": "new"}
+    assert exit_status(error.value) == TRY_AGAIN
+    assert file_texts(tmp_path) == {"a": "old", "b": "old", "new-a": "new", "new-b": "new", "new-c": "new"}
 
 
-def test_a_recording_whose_index_stays_open_resumes(tmp_path, refused):
+def test_a_recording_whose_index_stays_open_can_be_resumed(tmp_path, refuse_renames):
     rig, matrices, residuals = make_rig(), random_poses(12), random_residuals(12)
     with (
         pytest.raises(OutputError, match=r"another program has it open; 4 of 12 poses are complete, continue with"),
         RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(12)) as writer,
     ):
         writer.append(matrices[:4], residuals[:4])
-        refused({"recording.json": 10**9})
+        refuse_renames({"recording.json": 10**9})
         writer.append(matrices[4:8], residuals[4:8])
-    refused({"recording.json": 0})
+    refuse_renames({"recording.json": 0})
     assert read_index(tmp_path / "r")["complete"] == 4
     assert [path.name for path in (tmp_path / "r").glob("*.json")] == ["recording.json"]
     record_limb(tmp_path / "r", 12, resume=True)
     assert np.array_equal(read_recording(tmp_path / "r").residuals, residuals)
 
 
-@on_windows
-def test_a_file_is_replaced_while_another_process_reads_it_all_the_time(tmp_path, read):
+@windows_only
+def test_a_file_is_replaced_while_another_process_reads_it_repeatedly(tmp_path, start_reader):
     path = tmp_path / "a.json"
     write_text(path, "0")
-    read(0.03, path)
+    start_reader(0.03, path)
     for number in range(20):
         write_text(path, str(number))
         assert path.read_text() == str(number)
-    assert contents(tmp_path) == {"a.json": "19"}
+    assert file_texts(tmp_path) == {"a.json": "19"}
 
 
-@on_windows
-def test_a_file_that_another_process_keeps_open_stays_and_the_new_one_is_kept(tmp_path, read, monkeypatch):
+@windows_only
+def test_a_file_that_another_process_keeps_open_stays_and_the_new_file_is_kept(tmp_path, start_reader, monkeypatch):
     monkeypatch.setattr(open_files, "RETRY_SECONDS", 0.5)
     paths = [tmp_path / "a", tmp_path / "b"]
     for path in paths:
         path.write_text("old")
-    read(60, paths[1])
+    start_reader(60, paths[1])
     time.sleep(0.2)
     with (
-        pytest.raises(OutputError, match="another program has it open; nothing was changed") as failed,
+        pytest.raises(OutputError, match="another program has it open; nothing was changed") as error,
         atomic_write_all(*paths) as temporaries,
     ):
         for temporary in temporaries:
             temporary.write_text("new")
-    assert exit_status(failed.value) == TRY_AGAIN
-    assert contents(tmp_path) == {"a": "old", "b": "old", "new-a": "new", "new-b": "new"}
+    assert exit_status(error.value) == TRY_AGAIN
+    assert file_texts(tmp_path) == {"a": "old", "b": "old", "new-a": "new", "new-b": "new"}
 
 
-@on_windows
-def test_a_recording_is_written_while_another_process_reads_it_all_the_time(tmp_path, read):
+@windows_only
+def test_a_recording_is_written_while_another_process_reads_it_repeatedly(tmp_path, start_reader):
     rig, poses = make_rig(), 60
     matrices, residuals = random_poses(poses), random_residuals(poses)
     with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(poses)) as writer:
-        read(0.02, *(tmp_path / "r" / name for name in ("recording.json", "residuals.npy")))
+        start_reader(0.02, *(tmp_path / "r" / name for name in ("recording.json", "residuals.npy")))
         for number in range(poses):
             writer.append(matrices[number : number + 1], residuals[number : number + 1])
             assert read_index(tmp_path / "r")["complete"] == number + 1
     assert np.array_equal(read_recording(tmp_path / "r").residuals, residuals)
 
 
-@on_windows
-def test_a_recording_that_is_mapped_is_neither_removed_nor_replaced(tmp_path, monkeypatch):
+@windows_only
+def test_a_memory_mapped_recording_is_neither_removed_nor_replaced(tmp_path, monkeypatch):
     monkeypatch.setattr(open_files, "RETRY_SECONDS", 0.2)
     record_limb(tmp_path / "r", 12)
-    opened = read_recording(tmp_path / "r")
+    mapped_recording = read_recording(tmp_path / "r")
     with pytest.raises(OutputError, match=r"Cannot remove .*: another program has it open; end what uses it"):
         remove_recording(tmp_path / "r")
     check_recordable(tmp_path / "r", resume=False, overwrite=True)
     rig = make_rig()
     with pytest.raises(OutputError, match="another program has it open"):
         RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(12), overwrite=True)
-    assert np.array_equal(opened.residuals, read_recording(tmp_path / "r").residuals)
-    del opened
+    assert np.array_equal(mapped_recording.residuals, read_recording(tmp_path / "r").residuals)
+    del mapped_recording
     remove_recording(tmp_path / "r")
     assert not (tmp_path / "r").exists()

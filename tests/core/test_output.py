@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Files are replaced wholly or not at all, and a path that cannot be written is refused before the work."""
+"""Files are replaced completely or not at all, and a path that cannot be written is refused before any work."""
 
 import errno
 import json
@@ -29,7 +29,8 @@ from .. import systems
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def names(folder: Path) -> list[str]:
+def file_names(folder: Path) -> list[str]:
+    """Return the sorted names of the files in a folder."""
     return sorted(file.name for file in folder.iterdir())
 
 
@@ -41,41 +42,41 @@ def test_a_file_is_replaced(tmp_path):
         assert path.read_text() == "old"
         assert temporary.parent == tmp_path
     assert path.read_text() == "new"
-    assert names(tmp_path) == ["a.txt"]
+    assert file_names(tmp_path) == ["a.txt"]
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_an_error_leaves_the_old_file(tmp_path, error):
+def test_an_error_keeps_the_old_file(tmp_path, error):
     path = tmp_path / "a.txt"
     path.write_text("old")
     with pytest.raises(error), atomic_write(path) as temporary:
         temporary.write_text("half")
         raise error
-    assert path.read_text() == "old" and names(tmp_path) == ["a.txt"]
+    assert path.read_text() == "old" and file_names(tmp_path) == ["a.txt"]
 
 
-def test_json_without_numbers_leaves_the_old_file(tmp_path):
+def test_non_finite_json_keeps_the_old_file(tmp_path):
     path = tmp_path / "a.json"
     write_json(path, {"é": [1.5, None]})
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(path, {"mean": float("nan")})
     assert json.loads(path.read_text("utf-8")) == {"é": [1.5, None]}
-    assert names(tmp_path) == ["a.json"]
+    assert file_names(tmp_path) == ["a.json"]
 
 
 @systems.symbolic_links
-def test_names_of_temporary_files_cannot_be_foreseen_and_no_link_is_followed(tmp_path, monkeypatch):
+def test_temporary_names_are_random_and_links_are_not_followed(tmp_path, monkeypatch):
     path, victim = tmp_path / "a.json", tmp_path / "victim"
     victim.write_text("precious")
     (tmp_path / f".{os.getpid()}-a.json").symlink_to(victim)
-    seen = set()
+    temporary_names = set()
     for _ in range(20):
         with atomic_write(path) as temporary:
-            seen.add(temporary.name)
+            temporary_names.add(temporary.name)
             temporary.write_text("new")
-    assert len(seen) == 20 and all(is_temporary_name(name) for name in seen)
+    assert len(temporary_names) == 20 and all(is_temporary_name(name) for name in temporary_names)
     assert victim.read_text() == "precious" and path.read_text() == "new"
-    # Even one who knows the name gains nothing.
+    # A link at a known temporary name is not followed either.
     monkeypatch.setattr("secrets.token_hex", lambda _: "0" * 12)
     (tmp_path / f".fdda-{'0' * 12}.json").symlink_to(victim)
     with pytest.raises(OutputError, match="File exists; nothing was changed"):
@@ -83,7 +84,7 @@ def test_names_of_temporary_files_cannot_be_foreseen_and_no_link_is_followed(tmp
     assert victim.read_text() == "precious" and path.read_text() == "new"
 
 
-def test_files_that_belong_together_are_replaced_together(tmp_path):
+def test_several_files_are_replaced_together(tmp_path):
     paths = [tmp_path / name for name in ("a", "b", "c")]
     for path in paths[:2]:
         path.write_text("old")
@@ -94,15 +95,15 @@ def test_files_that_belong_together_are_replaced_together(tmp_path):
         for temporary in temporaries[:2]:
             temporary.write_text("new")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    assert [path.read_text() for path in paths[:2]] == ["old", "old"] and names(tmp_path) == ["a", "b"]
+    assert [path.read_text() for path in paths[:2]] == ["old", "old"] and file_names(tmp_path) == ["a", "b"]
     with atomic_write_all(*paths) as temporaries:
         for temporary in temporaries:
             temporary.write_text("new")
-    assert [path.read_text() for path in paths] == ["new"] * 3 and names(tmp_path) == ["a", "b", "c"]
+    assert [path.read_text() for path in paths] == ["new"] * 3 and file_names(tmp_path) == ["a", "b", "c"]
 
 
 @pytest.mark.parametrize("old", ["old", None])
-def test_a_rename_that_fails_changes_no_file_and_keeps_what_was_made(tmp_path, old):
+def test_a_failed_rename_changes_no_file_and_keeps_the_new_files(tmp_path, old):
     paths = [tmp_path / "a", tmp_path / "b"]
     if old:
         paths[0].write_text(old)
@@ -114,29 +115,34 @@ def test_a_rename_that_fails_changes_no_file_and_keeps_what_was_made(tmp_path, o
         for temporary in temporaries:
             temporary.write_text("new")
         paths[1].mkdir()
-    assert names(tmp_path) == [*(["a"] if old else []), "b", "new-2-a", "new-2-b", "new-a"]
+    assert file_names(tmp_path) == [*(["a"] if old else []), "b", "new-2-a", "new-2-b", "new-a"]
     assert not old or paths[0].read_text() == "old"
     assert {(tmp_path / f"new-2-{path.name}").read_text() for path in paths} == {"new"}
 
 
-def test_the_first_of_two_files_is_restored_when_the_second_is_refused(tmp_path, monkeypatch):
-    paths, rename = [tmp_path / "a", tmp_path / "b"], output.replace_file
+def test_the_first_file_is_restored_when_the_second_is_refused(tmp_path, monkeypatch):
+    paths, replace_file = [tmp_path / "a", tmp_path / "b"], output.replace_file
     for path in paths:
         path.write_text("old")
 
-    def refuse(source: Path, target: Path) -> None:
+    def refuse_second_file(source: Path, target: Path) -> None:
         if target == paths[1]:
             raise OSError(errno.EACCES, os.strerror(errno.EACCES))
-        rename(source, target)
+        replace_file(source, target)
 
-    monkeypatch.setattr(output, "replace_file", refuse)
+    monkeypatch.setattr(output, "replace_file", refuse_second_file)
     with pytest.raises(OutputError, match="nothing was changed"), atomic_write_all(*paths) as temporaries:
         for temporary in temporaries:
             temporary.write_text("new")
-    assert [path.read_text() for path in paths] == ["old", "old"] and names(tmp_path) == ["a", "b", "new-a", "new-b"]
+    assert [path.read_text() for path in paths] == ["old", "old"] and file_names(tmp_path) == [
+        "a",
+        "b",
+        "new-a",
+        "new-b",
+    ]
 
 
-def test_a_file_is_on_the_disk_before_it_takes_its_place(tmp_path, monkeypatch):
+def test_a_file_is_synced_before_it_is_renamed(tmp_path, monkeypatch):
     calls = []
     for name in ("fsync", "replace"):
         function = getattr(os, name)
@@ -151,18 +157,18 @@ def test_a_new_file_has_the_usual_permissions(tmp_path):
     assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
 
 
-def test_replacing_in_a_folder_that_went_away(tmp_path):
+def test_writing_into_a_removed_folder_is_refused(tmp_path):
     with pytest.raises(OutputError, match=r"Cannot write '.*': No such file or directory; nothing was changed\."):
         write_text(tmp_path / "gone" / "a.txt", "")
 
 
-def test_replacing_below_a_file(tmp_path):
+def test_writing_below_a_file_is_refused(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match=f"{systems.BELOW_A_FILE}; nothing was changed"):
         write_text(tmp_path / "file" / "a.txt", "")
 
 
-def test_a_name_that_is_too_long(tmp_path):
+def test_a_name_that_is_too_long_is_refused(tmp_path):
     check_folder_writable(tmp_path / ("a" * 100))
     words = "a name in it has 300 bytes, and 255 are the most; shorten it"
     if systems.WINDOWS:  # unless long paths are enabled
@@ -172,31 +178,31 @@ def test_a_name_that_is_too_long(tmp_path):
             check(tmp_path / ("a" * 298 + "é"))
 
 
-def test_a_good_path_is_left_as_it_is(tmp_path):
+def test_checking_a_valid_path_changes_nothing(tmp_path):
     (tmp_path / "old.txt").write_text("old")
     check_writable(tmp_path / "new.txt")
     check_writable(tmp_path / "old.txt")
     check_folder_writable(tmp_path / "a" / "b")
     check_folder_writable(tmp_path)
-    assert names(tmp_path) == ["old.txt"]
+    assert file_names(tmp_path) == ["old.txt"]
 
 
-def test_a_folder_is_no_file(tmp_path):
+def test_a_folder_in_place_of_a_file_is_refused(tmp_path):
     with pytest.raises(OutputError, match="it is a folder; give the name of a file"):
         check_writable(tmp_path)
 
 
-def test_a_device_is_no_file():
+def test_a_device_in_place_of_a_file_is_refused():
     with pytest.raises(OutputError, match=f"'{os.devnull}': (it is not a regular file|'nul' is the name of a device)"):
         check_writable(Path(os.devnull))
 
 
-def test_a_missing_folder(tmp_path):
+def test_a_file_in_a_missing_folder_is_refused(tmp_path):
     with pytest.raises(OutputError, match=r"the folder '.*none' does not exist; create it first"):
         check_writable(tmp_path / "none" / "a.txt")
 
 
-def test_a_folder_below_a_file(tmp_path):
+def test_a_folder_below_a_file_is_refused(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match=r"the folder .* does not exist"):
         check_writable(tmp_path / "file" / "a.txt")
@@ -205,7 +211,7 @@ def test_a_folder_below_a_file(tmp_path):
 
 
 @systems.drives
-def test_a_drive_that_is_not_connected():
+def test_a_missing_drive_is_refused():
     path = Path(systems.UNWRITABLE) / "a"
     words = re.escape(f"Cannot write into '{path}': '{path.anchor}' does not exist; choose another folder.")
     with pytest.raises(OutputError, match=words):
@@ -215,17 +221,16 @@ def test_a_drive_that_is_not_connected():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Only Linux has /proc.")
-def test_a_folder_that_takes_no_files():
-    """Permissions do not stop root; /proc stops everyone."""
+def test_a_folder_without_write_access_is_refused():
+    """Permissions do not restrict root, but nobody can create files in /proc."""
     for check, path in ((check_writable, Path("/proc/a.json")), (check_folder_writable, Path("/proc/a/b"))):
         with pytest.raises(OutputError, match=f"Cannot write '{path}': .*; choose a folder that you may write"):
             check(path)
 
 
-CHECK_AS_NOBODY = """
+CHECK_PATHS_AS_NOBODY = """
 import os, sys
 from pathlib import Path
-from fdda_addon.core import output
 from fdda_addon.core.errors import OutputError
 from fdda_addon.core.output import check_folder_writable, check_writable
 os.setuid(65534)
@@ -238,12 +243,12 @@ for check, path in ((check_writable, sys.argv[1]), (check_folder_writable, sys.a
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="Only root may become someone else.")
-def test_a_folder_that_may_not_be_entered(tmp_path):
-    """Asking whether something inside it exists is an error of its own in older Pythons."""
+def test_a_folder_without_search_access_is_refused(tmp_path):
+    """In Python 3.11, `Path.exists` raises an error for a path inside such a folder."""
     closed = tmp_path / "closed"
     (closed / "inside").mkdir(parents=True)
     closed.chmod(0)
-    command = [sys.executable, "-c", CHECK_AS_NOBODY, str(closed / "inside" / "a.json")]
+    command = [sys.executable, "-c", CHECK_PATHS_AS_NOBODY, str(closed / "inside" / "a.json")]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     lines = result.stdout.splitlines()
     assert len(lines) == 2 and all(line.startswith("Cannot write") for line in lines), result.stderr

@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Partitions by main joint, and the measure of how far a joint moves them."""
+"""Partitions by main joint, and how far their residuals change between poses."""
 
 import numpy as np
 
 from fdda_addon.core.partition import main_joints, make_partitions, max_residual_changes, partition_colors
 
-from .limb import INFLUENCING, VERTICES, make_rig, partitions_of
+from .limb import INFLUENCING, VERTEX_COUNT, make_rig, partitions_of
 
 
-def test_main_joint_has_the_largest_weight_and_the_first_wins_a_tie():
+def test_main_joint_is_the_first_with_the_largest_weight():
     joints = np.array([[3, 1, 0], [2, 5, 0], [4, 0, 0], [7, 6, 2]], np.int32)
     weights = np.array([[0.2, 0.8, 0], [0.5, 0.5, 0], [1, 0, 0], [0.3, 0.3, 0.4]], np.float32)
-    found = main_joints(joints, weights)
-    assert found.tolist() == [1, 2, 4, 2] and found.dtype == np.int32
+    computed_joints = main_joints(joints, weights)
+    assert computed_joints.tolist() == [1, 2, 4, 2] and computed_joints.dtype == np.int32
 
 
-def test_partitions_cut_the_mesh():
+def test_each_vertex_is_in_the_partition_of_its_main_joint():
     rig = make_rig()
     partitions = partitions_of(rig)
     assert [p.joint for p in partitions] == [0, 1, 2, 3]
-    assert sorted(np.concatenate([p.vertices for p in partitions]).tolist()) == list(range(VERTICES))
+    assert sorted(np.concatenate([p.vertices for p in partitions]).tolist()) == list(range(VERTEX_COUNT))
     for p in partitions:
         assert p.vertices.dtype == np.int32 and (np.diff(p.vertices) > 0).all()
         assert p.influencing == INFLUENCING[p.joint]
@@ -31,32 +31,34 @@ def test_influencing_joints_may_be_left_out():
     assert all(p.influencing == () for p in make_partitions(make_rig()))
 
 
-def test_a_partition_may_have_taken_vertices():
+def test_vertices_are_reassigned():
     rig = make_rig()
-    first, second, *others = partitions_of(rig)
-    reassigned = second.vertices[:2].tolist()
-    cut = make_partitions(rig, INFLUENCING, reassigned={first.joint: reassigned})
-    assert cut[0].vertices.tolist() == sorted([*first.vertices.tolist(), *reassigned])
-    assert cut[1].vertices.tolist() == second.vertices[2:].tolist()
-    assert [p.vertices.tolist() for p in cut[2:]] == [p.vertices.tolist() for p in others]
+    first_partition, second_partition, *other_partitions = partitions_of(rig)
+    reassigned = second_partition.vertices[:2].tolist()
+    changed_partitions = make_partitions(rig, INFLUENCING, reassigned={first_partition.joint: reassigned})
+    assert changed_partitions[0].vertices.tolist() == sorted([*first_partition.vertices.tolist(), *reassigned])
+    assert changed_partitions[1].vertices.tolist() == second_partition.vertices[2:].tolist()
+    assert [p.vertices.tolist() for p in changed_partitions[2:]] == [p.vertices.tolist() for p in other_partitions]
 
 
-def test_residual_changes_are_the_largest_distance_in_each_partition():
+def test_residual_changes_are_the_largest_distances_in_each_partition():
     partitions = partitions_of(make_rig())
-    base = np.random.default_rng(0).normal(size=(2, VERTICES, 3)).astype(np.float32)
-    moved = base.copy()
-    moved[1, partitions[1].vertices[2]] += (0.3, 0, -0.4)
-    moved[0, partitions[1].vertices[0]] += (0.1, 0, 0)
-    moved[0, partitions[3].vertices[-1]] += (0, 0.25, 0)
+    residuals = np.random.default_rng(0).normal(size=(2, VERTEX_COUNT, 3)).astype(np.float32)
+    changed_residuals = residuals.copy()
+    changed_residuals[1, partitions[1].vertices[2]] += (0.3, 0, -0.4)
+    changed_residuals[0, partitions[1].vertices[0]] += (0.1, 0, 0)
+    changed_residuals[0, partitions[3].vertices[-1]] += (0, 0.25, 0)
     expected = [[0, 0.1, 0, 0.25], [0, 0.5, 0, 0]]
-    np.testing.assert_allclose(max_residual_changes(partitions, moved, base), expected, atol=1e-6)
-    np.testing.assert_allclose(max_residual_changes(partitions, moved[1:], base[1:]), expected[1:], atol=1e-6)
+    np.testing.assert_allclose(max_residual_changes(partitions, changed_residuals, residuals), expected, atol=1e-6)
+    np.testing.assert_allclose(
+        max_residual_changes(partitions, changed_residuals[1:], residuals[1:]), expected[1:], atol=1e-6
+    )
 
 
-def test_every_partition_has_one_color_of_its_own():
+def test_every_partition_has_one_distinct_color():
     partitions = partitions_of(make_rig())
-    colors = partition_colors(partitions, VERTICES)
-    assert colors.shape == (VERTICES, 3) and colors.dtype == np.float32 and colors.max() <= 1
-    found = [np.unique(colors[partition.vertices], axis=0) for partition in partitions]
-    assert all(len(own) == 1 for own in found)
-    assert len(np.unique(np.concatenate(found), axis=0)) == len(partitions)
+    colors = partition_colors(partitions, VERTEX_COUNT)
+    assert colors.shape == (VERTEX_COUNT, 3) and colors.dtype == np.float32 and colors.max() <= 1
+    partition_color_rows = [np.unique(colors[partition.vertices], axis=0) for partition in partitions]
+    assert all(len(color_rows) == 1 for color_rows in partition_color_rows)
+    assert len(np.unique(np.concatenate(partition_color_rows), axis=0)) == len(partitions)

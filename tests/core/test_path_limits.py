@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Paths that Windows or Blender would take for others, or not at all, are refused before the work."""
+"""Paths that Windows or Blender would change or refuse are refused before any work."""
 
 import os
 import sys
@@ -15,42 +15,56 @@ from fdda_addon.core.path_limits import windows_name_problem
 from fdda_addon.core.recording.folder_check import check_recordable
 from fdda_addon.core.recording.index import INDEX_NAME
 
-DEVICE, DROPPED = "is the name of a device on Windows", "ends in a dot or a blank, which Windows drops"
-PROBLEMS = {
-    "con": f"'con' {DEVICE}",
-    "nul.onnx": f"'nul.onnx' {DEVICE}",
-    "AUX.tar.gz": f"'AUX.tar.gz' {DEVICE}",
-    "com1": f"'com1' {DEVICE}",
-    "LPT\u00b2 .x": f"'LPT\u00b2 .x' {DEVICE}",
-    "prn/model.onnx": f"'prn' {DEVICE}",
-    "model.": f"'model.' {DROPPED}",
-    "model.onnx ": f"'model.onnx ' {DROPPED}",
+DEVICE_ERROR, TRAILING_CHARACTER_ERROR = (
+    "is the name of a device on Windows",
+    "ends in a dot or a blank, which Windows drops",
+)
+PROBLEM_BY_NAME = {
+    "con": f"'con' {DEVICE_ERROR}",
+    "nul.onnx": f"'nul.onnx' {DEVICE_ERROR}",
+    "AUX.tar.gz": f"'AUX.tar.gz' {DEVICE_ERROR}",
+    "com1": f"'com1' {DEVICE_ERROR}",
+    "LPT\u00b2 .x": f"'LPT\u00b2 .x' {DEVICE_ERROR}",
+    "prn/model.onnx": f"'prn' {DEVICE_ERROR}",
+    "model.": f"'model.' {TRAILING_CHARACTER_ERROR}",
+    "model.onnx ": f"'model.onnx ' {TRAILING_CHARACTER_ERROR}",
     "why?.onnx": "'why?.onnx' has the character '?', which no name on Windows may have",
     "model.onnx:stream": "'model.onnx:stream' has the character ':', which no name on Windows may have",
 }
-GOOD = ("console.onnx", "com10", "null.onnx", ".con", "a.con", ".hidden", "a b.c", "\u00e9t\u00e9.onnx", "..", "comma")
+VALID_NAMES = (
+    "console.onnx",
+    "com10",
+    "null.onnx",
+    ".con",
+    "a.con",
+    ".hidden",
+    "a b.c",
+    "\u00e9t\u00e9.onnx",
+    "..",
+    "comma",
+)
 
 
 @pytest.fixture
-def windows(monkeypatch):
-    """The checks of a Windows that takes no long paths."""
+def windows_without_long_paths(monkeypatch):
+    """Let the checks run as on a Windows that does not support long paths."""
     monkeypatch.setattr(path_limits, "is_windows", lambda: True)
     monkeypatch.setattr(path_limits, "supports_long_windows_paths", lambda: False)
 
 
-@pytest.mark.parametrize(("name", "words"), PROBLEMS.items())
-def test_names_that_windows_takes_for_something_else(name, words):
+@pytest.mark.parametrize(("name", "words"), PROBLEM_BY_NAME.items())
+def test_problems_of_names_on_windows(name, words):
     for anchor in ("C:\\", "\\\\server\\share\\", "\\\\?\\C:\\"):
         assert windows_name_problem(PureWindowsPath(anchor) / "folder" / name) == words
 
 
-@pytest.mark.parametrize("name", GOOD)
-def test_names_that_windows_takes(name):
+@pytest.mark.parametrize("name", VALID_NAMES)
+def test_names_without_problems_on_windows(name):
     assert windows_name_problem(PureWindowsPath("C:\\") / name) == ""
 
 
-@pytest.mark.usefixtures("windows")
-def test_a_device_is_refused_before_anything_is_written(tmp_path):
+@pytest.mark.usefixtures("windows_without_long_paths")
+def test_a_device_name_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(
         OutputError, match=r"Cannot write '.*nul\.onnx': 'nul\.onnx' is the name .*; give another name\."
     ):
@@ -60,8 +74,8 @@ def test_a_device_is_refused_before_anything_is_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def folder_of(length: int, tmp_path: Path) -> Path:
-    """A folder, made on request, whose path has so many characters."""
+def folder_with_length(length: int, tmp_path: Path) -> Path:
+    """Return the path of a folder, which may not exist, with this number of characters."""
     folder = tmp_path
     while len(str(folder)) < length - 1:
         folder = folder / ("d" * min(200, length - len(str(folder)) - 1))
@@ -69,48 +83,48 @@ def folder_of(length: int, tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.usefixtures("windows")
-def test_the_longest_file_of_a_recording_has_to_fit(tmp_path):
-    longest = len("/.fdda-0123456789ab.json")
-    check_recordable(folder_of(259 - longest, tmp_path), resume=False)
+@pytest.mark.usefixtures("windows_without_long_paths")
+def test_a_recording_whose_longest_path_exceeds_the_limit_is_refused(tmp_path):
+    temporary_name_length = len("/.fdda-0123456789ab.json")
+    check_recordable(folder_with_length(259 - temporary_name_length, tmp_path), resume=False)
     with pytest.raises(
         OutputError, match=r"it needs a path of 260 characters, and Windows takes 259; choose a shorter"
     ):
-        check_recordable(folder_of(260 - longest, tmp_path), resume=False)
-    check_folder_writable(folder_of(259, tmp_path))
+        check_recordable(folder_with_length(260 - temporary_name_length, tmp_path), resume=False)
+    check_folder_writable(folder_with_length(259, tmp_path))
 
 
-@pytest.mark.usefixtures("windows")
-def test_a_file_has_to_fit_with_the_name_that_it_has_while_it_is_written(tmp_path):
-    folder = folder_of(234, tmp_path)
+@pytest.mark.usefixtures("windows_without_long_paths")
+def test_a_file_whose_temporary_path_exceeds_the_limit_is_refused(tmp_path):
+    folder = folder_with_length(234, tmp_path)
     folder.mkdir(parents=True)
     check_writable(folder / "a.json")
     with pytest.raises(OutputError, match="needs a path of 260 characters"):
         check_writable(folder / "a.jsons")
 
 
-def test_long_paths_are_taken_where_windows_takes_them(tmp_path, monkeypatch):
+def test_long_paths_are_accepted_if_windows_supports_them(tmp_path, monkeypatch):
     monkeypatch.setattr(path_limits, "is_windows", lambda: True)
     monkeypatch.setattr(path_limits, "supports_long_windows_paths", lambda: True)
-    check_recordable(folder_of(300, tmp_path), resume=False)
+    check_recordable(folder_with_length(300, tmp_path), resume=False)
 
 
-@pytest.mark.skipif(sys.platform != "win32", reason="asks Windows")
-def test_windows_says_whether_it_takes_long_paths():
+@pytest.mark.skipif(sys.platform != "win32", reason="Only Windows has this setting.")
+def test_windows_reports_its_support_of_long_paths():
     assert path_limits.supports_long_windows_paths() in (True, False)
 
 
-def test_a_path_that_blender_would_cut_is_refused_on_every_system(tmp_path):
-    """Blender counts bytes, and writes to what is left of the path."""
-    folder = folder_of(1023 - len("/" + INDEX_NAME), tmp_path)
+def test_a_path_that_blender_would_truncate_is_refused_on_every_system(tmp_path):
+    """Blender truncates a path that has too many bytes and writes to another file."""
+    folder = folder_with_length(1023 - len("/" + INDEX_NAME), tmp_path)
     with pytest.raises(OutputError, match=r"it needs a path of 1,032 bytes, and Blender takes 1,023; choose a shorter"):
         check_recordable(folder, resume=False)
     with pytest.raises(OutputError, match="bytes, and Blender takes 1,023"):
-        check_writable(folder_of(1015, tmp_path) / "a.blend")
+        check_writable(folder_with_length(1015, tmp_path) / "a.blend")
 
 
 @pytest.mark.parametrize("system", ["win32", "darwin", "linux"])
-def test_names_that_differ_by_letter_case_alone(tmp_path, monkeypatch, system):
+def test_names_that_differ_only_in_case(tmp_path, monkeypatch, system):
     monkeypatch.setattr(path_limits.sys, "platform", system)
     outputs = [(tmp_path / "A.onnx", EVALUATION), (tmp_path / "a.onnx", PICTURE)]
     if system == "linux":
@@ -120,9 +134,9 @@ def test_names_that_differ_by_letter_case_alone(tmp_path, monkeypatch, system):
         check_outputs(outputs)
 
 
-def test_a_file_that_is_read_is_recognized_in_other_letters(tmp_path):
+def test_an_input_file_is_recognized_in_another_case(tmp_path):
     (tmp_path / "rig.blend").write_bytes(b"BLENDER")
     if not os.path.exists(tmp_path / "RIG.blend"):
-        pytest.skip("this disk tells small letters from capital ones")
+        pytest.skip("The file system is case-sensitive.")
     with pytest.raises(OutputError, match="it is read for this"):
         check_outputs({tmp_path / "RIG.blend": PICTURE}, [tmp_path / "rig.blend"])

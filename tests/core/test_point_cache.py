@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Point caches: the bytes are those of the format, and a damaged file is refused in a sentence."""
+"""Point caches: files have the bytes of the PC2 format, and a damaged file is refused in one sentence."""
 
 import struct
 
@@ -16,19 +16,20 @@ def positions() -> np.ndarray:
 
 
 @pytest.fixture
-def cache(positions, tmp_path):
+def cache_path(positions, tmp_path):
+    """Path of a point cache of seven points, five samples from frame -3 on."""
     path = tmp_path / "a.pc2"
     with open(path, "wb") as file:
         writer = PointCacheWriter(file, 7, -3, 5)
         writer.append(positions[:2])
-        # Not contiguous, and of another float.
+        # An array that is not contiguous, of another floating-point type.
         writer.append(positions[2:].astype(np.float64)[:, :, ::-1][:, :, ::-1])
         writer.finish()
     return path
 
 
-def test_bytes(cache, positions):
-    data = cache.read_bytes()
+def test_bytes_of_the_format(cache_path, positions):
+    data = cache_path.read_bytes()
     assert data[:12] == b"POINTCACHE2\0" and len(data) == 32 + 5 * 7 * 12
     assert struct.unpack("<ii", data[12:20]) == (1, 7)
     assert struct.unpack("<ff", data[20:28]) == (-3.0, 1.0)
@@ -36,18 +37,18 @@ def test_bytes(cache, positions):
     assert struct.unpack("<3f", data[32 + 12 * 8 : 32 + 12 * 9]) == tuple(positions[1, 1].tolist())
 
 
-def test_what_was_written_is_read(cache, positions):
-    read = read_point_cache(cache)
-    assert (read.start, read.rate) == (-3, 1)
-    np.testing.assert_array_equal(read.positions, positions)
+def test_positions_are_read_back(cache_path, positions):
+    read_back = read_point_cache(cache_path)
+    assert (read_back.start, read_back.rate) == (-3, 1)
+    np.testing.assert_array_equal(read_back.positions, positions)
 
 
-def test_no_sample_is_forgotten_or_added(tmp_path, positions):
+def test_a_wrong_number_of_samples_or_points_is_refused(tmp_path, positions):
     with open(tmp_path / "a.pc2", "wb") as file:
         writer = PointCacheWriter(file, 7, 1, 4)
-        for wrong in (positions, positions[:, :6]):
+        for wrong_positions in (positions, positions[:, :6]):
             with pytest.raises(ValueError, match=r"where 4 of 7 points fit"):
-                writer.append(wrong)
+                writer.append(wrong_positions)
         writer.append(positions[:3])
         with pytest.raises(ValueError, match="1 samples are missing"):
             writer.finish()
@@ -67,12 +68,12 @@ def test_no_sample_is_forgotten_or_added(tmp_path, positions):
         (lambda data: data[:20] + struct.pack("<f", np.nan) + data[24:], "from frame nan on"),
     ],
 )
-def test_damaged_files(cache, change, words):
-    cache.write_bytes(change(cache.read_bytes()))
+def test_damaged_files_are_refused(cache_path, change, words):
+    cache_path.write_bytes(change(cache_path.read_bytes()))
     with pytest.raises(PointCacheError, match=words):
-        read_point_cache(cache)
+        read_point_cache(cache_path)
 
 
-def test_no_file(tmp_path):
+def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(PointCacheError, match="cannot be read: No such file or directory"):
         read_point_cache(tmp_path / "none.pc2")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Faces of a recording that someone or something has damaged, and recordings without faces."""
+"""Recordings with damaged faces are refused; recordings without faces are read."""
 
 import json
 
@@ -8,7 +8,7 @@ import pytest
 
 from fdda_addon.core.recording.reader import read_recording
 
-from .damage import edit, refused
+from .damage import assert_refused, edit_index
 
 
 def test_a_recording_without_faces_is_read(recording):
@@ -21,19 +21,19 @@ def test_a_recording_without_faces_is_read(recording):
 
 @pytest.mark.parametrize("key", ["faces", "corners"])
 @pytest.mark.parametrize("value", [None, "x", -1, 1.5, True, [1], {"a": 1}, float("inf")])
-def test_a_number_of_faces_that_is_none(recording, key, value):
-    edit(recording, **{key: value})
-    refused(recording, f"recording.json' is damaged: '{key}' is {value!r}; record again")
+def test_an_invalid_face_count_is_refused(recording, key, value):
+    edit_index(recording, **{key: value})
+    assert_refused(recording, f"recording.json' is damaged: '{key}' is {value!r}; record again")
 
 
 @pytest.mark.parametrize("counts", [{"faces": 5, "corners": 14}, {"faces": 1 << 62}, {"corners": 0}])
-def test_faces_of_too_few_corners(recording, counts):
-    index = edit(recording, **counts)
-    refused(recording, f"damaged: {index['faces']} faces cannot have {index['corners']} corners; record again")
+def test_a_corner_count_that_contradicts_the_face_count_is_refused(recording, counts):
+    index = edit_index(recording, **counts)
+    assert_refused(recording, f"damaged: {index['faces']} faces cannot have {index['corners']} corners; record again")
 
 
 @pytest.mark.parametrize(
-    ("name", "place", "value"),
+    ("name", "index", "value"),
     [
         ("face_starts", 0, 1),
         ("face_starts", 3, 0),
@@ -45,16 +45,18 @@ def test_faces_of_too_few_corners(recording, counts):
         ("face_vertices", -1, (1 << 31) - 1),
     ],
 )
-def test_faces_that_are_none(recording, name, place, value):
+def test_invalid_faces_are_refused(recording, name, index, value):
     array = np.load(recording / f"{name}.npy")
-    array[place] = value
+    array[index] = value
     np.save(recording / f"{name}.npy", array)
-    refused(recording, f"The faces of '{recording}' are damaged; record again.")
+    assert_refused(recording, f"The faces of '{recording}' are damaged; record again.")
 
 
 @pytest.mark.parametrize("name", ["face_starts", "face_vertices"])
 @pytest.mark.parametrize("dtype", [np.int64, np.uint32, ">i4", np.float32])
-def test_faces_of_another_dtype(recording, name, dtype):
+def test_faces_of_another_dtype_are_refused(recording, name, dtype):
     array = np.load(recording / f"{name}.npy")
     np.save(recording / f"{name}.npy", array.astype(dtype))
-    refused(recording, f"{name}.npy' cannot be used: it holds {array.shape} {np.dtype(dtype)}, not {array.shape} int32")
+    assert_refused(
+        recording, f"{name}.npy' cannot be used: it holds {array.shape} {np.dtype(dtype)}, not {array.shape} int32"
+    )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a recording will take: the sentence, the bytes, and the refusal of a disk without room."""
+"""Disk space and time that a recording will need, and the refusal if the disk has too little space."""
 
 import os
 import shutil
@@ -26,39 +26,40 @@ from .limb import make_rig, record_limb
         (Estimate(9, 9, 10**9, None), "9 poses of 9 vertices: about 1.0 GB on the disk"),
     ],
 )
-def test_the_sentence(estimate, sentence):
+def test_estimate_sentence(estimate, sentence):
     assert estimate.sentence() == sentence
 
 
-def test_the_bytes_are_those_of_the_files(tmp_path):
+def test_estimated_bytes_equal_the_size_of_the_arrays(tmp_path):
     record_limb(tmp_path / "r", poses=50)
-    written = sum(path.stat().st_size for path in (tmp_path / "r").glob("*.npy"))
-    headers = 128 * len(list((tmp_path / "r").glob("*.npy")))
-    assert recording_bytes(read_recording(tmp_path / "r").rig, 50) == written - headers
+    file_bytes = sum(path.stat().st_size for path in (tmp_path / "r").glob("*.npy"))
+    header_bytes = 128 * len(list((tmp_path / "r").glob("*.npy")))
+    assert recording_bytes(read_recording(tmp_path / "r").rig, 50) == file_bytes - header_bytes
 
 
-def test_what_a_training_takes(tmp_path):
+def test_training_size_sentence(tmp_path):
     record_limb(tmp_path / "r", poses=50)
     recording = read_recording(tmp_path / "r")
-    largest = max(recording.partitions, key=lambda partition: len(partition.vertices))
-    name = recording.rig.joint_names[largest.joint]
+    largest_partition = max(recording.partitions, key=lambda partition: len(partition.vertices))
+    name = recording.rig.joint_names[largest_partition.joint]
     assert training_size_sentence(recording) == (
         f"50 poses of {recording.rig.vertex_count} vertices: less than 1 MB on the disk; residuals of the largest "
-        f"partition, '{name}', of {len(largest.vertices)} vertices: less than 1 MB, in memory two or three times."
+        f"partition, '{name}', of {len(largest_partition.vertices)} vertices: less than 1 MB, "
+        "in memory two or three times."
     )
 
 
-def test_a_disk_without_room(tmp_path):
-    free = shutil.disk_usage(tmp_path).free
+def test_a_disk_with_too_little_space_is_refused(tmp_path):
+    free_bytes = shutil.disk_usage(tmp_path).free
     check_disk_space([(tmp_path / "a", 1000), (tmp_path / "b", 1000)])
     with pytest.raises(
         OutputError, match=r"Cannot write the recording '.*a.b': it takes .* GB and the disk has .* left"
     ):
-        check_disk_space([(tmp_path / "a" / "b", free), (tmp_path / "c", 10**9)])
+        check_disk_space([(tmp_path / "a" / "b", free_bytes), (tmp_path / "c", 10**9)])
 
 
-@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="Windows reserves no room for files.")
-def test_what_a_recording_has_already_needs_no_room(small_disk):
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="Windows does not reserve space for files.")
+def test_space_that_a_recording_has_reserved_is_not_counted_again(small_disk):
     record_limb(small_disk / "r", poses=20, complete=5)
     size = recording_bytes(make_rig(), 20)
     (small_disk / "ballast").write_bytes(b"x" * (shutil.disk_usage(small_disk).free - 8192))

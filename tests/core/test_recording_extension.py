@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A recording that grows: complete at every moment, whatever interrupts it."""
+"""Appending poses to a complete recording: it stays valid at every moment, also after an interruption."""
 
 import json
 
@@ -14,64 +14,65 @@ from fdda_addon.core.recording.writer import RecordingWriter
 
 from .limb import make_rig, partitions_of, random_poses, random_residuals, recording_info
 
-POSES, MORE = 12, 5
+POSE_COUNT, ADDED_COUNT = 12, 5
 
 
-def extend(path, count: int = MORE, seed: int = 7) -> None:
+def append_poses(path, count: int = ADDED_COUNT, seed: int = 7) -> None:
+    """Append random poses to the recording as those of a refinement."""
     with RecordingExtension(read_recording(path), "limb.onnx") as extension:
         extension.append(random_poses(count, seed), random_residuals(count, seed))
 
 
-def assert_holds(path, *parts: tuple[int, int]) -> None:
-    """The recording is the first poses, and then (count, seed) more for each part."""
-    read = read_recording(path)
-    matrices = [random_poses(POSES), *(random_poses(count, seed) for count, seed in parts)]
-    residuals = [random_residuals(POSES), *(random_residuals(count, seed) for count, seed in parts)]
-    assert np.array_equal(read.pose_matrices, np.concatenate(matrices))
-    assert np.array_equal(read.residuals, np.concatenate(residuals))
+def assert_poses(path, *parts: tuple[int, int]) -> None:
+    """Check that the recording has its first poses, then those that `append_poses` adds for each (count, seed)."""
+    recording = read_recording(path)
+    matrices = [random_poses(POSE_COUNT), *(random_poses(count, seed) for count, seed in parts)]
+    residuals = [random_residuals(POSE_COUNT), *(random_residuals(count, seed) for count, seed in parts)]
+    assert np.array_equal(recording.pose_matrices, np.concatenate(matrices))
+    assert np.array_equal(recording.residuals, np.concatenate(residuals))
 
 
-def test_poses_are_added_and_counted(recording):
-    extend(recording)
-    assert_holds(recording, (MORE, 7))
-    assert read_recording(recording).info.sampling.sources[2:] == (Source(REFINED, MORE, "limb.onnx"),)
+def test_poses_are_appended_and_counted(recording):
+    append_poses(recording)
+    assert_poses(recording, (ADDED_COUNT, 7))
+    assert read_recording(recording).info.sampling.sources[2:] == (Source(REFINED, ADDED_COUNT, "limb.onnx"),)
     with RecordingExtension(read_recording(recording), "again.onnx") as extension:
         for seed in (8, 9):
             extension.append(random_poses(2, seed), random_residuals(2, seed))
-            assert extension.complete == POSES + MORE + 2 * (seed - 7)
-    assert_holds(recording, (MORE, 7), (2, 8), (2, 9))
-    assert [s.poses for s in read_recording(recording).info.sampling.sources] == [POSES - 2, 2, MORE, 4]
+            assert extension.complete == POSE_COUNT + ADDED_COUNT + 2 * (seed - 7)
+    assert_poses(recording, (ADDED_COUNT, 7), (2, 8), (2, 9))
+    assert [s.poses for s in read_recording(recording).info.sampling.sources] == [POSE_COUNT - 2, 2, ADDED_COUNT, 4]
 
 
 def test_arrays_stay_plain_npy_files(recording):
-    extend(recording, 1000)
+    append_poses(recording, 1000)
     for name in ("pose_matrices", "residuals"):
-        assert len(np.load(recording / f"{name}.npy", mmap_mode="r", allow_pickle=False)) == POSES + 1000
+        assert len(np.load(recording / f"{name}.npy", mmap_mode="r", allow_pickle=False)) == POSE_COUNT + 1000
         assert (recording / f"{name}.npy").stat().st_size % 4 == 0
 
 
-def test_what_the_index_does_not_count_is_not_read_and_is_written_over(recording):
-    before = (recording / INDEX_NAME).read_bytes()
-    extend(recording)
-    # As if the machine had stopped between the arrays and the index.
-    (recording / INDEX_NAME).write_bytes(before)
-    assert_holds(recording)
-    extend(recording, 3, seed=8)
-    assert_holds(recording, (3, 8))
+def test_poses_beyond_the_index_are_ignored_and_overwritten(recording):
+    index_before = (recording / INDEX_NAME).read_bytes()
+    append_poses(recording)
+    # This is the state after the machine stopped between writing the arrays and writing the index.
+    (recording / INDEX_NAME).write_bytes(index_before)
+    assert_poses(recording)
+    append_poses(recording, 3, seed=8)
+    assert_poses(recording, (3, 8))
 
 
-def test_arrays_that_grew_without_a_header_are_read(recording):
+def test_bytes_beyond_the_header_are_ignored(recording):
     with open(recording / "residuals.npy", "ab") as file:
         file.write(b"torn")
-    assert_holds(recording)
-    extend(recording)
-    assert_holds(recording, (MORE, 7))
+    assert_poses(recording)
+    append_poses(recording)
+    assert_poses(recording, (ADDED_COUNT, 7))
 
 
-def test_a_header_that_promises_too_much_is_refused(recording):
-    extend(recording)
+def test_an_array_shorter_than_its_header_says_is_refused(recording):
+    append_poses(recording)
     index = json.loads((recording / INDEX_NAME).read_text())
-    index["poses"] = index["complete"] = POSES
+    index["poses"] = index["complete"] = POSE_COUNT
     index["sampling"]["sources"].pop()
     (recording / INDEX_NAME).write_text(json.dumps(index))
     with open(recording / "residuals.npy", "r+b") as file:
@@ -80,46 +81,48 @@ def test_a_header_that_promises_too_much_is_refused(recording):
         read_recording(recording)
 
 
-def test_sources_must_add_up(recording):
+def test_sources_that_contradict_the_pose_count_are_refused(recording):
     index = json.loads((recording / INDEX_NAME).read_text())
     index["sampling"]["sources"][0]["poses"] -= 1
     (recording / INDEX_NAME).write_text(json.dumps(index))
-    with pytest.raises(RecordingError, match=f"its sources do not add up to its {POSES} poses"):
+    with pytest.raises(RecordingError, match=f"its sources do not add up to its {POSE_COUNT} poses"):
         read_recording(recording)
 
 
-def test_values_that_are_not_numbers_add_nothing(recording):
-    residuals = random_residuals(MORE)
+def test_non_finite_values_append_nothing(recording):
+    residuals = random_residuals(ADDED_COUNT)
     residuals[3, 0, 0] = np.nan
     with (
-        pytest.raises(RecordingError, match=rf"Pose {POSES + 3} of the rig .* not numbers \(residuals\)"),
+        pytest.raises(RecordingError, match=rf"Pose {POSE_COUNT + 3} of the rig .* not numbers \(residuals\)"),
         RecordingExtension(read_recording(recording), "limb.onnx") as extension,
     ):
-        extension.append(random_poses(MORE), residuals)
-    assert_holds(recording)
+        extension.append(random_poses(ADDED_COUNT), residuals)
+    assert_poses(recording)
 
 
-def test_one_process_extends_at_a_time(recording):
+def test_a_second_extension_at_the_same_time_is_refused(recording):
     with (
         RecordingExtension(read_recording(recording), "limb.onnx"),
         pytest.raises(RecordingError, match="This Blender is recording into"),
     ):
         RecordingExtension(read_recording(recording), "limb.onnx")
-    extend(recording)
-    assert_holds(recording, (MORE, 7))
+    append_poses(recording)
+    assert_poses(recording, (ADDED_COUNT, 7))
 
 
-def test_poses_that_another_process_added_meanwhile_are_not_written_over(recording):
-    before = read_recording(recording)
-    extend(recording)
-    with pytest.raises(RecordingError, match=f"had {POSES} poses when it was read and has {POSES + MORE} now"):
-        RecordingExtension(before, "limb.onnx")
-    assert_holds(recording, (MORE, 7))
-    extend(recording, 2, seed=8)
-    assert_holds(recording, (MORE, 7), (2, 8))
+def test_poses_that_another_process_appended_are_not_overwritten(recording):
+    recording_before = read_recording(recording)
+    append_poses(recording)
+    with pytest.raises(
+        RecordingError, match=f"had {POSE_COUNT} poses when it was read and has {POSE_COUNT + ADDED_COUNT} now"
+    ):
+        RecordingExtension(recording_before, "limb.onnx")
+    assert_poses(recording, (ADDED_COUNT, 7))
+    append_poses(recording, 2, seed=8)
+    assert_poses(recording, (ADDED_COUNT, 7), (2, 8))
 
 
-def test_a_grown_recording_is_not_resumed_as_another(recording):
-    extend(recording)
+def test_resuming_an_extended_recording_is_refused(recording):
+    append_poses(recording)
     with pytest.raises(RecordingError, match=r"recorded differently \(poses, sampling\.sources\)"):
-        RecordingWriter(recording, make_rig(), partitions_of(make_rig()), recording_info(POSES), resume=True)
+        RecordingWriter(recording, make_rig(), partitions_of(make_rig()), recording_info(POSE_COUNT), resume=True)

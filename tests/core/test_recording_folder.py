@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is said of a folder before anything is recorded into it, and what removing a recording removes."""
+"""The state of a folder before anything is recorded into it, and which files removing a recording removes."""
 
 import json
 from dataclasses import replace
@@ -17,78 +17,80 @@ from fdda_addon.core.recording.writer import RecordingWriter
 from .good_recording import good_recording
 from .limb import JOINTS, make_rig, record_limb, recording_info
 
-POSES = 12
-SAMPLING = json.loads(json.dumps(recording_info(POSES).sampling.to_json()))
+POSE_COUNT = 12
+SAMPLING = json.loads(json.dumps(recording_info(POSE_COUNT).sampling.to_json()))
 
 
-def look(path: Path, **changes: object) -> FolderContent:
-    """What a folder holds for the limb, with changes to the sampling that is wanted."""
+def read_limb_folder(path: Path, **changes: object) -> FolderContent:
+    """Return the content of a folder, compared with the limb and `SAMPLING` with changed keys."""
     return read_folder(path, make_rig(), SAMPLING | changes)
 
 
-def test_a_folder_that_is_not_there_or_empty_is_free(tmp_path):
-    assert look(tmp_path / "none").state is look(tmp_path).state is FolderState.FREE
+def test_a_missing_or_empty_folder_is_free(tmp_path):
+    assert read_limb_folder(tmp_path / "none").state is read_limb_folder(tmp_path).state is FolderState.FREE
     (tmp_path / LOCK_NAME).write_text("{}")
-    assert look(tmp_path).state is FolderState.FREE
+    assert read_limb_folder(tmp_path).state is FolderState.FREE
 
 
-def test_something_else_is_in_it(tmp_path):
+def test_a_folder_with_other_files_is_foreign(tmp_path):
     (tmp_path / "letters.txt").write_text("dear")
-    content = look(tmp_path)
+    content = read_limb_folder(tmp_path)
     assert (content.state, content.poses) == (FolderState.FOREIGN, 0)
     assert content.sentence == f"'{tmp_path.name}' is not an empty folder; choose another."
     assert not content.is_recording
-    assert look(tmp_path / "letters.txt").state is FolderState.FOREIGN
+    assert read_limb_folder(tmp_path / "letters.txt").state is FolderState.FOREIGN
 
 
-def test_a_recording_that_is_complete(tmp_path):
-    record_limb(tmp_path / "r", POSES)
-    assert look(tmp_path / "r") == FolderContent(FolderState.COMPLETE, POSES, POSES, is_recording=True)
-    other = look(tmp_path / "r", limits=[], spread=0.5)
-    assert other.state is FolderState.COMPLETE
-    assert other.sentence == "It was recorded with other settings than those above: range of motion, spread."
+def test_a_complete_recording(tmp_path):
+    record_limb(tmp_path / "r", POSE_COUNT)
+    assert read_limb_folder(tmp_path / "r") == FolderContent(
+        FolderState.COMPLETE, POSE_COUNT, POSE_COUNT, is_recording=True
+    )
+    content = read_limb_folder(tmp_path / "r", limits=[], spread=0.5)
+    assert content.state is FolderState.COMPLETE
+    assert content.sentence == "It was recorded with other settings than those above: range of motion, spread."
 
 
-def test_what_was_measured_with_a_recording_is_said(tmp_path):
-    record_limb(tmp_path / "r", POSES)
+def test_measurements_of_a_recording_are_reported(tmp_path):
+    record_limb(tmp_path / "r", POSE_COUNT)
     repeatability = Repeatability((1, 2), dict.fromkeys(STATISTIC_NAMES, 0.25), 5.0)
     index = json.loads((tmp_path / "r" / "recording.json").read_text())
     (tmp_path / "r" / "recording.json").write_text(json.dumps({**index, "repeatability": repeatability.to_json()}))
-    assert look(tmp_path / "r").measured_sentences == (repeatability.sentence(),)
+    assert read_limb_folder(tmp_path / "r").measured_sentences == (repeatability.sentence(),)
     assert "0.25 mm apart on average" in repeatability.sentence()
 
 
-def test_a_recording_that_was_broken_off(tmp_path):
-    record_limb(tmp_path / "r", POSES, 5)
-    assert look(tmp_path / "r") == FolderContent(FolderState.INCOMPLETE, 5, POSES, is_recording=True)
-    other = look(tmp_path / "r", seed=9)
-    assert other.state is FolderState.OTHER
-    assert other.sentence.startswith("'r' was begun with other settings (seed) and has 5 of 12 poses.")
+def test_an_interrupted_recording(tmp_path):
+    record_limb(tmp_path / "r", POSE_COUNT, 5)
+    assert read_limb_folder(tmp_path / "r") == FolderContent(FolderState.INCOMPLETE, 5, POSE_COUNT, is_recording=True)
+    content = read_limb_folder(tmp_path / "r", seed=9)
+    assert content.state is FolderState.OTHER
+    assert content.sentence.startswith("'r' was begun with other settings (seed) and has 5 of 12 poses.")
 
 
-@pytest.mark.parametrize("complete", [5, POSES])
+@pytest.mark.parametrize("complete", [5, POSE_COUNT])
 def test_a_recording_of_another_rig(tmp_path, complete):
-    record_limb(tmp_path / "r", POSES, complete)
-    renamed = replace(make_rig(), joints=(replace(JOINTS[0], name="tail"), *JOINTS[1:]))
-    content = read_folder(tmp_path / "r", renamed, SAMPLING)
+    record_limb(tmp_path / "r", POSE_COUNT, complete)
+    renamed_rig = replace(make_rig(), joints=(replace(JOINTS[0], name="tail"), *JOINTS[1:]))
+    content = read_folder(tmp_path / "r", renamed_rig, SAMPLING)
     assert (content.state, content.complete) == (FolderState.OTHER, complete)
     assert f"the armature lacks the joint '{JOINTS[0].name}'; it does not know the joint 'tail'" in content.sentence
     assert read_folder(tmp_path / "r").state is not FolderState.OTHER, "without a rig nothing is compared"
 
 
-def test_a_recording_that_is_damaged(tmp_path):
-    record_limb(tmp_path / "r", POSES)
+def test_a_damaged_recording(tmp_path):
+    record_limb(tmp_path / "r", POSE_COUNT)
     (tmp_path / "r" / "recording.json").write_text("{")
-    content = look(tmp_path / "r")
+    content = read_limb_folder(tmp_path / "r")
     assert content.state is FolderState.FOREIGN and "cannot be read" in content.sentence
     assert content.is_recording and content.sentence.endswith("record again with --overwrite.")
     (tmp_path / "r" / "residuals.npy").unlink()
-    assert not look(tmp_path / "r").is_recording, "a '{' and some file may be anything"
+    assert not read_limb_folder(tmp_path / "r").is_recording, "a '{' and some file may be anything"
 
 
-def test_removing_leaves_nothing_of_it_and_all_else(tmp_path):
+def test_removing_deletes_the_recording_and_keeps_other_files(tmp_path):
     for name in ("r", "with_notes"):
-        record_limb(tmp_path / name, POSES)
+        record_limb(tmp_path / name, POSE_COUNT)
     (tmp_path / "with_notes" / "notes.txt").write_text("mine")
     for name in ("r", "with_notes"):
         remove_recording(tmp_path / name)
@@ -99,7 +101,7 @@ def test_removing_leaves_nothing_of_it_and_all_else(tmp_path):
 
 
 def test_every_array_is_removed(tmp_path):
-    """Of a rig with controls too: what is left would refuse the next recording."""
+    """The array of controls is removed too; otherwise the folder would not be empty for the next recording."""
     path, recording = tmp_path / "r", good_recording(4)
     info = replace(recording.info, complete=0)
     with RecordingWriter(path, recording.rig, recording.partitions, info) as writer:
@@ -111,21 +113,21 @@ def test_every_array_is_removed(tmp_path):
     assert not path.exists()
 
 
-LEFT_OVER = ("recording.lock", f".fdda-{'a1' * 6}.json")
+LEFTOVER_NAMES = ("recording.lock", f".fdda-{'a1' * 6}.json")
 
 
-def test_what_a_first_write_left_that_was_killed_stops_nobody(tmp_path):
-    """A process that is killed while it writes the index for the first time leaves a file and no index."""
-    for name in LEFT_OVER:
+def test_leftovers_of_a_killed_first_write_are_ignored(tmp_path):
+    """A process that is killed while it first writes the index leaves a temporary file and no index."""
+    for name in LEFTOVER_NAMES:
         (tmp_path / name).write_text("{")
-    assert look(tmp_path).state is FolderState.FREE
-    record_limb(tmp_path, POSES)
-    assert not {path.name for path in tmp_path.iterdir()} & set(LEFT_OVER)
-    (tmp_path / LEFT_OVER[1]).write_text("{")
-    assert look(tmp_path).state is FolderState.COMPLETE
+    assert read_limb_folder(tmp_path).state is FolderState.FREE
+    record_limb(tmp_path, POSE_COUNT)
+    assert not {path.name for path in tmp_path.iterdir()} & set(LEFTOVER_NAMES)
+    (tmp_path / LEFTOVER_NAMES[1]).write_text("{")
+    assert read_limb_folder(tmp_path).state is FolderState.COMPLETE
 
 
-def test_nothing_to_remove(tmp_path):
+def test_removing_from_a_folder_without_a_recording_is_refused(tmp_path):
     (tmp_path / "residuals.npy").write_text("of someone else")
     with pytest.raises(RecordingError, match="holds no recording; there is nothing to remove"):
         remove_recording(tmp_path)
@@ -133,17 +135,17 @@ def test_nothing_to_remove(tmp_path):
 
 
 def test_a_recording_that_is_being_written_is_not_removed(tmp_path):
-    record_limb(tmp_path / "r", POSES)
+    record_limb(tmp_path / "r", POSE_COUNT)
     lock = RecordingLock(tmp_path / "r")
     lock.acquire()
     with pytest.raises(RecordingError, match="is recording into"):
         remove_recording(tmp_path / "r")
     lock.release()
-    assert look(tmp_path / "r").state is FolderState.COMPLETE
+    assert read_limb_folder(tmp_path / "r").state is FolderState.COMPLETE
 
 
 def test_a_folder_that_cannot_be_removed_is_named(tmp_path):
-    record_limb(tmp_path / "r", POSES)
+    record_limb(tmp_path / "r", POSE_COUNT)
     (tmp_path / "r" / "residuals.npy").unlink()
     (tmp_path / "r" / "residuals.npy").mkdir()
     with pytest.raises(OutputError, match="Cannot remove the recording"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Two processes and one recording: the second is told, and a lock that nobody holds any more stops nobody."""
+"""Two processes with one recording: the second one is refused; a lock whose process has ended is ignored."""
 
 import json
 import os
@@ -21,7 +21,7 @@ from .. import systems
 from .limb import make_rig, partitions_of, record_limb, recording_info
 
 ROOT = Path(__file__).resolve().parents[2]
-OTHER_PROCESS = """
+HOLD_LOCK = """
 import os, sys
 from pathlib import Path
 from fdda_addon.core.recording.lock import RecordingLock
@@ -30,23 +30,23 @@ lock.acquire()
 print(os.getpid(), flush=True)
 sys.stdin.read()
 """
-TAKERS = """
+ACQUIRE_REPEATEDLY = """
 import os, sys, time
 from pathlib import Path
 from fdda_addon.core.errors import RecordingError
 from fdda_addon.core.recording.lock import RecordingLock
-folder, marker = Path(sys.argv[1]), sys.argv[1] + "/held"
-end, won = time.monotonic() + 2, 0
-while time.monotonic() < end:
+folder, marker_path = Path(sys.argv[1]), sys.argv[1] + "/held"
+end_time, acquired_count = time.monotonic() + 2, 0
+while time.monotonic() < end_time:
     child = os.fork()
     if not child:
-        # Takes the lock of one that is gone, and is gone without giving it back.
+        # The child acquires the lock of an ended process and ends without releasing it.
         try:
             lock = RecordingLock(folder)
             lock.acquire()
-            os.close(os.open(marker, os.O_CREAT | os.O_EXCL))
+            os.close(os.open(marker_path, os.O_CREAT | os.O_EXCL))
             time.sleep(0.001)
-            os.unlink(marker)
+            os.unlink(marker_path)
             os._exit(0)
         except RecordingError:
             os._exit(1)
@@ -54,81 +54,84 @@ while time.monotonic() < end:
             os._exit(2)
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if status == 2:
-        sys.exit("two had it")
-    won += status == 0
-print(won)
+        sys.exit("Two processes held the lock.")
+    acquired_count += status == 0
+print(acquired_count)
 """
 
 
 @pytest.fixture
-def other(tmp_path: Path):
-    """Another process that holds the lock of tmp_path, and never gives it back."""
-    command = [sys.executable, "-c", OTHER_PROCESS, str(tmp_path)]
+def lock_process(tmp_path: Path):
+    """Start another process that holds the lock of tmp_path until it is killed; its ID is `owner`."""
+    command = [sys.executable, "-c", HOLD_LOCK, str(tmp_path)]
     process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    # Not process.pid: the Python of a virtual environment on Windows starts another one.
+    # process.pid differs on Windows, where the Python of a virtual environment starts another process.
     process.owner = int(process.stdout.readline())
     yield process
     process.kill()
     process.communicate()
 
 
-def write(path: Path, **options) -> RecordingWriter:
+def make_writer(path: Path, **options) -> RecordingWriter:
+    """Return a writer of a recording of the limb, which acquires its lock."""
     rig = make_rig()
     return RecordingWriter(path, rig, partitions_of(rig), recording_info(4), **options)
 
 
-def test_the_second_process_is_told_and_changes_nothing(other, tmp_path):
-    with pytest.raises(RecordingError, match=rf"Another Blender \(process {other.owner}\) is recording into") as error:
-        write(tmp_path)
+def test_the_second_process_is_refused_and_changes_nothing(lock_process, tmp_path):
+    with pytest.raises(
+        RecordingError, match=rf"Another Blender \(process {lock_process.owner}\) is recording into"
+    ) as error:
+        make_writer(tmp_path)
     assert str(error.value).endswith("wait for it, or choose another folder.")
     assert [path.name for path in tmp_path.iterdir()] == [LOCK_NAME]
 
 
-def test_the_lock_of_a_process_that_is_gone_is_taken_over(other, tmp_path):
-    other.kill()
-    other.wait()
+def test_the_lock_of_an_ended_process_is_taken_over(lock_process, tmp_path):
+    lock_process.kill()
+    lock_process.wait()
     assert (tmp_path / LOCK_NAME).exists()
-    with write(tmp_path):
+    with make_writer(tmp_path):
         assert json.loads((tmp_path / LOCK_NAME).read_text())["pid"] == os.getpid()
     assert LOCK_NAME not in [path.name for path in tmp_path.iterdir()]
 
 
 @systems.forks
-def test_of_several_takers_of_a_dead_lock_one_gets_it(tmp_path):
+def test_one_of_several_processes_acquires_a_stale_lock(tmp_path):
     (tmp_path / LOCK_NAME).write_text("{}")
-    command = [sys.executable, "-c", TAKERS, str(tmp_path)]
-    takers = [
+    command = [sys.executable, "-c", ACQUIRE_REPEATEDLY, str(tmp_path)]
+    processes = [
         subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(4)
     ]
-    answers = [taker.communicate() for taker in takers]
-    assert [taker.returncode for taker in takers] == [0] * 4, answers
-    assert sum(int(out) for out, _ in answers) > 20
+    outputs = [process.communicate() for process in processes]
+    assert [process.returncode for process in processes] == [0] * 4, outputs
+    assert sum(int(stdout) for stdout, _ in outputs) > 20
 
 
-OTHERS_LOCKS = {
+STALE_LOCKS = {
     "of another machine": json.dumps({"pid": 1, "host": "render-07"}),
-    "of the same number": json.dumps({"pid": os.getpid(), "host": socket.gethostname()}),
+    "of the same process ID": json.dumps({"pid": os.getpid(), "host": socket.gethostname()}),
     "empty, from a full disk": "",
     "damaged": '{"pid": "x", "host": 1}',
 }
 
 
-@pytest.mark.parametrize("text", OTHERS_LOCKS.values(), ids=OTHERS_LOCKS)
-def test_what_a_file_says_that_nobody_has_locked_stops_nobody(tmp_path, text):
-    """Numbers of processes mean nothing in another container, or after a restart."""
+@pytest.mark.parametrize("text", STALE_LOCKS.values(), ids=STALE_LOCKS)
+def test_a_stale_lock_file_is_ignored(tmp_path, text):
+    """Process IDs are meaningless in another container or after a restart."""
     (tmp_path / LOCK_NAME).write_text(text)
-    with write(tmp_path):
+    with make_writer(tmp_path):
         pass
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"pid": "x", "host": 1}', "x" * 5000, "[" * 900])
-def test_a_lock_that_names_nobody_holds_all_the_same(other, tmp_path, text):
+def test_a_held_lock_with_an_unreadable_file_refuses_others(lock_process, tmp_path, text):
     (tmp_path / LOCK_NAME).write_text(text)
     with pytest.raises(RecordingError, match=r"^Another process is recording into"):
-        write(tmp_path)
+        make_writer(tmp_path)
 
 
-def test_a_lock_on_a_full_disk_holds(small_disk):
+def test_a_lock_on_a_full_disk_refuses_others(small_disk):
     (small_disk / "ballast").write_bytes(b"x" * os.statvfs(small_disk).f_bavail * 4096)
     lock = RecordingLock(small_disk)
     lock.acquire()
@@ -138,22 +141,22 @@ def test_a_lock_on_a_full_disk_holds(small_disk):
     assert not (small_disk / LOCK_NAME).exists()
 
 
-def test_one_process_does_not_write_a_recording_twice(tmp_path):
-    with write(tmp_path / "r"):
-        before = sorted(path.name for path in (tmp_path / "r").iterdir())
+def test_one_process_cannot_open_two_writers_of_a_recording(tmp_path):
+    with make_writer(tmp_path / "r"):
+        names_before = sorted(path.name for path in (tmp_path / "r").iterdir())
         with pytest.raises(RecordingError, match="This Blender is recording into"):
-            write(tmp_path / "r", resume=True)
-        assert sorted(path.name for path in (tmp_path / "r").iterdir()) == before
+            make_writer(tmp_path / "r", resume=True)
+        assert sorted(path.name for path in (tmp_path / "r").iterdir()) == names_before
     assert read_index(tmp_path / "r")["complete"] == 0
 
 
-def test_an_extension_locks_too(tmp_path):
+def test_an_extension_holds_the_lock(tmp_path):
     record_limb(tmp_path / "r", 4)
     with (
         RecordingExtension(read_recording(tmp_path / "r"), "m.onnx"),
         pytest.raises(RecordingError, match="This Blender is recording into"),
     ):
-        write(tmp_path / "r", resume=True)
+        make_writer(tmp_path / "r", resume=True)
     assert not (tmp_path / "r" / LOCK_NAME).exists()
 
 
@@ -165,18 +168,18 @@ def test_a_lock_that_is_not_held_is_not_released(tmp_path):
 
 
 @systems.symbolic_links
-def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path):
+def test_a_link_in_place_of_the_lock_file_is_not_followed(tmp_path):
     victim = tmp_path / "victim"
     victim.write_text("precious")
     (tmp_path / "r").mkdir()
     (tmp_path / "r" / LOCK_NAME).symlink_to(victim)
     with pytest.raises(OutputError, match="Cannot write the recording"):
-        write(tmp_path / "r")
+        make_writer(tmp_path / "r")
     assert victim.read_text() == "precious" and victim.exists()
 
 
 @systems.named_pipes
-def test_a_pipe_in_place_of_the_lock_blocks_nobody(tmp_path):
+def test_a_pipe_in_place_of_the_lock_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / LOCK_NAME)
     with pytest.raises(OutputError, match=rf"'{LOCK_NAME}' is not a regular file"):
-        write(tmp_path)
+        make_writer(tmp_path)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reading a recording that someone or something has damaged: one sentence, never a traceback, never wrong data."""
+"""Reading a damaged recording fails with one sentence, never with a traceback, and never returns wrong data."""
 
 import json
 import re
@@ -12,19 +12,19 @@ from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 
 from .. import systems
-from .damage import array_file, edit, refused
+from .damage import assert_refused, edit_index, npy_bytes
 
-FIST = {"owner": "mesh_object", "path": '["fist"]', "low": 0, "high": 1}
-
-
-def test_no_recording(tmp_path):
-    refused(tmp_path, f"'{tmp_path}' is not a recording: it has no recording.json; make one with record.")
-    refused(tmp_path / "none", "is not a recording")
+FIST_CONTROL = {"owner": "mesh_object", "path": '["fist"]', "low": 0, "high": 1}
 
 
-def test_a_file_in_place_of_the_folder(tmp_path):
+def test_a_folder_without_a_recording_is_refused(tmp_path):
+    assert_refused(tmp_path, f"'{tmp_path}' is not a recording: it has no recording.json; make one with record.")
+    assert_refused(tmp_path / "none", "is not a recording")
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    refused(tmp_path / "file", "is not a recording" if systems.WINDOWS else "cannot be read")
+    assert_refused(tmp_path / "file", "is not a recording" if systems.WINDOWS else "cannot be read")
 
 
 @pytest.mark.parametrize(
@@ -39,35 +39,46 @@ def test_a_file_in_place_of_the_folder(tmp_path):
         ('{"format": "other", "version": 1}', "is not the index of a recording"),
     ],
 )
-def test_an_index_that_is_none(recording, text, words):
+def test_an_invalid_index_is_refused(recording, text, words):
     (recording / "recording.json").write_text(text, encoding="latin-1")
-    refused(recording, words)
+    assert_refused(recording, words)
 
 
 @pytest.mark.parametrize("version", [2, 0, "1", None])
-def test_another_version(recording, version):
-    edit(recording, version=version)
-    refused(recording, f"is a recording of version {version!r} and this add-on reads version 1; record again")
+def test_another_version_is_refused(recording, version):
+    edit_index(recording, version=version)
+    assert_refused(recording, f"is a recording of version {version!r} and this add-on reads version 1; record again")
 
 
-KEYS = ("poses", "complete", "vertices", "influences", "rig", "joints", "controls", "partitions", "sampling", "blender")
+REQUIRED_KEYS = (
+    "poses",
+    "complete",
+    "vertices",
+    "influences",
+    "rig",
+    "joints",
+    "controls",
+    "partitions",
+    "sampling",
+    "blender",
+)
 
 
-@pytest.mark.parametrize("key", KEYS)
-def test_a_key_is_missing(recording, key):
+@pytest.mark.parametrize("key", REQUIRED_KEYS)
+def test_an_index_without_a_key_is_refused(recording, key):
     index = json.loads((recording / "recording.json").read_text())
     del index[key]
     (recording / "recording.json").write_text(json.dumps(index))
-    refused(recording, f"recording.json' is damaged: it lacks '{key}'; record again")
+    assert_refused(recording, f"recording.json' is damaged: it lacks '{key}'; record again")
 
 
-@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("key", REQUIRED_KEYS)
 @pytest.mark.parametrize("value", [None, "x", -1, 1.5, True, [1], {"a": 1}, float("inf")])
-def test_a_key_of_another_type(recording, key, value):
+def test_a_value_of_a_wrong_type_is_refused(recording, key, value):
     if (key, value) == ("blender", "x"):
         value = None
-    edit(recording, **{key: value})
-    refused(recording, "recording.json' is damaged: ")
+    edit_index(recording, **{key: value})
+    assert_refused(recording, "recording.json' is damaged: ")
 
 
 @pytest.mark.parametrize(
@@ -82,24 +93,24 @@ def test_a_key_of_another_type(recording, key, value):
         ({"partitions": [{"joint": 0, "influencing": [-1]}]}, "a partition has joint -1 of 4"),
         ({"controls": [{"name": "fist"}]}, "lacks 'owner'"),
         ({"controls": {}}, "its controls are not a list"),
-        ({"controls": [FIST, FIST]}, "two of its controls have one name"),
-        ({"controls": [{**FIST, "owner": "../scene"}]}, "a control belongs to '../scene'"),
-        ({"controls": [{**FIST, "path": 3}]}, "a control is called 3"),
-        ({"controls": [{**FIST, "low": 2}]}, "has the range 2.0 to 1.0"),
+        ({"controls": [FIST_CONTROL, FIST_CONTROL]}, "two of its controls have one name"),
+        ({"controls": [{**FIST_CONTROL, "owner": "../scene"}]}, "a control belongs to '../scene'"),
+        ({"controls": [{**FIST_CONTROL, "path": 3}]}, "a control is called 3"),
+        ({"controls": [{**FIST_CONTROL, "low": 2}]}, "has the range 2.0 to 1.0"),
         ({"partitions": [{"joint": 0, "influencing": [], "controls": [0]}]}, "a partition has control 0 of 0"),
         ({"partitions": [{"joint": 0, "influencing": [], "merged": [9]}]}, "a partition has joint 9 of 4"),
     ],
 )
-def test_values_that_contradict_each_other(recording, changes, words):
-    edit(recording, **changes)
-    refused(recording, "recording.json' is damaged: ", words)
+def test_inconsistent_values_are_refused(recording, changes, words):
+    edit_index(recording, **changes)
+    assert_refused(recording, "recording.json' is damaged: ", words)
 
 
 @pytest.mark.parametrize("seed", [float("inf"), float("nan"), "one", None])
-def test_a_seed_that_is_no_number(recording, seed):
+def test_an_invalid_seed_is_refused(recording, seed):
     index = json.loads((recording / "recording.json").read_text())
-    edit(recording, sampling={**index["sampling"], "seed": seed})
-    refused(recording, "is damaged")
+    edit_index(recording, sampling={**index["sampling"], "seed": seed})
+    assert_refused(recording, "is damaged")
 
 
 @pytest.mark.parametrize(
@@ -109,110 +120,110 @@ def test_a_seed_that_is_no_number(recording, seed):
         *({"corners": 1 << 62}, {"faces": 1 << 60, "corners": 1 << 62}),
     ],
 )
-def test_counts_far_beyond_the_data_allocate_nothing(recording, counts):
-    edit(recording, **counts, **({"complete": counts["poses"]} if "poses" in counts else {}))
-    refused(recording, "cannot be used: it holds")
+def test_counts_larger_than_the_arrays_are_refused(recording, counts):
+    edit_index(recording, **counts, **({"complete": counts["poses"]} if "poses" in counts else {}))
+    assert_refused(recording, "cannot be used: it holds")
 
 
-def test_counts_far_beyond_the_data_in_index_and_header(recording):
-    """Both agree, and the number of bytes is a multiple of 2^64: only the size of the file tells."""
+def test_huge_counts_in_index_and_header_are_refused(recording):
+    """Index and header agree, and the byte count overflows 64 bits to 0, so only the size of the file contradicts."""
     poses = 1 << 57
-    edit(recording, poses=poses, complete=poses)
+    edit_index(recording, poses=poses, complete=poses)
     for name, shape in (("pose_matrices", (poses, 4, 4, 4)), ("residuals", (poses, 40, 3))):
         header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n"
-        (recording / f"{name}.npy").write_bytes(array_file(header, b"\0" * 4096))
-    refused(recording, "pose_matrices.npy' cannot be used: it is truncated")
+        (recording / f"{name}.npy").write_bytes(npy_bytes(header, b"\0" * 4096))
+    assert_refused(recording, "pose_matrices.npy' cannot be used: it is truncated")
 
 
 @pytest.mark.parametrize(
     "name", ["residuals", "pose_matrices", "rest_positions", "skin_joints", "face_starts", "face_vertices"]
 )
-def test_truncated(recording, name):
+def test_a_truncated_array_is_refused(recording, name):
     path = recording / f"{name}.npy"
     path.write_bytes(path.read_bytes()[:-1])
-    refused(recording, f"{name}.npy' cannot be used: it is truncated: {path.stat().st_size} of", "record again")
+    assert_refused(recording, f"{name}.npy' cannot be used: it is truncated: {path.stat().st_size} of", "record again")
 
 
 @pytest.mark.parametrize("name", ["skin_weights", "face_starts", "face_vertices"])
-def test_missing_array(recording, name):
+def test_a_missing_array_is_refused(recording, name):
     (recording / f"{name}.npy").unlink()
-    refused(recording, f"{name}.npy' cannot be used", systems.NOT_FOUND)
+    assert_refused(recording, f"{name}.npy' cannot be used", systems.NOT_FOUND)
 
 
 @pytest.mark.parametrize("name", ["residuals", "pose_matrices"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_values_that_are_no_numbers(recording, name, value):
+def test_non_finite_values_are_refused(recording, name, value):
     array = np.load(recording / f"{name}.npy")
     array[11, 3, 1] = value
     np.save(recording / f"{name}.npy", array)
-    refused(recording, "holds values that are not numbers", f"({name}, pose 11)", "record again")
+    assert_refused(recording, "holds values that are not numbers", f"({name}, pose 11)", "record again")
 
 
 @pytest.mark.parametrize("value", [np.nan, -0.5, 3.0])
-def test_weights_that_are_none(recording, value):
+def test_invalid_weights_are_refused(recording, value):
     array = np.load(recording / "skin_weights.npy")
     array[5, 0] = value
     np.save(recording / "skin_weights.npy", array)
-    refused(recording, "The rest pose or skin weights of", "are damaged; record again")
+    assert_refused(recording, "The rest pose or skin weights of", "are damaged; record again")
 
 
 @pytest.mark.parametrize("joint", [-1, 4, 1 << 30])
-def test_weights_on_joints_that_are_none(recording, joint):
+def test_weights_on_unknown_joints_are_refused(recording, joint):
     array = np.load(recording / "skin_joints.npy")
     array[5, 0] = joint
     np.save(recording / "skin_joints.npy", array)
-    refused(recording, "The rest pose or skin weights of")
+    assert_refused(recording, "The rest pose or skin weights of")
 
 
-def test_a_rest_pose_that_has_no_inverse(recording):
+def test_a_singular_rest_pose_is_refused(recording):
     array = np.load(recording / "rest_matrices.npy")
     array[2, :3, 0] = 0
     np.save(recording / "rest_matrices.npy", array)
-    refused(recording, "The rest pose or skin weights of")
+    assert_refused(recording, "The rest pose or skin weights of")
 
 
-def test_partitions_that_contradict_the_weights(recording):
-    edit(recording, partitions=[{"joint": 0, "influencing": [1]}])
-    refused(recording, "The partitions of", "contradict its skin weights; record again")
+def test_partitions_that_contradict_the_weights_are_refused(recording):
+    edit_index(recording, partitions=[{"joint": 0, "influencing": [1]}])
+    assert_refused(recording, "The partitions of", "contradict its skin weights; record again")
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.int32, ">f4", np.complex64])
-def test_another_dtype(recording, dtype):
+def test_another_dtype_is_refused(recording, dtype):
     array = np.load(recording / "residuals.npy")
     np.save(recording / "residuals.npy", array.astype(dtype))
-    refused(recording, f"residuals.npy' cannot be used: it holds {array.shape} {np.dtype(dtype)}, not")
+    assert_refused(recording, f"residuals.npy' cannot be used: it holds {array.shape} {np.dtype(dtype)}, not")
 
 
-def test_another_shape_or_order(recording):
+def test_another_shape_or_memory_order_is_refused(recording):
     array = np.load(recording / "residuals.npy")
     np.save(recording / "residuals.npy", array[:, :, :2])
-    refused(recording, f"it holds {(12, 40, 2)} float32, not {array.shape} float32")
+    assert_refused(recording, f"it holds {(12, 40, 2)} float32, not {array.shape} float32")
     np.save(recording / "residuals.npy", np.asfortranarray(array))
-    refused(recording, "residuals.npy' cannot be used")
+    assert_refused(recording, "residuals.npy' cannot be used")
 
 
-class Trap:
-    """Leaves a trace when someone unpickles it."""
+class Unpickled:
+    """An object that sets `is_unpickled` of its class when it is unpickled."""
 
-    sprung = False
+    is_unpickled = False
 
     def __reduce__(self):
-        return _spring, ()
+        return _mark_unpickled, ()
 
 
-def _spring() -> None:
-    Trap.sprung = True
+def _mark_unpickled() -> None:
+    Unpickled.is_unpickled = True
 
 
 def test_pickled_objects_are_not_loaded(recording):
     array = np.empty((12, 40, 3), object)
-    array[:] = Trap()
+    array[:] = Unpickled()
     np.save(recording / "residuals.npy", array)
-    refused(recording, "residuals.npy' cannot be used: it holds (12, 40, 3) object")
-    assert not Trap.sprung
+    assert_refused(recording, "residuals.npy' cannot be used: it holds (12, 40, 3) object")
+    assert not Unpickled.is_unpickled
 
 
-HEADERS = {
+INVALID_HEADERS = {
     "empty": "",
     "no dictionary": "[1, 2]",
     "unclosed": "{'descr': '<f4', 'fortran_order': False, 'shape': (12, 40, 3",
@@ -241,31 +252,31 @@ HEADERS = {
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", ["residuals", "face_vertices"])
-@pytest.mark.parametrize("header", HEADERS.values(), ids=HEADERS.keys())
-def test_absurd_headers(recording, name, header):
-    (recording / f"{name}.npy").write_bytes(array_file(header, b"\0" * 5760))
+@pytest.mark.parametrize("header", INVALID_HEADERS.values(), ids=INVALID_HEADERS.keys())
+def test_invalid_array_headers_are_refused(recording, name, header):
+    (recording / f"{name}.npy").write_bytes(npy_bytes(header, b"\0" * 5760))
     with pytest.raises(RecordingError, match=re.escape(f"{name}.npy' cannot be used: ")):
         read_recording(recording)
 
 
-@pytest.mark.parametrize("data", [b"", b"\x93NUMPY", b"PK\x03\x04zip", array_file("{}", version=b"\x02\x00")])
-def test_files_that_are_no_arrays(recording, data):
+@pytest.mark.parametrize("data", [b"", b"\x93NUMPY", b"PK\x03\x04zip", npy_bytes("{}", version=b"\x02\x00")])
+def test_files_that_are_not_arrays_are_refused(recording, data):
     (recording / "residuals.npy").write_bytes(data)
-    refused(recording, "residuals.npy' cannot be used: ")
+    assert_refused(recording, "residuals.npy' cannot be used: ")
 
 
-def test_more_data_than_complete_is_not_read(recording):
+def test_data_beyond_the_complete_poses_is_not_read(recording):
     with open(recording / "residuals.npy", "ab") as file:
         file.write(b"\xff" * 1000)
     assert read_recording(recording).residuals.shape == (12, 40, 3)
 
 
 def test_the_index_of_an_incomplete_recording_is_read(recording):
-    edit(recording, complete=3)
+    edit_index(recording, complete=3)
     assert read_index(recording)["complete"] == 3
-    refused(recording, "is incomplete: 3 of 12 poses; finish it with record --resume.")
+    assert_refused(recording, "is incomplete: 3 of 12 poses; finish it with record --resume.")
 
 
-def test_a_recording_without_poses(recording):
-    edit(recording, poses=0, complete=0)
-    refused(recording, "is incomplete: 0 of 0 poses")
+def test_a_recording_without_poses_is_refused(recording):
+    edit_index(recording, poses=0, complete=0)
+    assert_refused(recording, "is incomplete: 0 of 0 poses")

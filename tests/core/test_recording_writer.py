@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Writing a recording: what is written is read back, and an interruption leaves a recording that resumes."""
+"""Writing a recording: its content is read back unchanged, and an interrupted recording can be resumed."""
 
 import errno
 import json
@@ -28,31 +28,32 @@ from .limb import (
     recording_info,
 )
 
-POSES = 12
+POSE_COUNT = 12
 
 
-def files(path) -> dict[str, bytes]:
+def file_bytes(path) -> dict[str, bytes]:
+    """Return the bytes of each file of the folder by its name."""
     return {file.name: file.read_bytes() for file in path.iterdir()}
 
 
-def test_what_is_written_is_read_back(recording):
-    rig, read = make_rig(), read_recording(recording)
-    assert np.array_equal(read.pose_matrices, random_poses(POSES))
-    assert np.array_equal(read.residuals, random_residuals(POSES))
-    assert isinstance(read.residuals, np.memmap) and not read.residuals.flags.writeable
+def test_content_is_read_back_unchanged(recording):
+    rig, read_back = make_rig(), read_recording(recording)
+    assert np.array_equal(read_back.pose_matrices, random_poses(POSE_COUNT))
+    assert np.array_equal(read_back.residuals, random_residuals(POSE_COUNT))
+    assert isinstance(read_back.residuals, np.memmap) and not read_back.residuals.flags.writeable
     for name in ("rest_positions", "rest_matrices", "skin_joints", "skin_weights", "face_starts", "face_vertices"):
-        assert np.array_equal(getattr(read.rig, name), getattr(rig, name))
-        assert getattr(read.rig, name).dtype == getattr(rig, name).dtype
-    assert read.rig.joints == JOINTS and read.rig.fingerprint == rig.fingerprint
-    assert [(p.joint, p.influencing) for p in read.partitions] == list(INFLUENCING.items())
-    assert (read.info.poses, read.info.complete) == (POSES, POSES)
-    assert read.info.sampling == recording_info(POSES).sampling
+        assert np.array_equal(getattr(read_back.rig, name), getattr(rig, name))
+        assert getattr(read_back.rig, name).dtype == getattr(rig, name).dtype
+    assert read_back.rig.joints == JOINTS and read_back.rig.fingerprint == rig.fingerprint
+    assert [(p.joint, p.influencing) for p in read_back.partitions] == list(INFLUENCING.items())
+    assert (read_back.info.poses, read_back.info.complete) == (POSE_COUNT, POSE_COUNT)
+    assert read_back.info.sampling == recording_info(POSE_COUNT).sampling
 
 
 def test_arrays_are_plain_npy_files(recording):
     residuals = np.load(recording / "residuals.npy", mmap_mode="r", allow_pickle=False)
-    assert residuals.shape == (POSES, 40, 3) and residuals.dtype == np.float32
-    assert sorted(files(recording)) == [
+    assert residuals.shape == (POSE_COUNT, 40, 3) and residuals.dtype == np.float32
+    assert sorted(file_bytes(recording)) == [
         "face_starts.npy",
         "face_vertices.npy",
         "pose_matrices.npy",
@@ -66,165 +67,166 @@ def test_arrays_are_plain_npy_files(recording):
 
 
 @pytest.mark.parametrize("complete", [0, 5, 10])
-def test_resuming_continues_bit_for_bit(recording, tmp_path, complete):
+def test_a_resumed_recording_has_the_same_bytes(recording, tmp_path, complete):
     path = tmp_path / "interrupted"
-    record_limb(path, POSES, complete)
+    record_limb(path, POSE_COUNT, complete)
     assert read_index(path)["complete"] == complete
     with pytest.raises(RecordingError, match=rf"is incomplete: {complete} of 12 poses; finish it with record --resume"):
         read_recording(path)
-    record_limb(path, POSES, resume=True)
-    assert files(path) == files(recording)
+    record_limb(path, POSE_COUNT, resume=True)
+    assert file_bytes(path) == file_bytes(recording)
 
 
 def test_resuming_a_complete_recording_changes_nothing(recording):
-    before = files(recording)
-    record_limb(recording, POSES, resume=True)
-    assert files(recording) == before
+    bytes_before = file_bytes(recording)
+    record_limb(recording, POSE_COUNT, resume=True)
+    assert file_bytes(recording) == bytes_before
 
 
-def test_resume_where_nothing_was_recorded_starts(tmp_path, recording):
-    record_limb(tmp_path / "new", POSES, resume=True)
-    assert files(tmp_path / "new") == files(recording)
+def test_resuming_without_a_recording_starts_one(tmp_path, recording):
+    record_limb(tmp_path / "new", POSE_COUNT, resume=True)
+    assert file_bytes(tmp_path / "new") == file_bytes(recording)
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_an_error_between_batches_leaves_what_was_complete(tmp_path, recording, error):
+def test_an_error_between_batches_keeps_complete_poses(tmp_path, recording, error):
     path, rig = tmp_path / "interrupted", make_rig()
     with (
         pytest.raises(error),
-        RecordingWriter(path, rig, partitions_of(rig), recording_info(POSES)) as writer,
+        RecordingWriter(path, rig, partitions_of(rig), recording_info(POSE_COUNT)) as writer,
     ):
-        writer.append(random_poses(POSES)[:5], random_residuals(POSES)[:5])
+        writer.append(random_poses(POSE_COUNT)[:5], random_residuals(POSE_COUNT)[:5])
         raise error
-    record_limb(path, POSES, resume=True)
-    assert files(path) == files(recording)
+    record_limb(path, POSE_COUNT, resume=True)
+    assert file_bytes(path) == file_bytes(recording)
 
 
-def test_an_error_before_the_first_pose_leaves_nothing(tmp_path):
+def test_an_error_before_the_first_pose_leaves_no_folder(tmp_path):
     path, rig = tmp_path / "new" / "deeper", make_rig()
-    with pytest.raises(KeyboardInterrupt), RecordingWriter(path, rig, partitions_of(rig), recording_info(POSES)):
+    with pytest.raises(KeyboardInterrupt), RecordingWriter(path, rig, partitions_of(rig), recording_info(POSE_COUNT)):
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_error_before_the_first_pose_leaves_a_folder_that_was_there(tmp_path):
+def test_an_error_before_the_first_pose_keeps_an_existing_folder(tmp_path):
     rig = make_rig()
-    with pytest.raises(RuntimeError), RecordingWriter(tmp_path, rig, partitions_of(rig), recording_info(POSES)):
+    with pytest.raises(RuntimeError), RecordingWriter(tmp_path, rig, partitions_of(rig), recording_info(POSE_COUNT)):
         raise RuntimeError
     assert tmp_path.is_dir() and list(tmp_path.iterdir()) == []
 
 
-def test_a_torn_write_is_never_read(tmp_path, recording):
-    """What lies behind the complete poses may be anything: a batch was being written when the power went."""
+def test_an_incompletely_written_batch_is_not_read(tmp_path, recording):
+    """After a power failure, the arrays may contain any bytes beyond the complete poses."""
     path = tmp_path / "torn"
-    record_limb(path, POSES, 5)
+    record_limb(path, POSE_COUNT, 5)
     for name, shape in (("pose_matrices", (4, 4, 4)), ("residuals", (40, 3))):
-        row = 4 * math.prod(shape)
+        pose_bytes = 4 * math.prod(shape)
         with open(path / f"{name}.npy", "r+b") as file:
-            file.seek(len(array_header((POSES, *shape), np.float32)) + 5 * row)
-            file.write(b"\xff" * 2 * row)
-    record_limb(path, POSES, resume=True)
-    assert files(path) == files(recording)
+            file.seek(len(array_header((POSE_COUNT, *shape), np.float32)) + 5 * pose_bytes)
+            file.write(b"\xff" * 2 * pose_bytes)
+    record_limb(path, POSE_COUNT, resume=True)
+    assert file_bytes(path) == file_bytes(recording)
 
 
-def test_poses_do_not_count_when_the_index_cannot_be_written(tmp_path, monkeypatch):
+def test_poses_are_incomplete_if_the_index_cannot_be_written(tmp_path, monkeypatch):
     def refuse(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     rig = make_rig()
     with (
         pytest.raises(OutputError, match="5 of 12 poses are complete, continue with --resume"),
-        RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSES)) as writer,
+        RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSE_COUNT)) as writer,
     ):
-        writer.append(random_poses(POSES)[:5], random_residuals(POSES)[:5])
+        writer.append(random_poses(POSE_COUNT)[:5], random_residuals(POSE_COUNT)[:5])
         monkeypatch.setattr(f"{RecordingWriter.__module__}.write_index", refuse)
-        writer.append(random_poses(POSES)[5:], random_residuals(POSES)[5:])
+        writer.append(random_poses(POSE_COUNT)[5:], random_residuals(POSE_COUNT)[5:])
 
 
-def test_poses_that_did_not_settle_are_counted_from_the_first_of_the_recording(tmp_path):
+def test_unsettled_poses_are_indexed_within_the_recording(tmp_path):
     rig = make_rig()
-    with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSES)) as writer:
+    with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSE_COUNT)) as writer:
         for start in (0, 6):
             batch = slice(start, start + 6)
-            writer.append(random_poses(POSES)[batch], random_residuals(POSES)[batch], unsettled=(1, 4))
+            writer.append(random_poses(POSE_COUNT)[batch], random_residuals(POSE_COUNT)[batch], unsettled=(1, 4))
     assert read_index(tmp_path / "r")["unsettled"] == [1, 4, 7, 10]
 
 
 @pytest.mark.parametrize("name", ["residuals.npy", "pose_matrices.npy"])
 @pytest.mark.parametrize("damage", ["shorter", "missing", "other header"])
-def test_resuming_does_not_make_up_poses_that_are_gone(tmp_path, name, damage):
-    record_limb(tmp_path / "r", POSES, 10)
+def test_resuming_without_the_complete_poses_is_refused(tmp_path, name, damage):
+    record_limb(tmp_path / "r", POSE_COUNT, 10)
     path = tmp_path / "r" / name
     data = path.read_bytes()
     if damage == "missing":
         path.unlink()
     else:
         path.write_bytes(data[: len(data) // 2] if damage == "shorter" else data.replace(b"<f4", b"<i4"))
-    before = files(tmp_path / "r")
+    bytes_before = file_bytes(tmp_path / "r")
     with pytest.raises(RecordingError, match=rf"Cannot resume.*'{name}' does not hold the 10 poses"):
-        record_limb(tmp_path / "r", POSES, resume=True)
-    assert files(tmp_path / "r") == before
+        record_limb(tmp_path / "r", POSE_COUNT, resume=True)
+    assert file_bytes(tmp_path / "r") == bytes_before
 
 
 def test_a_mesh_without_faces(tmp_path):
     rig = replace(make_rig(), face_starts=np.zeros(0, np.int32), face_vertices=np.zeros(0, np.int32))
-    with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSES)) as writer:
-        writer.append(random_poses(POSES), random_residuals(POSES))
+    with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSE_COUNT)) as writer:
+        writer.append(random_poses(POSE_COUNT), random_residuals(POSE_COUNT))
     assert not {"faces", "corners"} & set(read_index(tmp_path / "r"))
     assert not list((tmp_path / "r").glob("face*"))
     assert len(read_recording(tmp_path / "r").rig.face_vertices) == 0
 
 
 def test_a_recording_is_not_overwritten(recording):
-    before = files(recording)
+    bytes_before = file_bytes(recording)
     with pytest.raises(RecordingError, match="already; continue it with --resume, replace it with --overwrite, or cho"):
         record_limb(recording)
-    assert files(recording) == before
+    assert file_bytes(recording) == bytes_before
 
 
-@pytest.mark.parametrize("index", ["", '{\n "format": "fdda-recording",\n "ver', '{"poses"', "whole"])
-def test_a_recording_is_replaced_where_that_is_asked_for(recording, index):
-    """One whose index is torn, too: it can be neither resumed nor recorded into."""
-    other, place = recording.with_name("other"), recording / "recording.json"
-    record_limb(other, POSES - 2)
+@pytest.mark.parametrize("index_text", ["", '{\n "format": "fdda-recording",\n "ver', '{"poses"', "whole"])
+def test_a_recording_is_replaced_on_request(recording, index_text):
+    """A recording with an incomplete index is replaced too, although it cannot be resumed."""
+    expected_recording, index_path = recording.with_name("other"), recording / "recording.json"
+    record_limb(expected_recording, POSE_COUNT - 2)
     (recording / "notes.txt").write_text("mine")
-    place.write_text(place.read_text() if index == "whole" else index)
+    index_path.write_text(index_path.read_text() if index_text == "whole" else index_text)
     check_recordable(recording, resume=False, overwrite=True)
     rig = make_rig()
-    info = recording_info(POSES - 2)
+    info = recording_info(POSE_COUNT - 2)
     with RecordingWriter(recording, rig, partitions_of(rig), info, overwrite=True) as writer:
-        writer.append(random_poses(POSES - 2), random_residuals(POSES - 2))
-    assert files(recording) == {**files(other), "notes.txt": b"mine"}
+        writer.append(random_poses(POSE_COUNT - 2), random_residuals(POSE_COUNT - 2))
+    assert file_bytes(recording) == {**file_bytes(expected_recording), "notes.txt": b"mine"}
 
 
 def test_the_index_of_something_else_is_not_replaced(tmp_path):
     (tmp_path / "recording.json").write_text('{"songs": []}')
     with pytest.raises(OutputError, match=r"its 'recording\.json' is of something else; choose another folder"):
         check_recordable(tmp_path, resume=False, overwrite=True)
-    assert files(tmp_path) == {"recording.json": b'{"songs": []}'}
+    assert file_bytes(tmp_path) == {"recording.json": b'{"songs": []}'}
 
 
-def test_another_folder_is_not_recorded_into(tmp_path):
+def test_a_folder_with_other_files_is_refused(tmp_path):
     (tmp_path / "letter.txt").write_text("dear")
     with pytest.raises(OutputError, match="it is not an empty folder"):
         record_limb(tmp_path)
     with pytest.raises(OutputError, match="it is not an empty folder"):
         record_limb(tmp_path / "letter.txt")
-    # Windows says that the file exists.
+    # Windows reports another error: that the file exists.
     words = ".+" if systems.WINDOWS else "Not a directory"
     with pytest.raises(OutputError, match=rf"letter\.txt.below'.*: {words}; make room or choose another folder"):
         record_limb(tmp_path / "letter.txt" / "below")
-    assert files(tmp_path) == {"letter.txt": b"dear"}
+    assert file_bytes(tmp_path) == {"letter.txt": b"dear"}
 
 
-def change(index, *keys, value):
+def set_nested_value(index, *keys, value):
+    """Set a value in nested dictionaries and lists of the index."""
     for key in keys[:-1]:
         index = index[key]
     index[keys[-1]] = value
 
 
 @pytest.mark.parametrize(
-    ("keys", "value", "named"),
+    ("keys", "value", "difference"),
     [
         (("sampling", "seed"), 3, "sampling.seed"),
         (("sampling", "spread"), 0.5, "sampling.spread"),
@@ -241,24 +243,26 @@ def change(index, *keys, value):
         (("corners",), 60, "corners"),
     ],
 )
-def test_resuming_something_else_names_what_differs(tmp_path, keys, value, named):
-    record_limb(tmp_path / "r", POSES, 5)
-    index = tmp_path / "r" / "recording.json"
-    content = json.loads(index.read_text())
-    change(content, *keys, value=value)
-    index.write_text(json.dumps(content))
-    before = files(tmp_path / "r")
-    with pytest.raises(RecordingError, match=rf"it was recorded differently \({named}\); record with the same rig"):
-        record_limb(tmp_path / "r", POSES, resume=True)
-    assert files(tmp_path / "r") == before
+def test_resuming_another_recording_names_the_differences(tmp_path, keys, value, difference):
+    record_limb(tmp_path / "r", POSE_COUNT, 5)
+    index_path = tmp_path / "r" / "recording.json"
+    content = json.loads(index_path.read_text())
+    set_nested_value(content, *keys, value=value)
+    index_path.write_text(json.dumps(content))
+    bytes_before = file_bytes(tmp_path / "r")
+    with pytest.raises(
+        RecordingError, match=rf"it was recorded differently \({difference}\); record with the same rig"
+    ):
+        record_limb(tmp_path / "r", POSE_COUNT, resume=True)
+    assert file_bytes(tmp_path / "r") == bytes_before
 
 
 @pytest.mark.parametrize("name", ["pose_matrices", "residuals"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_values_that_are_no_numbers_are_refused_and_the_pose_named(tmp_path, name, value):
-    rig, arrays = make_rig(), {"pose_matrices": random_poses(POSES), "residuals": random_residuals(POSES)}
+def test_non_finite_values_are_refused_with_the_pose(tmp_path, name, value):
+    rig, arrays = make_rig(), {"pose_matrices": random_poses(POSE_COUNT), "residuals": random_residuals(POSE_COUNT)}
     arrays[name][7, 1, 2] = value
-    with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSES)) as writer:
+    with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSE_COUNT)) as writer:
         writer.append(*(array[:5] for array in arrays.values()))
         with pytest.raises(FDDAError, match=rf"Pose 7 of the rig .* not numbers \({name}\)"):
             writer.append(*(array[5:10] for array in arrays.values()))

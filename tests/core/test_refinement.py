@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The choice of poses that a model should see more of."""
+"""The choice of additional poses where a model is worst."""
 
 import numpy as np
 import pytest
@@ -13,53 +13,57 @@ CHANNELS = (
     Channel("b", "rotation", 0, -2, 0),
     Channel("c", "location", 2, -0.1, 0.1),
 )
-OWNED = [np.array([0, 1]), np.array([1, 2]), np.array([3]), np.array([], int)]
+PARTITION_CHANNELS = [np.array([0, 1]), np.array([1, 2]), np.array([3]), np.array([], int)]
 LOW, HIGH = (np.array([getattr(c, end) for c in CHANNELS]) for end in ("low", "high"))
 
 
-def draw(count: int, seed: int = 0) -> np.ndarray:
+def draw_values(count: int, seed: int = 0) -> np.ndarray:
+    """Return (count, channels) random values within the ranges of `CHANNELS`."""
     return np.random.default_rng(seed).uniform(LOW, HIGH, (count, len(CHANNELS)))
 
 
-def choose(errors: np.ndarray, distances: np.ndarray, values: np.ndarray, count: int = 400) -> np.ndarray:
+def choose_values(errors: np.ndarray, distances: np.ndarray, values: np.ndarray, count: int = 400) -> np.ndarray:
     probes = Probes(values, errors, distances)
-    return choose_poses(probes, CHANNELS, OWNED, draw(count, 9), np.random.default_rng(3))
+    return choose_poses(probes, CHANNELS, PARTITION_CHANNELS, draw_values(count, 9), np.random.default_rng(3))
 
 
-def test_poses_lie_in_range_and_follow_from_the_seed():
-    values, rng = draw(50), np.random.default_rng(1)
+def test_poses_are_in_range_and_repeatable():
+    values, rng = draw_values(50), np.random.default_rng(1)
     errors, distances = rng.uniform(size=(2, 50, 4))
-    poses = choose(errors, distances, values)
+    poses = choose_values(errors, distances, values)
     assert (poses >= LOW).all() and (poses <= HIGH).all() and len(poses) == 400
-    assert np.array_equal(poses, choose(errors, distances, values))
+    assert np.array_equal(poses, choose_values(errors, distances, values))
 
 
-def test_poses_lie_near_the_worst_probe_of_a_partition_and_where_the_recording_is_thin():
-    values = draw(50)
+def test_poses_are_near_the_largest_error_and_the_largest_distance():
+    values = draw_values(50)
     values[7], values[8] = (-0.6, 0.1, -1.5, 0.05), (0.6, 0.4, -0.5, -0.05)
     errors, distances = np.full((2, 50, 4), 1e-6)
     errors[7, 0] = distances[8, 0] = 0.01
-    poses = choose(errors, distances, values)
-    # Partition 0 errs most by far, so that it is asked first: two thirds of the poses by error, one by distance.
-    near_worst = np.abs(poses[:, 0] + 0.6) < 0.4
-    near_thin = np.abs(poses[:, 0] - 0.6) < 0.4
-    assert near_worst.mean() == pytest.approx(2 / 3, abs=0.08) and near_thin.mean() == pytest.approx(1 / 3, abs=0.08)
-    # Partition 1 shares a channel with it and must not tear its pose apart; channel 2 stays as drawn.
-    assert np.array_equal(poses[:, 2], draw(400, 9)[:, 2])
+    poses = choose_values(errors, distances, values)
+    # Partition 0 has by far the largest error and chooses first: two thirds of the poses by error, a third
+    # by distance.
+    is_near_largest_error = np.abs(poses[:, 0] + 0.6) < 0.4
+    is_near_largest_distance = np.abs(poses[:, 0] - 0.6) < 0.4
+    assert is_near_largest_error.mean() == pytest.approx(
+        2 / 3, abs=0.08
+    ) and is_near_largest_distance.mean() == pytest.approx(1 / 3, abs=0.08)
+    # Partition 1 shares a channel with partition 0 and must not change these poses; channel 2 keeps its random values.
+    assert np.array_equal(poses[:, 2], draw_values(400, 9)[:, 2])
 
 
 def test_a_partition_without_channels_changes_nothing():
-    values = draw(20)
+    values = draw_values(20)
     errors = np.tile([0.0, 0.0, 0.0, 1.0], (20, 1))
     poses = choose_poses(
-        Probes(values, errors, errors), CHANNELS, [np.array([], int)] * 4, draw(5, 9), np.random.default_rng(0)
+        Probes(values, errors, errors), CHANNELS, [np.array([], int)] * 4, draw_values(5, 9), np.random.default_rng(0)
     )
-    assert np.array_equal(poses, draw(5, 9))
+    assert np.array_equal(poses, draw_values(5, 9))
 
 
-def test_nearest_distances_are_in_units_of_the_spread():
+def test_nearest_distances_are_relative_to_standard_deviations():
     recorded = np.array([[0.0, 0, 5], [2, 0, 5], [2, 20, 5], [0, 20, 5]])
-    found = nearest_recorded_distances(np.array([[1.0, 0, 5], [2, 20, 5], [0, -10, 9]]), recorded)
-    # The spread is 1 and 10; the third feature does not vary and does not count.
-    assert found == pytest.approx([1, 0, 1])
+    distances = nearest_recorded_distances(np.array([[1.0, 0, 5], [2, 20, 5], [0, -10, 9]]), recorded)
+    # The standard deviations are 1 and 10; the third feature does not vary and is ignored.
+    assert distances == pytest.approx([1, 0, 1])
     assert nearest_recorded_distances(np.zeros((3, 1)), np.zeros((4, 1))).tolist() == [0, 0, 0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report of a training: what is written is read, and what is damaged is refused with the place named."""
+"""The training report: it is read back unchanged, and a damaged report is refused with the path of the damage."""
 
 import json
 from pathlib import Path
@@ -51,38 +51,38 @@ REPORT = {
 }
 
 
-def damaged(place: tuple, value: object) -> dict:
-    """The report with another value at a place; the key is gone where it is `...`."""
-    copy = json.loads(json.dumps(REPORT))
-    owner = copy
-    for step in place[:-1]:
-        owner = owner[step]
+def damaged_report(key_path: tuple, value: object) -> dict:
+    """Return the report with another value at a path of keys; with the value `...`, the key is removed."""
+    report = json.loads(json.dumps(REPORT))
+    container = report
+    for key in key_path[:-1]:
+        container = container[key]
     if value is ...:
-        del owner[place[-1]]
+        del container[key_path[-1]]
     else:
-        owner[place[-1]] = value
-    return copy
+        container[key_path[-1]] = value
+    return report
 
 
-def test_what_lies_beside_a_model():
+def test_paths_next_to_a_model():
     model = Path("folder/arm.onnx")
     assert [path(model).as_posix() for path in (report_path, page_path, checkpoint_path)] == [
         *("folder/report.json", "folder/report.html", "folder/arm.checkpoint.npz")
     ]
 
 
-def test_what_is_written_is_read(tmp_path):
+def test_a_report_is_read_back_unchanged(tmp_path):
     write_report(tmp_path / "report.json", REPORT)
     assert read_report(tmp_path / "report.json") == {"format": "fdda-report", "version": 1, **REPORT}
 
 
 @pytest.mark.parametrize("key", ["warnings", "goal", "normals", "edges"])
-def test_what_may_be_missing(tmp_path, key):
-    write_report(tmp_path / "report.json", damaged((key,), ...))
+def test_optional_keys_may_be_missing(tmp_path, key):
+    write_report(tmp_path / "report.json", damaged_report((key,), ...))
     assert key not in read_report(tmp_path / "report.json")
 
 
-DAMAGE = [
+DAMAGES = [
     (("fdda",), ..., "it has no fdda"),
     (("fdda", "held_out"), 3, "fdda.held_out is no object"),
     (("fdda", "held_out", "p999"), ..., "fdda.held_out has no p999"),
@@ -100,30 +100,30 @@ DAMAGE = [
 ]
 
 
-@pytest.mark.parametrize(("place", "value", "sentence"), DAMAGE, ids=[sentence for *_, sentence in DAMAGE])
-def test_damage_is_named_and_not_written(tmp_path, place, value, sentence):
+@pytest.mark.parametrize(("key_path", "value", "sentence"), DAMAGES, ids=[sentence for *_, sentence in DAMAGES])
+def test_a_damaged_report_is_neither_written_nor_read(tmp_path, key_path, value, sentence):
     path = tmp_path / "report.json"
-    report = damaged(place, value)
+    report = damaged_report(key_path, value)
     with pytest.raises(ValueError, match=sentence.replace("[", r"\[")):
         write_report(path, report)
     assert not path.exists()
     path.write_text(json.dumps({"format": "fdda-report", "version": 1, **report}))
-    with pytest.raises(TrainingError) as caught:
+    with pytest.raises(TrainingError) as error:
         read_report(path)
-    assert str(caught.value) == f"The report '{path}' is damaged: {sentence}; train again."
+    assert str(error.value) == f"The report '{path}' is damaged: {sentence}; train again."
 
 
-@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
-def test_what_is_no_number_is_out_of_bounds(tmp_path, number):
+@pytest.mark.parametrize("number_text", ["NaN", "Infinity", "-Infinity", "1e999"])
+def test_non_finite_numbers_are_refused(tmp_path, number_text):
     path = tmp_path / "report.json"
     write_report(path, REPORT)
-    path.write_text(path.read_text().replace('"parity": 0.0001', f'"parity": {number}'))
+    path.write_text(path.read_text().replace('"parity": 0.0001', f'"parity": {number_text}'))
     with pytest.raises(TrainingError, match="parity is out of all bounds"):
         read_report(path)
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe{", b"[" * 200_000])
-def test_what_cannot_be_read(tmp_path, content):
+def test_unreadable_reports_are_refused(tmp_path, content):
     path = tmp_path / "report.json"
     path.write_bytes(content)
     with pytest.raises(TrainingError, match=r"The report '.*' cannot be read \(.*\); train again"):
@@ -133,31 +133,33 @@ def test_what_cannot_be_read(tmp_path, content):
 
 
 @pytest.mark.parametrize("text", ["[]", "{}", "3", '{"format": "fdda-report", "version": 2}'])
-def test_what_is_another_format(tmp_path, text):
+def test_other_formats_and_versions_are_refused(tmp_path, text):
     (tmp_path / "report.json").write_text(text)
     with pytest.raises(TrainingError, match="is not a training report of this version; train again"):
         read_report(tmp_path / "report.json")
 
 
-def test_a_report_that_is_too_large(tmp_path, monkeypatch):
+def test_a_report_that_is_too_large_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(report_format, "MAX_BYTES", 1 << 20)
     (tmp_path / "report.json").write_bytes(b" " * ((1 << 20) + 1))
     with pytest.raises(TrainingError, match=r"it is larger than 1 MB.*; train again"):
         read_report(tmp_path / "report.json")
 
 
-def test_the_manual_has_every_name():
+def test_the_formats_page_names_every_key():
     text = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
     section = text.partition("\n## Training report\n")[2].partition("\n## ")[0]
 
-    def names(kind: object) -> set[str]:
+    def key_names(kind: object) -> set[str]:
         if isinstance(kind, report_format._OrNull):
-            return names(kind.kind)
+            return key_names(kind.kind)
         if isinstance(kind, list):
-            return names(kind[0])
+            return key_names(kind[0])
         if not isinstance(kind, dict):
             return set()
-        return {key.removesuffix("?") for key in kind} | {name for inner in kind.values() for name in names(inner)}
+        return {key.removesuffix("?") for key in kind} | {name for inner in kind.values() for name in key_names(inner)}
 
-    elsewhere = {"inside", "beside", "across"} | set(REPORT["training"])  # chapter Evaluation, and the settings
-    assert sorted(name for name in names(report_format._REPORT) - elsewhere if name not in section) == []
+    documented_elsewhere = {"inside", "beside", "across"} | set(
+        REPORT["training"]
+    )  # chapter Evaluation, and the settings
+    assert sorted(name for name in key_names(report_format._REPORT) - documented_elsewhere if name not in section) == []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is said of two rigs that differ."""
+"""The sentences about differences between a rig and the rig that a model was trained for."""
 
 from dataclasses import replace
 
@@ -12,8 +12,8 @@ from fdda_addon.core.rig import REST_MATRIX_TOLERANCE, Fingerprint, Joint, Rig, 
 from .limb import JOINTS, make_rig
 
 
-def found(rig: Rig, **changes) -> list[str]:
-    """Differences between the rig, as a model knows it, and itself with changes."""
+def differences(rig: Rig, **changes) -> list[str]:
+    """Return the differences between a rig, as stored in a model, and the same rig with changed fields."""
     return rig_differences(rig.joints, rig.rest_matrices, rig.vertex_count, rig.fingerprint, replace(rig, **changes))
 
 
@@ -22,27 +22,28 @@ def rig() -> Rig:
     return make_rig()
 
 
-def test_the_same_rig(rig):
-    assert found(rig) == []
+def test_the_same_rig_has_no_differences(rig):
+    assert differences(rig) == []
 
 
-def test_vertex_count(rig):
-    assert found(rig, rest_positions=rig.rest_positions[:-3]) == ["it has 40 vertices, the mesh has 37"]
+def test_another_vertex_count_is_named(rig):
+    assert differences(rig, rest_positions=rig.rest_positions[:-3]) == ["it has 40 vertices, the mesh has 37"]
 
 
-def renamed(*names: str) -> tuple[Joint, ...]:
+def joints_with_names(*names: str) -> tuple[Joint, ...]:
+    """Return the joints of the limb with other names, the first few if there are fewer names."""
     return tuple(Joint(name, joint.parent) for name, joint in zip(names, JOINTS, strict=False))
 
 
 @pytest.mark.parametrize(
     ("joints", "sentences"),
     [
-        (renamed("root", "upper", "lower"), ["the armature lacks the joint 'thumb'"]),
+        (joints_with_names("root", "upper", "lower"), ["the armature lacks the joint 'thumb'"]),
         (
-            renamed("root", "a", "b", "thumb"),
+            joints_with_names("root", "a", "b", "thumb"),
             ["the armature lacks the joints 'lower', 'upper'", "it does not know the joints 'a', 'b'"],
         ),
-        (renamed("a", "b", "c", "d"), [
+        (joints_with_names("a", "b", "c", "d"), [
             "the armature lacks the joints 'lower', 'root', 'thumb' and 1 more",
             "it does not know the joints 'a', 'b', 'c' and 1 more",
         ]),
@@ -50,25 +51,29 @@ def renamed(*names: str) -> tuple[Joint, ...]:
         ((*JOINTS[:3], Joint("thumb", 2)), ["its joints have other parents"]),
     ],
 )  # fmt: skip
-def test_joints(rig, joints, sentences):
-    rest = np.resize(rig.rest_matrices, (len(joints), 4, 4))
-    assert found(rig, joints=joints, rest_matrices=rest) == sentences
+def test_other_joints_are_named(rig, joints, sentences):
+    rest_matrices = np.resize(rig.rest_matrices, (len(joints), 4, 4))
+    assert differences(rig, joints=joints, rest_matrices=rest_matrices) == sentences
 
 
-def test_rest_pose_of_the_armature(rig):
-    moved = rig.rest_matrices.copy()
-    moved[2, 0, 3] += 2 * REST_MATRIX_TOLERANCE
-    assert found(rig, rest_matrices=moved) == ["the rest pose of the armature differs"]
-    moved[2, 0, 3] -= 1.5 * REST_MATRIX_TOLERANCE
-    assert found(rig, rest_matrices=moved) == [], "versions of Blender compute a rest matrix a few steps apart"
+def test_another_rest_pose_of_the_armature_is_named(rig):
+    rest_matrices = rig.rest_matrices.copy()
+    rest_matrices[2, 0, 3] += 2 * REST_MATRIX_TOLERANCE
+    assert differences(rig, rest_matrices=rest_matrices) == ["the rest pose of the armature differs"]
+    rest_matrices[2, 0, 3] -= 1.5 * REST_MATRIX_TOLERANCE
+    assert differences(rig, rest_matrices=rest_matrices) == [], (
+        "versions of Blender compute rest matrices with different rounding"
+    )
 
 
-def test_rest_poses_are_compared_in_metres(rig):
-    moved = rig.rest_matrices.copy()
-    moved[2, 0, 3] += 50 * REST_MATRIX_TOLERANCE
-    assert found(replace(rig, metres_per_unit=0.01), rest_matrices=moved) == []
-    moved[2, 0, 3] += 100 * REST_MATRIX_TOLERANCE
-    assert found(replace(rig, metres_per_unit=0.01), rest_matrices=moved) == ["the rest pose of the armature differs"]
+def test_rest_poses_are_compared_in_meters(rig):
+    rest_matrices = rig.rest_matrices.copy()
+    rest_matrices[2, 0, 3] += 50 * REST_MATRIX_TOLERANCE
+    assert differences(replace(rig, metres_per_unit=0.01), rest_matrices=rest_matrices) == []
+    rest_matrices[2, 0, 3] += 100 * REST_MATRIX_TOLERANCE
+    assert differences(replace(rig, metres_per_unit=0.01), rest_matrices=rest_matrices) == [
+        "the rest pose of the armature differs"
+    ]
 
 
 @pytest.mark.parametrize(
@@ -79,11 +84,11 @@ def test_rest_poses_are_compared_in_metres(rig):
         ("skin_weights", "the skin weights differ"),
     ],
 )
-def test_fingerprint(rig, part, sentence):
-    assert found(rig, fingerprint=replace(rig.fingerprint, **{part: "0"})) == [sentence]
+def test_other_fingerprints_are_named(rig, part, sentence):
+    assert differences(rig, fingerprint=replace(rig.fingerprint, **{part: "0"})) == [sentence]
 
 
-def test_digest_tells_values_shapes_and_types_apart():
+def test_digest_depends_on_values_shapes_and_types():
     array = np.arange(12, dtype=np.int32)
     digests = {
         Fingerprint.digest(array),
@@ -109,43 +114,45 @@ DEFORMATION = {
 }
 
 
-def with_mush(**settings: object) -> dict:
+def with_mush_settings(**settings: object) -> dict:
     return {
         **DEFORMATION,
         "modifiers": [MODIFIERS[0], MODIFIERS[1] | {"settings": MODIFIERS[1]["settings"] | settings}],
     }
 
 
-def with_key(**settings: object) -> dict:
+def with_key_settings(**settings: object) -> dict:
     return {**DEFORMATION, "shape_keys": {"smile": DEFORMATION["shape_keys"]["smile"] | settings}}
 
 
-def with_another_key(**settings: object) -> dict:
+def with_additional_key(**settings: object) -> dict:
     return {**DEFORMATION, "shape_keys": {**DEFORMATION["shape_keys"], "frown": settings}}
 
 
-NEW = {"name": "New", "type": "CAST", "settings": {}}
-CHANGED = {
+NEW_MODIFIER = {"name": "New", "type": "CAST", "settings": {}}
+CHANGED_DEFORMATIONS = {
     "the same": (DEFORMATION, []),
     "one that says nothing": ({}, []),
-    "rounding": (with_mush(factor=0.500001), []),
-    "what was animated": (with_mush(scale=3.0), []),
-    "a control": (with_mush(iterations=None), []),
-    "a setting": (with_mush(factor=0.7), ["'factor' of the modifier 'Mush' was 0.5 and is 0.7"]),
-    "keys": (with_mush(factor=None), ["'factor' of the modifier 'Mush' is animated and is no control of the model"]),
+    "rounding": (with_mush_settings(factor=0.500001), []),
+    "what was animated": (with_mush_settings(scale=3.0), []),
+    "a control": (with_mush_settings(iterations=None), []),
+    "a setting": (with_mush_settings(factor=0.7), ["'factor' of the modifier 'Mush' was 0.5 and is 0.7"]),
+    "keys": (
+        with_mush_settings(factor=None), ["'factor' of the modifier 'Mush' is animated and is no control of the model"],
+    ),
     "a name": ({**DEFORMATION, "modifiers": [MODIFIERS[0], MODIFIERS[1] | {"name": "Other"}]}, []),
     "order": ({**DEFORMATION, "modifiers": MODIFIERS[::-1]}, ["the modifiers are in another order"]),
     "new": (
-        {**DEFORMATION, "modifiers": [NEW, *MODIFIERS]}, ["it was recorded without the modifier 'New'"]
+        {**DEFORMATION, "modifiers": [NEW_MODIFIER, *MODIFIERS]}, ["it was recorded without the modifier 'New'"]
     ),
     "gone": (
         {**DEFORMATION, "modifiers": MODIFIERS[:1]},
         ["the modifier 'Mush' is gone, switched off or behind the modifier FDDA"],
     ),
-    "a shape": (with_key(shape="b"), ["'shape' of the shape key 'smile' differs"]),
-    "a value": (with_key(value=1.0), ["'value' of the shape key 'smile' was 0.0 and is 1.0"]),
-    "another key": (with_another_key(value=1.0), ["it was recorded without the shape key 'frown'"]),
-    "a key that is muted": (with_another_key(value=1.0, mute=True), []),
+    "a shape": (with_key_settings(shape="b"), ["'shape' of the shape key 'smile' differs"]),
+    "a value": (with_key_settings(value=1.0), ["'value' of the shape key 'smile' was 0.0 and is 1.0"]),
+    "another key": (with_additional_key(value=1.0), ["it was recorded without the shape key 'frown'"]),
+    "a key that is muted": (with_additional_key(value=1.0, mute=True), []),
     "no key": ({**DEFORMATION, "shape_keys": {}}, ["the shape key 'smile' is gone"]),
     "B-Bones": (
         {**DEFORMATION, "b_bones": {"tail": {"segments": 4, "curve": [0.0, 1.0]}, "arm": {"segments": 2}}},
@@ -161,12 +168,15 @@ CHANGED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", CHANGED)
-def test_what_deforms_the_mesh_besides(rig, what):
-    now, sentences = CHANGED[what]
-    recorded = replace(rig, fingerprint=replace(rig.fingerprint, deformation=DEFORMATION))
+@pytest.mark.parametrize("change", CHANGED_DEFORMATIONS)
+def test_other_deformations_are_named(rig, change):
+    deformation, sentences = CHANGED_DEFORMATIONS[change]
+    recorded_rig = replace(rig, fingerprint=replace(rig.fingerprint, deformation=DEFORMATION))
     controls = (Control("mesh_object", 'modifiers["Mush"].iterations', 0.0, 1.0),)
-    assert found(recorded, fingerprint=replace(rig.fingerprint, deformation=now), controls=controls) == sentences
+    assert (
+        differences(recorded_rig, fingerprint=replace(rig.fingerprint, deformation=deformation), controls=controls)
+        == sentences
+    )
 
 
 @pytest.mark.parametrize(

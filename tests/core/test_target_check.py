@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is said of a target: in the index of a recording, and by the checks."""
+"""The target of a recording: its data in the index, and the warnings about it."""
 
 from dataclasses import replace
 
@@ -12,86 +12,97 @@ from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.recording.target import RecordedTarget, Repeatability
 from fdda_addon.core.skinning import LinearSkinning
 
-from .good_recording import good_recording, recorded_positions
+from .good_recording import good_recording, with_positions
 
-FRAMES = 40
+FRAME_COUNT = 40
 TARGET = RecordedTarget("flesh", "frames")
 
 
 @pytest.fixture
-def swinging() -> Recording:
-    """A chain that swings smoothly over the frames of an action, from frame 5 on; the target bulges with it."""
-    angles = 0.6 * np.sin(np.linspace(0, 6, FRAMES))[:, None] * np.ones(4)
+def swinging_recording() -> Recording:
+    """A recording of an action from frame 5 on: the joints swing smoothly, and the target bulges with them."""
+    angles = 0.6 * np.sin(np.linspace(0, 6, FRAME_COUNT))[:, None] * np.ones(4)
     recording = good_recording(angles=angles)
-    sampling = replace(recording.info.sampling, sources=(Source(ACTION, FRAMES, "swing", (5, 1)),))
-    controls = np.full((FRAMES, 1), 0.5, np.float32)
+    sampling = replace(recording.info.sampling, sources=(Source(ACTION, FRAME_COUNT, "swing", (5, 1)),))
+    controls = np.full((FRAME_COUNT, 1), 0.5, np.float32)
     residuals = recording.residuals.copy()
     residuals[:, :, 1] = 0
     recording = replace(recording, controls=controls, residuals=residuals)
     return replace(recording, info=replace(recording.info, sampling=sampling, target=TARGET))
 
 
-def shown(recording: Recording) -> np.ndarray:
+def target_positions(recording: Recording) -> np.ndarray:
+    """Return the (N, V, 3) recorded positions of the target."""
     skinning = LinearSkinning(recording.rig, recording.partitions)
     return skinning.complex_positions(recording.pose_matrices, recording.residuals)
 
 
-def only(recording: Recording, name: str) -> str:
+def single_warning_text(recording: Recording, name: str) -> str:
+    """Check that the target causes one warning, of this name, and return its text."""
     (warning,) = check_target(recording)
     assert warning.name == name
     return warning.text
 
 
-def test_a_target_that_follows_is_good(swinging):
-    assert check_target(swinging) == []
+def test_a_target_that_follows_the_rig_causes_no_warning(swinging_recording):
+    assert check_target(swinging_recording) == []
 
 
-def test_a_recording_without_a_target_is_not_looked_at(swinging):
-    info = replace(swinging.info, target=None)
-    assert check_target(replace(recorded_positions(swinging, shown(swinging) * 100), info=info)) == []
+def test_a_recording_without_a_target_is_not_checked(swinging_recording):
+    info = replace(swinging_recording.info, target=None)
+    assert (
+        check_target(replace(with_positions(swinging_recording, target_positions(swinging_recording) * 100), info=info))
+        == []
+    )
 
 
-def test_a_cache_that_ends_before_the_action(swinging):
-    positions = shown(swinging)
+def test_a_cache_that_ends_before_the_action_is_reported(swinging_recording):
+    positions = target_positions(swinging_recording)
     positions[35:] = positions[34]
-    text = only(recorded_positions(swinging, positions), "frozen-frames")
+    text = single_warning_text(with_positions(swinging_recording, positions), "frozen-frames")
     assert text.startswith("The target stands still in 5 frames in which the rig moves: 'swing 40', 'swing 41', ")
 
 
-def test_a_frame_that_jumps(swinging):
-    positions = shown(swinging)
+def test_jumps_in_a_frame_are_reported(swinging_recording):
+    positions = target_positions(swinging_recording)
     positions[20, 100] += (0.0, 0.3, 0.0)
-    text = only(recorded_positions(swinging, positions), "frame-jumps")
+    text = single_warning_text(with_positions(swinging_recording, positions), "frame-jumps")
     assert text.startswith("The target jumps in 2 frames, by up to 30")
     assert "'swing 25'" in text and "'swing 26'" in text
 
 
-@pytest.mark.parametrize(("factor", "move"), [(100.0, 0.0), (0.01, 0.0), (1.0, 3.0)])
-def test_a_target_in_other_units_or_another_place(factor, move, swinging):
-    text = only(recorded_positions(swinging, shown(swinging) * factor + (move, 0, 0)), "target-place")
+@pytest.mark.parametrize(("factor", "offset"), [(100.0, 0.0), (0.01, 0.0), (1.0, 3.0)])
+def test_a_target_in_other_units_or_at_another_location_is_reported(factor, offset, swinging_recording):
+    text = single_warning_text(
+        with_positions(swinging_recording, target_positions(swinging_recording) * factor + (offset, 0, 0)),
+        "target-place",
+    )
     assert text.startswith("The target 'flesh' is ") and "it is in other units or another place" in text
 
 
-def test_the_same_pose_from_two_directions(swinging):
+def test_a_low_repeatability_is_reported(swinging_recording):
     def with_repeatability(mean: float) -> Recording:
         statistics = {"mean": mean, "rms": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
-        return replace(swinging, info=replace(swinging.info, repeatability=Repeatability((1, 2), statistics, 5.0)))
+        return replace(
+            swinging_recording,
+            info=replace(swinging_recording.info, repeatability=Repeatability((1, 2), statistics, 5.0)),
+        )
 
     assert check_target(with_repeatability(0.9)) == []
-    assert only(with_repeatability(1.1), "hysteresis").startswith(
+    assert single_warning_text(with_repeatability(1.1), "hysteresis").startswith(
         "The target is 1.1 mm from itself when the same pose is"
     )
     sentence = with_repeatability(1.1).info.repeatability.sentence()
     assert sentence.startswith("The same pose from two directions: 1.1 mm apart on average, 4 mm at most (2 poses);")
 
 
-def test_poses_that_did_not_settle_in_words():
+def test_unsettled_sentence():
     assert unsettled_sentence({"complete": 9}) == ""
     index = {"complete": 9, "unsettled": [1, 4], "target": {"max_settle_frames": 30}}
     assert unsettled_sentence(index).startswith("2 of 9 poses did not come to rest in 30 frames: 1 and 4. A training")
 
 
-def test_index_of_repeatability():
+def test_repeatability_in_the_index():
     statistics = {"mean": 0.5, "rms": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
     repeatability = Repeatability((1, 2), statistics, 5.0)
     assert Repeatability.from_json(repeatability.to_json(), 3) == repeatability
@@ -100,9 +111,9 @@ def test_index_of_repeatability():
             Repeatability.from_json(repeatability.to_json() | change, 3)
 
 
-def test_index_of_a_target():
-    settled = RecordedTarget("flesh", "simulation", 3, 60, 0.1)
-    assert RecordedTarget.from_json(settled.to_json()) == settled
+def test_target_in_the_index():
+    simulation_target = RecordedTarget("flesh", "simulation", 3, 60, 0.1)
+    assert RecordedTarget.from_json(simulation_target.to_json()) == simulation_target
     assert RecordedTarget.from_json(TARGET.to_json()) == TARGET
     for change in (
         {"follows": "wind"},
@@ -112,4 +123,4 @@ def test_index_of_a_target():
         {"object": 3},
     ):
         with pytest.raises((ValueError, TypeError)):
-            RecordedTarget.from_json(settled.to_json() | change)
+            RecordedTarget.from_json(simulation_target.to_json() | change)

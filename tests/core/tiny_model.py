@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""ONNX models of three joints and four vertices, as good or as bad as a test wants them."""
+"""ONNX models of three joints and four vertices, valid or damaged as a test needs them."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -12,20 +12,20 @@ from fdda_addon.core.model import CHECKSUM_KEY, METADATA_KEY, ModelInfo, ModelPa
 from fdda_addon.core.onnx_file import read_onnx
 from fdda_addon.core.rig import Fingerprint, Joint
 
-J, V = 3, 4
+JOINT_COUNT, VERTEX_COUNT = 3, 4
 
 
 def tiny_info(**changes) -> ModelInfo:
-    """Metadata with a different value in every place."""
+    """Return metadata of the tiny model, with some changed fields."""
     rng = np.random.default_rng(0)
     info = ModelInfo(
         joints=(Joint("root", -1), Joint("upper.L", 0), Joint("löwer", 1)),
-        rest_matrices=rng.normal(size=(J, 4, 4)).astype(np.float32),
-        vertex_count=V,
+        rest_matrices=rng.normal(size=(JOINT_COUNT, 4, 4)).astype(np.float32),
+        vertex_count=VERTEX_COUNT,
         fingerprint=Fingerprint("a1", "b2", "c3"),
         partitions=(ModelPartition(0, (), 1, 0), ModelPartition(2, (1, 2), 3, 17)),
-        feature_low=rng.normal(size=(J, 12)).astype(np.float32),
-        feature_high=rng.normal(size=(J, 12)).astype(np.float32),
+        feature_low=rng.normal(size=(JOINT_COUNT, 12)).astype(np.float32),
+        feature_high=rng.normal(size=(JOINT_COUNT, 12)).astype(np.float32),
         held_out_mm={"mean": 0.1, "rms": 0.2, "p99": 0.3, "p999": 0.4, "max": 0.5},
         parity_mm=0.00123,
         training={"seed": 5, "hidden": [128, 128]},
@@ -33,12 +33,13 @@ def tiny_info(**changes) -> ModelInfo:
     return replace(info, **changes)
 
 
-def constant(name: str = "zeros") -> TensorProto:
-    return numpy_helper.from_array(np.zeros((1, V, 3), np.float32), name)
+def zeros_tensor(name: str = "zeros") -> TensorProto:
+    """Return a constant of zeros with the shape of the positions of one pose."""
+    return numpy_helper.from_array(np.zeros((1, VERTEX_COUNT, 3), np.float32), name)
 
 
-def external(tensor: TensorProto, location: str = "weights.bin") -> TensorProto:
-    """The tensor, its data in another file."""
+def with_external_data(tensor: TensorProto, location: str = "weights.bin") -> TensorProto:
+    """Change a tensor so that its data is in another file, and return it."""
     tensor.ClearField("raw_data")
     tensor.data_location = TensorProto.EXTERNAL
     tensor.external_data.add(key="location", value=location)
@@ -46,12 +47,12 @@ def external(tensor: TensorProto, location: str = "weights.bin") -> TensorProto:
 
 
 def tiny_model(metadata: str | None = "", nodes=(), initializers=(), inputs=(), sparse=()) -> onnx.ModelProto:
-    """A model that `read_model` takes, with more nodes, initializers and inputs.
+    """Return a model that `read_model` accepts, with additional nodes, initializers and inputs.
 
     Args:
-        metadata: text of the metadata property; `tiny_info` when empty, none when None.
+        metadata: text of the metadata property; that of `tiny_info` when empty, no property when None.
     """
-    # The first joint's first row, summed up, for every vertex: enough to have an output that depends on the input.
+    # Each coordinate is the sum of all pose matrices, so the output depends on the input.
     graph = helper.make_graph(
         [
             helper.make_node("ReduceSum", ["pose_matrices", "axes"], ["sum"], keepdims=0),
@@ -60,18 +61,18 @@ def tiny_model(metadata: str | None = "", nodes=(), initializers=(), inputs=(), 
             *nodes,
         ],
         "deformation",
-        [helper.make_tensor_value_info("pose_matrices", TensorProto.FLOAT, ["N", J, 4, 4]), *inputs],
-        [helper.make_tensor_value_info("positions", TensorProto.FLOAT, ["N", V, 3])],
+        [helper.make_tensor_value_info("pose_matrices", TensorProto.FLOAT, ["N", JOINT_COUNT, 4, 4]), *inputs],
+        [helper.make_tensor_value_info("positions", TensorProto.FLOAT, ["N", VERTEX_COUNT, 3])],
         [
             numpy_helper.from_array(np.array([1, 2, 3], np.int64), "axes"),
             numpy_helper.from_array(np.array([-1, 1, 1], np.int64), "shape"),
-            constant(),
+            zeros_tensor(),
             *initializers,
         ],
         sparse_initializer=list(sparse),
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    # Some are refused before their checksum is compared.
+    # A model that cannot be scanned has no checksum; it is refused before the checksum is compared.
     with suppress(ValueError):
         model.metadata_props.add(key=CHECKSUM_KEY, value=read_onnx(model.SerializeToString()).checksum)
     if metadata is not None:
@@ -80,7 +81,7 @@ def tiny_model(metadata: str | None = "", nodes=(), initializers=(), inputs=(), 
 
 
 def in_subgraph(node: onnx.NodeProto, depth: int = 1) -> onnx.NodeProto:
-    """An If node whose branches hold the node, `depth` levels down."""
+    """Nest a node `depth` levels deep in the branches of If nodes, and return the outermost node."""
     if depth == 0:
         return node
     output = helper.make_tensor_value_info("inner", TensorProto.FLOAT, None)
