@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`pytest` alone runs every tier that this Python can run; of each other one it prints a line with what to type."""
+"""`pytest` without arguments runs every tier that this Python supports; for other tiers it prints what to run."""
 
 import os
 import signal
@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-# Blender sets it when it is imported, and names its value in its output where it was set before: in the processes of
-# pytest-xdist, whose first process imports Blender.
+# Importing Blender sets this variable, and processes of pytest-xdist inherit it. If it is already set, Blender prints a
+# line about it.
 os.environ.pop("OCIO", None)
 
 TESTS = Path(__file__).resolve().parent
-TRAINER_PYTHON = "FDDA_TRAINER_PYTHON"
-NEEDS = {
+TRAINER_PYTHON_VARIABLE = "FDDA_TRAINER_PYTHON"
+PACKAGES_OF_TIERS = {
     "core": ("numpy", "onnx"),
     "contract": ("numpy",),
     "trainer": ("torch", "onnx", "onnxruntime", "matplotlib", "scipy"),
@@ -24,45 +24,51 @@ NEEDS = {
     "farm": ("distributed", "openjd", "bpy", "torch", "onnxruntime"),
     "examples": ("bpy", "torch", "onnx", "onnxruntime"),
 }
-"""Packages, by the folder of a tier."""
+"""Packages that the tests of a tier import, by the name of its folder."""
 
 
-def why_not(tier: str) -> str | None:
-    """Why this Python cannot run a tier, and what to type; None where it can."""
-    target = "test-core" if tier == "contract" else f"test-{tier}"
-    if lacking := [package for package in NEEDS[tier] if find_spec(package) is None]:
-        return f"tests/{tier} needs {' and '.join(lacking)}, which {sys.executable} lacks: make {target}"
-    if tier == "blender" and TRAINER_PYTHON not in os.environ:
-        return f"tests/{tier} trains models; set {TRAINER_PYTHON} to a Python that has torch, or: make {target}"
+def reason_to_skip(tier: str) -> str | None:
+    """Return why this Python cannot run a tier and which command can; None if it can."""
+    make_target = "test-core" if tier == "contract" else f"test-{tier}"
+    if missing_packages := [package for package in PACKAGES_OF_TIERS[tier] if find_spec(package) is None]:
+        return f"tests/{tier} needs {' and '.join(missing_packages)}, which {sys.executable} lacks: make {make_target}"
+    if tier == "blender" and TRAINER_PYTHON_VARIABLE not in os.environ:
+        return (
+            f"tests/{tier} trains models; set {TRAINER_PYTHON_VARIABLE} to a Python that has torch, "
+            f"or: make {make_target}"
+        )
     return None
 
 
 class SkippedTier(pytest.Collector):
-    """Stands for a tier that this Python cannot run."""
+    """Skip a tier that this Python cannot run."""
 
     def collect(self) -> Iterator[pytest.Item]:
-        pytest.skip(why_not(self.name), allow_module_level=True)
+        pytest.skip(reason_to_skip(self.name), allow_module_level=True)
 
 
-def heed_stop_signals() -> None:
-    """Let children be stopped by signals that this process ignores, as below nohup: they inherit no handler."""
-    for name in ("SIGINT", "SIGHUP"):
-        number = getattr(signal, name, None)
-        if number and signal.getsignal(number) is signal.SIG_IGN:
-            signal.signal(number, lambda *_: None)
+def enable_stop_signals() -> None:
+    """Handle stop signals that this process ignores, as under nohup; child processes then do not ignore them.
+
+    Child processes inherit ignored signals, but not handlers.
+    """
+    for signal_name in ("SIGINT", "SIGHUP"):
+        signal_number = getattr(signal, signal_name, None)
+        if signal_number and signal.getsignal(signal_number) is signal.SIG_IGN:
+            signal.signal(signal_number, lambda *_: None)
 
 
 def pytest_configure() -> None:
-    """Name the Python that trains for the Blender tier, as make does."""
-    heed_stop_signals()
-    of_the_checkout = TESTS.parent / ".venv/bin/python"
+    """Set the variable with the trainer's Python for the Blender tier, as make does."""
+    enable_stop_signals()
+    venv_python = TESTS.parent / ".venv/bin/python"
     if find_spec("torch"):
-        os.environ.setdefault(TRAINER_PYTHON, sys.executable)
-    elif of_the_checkout.is_file():
-        os.environ.setdefault(TRAINER_PYTHON, str(of_the_checkout))
+        os.environ.setdefault(TRAINER_PYTHON_VARIABLE, sys.executable)
+    elif venv_python.is_file():
+        os.environ.setdefault(TRAINER_PYTHON_VARIABLE, str(venv_python))
 
 
 def pytest_collect_directory(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
-    if path.parent == TESTS and path.name in NEEDS and why_not(path.name):
+    if path.parent == TESTS and path.name in PACKAGES_OF_TIERS and reason_to_skip(path.name):
         return SkippedTier.from_parent(parent, name=path.name)
     return None

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the sources, the pages and the set-up keep to."""
+"""Tests of rules for the source code, the documentation and the setup scripts; none of them starts Blender."""

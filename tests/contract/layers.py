@@ -28,21 +28,23 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 """From the top down. A file imports from its own package and lower layers, not from other packages of its layer."""
 
 
-def package_of(name: str) -> str:
-    """Return the package of a name below fdda_addon: "core.recording" for "core.recording.index", "__init__" for ""."""
-    packages = [package for layer in LAYERS for package in layer]
+def package_of(module_name: str) -> str:
+    """Return the package of a module: "core.recording" for "core.recording.index", "__init__" for ""."""
+    layer_packages = [package for layer in LAYERS for package in layer]
     return max(
-        (package for package in packages if f"{name}.".startswith(f"{package}.")), key=len, default=name or "__init__"
+        (package for package in layer_packages if f"{module_name}.".startswith(f"{package}.")),
+        key=len,
+        default=module_name or "__init__",
     )
 
 
 def module_of(file: Path) -> str:
-    """Return the dotted name of a file, "fdda_addon.core.rig"; for `__init__.py` that of its folder."""
+    """Return the dotted module name of a file, "fdda_addon.core.rig"; an `__init__.py` has the name of its folder."""
     return ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
 def imported_names(file: Path) -> Iterator[str]:
-    """Yield the absolute dotted names of everything that a file imports, also inside functions."""
+    """Yield the absolute dotted name of each import of a file, also of imports inside functions."""
     package = list(file.relative_to(ROOT).with_suffix("").parts[:-1])
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -50,22 +52,22 @@ def imported_names(file: Path) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else []
             base += node.module.split(".") if node.module else []
-            # `from . import name` imports the module name; elsewhere the last part may be a class, which does no harm.
+            # The last part is a module in `from . import name`; elsewhere it may be a class, which is harmless.
             yield from (".".join([*base, alias.name]) for alias in node.names)
 
 
 def import_graph(folder: str) -> dict[str, set[str]]:
-    """Return the modules of a folder, each with the modules of the folder that it imports."""
+    """Return, for each module of a folder, the modules of the same folder that it imports."""
     files = {module_of(file): file for file in (ROOT / folder).rglob("*.py")}
     graph: dict[str, set[str]] = {}
     for module, file in files.items():
-        found = (name if name in files else name.rpartition(".")[0] for name in imported_names(file))
-        graph[module] = {name for name in found if name in files and name != module}
+        imported_modules = (name if name in files else name.rpartition(".")[0] for name in imported_names(file))
+        graph[module] = {name for name in imported_modules if name in files and name != module}
     return graph
 
 
 def package_graph() -> dict[str, set[str]]:
-    """Return the packages of fdda_addon, each with the packages that it imports from."""
+    """Return, for each package of fdda_addon, the packages from which it imports."""
     graph: dict[str, set[str]] = {package: set() for layer in LAYERS for package in layer}
     for module, imported in import_graph("fdda_addon").items():
         package = _package(module)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The table of seeded faults fits the code: each fault can be seeded, and names test files that exist."""
+"""The seeded faults match the code: the text of each fault occurs once in its file, and its tests exist."""
 
 import ast
 import re
@@ -12,10 +12,10 @@ FAULTS = read_faults()
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.id)
-def test_a_fault_can_be_seeded(fault: Fault):
+def test_the_text_of_a_fault_occurs_once(fault: Fault):
     text = (ROOT / fault.file).read_text(encoding="utf-8")
     assert text.count(fault.old) == 1, fault.file
-    # A fault that is a syntax error would be caught by any test.
+    # The changed code must be valid and different; any test would catch a syntax error.
     assert ast.dump(ast.parse(fault.applied(text))) != ast.dump(ast.parse(text))
 
 
@@ -25,11 +25,11 @@ def test_the_tests_that_catch_a_fault_exist(fault: Fault):
     assert [test for test in fault.tests if not (ROOT / test).is_file()] == []
 
 
-def test_each_fault_has_an_id_of_its_own():
+def test_ids_of_faults_are_unique():
     assert len({fault.id for fault in FAULTS}) == len(FAULTS)
 
 
-def test_the_page_for_developers_lists_each_fault():
+def test_the_development_page_lists_each_fault():
     page = (ROOT / "docs" / "development.md").read_text(encoding="utf-8")
     rows = re.findall(
         r"^\| `([\w-]+)` \| .* \| `([\w/.]+)` \| \d+ \|$", page.partition("### Seeded faults")[2], re.MULTILINE

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What source files keep to and ruff cannot check: no pickled arrays, names that mean something, no host names."""
+"""Rules for source files that ruff cannot check: no pickled arrays, no empty file names, no host names."""
 
 import ast
 import os
@@ -21,15 +21,26 @@ FOLDERS = (
     "examples",
     ".ci",
 )
-INSTALLED = {"node_modules", "dist"}
-"""Folders of others, inside of ours."""
-NEW_PROCESS = ("Popen", "run", "call", "check_call", "check_output")
+GENERATED_FOLDERS = {"node_modules", "dist"}
+"""Names of folders that other programs generate; their files are not checked."""
+PROCESS_FUNCTIONS = ("Popen", "run", "call", "check_call", "check_output")
 SPDX = "# SPDX-License-Identifier: GPL-3.0-or-later"
 
-# Names that say nothing about what is inside: such a file grows without end.
-EMPTY_NAMES = {"util", "utils", "helper", "helpers", "function", "functions", "misc", "common", "manager", "service"}
+# These names do not say what a file contains, so everything would be added to it.
+FORBIDDEN_NAMES = {
+    "util",
+    "utils",
+    "helper",
+    "helpers",
+    "function",
+    "functions",
+    "misc",
+    "common",
+    "manager",
+    "service",
+}
 
-# Which mirror packages come from is up to the machine that installs them.
+# Each machine chooses the mirror from which it installs packages, so no file may name one.
 REGISTRY_HOST = re.compile(
     "|".join(
         "".join(parts)
@@ -39,10 +50,10 @@ REGISTRY_HOST = re.compile(
 
 
 def text_files() -> Iterator[tuple[Path, str]]:
-    """Every text file of the project, with its text."""
+    """Yield the path and the text of every text file of the project."""
     files = [file for file in ROOT.iterdir() if file.is_file() and not file.name.startswith(".venv")]
-    for folder, inner, names in (step for top in FOLDERS for step in os.walk(ROOT / top)):
-        inner[:] = sorted(set(inner) - INSTALLED)
+    for folder, subfolders, names in (walk_step for top in FOLDERS for walk_step in os.walk(ROOT / top)):
+        subfolders[:] = sorted(set(subfolders) - GENERATED_FOLDERS)
         files += [Path(folder, name) for name in names]
     for file in files:
         try:
@@ -56,26 +67,26 @@ WEB_FILES = (".js", ".mjs", ".css", ".html")
 PYTHON_FILES = {str(path): text for path, text in sorted(text_files()) if path.suffix == ".py"}
 
 
-def test_files_of_web_pages_name_their_license():
+def test_web_files_name_their_license():
     texts = {str(path): text for path, text in text_files() if path.suffix in WEB_FILES}
     assert texts and [path for path, text in texts.items() if SPDX[2:] not in "".join(text.splitlines()[:2])] == []
 
 
 def test_no_file_loads_pickled_arrays():
-    unsafe = {("allow_pickle", True), ("weights_only", False)}  # of numpy.load and torch.load
-    found = [
+    unsafe_arguments = {("allow_pickle", True), ("weights_only", False)}  # of numpy.load and torch.load
+    violations = [
         f"{path}:{node.value.lineno}: {node.arg}={node.value.value}"
         for path, text in PYTHON_FILES.items()
         for node in ast.walk(ast.parse(text))
         if isinstance(node, ast.keyword)
         and isinstance(node.value, ast.Constant)
-        and (node.arg, node.value.value) in unsafe
+        and (node.arg, node.value.value) in unsafe_arguments
     ]
-    assert found == []
+    assert violations == []
 
 
-def test_files_are_named_for_what_they_hold():
-    assert [path for path in PYTHON_FILES if EMPTY_NAMES & set(Path(path).with_suffix("").parts)] == []
+def test_file_names_say_what_the_files_contain():
+    assert [path for path in PYTHON_FILES if FORBIDDEN_NAMES & set(Path(path).with_suffix("").parts)] == []
 
 
 def test_no_file_names_a_package_registry():
@@ -83,14 +94,14 @@ def test_no_file_names_a_package_registry():
 
 
 def test_processes_of_blender_open_no_console_window():
-    """`popen_options` keeps Windows from it. A verb has a console already, and what it starts prints there."""
-    calls, bare = 0, []
+    """`popen_options` prevents the window on Windows. Verbs are exempt: their processes print into the open console."""
+    call_count, calls_without_options = 0, []
     for file in sorted((ROOT / "fdda_addon").rglob("*.py")):
         if "cli" in file.parts:
             continue
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and ast.unparse(node.func) in {f"subprocess.{n}" for n in NEW_PROCESS}:
-                calls += 1
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in {f"subprocess.{n}" for n in PROCESS_FUNCTIONS}:
+                call_count += 1
                 if not any(k.arg is None and ast.unparse(k.value).startswith("popen_options(") for k in node.keywords):
-                    bare.append(f"{file.relative_to(ROOT).as_posix()}:{node.lineno}")
-    assert calls > 4 and bare == []
+                    calls_without_options.append(f"{file.relative_to(ROOT).as_posix()}:{node.lineno}")
+    assert call_count > 4 and calls_without_options == []
