@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Trains many recordings in one process, in the Python that has torch: most of a short training is the start of that.
+"""Training of many recordings in one process: starting PyTorch takes longer than a short training.
 
-Run as a module it reads the arguments of a training from each line of stdin, as JSON, until stdin ends. It answers each
-with a line of JSON: the exit status.
+As a program, this module runs in the Python that has PyTorch. It reads the arguments of one training from each line of
+stdin, as JSON, until stdin ends. For each training it prints a line of JSON: the exit status.
 """
 
 import contextlib
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -17,11 +18,11 @@ from fdda_addon.training.process import trainer_command
 
 MODULE = "blend_fixtures.characters.training"
 SMALL = ("--hidden", "32", "32", "--batch-size", "16")
-"""Options for a recording of few poses: small networks and many steps."""
+"""Options of the trainer for a recording of few poses: small networks and small batches."""
 
 
 class Trainings:
-    """Trainings one after the other, in a process beside this one; all are done when the `with` block is left."""
+    """A process that trains one model after another. Leaving the `with` block waits until all are trained."""
 
     def __init__(self):
         command, environment = trainer_command([], module=MODULE)
@@ -35,30 +36,37 @@ class Trainings:
             text=True,
             encoding="utf-8",
         )
-        self._under_way: list[list[str]] = []
+        self._pending: list[tuple[list[str], int]] = []
+        """Arguments of each training that has not ended, and the size of `_errors` when it was added."""
 
     def add(self, recording: Path, model: Path, *options: object) -> None:
-        """Train a model when those before are done; does not wait. `options` are those of `python -m trainer`."""
+        """Add a training that starts when those before it have ended, and return at once.
+
+        Args:
+            recording: folder of the recording.
+            model: file to write the model to.
+            options: of `python -m trainer`.
+        """
         arguments = [str(argument) for argument in (recording, model, *options)]
-        self._under_way.append(arguments)
+        self._pending.append((arguments, os.fstat(self._errors.fileno()).st_size))
         self._process.stdin.write(json.dumps(arguments) + "\n")
         self._process.stdin.flush()
 
     def wait(self) -> None:
-        """Wait until all trainings are done.
+        """Wait until all trainings have ended.
 
         Raises:
-            RuntimeError: one failed; the text is what the process wrote.
+            RuntimeError: a training failed; the message holds what the process has written since it was added.
         """
-        while self._under_way:
-            arguments = self._under_way.pop(0)
-            answer = self._process.stdout.readline()
-            if not answer or json.loads(answer):
-                self._errors.seek(0)
+        while self._pending:
+            arguments, error_start = self._pending.pop(0)
+            status_line = self._process.stdout.readline()
+            if not status_line or json.loads(status_line):
+                self._errors.seek(error_start)
                 raise RuntimeError(f"train {' '.join(arguments)} failed: {self._errors.read()}")
 
     def close(self) -> None:
-        """End the process, whatever it does."""
+        """Kill the process."""
         self._process.kill()
         self._process.communicate()
         self._errors.close()
@@ -75,19 +83,19 @@ class Trainings:
 
 
 def main() -> None:
-    """Train what stdin asks for."""
-    # Loaded before the first line comes: meanwhile the first character is recorded.
+    """Run the trainings whose arguments stdin lists."""
+    # This import takes seconds. It runs while the caller records the first character.
     import trainer.training  # noqa: F401
     from trainer.__main__ import main as train
 
-    answers = sys.stdout
+    status_output = sys.stdout
     for line in sys.stdin:
         with contextlib.redirect_stdout(sys.stderr):
             try:
                 status = train(json.loads(line))
-            except SystemExit as error:  # wrong usage
+            except SystemExit as error:  # raised by argparse
                 status = error.code
-        print(json.dumps(status), file=answers, flush=True)
+        print(json.dumps(status), file=status_output, flush=True)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The elbow, recorded, trained and bound once for all tests; and what the tests measure with."""
+"""Fixtures of the Blender tests, above all the elbow: recorded, trained and bound once; and functions that measure."""
 
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -27,7 +28,7 @@ ELBOW_RIG = "elbow_rig"
 
 @dataclass(frozen=True)
 class ElbowFiles:
-    """The files of the elbow, in one folder: rig, recording, model, bound file."""
+    """Paths of the elbow's files, all in one folder."""
 
     rig: Path
     recording: Path
@@ -36,30 +37,39 @@ class ElbowFiles:
 
 
 def run(*arguments: object) -> int:
-    """Run a verb of the command line; returns the exit status."""
+    """Run a verb of the command line, and return its exit status."""
     return main([str(argument) for argument in arguments], "fdda")
 
 
 @cache
-def _trainings() -> Trainings:
+def _shared_trainings() -> Trainings:
     return Trainings()
 
 
 def train(recording: Path, model: Path, *options: object) -> None:
-    """Train a model as the verb does, in a process that all such trainings share: starting PyTorch takes seconds."""
-    trainings = _trainings()
-    trainings.add(recording, model, *options)
-    trainings.wait()
+    """Train a model as `train` does, in a process that all such trainings share: starting PyTorch takes seconds."""
+    trainings = _shared_trainings()
+    try:
+        trainings.add(recording, model, *options)
+        trainings.wait()
+    except (RuntimeError, OSError):
+        # The process may have ended. The next training starts another one.
+        _shared_trainings.cache_clear()
+        trainings.close()
+        raise
 
 
 def pytest_sessionfinish() -> None:
-    if _trainings.cache_info().currsize:
-        _trainings().close()
+    if _shared_trainings.cache_info().currsize:
+        _shared_trainings().close()
 
 
 @pytest.fixture(scope="session")
 def elbow(tmp_path_factory: pytest.TempPathFactory) -> ElbowFiles:
-    """The elbow's files, made by the first of the processes that run tests side by side; read only."""
+    """Make the elbow's files in the first test process that needs them; the processes share the folder.
+
+    No test may change these files. A test that writes another file beside them puts its process ID into the name.
+    """
     from blend_fixtures.elbow import build_elbow
     from fdda_addon.scene.blend_file import save_copy
 
@@ -68,6 +78,8 @@ def elbow(tmp_path_factory: pytest.TempPathFactory) -> ElbowFiles:
     files = ElbowFiles(*(folder / name for name in ("elbow.blend", "recording", "elbow.onnx", "bound.blend")))
     with FileLock(folder.with_suffix(".lock")):
         if not files.bound.exists():
+            # What a process left that failed here.
+            shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
             bpy.ops.wm.read_factory_settings(use_empty=True)
             build_elbow()
@@ -80,9 +92,9 @@ def elbow(tmp_path_factory: pytest.TempPathFactory) -> ElbowFiles:
 
 @pytest.fixture(autouse=True)
 def _addon() -> Iterator[None]:
-    """The add-on is registered in an empty file; nothing stays for the next test but preferences."""
+    """Register the add-on in an empty file. Preferences are not reset between tests."""
     fdda_addon.register()
-    # Several times as fast as `read_factory_settings`.
+    # This is several times faster than `read_factory_settings`.
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
     fdda_addon.register()
     yield
@@ -127,7 +139,7 @@ def write_edited(model: Path, path: Path, edit: Callable) -> Path:
 
 @pytest.fixture
 def refusal(tmp_path: Path, capfd: pytest.CaptureFixture):
-    """What runs a verb that refuses (`refusals.Refusal`), and returns its sentence."""
+    """Return a function that runs a verb which must fail, and returns its error message."""
     from .refusals import Refusal
 
     return Refusal(tmp_path, capfd)
@@ -135,7 +147,7 @@ def refusal(tmp_path: Path, capfd: pytest.CaptureFixture):
 
 @pytest.fixture
 def refusal_on_a_full_disk(tmp_path: Path, capsys: pytest.CaptureFixture):
-    """As `refusal`; what is caught stays in memory, for it could not be written to a file either."""
+    """Like `refusal`, but captures output in memory: a full disk takes no file."""
     from .refusals import Refusal
 
     return Refusal(tmp_path, capsys)

@@ -15,8 +15,6 @@ from fdda_addon.jobs import background
 from fdda_addon.jobs.background import iterate_in_thread, run_in_background
 from fdda_addon.jobs.job import CHARACTER, ENVIRONMENT, JobRunner, JobState, current, request_cancel, state_of
 
-pytestmark = pytest.mark.one_blender_version
-
 
 class Work:
     """Steps that wait for `go`, one after the other, and end when `cancel` is called."""

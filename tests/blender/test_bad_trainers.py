@@ -197,7 +197,8 @@ def test_nobody_waits_for_a_trainer_that_is_silent(tmp_path, monkeypatch):
             start = time.monotonic()
             assert next(messages) is None
             seconds.append(time.monotonic() - start)
-        assert statistics.median(seconds) < 0.0005  # Other processes may delay some of them.
+        assert statistics.median(seconds) < 0.0005  # Other processes may delay some polls.
+        assert max(seconds) < 1
         monkeypatch.setattr(process, "KILL_AFTER_SECONDS", 0.5)
         training.cancel()
         assert first_of(messages) is None

@@ -2,6 +2,7 @@
 """A character that cannot play any more: it shows its rig and says why, and the others play on."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -92,7 +93,7 @@ def with_control(model: Path, owner: str, path: str) -> Path:
         info["controls"] = [{"owner": owner, "path": path, "low": 0.0, "high": 1.0}]
         metadata.value = json.dumps(info)
 
-    return write_edited(model, model.with_name("controlled.onnx"), add_control)
+    return write_edited(model, model.with_name(f"controlled_{os.getpid()}.onnx"), add_control)
 
 
 def armature_object() -> bpy.types.Object:

@@ -23,8 +23,6 @@ from fdda_addon.scene.scene_rig import SceneRig
 from .conftest import assert_plays, evaluated, pose, run
 from .refusals import files, save_elbow
 
-pytestmark = pytest.mark.one_blender_version
-
 
 @pytest.mark.parametrize("arguments", [["--help"], *([verb, "--help"] for verb in VERBS)], ids=" ".join)
 def test_help(arguments, capfd):

@@ -18,7 +18,7 @@ from .conftest import run
 from .refusals import files
 
 ROOT = Path(__file__).resolve().parents[2]
-
+POSES = 8 * BATCH_POSES
 
 INTERRUPT = "CTRL_BREAK_EVENT" if os.name == "nt" else "SIGINT"
 REQUESTS = ("CTRL_BREAK_EVENT",) if os.name == "nt" else ("SIGINT", "SIGTERM", "SIGHUP")
@@ -110,11 +110,9 @@ def complete(path: Path) -> int:
         return -1
 
 
-@pytest.mark.slow
 def test_an_interrupted_recording_resumes(elbow, tmp_path):
     """Stopped by Ctrl-C in the middle and continued, it is the recording that was never stopped, byte for byte."""
-    poses = 20 * BATCH_POSES
-    options = ["--poses", poses, "--seed", 5]
+    options = ["--poses", POSES, "--seed", 5]
     path = tmp_path / "interrupted"
     process = start("record", elbow.rig, path, *options)
     wait_for(lambda: complete(path) > 0, process)
@@ -123,23 +121,22 @@ def test_an_interrupted_recording_resumes(elbow, tmp_path):
     assert process.returncode == 130, err
     assert out.count("\n") == 1 and err.splitlines()[-1] == "Interrupted." and "Traceback" not in err
     done = complete(path)
-    assert 0 < done < poses
+    assert 0 < done < POSES
     assert run("record", elbow.rig, path, *options, "--resume") == 0
     assert run("record", elbow.rig, tmp_path / "whole", *options) == 0
     assert files(path) == files(tmp_path / "whole")
 
 
 def test_a_recording_that_is_killed_resumes(elbow, tmp_path):
-    poses = 20 * BATCH_POSES
     path = tmp_path / "killed"
-    process = start("record", elbow.rig, path, "--poses", poses)
+    process = start("record", elbow.rig, path, "--poses", POSES)
     wait_for(lambda: complete(path) > 0, process)
     process.kill()
     process.communicate(timeout=60)
     assert process.returncode == (1 if os.name == "nt" else -signal.SIGKILL)
-    assert 0 < complete(path) < poses
-    assert run("record", elbow.rig, path, "--poses", poses, "--resume") == 0
-    assert run("record", elbow.rig, tmp_path / "whole", "--poses", poses) == 0
+    assert 0 < complete(path) < POSES
+    assert run("record", elbow.rig, path, "--poses", POSES, "--resume") == 0
+    assert run("record", elbow.rig, tmp_path / "whole", "--poses", POSES) == 0
     assert files(path) == files(tmp_path / "whole")
 
 

@@ -89,7 +89,6 @@ def test_evaluation_code(folder):
     assert lines[1].startswith("largest error: ")
 
 
-@pytest.mark.slow
 def test_messages_code(folder, tmp_path):
     shutil.copytree(folder / "recording", tmp_path / "recording")
     lines = run_code(chapter("Trainer messages"), tmp_path, trainer_python()).splitlines()

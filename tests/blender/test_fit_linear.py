@@ -32,8 +32,6 @@ from .conftest import ELBOW, assert_plays, evaluated, pose, run, train
 from .refusals import save_elbow
 from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
-pytestmark = pytest.mark.one_blender_version
-
 SMOOTH = RecordingSettings(poses=60, influence_poses=2, fit_linear="smooth")
 
 
