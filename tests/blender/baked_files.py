@@ -12,9 +12,9 @@ import numpy as np
 
 from .conftest import ELBOW, ElbowFiles, predicted
 
-WAVE = range(1, 31)
+WAVE_FRAMES = range(1, 31)
 """Frames of the elbow's action."""
-CLOSE = 1e-5
+POSITION_TOLERANCE = 1e-5
 """Metres."""
 
 PLAIN_BLENDER = """
@@ -37,7 +37,7 @@ np.savez(out, **found)
 """
 
 
-def plain_blender(folder: Path, *jobs: tuple[Path, list[float]]) -> dict[tuple[Path, float], np.ndarray]:
+def shown_without_add_on(folder: Path, *jobs: tuple[Path, list[float]]) -> dict[tuple[Path, float], np.ndarray]:
     """What files show at some times, in a process that has `bpy` and not the add-on."""
     out, arguments = folder / "plain.npz", [json.dumps([str(path), times]) for path, times in jobs]
     command = [sys.executable, "-I", "-c", PLAIN_BLENDER, str(out), *arguments]
@@ -59,7 +59,7 @@ def read_pc2(path: Path) -> tuple[float, float, np.ndarray]:
     return start, rate, np.frombuffer(data, "<f4", offset=32).reshape(samples, points, 3)
 
 
-def model_says(frames, model: Path) -> np.ndarray:
+def predicted_in_frames(frames, model: Path) -> np.ndarray:
     """(N, V, 3), the model's positions in frames of the open file, one by one."""
     found = []
     for frame in frames:
@@ -68,7 +68,7 @@ def model_says(frames, model: Path) -> np.ndarray:
     return np.array(found)
 
 
-def elbow_wave(elbow: ElbowFiles) -> np.ndarray:
+def predicted_wave(elbow: ElbowFiles) -> np.ndarray:
     """(30, V, 3), what the model makes of the elbow's action."""
     bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
-    return model_says(WAVE, elbow.model)
+    return predicted_in_frames(WAVE_FRAMES, elbow.model)

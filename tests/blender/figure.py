@@ -10,7 +10,7 @@ from mathutils import Euler
 
 from fdda_addon.scene.scene_rig import SceneRig
 
-REACH, HEIGHT, RADIUS = 0.8, 0.9, 0.06
+ARM_REACH, HEIGHT, RADIUS = 0.8, 0.9, 0.06
 WAVE, FRAMES = "wave", 24
 SMILE = 'key_blocks["Smile"].value'
 _AROUND, _RINGS = 8, 24
@@ -56,14 +56,14 @@ def _next(place: int) -> int:
 
 def _points() -> np.ndarray:
     angles = (np.arange(_AROUND) + 0.5) * 2 * np.pi / _AROUND
-    along = np.linspace(-REACH, REACH, _RINGS + 1)
+    along = np.linspace(-ARM_REACH, ARM_REACH, _RINGS + 1)
     return np.array([(x, RADIUS * np.cos(a), HEIGHT + RADIUS * np.sin(a)) for x in along for a in angles])
 
 
 def _add_bones(armature_object: bpy.types.Object) -> None:
     bpy.ops.object.mode_set(mode="EDIT")
     bones = armature_object.data.edit_bones
-    ends = {"spine": ((0, 0, 0), (0, 0, HEIGHT)), "arm.L": ((0.2, 0, HEIGHT), (REACH, 0, HEIGHT))}
+    ends = {"spine": ((0, 0, 0), (0, 0, HEIGHT)), "arm.L": ((0.2, 0, HEIGHT), (ARM_REACH, 0, HEIGHT))}
     ends["arm.R"] = tuple((-x, y, z) for x, y, z in ends["arm.L"])
     for name, (head, tail) in ends.items():
         bone = bones.new(name)
@@ -76,7 +76,7 @@ def _add_bones(armature_object: bpy.types.Object) -> None:
         bone["fist"] = 0.0
 
 
-def key(bone: bpy.types.PoseBone, frame: int, channel: str, value: object) -> None:
+def key_channel(bone: bpy.types.PoseBone, frame: int, channel: str, value: object) -> None:
     """Set a channel of a bone and key it."""
     setattr(bone, channel, value)
     bone.keyframe_insert(channel, frame=frame)
@@ -89,11 +89,11 @@ def add_wave(rig: SceneRig) -> bpy.types.Action:
     bones = rig.armature_object.pose.bones
     for frame in range(1, FRAMES + 1):
         part = math.sin((frame - 1) / (FRAMES - 1) * math.pi)
-        key(bones["spine"], frame, "rotation_euler", (0.1 * part, 0.4 * part, 0))
-        key(bones["spine"], frame, "location", (0.02 * part, 0.05 * part, 0))
+        key_channel(bones["spine"], frame, "rotation_euler", (0.1 * part, 0.4 * part, 0))
+        key_channel(bones["spine"], frame, "location", (0.02 * part, 0.05 * part, 0))
         for name, turn in (("arm.L", (0.2 + part, 0, 0.3 * part)), ("arm.R", (0.3 * part, 0.1 * part, 0))):
-            key(bones[name], frame, "rotation_quaternion", Euler(turn).to_quaternion())
-        key(bones["arm.R"], frame, "scale", (1, 1 + 0.1 * part, 1))
+            key_channel(bones[name], frame, "rotation_quaternion", Euler(turn).to_quaternion())
+        key_channel(bones["arm.R"], frame, "scale", (1, 1 + 0.1 * part, 1))
         bones["arm.L"]["fist"] = part
         bones["arm.L"].keyframe_insert('["fist"]', frame=frame)
     bpy.context.view_layer.update()

@@ -56,33 +56,33 @@ def make_library(elbow: ElbowFiles, folder: Path) -> Library:
     files.path.parent.mkdir()
     shutil.copy(elbow.model, files.model)
     save_character(elbow.bound, files.path)
-    new_shot(folder)
+    save_new_shot(folder)
     return files
 
 
-def new_shot(folder: Path) -> None:
+def save_new_shot(folder: Path) -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     fdda_addon.register()
     (folder / "shots").mkdir(exist_ok=True)
-    bpy.ops.wm.save_as_mainfile(filepath=str(shot(folder)))
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(folder)))
 
 
-def shot(folder: Path) -> Path:
+def shot_path(folder: Path) -> Path:
     return folder / "shots" / "shot.blend"
 
 
-def save_and_open(folder: Path) -> None:
-    bpy.ops.wm.save_as_mainfile(filepath=str(shot(folder)))
-    bpy.ops.wm.open_mainfile(filepath=str(shot(folder)))
+def save_and_reopen_shot(folder: Path) -> None:
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(folder)))
+    bpy.ops.wm.open_mainfile(filepath=str(shot_path(folder)))
 
 
-def link(path: Path) -> bpy.types.Collection:
+def link_character(path: Path) -> bpy.types.Collection:
     with bpy.data.libraries.load(str(path), link=True, relative=True) as (_, wanted):
         wanted.collections = [COLLECTION]
     return wanted.collections[0]
 
 
-def override(collection: bpy.types.Collection, angle: float | None = None, is_editable: bool = True):
+def override_character(collection: bpy.types.Collection, angle: float | None = None, is_editable: bool = True):
     """A library override of a linked character in a pose, without its action; its mesh object."""
     root = collection.override_hierarchy_create(
         bpy.context.scene, bpy.context.view_layer, do_fully_editable=is_editable
@@ -90,7 +90,7 @@ def override(collection: bpy.types.Collection, angle: float | None = None, is_ed
     mesh_object = next(o for o in root.all_objects if o.type == "MESH")
     if angle is not None:
         armature_of(mesh_object).animation_data.action = None
-        bend(mesh_object, angle)
+        bend_elbow(mesh_object, angle)
     return mesh_object
 
 
@@ -102,11 +102,11 @@ def rig_of(mesh_object: bpy.types.Object) -> SceneRig:
     return SceneRig(mesh_object, armature_of(mesh_object))
 
 
-def bend(mesh_object: bpy.types.Object, angle: float) -> None:
+def bend_elbow(mesh_object: bpy.types.Object, angle: float) -> None:
     armature_of(mesh_object).pose.bones["lower"].rotation_euler[0] = angle
 
 
-def own_characters() -> list[bpy.types.Object]:
+def overridden_meshes() -> list[bpy.types.Object]:
     """The mesh objects of the open file's overrides, by name."""
     return [o for o in bpy.data.objects if o.type == "MESH" and o.override_library]
 
@@ -115,10 +115,10 @@ def buffer_name(mesh_object: bpy.types.Object) -> str:
     return playback_modifier.buffer_of(playback_modifier.find_modifier(mesh_object)).name
 
 
-def assert_play(library: Library, angles: tuple[float, ...] = ANGLES) -> list[np.ndarray]:
+def assert_overrides_play(library: Library, angles: tuple[float, ...] = ANGLES) -> list[np.ndarray]:
     """Each override shows the model's output for its own pose; their positions."""
     bpy.context.view_layer.update()
-    mesh_objects = own_characters()
+    mesh_objects = overridden_meshes()
     found = [armature_of(o).pose.bones["lower"].rotation_euler[0] for o in mesh_objects]
     assert found == pytest.approx(angles)
     positions = [assert_plays(o, library.model) for o in mesh_objects]
@@ -127,7 +127,7 @@ def assert_play(library: Library, angles: tuple[float, ...] = ANGLES) -> list[np
     return positions
 
 
-def elsewhere(call: str) -> None:
+def run_in_another_process(call: str) -> None:
     """Call a function of this file in a process of its own, which has done nothing before."""
     code = f"""
 import fdda_addon
@@ -145,7 +145,7 @@ finally:
 def open_shot(path: str, model: str) -> None:
     """Open a shot; its overrides play as they were saved."""
     bpy.ops.wm.open_mainfile(filepath=path)
-    assert_play(Library(Path(), Path(model)))
+    assert_overrides_play(Library(Path(), Path(model)))
 
 
 def pack_model(path: str) -> None:

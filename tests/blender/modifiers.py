@@ -20,10 +20,10 @@ from fdda_addon.scene.scene_rig import SceneRig, find_rig
 from .conftest import ELBOW
 from .scene_state import assert_same_state, drain, scene_state
 
-FEW = RecordingSettings(poses=4, influence_poses=1)
+FEW_POSES = RecordingSettings(poses=4, influence_poses=1)
 
 
-def character(build: Callable[[], object] = tube) -> SceneRig:
+def build_rig(build: Callable[[], object] = tube) -> SceneRig:
     """Build a character in the empty scene."""
     build()
     return find_rig(ELBOW)
@@ -33,7 +33,7 @@ def assert_refused(rig: SceneRig, model: Path, recording: Path, sentence: str) -
     """Check, record, evaluate and bind say the same sentence; nothing is written, and the scene is as before."""
     before = scene_state(rig)
     for refused in (
-        lambda: drain(record(rig, recording, FEW)),
+        lambda: drain(record(rig, recording, FEW_POSES)),
         lambda: drain(evaluate(rig, model, EvaluationSettings(poses=2))),
         lambda: bind(rig, model),
     ):
@@ -45,7 +45,7 @@ def assert_refused(rig: SceneRig, model: Path, recording: Path, sentence: str) -
     assert not recording.exists()
 
 
-def at(place: int, kind: str, **settings: object) -> Callable[[bpy.types.Object], None]:
+def add_modifier_at(place: int, kind: str, **settings: object) -> Callable[[bpy.types.Object], None]:
     def add(mesh_object: bpy.types.Object) -> None:
         modifier = mesh_object.modifiers.new("It", kind)
         for name, value in settings.items():
@@ -55,8 +55,8 @@ def at(place: int, kind: str, **settings: object) -> Callable[[bpy.types.Object]
     return add
 
 
-def nodes_at(place: int, *kinds: str) -> Callable[[bpy.types.Object], None]:
+def add_nodes_at(place: int, *kinds: str) -> Callable[[bpy.types.Object], None]:
     def add(mesh_object: bpy.types.Object) -> None:
-        at(place, "NODES", node_group=stacks.chain("Group", *kinds))(mesh_object)
+        add_modifier_at(place, "NODES", node_group=stacks.chain("Group", *kinds))(mesh_object)
 
     return add

@@ -15,12 +15,12 @@ from .. import systems
 from .conftest import run
 from .scene_state import fresh_elbow
 
-PROGRESS = re.compile(
+PROGRESS_LINE = re.compile(
     r"(poses to fit|fit|influences|target|poses|training|evaluation|benchmark|frames): \d+ of \d+, .*"
 )
 
 
-def files(folder: Path) -> dict[str, bytes | None]:
+def file_contents(folder: Path) -> dict[str, bytes | None]:
     """Content of every file below a folder by path; None for a folder."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")
@@ -35,16 +35,16 @@ class Refusal:
 
     def __call__(self, *arguments: object, status: int = 1) -> str:
         """Run a verb that ends with an exit status, and return its sentence."""
-        before = files(self.folder)
+        before = file_contents(self.folder)
         self._capfd.readouterr()
         ended = run(*arguments)
         captured = self._capfd.readouterr()
         assert ended == status, captured
-        lines = [line for line in captured.err.splitlines() if not PROGRESS.fullmatch(line)]
+        lines = [line for line in captured.err.splitlines() if not PROGRESS_LINE.fullmatch(line)]
         assert len(lines) == 1, captured.err
         assert re.fullmatch(r"Error: .+[^.]\.", lines[0]), "a sentence"
         assert "Traceback" not in captured.out and "Error" not in captured.out
-        assert files(self.folder) == before, "files were touched"
+        assert file_contents(self.folder) == before, "files were touched"
         return lines[0].removeprefix("Error: ")
 
 
@@ -56,7 +56,7 @@ def save_elbow(path: Path, change: Callable[[SceneRig], object] = lambda rig: No
 
 
 @contextmanager
-def small_files(limit: int) -> Iterator[None]:
+def limited_file_size(limit: int) -> Iterator[None]:
     """No file grows beyond so many bytes: what a full disk looks like to the one who writes."""
     resource = pytest.importorskip("resource", reason=systems.NO_FILE_SIZE_LIMITS)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -8,10 +8,10 @@ import numpy as np
 
 from .conftest import ELBOW, ELBOW_RIG
 
-REST, WEIGHTS = "the rest pose of the", "the skin weights differ"
+REST_POSE_OF, WEIGHTS_DIFFER = "the rest pose of the", "the skin weights differ"
 
 
-def edit(scene_object: bpy.types.Object, change: Callable[[], object]) -> None:
+def change_in_edit_mode(scene_object: bpy.types.Object, change: Callable[[], object]) -> None:
     """Do something in edit mode, as a script: nothing is evaluated before it is over."""
     bpy.context.view_layer.objects.active = scene_object
     bpy.ops.object.mode_set(mode="EDIT")
@@ -51,7 +51,7 @@ def sort_vertices():
     bpy.ops.mesh.sort_elements(type="REVERSE", elements={"VERT"})
 
 
-def other_mesh():
+def exchange_mesh():
     mesh = bpy.data.meshes["elbow"].copy()
     mesh.vertices.foreach_set("co", np.random.default_rng(0).random(3 * len(mesh.vertices)).astype(np.float32))
     bpy.data.objects[ELBOW].data = mesh
@@ -64,7 +64,7 @@ def write_positions():
     mesh.vertices.foreach_set("co", positions * 1.1)
 
 
-def move_key():
+def move_reference_key():
     bpy.data.objects[ELBOW].data.shape_keys.reference_key.data[0].co.x += 0.05
 
 
@@ -73,39 +73,42 @@ def flip_faces():
     bpy.ops.mesh.flip_normals()
 
 
-def groups() -> bpy.types.VertexGroups:
+def vertex_groups() -> bpy.types.VertexGroups:
     return bpy.data.objects[ELBOW].vertex_groups
 
 
 def remove_group():
-    groups().remove(groups()["lower"])
+    vertex_groups().remove(vertex_groups()["lower"])
 
 
 def rename_bone():
     bpy.data.objects[ELBOW_RIG].data.bones["lower"].name = "elsewhere"
 
 
-NO_BONE = "some vertices follow no bone"
+NO_BONE_FOLLOWED = "some vertices follow no bone"
 
-IN_EDIT_MODE = {
-    "roll": (ELBOW_RIG, change_roll, f"{REST} armature differs"),
-    "head": (ELBOW_RIG, change_head, f"{REST} armature differs"),
+EDIT_MODE_CHANGES = {
+    "roll": (ELBOW_RIG, change_roll, f"{REST_POSE_OF} armature differs"),
+    "head": (ELBOW_RIG, change_head, f"{REST_POSE_OF} armature differs"),
     "parent": (ELBOW_RIG, change_parent, "its joints have other parents"),
     "exchanged joint": (ELBOW_RIG, exchange_joint, "the armature lacks the joint 'lower'"),
-    "sorted vertices": (ELBOW, sort_vertices, f"{REST} mesh differs"),
+    "sorted vertices": (ELBOW, sort_vertices, f"{REST_POSE_OF} mesh differs"),
     "flipped faces": (ELBOW, flip_faces, "the topology of the mesh differs"),
 }
 
-BY_SCRIPT = {
-    "another mesh": (other_mesh, f"{REST} mesh differs"),
-    "positions": (write_positions, f"{REST} mesh differs"),
-    "weights": (lambda: groups()["lower"].add([0, 1], 0.3, "ADD"), WEIGHTS),
-    "a weight": (lambda: change_weight(), WEIGHTS),
-    "a group is gone": (remove_group, NO_BONE),
-    "a group has another name": (lambda: setattr(groups()["lower"], "name", "elsewhere"), NO_BONE),
-    "no deform": (lambda: setattr(bpy.data.objects[ELBOW_RIG].data.bones["lower"], "use_deform", False), NO_BONE),
-    "an inverted group": (lambda: set_modifier(vertex_group="upper"), NO_BONE),
-    "no groups": (lambda: set_modifier(use_vertex_groups=False, use_bone_envelopes=True), WEIGHTS),
+SCRIPT_CHANGES = {
+    "another mesh": (exchange_mesh, f"{REST_POSE_OF} mesh differs"),
+    "positions": (write_positions, f"{REST_POSE_OF} mesh differs"),
+    "weights": (lambda: vertex_groups()["lower"].add([0, 1], 0.3, "ADD"), WEIGHTS_DIFFER),
+    "a weight": (lambda: change_weight(), WEIGHTS_DIFFER),
+    "a group is gone": (remove_group, NO_BONE_FOLLOWED),
+    "a group has another name": (lambda: setattr(vertex_groups()["lower"], "name", "elsewhere"), NO_BONE_FOLLOWED),
+    "no deform": (
+        lambda: setattr(bpy.data.objects[ELBOW_RIG].data.bones["lower"], "use_deform", False),
+        NO_BONE_FOLLOWED,
+    ),
+    "an inverted group": (lambda: set_modifier(vertex_group="upper"), NO_BONE_FOLLOWED),
+    "no groups": (lambda: set_modifier(use_vertex_groups=False, use_bone_envelopes=True), WEIGHTS_DIFFER),
     "bone name": (rename_bone, "the armature lacks the joint 'lower'"),
 }
 

@@ -54,7 +54,7 @@ def scene_state(rig: SceneRig) -> dict:
     }
 
 
-def disarrange(rig: SceneRig) -> None:
+def set_unusual_state(rig: SceneRig) -> None:
     """Bring everything that is borrowed into a state that no default would restore."""
     armature_object = rig.armature_object
     animation = armature_object.animation_data

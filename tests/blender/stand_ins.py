@@ -34,12 +34,12 @@ def stand_in_trainer(folder: Path, monkeypatch: pytest.MonkeyPatch, *lines: str,
     monkeypatch.setenv(PYTHON_VARIABLE, sys.executable)
 
 
-def say(kind: MessageType, **values) -> str:
+def print_message_code(kind: MessageType, **values) -> str:
     """The line of code that says a message."""
     return f"print({Message(kind, values).encode()!r}, flush=True)"
 
 
-def program(path: Path, *lines: str) -> str:
+def write_program(path: Path, *lines: str) -> str:
     """A program in place of a Python, which runs lines; returns its path."""
     script = path.with_name(f"{path.name}.py")
     script.write_text("\n".join(["import json, os, subprocess, sys, time", *lines, ""]), encoding="utf-8")

@@ -16,7 +16,7 @@ from fdda_addon.recording.run import record
 from fdda_addon.scene.scene_rig import SceneRig
 
 from .conftest import run, train
-from .figure import FRAMES, REACH, SMILE, WAVE, add_smile, add_wave, build_figure, edit_bones, key
+from .figure import ARM_REACH, FRAMES, SMILE, WAVE, add_smile, add_wave, build_figure, edit_bones, key_channel
 from .scene_state import assert_same_state, drain, scene_state
 
 HAS_SLOTS = bpy.app.version >= (4, 4, 0)
@@ -70,7 +70,7 @@ def strip_of(rig: SceneRig, action: bpy.types.Action, start: int = 40, name: str
     """Put an action into the NLA, with one below it that turns the spine."""
     animation = rig.armature_object.animation_data
     animation.action = lean = bpy.data.actions.new("lean")
-    key(rig.armature_object.pose.bones["spine"], 1, "rotation_euler", (0, 0, 0.3))
+    key_channel(rig.armature_object.pose.bones["spine"], 1, "rotation_euler", (0, 0, 0.3))
     below = animation.nla_tracks.new()
     below.strips.new("lean", 1, lean).frame_end = 200
     above = animation.nla_tracks.new()
@@ -86,7 +86,7 @@ def test_the_frames_of_a_strip_are_those_of_the_whole_nla(figure, tmp_path):
     shown = played(figure, range(40, 40 + FRAMES))
     other = bpy.data.actions.new("other")
     figure.armature_object.animation_data.action = other
-    key(figure.armature_object.pose.bones["arm.R"], 1, "rotation_quaternion", (0.5, 0.5, 0.5, 0.5))
+    key_channel(figure.armature_object.pose.bones["arm.R"], 1, "rotation_quaternion", (0.5, 0.5, 0.5, 0.5))
     before = scene_state(figure)
     recording = recorded(figure, tmp_path / "recording", strips=("swing",))
     assert_same_state(before, scene_state(figure))
@@ -145,7 +145,7 @@ def test_rigs_that_are_not_the_same_on_both_sides_are_refused(figure, tmp_path):
     edit_bones(figure, lambda edited: setattr(edited["arm.R"], "roll", edited["arm.R"].roll + 0.2))
     assert "the bones 'arm.L' and 'arm.R' differ in roll or direction, by 11.5°" in refusal()
     edit_bones(figure, lambda edited: edited["arm.R"].align_roll((0, -1, 0)))
-    edit_bones(figure, lambda edited: setattr(edited["arm.R"], "tail", (-REACH - 0.01, 0, 0.9)))
+    edit_bones(figure, lambda edited: setattr(edited["arm.R"], "tail", (-ARM_REACH - 0.01, 0, 0.9)))
     assert "the bones 'arm.L' and 'arm.R' differ by 10.0 mm" in refusal()
     edit_bones(figure, lambda edited: edited.remove(edited["arm.R"]))
     assert "there is no bone 'arm.R' for 'arm.L'; add it, or leave mirroring out." in refusal()

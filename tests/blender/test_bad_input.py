@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from .. import systems
-from .refusals import files, save_elbow, small_files
+from .refusals import file_contents, limited_file_size, save_elbow
 
 pytestmark = pytest.mark.one_blender_version
 
@@ -212,7 +212,7 @@ def test_an_output_that_is_a_folder(refusal, writing, tmp_path):
 
 
 def test_a_disk_that_fills_up(refusal_on_a_full_disk, writing, tmp_path):
-    with small_files(100):
+    with limited_file_size(100):
         text = refusal_on_a_full_disk(*writing(tmp_path / "out"))
     assert text.startswith("Cannot write"), text
 
@@ -221,9 +221,9 @@ def test_a_disk_that_fills_up_leaves_the_old_file(refusal_on_a_full_disk, writin
     if writing("")[0] == "record":
         pytest.skip("record replaces nothing")
     (tmp_path / "out").write_text("old")
-    with small_files(100):
+    with limited_file_size(100):
         refusal_on_a_full_disk(*writing(tmp_path / "out"))
-    assert files(tmp_path) == {"out": b"old"}
+    assert file_contents(tmp_path) == {"out": b"old"}
 
 
 def test_a_model_that_cannot_be_copied_beside_the_bound_file(refusal, elbow, tmp_path):

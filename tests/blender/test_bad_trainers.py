@@ -18,7 +18,7 @@ from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 from fdda_addon.training.process import trainer_command
 
 from .conftest import run
-from .stand_ins import say, stand_in_trainer
+from .stand_ins import print_message_code, stand_in_trainer
 
 pytestmark = pytest.mark.one_blender_version
 
@@ -33,8 +33,8 @@ def train(refusal, elbow, tmp_path):
     return run_train
 
 
-STARTED = say(MessageType.STARTED, partitions=1, poses=1, vertices=1, device="cpu")
-PROGRESS = say(MessageType.PROGRESS, epoch=1, epochs=2, validation_mm=0.5)
+STARTED = print_message_code(MessageType.STARTED, partitions=1, poses=1, vertices=1, device="cpu")
+PROGRESS = print_message_code(MessageType.PROGRESS, epoch=1, epochs=2, validation_mm=0.5)
 
 
 def test_a_python_without_torch(train, tmp_path, monkeypatch):
@@ -154,17 +154,19 @@ def test_a_trainer_whose_disk_is_full(elbow, train, tmp_path, monkeypatch, is_si
 
 
 def test_a_trainer_that_fails_in_a_sentence(train, tmp_path, monkeypatch):
-    stand_in_trainer(tmp_path, monkeypatch, STARTED, say(MessageType.FAILED, text="The sky fell; wait."), status=1)
+    stand_in_trainer(
+        tmp_path, monkeypatch, STARTED, print_message_code(MessageType.FAILED, text="The sky fell; wait."), status=1
+    )
     assert train() == "The sky fell; wait."
 
 
 def test_lines_that_are_no_messages_are_passed_over(train, tmp_path, monkeypatch):
     noise = ["print('a warning')", "print('{}')", "sys.stdout.buffer.write(b'\\xfc\\n')", STARTED, "print()"]
-    stand_in_trainer(tmp_path, monkeypatch, *noise, say(MessageType.FAILED, text="Enough."))
+    stand_in_trainer(tmp_path, monkeypatch, *noise, print_message_code(MessageType.FAILED, text="Enough."))
     assert train() == "Enough."
 
 
-@pytest.mark.parametrize("lines", [(STARTED, say(MessageType.CANCELLED)), ()])
+@pytest.mark.parametrize("lines", [(STARTED, print_message_code(MessageType.CANCELLED)), ()])
 def test_a_trainer_that_is_cancelled_by_someone_else(elbow, tmp_path, monkeypatch, lines):
     stand_in_trainer(tmp_path, monkeypatch, *lines, status=130)
     assert run("train", elbow.recording, tmp_path / "m.onnx") == 130

@@ -10,15 +10,22 @@ import pytest
 
 from fdda_addon.scene.blend_file import save_copy
 
-from .baked_files import CLOSE, WAVE, elbow_wave, model_says, plain_blender, read_pc2
+from .baked_files import (
+    POSITION_TOLERANCE,
+    WAVE_FRAMES,
+    predicted_in_frames,
+    predicted_wave,
+    read_pc2,
+    shown_without_add_on,
+)
 from .conftest import ELBOW, ELBOW_RIG, evaluated, run, train
-from .refusals import files, save_elbow
+from .refusals import file_contents, save_elbow
 from .scene_state import fresh_elbow
 
 
 @pytest.fixture(scope="module")
 def wave(elbow) -> np.ndarray:
-    return elbow_wave(elbow)
+    return predicted_wave(elbow)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +45,7 @@ class TestFiles:
         assert np.abs(positions - wave).max() < 1e-6 < np.abs(np.diff(wave, axis=0)).max()
 
     def test_only_these_files_are_written(self, baked):
-        assert sorted(files(baked)) == ["cache.blend", "cache.pc2", "keys.blend", "walk.pc2"]
+        assert sorted(file_contents(baked)) == ["cache.blend", "cache.pc2", "keys.blend", "walk.pc2"]
         assert (baked / "cache.pc2").read_bytes() == (baked / "walk.pc2").read_bytes()
 
     @pytest.mark.parametrize("name", ["cache.blend", "keys.blend"])
@@ -55,16 +62,16 @@ class TestWithoutTheAddOn:
         """Every frame, between frames, before the first and after the last; also from another folder."""
         moved = shutil.copytree(baked, tmp_path / "moved")
         (moved / "walk.pc2").unlink()
-        inside, between = list(map(float, WAVE)), 8.25
+        inside, between = list(map(float, WAVE_FRAMES)), 8.25
         times = [*inside, between, -5.0, 99.0]
         jobs = [(folder / name, times) for name in ("cache.blend", "keys.blend") for folder in (baked, moved)]
-        shown = plain_blender(tmp_path, *jobs)
+        shown = shown_without_add_on(tmp_path, *jobs)
         for path, _ in jobs:
             frames = np.array([shown[path, time] for time in inside])
-            assert np.abs(frames - wave).max() < CLOSE
-            assert np.abs(shown[path, between] - (0.75 * wave[7] + 0.25 * wave[8])).max() < CLOSE
-            assert np.abs(shown[path, -5.0] - wave[0]).max() < CLOSE
-            assert np.abs(shown[path, 99.0] - wave[-1]).max() < CLOSE
+            assert np.abs(frames - wave).max() < POSITION_TOLERANCE
+            assert np.abs(shown[path, between] - (0.75 * wave[7] + 0.25 * wave[8])).max() < POSITION_TOLERANCE
+            assert np.abs(shown[path, -5.0] - wave[0]).max() < POSITION_TOLERANCE
+            assert np.abs(shown[path, 99.0] - wave[-1]).max() < POSITION_TOLERANCE
 
     def test_the_cache_that_moved_along_is_the_one_that_plays(self, baked, tmp_path):
         moved = shutil.copytree(baked, tmp_path / "moved")
@@ -72,7 +79,7 @@ class TestWithoutTheAddOn:
         data[32:] = np.ones((len(data) - 32) // 4, "<f4").tobytes()
         (moved / "cache.pc2").write_bytes(data)
         path = moved / "cache.blend"
-        assert (plain_blender(tmp_path, (path, [4.0]))[path, 4.0] == 1).all()
+        assert (shown_without_add_on(tmp_path, (path, [4.0]))[path, 4.0] == 1).all()
 
     def test_an_output_in_another_folder_than_the_rig(self, elbow, wave, tmp_path, monkeypatch):
         (tmp_path / "in").mkdir()
@@ -82,7 +89,7 @@ class TestWithoutTheAddOn:
         assert run("bake", rig, elbow.model, "out/a.blend") == 0
         bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "a.blend"))
         assert bpy.data.objects[ELBOW].modifiers[0].filepath == "//a.pc2"
-        assert np.abs(evaluated(bpy.data.objects[ELBOW]) - wave[0]).max() < CLOSE
+        assert np.abs(evaluated(bpy.data.objects[ELBOW]) - wave[0]).max() < POSITION_TOLERANCE
 
     def test_a_subdivision_above_stays_live(self, elbow, wave, tmp_path):
         def subdivide(rig):
@@ -95,7 +102,7 @@ class TestWithoutTheAddOn:
             assert run("bake", rig, elbow.model, out, "--action", "elbow_wave", *options) == 0
         bpy.ops.wm.open_mainfile(filepath=str(outs[0]))
         assert [m.type for m in bpy.data.objects[ELBOW].modifiers] == ["MESH_CACHE", "SUBSURF"]
-        shown = plain_blender(tmp_path, *((out, [10.0]) for out in outs))
+        shown = shown_without_add_on(tmp_path, *((out, [10.0]) for out in outs))
         mesh_object = fresh_elbow().mesh_object
         mesh_object.modifiers.clear()
         mesh_object.data.attributes["position"].data.foreach_set("vector", wave[9].reshape(-1))
@@ -103,7 +110,7 @@ class TestWithoutTheAddOn:
         expected = evaluated(mesh_object)
         assert len(expected) > 3 * len(wave[9])
         for out in outs:
-            assert np.abs(shown[out, 10.0] - expected).max() < CLOSE
+            assert np.abs(shown[out, 10.0] - expected).max() < POSITION_TOLERANCE
 
     def test_keys_of_the_mesh_and_a_parent_that_deforms_do_not_show(self, elbow, wave, tmp_path):
         """The mesh that another object shares keeps its own keys."""
@@ -123,14 +130,14 @@ class TestWithoutTheAddOn:
         outs = [tmp_path / "cache.blend", tmp_path / "keys.blend"]
         for out, options in zip(outs, ([], ["--shape-keys"]), strict=True):
             assert run("bake", rig, elbow.model, out, "--action", "elbow_wave", *options) == 0
-        shown = plain_blender(tmp_path, *((out, [1.0, 10.0]) for out in outs))
+        shown = shown_without_add_on(tmp_path, *((out, [1.0, 10.0]) for out in outs))
         for out in outs:
-            assert np.abs(shown[out, 10.0] - wave[9]).max() < CLOSE
-            assert np.abs(shown[out, 1.0] - wave[0]).max() < CLOSE
+            assert np.abs(shown[out, 10.0] - wave[9]).max() < POSITION_TOLERANCE
+            assert np.abs(shown[out, 1.0] - wave[0]).max() < POSITION_TOLERANCE
         bpy.ops.wm.open_mainfile(filepath=str(outs[1]))
         assert [key.name for key in bpy.data.objects["twin"].data.shape_keys.key_blocks] == ["Basis", "Fat"]
         keys = bpy.data.objects[ELBOW].data.shape_keys.key_blocks
-        assert [key.name for key in keys] == ["Basis", *(f"Frame {frame}" for frame in WAVE)]
+        assert [key.name for key in keys] == ["Basis", *(f"Frame {frame}" for frame in WAVE_FRAMES)]
 
 
 class TestLinked:
@@ -167,8 +174,8 @@ class TestLinked:
         path = shot(override=True)
         out = tmp_path / "a.blend"
         assert run("bake", path, elbow.model, out, "--frames", 1, 30, *options) == 0
-        shown = plain_blender(tmp_path, (out, [9.0]))
-        assert np.abs(shown[out, 9.0] - wave[8]).max() < CLOSE
+        shown = shown_without_add_on(tmp_path, (out, [9.0]))
+        assert np.abs(shown[out, 9.0] - wave[8]).max() < POSITION_TOLERANCE
 
 
 def test_controls_are_baked_along(tmp_path):
@@ -189,11 +196,11 @@ def test_controls_are_baked_along(tmp_path):
     assert run("bake", rig, model, out, "--action", "elbow_wave", "--shape-keys") == 0
     assert run("bake", rig, model, tmp_path / "a.pc2", "--action", "elbow_wave") == 0
     bpy.ops.wm.open_mainfile(filepath=str(rig))
-    expected = model_says(WAVE, model)
+    expected = predicted_in_frames(WAVE_FRAMES, model)
     keys = bpy.data.objects[ELBOW].data.shape_keys
     keys.animation_data_clear()
     keys.key_blocks["Fat"].value = 0.0
-    assert np.abs(model_says([20], model)[0] - expected[19]).max() > 0.01, "the key matters"
+    assert np.abs(predicted_in_frames([20], model)[0] - expected[19]).max() > 0.01, "the key matters"
     assert np.abs(read_pc2(tmp_path / "a.pc2")[2] - expected).max() < 1e-6
-    shown = plain_blender(tmp_path, (out, [20.0]))
-    assert np.abs(shown[out, 20.0] - expected[19]).max() < CLOSE
+    shown = shown_without_add_on(tmp_path, (out, [20.0]))
+    assert np.abs(shown[out, 20.0] - expected[19]).max() < POSITION_TOLERANCE

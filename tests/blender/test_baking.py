@@ -8,15 +8,15 @@ import pytest
 from fdda_addon.baking.run import MAX_BATCH_FRAMES, BakeSettings, bake
 from fdda_addon.scene.scene_rig import find_rig
 
-from .baked_files import CLOSE, elbow_wave, model_says, read_pc2
+from .baked_files import POSITION_TOLERANCE, predicted_in_frames, predicted_wave, read_pc2
 from .conftest import ELBOW, ELBOW_RIG, evaluated, run
-from .refusals import files, save_elbow
-from .scene_state import assert_same_state, disarrange, drain, fresh_elbow, scene_state
+from .refusals import file_contents, save_elbow
+from .scene_state import assert_same_state, drain, fresh_elbow, scene_state, set_unusual_state
 
 
 @pytest.fixture(scope="module")
 def wave(elbow) -> np.ndarray:
-    return elbow_wave(elbow)
+    return predicted_wave(elbow)
 
 
 def test_more_frames_than_a_batch_take(elbow, tmp_path):
@@ -26,7 +26,7 @@ def test_more_frames_than_a_batch_take(elbow, tmp_path):
     start, _, positions = read_pc2(out)
     bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
     assert start == -9 and len(positions) == len(frames)
-    assert np.abs(positions - model_says(frames, elbow.model)).max() < 1e-6
+    assert np.abs(positions - predicted_in_frames(frames, elbow.model)).max() < 1e-6
 
 
 def test_what_is_printed(elbow, tmp_path, capfd):
@@ -64,7 +64,7 @@ def test_the_scene_as_it_is_animated(elbow, wave, tmp_path):
     assert run("bake", rig, elbow.model, tmp_path / "scene.pc2", "--frames", 5, 12) == 0
     assert run("bake", rig, elbow.model, tmp_path / "action.blend", "--action", "elbow_wave") == 0
     bpy.ops.wm.open_mainfile(filepath=str(rig))
-    expected = model_says(range(5, 13), elbow.model)
+    expected = predicted_in_frames(range(5, 13), elbow.model)
     _, _, scene = read_pc2(tmp_path / "scene.pc2")
     assert np.abs(scene - expected).max() < 1e-6 and np.abs(scene - wave[4:12]).max() > 0.01
     assert np.abs(read_pc2(tmp_path / "action.pc2")[2] - wave).max() < 1e-6
@@ -81,14 +81,14 @@ def test_a_bound_file(elbow, wave, tmp_path):
     assert not mesh_object.fdda.is_bound and [m.type for m in mesh_object.modifiers] == ["MESH_CACHE"]
     assert len(bpy.data.objects) == 2
     bpy.context.scene.frame_set(17)
-    assert np.abs(evaluated(mesh_object) - wave[16]).max() < CLOSE
+    assert np.abs(evaluated(mesh_object) - wave[16]).max() < POSITION_TOLERANCE
 
 
 class TestBorrowed:
     @pytest.fixture
     def disarranged(self):
         rig = fresh_elbow()
-        disarrange(rig)
+        set_unusual_state(rig)
         return rig
 
     @pytest.mark.parametrize("out", ["a.pc2", "a.blend", "keys.blend"])
@@ -109,7 +109,7 @@ class TestBorrowed:
             settings = BakeSettings("elbow_wave", shape_keys=name.startswith("keys"))
             drain(bake(disarranged, elbow.model, tmp_path / name, settings), stop_after=3 + number)
             assert_same_state(before, scene_state(disarranged))
-        assert files(tmp_path) == {}
+        assert file_contents(tmp_path) == {}
 
     def test_what_hides_in_some_frames_is_baked_in_all(self, elbow, wave, tmp_path):
         rig = fresh_elbow()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from .conftest import run
-from .refusals import files, save_elbow, small_files
+from .refusals import file_contents, limited_file_size, save_elbow
 
 
 class TestRefusals:
@@ -43,7 +43,7 @@ class TestRefusals:
         assert run("bake", elbow.rig, elbow.model, tmp_path / out, *options) == 2
         captured = capfd.readouterr()
         assert words in captured.err and captured.err.count("\n") == 1 and not captured.out
-        assert files(tmp_path) == {}
+        assert file_contents(tmp_path) == {}
 
     def test_the_file_of_the_rig(self, refusal, elbow, tmp_path):
         rig = shutil.copy(elbow.rig, tmp_path / "rig.blend")
@@ -74,7 +74,7 @@ class TestRefusals:
         rig = save_elbow(tmp_path / "rig.blend", fatten)
         for name in ("a.pc2", "a.blend"):
             (tmp_path / name).write_text("old")
-        with small_files(limit):
+        with limited_file_size(limit):
             text = refusal_on_a_full_disk("bake", rig, elbow.model, tmp_path / out, *options)
         assert re.match(f"Cannot write '{tmp_path / 'a'}.", text)
 

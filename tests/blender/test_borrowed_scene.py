@@ -13,13 +13,13 @@ from fdda_addon.runtime.binding import model_disabled
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 from fdda_addon.timing.benchmark import benchmark
 
-from .scene_state import assert_same_state, disarrange, drain, fresh_elbow, scene_state
+from .scene_state import assert_same_state, drain, fresh_elbow, scene_state, set_unusual_state
 
 
 @pytest.fixture
 def disarranged() -> SceneRig:
     rig = fresh_elbow()
-    disarrange(rig)
+    set_unusual_state(rig)
     return rig
 
 
@@ -140,7 +140,7 @@ def test_an_armature_modifier_that_is_off_is_refused(disarranged, tmp_path):
 
 @pytest.mark.parametrize("step", [None, 3, 12])
 def test_evaluating(rig, elbow, step):
-    disarrange(rig)
+    set_unusual_state(rig)
     before = scene_state(rig)
     drain(evaluate(rig, elbow.model, EVALUATION), stop_after=step)
     assert_same_state(before, scene_state(rig))
@@ -148,7 +148,7 @@ def test_evaluating(rig, elbow, step):
 
 @pytest.mark.parametrize("step", [None, 2])
 def test_timing(rig, elbow, step):
-    disarrange(rig)
+    set_unusual_state(rig)
     before = scene_state(rig)
     drain(benchmark(rig, elbow.model, 5), stop_after=step)
     assert_same_state(before, scene_state(rig))

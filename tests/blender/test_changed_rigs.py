@@ -12,17 +12,17 @@ from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
 from .rig_changes import (
-    BY_SCRIPT,
-    IN_EDIT_MODE,
-    REST,
-    WEIGHTS,
+    EDIT_MODE_CHANGES,
+    REST_POSE_OF,
+    SCRIPT_CHANGES,
+    WEIGHTS_DIFFER,
     add_bone,
+    change_in_edit_mode,
     change_roll,
-    edit,
     edit_bones,
     flip_faces,
-    groups,
-    move_key,
+    move_reference_key,
+    vertex_groups,
 )
 from .test_evaluations import keyed
 from .test_player_batch import crowd_of
@@ -48,19 +48,19 @@ def look(when: str) -> None:
 
 
 @pytest.mark.parametrize("when", ["update", "frame"])
-@pytest.mark.parametrize("what", IN_EDIT_MODE)
+@pytest.mark.parametrize("what", EDIT_MODE_CHANGES)
 def test_an_edit_gives_the_rig_back(bound, what, when, capsys):
-    name, change, clause = IN_EDIT_MODE[what]
+    name, change, clause = EDIT_MODE_CHANGES[what]
     pose(angle=1.0)
-    edit(bpy.data.objects[name], change)
+    change_in_edit_mode(bpy.data.objects[name], change)
     look(when)
     assert_given_back(bound, clause, capsys)
 
 
 @pytest.mark.parametrize("when", ["update", "frame"])
-@pytest.mark.parametrize("what", BY_SCRIPT)
+@pytest.mark.parametrize("what", SCRIPT_CHANGES)
 def test_a_script_gives_the_rig_back(bound, what, when, capsys):
-    change, clause = BY_SCRIPT[what]
+    change, clause = SCRIPT_CHANGES[what]
     pose(angle=1.0)
     change()
     look(when)
@@ -71,25 +71,25 @@ def test_the_reference_key_gives_the_rig_back(bound, capsys):
     keyed(bound)
     pose(angle=1.0)
     assert not bound.fdda.status
-    move_key()
+    move_reference_key()
     look("update")
-    assert_given_back(bound, f"{REST} mesh differs", capsys)
+    assert_given_back(bound, f"{REST_POSE_OF} mesh differs", capsys)
 
 
 def test_data_of_another_object_give_the_rig_back(bound, capsys):
     """The armature is edited, and the mesh is, through an object that has nothing to do with the character."""
     for scene_object, change, clause in (
-        (bpy.data.objects[ELBOW_RIG], change_roll, f"{REST} armature differs"),
+        (bpy.data.objects[ELBOW_RIG], change_roll, f"{REST_POSE_OF} armature differs"),
         (bound, flip_faces, "the topology of the mesh differs"),
     ):
         other = bpy.data.objects.new("other", scene_object.data)
         bpy.context.scene.collection.objects.link(other)
         pose(angle=1.0)
-        edit(other, change)
+        change_in_edit_mode(other, change)
         look("update")
         assert_given_back(bound, clause, capsys)
         if scene_object.type == "ARMATURE":
-            edit(other, lambda: setattr(edit_bones()["lower"], "roll", edit_bones()["lower"].roll - 0.4))
+            change_in_edit_mode(other, lambda: setattr(edit_bones()["lower"], "roll", edit_bones()["lower"].roll - 0.4))
             bound.fdda.mode = "FDDA"
             look("update")
             assert not bound.fdda.status
@@ -104,26 +104,26 @@ def test_bones_that_are_no_joints_may_come_go_and_change_places(bound, elbow, wh
     def names():
         return [bone.name for bone in rig.data.bones]
 
-    edit(rig, lambda: (add_bone("a"), add_bone("b"), add_bone("c", "upper")))
+    change_in_edit_mode(rig, lambda: (add_bone("a"), add_bone("b"), add_bone("c", "upper")))
     look(when)
     pose(angle=0.7)
     assert_plays(bound, elbow.model)
     seen = {names().index("lower")}
     for bone, parent in (("upper", "a"), ("a", "b"), ("upper", ""), ("b", "upper"), ("c", "a"), ("c", "")):
-        edit(rig, lambda b=bone, p=parent: setattr(edit_bones()[b], "parent", edit_bones().get(p)))
+        change_in_edit_mode(rig, lambda b=bone, p=parent: setattr(edit_bones()[b], "parent", edit_bones().get(p)))
         seen.add(names().index("lower"))
         look(when)
         pose(angle=0.9)
         assert_plays(bound, elbow.model)
     assert len(seen) > 1
-    edit(rig, lambda: edit_bones().remove(edit_bones()["a"]))
+    change_in_edit_mode(rig, lambda: edit_bones().remove(edit_bones()["a"]))
     look(when)
     assert_plays(bound, elbow.model)
     assert bound.fdda.mode == "FDDA"
 
 
 def test_an_edit_that_changes_nothing_of_the_rig(bound, elbow):
-    edit(bound, lambda: bpy.ops.mesh.select_all(action="SELECT"))
+    change_in_edit_mode(bound, lambda: bpy.ops.mesh.select_all(action="SELECT"))
     bound.vertex_groups.new(name="no bone").add([0, 5], 0.5, "REPLACE")
     bound.data.attributes.new("color", "FLOAT_COLOR", "POINT")
     look("update")
@@ -144,15 +144,15 @@ def test_objects_that_move_on_their_own_play_on(bound, elbow):
 
 def test_a_change_while_no_model_played(bound, capsys):
     bound.fdda.mode = "RIG"
-    edit(bpy.data.objects[ELBOW_RIG], change_roll)
+    change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_roll)
     bound.fdda.mode = "FDDA"
     look("update")
-    assert_given_back(bound, f"{REST} armature differs", capsys)
+    assert_given_back(bound, f"{REST_POSE_OF} armature differs", capsys)
 
 
 def test_undone_it_plays_again(bound, elbow):
     bpy.ops.ed.undo_push(message="start")
-    edit(bpy.data.objects[ELBOW_RIG], change_roll)
+    change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_roll)
     bpy.context.view_layer.update()
     assert bound.fdda.mode == "RIG"
     bpy.ops.ed.undo_push(message="roll")
@@ -168,17 +168,17 @@ def test_undone_it_plays_again(bound, elbow):
 def test_weights_that_an_undo_brings_back(bound):
     """What is written without an evaluation is found by the undo that reads it."""
     bound.fdda.mode = "RIG"
-    groups()["lower"].add([0], 0.3, "ADD")
+    vertex_groups()["lower"].add([0], 0.3, "ADD")
     bpy.context.view_layer.update()
     bpy.ops.ed.undo_push(message="other weights")
-    groups()["lower"].add([0], 0.3, "SUBTRACT")
+    vertex_groups()["lower"].add([0], 0.3, "SUBTRACT")
     bound.fdda.mode = "FDDA"
     bpy.context.view_layer.update()
     bpy.ops.ed.undo_push(message="weights as before")
     bpy.ops.ed.undo()
     bpy.data.objects[ELBOW].fdda.mode = "FDDA"
     bpy.context.view_layer.update()
-    assert WEIGHTS in bpy.data.objects[ELBOW].fdda.status
+    assert WEIGHTS_DIFFER in bpy.data.objects[ELBOW].fdda.status
 
 
 def test_a_file_in_which_the_rig_was_changed_without_the_addon(bound, tmp_path, capsys):
@@ -186,13 +186,13 @@ def test_a_file_in_which_the_rig_was_changed_without_the_addon(bound, tmp_path, 
 
     path = bpy.data.filepath.replace("bound.blend", "changed.blend")
     fdda_addon.unregister()
-    edit(bpy.data.objects[ELBOW_RIG], change_roll)
+    change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_roll)
     bpy.ops.wm.save_as_mainfile(filepath=path, copy=True)
     fdda_addon.register()
     capsys.readouterr()
     bpy.ops.wm.open_mainfile(filepath=path)
     bpy.context.view_layer.update()
-    assert_given_back(bpy.data.objects[ELBOW], f"{REST} armature differs", capsys)
+    assert_given_back(bpy.data.objects[ELBOW], f"{REST_POSE_OF} armature differs", capsys)
 
 
 @pytest.mark.parametrize("is_reloaded", [False, True], ids=["opened", "reloaded"])
@@ -250,12 +250,12 @@ def test_the_mode_of_the_mesh_holds_the_check_back(bound, capsys):
     pose(angle=1.0)
     bpy.context.view_layer.objects.active = bound
     bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
-    groups()["lower"].add([0, 1], 0.3, "ADD")
+    vertex_groups()["lower"].add([0, 1], 0.3, "ADD")
     bpy.context.view_layer.update()
     assert bound.fdda.mode == "FDDA" and not bound.fdda.status
     bpy.ops.object.mode_set(mode="OBJECT")
     bpy.context.view_layer.update()
-    assert_given_back(bound, WEIGHTS, capsys)
+    assert_given_back(bound, WEIGHTS_DIFFER, capsys)
 
 
 def test_playback_and_posing_read_no_rig(bound, elbow, monkeypatch):
@@ -279,6 +279,6 @@ def test_playback_and_posing_read_no_rig(bound, elbow, monkeypatch):
 
 def test_the_joints_of_a_model_keep_their_order(bound):
     rig = bpy.data.objects[ELBOW_RIG]
-    edit(rig, lambda: (add_bone("a", "upper"), add_bone("b", "a")))
+    change_in_edit_mode(rig, lambda: (add_bone("a", "upper"), add_bone("b", "a")))
     info = network_of(bound).info
     assert read_model_rig(find_rig(), info).joints == info.joints

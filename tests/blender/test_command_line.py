@@ -21,7 +21,7 @@ from fdda_addon.scene import blend_file
 from fdda_addon.scene.scene_rig import SceneRig
 
 from .conftest import assert_plays, evaluated, pose, run
-from .refusals import files, save_elbow
+from .refusals import file_contents, save_elbow
 
 
 @pytest.mark.parametrize("arguments", [["--help"], *([verb, "--help"] for verb in VERBS)], ids=" ".join)
@@ -71,7 +71,7 @@ def test_wrong_usage(arguments, capfd, tmp_path, monkeypatch):
     captured = capfd.readouterr()
     assert captured.err.strip() and not captured.out
     assert "Traceback" not in captured.err
-    assert files(tmp_path) == {}
+    assert file_contents(tmp_path) == {}
 
 
 def test_a_full_disk_is_no_fault_of_the_user(tmp_path, monkeypatch, capfd):
@@ -97,13 +97,13 @@ def test_train_passes_its_options_on(elbow, tmp_path, capfd):
     captured = capfd.readouterr()
     assert captured.out.splitlines()[-1].startswith(f"{model}: trained in ")
     assert "training: 3 of 3, " in captured.err and "validation " in captured.err
-    assert sorted(files(tmp_path)) == ["m.checkpoint.npz", "m.onnx", "report.html", "report.json"]
+    assert sorted(file_contents(tmp_path)) == ["m.checkpoint.npz", "m.onnx", "report.html", "report.json"]
 
 
 def test_an_impossible_setting_fails(elbow, tmp_path, capfd):
     assert run("train", elbow.recording, tmp_path / "m.onnx", "--learning-rate", -1) == 1
     assert "learning_rate cannot be -1.0" in capfd.readouterr().err
-    assert files(tmp_path) == {}
+    assert file_contents(tmp_path) == {}
 
 
 def test_record_prints_lines_where_there_is_no_terminal(elbow, tmp_path, capfd):
@@ -210,7 +210,7 @@ def test_a_bound_file_that_cannot_be_saved_leaves_no_copy_of_the_model(elbow, tm
 
     monkeypatch.setattr(blend_file, "save_copy", fail)
     assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend") == 1
-    assert files(tmp_path) == {}
+    assert file_contents(tmp_path) == {}
 
 
 def test_a_model_in_the_folder_or_below_stays_where_it_is(elbow, tmp_path, monkeypatch):
@@ -218,7 +218,7 @@ def test_a_model_in_the_folder_or_below_stays_where_it_is(elbow, tmp_path, monke
     shutil.copy(elbow.model, tmp_path / "models" / "m.onnx")
     monkeypatch.chdir(tmp_path)
     assert run("bind", elbow.rig, "models/m.onnx", "bound.blend") == 0
-    assert sorted(files(tmp_path)) == ["bound.blend", "models", "models/m.onnx"]
+    assert sorted(file_contents(tmp_path)) == ["bound.blend", "models", "models/m.onnx"]
     mesh_object = opened(tmp_path / "bound.blend")
     assert mesh_object.fdda.model == "//models/m.onnx"
     pose(angle=1.0)
@@ -271,7 +271,7 @@ def test_a_bound_file_shows_the_rig_without_the_add_on(elbow, tmp_path):
 def test_recording_a_bound_file_records_the_rig(elbow, tmp_path):
     assert run("record", elbow.bound, tmp_path / "bound", "--poses", 5) == 0
     assert run("record", elbow.rig, tmp_path / "rig", "--poses", 5) == 0
-    first, second = (files(tmp_path / name) for name in ("bound", "rig"))
+    first, second = (file_contents(tmp_path / name) for name in ("bound", "rig"))
     assert first["residuals.npy"] == second["residuals.npy"]
 
 

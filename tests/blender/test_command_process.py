@@ -15,7 +15,7 @@ from fdda_addon.core.recording.index import read_index
 from fdda_addon.recording.appender import BATCH_POSES
 
 from .conftest import run
-from .refusals import files
+from .refusals import file_contents
 
 ROOT = Path(__file__).resolve().parents[2]
 POSES = 8 * BATCH_POSES
@@ -124,7 +124,7 @@ def test_an_interrupted_recording_resumes(elbow, tmp_path):
     assert 0 < done < POSES
     assert run("record", elbow.rig, path, *options, "--resume") == 0
     assert run("record", elbow.rig, tmp_path / "whole", *options) == 0
-    assert files(path) == files(tmp_path / "whole")
+    assert file_contents(path) == file_contents(tmp_path / "whole")
 
 
 def test_a_recording_that_is_killed_resumes(elbow, tmp_path):
@@ -137,7 +137,7 @@ def test_a_recording_that_is_killed_resumes(elbow, tmp_path):
     assert 0 < complete(path) < POSES
     assert run("record", elbow.rig, path, "--poses", POSES, "--resume") == 0
     assert run("record", elbow.rig, tmp_path / "whole", "--poses", POSES) == 0
-    assert files(path) == files(tmp_path / "whole")
+    assert file_contents(path) == file_contents(tmp_path / "whole")
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_an_interrupted_training_leaves_neither_model_nor_trainer(elbow, tmp_pat
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert "Traceback" not in err and out == ""
-    assert files(tmp_path) == {}
+    assert file_contents(tmp_path) == {}
     commands = [path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if path.is_file()]
     assert not any(os.fsencode(tmp_path) in command for command in commands)
 
@@ -170,7 +170,7 @@ def test_ctrl_c_while_classes_are_registered(elbow, tmp_path):
     (tmp_path / "sitecustomize.py").write_text(REGISTRATION_HOOK)
     status, out, err = finish("record", elbow.rig, tmp_path / "r", "--poses", 10_000, PYTHONPATH=str(tmp_path))
     assert (status, out, err) == (130, "", "Interrupted.\n")
-    assert files(tmp_path / "r") == {}
+    assert file_contents(tmp_path / "r") == {}
 
 
 def test_names_on_a_console_of_another_country(tmp_path):

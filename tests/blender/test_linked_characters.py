@@ -13,15 +13,15 @@ from .linked import (
     ANGLES,
     COLLECTION,
     armature_of,
-    assert_play,
-    bend,
+    assert_overrides_play,
+    bend_elbow,
     buffer_name,
-    elsewhere,
-    link,
-    override,
-    own_characters,
-    save_and_open,
-    shot,
+    link_character,
+    overridden_meshes,
+    override_character,
+    run_in_another_process,
+    save_and_reopen_shot,
+    shot_path,
 )
 from .test_renders import render_positions, rig_pixels, set_camera, still
 
@@ -29,60 +29,60 @@ CROWD = 20
 
 
 def test_overrides_play_their_own_poses(pair, library):
-    assert_play(library)
-    bend(pair[0], 0.8)
-    assert_play(library, (0.8, 1.4))
+    assert_overrides_play(library)
+    bend_elbow(pair[0], 0.8)
+    assert_overrides_play(library, (0.8, 1.4))
 
 
 @pytest.mark.parametrize("is_editable", [True, False], ids=["editable", "system override"])
 def test_overrides_play_when_the_shot_is_opened_elsewhere(library, tmp_path, is_editable):
-    collection = link(library.path)
+    collection = link_character(library.path)
     for angle in ANGLES:
-        override(collection, angle, is_editable)
-    assert_play(library)
-    bpy.ops.wm.save_as_mainfile(filepath=str(shot(tmp_path)))
-    assert_play(library)
-    elsewhere(f"open_shot({str(shot(tmp_path))!r}, {str(library.model)!r})")
+        override_character(collection, angle, is_editable)
+    assert_overrides_play(library)
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(tmp_path)))
+    assert_overrides_play(library)
+    run_in_another_process(f"open_shot({str(shot_path(tmp_path))!r}, {str(library.model)!r})")
 
 
 def test_overrides_follow_their_actions(library, tmp_path):
-    collection = link(library.path)
-    override(collection)
-    second = override(collection)
+    collection = link_character(library.path)
+    override_character(collection)
+    second = override_character(collection)
     armature_object = armature_of(second)
     armature_object.animation_data.action = None
     for frame, angle in ((1, 1.5), (30, 0.1)):
-        bend(second, angle)
+        bend_elbow(second, angle)
         armature_object.pose.bones["lower"].keyframe_insert("rotation_euler", index=0, frame=frame)
-    save_and_open(tmp_path)
+    save_and_reopen_shot(tmp_path)
     seen = []
     for frame in (2, 15, 27):
         bpy.context.scene.frame_set(frame)
-        seen.append([assert_plays(mesh_object, library.model) for mesh_object in own_characters()])
+        seen.append([assert_plays(mesh_object, library.model) for mesh_object in overridden_meshes()])
         assert np.abs(seen[-1][0] - seen[-1][1]).max() > 1e-3
     assert np.abs(seen[0][1] - seen[2][1]).max() > 1e-2
 
 
 def test_overrides_after_undo_and_redo(pair, library):
-    assert_play(library)
+    assert_overrides_play(library)
     bpy.ops.ed.undo_push(message="start")
-    bend(pair[0], 0.9)
+    bend_elbow(pair[0], 0.9)
     bpy.context.view_layer.update()
     bpy.ops.ed.undo_push(message="bent")
     pair[1].fdda.mode = "RIG"
     bpy.context.view_layer.update()
     bpy.ops.ed.undo_push(message="rig")
     bpy.ops.ed.undo()
-    assert_play(library, (0.9, 1.4))
+    assert_overrides_play(library, (0.9, 1.4))
     bpy.ops.ed.undo()
-    assert_play(library)
+    assert_overrides_play(library)
     bpy.ops.ed.redo()
     bpy.ops.ed.redo()
-    first, second = own_characters()
+    first, second = overridden_meshes()
     assert (second.fdda.mode, second.fdda.is_playing) == ("RIG", False)
     assert_plays(first, library.model)
     second.fdda.mode = "FDDA"
-    assert_play(library, (0.9, 1.4))
+    assert_overrides_play(library, (0.9, 1.4))
 
 
 @pytest.mark.parametrize("use_in_render", [False, True])
@@ -97,12 +97,12 @@ def test_renders_of_overrides(pair, library, tmp_path, use_in_render):
     rig = rig_pixels(first, tmp_path)
     assert not np.array_equal(model, rig)
     assert np.array_equal(rendered, model if use_in_render else rig)
-    assert_play(library)
+    assert_overrides_play(library)
 
 
 def test_a_linked_character_without_override_plays_its_action(library, tmp_path):
-    bpy.context.scene.collection.children.link(link(library.path))
-    save_and_open(tmp_path)
+    bpy.context.scene.collection.children.link(link_character(library.path))
+    save_and_reopen_shot(tmp_path)
     linked = next(o for o in bpy.context.scene.objects if o.type == "MESH")
     assert linked.library is not None and linked.override_library is None
     frames = [assert_plays(linked, library.model) for f in (5, 12, 25) if not bpy.context.scene.frame_set(f)]
@@ -117,25 +117,25 @@ def test_a_linked_character_without_override_plays_its_action(library, tmp_path)
 def test_an_override_of_what_plays_already(library, tmp_path):
     """As users do it: link with an instance, then make an override of what it shows."""
     empty = bpy.data.objects.new("instance", None)
-    empty.instance_type, empty.instance_collection = "COLLECTION", link(library.path)
+    empty.instance_type, empty.instance_collection = "COLLECTION", link_character(library.path)
     bpy.context.scene.collection.objects.link(empty)
     bpy.context.scene.frame_set(9)
     empty.select_set(True)
     bpy.context.view_layer.objects.active = empty
     bpy.ops.object.make_override_library()
-    mesh_object = own_characters()[0]
+    mesh_object = overridden_meshes()[0]
     armature_of(mesh_object).animation_data.action = None
-    bend(mesh_object, 0.8)
-    assert_play(library, (0.8,))
+    bend_elbow(mesh_object, 0.8)
+    assert_overrides_play(library, (0.8,))
     assert playback_modifier.buffer_of(playback_modifier.find_modifier(mesh_object)).is_runtime_data
-    save_and_open(tmp_path)
-    assert_play(library, (0.8,))
+    save_and_reopen_shot(tmp_path)
+    assert_overrides_play(library, (0.8,))
 
 
 @pytest.mark.parametrize("is_linked", [True, False], ids=["linked", "local"])
 def test_instances_of_a_collection_show_one_pose(library, is_linked):
     if is_linked:
-        collection = link(library.path)
+        collection = link_character(library.path)
     else:
         bpy.ops.wm.open_mainfile(filepath=str(library.path))
         collection = bpy.data.collections[COLLECTION]
@@ -165,16 +165,16 @@ def test_a_duplicated_override_has_its_own_positions(pair, library, tmp_path):
     bpy.ops.object.duplicate()
     copy = next(o for o in bpy.context.selected_objects if o.type == "MESH")
     assert copy not in pair and copy.override_library and armature_of(copy) != armature_of(pair[1])
-    bend(copy, 0.7)
-    assert_play(library, (*ANGLES, 0.7))
-    assert len({buffer_name(o) for o in own_characters()}) == 3
-    save_and_open(tmp_path)
-    assert_play(library, (*ANGLES, 0.7))
+    bend_elbow(copy, 0.7)
+    assert_overrides_play(library, (*ANGLES, 0.7))
+    assert len({buffer_name(o) for o in overridden_meshes()}) == 3
+    save_and_reopen_shot(tmp_path)
+    assert_overrides_play(library, (*ANGLES, 0.7))
 
 
 def test_a_crowd_of_overrides_is_one_call(library, monkeypatch):
-    collection = link(library.path)
-    crowd = [override(collection, 1.2 * number / CROWD) for number in range(CROWD)]
+    collection = link_character(library.path)
+    crowd = [override_character(collection, 1.2 * number / CROWD) for number in range(CROWD)]
     crowd_tests.animate(crowd)
     calls = crowd_tests.count_calls(monkeypatch)
     for frame in (1, 2, 3, 4):

@@ -15,15 +15,15 @@ from .linked import (
     ANGLES,
     COLLECTION,
     Library,
-    assert_play,
-    bend,
-    elsewhere,
-    link,
-    new_shot,
-    override,
-    own_characters,
-    save_and_open,
-    shot,
+    assert_overrides_play,
+    bend_elbow,
+    link_character,
+    overridden_meshes,
+    override_character,
+    run_in_another_process,
+    save_and_reopen_shot,
+    save_new_shot,
+    shot_path,
 )
 
 OWN = {"parent", 'modifiers["Armature"].object', 'modifiers["FDDA"].properties.inputs.Socket_1.value'}
@@ -35,8 +35,8 @@ def test_overrides_keep_mode_strength_and_use_in_render(pair, library, tmp_path)
     first.fdda.mode, second.fdda.strength, second.fdda.use_in_render = "RIG", 0.25, True
     bpy.context.view_layer.update()
     before = evaluated(first), evaluated(second)
-    save_and_open(tmp_path)
-    first, second = own_characters()
+    save_and_reopen_shot(tmp_path)
+    first, second = overridden_meshes()
     assert (first.fdda.mode, first.fdda.is_playing) == ("RIG", False)
     assert (second.fdda.mode, second.fdda.strength, second.fdda.use_in_render) == ("FDDA", 0.25, True)
     for mesh_object, positions in zip((first, second), before, strict=True):
@@ -55,10 +55,10 @@ def test_saved_overrides_hold_the_true_rig(pair, library, tmp_path):
     true, shown = (show_all(pair, mode) for mode in ("RIG", "FDDA"))
     assert all(np.abs(a - b).max() > 1e-5 for a, b in zip(true, shown, strict=True)), "rig and model differ"
     bpy.ops.ed.undo_push(message="playing")
-    bpy.ops.wm.save_as_mainfile(filepath=str(shot(tmp_path)))
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(tmp_path)))
     fdda_addon.unregister()
-    bpy.ops.wm.open_mainfile(filepath=str(shot(tmp_path)))
-    for mesh_object, positions in zip(own_characters(), true, strict=True):
+    bpy.ops.wm.open_mainfile(filepath=str(shot_path(tmp_path)))
+    for mesh_object, positions in zip(overridden_meshes(), true, strict=True):
         assert not hasattr(mesh_object, "fdda")
         shown = {m.name: (m.show_viewport, m.show_render) for m in mesh_object.modifiers}
         assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
@@ -75,14 +75,14 @@ def test_a_saved_shot_holds_what_was_changed_and_no_more(pair, library, tmp_path
     pair[0].fdda.strength = 0.5
     bpy.context.view_layer.update()
     bpy.ops.ed.undo_push(message="playing")
-    save_and_open(tmp_path)
-    bpy.ops.wm.save_as_mainfile(filepath=str(shot(tmp_path)))
+    save_and_reopen_shot(tmp_path)
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(tmp_path)))
     # Blender has just looked for what differs.
-    assert overridden_paths(own_characters()[0]) - OWN == {"fdda.strength"}
-    assert overridden_paths(own_characters()[1]) - OWN == set()
+    assert overridden_paths(overridden_meshes()[0]) - OWN == {"fdda.strength"}
+    assert overridden_paths(overridden_meshes()[1]) - OWN == set()
     fdda_addon.unregister()
-    bpy.ops.wm.open_mainfile(filepath=str(shot(tmp_path)))
-    first, second = own_characters()
+    bpy.ops.wm.open_mainfile(filepath=str(shot_path(tmp_path)))
+    first, second = overridden_meshes()
     # No positions have a place in the shot.
     assert [o for o in bpy.data.objects if o.library is None and o.type == "MESH"] == [first, second]
     assert {mesh.library is None for mesh in bpy.data.meshes} == {False}
@@ -90,17 +90,17 @@ def test_a_saved_shot_holds_what_was_changed_and_no_more(pair, library, tmp_path
 
 def test_a_shot_that_was_saved_by_itself(library, tmp_path):
     """An auto-save calls no handler: the override of a character that is saved with its rig is caught playing."""
-    elsewhere(f"pack_model({str(library.path)!r})")
-    mesh_object = override(link(library.path), 0.6)
+    run_in_another_process(f"pack_model({str(library.path)!r})")
+    mesh_object = override_character(link_character(library.path), 0.6)
     mesh_object.fdda.mode = "FDDA"
     expected = assert_plays(mesh_object, library.model)
     handlers = [bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:]]
     bpy.app.handlers.save_pre.clear()
     bpy.app.handlers.save_post.clear()
-    bpy.ops.wm.save_as_mainfile(filepath=str(shot(tmp_path)))
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(tmp_path)))
     bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:] = handlers
-    bpy.ops.wm.open_mainfile(filepath=str(shot(tmp_path)))
-    mesh_object = own_characters()[0]
+    bpy.ops.wm.open_mainfile(filepath=str(shot_path(tmp_path)))
+    mesh_object = overridden_meshes()[0]
     assert np.array_equal(assert_plays(mesh_object, library.model), expected)
     mesh_object.fdda.mode = "RIG"
     assert [m.show_viewport for m in mesh_object.modifiers] == [True, True, False]
@@ -113,16 +113,16 @@ def test_a_packed_model_is_found_in_the_library(library, tmp_path):
     model_list.pack_entry(mesh_object, mesh_object.fdda.models[0])
     bpy.ops.wm.save_as_mainfile(filepath=str(library.path))
     moved = library.model.rename(tmp_path / "moved.onnx")
-    new_shot(tmp_path)
-    collection = link(library.path)
+    save_new_shot(tmp_path)
+    collection = link_character(library.path)
     for angle in ANGLES:
-        override(collection, angle)
+        override_character(collection, angle)
     bpy.context.scene.collection.children.link(collection)
-    assert_play(Library(library.path, moved))
-    save_and_open(tmp_path)
-    assert_play(Library(library.path, moved))
-    assert own_characters()[0].fdda.packed.library is not None
-    assert_plays(own_characters()[0].override_library.reference, moved)
+    assert_overrides_play(Library(library.path, moved))
+    save_and_reopen_shot(tmp_path)
+    assert_overrides_play(Library(library.path, moved))
+    assert overridden_meshes()[0].fdda.packed.library is not None
+    assert_plays(overridden_meshes()[0].override_library.reference, moved)
 
 
 def test_a_path_out_of_the_folder_of_the_library_is_not_followed(library, tmp_path):
@@ -131,8 +131,8 @@ def test_a_path_out_of_the_folder_of_the_library_is_not_followed(library, tmp_pa
     bpy.data.objects[ELBOW].fdda.model = f"//../shots/{outside.name}"
     bpy.ops.wm.save_as_mainfile(filepath=str(library.path))
     model_files._chosen_paths.clear()
-    new_shot(tmp_path)
-    mesh_object = override(link(library.path), 0.5)
+    save_new_shot(tmp_path)
+    mesh_object = override_character(link_character(library.path), 0.5)
     bpy.context.view_layer.update()
     assert "lies outside the folder of 'elbow.blend' and is not followed" in mesh_object.fdda.status
     assert (mesh_object.fdda.mode, mesh_object.modifiers["Armature"].show_viewport) == ("RIG", True)
@@ -140,7 +140,7 @@ def test_a_path_out_of_the_folder_of_the_library_is_not_followed(library, tmp_pa
 
 def change_library(library: Library, change, folder: Path) -> None:
     """Change the library's file; the shot, saved before, is open again."""
-    bpy.ops.wm.save_as_mainfile(filepath=str(shot(folder)))
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(folder)))
     bpy.ops.wm.open_mainfile(filepath=str(library.path))
     change()
     bpy.ops.wm.save_as_mainfile(filepath=str(library.path))
@@ -156,15 +156,15 @@ def add_a_hat() -> None:
 
 
 def test_a_resynced_override_plays_on(pair, library, tmp_path):
-    assert_play(library)
+    assert_overrides_play(library)
     change_library(library, add_a_hat, tmp_path)
-    bpy.ops.wm.open_mainfile(filepath=str(shot(tmp_path)))
+    bpy.ops.wm.open_mainfile(filepath=str(shot_path(tmp_path)))
     assert sum("hat" in o.name and o.library is None for o in bpy.data.objects) == 2
-    pair = [o for o in own_characters() if o.fdda.is_bound]
+    pair = [o for o in overridden_meshes() if o.fdda.is_bound]
     assert [[m.name for m in o.modifiers][2:] for o in pair] == [["FDDA", "Cast", "Subdivision"]] * 2
     for mesh_object in pair:
         assert_plays(mesh_object, library.model)
-        bend(mesh_object, 0.5)
+        bend_elbow(mesh_object, 0.5)
     bpy.context.view_layer.update()
     for mesh_object in pair:
         assert_plays(mesh_object, library.model)
@@ -172,26 +172,26 @@ def test_a_resynced_override_plays_on(pair, library, tmp_path):
 
 def test_a_reloaded_library_plays_on(pair, library, tmp_path):
     bpy.context.scene.collection.children.link(pair[0].override_library.reference.users_collection[0])
-    assert_play(library)
+    assert_overrides_play(library)
     bpy.data.libraries[0].reload()
-    assert_play(library)
-    bend(own_characters()[0], 0.6)
-    assert_play(library, (0.6, 1.4))
-    assert_plays(own_characters()[0].override_library.reference, library.model)
-    save_and_open(tmp_path)
-    assert_play(library, (0.6, 1.4))
+    assert_overrides_play(library)
+    bend_elbow(overridden_meshes()[0], 0.6)
+    assert_overrides_play(library, (0.6, 1.4))
+    assert_plays(overridden_meshes()[0].override_library.reference, library.model)
+    save_and_reopen_shot(tmp_path)
+    assert_overrides_play(library, (0.6, 1.4))
 
 
 def test_a_reloaded_library_brings_its_new_model(pair, library, tmp_path, elbow):
     """Reloaded while the shot is open; another process has saved the library with its model packed and mode RIG."""
-    bpy.ops.wm.save_as_mainfile(filepath=str(shot(tmp_path)), copy=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(tmp_path)), copy=True)
     pair[1].fdda.mode = "LINEAR"
     bpy.context.view_layer.update()
-    elsewhere(f"pack_model({str(library.path)!r})")
+    run_in_another_process(f"pack_model({str(library.path)!r})")
     library.model.unlink()
     bpy.data.libraries[0].reload()
     bpy.context.view_layer.update()
-    first, second = own_characters()
+    first, second = overridden_meshes()
     # The first has the mode of its library, the second its own.
     assert [(o.fdda.mode, o.fdda.is_playing) for o in (first, second)] == [("RIG", False), ("LINEAR", True)]
     assert first.modifiers["Armature"].show_viewport and not second.modifiers["Armature"].show_viewport
@@ -204,18 +204,18 @@ def test_a_reloaded_library_brings_its_new_model(pair, library, tmp_path, elbow)
 
 def test_an_override_of_an_override(library, tmp_path):
     """The shot links a set that holds an override of the character: two libraries away, the model is found."""
-    mesh_object = override(link(library.path), 0.2)
+    mesh_object = override_character(link_character(library.path), 0.2)
     collection = mesh_object.users_collection[0]
     collection.name = COLLECTION
     folder = tmp_path / "sets"
     folder.mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "set.blend"), copy=True)
-    new_shot(tmp_path)
-    collection = link(folder / "set.blend")
+    save_new_shot(tmp_path)
+    collection = link_character(folder / "set.blend")
     for angle in ANGLES:
-        override(collection, angle)
-    save_and_open(tmp_path)
-    mesh_objects = [o for o in own_characters() if o.library is None]
+        override_character(collection, angle)
+    save_and_reopen_shot(tmp_path)
+    mesh_objects = [o for o in overridden_meshes() if o.library is None]
     for mesh_object in mesh_objects:
         assert mesh_object.override_library.reference.override_library
         assert_plays(mesh_object, library.model)

@@ -22,7 +22,7 @@ from fdda_addon.scene.blend_file import save_copy
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from .conftest import run, train
-from .refusals import files, save_elbow
+from .refusals import file_contents, save_elbow
 from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
 pytestmark = pytest.mark.one_blender_version
@@ -109,7 +109,7 @@ def test_resumed_it_is_bit_for_bit_the_same(rig, tmp_path, at):
             break
     steps.close()
     drain(record(opened(rig), tmp_path / "broken", replace(SETTINGS, resume=True)))
-    assert files(tmp_path / "broken") == files(tmp_path / "whole")
+    assert file_contents(tmp_path / "broken") == file_contents(tmp_path / "whole")
 
 
 def test_shards_join_to_the_same(rig, tmp_path):
@@ -118,7 +118,7 @@ def test_shards_join_to_the_same(rig, tmp_path):
     for number, shard in enumerate(shards, 1):
         drain(record(opened(rig), shard, replace(SETTINGS, shard=(number, 3))))
     drain(merge_recordings(shards, tmp_path / "merged"))
-    assert files(tmp_path / "merged") == files(tmp_path / "whole")
+    assert file_contents(tmp_path / "merged") == file_contents(tmp_path / "whole")
 
 
 def test_another_margin_is_another_recording(rig, tmp_path):

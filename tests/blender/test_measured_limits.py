@@ -17,7 +17,7 @@ from fdda_addon.rig.reading import read_rig
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from .conftest import run
-from .figure import FRAMES, SMILE, WAVE, add_smile, add_wave, build_figure, edit_bones, key
+from .figure import FRAMES, SMILE, WAVE, add_smile, add_wave, build_figure, edit_bones, key_channel
 from .scene_state import fresh_elbow
 
 HAS_SLOTS = bpy.app.version >= (4, 4, 0)
@@ -65,8 +65,8 @@ def test_what_actions_key_and_move_is_measured(figure):
 def test_several_actions_are_measured_together(figure):
     spine = figure.armature_object.pose.bones["spine"]
     figure.armature_object.animation_data.action = bow = bpy.data.actions.new("bow")
-    key(spine, 1, "rotation_euler", (0, 0, 0))
-    key(spine, 9, "rotation_euler", (-1, 0, 0))
+    key_channel(spine, 1, "rotation_euler", (0, 0, 0))
+    key_channel(spine, 9, "rotation_euler", (-1, 0, 0))
     found = measured_ranges(figure.armature_object, [wave(), bow])
     assert found["spine", "rotation", 0] == pytest.approx((-1, 0.1), abs=1e-3)
     assert found["spine", "rotation", 1] == pytest.approx((0, 0.4), abs=1e-2)
@@ -78,7 +78,7 @@ def test_turns_of_quaternions_go_on_beyond_half_a_turn(figure):
     for frame in range(37):
         turn = Euler((math.radians(10 * frame), 0, 0)).to_quaternion()
         # The same rotation has two quaternions, and what writes actions may take either.
-        key(arm, frame, "rotation_quaternion", -turn if frame % 2 else turn)
+        key_channel(arm, frame, "rotation_quaternion", -turn if frame % 2 else turn)
     found = measured_ranges(figure.armature_object, [spin])
     assert found == {("arm.L", "rotation", 0): pytest.approx((0, 2 * math.pi), abs=1e-5)}
 
@@ -87,7 +87,7 @@ def test_angles_that_jump_by_a_turn_do_not_widen_a_range(figure):
     spine = figure.armature_object.pose.bones["spine"]
     figure.armature_object.animation_data.action = baked = bpy.data.actions.new("baked")
     for frame, degrees in enumerate((-10, 10, 370, 380, 15)):
-        key(spine, frame, "rotation_euler", (0, math.radians(degrees), 0))
+        key_channel(spine, frame, "rotation_euler", (0, math.radians(degrees), 0))
     found = measured_ranges(figure.armature_object, [baked])
     assert found == {("spine", "rotation", 1): pytest.approx((-math.radians(10), math.radians(20)), abs=1e-5)}
 
@@ -188,8 +188,8 @@ def test_locked_axes_and_connected_bones_are_left(figure):
     bones = figure.armature_object.pose.bones
     bones["spine"].lock_rotation[1] = bones["spine"].lock_location[0] = bones["arm.R"].lock_ik_x = True
     arm = bones["arm.L"]
-    key(arm, 1, "location", (0, 0, 0))
-    key(arm, 9, "location", (0, 1, 0))
+    key_channel(arm, 1, "location", (0, 0, 0))
+    key_channel(arm, 9, "location", (0, 1, 0))
 
     def connect(edited):
         edited["arm.L"].head = edited["spine"].tail

@@ -14,7 +14,7 @@ from fdda_addon.runtime.binding import bind
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW, ELBOW_RIG, assert_plays
-from .modifiers import FEW, assert_refused, at, character, nodes_at
+from .modifiers import FEW_POSES, add_modifier_at, add_nodes_at, assert_refused, build_rig
 from .scene_state import assert_same_state, drain, scene_state
 
 
@@ -22,7 +22,7 @@ def simulating(mesh_object: bpy.types.Object) -> None:
     group = stacks.chain("Group", "GeometryNodeSimulationInput", "GeometryNodeSimulationOutput")
     group.nodes["Simulation Input"].pair_with_output(group.nodes["Simulation Output"])
     stacks.link_chain(group)
-    at(2, "NODES", node_group=group)(mesh_object)
+    add_modifier_at(2, "NODES", node_group=group)(mesh_object)
 
 
 def in_a_nested_group(mesh_object: bpy.types.Object) -> None:
@@ -30,7 +30,7 @@ def in_a_nested_group(mesh_object: bpy.types.Object) -> None:
     inner.nodes.new("GeometryNodeInputSceneTime")
     outer.nodes["Group"].node_tree = inner
     stacks.link_chain(outer)
-    at(2, "NODES", node_group=outer)(mesh_object)
+    add_modifier_at(2, "NODES", node_group=outer)(mesh_object)
 
 
 def painted(mesh_object: bpy.types.Object) -> None:
@@ -51,31 +51,31 @@ ORIGINAL = (
 )
 UNBOUND = "is not bound, so it does nothing; bind it first, or switch it off in the viewport."
 REFUSED = {
-    **{kind: (at(2, kind), f"is a simulation, {POSE}") for kind in ("CLOTH", "SOFT_BODY")},
-    **{kind: (at(2, kind), f"plays a cache, {POSE}") for kind in ("MESH_CACHE", "MESH_SEQUENCE_CACHE")},
-    **{kind: (at(0, kind), f"changes with time, {POSE}") for kind in ("WAVE", "BUILD")},
-    "OCEAN": (at(2, "OCEAN", geometry_mode="DISPLACE", resolution=2), f"changes with time, {POSE}"),
-    "EXPLODE": (at(1, "EXPLODE"), f"is a simulation, {POSE}"),
-    "FLUID": (at(1, "FLUID", fluid_type="DOMAIN"), f"is a simulation, {POSE}"),
+    **{kind: (add_modifier_at(2, kind), f"is a simulation, {POSE}") for kind in ("CLOTH", "SOFT_BODY")},
+    **{kind: (add_modifier_at(2, kind), f"plays a cache, {POSE}") for kind in ("MESH_CACHE", "MESH_SEQUENCE_CACHE")},
+    **{kind: (add_modifier_at(0, kind), f"changes with time, {POSE}") for kind in ("WAVE", "BUILD")},
+    "OCEAN": (add_modifier_at(2, "OCEAN", geometry_mode="DISPLACE", resolution=2), f"changes with time, {POSE}"),
+    "EXPLODE": (add_modifier_at(1, "EXPLODE"), f"is a simulation, {POSE}"),
+    "FLUID": (add_modifier_at(1, "FLUID", fluid_type="DOMAIN"), f"is a simulation, {POSE}"),
     "DYNAMIC_PAINT": (painted, f"is a simulation, {POSE}"),
     "simulation zone": (simulating, f"changes with time (node 'Simulation Input' of 'Group'), {POSE}"),
     "scene time": (in_a_nested_group, f"changes with time (node 'Scene Time' of 'Ripple'), {POSE}"),
     **{
-        f"{kind} at {place}": (at(place, kind), MIDDLE)
+        f"{kind} at {place}": (add_modifier_at(place, kind), MIDDLE)
         for kind in ("SUBSURF", "MIRROR", "DECIMATE", "SOLIDIFY")
         for place in (0, 1)
     },
-    **{f"MULTIRES at {place}": (at(place, "MULTIRES"), ORIGINAL) for place in (0, 2)},
-    "subdividing nodes": (nodes_at(1, "GeometryNodeSubdivideMesh"), MIDDLE),
-    "CORRECTIVE_SMOOTH": (at(2, "CORRECTIVE_SMOOTH", rest_source="BIND"), UNBOUND),
-    **{kind: (at(0, kind), UNBOUND) for kind in ("SURFACE_DEFORM", "MESH_DEFORM", "LAPLACIANDEFORM")},
+    **{f"MULTIRES at {place}": (add_modifier_at(place, "MULTIRES"), ORIGINAL) for place in (0, 2)},
+    "subdividing nodes": (add_nodes_at(1, "GeometryNodeSubdivideMesh"), MIDDLE),
+    "CORRECTIVE_SMOOTH": (add_modifier_at(2, "CORRECTIVE_SMOOTH", rest_source="BIND"), UNBOUND),
+    **{kind: (add_modifier_at(0, kind), UNBOUND) for kind in ("SURFACE_DEFORM", "MESH_DEFORM", "LAPLACIANDEFORM")},
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_no_model_can_stand_in_for_is_named(name, loose_model, tmp_path):
     add, sentence = REFUSED[name]
-    rig = character(stacks.corrective_smooth)
+    rig = build_rig(stacks.corrective_smooth)
     add(rig.mesh_object)
     sentence = f"Modifier 'It' of 'elbow' {sentence}"
     assert_refused(rig, loose_model, tmp_path / "recording", sentence)
@@ -87,27 +87,27 @@ def test_what_no_model_can_stand_in_for_is_named(name, loose_model, tmp_path):
 
 
 def test_hidden_nodes_cannot_be_sorted(loose_model):
-    rig = character()
-    nodes_at(1, "GeometryNodeTransform")(rig.mesh_object)
+    rig = build_rig()
+    add_nodes_at(1, "GeometryNodeTransform")(rig.mesh_object)
     rig.mesh_object.hide_viewport = True
     with pytest.raises(RigError, match="'elbow' is hidden, so Blender does not evaluate it"):
         bind(rig, loose_model)
 
 
 def test_a_live_modifier_that_a_driver_keeps_on(tmp_path):
-    rig = character()
+    rig = build_rig()
     modifier = rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     drive(modifier, "show_viewport", rig.armature_object, "1")
     count = len(rig.mesh_object.data.vertices)
     with pytest.raises(RigError) as error:
-        drain(record(rig, tmp_path / "recording", FEW))
+        drain(record(rig, tmp_path / "recording", FEW_POSES))
     assert f"The modifiers of 'elbow' turn {count} vertices into " in str(error.value)
     assert str(error.value).endswith("; switch off the one that changes the topology (Subdivision).")
 
 
 def test_nodes_that_remove_vertices_in_some_poses(tmp_path):
-    rig = character()
-    nodes_at(1, "GeometryNodeDeleteGeometry")(rig.mesh_object)
+    rig = build_rig()
+    add_nodes_at(1, "GeometryNodeDeleteGeometry")(rig.mesh_object)
     group = rig.mesh_object.modifiers["It"].node_group
     position, height, above = (
         group.nodes.new(kind) for kind in ("GeometryNodeInputPosition", "ShaderNodeSeparateXYZ", "ShaderNodeMath")

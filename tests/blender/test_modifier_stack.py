@@ -17,7 +17,7 @@ from fdda_addon.scene.scene_rig import SceneRig
 from fdda_addon.timing import benchmark, rig_cost
 
 from .conftest import assert_plays, evaluated, pose
-from .modifiers import FEW, at, character, nodes_at
+from .modifiers import FEW_POSES, add_modifier_at, add_nodes_at, build_rig
 from .scene_state import assert_same_state, drain, scene_state
 
 MOVES = 0.001
@@ -25,7 +25,7 @@ MOVES = 0.001
 
 
 def residuals(rig: SceneRig, folder: Path) -> np.ndarray:
-    drain(record(rig, folder / "recording", FEW))
+    drain(record(rig, folder / "recording", FEW_POSES))
     return np.load(folder / "recording" / "residuals.npy")
 
 
@@ -35,7 +35,7 @@ def shown(rig: SceneRig) -> list[tuple]:
 
 @pytest.mark.parametrize("build", stacks.STACKS, ids=lambda build: build.__name__)
 def test_a_deforming_stack_is_recorded_and_played(build, loose_model, tmp_path):
-    rig = character(build)
+    rig = build_rig(build)
     assert check_recordable_rig(rig).problems == ()
     before, modifiers = scene_state(rig), shown(rig)
     assert np.linalg.norm(residuals(rig, tmp_path), axis=2).max() > MOVES
@@ -69,7 +69,7 @@ def read_live(rig: SceneRig) -> tuple[str, ...]:
 
 
 def test_what_makes_vertices_after_the_rig_works_on_what_the_model_gives(loose_model):
-    rig = character(stacks.subdivided)
+    rig = build_rig(stacks.subdivided)
     assert read_stack(rig.mesh_object) == ModifierStack(
         ("Armature", "Mush"), (), ("Subdivision", "Thickness", "Detail"), 2
     )
@@ -114,14 +114,14 @@ def test_times_are_those_of_a_frame_with_what_is_live(rig, elbow, monkeypatch):
 
 
 def test_what_is_live_comes_back_when_a_recording_is_broken_off(tmp_path):
-    rig = character(stacks.subdivided)
+    rig = build_rig(stacks.subdivided)
     before = scene_state(rig)
-    drain(record(rig, tmp_path / "recording", FEW), stop_after=2)
+    drain(record(rig, tmp_path / "recording", FEW_POSES), stop_after=2)
     assert_same_state(before, scene_state(rig))
 
 
 def test_modifiers_that_do_not_deform_stay_as_they_are_wherever_they_are(loose_model, tmp_path):
-    rig = character(stacks.corrective_smooth)
+    rig = build_rig(stacks.corrective_smooth)
     plain = residuals(rig, tmp_path)
     first = ("UV_WARP", "VERTEX_WEIGHT_EDIT", "DATA_TRANSFER")
     for kind in ("WEIGHTED_NORMAL", "TRIANGULATE", "PARTICLE_SYSTEM", "FLUID", "COLLISION", *first):
@@ -137,7 +137,7 @@ def test_modifiers_that_do_not_deform_stay_as_they_are_wherever_they_are(loose_m
 
 
 def test_a_modifier_that_only_renders_show_is_off_while_a_model_renders(loose_model):
-    rig = character(stacks.corrective_smooth)
+    rig = build_rig(stacks.corrective_smooth)
     rig.mesh_object.modifiers.new("Subdivision", "SUBSURF").show_viewport = False
     rig.mesh_object.modifiers.move(2, 1)
     before = shown(rig)
@@ -148,14 +148,14 @@ def test_a_modifier_that_only_renders_show_is_off_while_a_model_renders(loose_mo
 
 
 def test_a_modifier_that_is_off_after_what_is_live_stays_out_of_it(loose_model):
-    rig = character(stacks.subdivided)
+    rig = build_rig(stacks.subdivided)
     rig.mesh_object.modifiers.new("Cast", "CAST").show_viewport = False
     bind(rig, loose_model)
     assert rig.mesh_object.modifiers.find("FDDA") == 2
 
 
 def test_the_modifier_that_plays_goes_before_one_that_is_pinned_to_the_end(loose_model):
-    rig = character(stacks.corrective_smooth)
+    rig = build_rig(stacks.corrective_smooth)
     last = rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
     last.use_pin_to_last = True
     bind(rig, loose_model)
@@ -164,8 +164,8 @@ def test_the_modifier_that_plays_goes_before_one_that_is_pinned_to_the_end(loose
 
 @pytest.mark.parametrize("kind", ["BUILD", "EXPLODE", "PARTICLE_INSTANCE"])
 def test_what_makes_vertices_in_time_after_the_rig_is_live(kind):
-    rig = character(stacks.corrective_smooth)
-    at(2, kind)(rig.mesh_object)
+    rig = build_rig(stacks.corrective_smooth)
+    add_modifier_at(2, kind)(rig.mesh_object)
     assert read_stack(rig.mesh_object).downstream == ("It",)
     assert check_recordable_rig(rig).problems == ()
 
@@ -187,8 +187,8 @@ def test_what_makes_vertices_in_time_after_the_rig_is_live(kind):
 )
 @pytest.mark.parametrize("after", ["", "SUBSURF"])
 def test_geometry_nodes_are_sorted_by_what_they_do(kinds, expected, after):
-    rig = character(stacks.corrective_smooth)
-    nodes_at(2, *kinds)(rig.mesh_object)
+    rig = build_rig(stacks.corrective_smooth)
+    add_nodes_at(2, *kinds)(rig.mesh_object)
     if after:
         rig.mesh_object.modifiers.new("After", after)
     before = scene_state(rig)
@@ -199,16 +199,16 @@ def test_geometry_nodes_are_sorted_by_what_they_do(kinds, expected, after):
 
 
 def test_a_group_whose_geometry_leads_nowhere_leaves_no_vertices():
-    rig = character()
-    nodes_at(1)(rig.mesh_object)
+    rig = build_rig()
+    add_nodes_at(1)(rig.mesh_object)
     group = rig.mesh_object.modifiers["It"].node_group
     group.links.clear()
     assert read_stack(rig.mesh_object).downstream == ("It",)
 
 
 def test_an_attribute_that_is_the_position_moves_vertices():
-    rig = character()
-    nodes_at(1, "GeometryNodeStoreNamedAttribute")(rig.mesh_object)
+    rig = build_rig()
+    add_nodes_at(1, "GeometryNodeStoreNamedAttribute")(rig.mesh_object)
     group = rig.mesh_object.modifiers["It"].node_group
     group.nodes["Store Named Attribute"].inputs["Name"].default_value = "position"
     assert read_stack(rig.mesh_object).replaced == ("Armature", "It")
@@ -216,18 +216,18 @@ def test_an_attribute_that_is_the_position_moves_vertices():
 
 def test_shading_nodes_after_a_subdivision_are_no_reason_to_refuse_it(loose_model, tmp_path):
     """As Blender adds them to every file that had auto smooth."""
-    rig = character(stacks.corrective_smooth)
+    rig = build_rig(stacks.corrective_smooth)
     rig.mesh_object.modifiers.new("Subdivision", "SUBSURF")
-    nodes_at(3, "GeometryNodeSetShadeSmooth")(rig.mesh_object)
+    add_nodes_at(3, "GeometryNodeSetShadeSmooth")(rig.mesh_object)
     rig.mesh_object.modifiers["It"].use_pin_to_last = True
-    assert len(residuals(rig, tmp_path)) == FEW.poses
+    assert len(residuals(rig, tmp_path)) == FEW_POSES.poses
     bind(rig, loose_model)
     assert [m.name for m in rig.mesh_object.modifiers if m.show_viewport] == ["FDDA", "Subdivision", "It"]
 
 
 def test_a_simulation_after_the_rig_works_on_what_the_model_gives(loose_model):
-    rig = character(stacks.corrective_smooth)
-    at(2, "CLOTH", show_viewport=False)(rig.mesh_object)
+    rig = build_rig(stacks.corrective_smooth)
+    add_modifier_at(2, "CLOTH", show_viewport=False)(rig.mesh_object)
     bind(rig, loose_model)
     rig.mesh_object.modifiers["It"].show_viewport = True
     for frame in range(1, 5):

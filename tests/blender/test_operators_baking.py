@@ -7,16 +7,16 @@ import pytest
 
 from fdda_addon.scene.scene_rig import find_rig
 
-from .baked_files import CLOSE, elbow_wave, plain_blender, read_pc2
+from .baked_files import POSITION_TOLERANCE, predicted_wave, read_pc2, shown_without_add_on
 from .conftest import ELBOW, assert_plays, evaluated, pose
-from .refusals import files
+from .refusals import file_contents
 from .scene_state import assert_same_state, scene_state
 from .test_operators_playback import refused
 
 
 @pytest.fixture(scope="module")
 def wave(elbow) -> np.ndarray:
-    return elbow_wave(elbow)
+    return predicted_wave(elbow)
 
 
 class TestOperator:
@@ -34,13 +34,13 @@ class TestOperator:
         pose(angle=0.7)
         assert_plays(bpy.data.objects[ELBOW], elbow.model)
         assert np.abs(read_pc2(tmp_path / "a.pc2")[2] - wave).max() < 1e-6
-        shown = plain_blender(tmp_path, (out, [12.0]))
-        assert np.abs(shown[out, 12.0] - wave[11]).max() < CLOSE
+        shown = shown_without_add_on(tmp_path, (out, [12.0]))
+        assert np.abs(shown[out, 12.0] - wave[11]).max() < POSITION_TOLERANCE
 
     def test_shape_keys_and_point_caches(self, active, wave, tmp_path):
         assert bpy.ops.fdda.bake(filepath=str(tmp_path / "a.blend"), shape_keys=True) == {"FINISHED"}
         assert bpy.ops.fdda.bake(filepath=str(tmp_path / "b.pc2")) == {"FINISHED"}
-        assert sorted(files(tmp_path)) == ["a.blend", "b.pc2"]
+        assert sorted(file_contents(tmp_path)) == ["a.blend", "b.pc2"]
         assert np.abs(read_pc2(tmp_path / "b.pc2")[2] - wave).max() < 1e-6
 
     def test_refusals(self, active, tmp_path):
@@ -51,7 +51,7 @@ class TestOperator:
         )
         bpy.ops.fdda.unbind()
         refused(lambda: bpy.ops.fdda.bake(filepath=str(tmp_path / "a.pc2")), "No model is bound; bind one first")
-        assert files(tmp_path) == {}
+        assert file_contents(tmp_path) == {}
 
     @pytest.mark.parametrize(("mode", "strength"), [("FDDA", 0.4), ("LINEAR", 1.0)])
     def test_strength_and_mode_are_baked_as_the_viewport_shows_them(self, active, tmp_path, mode, strength):

@@ -12,7 +12,7 @@ from fdda_addon.core.recording.reader import read_recording
 
 from .. import systems
 from .conftest import run
-from .refusals import Refusal, files
+from .refusals import Refusal, file_contents
 
 pytestmark = pytest.mark.one_blender_version
 
@@ -155,7 +155,7 @@ def test_what_a_verb_wrote_before_it_writes_again(place, monkeypatch):
     )
     for verb in (*verbs, *verbs):
         assert done(verb), verb
-    left = [name for name in files(place) if "/" not in name and name.startswith(".")]
+    left = [name for name in file_contents(place) if "/" not in name and name.startswith(".")]
     assert left == []
 
 

@@ -21,7 +21,7 @@ from fdda_addon.runtime.network import Network
 from fdda_addon.scene.scene_rig import find_rig
 
 from .conftest import ELBOW_RIG, run, train
-from .refusals import files
+from .refusals import file_contents
 from .scene_state import scene_state
 
 pytestmark = pytest.mark.one_blender_version
@@ -131,7 +131,7 @@ def test_a_refinement_that_is_resumed_adds_what_is_missing(elbow, recording, rig
     assert len(read_recording(recording).pose_matrices) == 153
     for _ in range(2):
         assert list(refine(rig, recording, elbow.model, settings))[-1].done == 7
-        assert files(recording) == files(whole)
+        assert file_contents(recording) == file_contents(whole)
 
 
 def test_poses_that_were_not_chosen_for_the_model_are_not_resumed(elbow, recording, rig):

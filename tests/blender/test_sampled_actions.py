@@ -19,7 +19,7 @@ from fdda_addon.scene.armature import Poser
 from fdda_addon.scene.compatibility import curves_of
 from fdda_addon.scene.scene_rig import SceneRig
 
-from .figure import WAVE, add_wave, build_figure, key
+from .figure import WAVE, add_wave, build_figure, key_channel
 
 ARM = "arm.L"
 
@@ -83,8 +83,8 @@ def test_what_stands_still_beside_the_rest_pose_stays_there(figure):
     spine = figure.armature_object.pose.bones["spine"]
     figure.armature_object.animation_data_create().action = bpy.data.actions.new("lean")
     for frame, turn in ((1, -0.2), (9, 0.2)):
-        key(spine, frame, "rotation_euler", (0.75, turn, 0))
-        key(spine, frame, "location", (0, 0.5, 0))
+        key_channel(spine, frame, "rotation_euler", (0.75, turn, 0))
+        key_channel(spine, frame, "location", (0, 0.5, 0))
     limits = set_limits_from_actions(figure, bpy.data.actions, 0.0)
     assert describe_limits(figure.armature_object, limits) == [
         "spine: turns X 43.0 to 43.0° (stands still away from rest, has no range), turns Y -11.5 to 11.5°"
@@ -138,7 +138,7 @@ def test_random_poses_are_near_what_actions_do(figure, motion, mode):
         for frame, turn in enumerate(turns):
             axis, angle = turn.to_axis_angle()
             value = {"rotation_quaternion": turn} if mode == "QUATERNION" else {"rotation_axis_angle": (angle, *axis)}
-            key(bone, frame, *value.popitem())
+            key_channel(bone, frame, *value.popitem())
     channels = sampled(figure)
     assert {channel.kind for channel in channels} == {ROTATION_VECTOR}
     poser = Poser(figure, channels)
@@ -160,7 +160,7 @@ def test_euler_angles_of_several_actions_do_not_wrap(figure):
     for turns in MOTIONS["half a turn away"]:
         figure.armature_object.animation_data_create().action = bpy.data.actions.new("turns")
         for frame, turn in enumerate(turns):
-            key(bone, frame, "rotation_quaternion", turn)
+            key_channel(bone, frame, "rotation_quaternion", turn)
     found = measured_ranges(figure.armature_object, bpy.data.actions)
     assert found[ARM, "rotation", 0] == pytest.approx((math.radians(165), math.radians(195)), abs=1e-4)
     assert found[ARM, "rotation", 1] == pytest.approx((math.radians(-5), math.radians(5)), abs=1e-4)

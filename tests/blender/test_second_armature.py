@@ -17,7 +17,7 @@ from fdda_addon.rig.reading import PoseEvaluator
 from fdda_addon.runtime.binding import bind
 
 from .conftest import evaluated
-from .modifiers import FEW, character
+from .modifiers import FEW_POSES, build_rig
 from .scene_state import assert_same_state, drain, scene_state
 
 APART = 1e-3
@@ -63,11 +63,11 @@ def move(bone: bpy.types.PoseBone) -> None:
 
 @pytest.mark.parametrize("build", SENTENCES, ids=lambda build: build.__name__)
 def test_what_a_model_is_not_told_is_named(build, loose_model, tmp_path):
-    rig = character(build)
+    rig = build_rig(build)
     before = scene_state(rig)
     assert SENTENCES[build] in check_recordable_rig(rig).problems
     with pytest.raises(RigError) as error:
-        drain(record(rig, tmp_path / "recording", FEW))
+        drain(record(rig, tmp_path / "recording", FEW_POSES))
     assert str(error.value) == SENTENCES[build]
     # This model is not told of Euler angles either.
     with pytest.raises(RigError, match=r" of a second armature, 'muscle_rig', .*without the model being told; "):
@@ -89,7 +89,7 @@ EXPECTED = {
 
 @pytest.mark.parametrize("build", EXPECTED, ids=lambda build: build.__name__)
 def test_what_a_model_is_told_is_recorded(build, tmp_path):
-    rig = character(build)
+    rig = build_rig(build)
     assert check_recordable_rig(rig).problems == ()
     drain(record(rig, tmp_path / "recording", RecordingSettings(poses=6, influence_poses=1)))
     recording = read_recording(tmp_path / "recording")

@@ -24,7 +24,7 @@ from fdda_addon.scene.scene_rig import find_rigs
 
 from .command_output import CommandOutput, output_of
 from .conftest import assert_plays, pose, run
-from .refusals import Refusal, files
+from .refusals import Refusal, file_contents
 
 pytestmark = pytest.mark.one_blender_version
 
@@ -77,7 +77,7 @@ def test_each_mesh_is_recorded_as_by_itself(two, tmp_path):
     for name in (BODY, SLEEVE):
         options = ("--object", name, "--poses", POSES, "--action", "elbow_wave")
         assert run("record", two.rig, tmp_path / name, *options) == 0
-    assert files(tmp_path) == files(two.recordings)
+    assert file_contents(tmp_path) == file_contents(two.recordings)
 
 
 def test_a_pose_is_evaluated_once(two, tmp_path):
@@ -149,7 +149,7 @@ def test_an_interrupted_recording_goes_on_where_each_mesh_stopped(two, tmp_path)
     shutil.copytree(two.recordings / BODY, tmp_path / "r" / BODY)
     options = ("--all", "--poses", POSES, "--action", "elbow_wave", "--resume")
     assert run("record", two.rig, tmp_path / "r", *options) == 0
-    assert files(tmp_path / "r") == files(two.recordings)
+    assert file_contents(tmp_path / "r") == file_contents(two.recordings)
 
 
 def test_each_mesh_has_a_model_and_a_report_of_its_own(two):
@@ -191,7 +191,7 @@ def test_the_bound_file_plays_both(two):
 
 def test_models_are_copied_beside_a_file_elsewhere(two, tmp_path, capfd):
     assert run("bind", two.rig, two.models, tmp_path / "bound.blend") == 0
-    assert sorted(files(tmp_path)) == ["bound.blend", "elbow.onnx", "sleeve.onnx"]
+    assert sorted(file_contents(tmp_path)) == ["bound.blend", "elbow.onnx", "sleeve.onnx"]
     assert capfd.readouterr().out.count("a copy of") == 2
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "bound.blend"))
     pose(angle=0.7)
@@ -287,7 +287,7 @@ def test_what_takes_one_mesh(two, tmp_path, monkeypatch, capfd, verb, options, t
     }
     assert run(verb, *first[verb], *options) == 2
     assert text in capfd.readouterr().err
-    assert files(tmp_path) == {}
+    assert file_contents(tmp_path) == {}
 
 
 def test_a_full_disk_is_refused_before_anything_is_recorded(two, tmp_path, capfd):

@@ -22,7 +22,7 @@ from fdda_addon.scene.scene_rig import SceneRig, find_rig, find_rigs
 
 from .conftest import run
 from .figure import WAVE, add_wave, build_figure
-from .refusals import Refusal, files
+from .refusals import Refusal, file_contents
 
 pytestmark = pytest.mark.one_blender_version
 
@@ -76,7 +76,7 @@ def test_shards_are_the_recording_of_one_run(tmp_path, case, count):
         own = replace(settings, shard=(number, count), influences=found)
         drain(record(opened(rig), shards[number - 1], own))
     drain(merge_recordings(shards, tmp_path / "merged"))
-    assert files(tmp_path / "merged") == files(tmp_path / "whole")
+    assert file_contents(tmp_path / "merged") == file_contents(tmp_path / "whole")
     assert len(read_recording(tmp_path / "merged").pose_matrices) >= settings.poses
 
 
@@ -88,7 +88,7 @@ def test_shards_that_find_the_influences_themselves_are_the_same(tmp_path):
     for number, shard in enumerate(shards, 1):
         drain(record(opened(rig), shard, replace(settings, shard=(number, 2))))
     drain(merge_recordings(shards, tmp_path / "merged"))
-    assert files(tmp_path / "merged") == files(tmp_path / "whole")
+    assert file_contents(tmp_path / "merged") == file_contents(tmp_path / "whole")
 
 
 @pytest.mark.parametrize("alone", [False, True])
@@ -113,7 +113,7 @@ def test_shards_of_several_meshes(tmp_path, alone):
     own = replace(settings, influences=found)
     shards = [recorded(str(number), replace(own, shard=(number, 4))) for number in range(1, 5)]
     drain(merge_recordings(shards, tmp_path / "merged"))
-    assert len(files(whole)) > 10 and files(tmp_path / "merged") == files(whole)
+    assert len(file_contents(whole)) > 10 and file_contents(tmp_path / "merged") == file_contents(whole)
 
 
 @pytest.mark.parametrize("shard", [None, (2, 3)])
@@ -133,9 +133,9 @@ def test_what_is_resumed_repeats_nothing(tmp_path, monkeypatch, shard):
     resumed = replace(settings, resume=True)
     done = [step.done for step in record(opened(rig), tmp_path / "part", resumed)]
     assert done[0] >= 7 and done == list(range(done[0], done[-1] + 1))
-    assert files(tmp_path / "part") == files(tmp_path / "whole")
+    assert file_contents(tmp_path / "part") == file_contents(tmp_path / "whole")
     assert [step.done for step in record(opened(rig), tmp_path / "part", resumed)] == done[-1:]
-    assert files(tmp_path / "part") == files(tmp_path / "whole")
+    assert file_contents(tmp_path / "part") == file_contents(tmp_path / "whole")
 
 
 def test_the_verbs(elbow, tmp_path, capfd):
@@ -151,7 +151,7 @@ def test_the_verbs(elbow, tmp_path, capfd):
     out = capfd.readouterr().out
     assert f"{tmp_path / 'found'}: influences in" in out and f"{tmp_path / 's2'}: 20 poses in" in out
     assert f"{tmp_path / 'merged'}: 40 poses of 2 shards in" in out
-    assert files(tmp_path / "merged") == files(tmp_path / "whole")
+    assert file_contents(tmp_path / "merged") == file_contents(tmp_path / "whole")
 
 
 def test_options_of_shards_that_make_no_sense(elbow, tmp_path, capfd):

@@ -19,7 +19,7 @@ from fdda_addon.scene.controls import ControlReader
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
 from .conftest import ELBOW, evaluated
-from .modifiers import FEW, assert_refused, character
+from .modifiers import FEW_POSES, assert_refused, build_rig
 from .scene_state import assert_same_state, drain, scene_state
 
 APART = 1e-4
@@ -99,7 +99,7 @@ def shown_in_frames(rig: SceneRig) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("build", CASES, ids=lambda build: build.__name__)
 def test_what_changes_with_time_is_named(build, loose_model, tmp_path):
-    rig, sentence = character(build), SURFACE.format(*CASES[build])
+    rig, sentence = build_rig(build), SURFACE.format(*CASES[build])
     assert_refused(rig, loose_model, tmp_path / "recording", sentence)
     if build is not in_time.keyed_property_without_a_range:
         assert np.abs(np.subtract(*shown_in_frames(rig))).max() > APART
@@ -110,10 +110,10 @@ def test_what_no_analysis_names_is_found_by_holding_a_pose(build, tmp_path, monk
     """The same characters, where keys, drivers and modifiers are not looked at."""
     for analysis in ("time_inputs", "_time_modifiers"):
         monkeypatch.setattr(time_inputs, analysis, lambda *_: ())
-    rig = character(build)
+    rig = build_rig(build)
     before = scene_state(rig)
     with pytest.raises(RigError, match=r"The surface of 'elbow' differs by [\d.e+]+ mm between frames 1 and \d+ in"):
-        drain(record(rig, tmp_path / "recording", FEW))
+        drain(record(rig, tmp_path / "recording", FEW_POSES))
     assert_same_state(before, scene_state(rig))
     assert not (tmp_path / "recording").exists()
 
@@ -139,7 +139,7 @@ PLAYED = {
 @pytest.mark.parametrize("build", PLAYED, ids=lambda build: build.__name__)
 def test_what_a_model_is_told_may_be_keyed(build, tmp_path):
     """It is a control, by itself or by its name, it is sampled, and it is keyed afterwards as before."""
-    rig, (named, expected) = character(build), PLAYED[build]
+    rig, (named, expected) = build_rig(build), PLAYED[build]
     settings = RecordingSettings(poses=8, influence_poses=1, controls=named)
     assert check_recordable_rig(rig, settings).problems == ()
     before = scene_state(rig)
@@ -193,9 +193,9 @@ def second_armature_on(flesh: bpy.types.Object) -> None:
 
 @pytest.mark.parametrize("build", in_time.HARMLESS, ids=lambda build: build.__name__)
 def test_what_follows_the_pose_is_recorded(build, tmp_path):
-    rig = character(build)
+    rig = build_rig(build)
     assert check_recordable_rig(rig).problems == ()
-    drain(record(rig, tmp_path / "recording", FEW))
+    drain(record(rig, tmp_path / "recording", FEW_POSES))
 
 
 def test_every_character_has_its_sentence():

@@ -20,8 +20,8 @@ from fdda_addon.training.environment.creation import EnvironmentCreation
 from fdda_addon.training.environment.folder import FolderState
 
 from .conftest import run
-from .stand_ins import program
-from .tiny_wheels import pinned, write_wheel, write_wheels
+from .stand_ins import write_program
+from .tiny_wheels import pinned_version, write_wheel, write_wheels
 
 pytestmark = pytest.mark.one_blender_version
 
@@ -86,9 +86,9 @@ def test_it_is_created_from_a_folder_of_wheels(user: Path, wheels: Path):
     assert create(wheels=str(wheels)) == {"FINISHED"}
     assert session.environment_state() is FolderState.READY and not junk.exists()
     assert choice.select_python() == (str(folder.interpreter_path(folder.environment_folder())), Origin.OWN)
-    assert session.check_result.message.endswith(f"torch {pinned('torch')}.")
+    assert session.check_result.message.endswith(f"torch {pinned_version('torch')}.")
     assert session.check_result.message.startswith("Ready to train on the CPU: Python 3.")
-    assert f"onnx {pinned('onnx')}" in session.check_result.details
+    assert f"onnx {pinned_version('onnx')}" in session.check_result.details
     log = folder.log_path().read_text()
     assert "-m venv" in log and "Successfully installed" in log and "Ready to train" in log
     assert sorted(path.name for path in user.iterdir()) == ["trainer", "trainer.lock", "trainer.log"]
@@ -122,7 +122,9 @@ def test_a_wheel_that_is_missing(own: Path, wheels: Path, tmp_path: Path):
     shutil.copytree(wheels, tmp_path / "fewer")
     next((tmp_path / "fewer").glob("onnx-*")).unlink()
     text = refused(create, wheels=str(tmp_path / "fewer"))
-    assert text.startswith(f"The folder '{tmp_path / 'fewer'}' lacks the packages onnx {pinned('onnx')} for Python 3.1")
+    assert text.startswith(
+        f"The folder '{tmp_path / 'fewer'}' lacks the packages onnx {pinned_version('onnx')} for Python 3.1"
+    )
     assert " -m pip download --only-binary=:all: " in folder.log_path().read_text()
     assert session.environment_state() is FolderState.READY
     assert session.notice.message == text
@@ -176,7 +178,7 @@ def test_a_full_disk_is_noticed_before(user: Path, own: Path, monkeypatch: pytes
 
 def test_a_python_that_cannot_make_one(user: Path, wheels: Path, tmp_path: Path):
     said = [sys.version_info[:2], True, []]
-    broken = program(
+    broken = write_program(
         tmp_path / "python",
         "if '-c' in sys.argv:",
         f"    print(json.dumps([*{said!r}, {str(tmp_path / 'python')!r} + '.cmd' * (os.name == 'nt')]))",

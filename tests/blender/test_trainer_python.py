@@ -19,7 +19,7 @@ from fdda_addon.training.environment.folder import COMPLETION_MARKER, PACKAGES, 
 from fdda_addon.training.environment.interpreters import find_interpreters, query_interpreter
 
 from .conftest import run
-from .stand_ins import program
+from .stand_ins import write_program
 from .tiny_wheels import TORCH
 
 pytestmark = pytest.mark.one_blender_version
@@ -99,7 +99,7 @@ def test_a_package_is_broken(packages: Path):
 
 def test_an_old_python(tmp_path: Path):
     said = json.dumps({"version": [3, 9, 18], "packages": {}, "broken": {}})
-    python = program(tmp_path / "python3.9", f"print({said!r})")
+    python = write_program(tmp_path / "python3.9", f"print({said!r})")
     assert asked(python).message == f"'{python}' is Python 3.9.18, and the trainer needs 3.11 or later; do this."
 
 
@@ -110,30 +110,32 @@ def test_it_is_not_there():
 
 @pytest.mark.parametrize("said", ["", "hello", "5", "{}", '{"version": 3}'])
 def test_it_is_no_python(tmp_path: Path, said: str):
-    python = program(tmp_path / "program", f"print({said!r})")
+    python = write_program(tmp_path / "program", f"print({said!r})")
     answer = asked(python)
     assert answer.level == "ERROR"
     assert answer.message.startswith(f"'{python}' does not answer as a Python does (status 0); do this.")
 
 
 def test_it_says_why_it_fails(tmp_path: Path):
-    answer = asked(program(tmp_path / "program", "sys.exit('wrong machine of Jürgen 李')"))
+    answer = asked(write_program(tmp_path / "program", "sys.exit('wrong machine of Jürgen 李')"))
     assert "(wrong machine of Jürgen 李)" in answer.message
-    answer = asked(program(tmp_path / "crashes", "import faulthandler", "faulthandler._read_null()"))
+    answer = asked(write_program(tmp_path / "crashes", "import faulthandler", "faulthandler._read_null()"))
     assert ("(crashed: access violation" if os.name == "nt" else "(was ended by signal 11") in answer.message
 
 
 def test_it_never_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(check, "TIMEOUT_SECONDS", 0.5)
-    assert asked(program(tmp_path / "program", "time.sleep(5)")).message.endswith("did not answer in 0 s; do this.")
+    assert asked(write_program(tmp_path / "program", "time.sleep(5)")).message.endswith(
+        "did not answer in 0 s; do this."
+    )
 
 
 def test_a_base_is_run_and_not_just_found(tmp_path: Path):
-    shim = program(tmp_path / "python3.13", "sys.exit('this version is not selected')")
-    hangs = program(tmp_path / "hangs")
+    shim = write_program(tmp_path / "python3.13", "sys.exit('this version is not selected')")
+    hangs = write_program(tmp_path / "hangs")
     python, real = sys.executable, sys.executable
     if os.name != "nt":
-        real = program(tmp_path / "real", f"os.execv({python!r}, [{python!r}, *sys.argv[1:]])")
+        real = write_program(tmp_path / "real", f"os.execv({python!r}, [{python!r}, *sys.argv[1:]])")
     found = list(find_interpreters(iter([[shim], [hangs], ["/none"], [real], [sys.executable]])))
     assert [(base.path, base.version, base.problem) for base in found] == [(sys.executable, sys.version_info[:2], "")]
 
@@ -147,7 +149,7 @@ def test_a_base_is_run_and_not_just_found(tmp_path: Path):
     ],
 )
 def test_what_a_base_lacks(tmp_path: Path, answer: list, lacks: str):
-    base = query_interpreter([program(tmp_path / "python", f"print({json.dumps(answer)!r})")])
+    base = query_interpreter([write_program(tmp_path / "python", f"print({json.dumps(answer)!r})")])
     assert base.problem == lacks and str(base) == f"'/p' (Python {answer[0][0]}.{answer[0][1]})"
 
 

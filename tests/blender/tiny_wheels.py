@@ -14,14 +14,14 @@ class cuda:
 """
 
 
-def pinned(package: str) -> str:
+def pinned_version(package: str) -> str:
     """The version that an environment made from this Python gets."""
     return re.search(rf"^{package}==(\S+)$", requirements_file(sys.version_info[:2]).read_text(), re.MULTILINE)[1]
 
 
 def write_wheel(folder: Path, package: str, text: str = '__version__ = "{version}"\n', requires: str = "") -> Path:
     """Write the wheel of a package whose `__init__.py` is `text`, and which requires another."""
-    version = pinned(package)
+    version = pinned_version(package)
     information = f"{package}-{version}.dist-info"
     path = folder / f"{package}-{version}-py3-none-any.whl"
     with zipfile.ZipFile(path, "w") as archive:
