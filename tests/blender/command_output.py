@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a verb of the command line prints."""
+"""The output of a verb of the command line, as lines."""
 
 import io
 from contextlib import redirect_stderr, redirect_stdout
@@ -10,7 +10,7 @@ from .conftest import run
 
 @dataclass(frozen=True)
 class CommandOutput:
-    """What a command printed, a list of lines each."""
+    """Lines that a command printed to stdout and to stderr."""
 
     out: list[str]
     err: list[str]

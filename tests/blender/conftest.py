@@ -102,17 +102,17 @@ def _addon() -> Iterator[None]:
 
 
 def without_deformation(model: Path) -> Path:
-    """Write a model beside another that says nothing about modifiers and shape keys: it plays on any."""
+    """Write a copy of a model without requirements for modifiers and shape keys, in the same folder."""
     return with_deformation(model, {})
 
 
 def with_deformation(model: Path, deformation: dict) -> Path:
-    """Write a model beside another that was recorded with other modifiers, shape keys and drivers."""
+    """Write a copy of a model that requires other modifiers, shape keys and drivers, in the same folder."""
     import json
 
     import onnx
 
-    # Processes that run tests side by side share the folder.
+    # Test processes share the folder.
     loaded, path = onnx.load(model), model.with_name(f"other_{os.getpid()}_{model.name}")
     (prop,) = (prop for prop in loaded.metadata_props if prop.key == METADATA_KEY)
     info = json.loads(prop.value)
@@ -123,7 +123,7 @@ def with_deformation(model: Path, deformation: dict) -> Path:
 
 
 def write_edited(model: Path, path: Path, edit: Callable) -> Path:
-    """Write a model that `edit` has changed in place, with the checksum of its changed weights, to a path."""
+    """Write a copy of a model that `edit` changes, with a matching checksum, and return its path."""
     import onnx
 
     from fdda_addon.core.model import CHECKSUM_KEY
@@ -155,27 +155,27 @@ def refusal_on_a_full_disk(tmp_path: Path, capsys: pytest.CaptureFixture):
 
 @pytest.fixture
 def loose_model(elbow: ElbowFiles) -> Path:
-    """The elbow's model for characters with other modifiers."""
+    """Return a copy of the elbow's model that plays with any modifiers."""
     return without_deformation(elbow.model)
 
 
 @pytest.fixture
 def rig(elbow: ElbowFiles) -> SceneRig:
-    """The elbow's file, opened."""
+    """Open the elbow's file, and return its rig."""
     bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
     return find_rig()
 
 
 @pytest.fixture
 def bound(elbow: ElbowFiles) -> bpy.types.Object:
-    """The bound elbow's mesh object, its file opened."""
+    """Open the file of the bound elbow, and return its mesh object."""
     bpy.ops.wm.open_mainfile(filepath=str(elbow.bound))
     return bpy.data.objects[ELBOW]
 
 
 @pytest.fixture
 def library(elbow: ElbowFiles, tmp_path: Path):
-    """A library with the bound elbow (`linked.Library`), and a new shot that is open."""
+    """Make a library with the bound elbow (`linked.Library`), and leave an empty shot open."""
     from .linked import make_library
 
     return make_library(elbow, tmp_path)
@@ -183,7 +183,7 @@ def library(elbow: ElbowFiles, tmp_path: Path):
 
 @pytest.fixture
 def pair(library) -> list[bpy.types.Object]:
-    """Two overrides of the library's elbow in two poses."""
+    """Make two library overrides of the elbow, each in another pose."""
     from .linked import ANGLES, link, override
 
     collection = link(library.path)
@@ -191,7 +191,7 @@ def pair(library) -> list[bpy.types.Object]:
 
 
 def rig_positions(mesh_object: bpy.types.Object) -> np.ndarray:
-    """What the rig of a playing character shows; it plays on."""
+    """Return the positions (V, 3) that a playing character has in mode RIG; the mode is FDDA afterwards."""
     mesh_object.fdda.mode = "RIG"
     positions = evaluated(mesh_object)
     mesh_object.fdda.mode = "FDDA"
@@ -199,13 +199,13 @@ def rig_positions(mesh_object: bpy.types.Object) -> np.ndarray:
 
 
 def pose(armature_name: str = ELBOW_RIG, angle: float = 1.0, bone: str = "lower") -> None:
-    """Bend a bone about X and evaluate."""
+    """Rotate a bone to an angle about X, in radians, and update the view layer."""
     bpy.data.objects[armature_name].pose.bones[bone].rotation_euler[0] = angle
     bpy.context.view_layer.update()
 
 
 def evaluated(mesh_object: bpy.types.Object) -> np.ndarray:
-    """(V, 3), what Blender shows, as a user's script would read it."""
+    """Return the positions (V, 3) of the evaluated mesh, read as a user's script reads them."""
     mesh_object = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
     mesh = mesh_object.to_mesh()
     positions = np.array([vertex.co[:] for vertex in mesh.vertices], np.float32)
@@ -214,7 +214,7 @@ def evaluated(mesh_object: bpy.types.Object) -> np.ndarray:
 
 
 def predicted(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:
-    """(V, 3), what the model says of the pose that Blender has evaluated; nothing of the playback is used."""
+    """Return the model's positions (V, 3) for the evaluated pose, computed without the code for playback."""
     network = Network(model)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     armature_object = armature_of(mesh_object)
@@ -227,7 +227,7 @@ def predicted(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:
 
 
 def assert_plays(mesh_object: bpy.types.Object, model: Path) -> np.ndarray:
-    """The evaluated mesh is the model's output within 1e-5 m; returns it."""
+    """Assert that the evaluated mesh equals the model's output within 1e-5 m, and return its positions (V, 3)."""
     positions = evaluated(mesh_object)
     assert not mesh_object.fdda.status
     assert np.abs(positions - predicted(mesh_object, model)).max() < 1e-5

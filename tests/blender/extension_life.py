@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The extension in a Blender of its own: `python extension_life.py live|install|play|start|list [ZIP [BOUND]]`.
+"""Program that installs and uses the extension: `python extension_life.py live|install|play|start|list [ZIP [BOUND]]`.
 
-`live` installs the zip, enables, disables, installs again, uninstalls, and prints what Blender holds after each;
-`install` installs and enables it; `play` then opens a bound file and poses it; `start` says what it costs
-to enable it, once it is installed; `list` names the files of the user. The last line is JSON.
-BLENDER_USER_RESOURCES names the folder for all that. Blender itself runs it too: `blender -b --python … -- live ZIP`.
+Its last line of output is JSON. The environment variable BLENDER_USER_RESOURCES names the user's folder. Blender can
+run this file too: `blender -b --python … -- live ZIP`.
+
+* `live` installs, enables, disables, updates and uninstalls the extension, and prints what is registered each time.
+* `install` installs and enables the extension.
+* `play` installs the extension, opens a bound file and poses the character.
+* `start` enables the installed extension, and prints how long that takes.
+* `list` prints the files in the user's folder.
 """
 
 import json
@@ -20,13 +24,13 @@ REPOSITORY, IDENTIFIER = "user_default", "fdda"
 MODULE = f"bl_ext.{REPOSITORY}.{IDENTIFIER}"
 
 
-def registered() -> dict:
-    """What Blender holds that an add-on may have left."""
+def registered_items() -> dict:
+    """Return everything that an add-on can register in Blender, by kind."""
     owners = (bpy.types.Object, bpy.types.Scene, bpy.types.WindowManager, bpy.types.Armature, bpy.types.Mesh)
     handlers = {name: getattr(bpy.app.handlers, name) for name in dir(bpy.app.handlers)}
     keymaps = bpy.context.window_manager.keyconfigs.addon
     return {
-        "classes": sorted(cls.__name__ for cls in classes() if "fdda" in cls.__module__ and cls.is_registered),
+        "classes": sorted(cls.__name__ for cls in blender_classes() if "fdda" in cls.__module__ and cls.is_registered),
         "operators": sorted(dir(bpy.ops.fdda)),
         "properties": sorted(f"{owner.__name__}.{name}" for owner in owners for name in dir(owner) if "fdda" in name),
         "handlers": sorted(
@@ -39,7 +43,7 @@ def registered() -> dict:
         "keymap_items": sum(len(keymap.keymap_items) for keymap in keymaps.keymaps) if keymaps else 0,
         "additions": sorted(
             f"{cls.__name__}: {function.__module__}"
-            for cls in classes()
+            for cls in blender_classes()
             for function in getattr(getattr(cls, "draw", None), "_draw_funcs", ())
             if "fdda" in function.__module__
         ),
@@ -48,15 +52,15 @@ def registered() -> dict:
     }
 
 
-def classes() -> list[type]:
-    """The classes that Python code has made for Blender, registered or not."""
+def blender_classes() -> list[type]:
+    """Return the Python subclasses of Blender's types, registered or not."""
     kinds = ("AddonPreferences", "Gizmo", "GizmoGroup", "Header", "KeyingSetInfo", "Menu", "Operator", "Panel")
     kinds += ("PropertyGroup", "UIList")
     return [cls for kind in kinds for cls in getattr(bpy.types, kind).__subclasses__()]
 
 
 def loaded_commands() -> list[str]:
-    """Modules whose command is registered: Blender keeps no list of them for scripts, the add-on does."""
+    """Return the modules of the add-on that have registered a command: Blender offers no list of commands."""
     return [
         name
         for name, module in sys.modules.items()
@@ -64,23 +68,27 @@ def loaded_commands() -> list[str]:
     ]
 
 
-def files(user: Path) -> list[str]:
-    """What lies in the user's folder, but for caches of Blender's own and the list of extensions."""
+def user_files(user: Path) -> list[str]:
+    """Return the paths of all files in the user's folder, without caches."""
     paths = (path.relative_to(user).as_posix() for path in user.rglob("*") if path.is_file())
     return sorted(path for path in paths if "__pycache__" not in path and "/.cache/" not in path)
 
 
-def install(package: str, enable: bool) -> list[str]:
-    """Install the zip, as Install from Disk does."""
+def install_zip(package: str, enable: bool) -> list[str]:
+    """Install a zip with the operator of Install from Disk, and return its result."""
     options = {"filepath": package, "repo": REPOSITORY, "enable_on_install": enable}
     return list(bpy.ops.extensions.package_install_files(**options))
 
 
-def start() -> dict:
-    """Enable the installed extension as Blender does when it starts, and play a frame with nothing bound."""
+def enable_at_startup() -> dict:
+    """Enable the installed extension as Blender does when it starts, and change the frame of a file without models.
+
+    Returns:
+        CPU time and wall-clock time in seconds, and the large libraries that were imported.
+    """
     import addon_utils
 
-    # The bpy module imports numpy, Blender's program does not.
+    # Blender starts without numpy, but the bpy module has imported it.
     for name in [name for name in sys.modules if name.partition(".")[0] == "numpy"]:
         del sys.modules[name]
     begin, begin_wall = time.process_time(), time.perf_counter()
@@ -92,7 +100,7 @@ def start() -> dict:
 
 
 def installed_onnxruntime() -> ModuleType:
-    """Import what the zip brought, ahead of another one, which the bpy wheel's environment may have."""
+    """Import the ONNX Runtime that the zip has installed, although the environment may contain another one."""
     user = Path(os.environ["BLENDER_USER_RESOURCES"])
     sys.path.insert(0, str(next(user.glob("extensions/.local/lib/*/site-packages"))))
     import onnxruntime
@@ -100,9 +108,9 @@ def installed_onnxruntime() -> ModuleType:
     return onnxruntime
 
 
-def play(package: str, bound: str) -> dict:
-    """Install the zip and play a bound file: what the elbow shows when it is bent."""
-    install(package, True)
+def play_bound_file(package: str, bound: str) -> dict:
+    """Install a zip, open a bound file and bend the elbow; return the evaluated positions."""
+    install_zip(package, True)
     onnxruntime = installed_onnxruntime()
     bpy.ops.wm.open_mainfile(filepath=bound)
     bpy.data.objects["elbow_rig"].pose.bones["lower"].rotation_euler[0] = 1.0
@@ -115,45 +123,45 @@ def play(package: str, bound: str) -> dict:
     }
 
 
-def live(package: str) -> dict[str, dict]:
-    """The whole life: what Blender holds after each step."""
+def run_life_cycle(package: str) -> dict[str, dict]:
+    """Install, enable, disable, update and uninstall the extension; return what is registered after each step."""
     user = Path(os.environ["BLENDER_USER_RESOURCES"])
-    story: dict[str, dict] = {}
+    states: dict[str, dict] = {}
 
-    def note(name: str, **values: object) -> None:
-        story[name] = {**registered(), "files": files(user), **values}
+    def add_state(name: str, **values: object) -> None:
+        states[name] = {**registered_items(), "files": user_files(user), **values}
 
-    note("before")
-    note("installed", result=install(package, False))
+    add_state("before")
+    add_state("installed", result=install_zip(package, False))
     bpy.ops.preferences.addon_enable(module=MODULE)
-    note("enabled")
+    add_state("enabled")
     bpy.ops.preferences.addon_disable(module=MODULE)
-    note("disabled")
+    add_state("disabled")
     bpy.ops.preferences.addon_enable(module=MODULE)
-    own = Path(bpy.utils.extension_path_user(MODULE, create=True)) / "kept"
-    own.write_text("what the user has made")
+    user_file = Path(bpy.utils.extension_path_user(MODULE, create=True)) / "kept"
+    user_file.write_text("made by the user")
     onnxruntime = installed_onnxruntime()
-    note("used", onnxruntime=onnxruntime.__file__, providers=onnxruntime.get_available_providers())
-    note("updated", result=install(package, True), kept=own.is_file())
+    add_state("used", onnxruntime=onnxruntime.__file__, providers=onnxruntime.get_available_providers())
+    add_state("updated", result=install_zip(package, True), kept=user_file.is_file())
     repositories = bpy.context.preferences.extensions.repos
     index = next(i for i, repository in enumerate(repositories) if repository.module == REPOSITORY)
     result = bpy.ops.extensions.package_uninstall(repo_index=index, pkg_id=IDENTIFIER)
-    note("uninstalled", result=list(result), kept=own.exists())
-    return story
+    add_state("uninstalled", result=list(result), kept=user_file.exists())
+    return states
 
 
 def main(action: str, *paths: str) -> None:
     if action == "live":
-        told = live(*paths)
+        result = run_life_cycle(*paths)
     elif action == "install":
-        told = {"result": install(*paths, True)}
+        result = {"result": install_zip(*paths, True)}
     elif action == "list":
-        told = {"files": files(Path(os.environ["BLENDER_USER_RESOURCES"]))}
+        result = {"files": user_files(Path(os.environ["BLENDER_USER_RESOURCES"]))}
     elif action == "play":
-        told = play(*paths)
+        result = play_bound_file(*paths)
     else:
-        told = start()
-    print(json.dumps(told))
+        result = enable_at_startup()
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

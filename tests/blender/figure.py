@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A figure with two arms, the same on both sides, that animation moves: bones, a custom property, a shape key."""
+"""A symmetric figure with two arms. Actions animate its bones, a custom property and a shape key."""
 
 import math
 from collections.abc import Callable
@@ -10,31 +10,38 @@ from mathutils import Euler
 
 from fdda_addon.scene.scene_rig import SceneRig
 
-ARM_REACH, HEIGHT, RADIUS = 0.8, 0.9, 0.06
+ARM_REACH, ARM_HEIGHT, ARM_RADIUS = 0.8, 0.9, 0.06
 WAVE, FRAMES = "wave", 24
 SMILE = 'key_blocks["Smile"].value'
-_AROUND, _RINGS = 8, 24
+_VERTICES_PER_RING, _SEGMENT_COUNT = 8, 24
 
 
 def build_figure() -> SceneRig:
-    """A new figure in an empty scene: `body`, a bar along X, and `figure_rig` with the bones spine, arm.L and arm.R."""
+    """Build the figure in an empty scene.
+
+    Its mesh `body` is a bar along X. Its armature `figure_rig` has the bones spine, arm.L and arm.R.
+    """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     armature_object = bpy.data.objects.new("figure_rig", bpy.data.armatures.new("figure_rig"))
     bpy.context.scene.collection.objects.link(armature_object)
     bpy.context.view_layer.objects.active = armature_object
-    _add_bones(armature_object)
-    points = _points()
+    _build_bones(armature_object)
+    points = _rest_positions()
     mesh = bpy.data.meshes.new("body")
     faces = [
-        (ring * _AROUND + j, ring * _AROUND + (j + 1) % _AROUND, *(((ring + 1) * _AROUND + k) for k in (_next(j), j)))
-        for ring in range(_RINGS)
-        for j in range(_AROUND)
+        (
+            ring * _VERTICES_PER_RING + j,
+            ring * _VERTICES_PER_RING + (j + 1) % _VERTICES_PER_RING,
+            *(((ring + 1) * _VERTICES_PER_RING + k) for k in (_next_around(j), j)),
+        )
+        for ring in range(_SEGMENT_COUNT)
+        for j in range(_VERTICES_PER_RING)
     ]
     mesh.from_pydata(points.tolist(), [], faces)
     body = bpy.data.objects.new("body", mesh)
     bpy.context.scene.collection.objects.link(body)
     left = np.clip((points[:, 0] - 0.1) / 0.2, 0, 1)
-    right = left.reshape(_RINGS + 1, _AROUND)[::-1].ravel()
+    right = left.reshape(_SEGMENT_COUNT + 1, _VERTICES_PER_RING)[::-1].ravel()
     for name, weights in (("arm.L", left), ("arm.R", right), ("spine", 1 - left - right)):
         group = body.vertex_groups.new(name=name)
         for index in np.flatnonzero(weights > 0):
@@ -50,20 +57,20 @@ def build_figure() -> SceneRig:
     return SceneRig(body, armature_object)
 
 
-def _next(place: int) -> int:
-    return (place + 1) % _AROUND
+def _next_around(index: int) -> int:
+    return (index + 1) % _VERTICES_PER_RING
 
 
-def _points() -> np.ndarray:
-    angles = (np.arange(_AROUND) + 0.5) * 2 * np.pi / _AROUND
-    along = np.linspace(-ARM_REACH, ARM_REACH, _RINGS + 1)
-    return np.array([(x, RADIUS * np.cos(a), HEIGHT + RADIUS * np.sin(a)) for x in along for a in angles])
+def _rest_positions() -> np.ndarray:
+    angles = (np.arange(_VERTICES_PER_RING) + 0.5) * 2 * np.pi / _VERTICES_PER_RING
+    along = np.linspace(-ARM_REACH, ARM_REACH, _SEGMENT_COUNT + 1)
+    return np.array([(x, ARM_RADIUS * np.cos(a), ARM_HEIGHT + ARM_RADIUS * np.sin(a)) for x in along for a in angles])
 
 
-def _add_bones(armature_object: bpy.types.Object) -> None:
+def _build_bones(armature_object: bpy.types.Object) -> None:
     bpy.ops.object.mode_set(mode="EDIT")
     bones = armature_object.data.edit_bones
-    ends = {"spine": ((0, 0, 0), (0, 0, HEIGHT)), "arm.L": ((0.2, 0, HEIGHT), (ARM_REACH, 0, HEIGHT))}
+    ends = {"spine": ((0, 0, 0), (0, 0, ARM_HEIGHT)), "arm.L": ((0.2, 0, ARM_HEIGHT), (ARM_REACH, 0, ARM_HEIGHT))}
     ends["arm.R"] = tuple((-x, y, z) for x, y, z in ends["arm.L"])
     for name, (head, tail) in ends.items():
         bone = bones.new(name)
@@ -77,31 +84,31 @@ def _add_bones(armature_object: bpy.types.Object) -> None:
 
 
 def key_channel(bone: bpy.types.PoseBone, frame: int, channel: str, value: object) -> None:
-    """Set a channel of a bone and key it."""
+    """Set a property of a pose bone, and insert a keyframe."""
     setattr(bone, channel, value)
     bone.keyframe_insert(channel, frame=frame)
 
 
 def add_wave(rig: SceneRig) -> bpy.types.Action:
-    """The action `wave`: the spine turns and rises, the left arm swings farther than the right, its fist closes."""
+    """Add the action `wave`: the spine moves, the left arm swings farther than the right, and its fist closes."""
     animation = rig.armature_object.animation_data_create()
     animation.action = action = bpy.data.actions.new(WAVE)
     bones = rig.armature_object.pose.bones
     for frame in range(1, FRAMES + 1):
-        part = math.sin((frame - 1) / (FRAMES - 1) * math.pi)
-        key_channel(bones["spine"], frame, "rotation_euler", (0.1 * part, 0.4 * part, 0))
-        key_channel(bones["spine"], frame, "location", (0.02 * part, 0.05 * part, 0))
-        for name, turn in (("arm.L", (0.2 + part, 0, 0.3 * part)), ("arm.R", (0.3 * part, 0.1 * part, 0))):
-            key_channel(bones[name], frame, "rotation_quaternion", Euler(turn).to_quaternion())
-        key_channel(bones["arm.R"], frame, "scale", (1, 1 + 0.1 * part, 1))
-        bones["arm.L"]["fist"] = part
+        amount = math.sin((frame - 1) / (FRAMES - 1) * math.pi)
+        key_channel(bones["spine"], frame, "rotation_euler", (0.1 * amount, 0.4 * amount, 0))
+        key_channel(bones["spine"], frame, "location", (0.02 * amount, 0.05 * amount, 0))
+        for name, angles in (("arm.L", (0.2 + amount, 0, 0.3 * amount)), ("arm.R", (0.3 * amount, 0.1 * amount, 0))):
+            key_channel(bones[name], frame, "rotation_quaternion", Euler(angles).to_quaternion())
+        key_channel(bones["arm.R"], frame, "scale", (1, 1 + 0.1 * amount, 1))
+        bones["arm.L"]["fist"] = amount
         bones["arm.L"].keyframe_insert('["fist"]', frame=frame)
     bpy.context.view_layer.update()
     return action
 
 
 def add_smile(rig: SceneRig, action: bpy.types.Action) -> None:
-    """Let the action move the shape key as well; only where actions have slots."""
+    """Animate the shape key in the same action. This needs a Blender whose actions have slots."""
     keys = rig.mesh_object.data.shape_keys
     animation = keys.animation_data_create()
     action.slots.new(id_type="KEY", name=keys.name)
@@ -114,7 +121,7 @@ def add_smile(rig: SceneRig, action: bpy.types.Action) -> None:
 
 
 def edit_bones(rig: SceneRig, change: Callable[[bpy.types.ArmatureEditBones], None]) -> None:
-    """Change the rest pose."""
+    """Change the armature's bones in edit mode."""
     bpy.context.view_layer.objects.active = rig.armature_object
     bpy.ops.object.mode_set(mode="EDIT")
     change(rig.armature_object.data.edit_bones)

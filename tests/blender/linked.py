@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A character in a library, and shots that link it."""
+"""The elbow in a library file, and shots that link it."""
 
 import itertools
 import shutil
@@ -23,19 +23,19 @@ from .conftest import ELBOW, ELBOW_RIG, ElbowFiles, assert_plays
 ROOT = Path(__file__).resolve().parents[2]
 COLLECTION = "Character"
 ANGLES = (0.3, 1.4)
-"""Radians: the bend of the elbows of a shot."""
+"""Angle of the elbow of each override in a shot, in radians."""
 
 
 @dataclass(frozen=True)
 class Library:
-    """A character that is linked: its file, and its model beside it."""
+    """Paths of a library: the file of the character, and its model in the same folder."""
 
     path: Path
     model: Path
 
 
 def save_character(source: Path, path: Path) -> None:
-    """Save what a file holds, in a collection to be linked."""
+    """Save a copy of a file in which the character is in a collection that can be linked."""
     bpy.ops.wm.open_mainfile(filepath=str(source))
     collection = bpy.data.collections.new(COLLECTION)
     bpy.context.scene.collection.children.link(collection)
@@ -50,7 +50,7 @@ def save_character(source: Path, path: Path) -> None:
 
 
 def make_library(elbow: ElbowFiles, folder: Path) -> Library:
-    """The bound elbow in a folder of its own; the open file is an empty shot, saved in another."""
+    """Save the bound elbow as a library in one folder; then open an empty shot in another folder."""
     model_files._chosen_paths.clear()
     files = Library(folder / "characters" / "elbow.blend", folder / "characters" / "elbow.onnx")
     files.path.parent.mkdir()
@@ -77,13 +77,16 @@ def save_and_reopen_shot(folder: Path) -> None:
 
 
 def link_character(path: Path) -> bpy.types.Collection:
-    with bpy.data.libraries.load(str(path), link=True, relative=True) as (_, wanted):
-        wanted.collections = [COLLECTION]
-    return wanted.collections[0]
+    with bpy.data.libraries.load(str(path), link=True, relative=True) as (_, linked_data):
+        linked_data.collections = [COLLECTION]
+    return linked_data.collections[0]
 
 
 def override_character(collection: bpy.types.Collection, angle: float | None = None, is_editable: bool = True):
-    """A library override of a linked character in a pose, without its action; its mesh object."""
+    """Create a library override of a linked character, and return its mesh object.
+
+    With an angle, remove the override's action and bend the elbow.
+    """
     root = collection.override_hierarchy_create(
         bpy.context.scene, bpy.context.view_layer, do_fully_editable=is_editable
     )
@@ -107,7 +110,7 @@ def bend_elbow(mesh_object: bpy.types.Object, angle: float) -> None:
 
 
 def overridden_meshes() -> list[bpy.types.Object]:
-    """The mesh objects of the open file's overrides, by name."""
+    """Return the mesh objects of all library overrides in the open file, sorted by name."""
     return [o for o in bpy.data.objects if o.type == "MESH" and o.override_library]
 
 
@@ -116,19 +119,19 @@ def buffer_name(mesh_object: bpy.types.Object) -> str:
 
 
 def assert_overrides_play(library: Library, angles: tuple[float, ...] = ANGLES) -> list[np.ndarray]:
-    """Each override shows the model's output for its own pose; their positions."""
+    """Assert that each override shows the model's output for its own pose; return the positions of each."""
     bpy.context.view_layer.update()
     mesh_objects = overridden_meshes()
-    found = [armature_of(o).pose.bones["lower"].rotation_euler[0] for o in mesh_objects]
-    assert found == pytest.approx(angles)
+    elbow_angles = [armature_of(o).pose.bones["lower"].rotation_euler[0] for o in mesh_objects]
+    assert elbow_angles == pytest.approx(angles)
     positions = [assert_plays(o, library.model) for o in mesh_objects]
-    for one, other in itertools.pairwise(positions):
-        assert np.abs(one - other).max() > 1e-3
+    for first, second in itertools.pairwise(positions):
+        assert np.abs(first - second).max() > 1e-3
     return positions
 
 
 def run_in_another_process(call: str) -> None:
-    """Call a function of this file in a process of its own, which has done nothing before."""
+    """Call a function of this module in a new process."""
     code = f"""
 import fdda_addon
 from tests.blender import linked
@@ -138,18 +141,18 @@ try:
 finally:
     fdda_addon.unregister()
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
 
 
 def open_shot(path: str, model: str) -> None:
-    """Open a shot; its overrides play as they were saved."""
+    """Open a shot, and assert that its overrides play in their saved poses."""
     bpy.ops.wm.open_mainfile(filepath=path)
     assert_overrides_play(Library(Path(), Path(model)))
 
 
 def pack_model(path: str) -> None:
-    """Pack the model into the file of the character, and let the character be saved with the rig shown."""
+    """Pack the model into the character's file, set the mode RIG, and save the file."""
     bpy.ops.wm.open_mainfile(filepath=path)
     mesh_object = bpy.data.objects[ELBOW]
     model_list.add_bound_model(mesh_object)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Characters with a modifier more, the smallest recording of them, and what a refusal of them must be."""
+"""Characters with an additional modifier, a small recording of them, and a check that they are refused."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -30,33 +30,37 @@ def build_rig(build: Callable[[], object] = tube) -> SceneRig:
 
 
 def assert_refused(rig: SceneRig, model: Path, recording: Path, sentence: str) -> None:
-    """Check, record, evaluate and bind say the same sentence; nothing is written, and the scene is as before."""
+    """Assert that check, record, evaluate and bind refuse a rig with one sentence, and change no file and no scene."""
     before = scene_state(rig)
-    for refused in (
+    for call in (
         lambda: drain(record(rig, recording, FEW_POSES)),
         lambda: drain(evaluate(rig, model, EvaluationSettings(poses=2))),
         lambda: bind(rig, model),
     ):
         with pytest.raises(RigError) as error:
-            refused()
+            call()
         assert str(error.value) == sentence
     assert sentence in check_recordable_rig(rig).problems
     assert_same_state(before, scene_state(rig))
     assert not recording.exists()
 
 
-def add_modifier_at(place: int, kind: str, **settings: object) -> Callable[[bpy.types.Object], None]:
+def add_modifier_at(index: int, kind: str, **settings: object) -> Callable[[bpy.types.Object], None]:
+    """Return a function that adds a modifier to an object, at an index of its stack."""
+
     def add(mesh_object: bpy.types.Object) -> None:
         modifier = mesh_object.modifiers.new("It", kind)
         for name, value in settings.items():
             setattr(modifier, name, value)
-        mesh_object.modifiers.move(len(mesh_object.modifiers) - 1, place)
+        mesh_object.modifiers.move(len(mesh_object.modifiers) - 1, index)
 
     return add
 
 
-def add_nodes_at(place: int, *kinds: str) -> Callable[[bpy.types.Object], None]:
+def add_nodes_at(index: int, *kinds: str) -> Callable[[bpy.types.Object], None]:
+    """Return a function that adds Geometry Nodes with a chain of nodes to an object, at an index of its stack."""
+
     def add(mesh_object: bpy.types.Object) -> None:
-        add_modifier_at(place, "NODES", node_group=stacks.chain("Group", *kinds))(mesh_object)
+        add_modifier_at(index, "NODES", node_group=stacks.chain("Group", *kinds))(mesh_object)
 
     return add

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What a refused command line must look like: one sentence, exit status 1, no file touched."""
+"""Verbs that must fail with one error message and exit status 1, and must leave all files unchanged."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -21,35 +21,35 @@ PROGRESS_LINE = re.compile(
 
 
 def file_contents(folder: Path) -> dict[str, bytes | None]:
-    """Content of every file below a folder by path; None for a folder."""
+    """Return the content of every file below a folder by relative path; the content of a folder is None."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")
     }
 
 
 class Refusal:
-    """Runs verbs that must be refused; `folder` holds all files that they could touch."""
+    """A function that runs verbs which must fail; `folder` contains all files that they could change."""
 
     def __init__(self, folder: Path, capfd: pytest.CaptureFixture):
         self.folder, self._capfd = folder, capfd
 
     def __call__(self, *arguments: object, status: int = 1) -> str:
-        """Run a verb that ends with an exit status, and return its sentence."""
+        """Run a verb that must end with an exit status, and return its error message."""
         before = file_contents(self.folder)
         self._capfd.readouterr()
-        ended = run(*arguments)
+        exit_status = run(*arguments)
         captured = self._capfd.readouterr()
-        assert ended == status, captured
+        assert exit_status == status, captured
         lines = [line for line in captured.err.splitlines() if not PROGRESS_LINE.fullmatch(line)]
         assert len(lines) == 1, captured.err
         assert re.fullmatch(r"Error: .+[^.]\.", lines[0]), "a sentence"
         assert "Traceback" not in captured.out and "Error" not in captured.out
-        assert file_contents(self.folder) == before, "files were touched"
+        assert file_contents(self.folder) == before, "files were changed"
         return lines[0].removeprefix("Error: ")
 
 
 def save_elbow(path: Path, change: Callable[[SceneRig], object] = lambda rig: None) -> Path:
-    """Save an elbow that something was done to."""
+    """Build an elbow, change it and save it; return the path of the file."""
     change(fresh_elbow())
     save_copy(path)
     return path
@@ -57,7 +57,7 @@ def save_elbow(path: Path, change: Callable[[SceneRig], object] = lambda rig: No
 
 @contextmanager
 def limited_file_size(limit: int) -> Iterator[None]:
-    """No file grows beyond so many bytes: what a full disk looks like to the one who writes."""
+    """Limit the size of every file that this process writes, in bytes, to imitate a full disk."""
     resource = pytest.importorskip("resource", reason=systems.NO_FILE_SIZE_LIMITS)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))

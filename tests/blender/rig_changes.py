@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Changes of a rig that its model does not follow: by hand in edit mode, and by a script."""
+"""Changes of a rig after which its model no longer fits: made in edit mode, and made by a script."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ REST_POSE_OF, WEIGHTS_DIFFER = "the rest pose of the", "the skin weights differ"
 
 
 def change_in_edit_mode(scene_object: bpy.types.Object, change: Callable[[], object]) -> None:
-    """Do something in edit mode, as a script: nothing is evaluated before it is over."""
+    """Change an object in edit mode without an evaluation in between."""
     bpy.context.view_layer.objects.active = scene_object
     bpy.ops.object.mode_set(mode="EDIT")
     change()
@@ -29,19 +29,19 @@ def add_bone(name: str, parent: str = "") -> None:
     bone.parent = edit_bones().get(parent)
 
 
-def change_roll():
+def change_bone_roll():
     edit_bones()["lower"].roll += 0.4
 
 
-def change_head():
+def change_bone_head():
     edit_bones()["lower"].head.x += 0.05
 
 
-def change_parent():
+def remove_bone_parent():
     edit_bones()["lower"].parent = None
 
 
-def exchange_joint():
+def replace_joint():
     edit_bones().remove(edit_bones()["lower"])
     add_bone("other", "upper")
 
@@ -57,7 +57,7 @@ def exchange_mesh():
     bpy.data.objects[ELBOW].data = mesh
 
 
-def write_positions():
+def scale_positions():
     mesh = bpy.data.objects[ELBOW].data
     positions = np.empty(3 * len(mesh.vertices), np.float32)
     mesh.vertices.foreach_get("co", positions)
@@ -77,7 +77,7 @@ def vertex_groups() -> bpy.types.VertexGroups:
     return bpy.data.objects[ELBOW].vertex_groups
 
 
-def remove_group():
+def remove_vertex_group():
     vertex_groups().remove(vertex_groups()["lower"])
 
 
@@ -88,27 +88,27 @@ def rename_bone():
 NO_BONE_FOLLOWED = "some vertices follow no bone"
 
 EDIT_MODE_CHANGES = {
-    "roll": (ELBOW_RIG, change_roll, f"{REST_POSE_OF} armature differs"),
-    "head": (ELBOW_RIG, change_head, f"{REST_POSE_OF} armature differs"),
-    "parent": (ELBOW_RIG, change_parent, "its joints have other parents"),
-    "exchanged joint": (ELBOW_RIG, exchange_joint, "the armature lacks the joint 'lower'"),
+    "roll": (ELBOW_RIG, change_bone_roll, f"{REST_POSE_OF} armature differs"),
+    "head": (ELBOW_RIG, change_bone_head, f"{REST_POSE_OF} armature differs"),
+    "parent": (ELBOW_RIG, remove_bone_parent, "its joints have other parents"),
+    "exchanged joint": (ELBOW_RIG, replace_joint, "the armature lacks the joint 'lower'"),
     "sorted vertices": (ELBOW, sort_vertices, f"{REST_POSE_OF} mesh differs"),
     "flipped faces": (ELBOW, flip_faces, "the topology of the mesh differs"),
 }
 
 SCRIPT_CHANGES = {
     "another mesh": (exchange_mesh, f"{REST_POSE_OF} mesh differs"),
-    "positions": (write_positions, f"{REST_POSE_OF} mesh differs"),
+    "positions": (scale_positions, f"{REST_POSE_OF} mesh differs"),
     "weights": (lambda: vertex_groups()["lower"].add([0, 1], 0.3, "ADD"), WEIGHTS_DIFFER),
     "a weight": (lambda: change_weight(), WEIGHTS_DIFFER),
-    "a group is gone": (remove_group, NO_BONE_FOLLOWED),
+    "a group is gone": (remove_vertex_group, NO_BONE_FOLLOWED),
     "a group has another name": (lambda: setattr(vertex_groups()["lower"], "name", "elsewhere"), NO_BONE_FOLLOWED),
     "no deform": (
         lambda: setattr(bpy.data.objects[ELBOW_RIG].data.bones["lower"], "use_deform", False),
         NO_BONE_FOLLOWED,
     ),
-    "an inverted group": (lambda: set_modifier(vertex_group="upper"), NO_BONE_FOLLOWED),
-    "no groups": (lambda: set_modifier(use_vertex_groups=False, use_bone_envelopes=True), WEIGHTS_DIFFER),
+    "an inverted group": (lambda: set_armature_modifier(vertex_group="upper"), NO_BONE_FOLLOWED),
+    "no groups": (lambda: set_armature_modifier(use_vertex_groups=False, use_bone_envelopes=True), WEIGHTS_DIFFER),
     "bone name": (rename_bone, "the armature lacks the joint 'lower'"),
 }
 
@@ -118,6 +118,6 @@ def change_weight():
     vertex.groups[0].weight *= 0.5
 
 
-def set_modifier(**settings: object) -> None:
+def set_armature_modifier(**settings: object) -> None:
     for name, value in settings.items():
         setattr(bpy.data.objects[ELBOW].modifiers["Armature"], name, value)

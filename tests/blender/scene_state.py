@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Everything of a scene that a job may borrow, as values that can be compared; and a fresh elbow to borrow from."""
+"""The state of a scene as values that can be compared, to check that a job restores everything it changes."""
 
 from collections.abc import Iterator
 
@@ -12,7 +12,7 @@ TRANSFORMS = ("location", "rotation_euler", "rotation_quaternion", "rotation_axi
 
 
 def fresh_elbow() -> SceneRig:
-    """A new elbow in an empty scene."""
+    """Build an elbow in an empty scene."""
     from blend_fixtures.elbow import build_elbow
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -25,7 +25,7 @@ def _properties(owner: object) -> dict:
 
 
 def scene_state(rig: SceneRig) -> dict:
-    """What must be the same before and after: animation, frame, poses, modifiers, selection, datablocks, positions."""
+    """Return all that a job must restore: animation, frame, poses, modifiers, selection, datablocks, positions."""
     scene, armature_object, animation = bpy.context.scene, rig.armature_object, rig.armature_object.animation_data
     bpy.context.view_layer.update()
     evaluated = rig.mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
@@ -55,19 +55,19 @@ def scene_state(rig: SceneRig) -> dict:
 
 
 def set_unusual_state(rig: SceneRig) -> None:
-    """Bring everything that is borrowed into a state that no default would restore."""
+    """Give everything that jobs change a value that differs from its default."""
     armature_object = rig.armature_object
     animation = armature_object.animation_data
-    other = bpy.data.actions.new("other")
+    other_action = bpy.data.actions.new("other")
     track = animation.nla_tracks.new()
     track.name = "below"
     track.strips.new("wave", 40, bpy.data.actions["elbow_wave"])
-    animation.action = other
+    animation.action = other_action
     for frame, angle in ((1, 0.0), (20, 0.4)):
         armature_object.pose.bones["upper"].rotation_euler[1] = angle
         armature_object.pose.bones["upper"].keyframe_insert("rotation_euler", index=1, frame=frame)
     bpy.context.scene.frame_set(7, subframe=0.25)
-    # Not keyed, and other than what the animation says at this frame.
+    # These values have no keyframes, and differ from the animated values of this frame.
     upper, lower = (armature_object.pose.bones[name] for name in ("upper", "lower"))
     upper.rotation_euler = (0.1, 0.2, 0.3)
     lower.rotation_euler[0] = 1.1
@@ -81,20 +81,20 @@ def set_unusual_state(rig: SceneRig) -> None:
 
 
 def drain(steps: Iterator, stop_after: int | None = None) -> object:
-    """Iterate to the end, or close after so many steps; returns the last step."""
-    seen = []
+    """Iterate to the end or close the iterator after a number of steps; return the last step."""
+    passed_steps = []
     for step in steps:
-        seen.append(step)
-        if len(seen) == stop_after:
+        passed_steps.append(step)
+        if len(passed_steps) == stop_after:
             steps.close()
-    return seen[-1]
+    return passed_steps[-1]
 
 
 def assert_same_state(before: dict, after: dict) -> None:
-    """Compare two states, key by key, so that a failure says what was not given back."""
+    """Assert that two states are equal; a failure names the key that was not restored."""
     for key in before:
         if key == "positions":
-            # The graph may sum up in another order; a pose that is off would show far above this.
+            # The order of floating-point sums may differ. Another pose would differ by far more.
             np.testing.assert_allclose(after[key], before[key], atol=1e-6)
         else:
             assert after[key] == before[key], key

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Programs that do as a test says in place of a Python or of the trainer, on every system."""
+"""Fake programs that run in place of Python or the trainer, on every operating system."""
 
 import os
 import sys
@@ -10,7 +10,7 @@ import pytest
 from fdda_addon.core.messages import Message, MessageType
 from fdda_addon.training.environment.choice import PYTHON_VARIABLE
 
-_HIJACK = """
+_SITE_CUSTOMIZE = """
 import sys
 if "trainer" in sys.orig_argv:
     import os, signal, time
@@ -24,23 +24,23 @@ if "trainer" in sys.orig_argv:
 
 
 def stand_in_trainer(folder: Path, monkeypatch: pytest.MonkeyPatch, *lines: str, status: int = 0) -> None:
-    """Have this Python run lines in place of the trainer, and exit with a status."""
+    """Run lines of Python code instead of the trainer, and exit with a status."""
     packages = folder / "packages"
     packages.mkdir()
     code = "\n".join(f"        {line}" for line in (f"status = {status}", *lines))
-    (packages / "sitecustomize.py").write_text(_HIJACK.format(code=code), encoding="utf-8")
+    (packages / "sitecustomize.py").write_text(_SITE_CUSTOMIZE.format(code=code), encoding="utf-8")
     monkeypatch.setenv("PYTHONPATH", str(packages))
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
     monkeypatch.setenv(PYTHON_VARIABLE, sys.executable)
 
 
 def print_message_code(kind: MessageType, **values) -> str:
-    """The line of code that says a message."""
+    """Return a line of code that prints a message of the trainer."""
     return f"print({Message(kind, values).encode()!r}, flush=True)"
 
 
 def write_program(path: Path, *lines: str) -> str:
-    """A program in place of a Python, which runs lines; returns its path."""
+    """Write a program that runs lines of Python code, whatever its arguments; return its path."""
     script = path.with_name(f"{path.name}.py")
     script.write_text("\n".join(["import json, os, subprocess, sys, time", *lines, ""]), encoding="utf-8")
     if os.name == "nt":

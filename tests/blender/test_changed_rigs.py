@@ -17,8 +17,8 @@ from .rig_changes import (
     SCRIPT_CHANGES,
     WEIGHTS_DIFFER,
     add_bone,
+    change_bone_roll,
     change_in_edit_mode,
-    change_roll,
     edit_bones,
     flip_faces,
     move_reference_key,
@@ -79,7 +79,7 @@ def test_the_reference_key_gives_the_rig_back(bound, capsys):
 def test_data_of_another_object_give_the_rig_back(bound, capsys):
     """The armature is edited, and the mesh is, through an object that has nothing to do with the character."""
     for scene_object, change, clause in (
-        (bpy.data.objects[ELBOW_RIG], change_roll, f"{REST_POSE_OF} armature differs"),
+        (bpy.data.objects[ELBOW_RIG], change_bone_roll, f"{REST_POSE_OF} armature differs"),
         (bound, flip_faces, "the topology of the mesh differs"),
     ):
         other = bpy.data.objects.new("other", scene_object.data)
@@ -144,7 +144,7 @@ def test_objects_that_move_on_their_own_play_on(bound, elbow):
 
 def test_a_change_while_no_model_played(bound, capsys):
     bound.fdda.mode = "RIG"
-    change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_roll)
+    change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_bone_roll)
     bound.fdda.mode = "FDDA"
     look("update")
     assert_given_back(bound, f"{REST_POSE_OF} armature differs", capsys)
@@ -152,7 +152,7 @@ def test_a_change_while_no_model_played(bound, capsys):
 
 def test_undone_it_plays_again(bound, elbow):
     bpy.ops.ed.undo_push(message="start")
-    change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_roll)
+    change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_bone_roll)
     bpy.context.view_layer.update()
     assert bound.fdda.mode == "RIG"
     bpy.ops.ed.undo_push(message="roll")
@@ -186,7 +186,7 @@ def test_a_file_in_which_the_rig_was_changed_without_the_addon(bound, tmp_path, 
 
     path = bpy.data.filepath.replace("bound.blend", "changed.blend")
     fdda_addon.unregister()
-    change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_roll)
+    change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_bone_roll)
     bpy.ops.wm.save_as_mainfile(filepath=path, copy=True)
     fdda_addon.register()
     capsys.readouterr()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Wheels of a few lines with the names and versions of what the trainer needs: enough to install and to import."""
+"""Tiny wheels with the names and versions of the trainer's packages, which can be installed and imported."""
 
 import re
 import sys
@@ -15,12 +15,19 @@ class cuda:
 
 
 def pinned_version(package: str) -> str:
-    """The version that an environment made from this Python gets."""
+    """Return the version of a package that the requirements for this Python pin."""
     return re.search(rf"^{package}==(\S+)$", requirements_file(sys.version_info[:2]).read_text(), re.MULTILINE)[1]
 
 
 def write_wheel(folder: Path, package: str, text: str = '__version__ = "{version}"\n', requires: str = "") -> Path:
-    """Write the wheel of a package whose `__init__.py` is `text`, and which requires another."""
+    """Write the wheel of a package.
+
+    Args:
+        folder: to write the wheel into.
+        package: its name.
+        text: content of `__init__.py`; `{version}` is replaced.
+        requires: another package that the wheel requires.
+    """
     version = pinned_version(package)
     information = f"{package}-{version}.dist-info"
     path = folder / f"{package}-{version}-py3-none-any.whl"
@@ -34,7 +41,7 @@ def write_wheel(folder: Path, package: str, text: str = '__version__ = "{version
 
 
 def write_wheels(folder: Path) -> Path:
-    """Write the wheels of all that the trainer needs; returns the folder."""
+    """Write a wheel for each package that the trainer needs, and return the folder."""
     folder.mkdir()
     for package in PACKAGES:
         write_wheel(folder, package, *([TORCH] if package == "torch" else []))
