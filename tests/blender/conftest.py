@@ -184,10 +184,10 @@ def library(elbow: ElbowFiles, tmp_path: Path):
 @pytest.fixture
 def pair(library) -> list[bpy.types.Object]:
     """Make two library overrides of the elbow, each in another pose."""
-    from .linked import ANGLES, link, override
+    from .linked import ANGLES, link_character, override_character
 
-    collection = link(library.path)
-    return [override(collection, angle) for angle in ANGLES]
+    collection = link_character(library.path)
+    return [override_character(collection, angle) for angle in ANGLES]
 
 
 def rig_positions(mesh_object: bpy.types.Object) -> np.ndarray:
