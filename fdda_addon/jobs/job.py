@@ -6,7 +6,6 @@ time works on a character, iterated by `operators.job`, and one on the training 
 """
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
@@ -17,13 +16,13 @@ from ..core.errors import FDDAError
 from ..core.progress import Progress
 from ..scene import draw_cache
 
-LOG_LINES = 2000
 CHARACTER, ENVIRONMENT = "character", "environment"
 """What a job works on. A job on a character ends with the file. A job on the training environment uses no data of
 Blender and continues when another file is opened."""
 STAGE_UNITS = {
     "fit": "vertices fitted",
     "probes": "poses compared with the rig",
+    "target": "poses of the target checked",
     "epochs": "training passes",
     "repeatability": "poses repeated",
     "evaluation": "poses compared",
@@ -36,6 +35,8 @@ STAGE_LABELS = {
     "partitions prepared": "Step 2 of 3: preparing body parts",
 }
 """Labels of preparing stages in panels."""
+PREPARING_STAGES = {*STAGE_LABELS, "poses to fit", "fit", "target", "probes"}
+"""Stages that are always followed by another stage of the same job."""
 
 
 @dataclass
@@ -56,7 +57,6 @@ class JobState:
         started, ended: `time.monotonic` seconds.
         outcome: how it ended, a sentence; empty while it runs.
         outcome_level: 'INFO', 'WARNING' (cancelled) or 'ERROR'.
-        log: lines of text that the job wrote, the last `LOG_LINES`.
         warnings: sentences about what the job works on, for jobs that have some.
         curves: values by name, one for each step, for jobs that have some ("training", "validation").
     """
@@ -77,7 +77,6 @@ class JobState:
     ended: float = 0.0
     outcome: str = ""
     outcome_level: str = "INFO"
-    log: deque[str] = field(default_factory=lambda: deque(maxlen=LOG_LINES))
     warnings: list[str] = field(default_factory=list)
     curves: dict[str, list[float]] = field(default_factory=dict)
     _stage_start: tuple[float, int] = (0.0, 0)
@@ -91,7 +90,7 @@ class JobState:
     def remaining_seconds(self) -> float | None:
         """Estimated remaining time of the stage; None where unknown."""
         began, first = self._stage_start
-        if self.done <= first or not self.is_running:
+        if not self.total or self.done <= first or not self.is_running:
             return None
         return (time.monotonic() - began) / (self.done - first) * (self.total - self.done)
 
@@ -114,7 +113,7 @@ class JobState:
     @property
     def is_finishing(self) -> bool:
         """Whether the last stage is complete."""
-        return 0 < self.total == self.done and self.stage.partition(" of '")[0] not in STAGE_LABELS
+        return 0 < self.total == self.done and self.stage.partition(" of '")[0] not in PREPARING_STAGES
 
     def begin_object(self, name: str) -> None:
         """Start the work on another object."""
@@ -126,8 +125,6 @@ class JobState:
         if progress.stage != self.stage:
             self.stage, self._stage_start = progress.stage, (time.monotonic(), progress.done)
         self.done, self.total = progress.done, progress.total
-        if progress.note:
-            self.log.append(progress.note)
 
 
 _states: dict[str, JobState] = {}

@@ -76,7 +76,7 @@ class JobOperator:
 
     @property
     def state(self) -> JobState:
-        """Return the state of the job, for its log and curves."""
+        """Return the state of the job, for its warnings and curves."""
         return self._run.state
 
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -157,7 +157,7 @@ class JobOperator:
             self._end_modal(context)
             return self._end()
         state, now = self._run.state, time.monotonic()
-        shown = (state.stage, state.done, len(state.log) + len(state.warnings), state.cancel_requested)
+        shown = (state.stage, state.done, len(state.warnings), state.cancel_requested)
         if shown != self._drawn_progress and now - self._last_redraw >= REDRAW_SECONDS:
             self._drawn_progress, self._last_redraw = shown, now
             text = f"{self.title}: {state.sentence} (ESC: cancel)" if self.changes_scene else None

@@ -48,9 +48,9 @@ class ModelListOperator(ModelOperator):
         count = len(mesh_object.fdda.models)
         if self.index >= count:
             raise ModelError(f"'{mesh_object.name}' has {count} models and none with index {self.index}.")
-        return scene_rig, model_list.require_active_entry(mesh_object) if self.index < 0 else mesh_object.fdda.models[
-            self.index
-        ]
+        if self.index < 0:
+            return scene_rig, model_list.require_active_entry(mesh_object)
+        return scene_rig, mesh_object.fdda.models[self.index]
 
 
 class FDDA_OT_add_model(ModelOperator, ModelFileOperator, bpy.types.Operator):
@@ -164,10 +164,10 @@ class FDDA_OT_check_model(ModelListOperator, bpy.types.Operator):
         from ..models.changes import find_changes
 
         scene_rig, entry = self.active_entry(context)
-        found = find_changes(scene_rig, entry)
-        if found.prevents_playback:
-            raise ModelError(found.sentence)
-        return found.sentence or f"{entry.name} matches '{scene_rig.mesh_object.name}'."
+        changes = find_changes(scene_rig, entry)
+        if changes.prevents_playback:
+            raise ModelError(changes.sentence)
+        return changes.sentence or f"{entry.name} matches '{scene_rig.mesh_object.name}'."
 
 
 CLASSES = (FDDA_OT_add_model, FDDA_OT_remove_model, FDDA_OT_pack_model, FDDA_OT_unpack_model, FDDA_OT_check_model)

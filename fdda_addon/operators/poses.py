@@ -30,12 +30,6 @@ class FDDA_OT_preview_pose(PoseOperator, bpy.types.Operator):
     )
     step: bpy.props.IntProperty(name="Step", description="Number to add to the index", options={"SKIP_SAVE"})
 
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        if properties.step:
-            return f"Show the {'next' if properties.step > 0 else 'previous'} of the random poses that will be recorded"
-        return cls.bl_description
-
     def apply(self, context: bpy.types.Context) -> str:
         from ..recording.preview import show_random_pose
 
@@ -167,8 +161,8 @@ class FDDA_OT_limits_from_actions(PoseOperator, bpy.types.Operator):
         if wide := list(dict.fromkeys(limit.bone for limit in limits if limit.near_gimbal_lock)):
             remarks += (
                 f"; {len(wide)} bones ('{wide[0]}') rotate near gimbal lock, so their limits are too wide: choose "
+                "Bones in the Checked Actions instead"
             )
-            remarks += "Bones in the Checked Actions instead"
         return f"Set the limits of {len(bones_set)} bones from {', '.join(names)}{remarks}."
 
 

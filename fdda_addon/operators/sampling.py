@@ -2,16 +2,12 @@
 """Operators that choose the bones and extra inputs of random poses."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import bpy
 
 from ..core.errors import RigError
 from ..properties.recording_options import recording_settings
 from .pose_operator import PoseOperator
-
-if TYPE_CHECKING:  # Blender starts without numpy.
-    pass
 
 
 class FDDA_OT_use_selected_bones(PoseOperator, bpy.types.Operator):

@@ -80,24 +80,17 @@ class TrainingOperator(RigOperator):
         return Training(arguments) if bpy.app.background else DetachedTraining(arguments, model)
 
     def _to_progress(self, message: object) -> object:
-        """Convert a message of the trainer to `Progress` or the result, or add it to the log and return None."""
+        """Convert a message of the trainer to `Progress` or the result; return None for other messages."""
         from ..core.messages import WARNING_LINE, MessageType
 
         values, state = message.values, self.state
-        if message.type is MessageType.STARTED:
-            state.log.append(
-                f"{values['partitions']} partitions, {values['vertices']:,} vertices, {values['poses']:,} poses, "
-                f"on {values['device']}"
-            )
-        elif message.type is MessageType.PREPARING:
+        if message.type is MessageType.PREPARING:
             return Progress("partitions prepared", values["done"], values["total"])
-        elif message.type is MessageType.PROGRESS:
+        if message.type is MessageType.PROGRESS:
             for name, curve in state.curves.items():
                 curve.append(float(values[f"{name}_mm"]))
             return Progress("epochs", values["epoch"], values["epochs"])
-        elif message.type is MessageType.LOG:
-            state.log.append(str(values["text"]))
-        elif message.type is MessageType.WARNING:
+        if message.type is MessageType.WARNING:
             state.warnings.append(WARNING_LINE.format(**values))
         elif message.type is MessageType.FINISHED:
             return float(values["seconds"])
@@ -248,10 +241,10 @@ def _follow_detached_training() -> None:
         if mesh_object.type != "MESH" or mesh_object.library or armature_of(mesh_object) is None:
             continue
         try:
-            is_left = is_detached(model_file(mesh_object))
+            has_detached_training = is_detached(model_file(mesh_object))
         except FDDAError:
             continue
-        if is_left and mesh_object.name in bpy.context.scene.objects:
+        if has_detached_training and mesh_object.name in bpy.context.scene.objects:
             with bpy.context.temp_override(window=windows[0]):
                 bpy.ops.fdda.train("INVOKE_DEFAULT", object=mesh_object.name, replace=True)
             return

@@ -89,7 +89,7 @@ class FDDA_OT_jump_to_worst(WorstPosesOperator, bpy.types.Operator):
         set_held_out_pose(scene_rig, last.channels, last.seed, index)
         context.view_layer.update()
         context.window_manager.fdda_view.pose = index
-        return f"Random pose {index}: max error {error_mm:.2f} mm."
+        return f"Random pose {index + 1}: max error {error_mm:.2f} mm."
 
 
 CLASSES = (FDDA_OT_add_worst_markers, FDDA_OT_remove_markers, FDDA_OT_jump_to_worst)

@@ -189,7 +189,7 @@ def _draw_worst(
         return
     column = body.column(align=True)
     for rank, (index, error_mm) in enumerate(_worst_poses(last, view.markers), 1):
-        place = f"Frame {last.first_frame + index}" if last.name else f"Pose {index}"
+        place = f"Frame {last.first_frame + index}" if last.name else f"Pose {index + 1}"
         button = column.operator("fdda.jump_to_worst", text=f"{place}: {error_mm:.2f} mm")
         button.rank = rank
     if not last.name:
@@ -202,15 +202,16 @@ def _draw_worst(
         row.operator("fdda.remove_markers", text="", icon="X")
 
 
-_worst_cache: dict[int, tuple[object, int, list[tuple[int, float]]]] = {}
+_worst_cache: tuple[object, int, list[tuple[int, float]]] | None = None
+"""Evaluation, count and worst poses of the last call of `_worst_poses`."""
 
 
 def _worst_poses(last: last_evaluation.LastEvaluation, count: int) -> list[tuple[int, float]]:
-    """Return the poses with the largest errors. They are computed once for each evaluation."""
-    cached = _worst_cache.get(0)
-    if cached is None or cached[0] is not last or cached[1] != count:
-        _worst_cache[0] = (last, count, last.worst(count))
-    return _worst_cache[0][2]
+    """Return index and largest error in mm of the worst poses. They are computed once for each evaluation."""
+    global _worst_cache
+    if _worst_cache is None or _worst_cache[0] is not last or _worst_cache[1] != count:
+        _worst_cache = (last, count, last.worst(count))
+    return _worst_cache[2]
 
 
 def _draw_table_row(layout: bpy.types.UILayout, label: str, figures: list[str]) -> None:
@@ -231,4 +232,5 @@ CLASSES = (FDDA_PT_evaluation,)
 
 def unregister() -> None:
     """Clear the cache."""
-    _worst_cache.clear()
+    global _worst_cache
+    _worst_cache = None

@@ -32,8 +32,6 @@ _child_processes: dict[int, subprocess.Popen] = {}
 class DetachedTraining(Training):
     """A training that continues after the block when it was detached; otherwise it ends with the block."""
 
-    loss_advice = "no model was written, train again"
-
     def __init__(self, arguments: list[str], model: Path):
         """Start the trainer.
 
@@ -86,6 +84,9 @@ class DetachedTraining(Training):
                 # On Windows, while `is_running` of another thread accesses the file.
                 time.sleep(POLL_SECONDS)
                 continue
+            except OSError:
+                # Another Blender that follows the same training has read its end and removed the files.
+                break
             offset += len(chunk)
             *lines, rest = (rest + chunk).split(b"\n")
             for line in lines:

@@ -128,6 +128,16 @@ def test_a_number_of_another_process_is_never_ended(tmp_path):
         bystander.wait()
 
 
+def test_an_attached_training_ends_when_another_blender_has_removed_its_files(tmp_path):
+    files = detached_process._ProcessFiles(tmp_path / "m.onnx")
+    with files.new_messages():
+        files.write_process_id(1)
+        with detached_process.AttachedTraining(tmp_path / "m.onnx") as training:
+            files.remove()
+            training._reader.join(5)
+            assert not training._reader.is_alive() and training._lines.get_nowait() is None
+
+
 def test_what_is_no_record_is_none(tmp_path):
     files = detached_process._ProcessFiles(tmp_path / "m.onnx")
     files.new_messages().close()

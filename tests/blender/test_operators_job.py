@@ -176,3 +176,29 @@ def test_remaining_time_comes_from_the_speed_of_the_stage(monkeypatch):
     now[0] += 10
     state.show(Progress("poses", 600, 1000))
     assert state.remaining_seconds == pytest.approx(40)
+    state.show(Progress("starting", 0, 0))
+    now[0] += 3
+    state.show(Progress("starting", 3, 0))
+    assert state.remaining_seconds is None, "without a total, the progress counts seconds"
+
+
+@pytest.mark.parametrize("stage", ["poses", "epochs", "frames of 'arm'"])
+def test_a_job_is_finishing_when_its_last_stage_is_complete(stage):
+    state = JobState("record", "Recording")
+    state.show(Progress(stage, 9, 10))
+    assert not state.is_finishing
+    state.show(Progress(stage, 10, 10))
+    assert state.is_finishing
+
+
+@pytest.mark.parametrize("stage", ["probes", "poses to fit", "fit", "target", "influences of 'arm'"])
+def test_a_job_is_not_finishing_when_a_preparing_stage_is_complete(stage):
+    state = JobState("record", "Recording")
+    state.show(Progress(stage, 10, 10))
+    assert not state.is_finishing
+
+
+def test_the_check_of_a_target_is_counted_in_poses():
+    state = JobState("record", "Recording")
+    state.show(Progress("target", 2, 5))
+    assert state.sentence == "2 of 5 poses of the target checked"

@@ -6,6 +6,8 @@ from types import MethodType, SimpleNamespace
 import bpy
 import pytest
 
+from fdda_addon.evaluation import last_evaluation
+from fdda_addon.operators.meshes import MENU_OPERATORS
 from fdda_addon.panels import MODULES, checks, models, playback
 from fdda_addon.scene.scene_rig import SceneRig
 
@@ -116,6 +118,24 @@ def test_a_section_of_a_bound_model(bound: bpy.types.Object, name: str):
     texts = [text for _, text, _ in draw(name)]
     expected = {"playback": "Confidence in This Pose", "evaluation": "Max Color (mm)", "models": "Matches this rig"}
     assert expected.get(name, texts[0]) in texts
+
+
+def test_worst_random_poses_are_numbered_from_1_as_in_the_preview(bound: bpy.types.Object, capfd):
+    bpy.context.view_layer.objects.active = bound
+    bpy.ops.fdda.evaluate(source="RANDOM", poses=3)
+    index, error_mm = last_evaluation.get(bound).worst(1)[0]
+    assert f"Pose {index + 1}: {error_mm:.2f} mm" in [text for _, text, _ in draw("evaluation")]
+    bpy.ops.fdda.jump_to_worst()
+    assert f"Random pose {index + 1}: max error {error_mm:.2f} mm." in capfd.readouterr().out
+
+
+def test_the_menu_has_all_operators_but_those_that_need_a_button_of_a_panel():
+    in_menu = {name.removeprefix("fdda.") for group in MENU_OPERATORS for name in group}
+    assert set(dir(bpy.ops.fdda)) - in_menu == {
+        *("add_trusted_folder", "remove_trusted_folder"),
+        *("cancel", "cancel_trainer_environment", "open_trainer_log", "remove_trainer_environment"),
+        *("set_limit", "clear_limit", "show_bone", "show_mesh", "copy_objects"),
+    }
 
 
 @pytest.mark.parametrize("name", MODULES)
