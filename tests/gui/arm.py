@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The arm of the stories: found, opened, looked at, and compared with what it was."""
+"""Functions for the sample arm: look it up, open its file, frame it in the view, and compare its shapes."""
 
 import importlib
 import shutil
@@ -9,83 +9,86 @@ from types import ModuleType
 
 import bpy
 import numpy as np
-from window import check, over, until, view_area
+from window import region_override, require, view_area, wait_until
 
 EXTENSION = "bl_ext.user_default.fdda"
-FRAME = 110
-"""Of the action, with elbow and fingers bent: where shapes are compared."""
-BLEND = "arm.blend"
+BENT_FRAME = 110
+"""Frame of the action at which shapes are compared: elbow and fingers are bent."""
+BLEND_FILE_NAME = "arm.blend"
 
 
-def part(name: str) -> ModuleType:
-    """A module of the installed extension."""
+def extension_module(name: str) -> ModuleType:
+    """Import a module of the installed extension, given its name without the package."""
     return importlib.import_module(f"{EXTENSION}.fdda_addon.{name}")
 
 
-def arm() -> bpy.types.Object:
-    """The mesh: looked up each time, as an undo or another file makes references invalid."""
+def arm_object() -> bpy.types.Object:
+    """Return the mesh object. It is looked up each time, because an undo and opening a file invalidate references."""
     return bpy.data.objects["arm"]
 
 
-def armature() -> bpy.types.Object:
-    """What moves it."""
+def armature_object() -> bpy.types.Object:
+    """Return the armature object of the arm."""
     return bpy.data.objects["arm_rig"]
 
 
-def emptied(own: Path) -> Path:
-    """The folder, without what an earlier run has left there."""
-    shutil.rmtree(own, ignore_errors=True)
-    own.mkdir()
-    return own
+def make_empty_folder(folder: Path) -> Path:
+    """Create a folder, without the files of an earlier run, and return it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
 
 
-def open_in(own: Path, folder: Path) -> Iterator[float]:
-    """Open the file that the path of a first model has left, copied into a folder of its own; the model plays."""
-    shutil.copy(folder / "work" / BLEND, emptied(own) / BLEND)
-    bpy.ops.wm.open_mainfile(filepath=str(own / BLEND), load_ui=False)
+def open_copy_in(target_folder: Path, pictures_folder: Path) -> Iterator[float]:
+    """Copy the file of the story `path` into another folder, open the copy, and check that its model plays."""
+    shutil.copy(pictures_folder / "work" / BLEND_FILE_NAME, make_empty_folder(target_folder) / BLEND_FILE_NAME)
+    bpy.ops.wm.open_mainfile(filepath=str(target_folder / BLEND_FILE_NAME), load_ui=False)
     yield 1.0
-    check_it_plays()
-    look_at(arm())
+    check_model_plays()
+    frame_object(arm_object())
 
 
-def check_it_plays() -> None:
-    """Fail where the model does not deform the arm, or something is odd about it."""
-    check(arm().fdda.mode == "FDDA" and not arm().fdda.status, f"it plays {arm().fdda.mode}: {arm().fdda.status}")
+def check_model_plays() -> None:
+    """Check that the model deforms the arm and has no problem."""
+    require(
+        arm_object().fdda.mode == "FDDA" and not arm_object().fdda.status,
+        f"it plays {arm_object().fdda.mode}: {arm_object().fdda.status}",
+    )
 
 
-def look_at(mesh_object: bpy.types.Object, times: float = 1.0) -> None:
-    """Make an object the active one, and have it fill the view, or a part of it."""
-    with over("WINDOW"):
+def frame_object(mesh_object: bpy.types.Object, distance_factor: float = 1.0) -> None:
+    """Make an object active and frame it in the view, at `distance_factor` times the distance that fits it."""
+    with region_override("WINDOW"):
         bpy.ops.object.select_all(action="DESELECT")
         mesh_object.select_set(True)
         bpy.context.view_layer.objects.active = mesh_object
         bpy.ops.view3d.view_selected()
-    view_area().spaces[0].region_3d.view_distance *= times
+    view_area().spaces[0].region_3d.view_distance *= distance_factor
 
 
-def positions(mesh_object: bpy.types.Object) -> np.ndarray:
-    """(V, 3) metres: what Blender shows of an object as it stands."""
+def evaluated_positions(mesh_object: bpy.types.Object) -> np.ndarray:
+    """Return the evaluated vertex positions of an object in the current frame: (V, 3) float32, meters."""
     mesh = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
-    found = np.empty((len(mesh.vertices), 3), np.float32)
-    mesh.attributes["position"].data.foreach_get("vector", found.reshape(-1))
-    return found
+    vertex_positions = np.empty((len(mesh.vertices), 3), np.float32)
+    mesh.attributes["position"].data.foreach_get("vector", vertex_positions.reshape(-1))
+    return vertex_positions
 
 
-def shape(frame: int = FRAME) -> np.ndarray:
-    """(V, 3) metres: what Blender shows of the arm at a frame of its action."""
+def arm_positions(frame: int = BENT_FRAME) -> np.ndarray:
+    """Return the evaluated vertex positions of the arm at a frame of its action: (V, 3) float32, meters."""
     bpy.context.scene.frame_set(frame)
-    return positions(arm())
+    return evaluated_positions(arm_object())
 
 
-def distance_mm(one: np.ndarray, other: np.ndarray) -> float:
-    """Mean distance of vertices."""
-    return float(np.linalg.norm(one - other, axis=1).mean()) * 1000
+def mean_distance_mm(first_positions: np.ndarray, second_positions: np.ndarray) -> float:
+    """Return the mean distance between corresponding vertices, mm."""
+    return float(np.linalg.norm(first_positions - second_positions, axis=1).mean()) * 1000
 
 
-def job_done(verb: str, seconds: float) -> Iterator[float]:
-    """Wait until the job that a button started has ended well."""
-    job = part("jobs.job")
-    yield from until(lambda: job.state_of(verb) is not None, 10, f"the button starts no job {verb}")
-    yield from until(lambda: not job.state_of(verb).is_running, seconds, f"the job {verb} does not end")
+def wait_for_job(verb: str, seconds: float) -> Iterator[float]:
+    """Wait until the job that a button has started ends, and check that it was successful."""
+    job = extension_module("jobs.job")
+    yield from wait_until(lambda: job.state_of(verb) is not None, 10, f"the button starts no job {verb}")
+    yield from wait_until(lambda: not job.state_of(verb).is_running, seconds, f"the job {verb} does not end")
     state = job.state_of(verb)
-    check(state.outcome_level == "INFO", f"the job {verb} ended with '{state.outcome}'")
+    require(state.outcome_level == "INFO", f"the job {verb} ended with '{state.outcome}'")

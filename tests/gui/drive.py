@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Goes the whole path in a Blender with a window: `blender --python tests/gui/drive.py -- FOLDER STORY`, by run.py.
+"""Runs a story in a Blender with a window. `run.py` calls `blender --python tests/gui/drive.py -- FOLDER STORY`.
 
-Each step has its checks and leaves a picture in the folder. A step that fails says why and ends Blender with status 1.
+Each step has checks, and a screenshot of its end is written to the folder. A step that fails prints the reason and ends
+Blender with status 1.
 """
 
 import faulthandler
@@ -27,9 +28,9 @@ import ranges_story
 import session_story
 import shot_story
 import work_story
-from window import StepError, picture, rest_mouse
+from window import StepError, park_mouse, save_screenshot
 
-FOLDER, NAME = Path(sys.argv[sys.argv.index("--") + 1]).resolve(), sys.argv[sys.argv.index("--") + 2]
+OUTPUT_FOLDER, STORY_NAME = Path(sys.argv[sys.argv.index("--") + 1]).resolve(), sys.argv[sys.argv.index("--") + 2]
 STEPS = {
     "path": path_story.STEPS,
     "work": work_story.STEPS,
@@ -39,44 +40,46 @@ STEPS = {
     "flesh": flesh_story.STEPS,
     "session": session_story.STEPS,
     "endure": endure_story.STEPS,
-    "leave": leave_story.LEAVE,
-    "back": leave_story.BACK,
-}[NAME]
-WATCH_SECONDS = 590
-"""All of it: a Blender that hangs is ended, and says where."""
+    "leave": leave_story.STEPS_BEFORE_CLOSING,
+    "back": leave_story.STEPS_AFTER_REOPENING,
+}[STORY_NAME]
+MAX_SECONDS = 590
+"""Time limit of the whole story. A Blender that exceeds it is killed and prints where it was."""
 
-done: list[dict] = []
-under_way = "starting"
-
-
-def steps() -> Iterator[float]:
-    """Take all steps; seconds to wait."""
-    global under_way
-    for number, step in enumerate(STEPS, 1):
-        under_way, began = step.__name__.replace("_", " "), time.monotonic()
-        yield from step(FOLDER)
-        shown = f"{number:02}_{step.__name__}.png"
-        yield from rest_mouse()
-        yield from picture(FOLDER / shown)
-        note({"step": under_way, "seconds": time.monotonic() - began, "picture": shown, "of": len(STEPS)})
+step_records: list[dict] = []
+current_step = "starting"
 
 
-def note(entry: dict) -> None:
-    """Keep what was done where run.py reads it."""
-    done.append(entry)
-    (FOLDER / "steps.json").write_text(json.dumps(done, indent=1), encoding="utf-8")
-    print(f"{entry['step']}: {entry['seconds']:.1f} s", flush=True)
+def run_steps() -> Iterator[float]:
+    """Run all steps; yield the seconds to wait."""
+    global current_step
+    for index, step in enumerate(STEPS, 1):
+        current_step, start = step.__name__.replace("_", " "), time.monotonic()
+        yield from step(OUTPUT_FOLDER)
+        screenshot_name = f"{index:02}_{step.__name__}.png"
+        yield from park_mouse()
+        yield from save_screenshot(OUTPUT_FOLDER / screenshot_name)
+        record_step(
+            {"step": current_step, "seconds": time.monotonic() - start, "picture": screenshot_name, "of": len(STEPS)}
+        )
 
 
-def give_up() -> None:
-    """Leave a picture of what went wrong, and end Blender: it has no way to end with a status."""
-    for _ in picture(FOLDER / "failed.png"):
+def record_step(step_record: dict) -> None:
+    """Append a finished step to the file that `run.py` reads."""
+    step_records.append(step_record)
+    (OUTPUT_FOLDER / "steps.json").write_text(json.dumps(step_records, indent=1), encoding="utf-8")
+    print(f"{step_record['step']}: {step_record['seconds']:.1f} s", flush=True)
+
+
+def fail() -> None:
+    """Write a screenshot of the failure, and end Blender with status 1."""
+    for _ in save_screenshot(OUTPUT_FOLDER / "failed.png"):
         pass
-    finish(1)
+    end_blender(1)
 
 
-def finish(status: int) -> None:
-    """End Blender. Closed by its operator, it disables its add-ons before: a part of what is tested."""
+def end_blender(status: int) -> None:
+    """End Blender. Without an error its own operator ends it, which tests that it disables the add-on."""
     sys.stdout.flush()
     sys.stderr.flush()
     if status:
@@ -84,25 +87,25 @@ def finish(status: int) -> None:
     bpy.ops.wm.quit_blender()
 
 
-def tick(path: Iterator[float] = steps()) -> float | None:  # noqa: B008
-    """The timer: one piece of the path."""
+def run_next_part(parts: Iterator[float] = run_steps()) -> float | None:  # noqa: B008
+    """Run the story up to its next wait, and return the seconds to wait. Called by a timer."""
     try:
-        return next(path)
+        return next(parts)
     except StopIteration:
-        finish(0)
+        end_blender(0)
     except StepError as error:
-        print(f"Step '{under_way}' failed: {error}", file=sys.stderr, flush=True)
-        give_up()
-    except Exception:  # Blender would print it and stay open.
+        print(f"Step '{current_step}' failed: {error}", file=sys.stderr, flush=True)
+        fail()
+    except Exception:  # Otherwise Blender would print it and stay open.
         traceback.print_exc()
-        print(f"Step '{under_way}' broke off (see above).", file=sys.stderr, flush=True)
-        give_up()
+        print(f"Step '{current_step}' raised an exception (see above).", file=sys.stderr, flush=True)
+        fail()
     return None
 
 
-# Not a thread of Python: it would wait for ever where Blender does not let go of the interpreter.
-faulthandler.dump_traceback_later(WATCH_SECONDS, exit=True)
+# A Python thread would wait forever if Blender hangs and keeps the GIL.
+faulthandler.dump_traceback_later(MAX_SECONDS, exit=True)
 bpy.context.preferences.view.show_splash = False
-# Without a window manager another window would lie over the first.
+# Without a window manager a second window would cover the first.
 bpy.context.preferences.view.filebrowser_display_type = "SCREEN"
-bpy.app.timers.register(tick, first_interval=1.0, persistent=True)
+bpy.app.timers.register(run_next_part, first_interval=1.0, persistent=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Learning a simulation: the arm learns from a copy of it that is a soft body. A function a step, with its checks."""
+"""Story: the arm learns from a copy of itself with a soft body simulation. Each function is a step."""
 
 import time
 from collections.abc import Iterator
@@ -7,109 +7,130 @@ from pathlib import Path
 
 import bpy
 import sidebar
-from arm import BLEND, arm, check_it_plays, distance_mm, emptied, job_done, look_at, part, positions, shape
-from window import check, click, picture, play, press, redraw, rest_mouse, stop, until
+from arm import (
+    BLEND_FILE_NAME,
+    arm_object,
+    arm_positions,
+    check_model_plays,
+    evaluated_positions,
+    extension_module,
+    frame_object,
+    make_empty_folder,
+    mean_distance_mm,
+    wait_for_job,
+)
+from window import (
+    click,
+    park_mouse,
+    press_keys,
+    redraw_window,
+    require,
+    save_screenshot,
+    start_playback,
+    stop_playback,
+    wait_until,
+)
 
 from blend_fixtures.flesh import FLESH, add_flesh, make_soft_body
 
-POSES, SETTLE, COMPARED, EPOCHS = 24, 60, 3, 60
-"""Few poses, as settling takes seconds: enough to be better than nothing."""
-FLESHY, PLAY_SECONDS = ("shoulder", "elbow"), 3
+POSES, MAX_SETTLE_FRAMES, COMPARED_POSES, EPOCHS = 24, 60, 3, 60
+"""Few poses, because settling takes seconds; enough to be more accurate than linear skinning."""
+SOFT_BONES, PLAY_SECONDS = ("shoulder", "elbow"), 3
 
 
-def give_the_arm_flesh(folder: Path) -> Iterator[float]:
-    """The sample arm, and a copy of it that is a soft body."""
+def add_a_soft_body_copy(folder: Path) -> Iterator[float]:
+    """Add the sample arm, and a copy of it with a soft body simulation."""
     bpy.ops.wm.read_homefile(app_template="", load_ui=False)
     yield 0.5
     bpy.data.objects.remove(bpy.data.objects["Cube"])
     bpy.ops.fdda.add_sample_arm(density="1")
-    make_soft_body(add_flesh(arm()), FLESHY)
-    # Both are in one place.
-    arm().display_type = "WIRE"
-    bpy.ops.wm.save_as_mainfile(filepath=str(emptied(folder / "flesh") / BLEND))
-    look_at(arm())
-    yield from sidebar.show()
+    make_soft_body(add_flesh(arm_object()), SOFT_BONES)
+    # The arm and its copy overlap.
+    arm_object().display_type = "WIRE"
+    bpy.ops.wm.save_as_mainfile(filepath=str(make_empty_folder(folder / "flesh") / BLEND_FILE_NAME))
+    frame_object(arm_object())
+    yield from sidebar.open_tab()
 
 
-def choose_the_target(folder: Path) -> Iterator[float]:
-    """Click the field Learn from Object, type the name of the copy; how long poses are held is set below it."""
-    settings = arm().fdda.settings
+def choose_the_soft_body_as_target(folder: Path) -> Iterator[float]:
+    """Enter the name of the copy under Learn from Object, and the number of frames under Settle."""
+    settings = arm_object().fdda.settings
     settings.poses, settings.epochs = POSES, EPOCHS
     yield from sidebar.open_section("recording")
-    yield from sidebar.type_into("settings.target", FLESH)
-    yield from press("Return")
-    yield from until(lambda: settings.target == FLESH, 5, f"the field has '{settings.target}'")
-    x, y = yield from sidebar.find("settings.max_settle_frames", across=0.7)
+    yield from sidebar.type_into_search_field("settings.target", FLESH)
+    yield from press_keys("Return")
+    yield from wait_until(lambda: settings.target == FLESH, 5, f"the field has '{settings.target}'")
+    x, y = yield from sidebar.find_button("settings.max_settle_frames", across=0.7)
     yield from click(x, y, times=2)
     yield 0.3
-    yield from press("ctrl+a", *str(SETTLE), "Return")
-    yield from until(
-        lambda: settings.max_settle_frames == SETTLE, 5, f"the field has {settings.max_settle_frames} frames"
+    yield from press_keys("ctrl+a", *str(MAX_SETTLE_FRAMES), "Return")
+    yield from wait_until(
+        lambda: settings.max_settle_frames == MAX_SETTLE_FRAMES, 5, f"the field has {settings.max_settle_frames} frames"
     )
-    yield from redraw()
-    yield from picture(folder / "target.png")
+    yield from redraw_window()
+    yield from save_screenshot(folder / "target.png")
 
 
 def record_settled_poses(folder: Path) -> Iterator[float]:
-    """Press Record: each pose is held until the flesh has come to rest."""
-    job = part("jobs.job")
-    yield from sidebar.push("fdda.record")
-    yield from until(lambda: job.state_of("record") and job.state_of("record").done > 1, 90, "nothing is recorded")
-    yield from picture(folder / "settling.png")
-    yield from job_done("record", 400)
-    index = part("core.recording.index").read_index(folder / "flesh" / "arm_recording")
-    check(index["complete"] == POSES and index["repeatability"]["poses"], f"recorded is {index['complete']}")
-    yield from redraw()
-    yield from picture(folder / "flesh_recorded.png")
-    check(len(index.get("unsettled", ())) < POSES // 2, f"{index.get('unsettled')} have not come to rest")
+    """Press Record: each pose is held until the simulation is at rest."""
+    job = extension_module("jobs.job")
+    yield from sidebar.press_button("fdda.record")
+    yield from wait_until(lambda: job.state_of("record") and job.state_of("record").done > 1, 90, "nothing is recorded")
+    yield from save_screenshot(folder / "settling.png")
+    yield from wait_for_job("record", 400)
+    index = extension_module("core.recording.index").read_index(folder / "flesh" / "arm_recording")
+    require(index["complete"] == POSES and index["repeatability"]["poses"], f"recorded is {index['complete']}")
+    yield from redraw_window()
+    yield from save_screenshot(folder / "flesh_recorded.png")
+    require(len(index.get("unsettled", ())) < POSES // 2, f"{index.get('unsettled')} did not settle")
 
 
 def train_and_bind(folder: Path) -> Iterator[float]:
-    """Press Train, and Bind: the arm has the flesh of its pose."""
+    """Press Train, then Bind: the model plays."""
     yield from sidebar.open_section("training")
-    yield from sidebar.push("fdda.train")
-    yield from job_done("train", 120)
+    yield from sidebar.press_button("fdda.train")
+    yield from wait_for_job("train", 120)
     yield from sidebar.open_section("playback")
-    yield from sidebar.push("fdda.bind")
-    yield from until(lambda: arm().fdda.is_bound, 20, "the button binds nothing")
-    check_it_plays()
+    yield from sidebar.press_button("fdda.bind")
+    yield from wait_until(lambda: arm_object().fdda.is_bound, 20, "the button binds nothing")
+    check_model_plays()
 
 
-def evaluate_against_the_flesh(folder: Path) -> Iterator[float]:
-    """Press Evaluate: random poses, compared with the flesh."""
+def evaluate_against_the_soft_body(folder: Path) -> Iterator[float]:
+    """Press Evaluate: the model is closer to the simulation than linear skinning is."""
     view = bpy.context.window_manager.fdda_view
-    view.source, view.poses = "RANDOM", COMPARED
-    evaluations = part("evaluation.last_evaluation")
+    view.source, view.poses = "RANDOM", COMPARED_POSES
+    evaluations = extension_module("evaluation.last_evaluation")
     yield from sidebar.open_section("evaluation")
-    yield from sidebar.push("fdda.evaluate")
-    yield from until(lambda: evaluations.get(arm()) is not None, 120, "nothing is evaluated")
-    total = evaluations.get(arm()).total
-    check(0 < total["fdda"].mean < total["linear"].mean, f"the model is no closer than linear skinning: {total}")
+    yield from sidebar.press_button("fdda.evaluate")
+    yield from wait_until(lambda: evaluations.get(arm_object()) is not None, 120, "nothing is evaluated")
+    total = evaluations.get(arm_object()).total
+    require(0 < total["fdda"].mean < total["linear"].mean, f"the model is no closer than linear skinning: {total}")
 
 
-def play_without_the_flesh(folder: Path) -> Iterator[float]:
-    """Remove the flesh, and play: the arm needs it no more."""
+def play_without_the_soft_body(folder: Path) -> Iterator[float]:
+    """Remove the simulated copy and play the action: the model does not need it."""
     bpy.data.objects.remove(bpy.data.objects[FLESH])
-    arm().display_type = "TEXTURED"
+    arm_object().display_type = "TEXTURED"
     yield from sidebar.open_section("playback")
-    before = shape()
+    before = arm_positions()
     bpy.context.scene.frame_set(1)
-    yield from play()
+    yield from start_playback()
     end = time.monotonic() + PLAY_SECONDS
     while time.monotonic() < end:
         yield 0.1
-    yield from stop()
-    check_it_plays()
-    check(distance_mm(positions(arm()), before) > 1, "the arm does not move")
-    yield from rest_mouse()
-    yield from picture(folder / "flesh_plays.png")
+    yield from stop_playback()
+    check_model_plays()
+    require(mean_distance_mm(evaluated_positions(arm_object()), before) > 1, "the arm does not move")
+    yield from park_mouse()
+    yield from save_screenshot(folder / "flesh_plays.png")
 
 
 STEPS = (
-    give_the_arm_flesh,
-    choose_the_target,
+    add_a_soft_body_copy,
+    choose_the_soft_body_as_target,
     record_settled_poses,
     train_and_bind,
-    evaluate_against_the_flesh,
-    play_without_the_flesh,
+    evaluate_against_the_soft_body,
+    play_without_the_soft_body,
 )

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Installs the zip that `make package` built into a Blender with a window, and drives it.
+"""Installs the zip of `make package` into a Blender with a window, and runs stories in it.
 
-Blender gets a scratch folder for its preferences and extensions, and the trainer the Python that FDDA_TRAINER_PYTHON
-names, else the one that runs this. The pictures of all steps are in FOLDER afterwards.
-Exit status: 0 all steps went well, 1 one did not, 3 this machine lacks what it takes; one sentence says which.
+Blender uses a temporary folder for its preferences and extensions. The trainer runs in the Python of the environment
+variable FDDA_TRAINER_PYTHON, or else in the Python that runs this script. FOLDER gets screenshots of all steps.
+Exit status: 0 all steps succeeded; 1 a step failed; 3 this machine lacks a program, which a message names.
 """
 
 import argparse
@@ -23,19 +23,17 @@ ROOT = Path(__file__).resolve().parents[2]
 VERSION = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))["version"]
 PACKAGE = ROOT / "dist" / f"fdda_addon-{VERSION}.zip"
 WIDTH, HEIGHT = 1600, 1200
-INSTALL_SECONDS, SECONDS, END_SECONDS = 60, 600, 5
-LACKING = 3
-FEW_VALUES = 32
+INSTALL_MAX_SECONDS, STORY_MAX_SECONDS, TERMINATE_MAX_SECONDS = 60, 600, 5
+MISSING_REQUIREMENT_STATUS = 3
+MAX_BLANK_IMAGE_VALUES = 32
 STORIES = ("path", "work", "shot", "cast", "ranges", "flesh", "session", "leave", "back")
-"""Each in a Blender of its own, with the files of those before: the path of a first model, the work with it, what a
-shot takes, several characters, ranges of motion, a simulation that is learned, what a long session must not spoil, a
-Blender that is closed while it trains, and the next one."""
-LONG = ("endure",)
-"""Run by name alone: five minutes of work with one character."""
+"""Names of the stories, in order. Each runs in a new Blender, and uses the files that the story `path` has saved."""
+LONG_STORIES = ("endure",)
+"""Stories that run only by name, because they take minutes."""
 
 
-def lacking(blender: str) -> str:
-    """What is not there, a sentence; empty when nothing is."""
+def missing_requirement(blender: str) -> str:
+    """Return a message about a program that this machine lacks; empty if it has all."""
     if shutil.which(blender) is None:
         return f"there is no Blender '{blender}'; name one that has a window with BLENDER=/path/to/blender"
     if not os.environ.get("DISPLAY") and shutil.which("xvfb-run") is None:
@@ -47,35 +45,42 @@ def lacking(blender: str) -> str:
 
 
 def package_for(blender: str) -> Path:
-    """The zip for the Python of a Blender: that of distributions where it runs on the system's."""
-    question = "import sys; print('Python {}.{}'.format(*sys.version_info))"
-    command = [blender, "--background", "--factory-startup", "--python-expr", question]
-    said = subprocess.run(command, capture_output=True, text=True, check=False, timeout=INSTALL_SECONDS).stdout
-    own = PACKAGE.with_name(f"{PACKAGE.stem}-python3.14.zip")
-    return own if "Python 3.14" in said.splitlines() else PACKAGE
+    """Return the zip for the Python version of a Blender; Linux distributions build Blender with Python 3.14."""
+    script = "import sys; print('Python {}.{}'.format(*sys.version_info))"
+    command = [blender, "--background", "--factory-startup", "--python-expr", script]
+    output = subprocess.run(command, capture_output=True, text=True, check=False, timeout=INSTALL_MAX_SECONDS).stdout
+    system_package = PACKAGE.with_name(f"{PACKAGE.stem}-python3.14.zip")
+    return system_package if "Python 3.14" in output.splitlines() else PACKAGE
 
 
-def on_display(command: list[str]) -> list[str]:
-    """The command on the display that there is, else on a virtual one."""
+def command_on_display(command: list[str]) -> list[str]:
+    """Return a command that runs on the current display, or on a virtual one if there is none."""
     if os.environ.get("DISPLAY"):
         return command
     return ["xvfb-run", "-a", "-s", f"-screen 0 {WIDTH}x{HEIGHT}x24 +extension GLX", *command]
 
 
-def end(process: subprocess.Popen) -> None:
-    """End a process and all that it has started."""
-    for how in (signal.SIGTERM, signal.SIGKILL):
+def end_process_group(process: subprocess.Popen) -> None:
+    """End a process and its child processes."""
+    for signal_number in (signal.SIGTERM, signal.SIGKILL):
         try:
-            os.killpg(process.pid, how)
-            process.wait(END_SECONDS)
+            os.killpg(process.pid, signal_number)
+            process.wait(TERMINATE_MAX_SECONDS)
         except ProcessLookupError:
             return
         except subprocess.TimeoutExpired:
             continue
 
 
-def run(command: list[str], environment: dict[str, str], seconds: float, output: Path) -> int | None:
-    """Exit status of a command, None when it took longer; nothing that it started is left. What it says is kept."""
+def run_command(command: list[str], environment: dict[str, str], seconds: float, output: Path) -> int | None:
+    """Run a command, and end its child processes with it; return its exit status, None after the time limit.
+
+    Args:
+        command: the command line.
+        environment: environment variables.
+        seconds: time limit.
+        output: file for stdout and stderr.
+    """
     with output.open("wb") as file:
         process = subprocess.Popen(
             command, cwd=ROOT, env=environment, start_new_session=True, stdout=file, stderr=subprocess.STDOUT
@@ -85,88 +90,90 @@ def run(command: list[str], environment: dict[str, str], seconds: float, output:
         except subprocess.TimeoutExpired:
             return None
         finally:
-            end(process)
+            end_process_group(process)
 
 
 def is_one_color(picture: Path) -> bool:
-    """Whether a PNG file is a single color, as of a screen on which nothing was drawn."""
-    data, place, packed = picture.read_bytes(), 8, b""
-    while place < len(data):
-        length, kind = struct.unpack(">I4s", data[place : place + 8])
-        if kind == b"IDAT":
-            packed += data[place + 8 : place + 8 + length]
-        place += 12 + length
-    # Stored are differences of neighbors: of a single color there are but a few.
-    return len(set(zlib.decompress(packed))) < FEW_VALUES
+    """Return whether a PNG file has a single color, as a screen on which nothing was drawn."""
+    data, offset, compressed = picture.read_bytes(), 8, b""
+    while offset < len(data):
+        length, chunk_type = struct.unpack(">I4s", data[offset : offset + 8])
+        if chunk_type == b"IDAT":
+            compressed += data[offset + 8 : offset + 8 + length]
+        offset += 12 + length
+    # PNG stores differences between neighboring pixels, which have few values in an image of one color.
+    return len(set(zlib.decompress(compressed))) < MAX_BLANK_IMAGE_VALUES
 
 
-def drive(folder: Path, blender: str, stories: Sequence[str]) -> str:
-    """Install and go through stories; returns what is wrong with the outcome, empty when all is well."""
+def install_and_run_stories(folder: Path, blender: str, stories: Sequence[str]) -> str:
+    """Install the extension and run stories; return a message about the first problem, empty if all succeed."""
     user = folder / "user"
     environment = {"FDDA_TRAINER_PYTHON": sys.executable, **os.environ, "BLENDER_USER_RESOURCES": str(user)}
     package = package_for(blender)
     install = [blender, "--command", "extension", "install-file", "-r", "user_default", "-e", str(package)]
-    status = run(install, environment, INSTALL_SECONDS, folder / "install.txt")
+    status = run_command(install, environment, INSTALL_MAX_SECONDS, folder / "install.txt")
     if status != 0:
-        return f"Blender did not install {package.name} ({status_name(status)})"
-    return next(filter(None, (_tell(folder, name, blender, environment) for name in stories)), "")
+        return f"Blender did not install {package.name} ({describe_status(status)})"
+    return next(filter(None, (_run_story(folder, name, blender, environment) for name in stories)), "")
 
 
-def _tell(folder: Path, name: str, blender: str, environment: dict[str, str]) -> str:
-    """Go through one story; returns as `drive`."""
-    window = ["--window-geometry", "0", "0", str(WIDTH), str(HEIGHT), "--no-window-focus"]
-    script = ["--python", str(Path(__file__).with_name("drive.py")), "--", str(folder), name]
-    said = folder / f"{name}.txt"
+def _run_story(folder: Path, name: str, blender: str, environment: dict[str, str]) -> str:
+    """Run one story; return a message about its problem, empty if it succeeds."""
+    window_options = ["--window-geometry", "0", "0", str(WIDTH), str(HEIGHT), "--no-window-focus"]
+    script_options = ["--python", str(Path(__file__).with_name("drive.py")), "--", str(folder), name]
+    output_path = folder / f"{name}.txt"
     (folder / "steps.json").unlink(missing_ok=True)
-    status = run(on_display([blender, *window, *script]), environment, SECONDS, said)
-    steps = folder / "steps.json"
-    done = json.loads(steps.read_text(encoding="utf-8")) if steps.is_file() else []
+    command = command_on_display([blender, *window_options, *script_options])
+    status = run_command(command, environment, STORY_MAX_SECONDS, output_path)
+    steps_path = folder / "steps.json"
+    finished_steps = json.loads(steps_path.read_text(encoding="utf-8")) if steps_path.is_file() else []
     if status != 0:
         return (
-            f"after {len(done)} steps Blender ended ({status_name(status)}); see failed.png and {said.name} in {folder}"
+            f"after {len(finished_steps)} steps Blender ended ({describe_status(status)}); see failed.png and "
+            f"{output_path.name} in {folder}"
         )
-    # An error while a panel is drawn ends nothing: the panel is empty from there on.
-    if b"Traceback" in said.read_bytes():
-        return f"Python failed meanwhile; see {said}"
-    if not done or len(done) != done[-1]["of"]:
-        return f"Blender ended after {len(done)} steps, before the last"
-    print(f"{name}: {len(done)} steps went well", flush=True)
-    for picture in {folder / step["picture"] for step in done} | set(folder.glob("*.png")):
+    # An exception while a panel is drawn does not end Blender; the rest of the panel stays empty.
+    if b"Traceback" in output_path.read_bytes():
+        return f"a Python exception was printed; see {output_path}"
+    if not finished_steps or len(finished_steps) != finished_steps[-1]["of"]:
+        return f"Blender ended after {len(finished_steps)} steps, before the last"
+    print(f"{name}: {len(finished_steps)} steps succeeded", flush=True)
+    for picture in {folder / step["picture"] for step in finished_steps} | set(folder.glob("*.png")):
         if not picture.is_file() or is_one_color(picture):
-            return f"there is nothing to see in {picture}"
+            return f"the screenshot {picture} is missing or blank"
     return ""
 
 
-def status_name(status: int | None) -> str:
+def describe_status(status: int | None) -> str:
     return "it took too long" if status is None else f"status {status}"
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path, help="for pictures; what an earlier run left there is removed")
+    parser.add_argument("folder", type=Path, help="folder for screenshots; files of an earlier run in it are deleted")
     parser.add_argument("blender", nargs="?", default="blender", help="command that starts Blender")
-    help_of_story = "these alone; all need what 'path' has left in FOLDER"
-    parser.add_argument("--story", nargs="+", choices=(*STORIES, *LONG), help=help_of_story)
+    story_help = "run only these stories; all need the files of the story 'path' in FOLDER"
+    parser.add_argument("--story", nargs="+", choices=(*STORIES, *LONG_STORIES), help=story_help)
     options = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # What was started is ended on the way out.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # Exit by an exception, so that child processes are ended.
     folder = options.folder.resolve()
-    if lack := lacking(options.blender):
-        print(f"The window is not tested: {lack}.", file=sys.stderr)
-        return LACKING
+    if requirement := missing_requirement(options.blender):
+        print(f"The window is not tested: {requirement}.", file=sys.stderr)
+        return MISSING_REQUIREMENT_STATUS
     if not PACKAGE.is_file():
         print(f"There is no {PACKAGE}; build it with 'make package'.", file=sys.stderr)
         return 1
     stories = options.story or STORIES
     if STORIES[0] in stories:
         shutil.rmtree(folder, ignore_errors=True)
-    for part in ("work", "user"):
-        (folder / part).mkdir(parents=True, exist_ok=True)
-    wrong = drive(folder, options.blender, stories)
-    if wrong:
-        print(f"The test of the window failed: {wrong}.", file=sys.stderr)
+    for subfolder in ("work", "user"):
+        (folder / subfolder).mkdir(parents=True, exist_ok=True)
+    problem = install_and_run_stories(folder, options.blender, stories)
+    if problem:
+        print(f"The test of the window failed: {problem}.", file=sys.stderr)
         return 1
     shutil.rmtree(folder / "user")
-    print(f"All steps went well: {folder}")
+    print(f"All steps succeeded: {folder}")
     return 0
 
 

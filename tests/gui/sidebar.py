@@ -1,118 +1,130 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The tab "FDDA" of the sidebar: its sections are opened, and its buttons found and pressed, with the mouse.
+"""Opens sections of the tab "FDDA" in the sidebar with the mouse, and finds and presses its buttons.
 
-Blender does not tell where a button is. But it says what the button below the mouse would do, as its menu "Copy Python
-Command" does: so the mouse goes down the sidebar until that is the button that is looked for.
+Blender's API has no positions of buttons, but an operator ("Copy Python Command") that describes the button below the
+mouse. So a search moves the mouse down the sidebar until the description is that of the wanted button.
 """
 
 from collections.abc import Iterator
 
 import bpy
-from window import below_mouse, check, click, move, over, press, redraw, region, settle, view_area
+from window import (
+    click,
+    describe_button_below_mouse,
+    move_mouse,
+    press_keys,
+    redraw_window,
+    region_override,
+    require,
+    view_area,
+    view_region,
+    wait_for_events,
+)
 
 SECTIONS = ("rig", "poses", "recording", "training", "playback", "evaluation", "models")
-"""From the top."""
-HEADER, PITCH = 15, 28
-"""From the top of the sidebar to the middle of the first header, and between headers of closed sections, pixels."""
-STEP = 18
-"""Less than the height of a button."""
-TRIES = 4
+"""Names of the sections, from the top."""
+HEADER_CENTER_PIXELS, HEADER_SPACING_PIXELS = 15, 28
+"""Distance from the top of the sidebar to the center of the first header, and between headers of closed sections."""
+SEARCH_STEP_PIXELS = 18
+"""Distance between two mouse positions of a search. It is less than the height of a button."""
+MAX_HEADER_CLICKS = 4
 
-_drawn: set[str] = set()
+_drawn_sections: set[str] = set()
 _open_index = 0
-_places: dict[str, float] = {}
-"""How high buttons were found."""
+_button_heights: dict[str, float] = {}
+"""Height in the window at which each button was found last, pixels, by identifier."""
 
 
-def show() -> Iterator[float]:
-    """Open the sidebar at its tab, and note from now on which sections are drawn."""
+def open_tab() -> Iterator[float]:
+    """Open the tab "FDDA" of the sidebar, and record from now on which sections are drawn."""
     view_area().spaces[0].show_region_ui = True
-    yield 1.0  # Its region is a pixel wide before.
-    region("UI").active_panel_category = "FDDA"
-    yield from redraw()
+    yield 1.0  # Until then its region is one pixel wide.
+    view_region("UI").active_panel_category = "FDDA"
+    yield from redraw_window()
     for name in SECTIONS:
         panel = getattr(bpy.types, f"FDDA_PT_{name}")
-        panel.append(lambda _panel, _context, name=name: _drawn.add(name))
+        panel.append(lambda _panel, _context, name=name: _drawn_sections.add(name))
 
 
-def open_sections() -> Iterator[float]:
-    """Which sections are open; returns their names. Closed, they are not drawn."""
-    forget_drawn()
-    yield from redraw()
-    return drawn()
+def list_open_sections() -> Iterator[float]:
+    """Return the names of the open sections. Blender does not draw closed ones."""
+    clear_drawn_sections()
+    yield from redraw_window()
+    return drawn_sections()
 
 
-def forget_drawn() -> None:
-    """Forget which sections were drawn."""
-    _drawn.clear()
+def clear_drawn_sections() -> None:
+    """Clear the record of drawn sections."""
+    _drawn_sections.clear()
 
 
-def drawn() -> set[str]:
-    """The sections that were drawn since that was forgotten."""
-    return set(_drawn)
+def drawn_sections() -> set[str]:
+    """Return the names of the sections that were drawn since `clear_drawn_sections`."""
+    return set(_drawn_sections)
 
 
 def open_section(name: str) -> Iterator[float]:
-    """Close all sections with the mouse, from the top, and open one."""
+    """Close all sections with the mouse, from the top, and open one of them."""
     global _open_index
-    opened = yield from open_sections()
+    open_names = yield from list_open_sections()
     for index, section in enumerate(SECTIONS):
-        for _ in range(TRIES):
-            if section not in opened:
+        for _ in range(MAX_HEADER_CLICKS):
+            if section not in open_names:
                 break
             yield from _click_header(index)
-            opened = yield from open_sections()
+            open_names = yield from list_open_sections()
     _open_index = SECTIONS.index(name)
     yield from _click_header(_open_index)
-    opened = yield from open_sections()
-    check(opened == {name}, f"of the sections, {sorted(opened)} are open instead of {name}")
+    open_names = yield from list_open_sections()
+    require(open_names == {name}, f"of the sections, {sorted(open_names)} are open instead of {name}")
 
 
 def _click_header(index: int) -> Iterator[float]:
-    """Click a header whose predecessors are all closed."""
-    sidebar, scale = region("UI"), bpy.context.preferences.system.ui_scale
+    """Click the header of a section while all sections above it are closed."""
+    sidebar, scale = view_region("UI"), bpy.context.preferences.system.ui_scale
     top = sidebar.y + sidebar.height
-    yield from click(sidebar.x + 90 * scale, top - (HEADER + index * PITCH) * scale)
+    yield from click(sidebar.x + 90 * scale, top - (HEADER_CENTER_PIXELS + index * HEADER_SPACING_PIXELS) * scale)
 
 
-def find(what: str, across: float = 0.5) -> Iterator[float]:
-    """Move the mouse down the sidebar onto a button; returns its place in the window.
+def find_button(identifier: str, across: float = 0.5) -> Iterator[float]:
+    """Move the mouse down the sidebar until it is over a button; return the position of the button in the window.
 
     Args:
-        what: part of what `below_mouse` says.
-        across: how far from the left of the sidebar's content, 0 to 1.
+        identifier: part of the text that `describe_button_below_mouse` returns for the button.
+        across: horizontal position of the search in the sidebar, 0 at the left and 1 at the right.
 
     Raises:
-        StepError: there is none.
+        StepError: there is no such button.
     """
-    sidebar, scale = region("UI"), bpy.context.preferences.system.ui_scale
-    # The strip of the tabs is at the right.
+    sidebar, scale = view_region("UI"), bpy.context.preferences.system.ui_scale
+    # The tabs are at the right of the content.
     x = sidebar.x + 15 * scale + across * (sidebar.width - 60 * scale)
-    first, last = sidebar.y + sidebar.height - (HEADER + _open_index * PITCH) * scale, sidebar.y
-    going_down = [first - step * STEP * scale for step in range(int((first - last) / STEP / scale))]
-    # First where it was the last time; twice, as the sidebar may be drawn anew meanwhile.
-    known = [_places[what]] if what in _places else []
-    for y in [*known, *going_down, *going_down]:
-        move(x, y)
-        yield from settle()
-        with over("UI"):
-            found = below_mouse()
-        if what in found:
-            _places[what] = y
+    top = sidebar.y + sidebar.height - (HEADER_CENTER_PIXELS + _open_index * HEADER_SPACING_PIXELS) * scale
+    step = SEARCH_STEP_PIXELS * scale
+    search_heights = [top - index * step for index in range(int((top - sidebar.y) / step))]
+    # The last position first; all others twice, because Blender may redraw the sidebar during the search.
+    last_heights = [_button_heights[identifier]] if identifier in _button_heights else []
+    for y in [*last_heights, *search_heights, *search_heights]:
+        move_mouse(x, y)
+        yield from wait_for_events()
+        with region_override("UI"):
+            description = describe_button_below_mouse()
+        if identifier in description:
+            _button_heights[identifier] = y
             return x, y
-    check(False, f"there is no button {what} in the sidebar")
+    require(False, f"there is no button {identifier} in the sidebar")
 
 
-def type_into(what: str, text: str) -> Iterator[float]:
-    """Click a field in which one searches by name, as `find` finds it, and type; Return would choose what is found."""
-    x, y = yield from find(what, across=0.7)
+def type_into_search_field(identifier: str, search_text: str) -> Iterator[float]:
+    """Click a search field, found as by `find_button`, and type a name. Return would then choose the match."""
+    x, y = yield from find_button(identifier, across=0.7)
     yield from click(x, y)
     yield 0.5
-    yield from press(*text)
+    yield from press_keys(*search_text)
     yield 0.3
 
 
-def push(what: str, across: float = 0.5) -> Iterator[float]:
-    """Press a button of the sidebar, as `find` finds it."""
-    x, y = yield from find(what, across)
+def press_button(identifier: str, across: float = 0.5) -> Iterator[float]:
+    """Find a button of the sidebar (`find_button`) and click it."""
+    x, y = yield from find_button(identifier, across)
     yield from click(x, y)
