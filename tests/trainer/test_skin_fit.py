@@ -241,6 +241,9 @@ def damage() -> Iterator:
 
         return change_it
 
+    def negative_count(folder: Path) -> None:
+        (folder / "parents.npy").write_bytes(array_header((-JOINTS,), np.int32) + bytes(100))
+
     def pickle(folder: Path) -> None:
         (folder / "parents.npy").write_bytes(array_header((JOINTS,), object) + b"cbuiltins\nprint\n(Vpoor\ntR.")
 
@@ -259,7 +262,8 @@ def damage() -> Iterator:
         lambda folder: (folder / "positions.npy").write_bytes(b"\x93NUMPY\x01\x00"),
         "'positions.npy' is no",
     )
-    yield "pickled", pickle, "'parents.npy' is no array"
+    yield "negative", negative_count, "'parents.npy' is no array"
+    yield "pickled", pickle, "'parents.npy' holds something else"
     yield "type", change("skin_weights", lambda a: a.astype(np.float64)), "'skin_weights.npy' holds something else"
     yield "size", change("positions", lambda a: a[:, 1:]), "rest_positions has the shape (300, 3)"
     yield "numbers", change("positions", with_nan), "positions holds values that are not numbers"

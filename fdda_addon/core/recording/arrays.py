@@ -81,7 +81,7 @@ def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -
     """
     try:
         with open_input(path, follow=False) as file:
-            found_shape, found_dtype = _read_header(file)
+            found_shape, found_dtype = read_array_header(file)
             # An interrupted extension may leave more poses than the index counts.
             longer = path.stem in STREAMED_ARRAY_NAMES and found_shape[:1] > shape[:1] and found_shape[1:] == shape[1:]
             if not (found_shape == shape or longer) or found_dtype != np.dtype(dtype):
@@ -101,7 +101,13 @@ def open_array(path: Path, shape: tuple, dtype: type, rows: int | None = None) -
         raise RecordingError(f"'{path}' cannot be used: its header is damaged; record again.") from error
 
 
-def _read_header(file: BinaryIO) -> tuple[tuple, np.dtype]:
+def read_array_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
+    """Read the header of a `.npy` file up to the first element; returns shape and dtype.
+
+    Raises:
+        ValueError: it is no such header, of another version, or of elements in another order.
+        NPY_HEADER_ERRORS: it is damaged.
+    """
     if np.lib.format.read_magic(file) != (1, 0):
         raise ValueError("its npy version is not 1.0")
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)

@@ -4,6 +4,8 @@
 All arrays are checked as untrusted input.
 """
 
+import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +17,7 @@ from ..input_file import open_input
 from ..rig import Fingerprint, Joint, Rig
 from ..skin_fit import INFLUENCES, are_skin_weights
 from ..skinning import are_invertible
-from .arrays import NPY_HEADER_ERRORS
+from .arrays import NPY_HEADER_ERRORS, read_array_header
 from .writer import array_header, check_pose_values
 
 MIN_POSES = 10
@@ -190,19 +192,21 @@ def _dtype(name: str) -> type:
 
 
 def _read_array(path: Path, dimensions: int, dtype: type) -> np.ndarray:
-    """Memory-map an array; numpy checks the file's size against its header."""
+    """Memory-map an array after its header and size are checked."""
     try:
-        # A pipe would block.
-        open_input(path, follow=False).close()
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        with open_input(path, follow=False) as file:
+            shape, found_dtype = read_array_header(file)
+            if len(shape) != dimensions or found_dtype != np.dtype(dtype):
+                raise _damaged_error(path.parent, f"'{path.name}' holds something else")
+            start = file.tell()
+            # Windows refuses to map more than a file holds with the error of a full memory.
+            if min(shape) < 1 or file.seek(0, os.SEEK_END) < start + math.prod(shape) * found_dtype.itemsize:
+                raise ValueError("empty or truncated")
+            return np.memmap(file, dtype, "r", start, shape)
     except OSError as error:
         raise _damaged_error(path.parent, f"'{path.name}' cannot be read ({os_error_text(error)})") from error
     except (ValueError, *NPY_HEADER_ERRORS) as error:
         raise _damaged_error(path.parent, f"'{path.name}' is no array, or truncated") from error
-    # np.load also reads zip files of arrays.
-    if not isinstance(array, np.ndarray) or array.ndim != dimensions or array.dtype != dtype:
-        raise _damaged_error(path.parent, f"'{path.name}' holds something else")
-    return array
 
 
 def _damaged_error(folder: Path, reason: str) -> RecordingError:
