@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draws the layers of the code for docs/development.md: `make map`.
+"""Draw the layers of the code for docs/development.md: `make map`.
 
     python docs/pictures/make_map.py OUT.svg
 
-The layout is that of a layered graph: an arrow that crosses a layer takes a slot in it, and packages and slots move to
-where their arrows are short.
+The layout is that of a layered graph. An arrow that crosses a layer passes through a slot in it. Packages and slots
+move horizontally until their arrows are short.
 """
 
 import ast
@@ -30,22 +30,29 @@ GROUPS = {
     "rig": ("Blender's data", "#3a7d44"),
     "core.checks": ("without Blender", "#6b5b95"),
 }
-"""From the layer of this package down: the name of the group of layers, and its color."""
+"""Name and color of each group of layers, by the package whose layer is the first of the group."""
 TRAINER, TRAINER_COLOR = "trainer", "#8a6d3b"
-WIDTH, HEIGHT, LANE, GAP = 6.9, 1.72, 0.3, 0.55
-"""Of a package, of the slot of an arrow, and between two of either."""
+WIDTH, HEIGHT, SLOT_WIDTH, GAP = 6.9, 1.72, 0.3, 0.55
+"""Width and height of a package, width of the slot of an arrow, and gap between neighbors in a layer."""
 LAYER_SPACING = 2.45
-"""From one layer to the next."""
-INK, PAPER = "#222222", "#ffffff"
-MAIN_FILES = 6
-SENTENCE, FILES = 48, 44
-"""Letters in a line."""
-SETTLING = 200
+"""Vertical distance from one layer to the next."""
+TEXT_COLOR, BACKGROUND_COLOR = "#222222", "#ffffff"
+MAX_FILE_NAMES = 6
+SENTENCE_WIDTH, FILE_NAMES_WIDTH = 48, 44
+"""Maximum numbers of letters in a line of the sentence, and in the line of file names."""
+LAYOUT_STEPS = 200
 
 
 @dataclass(eq=False)
 class Item:
-    """A package, or the slot of an arrow that crosses a layer; `x` is its center."""
+    """A package, or the slot of an arrow that crosses a layer.
+
+    Attributes:
+        name: name of the package; empty for a slot.
+        width: width in the picture.
+        x: horizontal center.
+        above, below: the items that arrows connect with this one.
+    """
 
     name: str
     width: float
@@ -65,7 +72,7 @@ def files_of(package: str) -> list[Path]:
     ]
 
 
-def purpose(package: str) -> str:
+def first_docstring_sentence(package: str) -> str:
     """Return the first sentence of a package's docstring."""
     file = ROOT / "fdda_addon" / Path(*package.split("."))
     if package == TRAINER:
@@ -75,85 +82,90 @@ def purpose(package: str) -> str:
     return text.partition(". ")[0].rstrip(".").replace("`", "")
 
 
-def main_files(package: str) -> list[str]:
-    """Return the files of a package, those that other packages import most first."""
+def most_imported_files(package: str) -> list[str]:
+    """Return the names of the files of a package, the ones that other packages import most first."""
     files = {module_of(file): file for file in files_of(package) if file.name != "__init__.py"}
     graph = import_graph(TRAINER if package == TRAINER else "fdda_addon")
     inside, outside = (
-        Counter(name for module, imported in graph.items() if (module in files) == own for name in imported)
-        for own in (True, False)
+        Counter(name for module, imported in graph.items() if (module in files) == is_inside for name in imported)
+        for is_inside in (True, False)
     )
     ranked = sorted(files, key=lambda module: (-outside[module], -inside[module], -_lines(files[module])))
-    return [files[module].stem for module in ranked[:MAIN_FILES]]
+    return [files[module].stem for module in ranked[:MAX_FILE_NAMES]]
 
 
 def _lines(file: Path) -> int:
     return len(file.read_text(encoding="utf-8").splitlines())
 
 
-def arrows() -> dict[str, set[str]]:
-    """Who imports from whom, without what follows from the other arrows."""
+def direct_imports() -> dict[str, set[str]]:
+    """Return the imports of each package, without those that it also reaches through other packages."""
     graph = package_graph()
-    below = {package: _reached(graph, package) for package in graph}
+    indirect = {package: _indirect_imports(graph, package) for package in graph}
     return {
-        package: {other for other in imported if not any(other in below[third] for third in imported - {other})}
+        package: {
+            other
+            for other in imported
+            if not any(other in indirect[intermediate] for intermediate in imported - {other})
+        }
         for package, imported in graph.items()
     }
 
 
-def _reached(graph: dict[str, set[str]], package: str) -> set[str]:
-    found: set[str] = set()
-    waiting = [package]
-    while waiting:
-        for other in graph[waiting.pop()] - found:
-            found.add(other)
-            waiting.append(other)
-    return found
+def _indirect_imports(graph: dict[str, set[str]], package: str) -> set[str]:
+    """Return all packages that a package imports, directly or through others."""
+    imported: set[str] = set()
+    pending = [package]
+    while pending:
+        for other in graph[pending.pop()] - imported:
+            imported.add(other)
+            pending.append(other)
+    return imported
 
 
-def place(layers: list[list[str]], edges: dict[str, set[str]]) -> tuple[list[list[Item]], dict[str, Item]]:
+def place_items(layers: list[list[str]], edges: dict[str, set[str]]) -> tuple[list[list[Item]], dict[str, Item]]:
     """Return the items of each layer from left to right, and the packages by name."""
-    number = {package: layer for layer, packages in enumerate(layers) for package in packages}
-    packages = {package: Item(package, WIDTH) for package in number}
+    layer_of = {package: layer for layer, packages in enumerate(layers) for package in packages}
+    packages = {package: Item(package, WIDTH) for package in layer_of}
     rows = [[packages[package] for package in layer] for layer in layers]
-    for package, below in sorted(edges.items()):
-        for other in sorted(below):
-            last = packages[package]
-            for layer in range(number[package] + 1, number[other]):
-                lane = Item("", LANE)
-                rows[layer].append(lane)
-                last = _join(last, lane)
-            _join(last, packages[other])
+    for package, imported in sorted(edges.items()):
+        for other in sorted(imported):
+            upper_item = packages[package]
+            for layer in range(layer_of[package] + 1, layer_of[other]):
+                slot = Item("", SLOT_WIDTH)
+                rows[layer].append(slot)
+                upper_item = _connect(upper_item, slot)
+            _connect(upper_item, packages[other])
     for row in rows:
-        _spread(row)
-    for turn in range(SETTLING):
-        order = range(len(rows)) if turn % 2 else reversed(range(len(rows)))
+        _remove_overlaps(row)
+    for step in range(LAYOUT_STEPS):
+        order = range(len(rows)) if step % 2 else reversed(range(len(rows)))
         for layer in order:
             row = rows[layer]
             for item in row:
-                near = [other.x for other in (*item.above, *item.below)]
-                item.x = sum(near) / len(near) if near else 0.0
-            if turn < SETTLING / 2:
+                neighbor_positions = [other.x for other in (*item.above, *item.below)]
+                item.x = sum(neighbor_positions) / len(neighbor_positions) if neighbor_positions else 0.0
+            if step < LAYOUT_STEPS / 2:
                 row.sort(key=lambda item: item.x)
-            _spread(row)
+            _remove_overlaps(row)
     return rows, packages
 
 
-def _join(above: Item, below: Item) -> Item:
+def _connect(above: Item, below: Item) -> Item:
     above.below.append(below)
     below.above.append(above)
     return below
 
 
-def _spread(row: list[Item]) -> None:
-    """Move items apart that overlap, in their order, with their common middle where it was."""
-    for _ in range(SETTLING):
-        moved = False
+def _remove_overlaps(row: list[Item]) -> None:
+    """Move overlapping items apart, keeping their order and the middle of each pair."""
+    for _ in range(LAYOUT_STEPS):
+        has_moved = False
         for left, right in itertools.pairwise(row):
-            lacking = (left.width + right.width) / 2 + GAP - (right.x - left.x)
-            if lacking > 1e-3:
-                left.x, right.x, moved = left.x - lacking / 2, right.x + lacking / 2, True
-        if not moved:
+            overlap = (left.width + right.width) / 2 + GAP - (right.x - left.x)
+            if overlap > 1e-3:
+                left.x, right.x, has_moved = left.x - overlap / 2, right.x + overlap / 2, True
+        if not has_moved:
             return
 
 
@@ -177,13 +189,13 @@ def _curve(item: Item, other: Item, y: dict[Item, float]) -> Curve:
 def draw(path: Path) -> None:
     """Draw the map into a file."""
     matplotlib.rcParams.update({"svg.hashsalt": "fdda", "font.family": "DejaVu Sans"})
-    edges = arrows()
-    rows, packages = place([list(layer) for layer in LAYERS], edges)
+    edges = direct_imports()
+    rows, packages = place_items([list(layer) for layer in LAYERS], edges)
     y = {item: -layer * LAYER_SPACING for layer, row in enumerate(rows) for item in row}
     if packages["training"].x < max(
         packages[package].x for layer in LAYERS if "training" in layer for package in layer
     ):
-        # Towards the process that it starts, which is drawn on the right.
+        # `training` has an arrow to the trainer, which is drawn on the right, so it should be on the right too.
         for item in y:
             item.x = -item.x
     colors, group = {}, None
@@ -203,7 +215,7 @@ def draw(path: Path) -> None:
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set(xlim=(left - 1.2, end), ylim=(low, high))
     axes.axis("off")
-    figure.patch.set_facecolor(PAPER)
+    figure.patch.set_facecolor(BACKGROUND_COLOR)
     for (text, color), numbers in spans.items():
         top, bottom = -numbers[0] * LAYER_SPACING + LAYER_SPACING / 2, -numbers[-1] * LAYER_SPACING - LAYER_SPACING / 2
         axes.add_patch(_box(left, bottom + 0.08, right - left, top - bottom - 0.16, color, 0.07, 0.3))
@@ -218,13 +230,13 @@ def draw(path: Path) -> None:
 
 
 def _draw_trainer(axes, packages: dict[str, Item], y: dict[Item, float]) -> None:
-    """The building beside: who starts it, and what it uses of the other."""
+    """Draw the trainer beside the layers, with an arrow from the package that starts it and one to what it imports."""
     trainer, training, used = packages[TRAINER], packages["training"], packages["core.checks"]
     width, height = trainer.width + 0.6, HEIGHT + 1.3
     axes.add_patch(_box(trainer.x - width / 2, y[trainer] - HEIGHT / 2 - 0.35, width, height, TRAINER_COLOR, 0.09, 0.3))
     text = "another process, with PyTorch and without Blender"
     axes.text(trainer.x, y[trainer] + HEIGHT / 2 + 0.45, text, ha="center", size=10, color=TRAINER_COLOR)
-    # Below its layer, where no package is in the way.
+    # The arrow runs below the layer of `training`, where it crosses no package.
     start, level, turn = training.x + 0.4 * training.width, y[training] - HEIGHT / 2 - 0.4, trainer.x - width / 2 - 0.6
     points = [(start, level + 0.4), (start, level), (turn, level), (turn, y[trainer])]
     _arrow(axes, Curve([*points, (trainer.x - trainer.width / 2, y[trainer])]), GROUPS["models"][1], "--")
@@ -251,7 +263,7 @@ def _arrow(axes, curve: Curve, color: str, style: str = "-") -> None:
 
 def _draw_package(axes, item: Item, y: float, color: str) -> None:
     x = item.x - item.width / 2
-    box = _box(x, y - HEIGHT / 2, item.width, HEIGHT, PAPER, 1.0, 0.16)
+    box = _box(x, y - HEIGHT / 2, item.width, HEIGHT, BACKGROUND_COLOR, 1.0, 0.16)
     box.set(edgecolor=color, linewidth=1.6, zorder=2)
     axes.add_patch(box)
     files = files_of(item.name)
@@ -259,10 +271,12 @@ def _draw_package(axes, item: Item, y: float, color: str) -> None:
     count = f"{len(files)} files, {lines:,} lines" if len(files) > 1 else f"{lines:,} lines"
     axes.text(x + 0.2, y + 0.58, item.name, size=13, weight="bold", color=color, va="center", zorder=3)
     axes.text(x + item.width - 0.2, y + 0.58, count, size=9, color="#666666", ha="right", va="center", zorder=3)
-    text = "\n".join(textwrap.wrap(purpose(item.name), SENTENCE, max_lines=2, placeholder=" …"))
-    axes.text(x + 0.2, y + 0.33, text, size=9, color=INK, va="top", zorder=3, linespacing=1.3)
+    text = "\n".join(textwrap.wrap(first_docstring_sentence(item.name), SENTENCE_WIDTH, max_lines=2, placeholder=" …"))
+    axes.text(x + 0.2, y + 0.33, text, size=9, color=TEXT_COLOR, va="top", zorder=3, linespacing=1.3)
     if len(files) > 1:
-        names = textwrap.shorten(" ".join(main_files(item.name)), FILES, placeholder="").replace(" ", "  ")
+        names = textwrap.shorten(" ".join(most_imported_files(item.name)), FILE_NAMES_WIDTH, placeholder="").replace(
+            " ", "  "
+        )
         axes.text(x + 0.2, y - 0.62, names, size=8.5, color=color, va="center", zorder=3, family="DejaVu Sans Mono")
 
 

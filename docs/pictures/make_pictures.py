@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Makes the README's pictures, small, from those of `make demo`: `make pictures`."""
+"""Make the small pictures of the documentation from those of `make demo`: `make pictures`."""
 
 import sys
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Makes the pictures of the sidebar from those of `make test-gui`: `python docs/pictures/make_sidebar.py out/gui`."""
+"""Make the pictures of the sidebar from those of `make test-gui`: `python docs/pictures/make_sidebar.py out/gui`."""
 
 import sys
 from pathlib import Path
@@ -8,20 +8,20 @@ import numpy as np
 from PIL import Image
 
 HERE = Path(__file__).parent
-SIDEBAR = (1028, 82, 1284)
-"""Left, top and right in the window of the test, pixels."""
-VIEW = (2, 62, 1312, 1090)
-INK = 150
-"""Of the darkest channel of what is written."""
-BELOW = 16
-GAP = 12
-MANUAL = {
+SIDEBAR_BOUNDS = (1028, 82, 1284)
+"""Left, top and right of the sidebar in the window of the test, pixels."""
+VIEW_BOUNDS = (2, 62, 1312, 1090)
+TEXT_BRIGHTNESS = 150
+"""Pixels are part of a text if their darkest channel exceeds this value."""
+BOTTOM_MARGIN = 16
+COLUMN_GAP = 12
+SECTION_PICTURES = {
     "manual_prepare": ("03_measure_the_rig", "04_show_a_random_pose", "07_record"),
     "simulation_sections": ("target", "flesh_recorded"),
     "manual_play": ("09_train", "12_measure_the_model", "14_evaluate"),
 }
-"""Pictures of sections beside each other, and the steps that they come from."""
-WHOLE = {
+"""Steps of the test whose sections are shown side by side, by the name of the picture."""
+WINDOW_PICTURES = {
     "sidebar_evaluation": "17_mark_the_worst_frames",
     "manual_heat_map": "16_show_the_heat_map",
     "simulation_settling": "settling",
@@ -29,40 +29,41 @@ WHOLE = {
 }
 
 
-def height_of_sections(picture: Image.Image) -> int:
-    """How far down the sidebar is written on."""
-    left, top, right = SIDEBAR
-    pixels = np.asarray(picture.convert("RGB"))[top : VIEW[3], left:right]
-    return int(np.flatnonzero((pixels.min(axis=2) > INK).any(axis=1))[-1]) + BELOW
+def sections_height(picture: Image.Image) -> int:
+    """Return the height of the part of the sidebar that contains text, pixels."""
+    left, top, right = SIDEBAR_BOUNDS
+    pixels = np.asarray(picture.convert("RGB"))[top : VIEW_BOUNDS[3], left:right]
+    return int(np.flatnonzero((pixels.min(axis=2) > TEXT_BRIGHTNESS).any(axis=1))[-1]) + BOTTOM_MARGIN
 
 
-def sections(picture: Image.Image) -> Image.Image:
-    """The sidebar alone."""
-    left, top, right = SIDEBAR
-    return picture.crop((left, top, right, top + height_of_sections(picture)))
+def crop_sections(picture: Image.Image) -> Image.Image:
+    """Return the part of the window with the sections of the sidebar."""
+    left, top, right = SIDEBAR_BOUNDS
+    return picture.crop((left, top, right, top + sections_height(picture)))
 
 
-def beside(pictures: list[Image.Image]) -> Image.Image:
-    """Pictures in a row, on the ground of the interface."""
-    width = sum(picture.width for picture in pictures) + GAP * (len(pictures) - 1)
+def join_pictures(pictures: list[Image.Image]) -> Image.Image:
+    """Return the pictures in a row, on the background color of Blender's interface."""
+    width = sum(picture.width for picture in pictures) + COLUMN_GAP * (len(pictures) - 1)
     row, x = Image.new("RGB", (width, max(picture.height for picture in pictures)), (48, 48, 48)), 0
     for picture in pictures:
         row.paste(picture, (x, 0))
-        x += picture.width + GAP
+        x += picture.width + COLUMN_GAP
     return row
 
 
-def write(picture: Image.Image, name: str) -> None:
+def write_picture(picture: Image.Image, name: str) -> None:
+    """Write a picture of this folder with a palette of 256 colors."""
     picture.convert("RGB").quantize(256).save(HERE / f"{name}.png", optimize=True)
 
 
 if __name__ == "__main__":
     folder = Path(sys.argv[1])
 
-    def step(name: str) -> Image.Image:
+    def open_step(name: str) -> Image.Image:
         return Image.open(folder / f"{name}.png")
 
-    for name, steps in MANUAL.items():
-        write(beside([sections(step(each)) for each in steps]), name)
-    for name, each in WHOLE.items():
-        write(step(each).crop(VIEW), name)
+    for name, steps in SECTION_PICTURES.items():
+        write_picture(join_pictures([crop_sections(open_step(each)) for each in steps]), name)
+    for name, each in WINDOW_PICTURES.items():
+        write_picture(open_step(each).crop(VIEW_BOUNDS), name)
