@@ -36,6 +36,7 @@ def defined_names(file: Path) -> set[str]:
 
 
 def _assigned_names(node: ast.stmt) -> Iterator[str]:
+    """Yield the names that a statement defines."""
     if isinstance(node, ast.FunctionDef | ast.ClassDef):
         yield node.name
     elif isinstance(node, ast.Assign | ast.AnnAssign):

@@ -33,6 +33,7 @@ def defined_names(file: Path) -> set[str]:
 
 
 def _top_level_statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """Yield the statements of a module that are not in functions or classes, also those below if, try and with."""
     for node in body:
         if isinstance(node, ast.If | ast.Try | ast.With):
             yield from _top_level_statements([*node.body, *getattr(node, "orelse", [])])

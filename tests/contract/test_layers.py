@@ -117,10 +117,10 @@ def test_every_file_of_the_addon_is_in_a_package():
 def test_imports_in_the_addon_point_down():
     layer_of = {package: layer_index for layer_index, layer in enumerate(LAYERS) for package in layer}
     violations = [
-        f"{package} imports from {other}, which is not below it"
+        f"{package} imports from {imported_package}, which is not below it"
         for package, imported in package_graph().items()
-        for other in imported
-        if layer_of[other] <= layer_of[package]
+        for imported_package in imported
+        if layer_of[imported_package] <= layer_of[package]
     ]
     assert violations == []
 

@@ -32,6 +32,7 @@ VALUE_PLACEHOLDER = "\0"
 
 
 def parse(path: Path) -> ast.Module:
+    """Return the syntax tree of a Python file."""
     return ast.parse(path.read_text(encoding="utf-8"))
 
 

@@ -30,7 +30,7 @@ SKIN_JOINTS = np.array([[0, 2, 0, 0], [1, 0, 0, 0], [2, 1, 0, 0], [0, 1, 2, 0]],
 SKIN_WEIGHTS = np.array([[0.75, 0.25, 0, 0], [1, 0, 0, 0], [0.5, 0.5, 0, 0], [0.5, 0.3, 0.2, 0]], np.float32)
 
 
-def test_fit_sentence():
+def test_sentence_about_a_fit():
     assert FIT.sentence() == (
         "Linear skinning with fitted weights (smooth), mm: 1.50 rms and 21.2 max on 12 held-out poses, 4.25 rms and "
         "40.0 max with the rig's own weights; 1.25 rms and 20.0 max on the 13 poses of the fit, 4.00 rms and 39.0 max "

@@ -28,10 +28,12 @@ def assert_refused(model, *phrases: str) -> str:
 
 
 def make_node(operator: str, *inputs: str, **attributes) -> onnx.NodeProto:
+    """Return a node whose output is named after the operator and the first input."""
     return helper.make_node(operator, list(inputs), [f"{operator}_of_{inputs[0] if inputs else ''}"], **attributes)
 
 
 def integer_tensor(name: str, *values: int) -> TensorProto:
+    """Return a constant of int64 values."""
     return numpy_helper.from_array(np.array(values, np.int64), name)
 
 
@@ -133,9 +135,9 @@ def test_a_product_of_poses_with_each_other_is_refused():
 
 
 def test_large_unexplained_constants_are_refused():
-    big = numpy_helper.from_array(np.zeros(4_000_000, np.float32), "big")
+    large_tensor = numpy_helper.from_array(np.zeros(4_000_000, np.float32), "big")
     assert_refused(
-        tiny_model(initializers=[big]), "its constants have 16000", "more than its joints, vertices and shapes"
+        tiny_model(initializers=[large_tensor]), "its constants have 16000", "more than its joints, vertices and shapes"
     )
 
 
@@ -190,8 +192,8 @@ def test_two_constants_with_one_name_are_refused():
 
 def test_sparse_tensors_are_refused():
     values, indices = numpy_helper.from_array(np.ones(1, np.float32), "s"), integer_tensor("i", 0)
-    sparse = helper.make_sparse_tensor(values, indices, [1 << 40])
-    assert_refused(tiny_model(sparse=[sparse]), "sparse tensors")
+    sparse_tensor = helper.make_sparse_tensor(values, indices, [1 << 40])
+    assert_refused(tiny_model(sparse=[sparse_tensor]), "sparse tensors")
 
 
 def test_a_training_graph_and_unknown_versions_are_refused():

@@ -99,24 +99,27 @@ def test_resuming_does_not_write_through_links(recording, tmp_path, name):
 
 @systems.symbolic_links
 def test_an_extension_does_not_write_through_links(recording, tmp_path):
-    read = read_recording(recording)
+    opened_recording = read_recording(recording)
     victim = shutil.move(recording / "residuals.npy", tmp_path / "victim.npy")
-    before = (tmp_path / "victim.npy").read_bytes()
+    bytes_before = (tmp_path / "victim.npy").read_bytes()
     (recording / "residuals.npy").symlink_to(victim)
     with pytest.raises(FDDAError, match="it is a link to another place"):
-        RecordingExtension(read, "m.onnx")
-    assert (tmp_path / "victim.npy").read_bytes() == before
+        RecordingExtension(opened_recording, "m.onnx")
+    assert (tmp_path / "victim.npy").read_bytes() == bytes_before
 
 
 def flatten_axis(matrix):
+    """Set the Y axis of a matrix to zero."""
     matrix[:3, 1] = 0
 
 
 def make_axes_parallel(matrix):
+    """Make the Y axis of a matrix parallel to its X axis."""
     matrix[:3, 1] = matrix[:3, 0]
 
 
 def clear_last_row(matrix):
+    """Set the last row to zero, so that the matrix is not a transform."""
     matrix[3] = 0
 
 
@@ -128,9 +131,9 @@ def test_degenerate_joint_matrices_are_refused(recording, damage):
     assert_refused(recording, "holds joints that have shrunk to nothing (pose_matrices, pose 7); record again.")
     with pytest.raises(RecordingError, match="shrunk to nothing"):
         check_resumable(recording)
-    rest = np.load(recording / "rest_matrices.npy")
-    damage(rest[2])
-    np.save(recording / "rest_matrices.npy", rest)
+    rest_matrices = np.load(recording / "rest_matrices.npy")
+    damage(rest_matrices[2])
+    np.save(recording / "rest_matrices.npy", rest_matrices)
     assert_refused(recording, "The rest pose or skin weights of")
 
 

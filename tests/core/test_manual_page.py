@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The manual as a page for browsers: every heading can be reached, and nothing of Markdown is left over."""
+"""The manual as an HTML page: every heading has an anchor, and no Markdown remains."""
 
 import re
 from pathlib import Path
@@ -10,23 +10,23 @@ ROOT = Path(__file__).resolve().parents[2]
 MANUAL = (ROOT / "docs" / "manual.md").read_text(encoding="utf-8")
 
 
-def test_the_whole_manual():
-    made = make_page(MANUAL, "file:///docs")
+def test_the_manual_is_converted_completely():
+    html_page = make_page(MANUAL, "file:///docs")
     headings = re.findall(r"^#{1,6} (.+)$", MANUAL, re.MULTILINE)
     assert len(headings) > 60
-    assert [heading for heading in headings if f'id="{heading_anchor(heading)}"' not in made] == []
-    text = re.sub(r"<pre>.*?</pre>|<code>.*?</code>", "", made, flags=re.DOTALL)
+    assert [heading for heading in headings if f'id="{heading_anchor(heading)}"' not in html_page] == []
+    text = re.sub(r"<pre>.*?</pre>|<code>.*?</code>", "", html_page, flags=re.DOTALL)
     assert [line for line in text.splitlines() if "**" in line or "](" in line or line.startswith(("|", "- "))] == []
-    assert made.count("<table>") >= 4 and "file:///docs/pictures/" in made
-    for name in re.findall(r'href="#([^"]+)"', made):
-        assert f'id="{name}"' in made, name
+    assert html_page.count("<table>") >= 4 and "file:///docs/pictures/" in html_page
+    for name in re.findall(r'href="#([^"]+)"', html_page):
+        assert f'id="{name}"' in html_page, name
 
 
-def test_blocks():
-    listed = "- i\n  more\n- j\n\n1. k"
+def test_headings_paragraphs_lists_code_and_tables_are_converted():
+    lists = "- i\n  more\n- j\n\n1. k"
     table = "| a | b |\n|---|---|\n| 1 | 2 |"
-    made = make_page(f"# A <b>\n\none\ntwo `**x**` & **b**\n{listed}\n\n    code **x**\n\n{table}", "f")
-    assert '<h1 id="a-b">A &lt;b&gt;</h1>' in made
-    assert "<p>one two <code>**x**</code> &amp; <b>b</b></p>" in made
-    assert "<ul><li>i more</li><li>j</li></ul>" in made and "<ol><li>k</li></ol>" in made
-    assert "<pre>code **x**</pre>" in made and "<tr><td>1</td><td>2</td></tr>" in made
+    html_page = make_page(f"# A <b>\n\none\ntwo `**x**` & **b**\n{lists}\n\n    code **x**\n\n{table}", "f")
+    assert '<h1 id="a-b">A &lt;b&gt;</h1>' in html_page
+    assert "<p>one two <code>**x**</code> &amp; <b>b</b></p>" in html_page
+    assert "<ul><li>i more</li><li>j</li></ul>" in html_page and "<ol><li>k</li></ol>" in html_page
+    assert "<pre>code **x**</pre>" in html_page and "<tr><td>1</td><td>2</td></tr>" in html_page

@@ -14,11 +14,13 @@ MASK_WEIGHTS = np.linspace(0, 1, VERTEX_COUNT).astype(np.float32)
 
 @pytest.fixture(scope="module")
 def rig():
+    """The rig of the limb."""
     return make_rig()
 
 
 @pytest.fixture
 def positions() -> np.ndarray:
+    """Positions of a model's output in five poses."""
     return np.random.default_rng(3).uniform(-1, 1, (5, VERTEX_COUNT, 3)).astype(np.float32)
 
 

@@ -45,7 +45,7 @@ def test_metadata_is_read_back_unchanged(tmp_path):
     assert read_model_info(path).to_json() == tiny_info().to_json()
 
 
-def test_metadata_keys():
+def test_metadata_has_the_documented_keys():
     """The keys are those that docs/formats.md documents."""
     value = json.loads(tiny_info().to_json())
     assert list(value) == [

@@ -118,10 +118,10 @@ def test_external_data_of_sparse_tensors_is_found(tensor_name):
         "indices": numpy_helper.from_array(np.zeros(1, np.int64), "i"),
     }
     with_external_data(tensors[tensor_name])
-    sparse = helper.make_sparse_tensor(tensors["values"], tensors["indices"], [4])
-    assert scan(tiny_model(sparse=[sparse])).external_files == {"weights.bin"}
+    sparse_tensor = helper.make_sparse_tensor(tensors["values"], tensors["indices"], [4])
+    assert scan(tiny_model(sparse=[sparse_tensor])).external_files == {"weights.bin"}
     node = helper.make_node("Constant", [], ["c"])
-    node.attribute.append(helper.make_attribute("sparse_value", sparse))
+    node.attribute.append(helper.make_attribute("sparse_value", sparse_tensor))
     assert scan(tiny_model(nodes=[node])).external_files == {"weights.bin"}
 
 

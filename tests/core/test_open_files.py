@@ -128,9 +128,9 @@ def test_a_file_is_replaced_while_another_process_reads_it_repeatedly(tmp_path, 
     path = tmp_path / "a.json"
     write_text(path, "0")
     start_reader(0.03, path)
-    for number in range(20):
-        write_text(path, str(number))
-        assert path.read_text() == str(number)
+    for repetition in range(20):
+        write_text(path, str(repetition))
+        assert path.read_text() == str(repetition)
     assert file_texts(tmp_path) == {"a.json": "19"}
 
 
@@ -158,9 +158,9 @@ def test_a_recording_is_written_while_another_process_reads_it_repeatedly(tmp_pa
     matrices, residuals = random_poses(poses), random_residuals(poses)
     with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(poses)) as writer:
         start_reader(0.02, *(tmp_path / "r" / name for name in ("recording.json", "residuals.npy")))
-        for number in range(poses):
-            writer.append(matrices[number : number + 1], residuals[number : number + 1])
-            assert read_index(tmp_path / "r")["complete"] == number + 1
+        for pose_index in range(poses):
+            writer.append(matrices[pose_index : pose_index + 1], residuals[pose_index : pose_index + 1])
+            assert read_index(tmp_path / "r")["complete"] == pose_index + 1
     assert np.array_equal(read_recording(tmp_path / "r").residuals, residuals)
 
 

@@ -12,6 +12,7 @@ from fdda_addon.core.point_cache import PointCacheWriter, read_point_cache
 
 @pytest.fixture
 def positions() -> np.ndarray:
+    """Positions of seven points in five samples."""
     return np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
 
 
@@ -28,7 +29,7 @@ def cache_path(positions, tmp_path):
     return path
 
 
-def test_bytes_of_the_format(cache_path, positions):
+def test_bytes_follow_the_format(cache_path, positions):
     data = cache_path.read_bytes()
     assert data[:12] == b"POINTCACHE2\0" and len(data) == 32 + 5 * 7 * 12
     assert struct.unpack("<ii", data[12:20]) == (1, 7)

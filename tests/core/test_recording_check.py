@@ -190,7 +190,7 @@ def test_small_partitions_are_reported(clean_recording):
     assert warning_texts(replace(changed_recording, partitions=partitions)) == {}
 
 
-def test_merges_sentence():
+def test_sentence_about_merged_partitions():
     joints = [{"name": name} for name in ("root", "a", "b", STATIC_JOINT, *map(str, range(20)))]
     without_merges = {"joints": joints, "partitions": [{"joint": 0}]}
     assert merges_sentence(without_merges, 8) == ""
@@ -202,7 +202,7 @@ def test_merges_sentence():
     assert merges_sentence(many_merges, 5).endswith("'8' into 'root', '9' into 'root' and 6 more.")
 
 
-def test_bone_lengths(clean_recording):
+def test_bone_lengths_of_the_tube(clean_recording):
     assert compute_bone_lengths(clean_recording.rig) == pytest.approx([BONE_LENGTH] * 4)
 
 

@@ -26,7 +26,7 @@ from .limb import make_rig, record_limb
         (Estimate(9, 9, 10**9, None), "9 poses of 9 vertices: about 1.0 GB on the disk"),
     ],
 )
-def test_estimate_sentence(estimate, sentence):
+def test_sentence_about_an_estimate(estimate, sentence):
     assert estimate.sentence() == sentence
 
 
@@ -37,7 +37,7 @@ def test_estimated_bytes_equal_the_size_of_the_arrays(tmp_path):
     assert recording_bytes(read_recording(tmp_path / "r").rig, 50) == file_bytes - header_bytes
 
 
-def test_training_size_sentence(tmp_path):
+def test_sentence_about_the_size_of_a_training(tmp_path):
     record_limb(tmp_path / "r", poses=50)
     recording = read_recording(tmp_path / "r")
     largest_partition = max(recording.partitions, key=lambda partition: len(partition.vertices))
@@ -61,8 +61,8 @@ def test_a_disk_with_too_little_space_is_refused(tmp_path):
 @pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="Windows does not reserve space for files.")
 def test_space_that_a_recording_has_reserved_is_not_counted_again(small_disk):
     record_limb(small_disk / "r", poses=20, complete=5)
-    size = recording_bytes(make_rig(), 20)
+    needed_bytes = recording_bytes(make_rig(), 20)
     (small_disk / "ballast").write_bytes(b"x" * (shutil.disk_usage(small_disk).free - 8192))
-    check_disk_space([(small_disk / "r", size)])
+    check_disk_space([(small_disk / "r", needed_bytes)])
     with pytest.raises(OutputError, match="make room"):
-        check_disk_space([(small_disk / "other", size)])
+        check_disk_space([(small_disk / "other", needed_bytes)])

@@ -41,7 +41,7 @@ def test_a_folder_with_other_files_is_foreign(tmp_path):
     assert read_limb_folder(tmp_path / "letters.txt").state is FolderState.FOREIGN
 
 
-def test_a_complete_recording(tmp_path):
+def test_state_of_a_complete_recording(tmp_path):
     record_limb(tmp_path / "r", POSE_COUNT)
     assert read_limb_folder(tmp_path / "r") == FolderContent(
         FolderState.COMPLETE, POSE_COUNT, POSE_COUNT, is_recording=True
@@ -60,7 +60,7 @@ def test_measurements_of_a_recording_are_reported(tmp_path):
     assert "0.25 mm apart on average" in repeatability.sentence()
 
 
-def test_an_interrupted_recording(tmp_path):
+def test_state_of_an_interrupted_recording(tmp_path):
     record_limb(tmp_path / "r", POSE_COUNT, 5)
     assert read_limb_folder(tmp_path / "r") == FolderContent(FolderState.INCOMPLETE, 5, POSE_COUNT, is_recording=True)
     content = read_limb_folder(tmp_path / "r", seed=9)
@@ -69,7 +69,7 @@ def test_an_interrupted_recording(tmp_path):
 
 
 @pytest.mark.parametrize("complete", [5, POSE_COUNT])
-def test_a_recording_of_another_rig(tmp_path, complete):
+def test_state_of_a_recording_of_another_rig(tmp_path, complete):
     record_limb(tmp_path / "r", POSE_COUNT, complete)
     renamed_rig = replace(make_rig(), joints=(replace(JOINTS[0], name="tail"), *JOINTS[1:]))
     content = read_folder(tmp_path / "r", renamed_rig, SAMPLING)
@@ -78,7 +78,7 @@ def test_a_recording_of_another_rig(tmp_path, complete):
     assert read_folder(tmp_path / "r").state is not FolderState.OTHER, "without a rig nothing is compared"
 
 
-def test_a_damaged_recording(tmp_path):
+def test_state_of_a_damaged_recording(tmp_path):
     record_limb(tmp_path / "r", POSE_COUNT)
     (tmp_path / "r" / "recording.json").write_text("{")
     content = read_limb_folder(tmp_path / "r")

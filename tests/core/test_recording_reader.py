@@ -212,6 +212,7 @@ class Unpickled:
 
 
 def _mark_unpickled() -> None:
+    """Set `Unpickled.is_unpickled`; unpickling calls this function."""
     Unpickled.is_unpickled = True
 
 

@@ -129,7 +129,7 @@ def test_an_incompletely_written_batch_is_not_read(tmp_path, recording):
 
 
 def test_poses_are_incomplete_if_the_index_cannot_be_written(tmp_path, monkeypatch):
-    def refuse(*_: object) -> None:
+    def fail_to_write(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     rig = make_rig()
@@ -138,7 +138,7 @@ def test_poses_are_incomplete_if_the_index_cannot_be_written(tmp_path, monkeypat
         RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSE_COUNT)) as writer,
     ):
         writer.append(random_poses(POSE_COUNT)[:5], random_residuals(POSE_COUNT)[:5])
-        monkeypatch.setattr(f"{RecordingWriter.__module__}.write_index", refuse)
+        monkeypatch.setattr(f"{RecordingWriter.__module__}.write_index", fail_to_write)
         writer.append(random_poses(POSE_COUNT)[5:], random_residuals(POSE_COUNT)[5:])
 
 
@@ -167,7 +167,7 @@ def test_resuming_without_the_complete_poses_is_refused(tmp_path, name, damage):
     assert file_bytes(tmp_path / "r") == bytes_before
 
 
-def test_a_mesh_without_faces(tmp_path):
+def test_a_mesh_without_faces_is_recorded_and_read(tmp_path):
     rig = replace(make_rig(), face_starts=np.zeros(0, np.int32), face_vertices=np.zeros(0, np.int32))
     with RecordingWriter(tmp_path / "r", rig, partitions_of(rig), recording_info(POSE_COUNT)) as writer:
         writer.append(random_poses(POSE_COUNT), random_residuals(POSE_COUNT))

@@ -25,7 +25,7 @@ REPORT = {
     "fdda": {"training": ERRORS, "held_out": ERRORS},
     "linear": {"held_out": ERRORS},
     "normals": None,
-    "edges": {way: {"inside": 0.1, "beside": None, "across": None} for way in ("fdda", "linear")},
+    "edges": {surface: {"inside": 0.1, "beside": None, "across": None} for surface in ("fdda", "linear")},
     "histogram": {"edges": [0.0, 1.0], "fdda": [3], "linear": [4]},
     "partitions": [
         {

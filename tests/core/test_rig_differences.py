@@ -19,6 +19,7 @@ def differences(rig: Rig, **changes) -> list[str]:
 
 @pytest.fixture(scope="module")
 def rig() -> Rig:
+    """The rig of the limb."""
     return make_rig()
 
 
@@ -115,6 +116,7 @@ DEFORMATION = {
 
 
 def with_mush_settings(**settings: object) -> dict:
+    """Return the deformation with changed settings of its Corrective Smooth modifier."""
     return {
         **DEFORMATION,
         "modifiers": [MODIFIERS[0], MODIFIERS[1] | {"settings": MODIFIERS[1]["settings"] | settings}],
@@ -122,10 +124,12 @@ def with_mush_settings(**settings: object) -> dict:
 
 
 def with_key_settings(**settings: object) -> dict:
+    """Return the deformation with changed settings of its shape key."""
     return {**DEFORMATION, "shape_keys": {"smile": DEFORMATION["shape_keys"]["smile"] | settings}}
 
 
 def with_additional_key(**settings: object) -> dict:
+    """Return the deformation with a second shape key."""
     return {**DEFORMATION, "shape_keys": {**DEFORMATION["shape_keys"], "frown": settings}}
 
 
@@ -188,7 +192,7 @@ def test_other_deformations_are_named(rig, change):
     ],
 )  # fmt: skip
 def test_a_damaged_deformation_is_refused(value):
-    parts = {"topology": "a", "rest_positions": "b", "skin_weights": "c"}
-    assert Fingerprint.from_json({**parts, "deformation": DEFORMATION}).deformation == DEFORMATION
+    hashes = {"topology": "a", "rest_positions": "b", "skin_weights": "c"}
+    assert Fingerprint.from_json({**hashes, "deformation": DEFORMATION}).deformation == DEFORMATION
     with pytest.raises((KeyError, TypeError, ValueError)):
-        Fingerprint.from_json({**parts, "deformation": value})
+        Fingerprint.from_json({**hashes, "deformation": value})

@@ -35,6 +35,7 @@ def quaternions_from_angles(angles: np.ndarray) -> np.ndarray:
 
 
 def random_quaternions() -> np.ndarray:
+    """Return (500, 4) random quaternions that are not normalized."""
     return np.random.default_rng(0).standard_normal((500, 4))
 
 

@@ -12,6 +12,7 @@ from .limb import JOINTS, VERTEX_COUNT, make_rig, partitions_of, random_poses, r
 
 @pytest.fixture(scope="module")
 def rig():
+    """The rig of the limb."""
     return make_rig()
 
 

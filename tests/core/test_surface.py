@@ -148,5 +148,5 @@ def test_a_single_partition_and_a_zero_length_edge_have_no_error():
         ([0, 3, 1 << 30], [0, 1, 2, 3, 0, 1], False),
     ],
 )
-def test_are_faces(starts, vertices, is_valid):
+def test_invalid_indices_are_no_faces(starts, vertices, is_valid):
     assert are_faces(np.array(starts, np.int32), np.array(vertices, np.int32), 4) is is_valid

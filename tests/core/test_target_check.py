@@ -82,6 +82,7 @@ def test_a_target_in_other_units_or_at_another_location_is_reported(factor, offs
 
 def test_a_low_repeatability_is_reported(swinging_recording):
     def with_repeatability(mean: float) -> Recording:
+        """Return the recording with a mean repeatability in millimeters."""
         statistics = {"mean": mean, "rms": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
         return replace(
             swinging_recording,
@@ -96,13 +97,13 @@ def test_a_low_repeatability_is_reported(swinging_recording):
     assert sentence.startswith("The same pose from two directions: 1.1 mm apart on average, 4 mm at most (2 poses);")
 
 
-def test_unsettled_sentence():
+def test_sentence_about_unsettled_poses():
     assert unsettled_sentence({"complete": 9}) == ""
     index = {"complete": 9, "unsettled": [1, 4], "target": {"max_settle_frames": 30}}
     assert unsettled_sentence(index).startswith("2 of 9 poses did not come to rest in 30 frames: 1 and 4. A training")
 
 
-def test_repeatability_in_the_index():
+def test_repeatability_is_read_back_from_json():
     statistics = {"mean": 0.5, "rms": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
     repeatability = Repeatability((1, 2), statistics, 5.0)
     assert Repeatability.from_json(repeatability.to_json(), 3) == repeatability
@@ -111,7 +112,7 @@ def test_repeatability_in_the_index():
             Repeatability.from_json(repeatability.to_json() | change, 3)
 
 
-def test_target_in_the_index():
+def test_target_is_read_back_from_json():
     simulation_target = RecordedTarget("flesh", "simulation", 3, 60, 0.1)
     assert RecordedTarget.from_json(simulation_target.to_json()) == simulation_target
     assert RecordedTarget.from_json(TARGET.to_json()) == TARGET
