@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Registers and unregisters the classes, properties and handlers of the add-on.
 
-A package of Blender classes lists its modules in `MODULES`, and each module lists its classes in `CLASSES`. A module
-with handlers lists them in `HANDLERS`; `handler_table` returns all of them.
+A package with Blender classes lists its modules in `MODULES`, and each module lists its classes in `CLASSES`. A module
+with handlers lists them in `HANDLERS`; `handler_table` returns the handlers of all modules.
 """
 
 import atexit
@@ -16,7 +16,7 @@ _is_registered = False
 
 
 def register() -> None:
-    """Register the add-on; do nothing if it is registered."""
+    """Register the add-on; do nothing if it is registered already."""
     global _is_registered
     if _is_registered:
         return
@@ -26,9 +26,9 @@ def register() -> None:
     for package in (properties, operators, panels):
         _register_package(package)
     for name, handler in handler_table():
-        listed = getattr(bpy.app.handlers, name)
-        if handler not in listed:
-            listed.append(handler)
+        blender_handlers = getattr(bpy.app.handlers, name)
+        if handler not in blender_handlers:
+            blender_handlers.append(handler)
     handlers.register()
     _is_registered = True
     if not bpy.app.binary_path:
@@ -51,18 +51,18 @@ def unregister() -> None:
 
     atexit.unregister(unregister)
     _is_registered = False
-    # Handlers that stay registered hang the `bpy` module of 4.5 at its exit.
+    # The `bpy` module of 4.5 hangs at its exit if handlers stay registered.
     for name, handler in handler_table():
-        listed = getattr(bpy.app.handlers, name)
-        if handler in listed:
-            listed.remove(handler)
+        blender_handlers = getattr(bpy.app.handlers, name)
+        if handler in blender_handlers:
+            blender_handlers.remove(handler)
     handlers.unregister()
     for package in (panels, operators, properties):
         _unregister_package(package)
 
 
 def handler_table() -> list[tuple[str, Callable[..., None]]]:
-    """Return the handlers of the add-on: name of the list in `bpy.app.handlers` and function, in calling order."""
+    """Return all handlers in calling order, each with the name of its list in `bpy.app.handlers`."""
     from .evaluation import side_by_side
     from .jobs import job
     from .operators import training
@@ -70,7 +70,7 @@ def handler_table() -> list[tuple[str, Callable[..., None]]]:
     from .runtime import handlers
     from .scene import stored_paths
 
-    # After a save, paths are restored before models are loaded.
+    # Paths must be restored before models are loaded, so `stored_paths` is the first module.
     modules = (stored_paths, job, checks, handlers, side_by_side, training)
     return [entry for module in modules for entry in module.HANDLERS.items()]
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Background jobs, which wait for other processes and use no data of Blender.
+"""Runs background jobs, which wait for other processes and use no data of Blender.
 
-A timer runs them, because a modal operator would end with its window, such as the preferences.
+A timer iterates them. A modal operator would end when its window, such as the preferences, is closed.
 """
 
 import queue
@@ -14,26 +14,26 @@ from .job import ENVIRONMENT, JobRunner, JobState, current, redraw
 
 TICK_SECONDS, TICK_WORK_SECONDS = 0.2, 0.02
 THREAD_JOIN_SECONDS = 10.0
-"""Time to wait for a thread that was asked to end."""
+"""Longest time to wait for the end of a canceled thread."""
 
-_run: JobRunner | None = None
+_runner: JobRunner | None = None
 
 
 def iterate_in_thread(
     steps: Iterator[object], state: JobState, cancel: Callable[[], None] | None = None
 ) -> Iterator[object]:
-    """Iterate `steps` in a thread, for work that blocks and uses no data of Blender.
+    """Iterate `steps` in a thread, because they block; they must not use data of Blender.
 
     Args:
-        steps: the work.
-        state: of the job, which may request its cancellation.
-        cancel: thread-safe function that ends `steps` soon; None where that is not possible.
+        steps: the steps of the job.
+        state: state of the job, whose `cancel_requested` is checked.
+        cancel: thread-safe function that makes `steps` end soon; None if they cannot be canceled.
 
     Yields:
-        The values of `steps`, None while there is none.
+        The values of `steps`, and None while there is no new one.
 
     Raises:
-        BaseException: as `steps`.
+        BaseException: the exception that `steps` has raised.
     """
     results: queue.SimpleQueue[tuple[object, BaseException | None]] = queue.SimpleQueue()
 
@@ -69,10 +69,10 @@ def iterate_in_thread(
         thread.join(THREAD_JOIN_SECONDS)
 
 
-def run_in_background(run: JobRunner) -> None:
-    """Iterate a job on the training environment until it ends, independent of windows and files."""
-    global _run
-    _run = run
+def run_in_background(runner: JobRunner) -> None:
+    """Start to iterate a job on the training environment; it continues when windows are closed and files opened."""
+    global _runner
+    _runner = runner
     if not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=TICK_SECONDS, persistent=True)
 
@@ -87,8 +87,8 @@ def _tick() -> float | None:
     if current(ENVIRONMENT) is None:
         # The job was stopped.
         return None
-    if _run.work(TICK_WORK_SECONDS):
-        print(f"FDDA: {_run.state.outcome}")
+    if _runner.work(TICK_WORK_SECONDS):
+        print(f"FDDA: {_runner.state.outcome}")
         return None
     redraw()
     return TICK_SECONDS

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Running and ended jobs, for panels to draw, and stopping of jobs.
+"""State of running and ended jobs, which panels draw, and functions that run and stop jobs.
 
-A job is a generator that yields `Progress`, None while it waits, and at most one other value, its result. One job at a
-time works on a character, iterated by `operators.job`, and one on the training environment, iterated by `background`.
+A job is a generator. It yields `Progress`, None while it waits, and at most one other value: its result. One job at a
+time works on a character (`operators.job` iterates it), and one on the training environment (`background` iterates it).
 """
 
 import time
@@ -17,8 +17,8 @@ from ..core.progress import Progress
 from ..scene import draw_cache
 
 CHARACTER, ENVIRONMENT = "character", "environment"
-"""What a job works on. A job on a character ends with the file. A job on the training environment uses no data of
-Blender and continues when another file is opened."""
+"""Kinds of jobs. A job on a character ends when another file is opened. A job on the training environment uses no data
+of Blender and continues."""
 STAGE_UNITS = {
     "fit": "vertices fitted",
     "probes": "poses compared with the rig",
@@ -28,7 +28,7 @@ STAGE_UNITS = {
     "evaluation": "poses compared",
     "benchmark": "measurements",
 }
-"""Labels for the units of stages whose names do not say what they count."""
+"""Labels of the steps of a stage, where they differ from the name of the stage."""
 STAGE_LABELS = {
     "influences": "Step 1 of 2: testing bones",
     "starting": "Step 1 of 3: reading the recording",
@@ -48,17 +48,17 @@ class JobState:
         title: label of the job ("Recording").
         subject: session_uid of its object, 0 for none.
         works_on: `CHARACTER` or `ENVIRONMENT`.
-        can_cancel: whether it can be cancelled.
-        changes_scene: it changes the scene and gives it back when it ends.
-        is_running: under way.
-        cancel_requested: the user wants it to end.
-        part: name of the current one of several objects; empty for one object.
-        stage, done, total: progress; where it is unknown, total is 0 and done counts seconds.
-        started, ended: `time.monotonic` seconds.
-        outcome: how it ended, a sentence; empty while it runs.
-        outcome_level: 'INFO', 'WARNING' (cancelled) or 'ERROR'.
-        warnings: sentences about what the job works on, for jobs that have some.
-        curves: values by name, one for each step, for jobs that have some ("training", "validation").
+        can_cancel: whether it can be canceled.
+        changes_scene: whether the job changes the scene and restores it.
+        is_running: whether it is running.
+        cancel_requested: whether the user has requested cancellation.
+        current_object: name of the object that the job works on now; empty for a job on one object.
+        stage, done, total: progress. If the number of steps is unknown, total is 0 and done counts seconds.
+        started, ended: times of `time.monotonic`, seconds.
+        outcome: message at the end of the job; empty while it runs.
+        outcome_level: 'INFO', 'WARNING' (canceled) or 'ERROR'.
+        warnings: messages about the recording.
+        curves: error after each epoch, mm, by name ("training", "validation"); empty for other jobs.
     """
 
     verb: str
@@ -69,7 +69,7 @@ class JobState:
     can_cancel: bool = True
     is_running: bool = True
     cancel_requested: bool = False
-    part: str = ""
+    current_object: str = ""
     stage: str = ""
     done: int = 0
     total: int = 0
@@ -83,41 +83,41 @@ class JobState:
 
     @property
     def fraction(self) -> float:
-        """Completed ratio of the stage, 0 to 1."""
+        """Return the completed ratio of the stage, 0 to 1."""
         return self.done / self.total if self.total else 0.0
 
     @property
     def remaining_seconds(self) -> float | None:
-        """Estimated remaining time of the stage; None where unknown."""
-        began, first = self._stage_start
-        if not self.total or self.done <= first or not self.is_running:
+        """Return the estimated remaining time of the stage; None if it is unknown."""
+        stage_start, first_done = self._stage_start
+        if not self.total or self.done <= first_done or not self.is_running:
             return None
-        return (time.monotonic() - began) / (self.done - first) * (self.total - self.done)
+        return (time.monotonic() - stage_start) / (self.done - first_done) * (self.total - self.done)
 
     @property
     def sentence(self) -> str:
-        """Progress as text: "212 of 1,000 poses"."""
-        stage, of_mesh, mesh = self.stage.partition(" of '")
-        unit = STAGE_UNITS.get(stage, stage) + of_mesh + mesh
+        """Return the progress as text: "212 of 1,000 poses"."""
+        stage, separator, mesh_part = self.stage.partition(" of '")
+        unit = STAGE_UNITS.get(stage, stage) + separator + mesh_part
         if not self.stage:
             text = "Starting…"
         elif stage in STAGE_LABELS:
             count = f"{self.done:,} of {self.total:,}" if self.total else f"{self.done} s"
-            text = f"{STAGE_LABELS[stage]}{of_mesh}{mesh} ({count})"
+            text = f"{STAGE_LABELS[stage]}{separator}{mesh_part} ({count})"
         elif not self.total:
             text = f"{unit[:1].upper()}{unit[1:]}: {self.done} s"
         else:
             text = f"{self.done:,} of {self.total:,} {unit}"
-        return f"{self.part}: {text}" if self.part else text
+        return f"{self.current_object}: {text}" if self.current_object else text
 
     @property
     def is_finishing(self) -> bool:
-        """Whether the last stage is complete."""
+        """Return whether the last stage is complete."""
         return 0 < self.total == self.done and self.stage.partition(" of '")[0] not in PREPARING_STAGES
 
     def begin_object(self, name: str) -> None:
-        """Start the work on another object."""
-        self.part, self.stage, self.done, self.total = name, "", 0, 0
+        """Reset the progress and the curves, because the job begins with another object."""
+        self.current_object, self.stage, self.done, self.total = name, "", 0, 0
         self.curves.clear()
 
     def show(self, progress: Progress) -> None:
@@ -132,18 +132,18 @@ _running: "dict[str, JobRunner]" = {}
 
 
 def current(works_on: str = CHARACTER) -> JobState | None:
-    """Return the state of the running job; None where there is none."""
-    run = _running.get(works_on)
-    return run.state if run else None
+    """Return the state of the running job of a kind; None if no job runs."""
+    runner = _running.get(works_on)
+    return runner.state if runner else None
 
 
 def state_of(verb: str) -> JobState | None:
-    """Return the state of the last job of a verb in this session; None where there was none."""
+    """Return the state of the last job with a verb in this session; None without one."""
     return _states.get(verb)
 
 
 def request_cancel(works_on: str = CHARACTER) -> None:
-    """Request the cancellation of the job."""
+    """Request the cancellation of the running job of a kind."""
     if state := current(works_on):
         state.cancel_requested = True
 
@@ -152,15 +152,15 @@ def stop(reason: str, works_on: str = CHARACTER) -> None:
     """Stop the running job now: its generator is closed, which restores the scene and ends its process.
 
     Args:
-        reason: the sentence that panels show.
-        works_on: which job.
+        reason: the message that panels show.
+        works_on: kind of the job.
     """
-    if run := _running.get(works_on):
+    if runner := _running.get(works_on):
         try:
-            run.close()
+            runner.close()
         except FDDAError as error:
             reason = f"{reason} {error}"
-        run.end(reason, "WARNING")
+        runner.end(reason, "WARNING")
 
 
 class JobRunner:
@@ -171,7 +171,7 @@ class JobRunner:
         state: JobState,
         steps: Iterator,
         finish: Callable[[object], str],
-        cancelled: Callable[[], str],
+        cancel_message: Callable[[], str],
         ends_itself: bool = False,
     ):
         """Register the job.
@@ -179,46 +179,46 @@ class JobRunner:
         Args:
             state: of the job.
             steps: the generator.
-            finish: processes the result and returns the outcome; an FDDAError is an outcome, too.
-            cancelled: returns the outcome of a canceled job without a result.
-            ends_itself: `steps` checks `state.cancel_requested` and ends soon; otherwise it is closed.
+            finish: processes the result and returns the outcome. The text of an FDDAError is the outcome too.
+            cancel_message: returns the outcome of a canceled job that has no result.
+            ends_itself: whether `steps` checks `state.cancel_requested` and ends soon; if not, it is closed.
         """
         self.state, self.steps = state, steps
         self.result: object = None
         self.is_waiting = False
-        self._finish, self._cancelled, self._ends_itself = finish, cancelled, ends_itself
+        self._finish, self._cancel_message, self._ends_itself = finish, cancel_message, ends_itself
         _states[state.verb] = state
         _running[state.works_on] = self
 
     def work(self, seconds: float) -> bool:
-        """Run for some seconds, or until the job waits; return whether it has ended.
+        """Run the job for some seconds, or until it waits; return whether it has ended.
 
-        Ctrl-C and bugs propagate. The scene is restored even then, and another job may start.
+        KeyboardInterrupt and unexpected exceptions propagate, after the scene was restored and the job has ended.
         """
         title = self.state.title
         try:
-            cancelled = self.state.cancel_requested
-            if cancelled and not self._ends_itself:
+            is_canceled = self.state.cancel_requested
+            if is_canceled and not self._ends_itself:
                 self.close()
             elif not self.advance(seconds):
                 return False
-            if cancelled and self.result is None:
-                self.end(self._cancelled(), "WARNING")
+            if is_canceled and self.result is None:
+                self.end(self._cancel_message(), "WARNING")
             else:
                 self.end(self._finish(self.result), "INFO")
         except FDDAError as error:
-            self.end(str(error), "WARNING" if cancelled and self._ends_itself else "ERROR")
+            self.end(str(error), "WARNING" if is_canceled and self._ends_itself else "ERROR")
         except ReferenceError:
-            self.end(f"{title} ended: what it worked on was removed.", "ERROR")
+            self.end(f"{title} ended: its object was removed.", "ERROR")
         except BaseException:
             self.close()
-            self.end(f"{title} broke off; the system console says why.", "ERROR")
+            self.end(f"{title} failed; see the system console.", "ERROR")
             raise
         return True
 
     def advance(self, seconds: float) -> bool:
-        """Iterate for some seconds, or until the job waits; return whether the generator has ended."""
-        until = time.monotonic() + seconds
+        """Iterate the generator for some seconds, or until the job waits; return whether the generator has ended."""
+        deadline = time.monotonic() + seconds
         self.is_waiting = False
         while True:
             try:
@@ -232,19 +232,19 @@ class JobRunner:
                 self.state.show(step)
             else:
                 self.result = step
-            if self.state.cancel_requested or time.monotonic() >= until:
+            if self.state.cancel_requested or time.monotonic() >= deadline:
                 return False
 
     def close(self) -> None:
-        """Close the generator.
+        """Close the generator, which restores the scene.
 
         Raises:
-            FDDAError: its cleanup failed.
+            FDDAError: restoring failed.
         """
         self.steps.close()
 
     def end(self, outcome: str, level: str) -> None:
-        """Store the outcome, so that another job may start."""
+        """Store the outcome and end the job, so that another job may start."""
         state = self.state
         state.is_running, state.ended, state.outcome, state.outcome_level = False, time.monotonic(), outcome, level
         if _running.get(state.works_on) is self:
@@ -253,7 +253,7 @@ class JobRunner:
 
 
 def redraw() -> None:
-    """Redraw sidebars and preferences, and clear cached values."""
+    """Redraw sidebars and preferences, with new values instead of cached ones."""
     draw_cache.clear()
     for window in getattr(bpy.context.window_manager, "windows", ()):
         for area in window.screen.areas:

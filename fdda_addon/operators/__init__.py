@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operators. Each gathers its settings, calls a function of a lower package, and reports."""
+"""The operators. Each reads its settings, calls a function of a lower package, and reports the result."""
 
 MODULES: tuple[str, ...] = (
     "job",
@@ -21,4 +21,4 @@ MODULES: tuple[str, ...] = (
     "meshes",
     "clipboard",
 )
-"""The modules of this package. Each lists its classes in `CLASSES`."""
+"""Names of the modules of this package. Each module lists its classes in `CLASSES`."""

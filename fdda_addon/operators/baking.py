@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operator that bakes the deformed mesh to a file that plays without the add-on."""
+"""The operator that bakes the deformed mesh to a file, which plays without the add-on."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operator that records, trains and binds."""
+"""The operator that records a rig, trains a model on the recording, and binds the model."""
 
 from collections.abc import Iterator
 

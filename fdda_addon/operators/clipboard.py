@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Blender's Copy Objects for characters that play a model: it copies their rigs.
+"""Copies objects to the clipboard with the rigs' modifiers restored, in place of Blender's Copy Objects.
 
-Blender has no handler that runs before the clipboard is written. So this operator takes the shortcut in the 3D View,
-and passes it on while no model plays. It cannot replace the entry in the Object menu.
+Blender has no handler that runs before the clipboard is written. So this operator has the same shortcut in the 3D View,
+and passes the event on if no model plays. It cannot replace the entry in the Object menu.
 """
 
 import bpy
 
-_keys: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
+_keymap_items: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
 
 
 class FDDA_OT_copy_objects(bpy.types.Operator):
@@ -40,15 +40,17 @@ CLASSES = (FDDA_OT_copy_objects,)
 
 def register() -> None:
     """Add the shortcut. In the background Blender has no key configuration."""
-    configuration = bpy.context.window_manager.keyconfigs.addon
-    if configuration is not None:
-        keymap = configuration.keymaps.new("3D View", space_type="VIEW_3D")
-        key = {"oskey" if bpy.app.build_platform == b"Darwin" else "ctrl": True}
-        _keys.append((keymap, keymap.keymap_items.new(FDDA_OT_copy_objects.bl_idname, "C", "PRESS", **key)))
+    key_configuration = bpy.context.window_manager.keyconfigs.addon
+    if key_configuration is not None:
+        keymap = key_configuration.keymaps.new("3D View", space_type="VIEW_3D")
+        modifier_key = {"oskey" if bpy.app.build_platform == b"Darwin" else "ctrl": True}
+        _keymap_items.append(
+            (keymap, keymap.keymap_items.new(FDDA_OT_copy_objects.bl_idname, "C", "PRESS", **modifier_key))
+        )
 
 
 def unregister() -> None:
     """Undo `register`."""
-    for keymap, item in _keys:
+    for keymap, item in _keymap_items:
         keymap.keymap_items.remove(item)
-    _keys.clear()
+    _keymap_items.clear()

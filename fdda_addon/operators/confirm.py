@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Jobs that first show a file browser or a dialog.
+"""Base class of operators that show a file browser or a dialog before their job.
 
-Blender calls `execute` after the dialog, where a job would run to its end at once. So it invokes the operator again.
+After the dialog Blender calls `execute`, which would block Blender until the job ends. So `execute` invokes the
+operator a second time.
 """
 
 import bpy
@@ -10,7 +11,7 @@ from .job import JobOperator
 
 
 class ConfirmFirst(JobOperator):
-    """Mixin for a job operator with a dialog. Its `invoke` shows it and sets `_is_confirming`."""
+    """Mixin for a job operator whose `invoke` shows a dialog and sets `_is_confirming`."""
 
     _is_confirming = False
 

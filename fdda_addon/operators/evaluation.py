@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators of the section "Compare with Rig": evaluate, color the mesh, show the rig, open the report."""
+"""Operators of the section "Compare with Rig": evaluate the model, color the mesh, show the rig, open the report."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -85,20 +85,21 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
         from ..poses.action_range import action_frames
         from ..scene.viewport import redraw_views
 
-        first = action_frames(bpy.data.actions[self._action]).start if self._action else 0
+        first_frame = action_frames(bpy.data.actions[self._action]).start if self._action else 0
         sentences = []
         for uid, evaluation in result:
             mesh_object = next(o for o in bpy.data.objects if o.session_uid == uid)
-            last = last_evaluation.store(
-                mesh_object, evaluation, bound_model_name(mesh_object), self._action, first, self.seed
+            stored = last_evaluation.store(
+                mesh_object, evaluation, bound_model_name(mesh_object), self._action, first_frame, self.seed
             )
-            fdda, linear = last.total["fdda"], last.total["linear"]
-            of = f" of '{mesh_object.name}'" if len(result) > 1 else ""
+            model_errors, skinning_errors = stored.total["fdda"], stored.total["linear"]
+            of_mesh = f" of '{mesh_object.name}'" if len(result) > 1 else ""
             target = mesh_object.fdda.settings.target
-            true = f"'{target}'" if target else "the rig"
+            reference = f"'{target}'" if target else "the rig"
             sentences.append(
-                f"The model{of} is {fdda.mean:.2f} mm from {true} on average and {fdda.max:.1f} mm at most; "
-                f"skinning alone {linear.mean:.2f} and {linear.max:.1f} mm."
+                f"The model{of_mesh} is {model_errors.mean:.2f} mm from {reference} on average "
+                f"and {model_errors.max:.1f} mm at most; "
+                f"skinning alone {skinning_errors.mean:.2f} and {skinning_errors.max:.1f} mm."
             )
         context.window_manager.fdda_view.pose = -1
         if self._action:
@@ -114,7 +115,7 @@ class FDDA_OT_evaluate(ModelOperator, JobOperator, bpy.types.Operator):
 
 
 class EvaluationOperator(ModelOperator):
-    """Mixin for an operator on the last evaluation."""
+    """Mixin for an operator on the last evaluation of a mesh."""
 
     @classmethod
     def has_evaluation(cls, context: bpy.types.Context) -> bool:
@@ -130,7 +131,7 @@ class EvaluationOperator(ModelOperator):
         """Return the rig and its last evaluation.
 
         Raises:
-            FDDAError: there is none.
+            FDDAError: there is no rig, or no evaluation.
         """
         scene_rig = self.rig(context)
         last = last_evaluation.get(scene_rig.mesh_object)
@@ -194,11 +195,11 @@ class FDDA_OT_fit_color_range(EvaluationOperator, bpy.types.Operator):
         from ..evaluation import heat_map
 
         scene_rig, _ = self.last_evaluation(context)
-        fitting = heat_map.fitting_range_mm(scene_rig.mesh_object)
-        if not fitting:
+        range_mm = heat_map.fitting_range_mm(scene_rig.mesh_object)
+        if not range_mm:
             raise ModelError("No errors are shown to fit the range to; choose another frame, or show the mean.")
         view = context.window_manager.fdda_view
-        view.range_mm = fitting
+        view.range_mm = range_mm
         return f"Max color: {view.range_mm:.3g} mm."
 
 
@@ -223,7 +224,7 @@ class FDDA_OT_open_report(ModelOperator, bpy.types.Operator):
         return f"Opened {path} in the web browser."
 
     def _report_page(self, mesh_object: bpy.types.Object) -> Path:
-        """Return the path of the report of the bound model."""
+        """Return the path of the training report of the bound model, an HTML page."""
         from ..models import model_list
 
         entry = bound_entry(mesh_object)
@@ -292,15 +293,15 @@ class FDDA_OT_show_bone(RigOperator, bpy.types.Operator):
         if bone is None:
             self.report({"ERROR"}, f"'{armature_object.name}' has no bone '{self.bone}'.")
             return {"CANCELLED"}
-        shown = self.rig(context).mesh_object
+        mesh_object = self.rig(context).mesh_object
         if context.mode != "POSE":
             if context.mode != "OBJECT":
                 bpy.ops.object.mode_set(mode="OBJECT")
             context.view_layer.objects.active = armature_object
             bpy.ops.object.mode_set(mode="POSE")
-            context.window_manager.fdda.mesh = shown.name
-        for other in armature_object.pose.bones:
-            select_bone(other, other == bone)
+            context.window_manager.fdda.mesh = mesh_object.name
+        for other_bone in armature_object.pose.bones:
+            select_bone(other_bone, other_bone == bone)
         armature_object.data.bones.active = bone.bone
         return {"FINISHED"}
 

@@ -29,13 +29,13 @@ class FDDA_OT_help(bpy.types.Operator):
         except (OSError, OutputError) as error:
             self.report({"ERROR"}, f"The manual cannot be opened ({error}).")
             return {"CANCELLED"}
-        address = path.as_uri() + (f"#{manual_page.heading_anchor(self.section)}" if self.section else "")
+        url = path.as_uri() + (f"#{manual_page.heading_anchor(self.section)}" if self.section else "")
         try:
-            bpy.ops.wm.url_open(url=address)
+            bpy.ops.wm.url_open(url=url)
         except RuntimeError:
             self.report({"ERROR"}, f"No web browser could be started; open '{path}' yourself.")
             return {"CANCELLED"}
-        self.report({"INFO"}, f"Opened {address} in the web browser.")
+        self.report({"INFO"}, f"Opened {url} in the web browser.")
         return {"FINISHED"}
 
 

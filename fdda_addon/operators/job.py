@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Base of operators that take longer than a moment.
+"""Base class of operators that run a job.
 
-Invoked in a window, the job advances at each tick of a timer. In the background, or executed, it runs to its end.
+Invoked in a window, an operator iterates the job at each tick of a timer. In the background, or if it is executed, it
+runs the job to its end.
 """
 
 import time
@@ -13,26 +14,26 @@ from ..core.errors import FDDAError
 from ..jobs.job import JobRunner, JobState, current, redraw, request_cancel, stop, unregister
 
 TICK_BUDGET, MAX_BUDGET = 0.03, 0.2
-"""Seconds that a job may work in one tick. A step is always finished, so steps must be short.
+"""Shortest and longest time that a job may work in one tick, seconds. A tick does not interrupt a step.
 
-Blender draws each pose of a job that borrows the scene. Where drawing takes longer than the budget, the job may work as
-long as the drawing took, or nearly all the time would go into drawing.
+Blender redraws the viewport after each tick of a job that changes the scene. If redrawing takes longer than
+`TICK_BUDGET`, the job may work for the same time, so that at most half of the time is spent on redrawing.
 """
 TICK_SECONDS, IDLE_TICK_SECONDS = 0.01, 0.1
-"""Seconds between ticks of a job that works in Blender, and of one that waits for another process."""
+"""Time between two ticks, seconds: for a job that changes the scene, and for one that waits for another process."""
 BACKGROUND_STEP_SECONDS = 0.05
 REDRAW_SECONDS = 0.1
 TAB_STRIP_WIDTH = 24
 
 VIEW_EVENTS = {"MOUSEMOVE", "INBETWEEN_MOUSEMOVE", "MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "WINDOW_DEACTIVATE"}
-"""Events that a job passes on to Blender while it borrows the scene: navigation of the view."""
+"""Events that a job passes on to Blender while it changes the scene: they navigate the view."""
 
 
 class JobOperator:
     """Mixin for an operator that runs a job.
 
-    A subclass states `verb` and `title`, and defines `steps`, `finish` and `cancelled`. FDDAErrors of all three are
-    reported, and the operator is cancelled. Invoked in a window the job runs in ticks, otherwise to its end at once.
+    A subclass sets `verb` and `title`, defines `steps` and `finish`, and may define `cancel_message`. FDDAErrors of
+    these are reported, and the operator is canceled.
     """
 
     verb = ""
@@ -40,23 +41,23 @@ class JobOperator:
     changes_scene = True
     """Whether the job changes the scene and restores it. Meanwhile only the view can be navigated; ESC cancels."""
     changes_file = False
-    """Whether the job changes data of the .blend file. Its end then adds an undo step and marks the file as changed."""
+    """Whether the job changes data of the .blend file. If so, an undo step is added at its end."""
     ends_itself = False
-    """Whether `steps` watches `state.cancel_requested` and ends by itself, as a process needs time to stop."""
+    """Whether `steps` checks `state.cancel_requested` and ends by itself. Otherwise the generator is closed."""
 
     def steps(self, context: bpy.types.Context) -> Iterator[object]:
-        """Do the work: yield `Progress`, None while there is nothing to do, or a result.
+        """Yield `Progress`, None while the job waits, and at last the result.
 
-        Closing the generator cancels the job. No step may take longer than a tick (`TICK_BUDGET`).
+        Closing the generator cancels the job. A step should take less than `TICK_BUDGET`.
         """
         raise NotImplementedError
 
     def subject(self, context: bpy.types.Context) -> int:
-        """Return the session_uid of the object that the job works on."""
+        """Return the session_uid of the object that the job works on; 0 without one."""
         return 0
 
     def finish(self, context: bpy.types.Context, result: object) -> str:
-        """Use the last result of `steps`, and return the message to report."""
+        """Process the result of `steps`, and return the message to report."""
         raise NotImplementedError
 
     def cancel_message(self, context: bpy.types.Context) -> str:
@@ -117,7 +118,7 @@ class JobOperator:
         return {"RUNNING_MODAL"}
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """Stop the job: its window or Blender is closed."""
+        """Stop the job, because its window or Blender is closed."""
         if self._run.state.is_running:
             stop(f"{self.title} ended with its window.")
         self._end_modal(context)
@@ -157,9 +158,9 @@ class JobOperator:
             self._end_modal(context)
             return self._end()
         state, now = self._run.state, time.monotonic()
-        shown = (state.stage, state.done, len(state.warnings), state.cancel_requested)
-        if shown != self._drawn_progress and now - self._last_redraw >= REDRAW_SECONDS:
-            self._drawn_progress, self._last_redraw = shown, now
+        progress = (state.stage, state.done, len(state.warnings), state.cancel_requested)
+        if progress != self._drawn_progress and now - self._last_redraw >= REDRAW_SECONDS:
+            self._drawn_progress, self._last_redraw = progress, now
             text = f"{self.title}: {state.sentence} (ESC: cancel)" if self.changes_scene else None
             self._set_status_text(context, text)
             redraw()
@@ -192,7 +193,7 @@ def _is_view_event(context: bpy.types.Context, event: bpy.types.Event) -> bool:
     """Return whether an event only navigates the view or presses a button of the sidebar, such as Cancel."""
     if event.type in VIEW_EVENTS:
         return True
-    # Without the strip of tabs: there would be no way back from another tab.
+    # Clicks on the tabs are blocked: there would be no way back from another tab.
     strip = TAB_STRIP_WIDTH * context.preferences.system.ui_scale
     return event.type == "LEFTMOUSE" and any(
         region.type == "UI"

@@ -13,7 +13,7 @@ AXES = "XYZ"
 
 
 def _count_bones(count: int) -> str:
-    """Return a number of bones in words: "1 bone", "4 bones"."""
+    """Return a number of bones as text: "1 bone", "4 bones"."""
     return "1 bone" if count == 1 else f"{count} bones"
 
 
@@ -24,7 +24,7 @@ class _SelectedBonesOperator(PoseOperator):
         """Return the selected bones.
 
         Raises:
-            RigError: there is none.
+            RigError: no bone is selected.
         """
         armature_object = self.rig(context).armature_object
         bones = [bone for bone in armature_object.pose.bones if is_selected(bone)]
@@ -35,18 +35,18 @@ class _SelectedBonesOperator(PoseOperator):
         return bones
 
 
-def _copy_limits(source: bpy.types.PoseBone, target: bpy.types.PoseBone, mirrored: bool = False) -> None:
-    """Copy the limits of one bone to another; mirrored limits change sign about Y and Z."""
+def _copy_limits(from_bone: bpy.types.PoseBone, to_bone: bpy.types.PoseBone, is_mirrored: bool = False) -> None:
+    """Copy the rotation limits of one bone to another. Mirroring negates the limits about Y and Z."""
     from ..poses.motion_range import DEFAULT, clear_rotation_range, rotation_ranges, set_rotation_range
 
-    for axis, found in enumerate(rotation_ranges(source)):
-        turned = mirrored and axis > 0
-        low, high = (-found.high, -found.low) if turned else (found.low, found.high)
-        if found.source == DEFAULT:
-            clear_rotation_range(target, axis)
+    for axis, limit in enumerate(rotation_ranges(from_bone)):
+        is_negated = is_mirrored and axis > 0
+        low, high = (-limit.high, -limit.low) if is_negated else (limit.low, limit.high)
+        if limit.source == DEFAULT:
+            clear_rotation_range(to_bone, axis)
         elif low < high:
-            set_rotation_range(target, axis, low, high)
-        target.lock_rotation[axis] = found.is_locked or low >= high
+            set_rotation_range(to_bone, axis, low, high)
+        to_bone.lock_rotation[axis] = limit.is_locked or low >= high
 
 
 class FDDA_OT_set_limits(_SelectedBonesOperator, bpy.types.Operator):
@@ -132,13 +132,17 @@ class FDDA_OT_mirror_limits(_SelectedBonesOperator, bpy.types.Operator):
 
         bones = self.rig(context).armature_object.pose.bones
         pairs = [(bone, bones.get(flipped_name(bone.name))) for bone in self.selected_bones(context)]
-        pairs = [(bone, other) for bone, other in pairs if other is not None and other != bone]
+        pairs = [
+            (bone, opposite_bone)
+            for bone, opposite_bone in pairs
+            if opposite_bone is not None and opposite_bone != bone
+        ]
         if not pairs:
             raise RigError(
                 "No selected bone has a bone of the same name on the other side; select bones such as arm.L or LeftArm."
             )
-        for bone, other in pairs:
-            _copy_limits(bone, other, mirrored=True)
+        for bone, opposite_bone in pairs:
+            _copy_limits(bone, opposite_bone, is_mirrored=True)
         return f"Mirrored the limits of {_count_bones(len(pairs))}."
 
 
@@ -159,26 +163,26 @@ class FDDA_OT_human_limits(PoseOperator, bpy.types.Operator):
         from ..poses.motion_range import DEFAULT, rotation_ranges, set_rotation_range
 
         armature_object = self.rig(context).armature_object
-        done = 0
+        count = 0
         for bone in armature_object.pose.bones:
             if self.only_selected and not is_selected(bone):
                 continue
-            stated = rotation_ranges(bone)
-            found = human_ranges(armature_object, bone.bone)
-            if found is None or not (self.replace or all(r.source == DEFAULT for r in stated)):
+            current_ranges = rotation_ranges(bone)
+            human_limits = human_ranges(armature_object, bone.bone)
+            if human_limits is None or not (self.replace or all(r.source == DEFAULT for r in current_ranges)):
                 continue
-            for axis, (low, high) in enumerate(found):
+            for axis, (low, high) in enumerate(human_limits):
                 if low < high:
                     set_rotation_range(bone, axis, low, high)
                 else:
                     bone.lock_rotation[axis] = True
-            done += 1
-        if not done:
+            count += 1
+        if not count:
             raise RigError(
                 f"No bone of '{armature_object.name}' without limits has the name of a body part; set the limits by "
                 "hand, or from actions."
             )
-        return f"Set human limits for {_count_bones(done)}."
+        return f"Set human limits for {_count_bones(count)}."
 
 
 class FDDA_OT_clear_limits(_SelectedBonesOperator, bpy.types.Operator):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Chooses the mesh of an armature that the sidebar shows, and adds a menu with all operators to Blender's menus.
+"""The operator that chooses the mesh that the sidebar shows, and the menu "FDDA".
 
-Blender's search (F3) finds what is in a menu, so all of them are.
+The menu makes Blender's search (F3) find the operators. It leaves out those that need a button of a panel.
 """
 
 import bpy
@@ -25,7 +25,7 @@ MENU_OPERATORS = (
     ("fdda.add_model", "fdda.remove_model", "fdda.pack_model", "fdda.unpack_model", "fdda.check_model"),
     ("fdda.help",),
 )
-"""Operators of the menu, in groups."""
+"""Operators of the menu, in groups with a separator between them."""
 
 
 class FDDA_OT_show_mesh(RigOperator, bpy.types.Operator):
@@ -40,11 +40,11 @@ class FDDA_OT_show_mesh(RigOperator, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
-            shown = self.rig(context).mesh_object
+            mesh_object = self.rig(context).mesh_object
         except RigError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        context.window_manager.fdda.mesh = shown.name
+        context.window_manager.fdda.mesh = mesh_object.name
         # The sidebar prefers a mesh that is selected together with the armature.
         for rig in rigs_of_active_armature(context):
             if rig.mesh_object.select_get():
@@ -58,13 +58,13 @@ class FDDA_MT_main(bpy.types.Menu):
     bl_label = "FDDA"
 
     def draw(self, context: bpy.types.Context) -> None:
-        together = context.window_manager.fdda.all_meshes and bool(cached_rigs_of_active_armature(context))
-        for number, group in enumerate(MENU_OPERATORS):
-            if number:
+        has_several_meshes = context.window_manager.fdda.all_meshes and bool(cached_rigs_of_active_armature(context))
+        for index, group in enumerate(MENU_OPERATORS):
+            if index:
                 self.layout.separator()
             for name in group:
                 properties = self.layout.operator(name)
-                if together and "all_meshes" in properties.bl_rna.properties:
+                if has_several_meshes and "all_meshes" in properties.bl_rna.properties:
                     properties.all_meshes = True
 
 
@@ -79,7 +79,7 @@ MENUS = ("VIEW3D_MT_object", "VIEW3D_MT_pose")
 
 
 def register() -> None:
-    """Add the menu to the menus Object and Pose."""
+    """Add the menu "FDDA" to the menus Object and Pose."""
     for name in MENUS:
         getattr(bpy.types, name).append(_draw_menu)
 

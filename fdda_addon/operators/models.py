@@ -14,7 +14,7 @@ def _has_models(mesh_object: bpy.types.Object) -> bool:
 
 
 class ModelListOperator(ModelOperator):
-    """Mixin for an operator on a model of the Model Library."""
+    """Mixin for an operator on one model of the Model Library."""
 
     index: bpy.props.IntProperty(
         name="Index",
@@ -35,10 +35,10 @@ class ModelListOperator(ModelOperator):
         return True
 
     def active_entry(self, context: bpy.types.Context) -> tuple[object, object]:
-        """Return the rig, and the entry at `index` or the active one.
+        """Return the rig, and the model of its list at `index`, or the active model.
 
         Raises:
-            FDDAError: there is none.
+            FDDAError: there is no rig, or no such model.
         """
         from ..models import model_list
 

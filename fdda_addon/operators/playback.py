@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators of the section "Model": bind, set the mode, measure, relink, unbind."""
+"""Operators of the section "Model": bind and unbind a model, switch the deformation, relink, measure the speed."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +18,7 @@ from .job import JobOperator
 from .rig_operator import RigOperator
 
 LARGE_MODEL_BYTES = 32_000_000
-"""Models above this size are packed on request only: every save writes them again."""
+"""Larger models are packed on request only, because every save writes a packed model again."""
 MODE_NAMES = {"RIG": "the rig", "LINEAR": "skinning alone", "FDDA": "the model"}
 
 
@@ -31,7 +31,7 @@ class ModelOperator(RigOperator):
 
     @classmethod
     def can_change_scene(cls, context: bpy.types.Context) -> bool:
-        """Return whether there is a rig and no job borrows the scene, else set the poll message. For `poll`."""
+        """Return whether there is a rig and no job changes the scene, else set the poll message. For `poll`."""
         job = current()
         if job is not None and job.changes_scene:
             cls.poll_message_set(f"{job.title} is under way; wait for it or cancel it")
@@ -40,7 +40,7 @@ class ModelOperator(RigOperator):
 
     @classmethod
     def has_bound_model(cls, context: bpy.types.Context) -> bool:
-        """As `can_change_scene`, and a mesh of the scene has a bound model."""
+        """Return whether `can_change_scene`, and a mesh of the scene has a bound model, else set the poll message."""
         if not cls.can_change_scene(context):
             return False
         if not any_mesh_object(context, _is_bound):
@@ -49,7 +49,7 @@ class ModelOperator(RigOperator):
         return True
 
     def bound_rig(self, context: bpy.types.Context) -> object:
-        """Return the rig to apply the operator to; it has a bound model.
+        """Return the rig to apply the operator to, which has a bound model.
 
         Raises:
             FDDAError: there is no rig, or no model is bound to it.
@@ -63,7 +63,7 @@ class ModelOperator(RigOperator):
         """Return the rigs with a bound model to apply the operator to.
 
         Raises:
-            FDDAError: none has a bound model.
+            FDDAError: there is no rig, or no model is bound to any of the rigs.
         """
         bound = [rig for rig in self.rigs(context) if rig.mesh_object.fdda.is_bound]
         return bound or [self.bound_rig(context)]
@@ -87,7 +87,7 @@ class ModelOperator(RigOperator):
 
 
 class ModelFileOperator:
-    """Mixin for an operator on a model file; without one, `invoke` opens the file browser."""
+    """Mixin for an operator on a model file, which the file browser chooses if the operator is invoked without one."""
 
     filepath: bpy.props.StringProperty(
         name="Model", description="Model file, .onnx", subtype="FILE_PATH", options={"SKIP_SAVE"}
@@ -102,7 +102,7 @@ class ModelFileOperator:
         return {"RUNNING_MODAL"}
 
     def draw(self, _context: bpy.types.Context) -> None:
-        # Without this the file browser would list the properties.
+        # Otherwise the file browser would list the properties.
         pass
 
     def chosen_path(self) -> Path:
@@ -116,7 +116,7 @@ def _has_model(mesh_object: bpy.types.Object) -> bool:
 
 
 def _unpacked_file(mesh_object: bpy.types.Object) -> Path | None:
-    """Return the file of the model that would be bound, None if it is packed."""
+    """Return the file of the model that Bind would use; None if there is no model, or it is packed."""
     from ..models import model_list
 
     entry = active_entry(mesh_object)
@@ -126,11 +126,11 @@ def _unpacked_file(mesh_object: bpy.types.Object) -> Path | None:
 
 
 def bind_model(scene_rig: SceneRig, path: Path | None = None, pack_large: bool = False) -> str:
-    """Bind a model, pack it unless the preferences disagree, and return the message to report.
+    """Bind a model, pack it if the preferences say so, and return the message to report.
 
     Args:
         scene_rig: the rig.
-        path: of the model; None for the active one of the Model Library, or the trained one.
+        path: file of the model; None for the active model of the Model Library, or else the trained model.
         pack_large: whether to pack a large model too.
 
     Raises:
@@ -153,7 +153,7 @@ def bind_model(scene_rig: SceneRig, path: Path | None = None, pack_large: bool =
 
 
 def pack_by_default(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pack_large: bool = False) -> str:
-    """Pack a model unless the preferences disagree or it is large; return an addition to the message."""
+    """Pack a model if the preferences say so and it is not large; return a text to append to the message."""
     from ..models import model_list
 
     if entry.packed or not packs_models():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Base of operators on the pose, the limits and the recorded inputs of a rig."""
+"""Base class of operators that change the pose, the limits or the recorded inputs of a rig."""
 
 import bpy
 
@@ -24,9 +24,9 @@ class PoseOperator(RigOperator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
-            sentence = self.apply(context)
+            message = self.apply(context)
         except FDDAError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, sentence)
+        self.report({"INFO"}, message)
         return {"FINISHED"}

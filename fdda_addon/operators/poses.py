@@ -155,15 +155,19 @@ class FDDA_OT_limits_from_actions(PoseOperator, bpy.types.Operator):
                 "No action is checked; check the actions under Also Record Actions that show how the rig moves."
             )
         limits = set_limits_from_actions(rig, [bpy.data.actions[name] for name in names], self.margin)
-        bones_set = {limit.bone for limit in limits if not limit.reason_unset}
-        unset = [limit for limit in limits if limit.reason_unset]
-        remarks = f"; {len(unset)} axes were not changed ('{unset[0].bone}' {unset[0].reason_unset})" if unset else ""
-        if wide := list(dict.fromkeys(limit.bone for limit in limits if limit.near_gimbal_lock)):
+        limited_bones = {limit.bone for limit in limits if not limit.reason_unset}
+        unset_limits = [limit for limit in limits if limit.reason_unset]
+        remarks = (
+            f"; {len(unset_limits)} axes were not changed ('{unset_limits[0].bone}' {unset_limits[0].reason_unset})"
+            if unset_limits
+            else ""
+        )
+        if wide_bones := list(dict.fromkeys(limit.bone for limit in limits if limit.near_gimbal_lock)):
             remarks += (
-                f"; {len(wide)} bones ('{wide[0]}') rotate near gimbal lock, so their limits are too wide: choose "
-                "Bones in the Checked Actions instead"
+                f"; {len(wide_bones)} bones ('{wide_bones[0]}') rotate near gimbal lock, so their limits are too wide: "
+                "choose Bones in the Checked Actions instead"
             )
-        return f"Set the limits of {len(bones_set)} bones from {', '.join(names)}{remarks}."
+        return f"Set the limits of {len(limited_bones)} bones from {', '.join(names)}{remarks}."
 
 
 CLASSES = (

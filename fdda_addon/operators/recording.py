@@ -18,22 +18,22 @@ from .job import JobOperator
 from .rig_operator import RigOperator
 
 
-def record_rigs(shown: SceneRig, rigs: list[tuple[SceneRig, Path]], resume: bool = False) -> Iterator[object]:
-    """Record the meshes of an armature together, with the settings of the one that the sidebar shows.
+def record_rigs(shown_rig: SceneRig, rigs: list[tuple[SceneRig, Path]], resume: bool = False) -> Iterator[object]:
+    """Record the meshes of an armature together, with the settings of the mesh that the sidebar shows.
 
     Raises:
-        FDDAError: as `recording.run.record_meshes`.
+        FDDAError: the errors of `recording.run.record_meshes`.
     """
     from ..recording.run import record_meshes
     from ..runtime.binding import model_disabled
 
-    with ExitStack() as borrowed:
+    with ExitStack() as stack:
         for rig, _ in rigs:
-            borrowed.enter_context(model_disabled(rig.mesh_object))
-            if rig.mesh_object != shown.mesh_object:
-                copy_sampling_settings(rig.mesh_object.fdda.settings, shown.mesh_object.fdda.settings)
-        # The shown mesh may be recorded already; its settings are used all the same.
-        yield from record_meshes(rigs, recording_settings(shown, resume))
+            stack.enter_context(model_disabled(rig.mesh_object))
+            if rig.mesh_object != shown_rig.mesh_object:
+                copy_sampling_settings(rig.mesh_object.fdda.settings, shown_rig.mesh_object.fdda.settings)
+        # The settings of the shown mesh are used even if this mesh is recorded already.
+        yield from record_meshes(rigs, recording_settings(shown_rig, resume))
 
 
 def is_recorded(path: Path) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators of the section "Rig": add the sample arm, measure the speed."""
+"""Operators of the section "Rig": add the sample arm, measure the speed of the rig."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -18,7 +18,7 @@ _measured_costs: "dict[int, RigCost]" = {}
 
 
 def measured_cost(mesh_object: bpy.types.Object) -> "RigCost | None":
-    """Return the measured cost of a rig, None without a measurement for its number of vertices."""
+    """Return the measured cost of a rig; None if it was not measured with its current number of vertices."""
     cost = _measured_costs.get(mesh_object.session_uid)
     return cost if cost is not None and cost.vertices == len(mesh_object.data.vertices) else None
 
@@ -76,7 +76,7 @@ class FDDA_OT_add_sample_arm(bpy.types.Operator):
 
 
 def _hide_startup_cube(context: bpy.types.Context) -> bool:
-    """Hide the unchanged default cube; return whether there was one."""
+    """Hide the default cube if it is unchanged; return whether it was hidden."""
     cube = context.scene.objects.get("Cube")
     is_untouched = (
         cube is not None
@@ -122,7 +122,7 @@ CLASSES = (FDDA_OT_add_sample_arm, FDDA_OT_measure)
 
 
 def register() -> None:
-    """Add the arm to the menu Add > Armature."""
+    """Add the sample arm to the menu Add > Armature."""
     bpy.types.VIEW3D_MT_armature_add.append(_draw_add_menu)
 
 

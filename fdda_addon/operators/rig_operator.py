@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Base of operators on a rig: the active one, or that of a named mesh object."""
+"""Base class of operators on a rig: the active rig, or the rig of a named mesh object."""
 
 import bpy
 
@@ -40,15 +40,15 @@ class RigOperator:
         """Return the rig to apply the operator to.
 
         Raises:
-            RigError: there is none.
+            RigError: there is no rig.
         """
         return active_rig(context, self.object)
 
     def rigs(self, context: bpy.types.Context) -> list[SceneRig]:
-        """Return the rigs to apply the operator to: those of all meshes of the armature with `all_meshes`, else one.
+        """Return the rigs to apply the operator to: with `all_meshes` all rigs of the active armature, else one rig.
 
         Raises:
-            RigError: there is none.
+            RigError: there is no rig.
         """
         together = rigs_of_active_armature(context) if self.all_meshes and not self.object else []
         return together or [self.rig(context)]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Operators on the Python for training: check it; install and remove the training environment.
 
-Invoked in a window they run in the background (`jobs.background`). Executed they run to their end.
+Invoked in a window, an operator runs in the background (`jobs.background`). If it is executed, it runs to its end.
 """
 
 import time
@@ -21,11 +21,11 @@ from ..training.environment.check_result import CheckResult
 
 WAIT_SECONDS = 0.05
 _EnvironmentJob = tuple[Iterator[Progress | CheckResult], Callable[[], None] | None]
-"""An iterator of steps, and a function that cancels them."""
+"""The steps of a job, and a function that cancels them; None if they cannot be canceled."""
 
 
 class _EnvironmentOperator:
-    """Mixin for a job on the training environment. It runs in a thread that a timer polls."""
+    """Mixin for an operator with a job on the training environment, which runs in a thread."""
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -35,32 +35,36 @@ class _EnvironmentOperator:
         return True
 
     def steps(self) -> _EnvironmentJob:
-        """Return the steps of the job and how to cancel it. Raises FDDAError if it cannot start."""
+        """Return the steps of the job, and the function that cancels it.
+
+        Raises:
+            FDDAError: the job cannot start.
+        """
         raise NotImplementedError
 
     @staticmethod
     def store_result(outcome: CheckResult) -> None:
-        """Show the result in the preferences."""
+        """Store the result of the job, which the preferences then show."""
         session.store_result(None, outcome)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if bpy.app.background or context.window is None:
             return self.execute(context)
-        run = self._begin()
-        if run.work(0):
-            return self._end(run.state)
+        runner = self._begin()
+        if runner.work(0):
+            return self._end(runner.state)
         # Blender frees the operator before the job ends, so the job must not refer to it.
-        run_in_background(run)
+        run_in_background(runner)
         return {"FINISHED"}
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        run, shown = self._begin(), ""
-        while not run.work(WAIT_SECONDS):
-            if run.state.stage != shown:
-                shown = run.state.stage
-                print(f"{self.bl_label}: {shown}")
+        runner, printed_stage = self._begin(), ""
+        while not runner.work(WAIT_SECONDS):
+            if runner.state.stage != printed_stage:
+                printed_stage = runner.state.stage
+                print(f"{self.bl_label}: {printed_stage}")
             time.sleep(WAIT_SECONDS)
-        return self._end(run.state)
+        return self._end(runner.state)
 
     def _begin(self) -> JobRunner:
         try:
@@ -84,10 +88,10 @@ def start_job(
     """Start a job on the training environment.
 
     Args:
-        verb, title: of its `JobState`.
-        steps: yields progress and then the result; iterated in a thread.
-        cancel: makes `steps` end soon, called from another thread; None if it cannot be canceled.
-        store_result: called with the result, in the main thread.
+        verb, title: attributes of its `JobState`.
+        steps: iterator of progress and, at last, the result. A thread iterates it.
+        cancel: thread-safe function that makes `steps` end soon; None if the job cannot be canceled.
+        store_result: called in the main thread with the result.
     """
     state = JobState(verb, title, works_on=ENVIRONMENT, can_cancel=cancel is not None)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operator that trains in another process and follows its progress."""
+"""The operator that trains a model in another process and shows the progress."""
 
 import time
 from collections.abc import Iterator
@@ -30,15 +30,15 @@ class TrainingOperator(RigOperator):
     def train(
         self, mesh_object: bpy.types.Object, recording: Path, model: Path, warm_start: bool = False
     ) -> Iterator[object]:
-        """Train a model, or follow its running training. Yields as `steps` does, and at last the seconds.
+        """Train a model, or follow its running training. Yield progress as `steps` does, and at last the seconds.
 
         Raises:
             FDDAError: the recording is not complete, or the training fails.
         """
         from ..core.messages import MessageType
 
-        # The user may change Blender's data from here on, so none of it is used.
-        uid, started = mesh_object.session_uid, time.monotonic()
+        # No data of Blender is used from here on, because the user may change it.
+        mesh_uid, start = mesh_object.session_uid, time.monotonic()
         state = self.state
         state.curves.update(training=[], validation=[])
         with self._training(mesh_object, recording, model, warm_start) as training:
@@ -48,13 +48,13 @@ class TrainingOperator(RigOperator):
                         training.cancel()
                     if message is not None:
                         if message.type is MessageType.FINISHED:
-                            # This may follow a Cancel: the trainer finishes writing.
-                            self.trained_models.append((uid, model))
+                            # This message may come after a cancellation, if the trainer was writing the model.
+                            self.trained_models.append((mesh_uid, model))
                         yield self._to_progress(message)
                         continue
                     if not state.total:
-                        # The trainer sends nothing for some seconds; show that it is running.
-                        yield Progress(STARTING_STAGE, int(time.monotonic() - started), 0)
+                        # The trainer sends no message while it loads, so show the elapsed seconds.
+                        yield Progress(STARTING_STAGE, int(time.monotonic() - start), 0)
                     yield None
             except GeneratorExit:
                 if not bpy.app.background:
@@ -107,7 +107,7 @@ class TrainingOperator(RigOperator):
                 add_model(mesh_object, model)
 
     def on_failure(self) -> None:
-        # Models that were trained before the failure are on the disk; packed copies of them are outdated.
+        # Models that were trained before the failure have new files, so packed copies of them are outdated.
         with suppress(FDDAError):
             self.add_trained_models_to_list()
 
@@ -162,16 +162,18 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
         return cls.is_idle() and cls.has_rig(context)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if not (self.replace or bpy.app.background) and (foreign := self._models_of_other_rigs(context)):
+        if not (self.replace or bpy.app.background) and (message := self._models_of_other_rigs(context)):
             self._is_confirming = True
             return context.window_manager.invoke_confirm(
-                self, event, title="Overwrite Another Model?", message=foreign, confirm_text="Overwrite", icon="WARNING"
+                self, event, title="Overwrite Another Model?", message=message, confirm_text="Overwrite", icon="WARNING"
             )
         return ConfirmFirst.invoke(self, context, event)
 
     def confirmed_properties(self) -> dict[str, object]:
-        given = {name: getattr(self, name) for name in ("object", "all_meshes", "recording", "model", "warm_start")}
-        return {**given, "replace": True}
+        properties = {
+            name: getattr(self, name) for name in ("object", "all_meshes", "recording", "model", "warm_start")
+        }
+        return {**properties, "replace": True}
 
     def _models_of_other_rigs(self, context: bpy.types.Context) -> str:
         """Return a message about models of other rigs that training would overwrite; empty without one."""
@@ -188,7 +190,7 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
         return ""
 
     def _files(self, mesh_object: bpy.types.Object) -> tuple[Path, Path]:
-        """Return the folder of the recording and the file of the model."""
+        """Return the folder of the recording and the file of the model of a mesh."""
         recording = Path(bpy.path.abspath(self.recording)) if self.recording else recording_folder(mesh_object)
         return recording, Path(bpy.path.abspath(self.model)) if self.model else model_file(mesh_object)
 
@@ -211,7 +213,7 @@ class FDDA_OT_train(TrainingOperator, ConfirmFirst, bpy.types.Operator):
 
 
 def _check_recording(path: Path) -> None:
-    """Raise at once the error that the trainer would report after it has started."""
+    """Raise an error before the trainer starts if the recording is missing or incomplete."""
     from ..core.recording.index import read_index
 
     index = read_index(path)
@@ -231,7 +233,7 @@ def _make_folder(model: Path) -> None:
 
 
 def _follow_detached_training() -> None:
-    """Follow the training of the open file that still runs from an earlier session."""
+    """Follow a training that an earlier Blender session has started for a mesh of the open file."""
     from ..training.detached_process import is_detached
 
     windows = bpy.context.window_manager.windows
@@ -263,7 +265,7 @@ HANDLERS = {"load_post": _on_load}
 
 
 def register() -> None:
-    """Follow the training of a file that is already open."""
+    """Schedule `_follow_detached_training` for the file that is open when the add-on is enabled."""
     _on_load()
 
 

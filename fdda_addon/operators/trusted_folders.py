@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Operators that add and remove the folders in the preferences from which models are loaded."""
+"""Operators that add and remove trusted folders in the preferences: .blend files may load models from them."""
 
 import bpy
 
@@ -7,7 +7,7 @@ from ..properties.preferences import preferences
 
 
 class _FolderOperator:
-    """Mixin for an operator on these folders."""
+    """Mixin for an operator on the trusted folders."""
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -48,7 +48,7 @@ class FDDA_OT_remove_trusted_folder(_FolderOperator, bpy.types.Operator):
     bl_description = "Remove the folder from the list. Its files are kept"
     bl_options = {"REGISTER"}
 
-    index: bpy.props.IntProperty(name="Index", description="Place in the list, from 0", min=0, options={"SKIP_SAVE"})
+    index: bpy.props.IntProperty(name="Index", description="Index in the list, from 0", min=0, options={"SKIP_SAVE"})
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         folders = preferences().folders

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Short bone names for narrow tables: without the prefix that all bones of an armature have."""
+"""Shortens bone names for narrow tables, by the prefix that nearly all bones of an armature share."""
 
 import re
 from collections import Counter
@@ -11,11 +11,11 @@ from ..scene.draw_cache import draw_cached
 
 MIN_PREFIX_LENGTH = 4
 MAX_UNPREFIXED_RATIO = 0.3
-"""Part of the bones that may lack the prefix, such as helper bones."""
+"""Ratio of the bones that may lack the prefix, such as helper bones."""
 
 
 def common_prefix(names: Sequence[str]) -> str:
-    """Return the prefix that nearly all names share, "mixamorig:" or "DEF-"; empty without one."""
+    """Return the prefix that nearly all names share, such as "mixamorig:" or "DEF-"; empty without one."""
     namespaces = Counter(name[: name.rindex(":") + 1] for name in names if ":" in name)
     for prefix, count in namespaces.most_common(1):
         if count >= max(2, (1 - MAX_UNPREFIXED_RATIO) * len(names)):

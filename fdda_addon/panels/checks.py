@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks of rigs for panels to draw. A timer runs a check after a change; drawing never does."""
+"""Checks rigs for the panels. A timer runs a check after a change; drawing a panel never runs one."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -17,20 +17,21 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from ..recording.rig_check import RigCheck
 
 CHECK_INTERVAL_SECONDS = 0.3
-"""Shortest time between two checks of a rig that keeps changing."""
+"""Time between two checks of a rig that changes continuously."""
 
 _checks: dict[int, "tuple[RigCheck, tuple]"] = {}
-"""Last check, and `_change_signature` at that time, by session_uid of the mesh object."""
+"""Last check of each rig, with the `_change_signature` at that time, by session_uid of the mesh object."""
 _requested: set[int] = set()
+"""Mesh objects that the timer will check, by session_uid."""
 _outdated: set[int] = set()
-"""Mesh objects to check again for a reason that `_change_signature` does not contain, by session_uid."""
+"""Mesh objects that may have changed in a way that `_change_signature` does not show, by session_uid."""
 _changed_meshes: set[str] = set()
 """Names of meshes whose geometry or weights have changed."""
 
 
 @draw_cache.draw_cached
 def last_check(scene_rig: SceneRig) -> "RigCheck | None":
-    """Return the last check of a rig, None before the first. Schedule another one after a change."""
+    """Return the last check of a rig; None before the first. Schedule a new check if the rig may have changed."""
     uid = scene_rig.mesh_object.session_uid
     stored = _checks.get(uid)
     if stored is None or uid in _outdated or stored[1] != _change_signature(scene_rig) or _is_mesh_changed(scene_rig):
@@ -41,7 +42,7 @@ def last_check(scene_rig: SceneRig) -> "RigCheck | None":
 
 
 def check_now(scene_rig: SceneRig) -> "RigCheck":
-    """Check a rig now. What has not changed is not read again."""
+    """Check a rig now, without reading unchanged data again, and return the result."""
     from ..recording.plan import RecordingSettings
     from ..recording.rig_check import check_recordable_rig
 
@@ -51,8 +52,8 @@ def check_now(scene_rig: SceneRig) -> "RigCheck":
         settings, problems = RecordingSettings(poses=0), (str(error),)
     uid, signature = scene_rig.mesh_object.session_uid, _change_signature(scene_rig)
     stored = _checks.get(uid)
-    same_rest = stored is not None and stored[1][0] == signature[0] and not _is_mesh_changed(scene_rig)
-    result = stored[0].recheck(scene_rig, settings) if same_rest else check_recordable_rig(scene_rig, settings)
+    is_rest_unchanged = stored is not None and stored[1][0] == signature[0] and not _is_mesh_changed(scene_rig)
+    result = stored[0].recheck(scene_rig, settings) if is_rest_unchanged else check_recordable_rig(scene_rig, settings)
     result = replace(result, problems=result.problems + problems)
     _outdated.discard(uid)
     _changed_meshes.discard(scene_rig.mesh_object.data.name)
@@ -61,22 +62,22 @@ def check_now(scene_rig: SceneRig) -> "RigCheck":
 
 
 def _run_requested_checks() -> None:
-    running = job.current()
-    before = _drawn_values()
+    running_job = job.current()
+    previous_values = _drawn_values()
     meshes = {o.session_uid: o for o in bpy.data.objects if o.type == "MESH"}
     for uid in list(_requested):
         _requested.discard(uid)
         mesh_object = meshes.get(uid)
         armature_object = mesh_object and armature_of(mesh_object)
-        # A job that borrows the scene has changed the pose and the modifiers.
-        if armature_object and not (running and running.changes_scene):
+        # A job that changes the scene has changed the pose and the modifiers.
+        if armature_object and not (running_job and running_job.changes_scene):
             check_now(SceneRig(mesh_object, armature_object))
-    if _drawn_values() != before:
+    if _drawn_values() != previous_values:
         job.redraw()
 
 
 def _drawn_values() -> dict[int, tuple]:
-    """Return what panels draw of the checks."""
+    """Return the values of all checks that panels draw, by session_uid of the mesh object."""
     return {
         uid: (id(check.rig), check.problems, check.channels, check.replaced_modifiers, check.automatic_controls)
         for uid, (check, _) in _checks.items()
@@ -84,12 +85,12 @@ def _drawn_values() -> dict[int, tuple]:
 
 
 def _change_signature(scene_rig: SceneRig) -> tuple:
-    """Return cheap values that change when a check may change: (those of the rest pose, all others)."""
+    """Return values that are cheap to read and change when a check may change; the first are those of the rest pose."""
     from ..scene.arrays import REST_MATRIX, read
 
     mesh_object, armature_object = scene_rig.mesh_object, scene_rig.armature_object
     mesh, bones = mesh_object.data, armature_object.data.bones
-    rest = (
+    rest_values = (
         mesh.name,
         len(mesh.vertices),
         len(mesh_object.vertex_groups),
@@ -100,12 +101,17 @@ def _change_signature(scene_rig: SceneRig) -> tuple:
         tuple(armature_object.scale),
     )
     modifiers = tuple((m.name, m.type, m.show_viewport) for m in mesh_object.modifiers)
-    state = (mesh_object.mode, armature_object.mode, mesh_object.visible_get(), armature_object.data.pose_position)
-    return rest, modifiers, state, mesh_object.fdda.is_playing, _sampling_settings(scene_rig)
+    object_state = (
+        mesh_object.mode,
+        armature_object.mode,
+        mesh_object.visible_get(),
+        armature_object.data.pose_position,
+    )
+    return rest_values, modifiers, object_state, mesh_object.fdda.is_playing, _sampling_settings(scene_rig)
 
 
 def _sampling_settings(scene_rig: SceneRig) -> tuple:
-    """Return the settings that choose what random poses move."""
+    """Return the settings that choose the bones and extra inputs of random poses."""
     try:
         settings = recording_settings(scene_rig)
     except RigError as error:
@@ -115,14 +121,14 @@ def _sampling_settings(scene_rig: SceneRig) -> tuple:
 
 def _is_mesh_changed(scene_rig: SceneRig) -> bool:
     mesh_object = scene_rig.mesh_object
-    # Reading a large mesh takes a moment, which would be noticed at each stroke of a brush.
+    # Reading a large mesh takes long enough to be noticed at each stroke of a brush.
     if mesh_object.mode not in {"OBJECT", "POSE"} or not _changed_meshes:
         return False
     return mesh_object.data.name in _changed_meshes
 
 
 @persistent
-def _on_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+def _on_depsgraph_update(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     draw_cache.clear()
     if not _checks:
         return
@@ -134,24 +140,24 @@ def _on_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
 
 
 @persistent
-def _on_undone(*_: object) -> None:
+def _on_undo(*_: object) -> None:
     draw_cache.clear()
     _outdated.update(_checks)
     _changed_meshes.update(mesh.name for mesh in bpy.data.meshes)
 
 
 @persistent
-def _on_loaded(*_: object) -> None:
+def _on_load(*_: object) -> None:
     draw_cache.clear()
     for state in (_checks, _requested, _outdated, _changed_meshes):
         state.clear()
 
 
 HANDLERS = {
-    "depsgraph_update_post": _on_changed,
-    "load_post": _on_loaded,
-    "undo_post": _on_undone,
-    "redo_post": _on_undone,
+    "depsgraph_update_post": _on_depsgraph_update,
+    "load_post": _on_load,
+    "undo_post": _on_undo,
+    "redo_post": _on_undo,
 }
 
 
@@ -159,4 +165,4 @@ def unregister() -> None:
     """Remove the timer and all checks."""
     if bpy.app.timers.is_registered(_run_requested_checks):
         bpy.app.timers.unregister(_run_requested_checks)
-    _on_loaded()
+    _on_load()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draws the error curves of a training into a panel, as a preview image in memory."""
+"""Draws the error curves of a training in a panel. The curves are a preview image in memory."""
 
 import math
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # Blender starts without numpy.
 
 WIDTH, HEIGHT = 224, 224
 MARGIN_LEFT, MARGIN_BOTTOM = 34, 16
-"""Space for the numbers of the axes, pixels."""
+"""Space for the numbers at the axes, pixels."""
 LINE_HALF_WIDTH = 1.6
 """Half the width of a line, pixels."""
 LEGEND = {
@@ -21,7 +21,7 @@ LEGEND = {
 BACKGROUND_COLOR, GRID_COLOR = (0.10, 0.10, 0.10, 1.0), (0.20, 0.20, 0.20, 1.0)
 TEXT_COLOR = (0.75, 0.75, 0.75)
 TICK_STEPS = (1, 2, 5)
-"""Errors with a grid line and a number in each decade."""
+"""Errors that get a grid line and a number, multiplied by each power of ten."""
 DIGIT_GLYPHS = {
     "0": "757555557", "1": "262222227", "2": "711744447", "3": "711711117", "4": "555711111", "5": "744711117",
     "6": "744755557", "7": "711111111", "8": "757557557", "9": "757711117", ".": "000000002",
@@ -45,7 +45,7 @@ def draw(layout: bpy.types.UILayout, curves: dict[str, list[float]]) -> None:
 
 
 def _icon(curves: dict[str, list[float]]) -> int:
-    """Return the icon of the curves. Paint it again when they have grown."""
+    """Return the icon of the curves. Paint it again when the curves have new values."""
     import bpy.utils.previews
 
     from ..scene.arrays import write_pixels
@@ -68,50 +68,55 @@ def paint(curves: "dict[str, list[float]]") -> "np.ndarray":
 
     pixels = np.empty((HEIGHT, WIDTH, 4), np.float32)
     pixels[:] = BACKGROUND_COLOR
-    logs = {name: np.log10(np.maximum(curves[name], 1e-6)) for name in LEGEND}
-    low, high = min(log.min() for log in logs.values()), max(log.max() for log in logs.values())
-    margin = max(0.05 * (high - low), 0.02)
-    low, high = low - margin, high + margin
-    inside = pixels[MARGIN_BOTTOM:, MARGIN_LEFT:]
-    height, width = inside.shape[:2]
+    log_errors = {name: np.log10(np.maximum(curves[name], 1e-6)) for name in LEGEND}
+    log_min, log_max = min(log.min() for log in log_errors.values()), max(log.max() for log in log_errors.values())
+    margin = max(0.05 * (log_max - log_min), 0.02)
+    log_min, log_max = log_min - margin, log_max + margin
+    plot_pixels = pixels[MARGIN_BOTTOM:, MARGIN_LEFT:]
+    height, width = plot_pixels.shape[:2]
 
     def to_row(log: "np.ndarray | float") -> "np.ndarray | float":
-        return (log - low) / (high - low) * (height - 1)
+        return (log - log_min) / (log_max - log_min) * (height - 1)
 
-    _paint_grid(pixels, {error: round(to_row(float(np.log10(error)))) for error in _tick_errors(10**low, 10**high)})
-    count = len(logs["training"])
+    _paint_grid(
+        pixels, {error: round(to_row(float(np.log10(error)))) for error in _tick_errors(10**log_min, 10**log_max)}
+    )
+    count = len(log_errors["training"])
     _paint_number(pixels, "1", MARGIN_LEFT, 3)
     _paint_number(pixels, str(count), WIDTH - 8 * len(str(count)), 3)
     rows = np.arange(height)[:, None]
     for name, (_, _, color) in LEGEND.items():
         columns = np.linspace(0, count - 1, width)
-        heights = to_row(np.interp(columns, np.arange(count), logs[name]))
-        after = np.append(heights[1:], heights[-1])
-        bottom, top = np.minimum(heights, after) - LINE_HALF_WIDTH, np.maximum(heights, after) + LINE_HALF_WIDTH
-        # Soft edges, half a pixel to either side.
-        cover = np.clip(np.minimum(rows - bottom, top - rows) + 0.5, 0, 1)[..., None]
-        inside[..., :3] += cover * (np.float32(color) - inside[..., :3])
+        heights = to_row(np.interp(columns, np.arange(count), log_errors[name]))
+        next_heights = np.append(heights[1:], heights[-1])
+        bottom, top = (
+            np.minimum(heights, next_heights) - LINE_HALF_WIDTH,
+            np.maximum(heights, next_heights) + LINE_HALF_WIDTH,
+        )
+        # Antialiasing: the coverage falls from 1 to 0 within one pixel.
+        coverage = np.clip(np.minimum(rows - bottom, top - rows) + 0.5, 0, 1)[..., None]
+        plot_pixels[..., :3] += coverage * (np.float32(color) - plot_pixels[..., :3])
     return pixels
 
 
 def _tick_errors(low: float, high: float) -> list[float]:
-    """Return the round errors from `low` to `high` that get a grid line, mm; usually at least one."""
+    """Return the errors between `low` and `high` that get a grid line, mm."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    marks = [mark * 10.0**decade for decade in decades for mark in TICK_STEPS if low <= mark * 10.0**decade <= high]
-    decadic = [mark for mark in marks if round(math.log10(mark), 6) % 1 == 0]
-    return decadic if len(decadic) > 2 else marks
+    ticks = [tick * 10.0**decade for decade in decades for tick in TICK_STEPS if low <= tick * 10.0**decade <= high]
+    powers_of_ten = [tick for tick in ticks if round(math.log10(tick), 6) % 1 == 0]
+    return powers_of_ten if len(powers_of_ten) > 2 else ticks
 
 
-def _paint_grid(pixels: "np.ndarray", marks: dict[float, int]) -> None:
-    """Paint a grid line and a number for each error. Leave out numbers that would touch the one below."""
-    above = -1
-    for error, row in sorted(marks.items()):
+def _paint_grid(pixels: "np.ndarray", tick_rows: dict[float, int]) -> None:
+    """Paint a grid line and a number for each error. Leave out a number that would touch the number below it."""
+    min_bottom = -1
+    for error, row in sorted(tick_rows.items()):
         pixels[MARGIN_BOTTOM + row, MARGIN_LEFT:] = GRID_COLOR
         bottom = max(0, min(MARGIN_BOTTOM + row - 4, HEIGHT - 9))
-        if bottom > above:
+        if bottom > min_bottom:
             text = f"{error:.10f}".rstrip("0").rstrip(".")
             _paint_number(pixels, text, max(0, MARGIN_LEFT - 4 - 8 * len(text)), bottom)
-            above = bottom + 11
+            min_bottom = bottom + 11
 
 
 def _paint_number(pixels: "np.ndarray", text: str, left: int, bottom: int) -> None:
@@ -125,7 +130,7 @@ def _paint_number(pixels: "np.ndarray", text: str, left: int, bottom: int) -> No
 
 
 def release() -> None:
-    """Free the image."""
+    """Free the preview image."""
     global _previews, _drawn_key
     if _previews is not None:
         bpy.utils.previews.remove(_previews)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Section "Compare with Rig": errors of the model in numbers, as colors and in the timeline."""
+"""Section "Compare with Rig": shows the errors of the model as numbers, colors and timeline markers."""
 
 import bpy
 
@@ -39,7 +39,7 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
             self._draw_evaluate(context, scene_rig)
         last = last_evaluation.get(scene_rig.mesh_object)
         if last is not None:
-            _draw_figures(layout, context, view, last, scene_rig)
+            _draw_statistics(layout, context, view, last, scene_rig)
         _draw_colors(layout, context, view, scene_rig.mesh_object, last)
         if last is not None:
             _draw_worst(layout, context, view, last)
@@ -52,9 +52,9 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
         if state is not None and state.is_running:
             draw_job(layout, context, "evaluate")
             return
-        choice = layout.column(align=True)
-        choice.label(text="Compare On")
-        choice.row(align=True).prop(view, "source", expand=True)
+        source_column = layout.column(align=True)
+        source_column.label(text="Compare On")
+        source_column.row(align=True).prop(view, "source", expand=True)
         column = layout.column()
         column.use_property_split, column.use_property_decorate = True, False
         animation = scene_rig.armature_object.animation_data
@@ -68,8 +68,8 @@ class FDDA_PT_evaluation(Section, bpy.types.Panel):
             if action is None:
                 draw_wrapped(layout, context, f"'{scene_rig.armature_object.name}' has no action.", "ERROR")
             else:
-                first, last = (round(frame) for frame in action.frame_range)
-                layout.label(text=f"Frames {first} to {last}", icon="TIME")
+                first_frame, last_frame = (round(frame) for frame in action.frame_range)
+                layout.label(text=f"Frames {first_frame} to {last_frame}", icon="TIME")
         row = layout.row()
         row.scale_y = 1.4
         row.enabled = view.source == "RANDOM" or action is not None
@@ -83,15 +83,15 @@ def _draw_side_by_side(layout: bpy.types.UILayout, context: bpy.types.Context, s
     column = layout.column(align=True)
     column.label(text="Show the Rig")
     row = column.row(align=True)
-    shown = side_by_side.display_mode(scene_rig.mesh_object)
+    current_placement = side_by_side.display_mode(scene_rig.mesh_object)
     for placement, text in (("NONE", "Off"), ("BESIDE", "Beside"), ("OVERLAY", "Overlay")):
-        button = row.operator("fdda.show_rig", text=text, depress=shown == placement)
+        button = row.operator("fdda.show_rig", text=text, depress=current_placement == placement)
         button.placement = placement
         if mesh_count(context):
             button.all_meshes = True
 
 
-def _draw_figures(
+def _draw_statistics(
     layout: bpy.types.UILayout,
     context: bpy.types.Context,
     view: object,
@@ -109,30 +109,30 @@ def _draw_figures(
         draw_wrapped(body, context, f"{last.model} is no longer the bound model; evaluate again.", "INFO")
     table = body.column(align=True)
     _draw_table_row(table, "", [label for label, _ in STATISTICS])
-    for label, way in (("Model", "fdda"), ("Skinning", "linear")):
-        _draw_table_row(table, label, [_format_mm(getattr(last.total[way], name)) for _, name in STATISTICS])
+    for label, method in (("Model", "fdda"), ("Skinning", "linear")):
+        _draw_table_row(table, label, [_format_mm(getattr(last.total[method], name)) for _, name in STATISTICS])
     body.separator()
     row = body.row()
     row.label(text="Body parts, worst first")
     if len(last.partitions) > SHOWN_PARTITIONS:
         row.prop(view, "show_partitions", text="All", toggle=True)
     active = active_bone_name(context, rig)
-    chosen = [partition for partition in last.partitions if partition.joint == active]
-    if context.mode == "POSE" and not chosen:
+    active_partitions = [partition for partition in last.partitions if partition.joint == active]
+    if context.mode == "POSE" and not active_partitions:
         draw_wrapped(
             body, context, "Click a bone to see its body part on top; click a name to select its bone.", "INFO"
         )
-    shown = last.partitions[: None if view.show_partitions else SHOWN_PARTITIONS]
+    shown_partitions = last.partitions[: None if view.show_partitions else SHOWN_PARTITIONS]
     column = body.column(align=True)
-    for partition in (*chosen, *(p for p in shown if p not in chosen)):
+    for partition in (*active_partitions, *(p for p in shown_partitions if p not in active_partitions)):
         row = column.split(factor=0.4, align=True)
         name = row.row(align=True)
         name.alignment = "LEFT"
         text = short_bone_name(rig.armature_object, partition.joint)
         icon = "BONE_DATA" if partition.joint == active else "NONE"
         name.operator("fdda.show_bone", text=text, icon=icon, emboss=False).bone = partition.joint
-        for _, figure in STATISTICS:
-            row.label(text=_format_mm(getattr(partition.fdda, figure)))
+        for _, statistic in STATISTICS:
+            row.label(text=_format_mm(getattr(partition.fdda, statistic)))
 
 
 def active_bone_name(context: bpy.types.Context, rig: SceneRig) -> str:
@@ -153,20 +153,20 @@ def _draw_colors(
     if body is None:
         return
     heat_map = loaded_heat_map()
-    shown = heat_map.painted(mesh_object) if heat_map else ""
+    painted_colors = heat_map.painted(mesh_object) if heat_map else ""
     row = body.row(align=True)
     for colors, text in (("NONE", "None"), ("ERRORS", "Heat Map"), ("PARTITIONS", "Body Parts")):
         button = row.row(align=True)
         button.enabled = colors != "ERRORS" or last is not None
         button.operator(
-            "fdda.color_mesh", text=text, depress=shown == ("" if colors == "NONE" else colors)
+            "fdda.color_mesh", text=text, depress=painted_colors == ("" if colors == "NONE" else colors)
         ).colors = colors
     if last is None:
         draw_wrapped(body, context, "Press Evaluate to get the heat map.", "INFO")
-    if shown and heat_map.is_hidden(mesh_object):
+    if painted_colors and heat_map.is_hidden(mesh_object):
         text = "Colors are hidden in Edit Mode, and while a modifier changes the topology in the viewport."
         draw_wrapped(body, context, text, "INFO")
-    if shown != "ERRORS" or last is None:
+    if painted_colors != "ERRORS" or last is None:
         return
     column = body.column(align=True)
     column.row(align=True).prop(view, "deformation", expand=True)
@@ -189,8 +189,8 @@ def _draw_worst(
         return
     column = body.column(align=True)
     for rank, (index, error_mm) in enumerate(_worst_poses(last, view.markers), 1):
-        place = f"Frame {last.first_frame + index}" if last.name else f"Pose {index + 1}"
-        button = column.operator("fdda.jump_to_worst", text=f"{place}: {error_mm:.2f} mm")
+        pose_label = f"Frame {last.first_frame + index}" if last.name else f"Pose {index + 1}"
+        button = column.operator("fdda.jump_to_worst", text=f"{pose_label}: {error_mm:.2f} mm")
         button.rank = rank
     if not last.name:
         return
@@ -214,13 +214,13 @@ def _worst_poses(last: last_evaluation.LastEvaluation, count: int) -> list[tuple
     return _worst_cache[2]
 
 
-def _draw_table_row(layout: bpy.types.UILayout, label: str, figures: list[str]) -> None:
+def _draw_table_row(layout: bpy.types.UILayout, label: str, texts: list[str]) -> None:
     row = layout.split(factor=0.4, align=True)
     row.label(text=label)
-    for figure in figures:
+    for text in texts:
         cell = row.row(align=True)
         cell.alignment = "RIGHT"
-        cell.label(text=figure)
+        cell.label(text=text)
 
 
 def _format_mm(value: float) -> str:

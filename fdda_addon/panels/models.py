@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Section "Model Library": the models of a mesh, packing, and changes of the rig since their training."""
+"""Section "Model Library": lists and packs the models of a mesh, and shows changes of the rig since their training."""
 
 from typing import TYPE_CHECKING
 
@@ -17,10 +17,11 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.poses import Channel
 
 _rig_cache: dict[tuple, object] = {}
+"""The last result of `rig_of_model`, by id of the checked rig and joint names of the model."""
 
 
 def rig_of_model(scene_rig: object, rig: object, info: object) -> object:
-    """Return the rig with the joints of a model. It is read once for each checked rig."""
+    """Return a rig with the joints of a model, read from the scene if the checked rig has other joints."""
     from ..rig.reading import read_model_rig
 
     if set(rig.joint_names) == set(info.joint_names):
@@ -28,7 +29,7 @@ def rig_of_model(scene_rig: object, rig: object, info: object) -> object:
     key = (id(rig), info.joint_names)
     if key not in _rig_cache:
         _rig_cache.clear()
-        # Keep the checked rig alive: a later one must not get its id.
+        # The checked rig is stored too, because a new object could get the id of a freed one.
         _rig_cache[key] = (rig, read_model_rig(scene_rig, info))
     return _rig_cache[key][1]
 
@@ -48,11 +49,11 @@ def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
             info = entry_info(mesh_object, entry)
             if check is not None and check.rig is not None:
                 rig = rig_of_model(scene_rig, check.rig, info)
-                changed = compare_with_model(
+                changes = compare_with_model(
                     entry.name, info, rig, _compared_channels(mesh_object, check.channels, info)
                 )
-                if changed.sentence:
-                    problems[_entry_key(entry)] = ("ERROR" if changed.prevents_playback else "INFO", changed.sentence)
+                if changes.sentence:
+                    problems[_entry_key(entry)] = ("ERROR" if changes.prevents_playback else "INFO", changes.sentence)
         except FDDAError as error:
             problems[_entry_key(entry)] = ("ERROR", str(error))
     return problems
@@ -61,7 +62,7 @@ def _find_problems(mesh_object: bpy.types.Object) -> dict[str, tuple[str, str]]:
 def _compared_channels(
     mesh_object: bpy.types.Object, channels: "tuple[Channel, ...]", info: "ModelInfo"
 ) -> "tuple[Channel, ...]":
-    """Return the ranges to compare a model's ranges with: those of the rig, or its own where other bones are posed."""
+    """Return the rig's ranges to compare with those of a model; the model's own if the user chose the posed bones."""
     from ..core.poses import CONTROL
 
     if mesh_object.fdda.settings.sample != "WEIGHTS":
@@ -73,7 +74,7 @@ def _entry_key(entry: bpy.types.PropertyGroup) -> str:
     return f"{entry.name}\n{entry.path}\n{entry.packed_bytes}"
 
 
-_problems = TimedValue(_find_problems, 0.5)
+_problem_values = TimedValue(_find_problems, 0.5)
 
 
 class FDDA_UL_models(bpy.types.UIList):
@@ -85,8 +86,8 @@ class FDDA_UL_models(bpy.types.UIList):
         row.prop(item, "name", text="", emboss=False, icon="LINKED" if is_bound(mesh_object, item) else "BLANK1")
         if item.packed:
             row.label(text=format_file_size(item.packed_bytes), icon="PACKAGE")
-        if (state := (_problems.get(mesh_object) or {}).get(_entry_key(item))) is not None:
-            row.label(icon=state[0])
+        if (problem := (_problem_values.get(mesh_object) or {}).get(_entry_key(item))) is not None:
+            row.label(icon=problem[0])
 
 
 class FDDA_PT_models(Section, bpy.types.Panel):
@@ -119,8 +120,8 @@ class FDDA_PT_models(Section, bpy.types.Panel):
         self, context: bpy.types.Context, mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup
     ) -> None:
         layout = self.enabled_layout()
-        states = _problems.get(mesh_object)
-        state = (states or {}).get(_entry_key(entry))
+        problems = _problem_values.get(mesh_object)
+        problem = (problems or {}).get(_entry_key(entry))
         if is_bound(mesh_object, entry):
             layout.operator("fdda.unbind", icon="UNLINKED")
         else:
@@ -133,11 +134,11 @@ class FDDA_PT_models(Section, bpy.types.Panel):
         else:
             draw_wrapped(layout, context, str(resolve_path(entry.path)), "FILE")
             layout.operator("fdda.pack_model", text="Pack into the .blend File", icon="PACKAGE")
-        if state is not None:
+        if problem is not None:
             box = layout.box()
-            box.alert = state[0] == "ERROR"
-            draw_wrapped(box, context, state[1], state[0])
-        elif states is not None:
+            box.alert = problem[0] == "ERROR"
+            draw_wrapped(box, context, problem[1], problem[0])
+        elif problems is not None:
             draw_wrapped(layout, context, "Matches this rig", "CHECKMARK")
 
 
@@ -146,4 +147,4 @@ CLASSES = (FDDA_UL_models, FDDA_PT_models)
 
 def unregister() -> None:
     """Stop the timer."""
-    _problems.stop()
+    _problem_values.stop()

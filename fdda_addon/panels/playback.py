@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Section "Model": bind a model, choose what deforms the mesh, measure its speed."""
+"""Section "Model": binds a model, switches the deformation, and shows speed and confidence of the model."""
 
 from pathlib import Path
 
@@ -24,14 +24,14 @@ MODES = (("RIG", "Rig"), ("LINEAR", "Skinning"), ("FDDA", "Model"))
 
 @draw_cached
 def is_outside_model_folders(mesh_object: bpy.types.Object) -> bool:
-    """Return whether the file of the bound model will not load when the .blend file is opened again."""
-    path = resolve_path(mesh_object.fdda.model, mesh_object.library).resolve()
-    file = Path(bpy.data.filepath).resolve()
-    return bool(bpy.data.filepath) and not path.is_relative_to(file.parent) and not is_trusted(path)
+    """Return whether the bound model lies outside the folders from which the .blend file may load models."""
+    model_path = resolve_path(mesh_object.fdda.model, mesh_object.library).resolve()
+    blend_path = Path(bpy.data.filepath).resolve()
+    return bool(bpy.data.filepath) and not model_path.is_relative_to(blend_path.parent) and not is_trusted(model_path)
 
 
 def mask_problem(mesh_object: bpy.types.Object) -> str:
-    """Return the problem with the mask of a mesh as a message; empty without one."""
+    """Return a message about a missing vertex group of the mask; empty without a problem."""
     name = mesh_object.fdda.mask
     if not name or name in mesh_object.vertex_groups:
         return ""
@@ -164,18 +164,22 @@ class FDDA_PT_playback(Section, bpy.types.Panel):
         if confidence is None or isinstance(confidence, str):
             draw_wrapped(body, context, confidence or "…")
             return
-        doubtful = [(name, value) for name, value in confidence if value < FULL_CONFIDENCE]
-        if not doubtful:
+        partitions_beyond_range = [(name, value) for name, value in confidence if value < FULL_CONFIDENCE]
+        if not partitions_beyond_range:
             draw_wrapped(body, context, "This pose is inside the trained range.", "CHECKMARK")
             return
-        draw_wrapped(body, context, f"{len(doubtful)} of {len(confidence)} body parts are beyond the trained range:")
+        draw_wrapped(
+            body,
+            context,
+            f"{len(partitions_beyond_range)} of {len(confidence)} body parts are beyond the trained range:",
+        )
         column = body.column(align=True)
-        for name, value in doubtful[:MAX_SHOWN_PARTITIONS]:
+        for name, value in partitions_beyond_range[:MAX_SHOWN_PARTITIONS]:
             row = column.split(factor=0.5, align=True)
             row.label(text=short_bone_name(armature_of(mesh_object), name))
             row.progress(factor=value, text=f"{100 * value:.0f} %")
-        if len(doubtful) > MAX_SHOWN_PARTITIONS:
-            column.label(text=f"and {len(doubtful) - MAX_SHOWN_PARTITIONS} more")
+        if len(partitions_beyond_range) > MAX_SHOWN_PARTITIONS:
+            column.label(text=f"and {len(partitions_beyond_range) - MAX_SHOWN_PARTITIONS} more")
 
     def _draw_bake(self, context: bpy.types.Context) -> None:
         if not draw_job(self.layout, context, "bake"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Section "Training Poses": rotation limits, random poses within them, and actions to record."""
+"""Section "Training Poses": sets rotation limits, random poses within them, and the actions to record."""
 
 import math
 from typing import TYPE_CHECKING
@@ -24,7 +24,7 @@ WIDE_SIDEBAR_PIXELS = 380
 
 
 class FDDA_UL_bones(bpy.types.UIList):
-    """The bones that random poses move, with their rotation limits about each axis."""
+    """List of the bones that random poses move, with their rotation limits about each axis."""
 
     def filter_items(self, context: bpy.types.Context, data: object, name: str) -> tuple[list[int], list[int]]:
         rig = panel_rig(context)[0]
@@ -55,19 +55,21 @@ def _ui_scale(preferences: bpy.types.Preferences) -> float:
 
 
 @draw_cached
-def _visible_bone_flags(rig: SceneRig, text: str, flag: int) -> tuple[int, ...]:
+def _visible_bone_flags(rig: SceneRig, search_text: str, flag: int) -> tuple[int, ...]:
     """Return a filter flag for each bone: whether random poses may move it and its name matches the search."""
     check, channels = checks.last_check(rig), sampled_channels_by_bone(rig)
-    listed = set(check.rig.joint_names) if check and check.rig else set()
+    listed_bones = set(check.rig.joint_names) if check and check.rig else set()
     if channels is not None:
-        listed = set(channels)
+        listed_bones = set(channels)
     names = [bone.name for bone in rig.armature_object.pose.bones]
-    return tuple(flag if (not listed or name in listed) and text in name.lower() else 0 for name in names)
+    return tuple(
+        flag if (not listed_bones or name in listed_bones) and search_text in name.lower() else 0 for name in names
+    )
 
 
 @draw_cached
 def _bone_row(rig: SceneRig, bone: bpy.types.PoseBone, is_wide: bool) -> tuple[str, str, str, bool]:
-    """Return icon, name and limits of a bone for the list, and whether it has any limits of its own."""
+    """Return icon, name and limits of a bone for the list, and whether limits are set for the bone."""
     from ..poses.motion_range import DEFAULT, rotation_ranges
     from ..poses.sampling import is_moved_by_constraints
 
@@ -93,7 +95,7 @@ def has_any_limits(rig: SceneRig) -> bool:
 
 @draw_cached
 def sampled_channels_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None":
-    """Return the sampled channels by bone, None for deforming bones or before the first check."""
+    """Return the channels that random poses set, by bone; None for "Deforming Bones" or before the first check."""
     check = checks.last_check(rig)
     if rig.mesh_object.fdda.settings.sample == "WEIGHTS" or check is None or not check.channels:
         return None
@@ -107,7 +109,7 @@ def sampled_channels_by_bone(rig: SceneRig) -> "dict[str, list[Channel]] | None"
 
 
 def _format_channels(channels: "list[Channel]", is_wide: bool) -> str:
-    """Return the rotation ranges, and the axes along which the bone is moved, as text."""
+    """Return the rotation ranges of a bone, and the axes along which random poses move it, as text."""
     from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR
 
     channels = [channel for channel in channels if channel.low < channel.high]
@@ -124,7 +126,7 @@ def _format_channels(channels: "list[Channel]", is_wide: bool) -> str:
 
 
 def _format_range(low: float, high: float, is_wide: bool) -> str:
-    """Return a range in degrees, "±45°" or "-10…140°"; in a narrow sidebar an asymmetric one as its width, "150°"."""
+    """Return a range in degrees, "±45°" or "-10…140°". In a narrow sidebar an asymmetric range is a width, "150°"."""
     low, high = round(math.degrees(low)), round(math.degrees(high))
     if low == -high:
         return f"±{high}°"
@@ -132,7 +134,7 @@ def _format_range(low: float, high: float, is_wide: bool) -> str:
 
 
 class FDDA_UL_actions(bpy.types.UIList):
-    """The actions of the file that move this rig, each with a checkbox."""
+    """List of the actions that move the rig, each with a checkbox."""
 
     def filter_items(self, context: bpy.types.Context, data: object, name: str) -> tuple[list[int], list[int]]:
         rig = panel_rig(context)[0]
@@ -147,10 +149,10 @@ class FDDA_UL_actions(bpy.types.UIList):
         row = layout.row()
         row.prop(action.fdda, "record", text="")
         row.label(text=action.name, icon="ACTION")
-        first, last = (round(frame) for frame in action.frame_range)
-        side = row.row()
-        side.alignment = "RIGHT"
-        side.label(text=f"{last - first + 1} frames")
+        first_frame, last_frame = (round(frame) for frame in action.frame_range)
+        right_part = row.row()
+        right_part.alignment = "RIGHT"
+        right_part.label(text=f"{last_frame - first_frame + 1} frames")
 
 
 class FDDA_PT_poses(Section, bpy.types.Panel):
@@ -216,7 +218,7 @@ def _count_selected(rig: SceneRig) -> int:
 
 
 def _draw_bone(layout: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBone) -> None:
-    """Draw the active bone of the list; nothing if the list does not show it."""
+    """Draw the limits of the active bone of the list; draw nothing if the list does not show the bone."""
     channels = sampled_channels_by_bone(rig)
     if channels is None:
         _draw_limits(layout.box(), rig, bone)
@@ -246,18 +248,20 @@ def _draw_limits(box: bpy.types.UILayout, rig: SceneRig, bone: bpy.types.PoseBon
     text, ranges, locations = _read_limits(rig, bone)
     box.label(text=text, icon="BONE_DATA")
     column = box.column(align=True)
-    for axis, r in enumerate(ranges):
+    for axis, axis_range in enumerate(ranges):
         row = column.split(factor=0.25, align=True)
-        # Blender draws the next icon, a closed lock, for an axis that is locked.
+        # Blender draws the icon after UNLOCKED, a closed lock, if the axis is locked.
         row.prop(bone, "lock_rotation", index=axis, text=AXES[axis].upper(), icon="UNLOCKED", toggle=1)
         fields = row.row(align=True)
         fields.enabled = not bone.lock_rotation[axis]
-        if r.source == DEFAULT:
-            text = "locked (IK)" if r.is_locked and not bone.lock_rotation[axis] else "±45° (default)"
+        if axis_range.source == DEFAULT:
+            text = "locked (IK)" if axis_range.is_locked and not bone.lock_rotation[axis] else "±45° (default)"
             fields.label(text="locked" if bone.lock_rotation[axis] else text)
             _draw_limit_button(fields, rig, bone, axis, "fdda.set_limit", "ADD")
             continue
-        owner, prefix = (find_local_limit(bone, "LIMIT_ROTATION"), "") if r.source == CONSTRAINT else (bone, "ik_")
+        owner, prefix = (
+            (find_local_limit(bone, "LIMIT_ROTATION"), "") if axis_range.source == CONSTRAINT else (bone, "ik_")
+        )
         fields.prop(owner, f"{prefix}min_{AXES[axis]}", text="")
         fields.prop(owner, f"{prefix}max_{AXES[axis]}", text="")
         _draw_limit_button(fields, rig, bone, axis, "fdda.clear_limit", "X")
@@ -275,7 +279,7 @@ def _draw_limit_button(
     properties = layout.operator(operator, text="", icon=icon)
     properties.object, properties.bone, properties.axis = rig.mesh_object.name, bone.name, AXES[axis].upper()
     if operator == FDDA_OT_set_limit.bl_idname:
-        # Blender would use the last values.
+        # Otherwise Blender would use the values of the last call.
         properties.low, properties.high = -math.pi / 4, math.pi / 4
 
 

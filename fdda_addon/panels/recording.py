@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Section "Recording": settings, the content of the folder, and the button to record."""
+"""Section "Recording": shows the settings, the content of the folder, and the button to record."""
 
 import json
 import os
@@ -21,12 +21,12 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.recording.folder import FolderContent
 
 _content_cache: "dict[int, tuple[tuple, FolderContent]]" = {}
-"""Content of the recording folder, and what it was read for, by session_uid of the mesh object."""
+"""Content of each recording folder, with the values that it depends on, by session_uid of the mesh object."""
 
 
 @draw_cached
 def read_content(rig: SceneRig) -> "tuple[Path, FolderContent] | str":
-    """Return the recording folder of a character and its content, or a message why there is none."""
+    """Return the recording folder of a character and its content, or an error message."""
     try:
         path = recording_folder(rig.mesh_object)
         return path, cached_content(rig, path)
@@ -50,7 +50,7 @@ def cached_content(rig: SceneRig, path: Path) -> "FolderContent":
     if uid not in _content_cache or _content_cache[uid][0] != cache_key:
         current_rig, sampling = None, None
         if check is not None and check.rig is not None:
-            # Through JSON, as the sampling in a recording has gone.
+            # Converted to JSON and back, so that it equals the sampling that is read from a recording.
             sampling = json.loads(json.dumps(make_sampling(rig, settings, check.channels).to_json()))
             current_rig = check.rig
         _content_cache[uid] = (cache_key, read_folder(path, current_rig, sampling, settings.fit_linear))
@@ -68,8 +68,8 @@ class FDDA_PT_recording(Section, bpy.types.Panel):
         from ..core.recording.folder import FolderState
 
         rig = panel_rig(context)[0]
-        running = job.current()
-        if rig is None or (running and running.verb == "record"):
+        running_job = job.current()
+        if rig is None or (running_job and running_job.verb == "record"):
             return False
         content = read_content(rig)
         return not isinstance(content, str) and content[1].state is FolderState.COMPLETE
@@ -96,22 +96,22 @@ def _draw_folder(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     settings = rig.mesh_object.fdda.settings
     draw_path(layout, settings, "recording", default_recording(rig.mesh_object))
     _draw_settings(layout, context, settings)
-    found = read_content(rig)
-    if isinstance(found, str):
-        draw_wrapped(layout, context, found, "ERROR")
+    folder_content = read_content(rig)
+    if isinstance(folder_content, str):
+        draw_wrapped(layout, context, folder_content, "ERROR")
         return
-    path, content = found
+    path, content = folder_content
     check = checks.last_check(rig)
-    ready = check is not None and not check.problems
+    can_record = check is not None and not check.problems
     if check is not None and check.problems:
         draw_wrapped(layout, context, "The rig cannot be recorded yet; see the Rig section.", "ERROR")
     if content.state is FolderState.FREE:
         draw_wrapped(layout, context, f"{_describe_poses(rig)} will go into '{path.name}'.")
-        _draw_record(layout, context, "Record", ready)
+        _draw_record(layout, context, "Record", can_record)
     elif content.state is FolderState.INCOMPLETE:
         text = f"{content.complete:,} of {content.poses:,} poses recorded. Press Resume to continue."
         draw_wrapped(layout, context, text, "INFO")
-        _draw_record(layout, context, "Resume", ready, resume=True)
+        _draw_record(layout, context, "Resume", can_record, resume=True)
     elif content.state is FolderState.COMPLETE:
         draw_wrapped(layout, context, f"{content.poses:,} poses recorded. Next: Train", "CHECKMARK")
         for sentence in content.measured_sentences:

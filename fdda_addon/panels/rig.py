@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Section "Rig": the character, problems that prevent recording, and whether a model would be faster."""
+"""Section "Rig": shows the character, problems that prevent recording, and whether a model would be faster."""
 
 import bpy
 
@@ -34,9 +34,9 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.enabled_layout()
-        rig, sentence = panel_rig(context)
+        rig, message = panel_rig(context)
         if rig is None:
-            draw_wrapped(layout, context, sentence, "INFO")
+            draw_wrapped(layout, context, message, "INFO")
             layout.operator("fdda.add_sample_arm", text="Add Sample Arm", icon="ADD")
             return
         _draw_build_model(layout, context)
@@ -51,20 +51,20 @@ class FDDA_PT_rig(Section, bpy.types.Panel):
 
 
 def _draw_meshes(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
-    """Draw the meshes of the active armature if there are several, and whether buttons apply to all."""
+    """Draw the meshes of the active armature if it has several, and the option to apply buttons to all."""
     rigs = cached_rigs_of_active_armature(context)
     if not rigs:
         return
     box = layout.box().column(align=True)
     box.label(text=f"{len(rigs)} meshes follow {rig.armature_object.name}")
-    for other in rigs[:MAX_MESHES]:
-        is_shown = other.mesh_object == rig.mesh_object
+    for listed_rig in rigs[:MAX_MESHES]:
+        is_shown = listed_rig.mesh_object == rig.mesh_object
         row = box.row(align=True)
         row.alignment = "LEFT"
         icon = "RADIOBUT_ON" if is_shown else "RADIOBUT_OFF"
-        button = row.operator("fdda.show_mesh", text=other.mesh_object.name, icon=icon, emboss=False)
-        button.object = other.mesh_object.name
-        if other.mesh_object.fdda.is_bound:
+        button = row.operator("fdda.show_mesh", text=listed_rig.mesh_object.name, icon=icon, emboss=False)
+        button.object = listed_rig.mesh_object.name
+        if listed_rig.mesh_object.fdda.is_bound:
             row.label(text="", icon="LINKED")
     if len(rigs) > MAX_MESHES:
         box.label(text=f"and {len(rigs) - MAX_MESHES} more; select one to see it")
@@ -75,10 +75,10 @@ def _draw_counts(layout: bpy.types.UILayout, rig: SceneRig) -> None:
     check = checks.last_check(rig)
     column = layout.column(align=True)
     column.label(text=f"{rig.mesh_object.name}: {len(rig.mesh_object.data.vertices):,} vertices", icon="MESH_DATA")
-    bones = len(rig.armature_object.data.bones)
-    deforming = len(check.rig.joints) if check and check.rig else bones
-    count = f"{bones} bones" if deforming == bones else f"{deforming} of {bones} bones"
-    column.label(text=f"{rig.armature_object.name}: {count}", icon="ARMATURE_DATA")
+    bone_count = len(rig.armature_object.data.bones)
+    deforming_count = len(check.rig.joints) if check and check.rig else bone_count
+    count_text = f"{bone_count} bones" if deforming_count == bone_count else f"{deforming_count} of {bone_count} bones"
+    column.label(text=f"{rig.armature_object.name}: {count_text}", icon="ARMATURE_DATA")
 
 
 def _draw_replaced(layout: bpy.types.UILayout, mesh_object: bpy.types.Object, replaced: tuple[str, ...]) -> None:
@@ -92,7 +92,7 @@ def _draw_replaced(layout: bpy.types.UILayout, mesh_object: bpy.types.Object, re
 
 
 def _draw_build_model(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Draw the button that does all steps below, or its progress."""
+    """Draw the button that records, trains and binds, or the progress of its job."""
     if draw_job(layout, context, "build_model"):
         state = job.state_of("build_model")
         if not state.changes_scene:
@@ -110,14 +110,14 @@ def _draw_cost(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Scen
         draw_job(layout, context, "measure")
     if cost is not None:
         column = layout.column(align=True)
-        for name, milliseconds in (
+        for label, time_text in (
             ("Rig", f"{cost.rig:.2f} ms per frame"),
             ("Armature Only", f"{cost.linear:.2f} ms"),
             ("Model (estimate)", f"{cost.model:.1f} ms"),
         ):
             row = column.split(factor=0.45)
-            row.label(text=name)
-            row.label(text=milliseconds)
+            row.label(text=label)
+            row.label(text=time_text)
         draw_wrapped(layout, context, cost.sentence, "INFO")
     if state is None or not state.is_running:
         layout.operator("fdda.measure", text="Measure Speed", icon="TIME")

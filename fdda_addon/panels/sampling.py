@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Part of the section "Training Poses": the bones and extra inputs that random poses move."""
+"""Draws the part of the section "Training Poses" that chooses the bones and extra inputs of random poses."""
 
 import math
 from typing import TYPE_CHECKING
@@ -16,19 +16,19 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from ..recording.rig_check import RigCheck
 
 MAX_SHOWN_CONTROLS = 8
-"""Number of detected extra inputs that the panel lists at most."""
+"""Largest number of detected extra inputs that the panel lists."""
 
 
 class FDDA_UL_controls(bpy.types.UIList):
-    """The extra inputs of the user, with their ranges."""
+    """List of the extra inputs that the user has added, with their ranges."""
 
     def draw_item(self, _context: bpy.types.Context, layout: bpy.types.UILayout, _data, control, _icon, _active, _name):
         row = layout.row()
         text = "All Shape Keys" if control.name == ALL_SHAPE_KEYS else control.name.rpartition("/")[2] or "(unnamed)"
         row.label(text=text, icon="SHAPEKEY_DATA" if "/" not in control.name else "DRIVER")
-        side = row.row()
-        side.alignment = "RIGHT"
-        side.label(text=f"{control.low:g}…{control.high:g}" if control.has_range else "default")
+        right_part = row.row()
+        right_part.alignment = "RIGHT"
+        right_part.label(text=f"{control.low:g}…{control.high:g}" if control.has_range else "default")
 
 
 def draw_bones_to_pose(layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig) -> None:
@@ -56,29 +56,29 @@ def describe_channels(check: "RigCheck") -> str:
     from ..core.poses import CONTROL
 
     channels = [channel for channel in check.channels if channel.kind != CONTROL]
-    bones, controls = len({channel.name for channel in channels}), len(check.channels) - len(channels)
+    bone_count, control_count = len({channel.name for channel in channels}), len(check.channels) - len(channels)
     parts = []
-    if bones:
-        parts.append(f"{_count(bones, 'bone')} ({_count(len(channels), 'channel')})")
-    if controls:
-        parts.append(_count(controls, "extra input"))
+    if bone_count:
+        parts.append(f"{_count_text(bone_count, 'bone')} ({_count_text(len(channels), 'channel')})")
+    if control_count:
+        parts.append(_count_text(control_count, "extra input"))
     return f"Random poses will move {' and '.join(parts)}."
 
 
-def _count(count: int, noun: str) -> str:
+def _count_text(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def draw_channels(box: bpy.types.UILayout, bone: bpy.types.PoseBone, channels: "list[Channel]") -> None:
-    """Draw the ranges of a bone as labels: those from actions cannot be edited."""
+    """Draw the ranges of a bone as labels, because ranges from actions cannot be edited."""
     from ..core.poses import LOCATION, ROTATION, ROTATION_VECTOR
 
     box.label(text=f"{bone.name} (from actions)", icon="BONE_DATA")
     column = box.column(align=True)
-    verbs = {ROTATION: "Rotation", ROTATION_VECTOR: "Rotation", LOCATION: "Location"}
+    kind_labels = {ROTATION: "Rotation", ROTATION_VECTOR: "Rotation", LOCATION: "Location"}
     for channel in channels:
         row = column.split(factor=0.4)
-        row.label(text=f"{verbs.get(channel.kind, 'Scale')} {'XYZ'[channel.axis]}")
+        row.label(text=f"{kind_labels.get(channel.kind, 'Scale')} {'XYZ'[channel.axis]}")
         low, high = channel.low, channel.high
         if channel.kind in {ROTATION, ROTATION_VECTOR}:
             row.label(text=f"{math.degrees(low):.0f}…{math.degrees(high):.0f}°")
@@ -87,7 +87,7 @@ def draw_channels(box: bpy.types.UILayout, bone: bpy.types.PoseBone, channels: "
 
 
 def draw_extra_inputs(layout: bpy.types.UILayout, rig: SceneRig) -> None:
-    """Draw the extra inputs of the user, and the detected ones."""
+    """Draw the extra inputs that the user has added, and those that were detected."""
     settings, check = rig.mesh_object.fdda.settings, checks.last_check(rig)
     detected = check.automatic_controls if check is not None else ()
     count = len(check.rig.controls) if check is not None and check.rig else len(settings.controls)
@@ -97,9 +97,9 @@ def draw_extra_inputs(layout: bpy.types.UILayout, rig: SceneRig) -> None:
         return
     row = body.row()
     row.template_list("FDDA_UL_controls", "", settings, "controls", settings, "control_index", rows=2)
-    side = row.column(align=True)
-    side.operator("fdda.add_control", text="", icon="ADD").object = rig.mesh_object.name
-    side.operator("fdda.remove_control", text="", icon="REMOVE").object = rig.mesh_object.name
+    buttons = row.column(align=True)
+    buttons.operator("fdda.add_control", text="", icon="ADD").object = rig.mesh_object.name
+    buttons.operator("fdda.remove_control", text="", icon="REMOVE").object = rig.mesh_object.name
     if 0 <= settings.control_index < len(settings.controls):
         control = settings.controls[settings.control_index]
         column = body.column(align=True)

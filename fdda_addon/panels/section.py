@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Base of all sections of the sidebar, and functions to draw wrapped text, paths and jobs."""
+"""Base class of all sections of the sidebar, and functions that draw wrapped text, paths and jobs."""
 
 import functools
 
@@ -13,13 +13,13 @@ from ..scene.draw_cache import draw_cached
 from ..scene.scene_rig import SceneRig
 
 TEXT_MARGIN, ICON_WIDTH = 74, 22
-"""Width of both margins of text in a box, and of an icon, pixels at a UI scale of 1."""
+"""Width of both margins of a text together, and width of an icon, pixels at a UI scale of 1."""
 MIN_TEXT_WIDTH = 60
 OUTCOME_ICONS = {"INFO": "CHECKMARK", "WARNING": "INFO", "ERROR": "ERROR"}
 
 
 class Section:
-    """Mixin for a panel of the tab "FDDA". It shows while the active object has a rig, or one of its jobs runs."""
+    """Mixin for a panel of the tab "FDDA". It is shown if the active object has a rig, or a job of the panel runs."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
@@ -33,14 +33,14 @@ class Section:
         return cached_active_rig(context) is not None or (running is not None and running.verb in cls.verbs)
 
     def enabled_layout(self) -> bpy.types.UILayout:
-        """Return the layout of the panel, disabled while a job of another section borrows the scene."""
+        """Return the layout of the panel, disabled while a job of another section changes the scene."""
         running = job.current()
         self.layout.enabled = running is None or not running.changes_scene or running.verb in self.verbs
         return self.layout
 
     @classmethod
     def is_done(cls, _context: bpy.types.Context) -> bool:
-        """Return whether the step of this section is done; its header then has a check mark."""
+        """Return whether the step of this section is done, so that its header shows a check mark."""
         return False
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
@@ -50,7 +50,7 @@ class Section:
 
 
 def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
-    """Return the rig that the sidebar shows, or None and a message why there is none."""
+    """Return the rig that the sidebar shows and an empty text, or None and an error message."""
     if (rig := cached_active_rig(context)) is not None:
         return rig, ""
     try:
@@ -60,7 +60,7 @@ def panel_rig(context: bpy.types.Context) -> tuple[SceneRig | None, str]:
 
 
 def mesh_count(context: bpy.types.Context) -> int:
-    """Return the number of meshes that buttons apply to; 0 if only to the one that is shown."""
+    """Return the number of meshes that buttons apply to; 0 if they apply to the shown mesh only."""
     rigs = cached_rigs_of_active_armature(context)
     return len(rigs) if rigs and context.window_manager.fdda.all_meshes else 0
 
@@ -68,7 +68,7 @@ def mesh_count(context: bpy.types.Context) -> int:
 def draw_button(
     layout: bpy.types.UILayout, context: bpy.types.Context, name: str, text: str, icon: str
 ) -> bpy.types.OperatorProperties:
-    """Draw the button of an operator that may apply to all meshes of an armature, with their number."""
+    """Draw the button of an operator that may apply to all meshes; its text then has the number of meshes."""
     count = mesh_count(context)
     properties = layout.operator(name, text=f"{text} ({count} Meshes)" if count else text, icon=icon)
     if count:
@@ -86,8 +86,8 @@ def draw_wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: s
         return
     column = layout.column(align=True)
     column.scale_y = 0.8
-    for number, line in enumerate(lines):
-        column.label(text=line, icon=icon if number == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
+    for index, line in enumerate(lines):
+        column.label(text=line, icon=icon if index == 0 else ("BLANK1" if icon != "NONE" else "NONE"))
 
 
 @draw_cached
@@ -99,7 +99,7 @@ def _text_size(preferences: bpy.types.Preferences) -> tuple[float, float]:
 
 @functools.lru_cache(maxsize=256)
 def _wrap(text: str, width: float, points: float) -> tuple[str, ...]:
-    """Wrap text to a width in pixels, in the font of the interface. A longer word is not broken."""
+    """Wrap text to a width in pixels, in the font of the interface, without breaking long words."""
     blf.size(0, points)
     lines: list[str] = []
     for word in text.split():
@@ -111,14 +111,14 @@ def _wrap(text: str, width: float, points: float) -> tuple[str, ...]:
 
 
 def draw_path(layout: bpy.types.UILayout, owner: bpy.types.bpy_struct, name: str, default: str) -> None:
-    """Draw a path below its label, so that it has the whole width; an empty one shows the default in gray."""
+    """Draw a path below its label, at full width. An empty path shows the default in gray."""
     column = layout.column(align=True)
     column.label(text=owner.bl_rna.properties[name].name)
     column.prop(owner, name, text="", placeholder=default)
 
 
 def draw_advanced(layout: bpy.types.UILayout, identifier: str) -> bpy.types.UILayout | None:
-    """Draw the header of a closed sub-panel "Advanced"; returns the column for its fields, None while it is closed."""
+    """Draw the sub-panel "Advanced", closed by default; return the column for its fields, None if it is closed."""
     header, body = layout.panel(identifier, default_closed=True)
     header.label(text="Advanced")
     if body is None:
@@ -137,9 +137,9 @@ def draw_job(
     """Draw the progress of a job with a button to cancel it, or its outcome.
 
     Args:
-        layout, context: of the panel.
-        verb: of the job.
-        levels: levels of outcomes to draw.
+        layout, context: layout and context of the panel.
+        verb: verb of the job.
+        levels: outcomes of other levels are not drawn.
 
     Returns:
         Whether the job is running.
@@ -149,22 +149,22 @@ def draw_job(
         return False
     if not state.is_running:
         rig = panel_rig(context)[0]
-        is_own = not state.subject or (rig is not None and rig.mesh_object.session_uid == state.subject)
-        if is_own and state.outcome_level in levels:
+        is_of_shown_mesh = not state.subject or (rig is not None and rig.mesh_object.session_uid == state.subject)
+        if is_of_shown_mesh and state.outcome_level in levels:
             draw_wrapped(layout, context, state.outcome, OUTCOME_ICONS[state.outcome_level])
         return False
     column = layout.column(align=True)
     if state.total:
         column.progress(factor=state.fraction, text=state.sentence)
     else:
-        # A bar without progress would look as if nothing happened.
+        # A progress bar that stays at 0 would look as if the job did nothing.
         draw_wrapped(column, context, state.sentence, "SORTTIME")
     row = column.row(align=True)
     row.enabled = not state.cancel_requested
     row.operator("fdda.cancel", text="Canceling…" if state.cancel_requested else "Cancel", icon="X")
-    remaining = state.remaining_seconds
-    # The line is always drawn, so that what is below does not jump.
-    text = f"About {format_duration(remaining)} left" if remaining is not None else "…"
+    seconds_left = state.remaining_seconds
+    # This line is always drawn, so that the elements below it do not move.
+    text = f"About {format_duration(seconds_left)} left" if seconds_left is not None else "…"
     layout.label(text="Finishing…" if state.is_finishing else text, icon="TIME")
     return True
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Values that a timer computes while a panel shows them: drawing itself neither computes nor reads files."""
+"""Values for panels, computed by a timer, because drawing should neither compute nor read files."""
 
 from collections.abc import Callable
 
@@ -13,14 +13,14 @@ SECOND_REDRAW_SECONDS = 0.1
 class TimedValue:
     """A value for each mesh object, computed by a timer.
 
-    Each `get` schedules one computation. When the value changes the panel is redrawn and calls `get` again. Nothing is
+    Each `get` schedules one computation. A changed value redraws the panel, which calls `get` again. Nothing is
     computed while no panel shows the value.
     """
 
     def __init__(self, compute: Callable[[bpy.types.Object], object], seconds: float):
         """Args:
         compute: returns the value. It is called outside of drawing, and not while a job changes the scene.
-        seconds: from a `get` to the computation, and so the shortest time between two computations.
+        seconds: time between a `get` and the computation, and so the shortest time between two computations.
         """
         self._compute, self._seconds = compute, seconds
         self._values: dict[int, object] = {}
@@ -29,7 +29,7 @@ class TimedValue:
         self._timer = self._tick
 
     def get(self, mesh_object: bpy.types.Object) -> object | None:
-        """Return the last value, None before the first. For `draw`."""
+        """Return the last value, None before the first, and schedule a computation. For `draw`."""
         uid = mesh_object.session_uid
         self._requested.add(uid)
         if not bpy.app.background and not bpy.app.timers.is_registered(self._timer):
@@ -53,12 +53,12 @@ class TimedValue:
         if job is not None and job.changes_scene:
             return
         objects = {o.session_uid: o for o in bpy.data.objects if o.session_uid in self._requested}
-        before = dict(self._values)
+        previous_values = dict(self._values)
         self._values = {uid: value for uid, value in self._values.items() if uid in objects}
         self._requested.clear()
         for mesh_object in objects.values():
             self.compute_now(mesh_object)
-        if self._values != before:
+        if self._values != previous_values:
             redraw()
-            # A panel of another height is placed correctly only by the second drawing.
+            # Blender places a panel whose height has changed correctly only in the second redraw.
             bpy.app.timers.register(redraw, first_interval=SECOND_REDRAW_SECONDS)

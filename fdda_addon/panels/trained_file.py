@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The model file that the training of a character has written, and whether it matches the rig."""
+"""Finds the model file that the training of a character has written, and compares it with the rig."""
 
 import os
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from ..scene.scene_rig import SceneRig
 from . import checks
 
 _mismatch_cache: dict[tuple, str] = {}
-"""Mismatches between model files and rigs, by path, time and size of the file, and id of the checked rig."""
+"""How a model file differs from a rig, by path, time and size of the file, and id of the checked rig."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class TrainedFile:
 
     Attributes:
         path: the file.
-        mismatch: how it differs from the rig; empty if it matches.
+        mismatch: how the model differs from the rig; empty if it matches.
     """
 
     path: Path
@@ -35,7 +35,7 @@ def find_trained_file(rig: SceneRig) -> TrainedFile | None:
 
 @draw_cached
 def _find_trained_file(rig: SceneRig) -> tuple[TrainedFile | None]:
-    """As `find_trained_file`, in a tuple: the cache does not store None."""
+    """Return the result of `find_trained_file` in a tuple, because the cache does not store None."""
     path = trained_file(rig.mesh_object)
     check = checks.last_check(rig)
     if path is None:

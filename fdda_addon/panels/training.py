@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Section "Training": the setup, settings, error curves, and errors of the trained model."""
+"""Section "Training": shows the setup, the settings, the error curves, and the errors of the trained model."""
 
 import os
 from pathlib import Path
@@ -22,7 +22,7 @@ from .trained_file import TrainedFile, find_trained_file
 SHOWN_PARTITIONS = 8
 
 _report_cache: dict[Path, tuple[int, dict | None]] = {}
-"""Modification time and content of training reports, by path."""
+"""Modification time and content of each training report, by path. The content is None if the report is invalid."""
 
 
 class FDDA_PT_training(Section, bpy.types.Panel):
@@ -34,37 +34,37 @@ class FDDA_PT_training(Section, bpy.types.Panel):
     @classmethod
     def is_done(cls, context: bpy.types.Context) -> bool:
         rig = panel_rig(context)[0]
-        running = job.current()
-        if rig is None or (running and running.verb == "train"):
+        running_job = job.current()
+        if rig is None or (running_job and running_job.verb == "train"):
             return False
         trained = find_trained_file(rig)
         return trained is not None and not trained.mismatch
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.enabled_layout()
-        running = job.current()
-        if running and running.verb == "train":
+        running_job = job.current()
+        if running_job and running_job.verb == "train":
             draw_job(layout, context, "train")
-            curves.draw(layout, running.curves)
-            for warning in running.warnings:
+            curves.draw(layout, running_job.curves)
+            for warning in running_job.warnings:
                 draw_wrapped(layout, context, warning, "INFO")
             draw_wrapped(layout, context, "You can keep working, or even quit Blender: training continues.", "INFO")
             return
-        if running and running.verb == "refine":
+        if running_job and running_job.verb == "refine":
             draw_job(layout, context, "refine")
             draw_wrapped(layout, context, "ESC cancels as well; the poses that were added are kept.", "INFO")
             return
         rig = panel_rig(context)[0]
         if rig is None:
             return
-        ready = _draw_python(layout, context)
+        can_train = _draw_python(layout, context)
         trained = find_trained_file(rig)
-        _draw_settings(layout, context, rig, trained, ready)
+        _draw_settings(layout, context, rig, trained, can_train)
         draw_job(layout, context, "refine")
         draw_job(layout, context, "train")
-        ended = job.state_of("train")
-        if ended is not None and ended.subject == rig.mesh_object.session_uid:
-            curves.draw(layout, ended.curves)
+        state = job.state_of("train")
+        if state is not None and state.subject == rig.mesh_object.session_uid:
+            curves.draw(layout, state.curves)
         if trained is not None and not trained.mismatch:
             _draw_report(layout, context, rig, trained.path)
         if (advanced := draw_advanced(layout, "fdda_training_advanced")) is not None:
@@ -74,15 +74,15 @@ class FDDA_PT_training(Section, bpy.types.Panel):
 
 def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
     """Draw the Python for training and the result of its check; return whether training may be tried."""
-    answer = session.check_result
-    if answer is not None and answer.level == "INFO":
-        draw_wrapped(layout, context, answer.message, "CHECKMARK")
+    result = session.check_result
+    if result is not None and result.level == "INFO":
+        draw_wrapped(layout, context, result.message, "CHECKMARK")
         return True
     box = layout.box()
-    if (checking := job.current(job.ENVIRONMENT)) is not None:
-        draw_wrapped(box, context, f"{checking.title}: {checking.stage}", "SORTTIME")
-    elif answer is not None:
-        draw_wrapped(box, context, answer.message, "ERROR" if answer.level == "ERROR" else "INFO")
+    if (running_check := job.current(job.ENVIRONMENT)) is not None:
+        draw_wrapped(box, context, f"{running_check.title}: {running_check.stage}", "SORTTIME")
+    elif result is not None:
+        draw_wrapped(box, context, result.message, "ERROR" if result.level == "ERROR" else "INFO")
     elif choice.select_python().origin is choice.Origin.THIS:
         text = "Training needs PyTorch, which is not installed yet; install it in the preferences."
         draw_wrapped(box, context, text, "ERROR")
@@ -92,11 +92,11 @@ def _draw_python(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool
     row.operator("fdda.check_trainer", text="Check Setup", icon="VIEWZOOM")
     if preferences() is not None:
         row.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = MODULE
-    return answer is None or answer.level != "ERROR"
+    return result is None or result.level != "ERROR"
 
 
 def _draw_settings(
-    layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, trained: TrainedFile | None, ready: bool
+    layout: bpy.types.UILayout, context: bpy.types.Context, rig: SceneRig, trained: TrainedFile | None, can_train: bool
 ) -> None:
     from ..core.recording.folder import FolderState
 
@@ -114,24 +114,24 @@ def _draw_settings(
     content = read_content(rig)
     if isinstance(content, str):
         draw_wrapped(layout, context, content, "ERROR")
-        ready = False
+        can_train = False
     elif content[1].state is not FolderState.COMPLETE:
         draw_wrapped(layout, context, "This rig has no complete recording yet; record first.", "INFO")
-        ready = False
+        can_train = False
     if trained is not None and trained.mismatch:
         text = f"{trained.path.name} belongs to another rig: {trained.mismatch}. Train asks before it overwrites it."
         draw_wrapped(layout, context, text, "ERROR")
     elif trained is not None:
         draw_wrapped(layout, context, f"{trained.path.name} exists; Train will overwrite it.", "CHECKMARK")
     row = layout.row()
-    row.enabled = ready
+    row.enabled = can_train
     row.scale_y = 1.3
     draw_button(row, context, "fdda.train", "Train" if trained is None else "Train Again", "PLAY")
     if trained is None or trained.mismatch:
         return
-    # What improves the model, in the order of the steps.
+    # Buttons that improve the model, in the order of their use.
     improve = layout.column(align=True)
-    improve.enabled = ready
+    improve.enabled = can_train
     improve.operator("fdda.refine", text="Add Poses at Worst Errors", icon="ADD")
     if checkpoint_path(trained.path).is_file():
         improve.operator("fdda.train", text="Continue Training", icon="FF").warm_start = True
@@ -150,7 +150,7 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
         draw_wrapped(layout, context, *_describe_goal(goal))
     for warning in report.get("warnings", ()):
         draw_wrapped(layout, context, f"Warning: {warning['name']}; see the training report.", "INFO")
-    model_mm, skinning_mm = (report[way]["held_out"] for way in ("fdda", "linear"))
+    model_mm, skinning_mm = (report[method]["held_out"] for method in ("fdda", "linear"))
     text = f"Unseen poses: mean {model_mm['mean']:.2f} mm (skinning alone {skinning_mm['mean']:.2f}), max "
     draw_wrapped(layout, context, f"{text}{model_mm['max']:.1f} ({skinning_mm['max']:.1f})")
     draw_wrapped(layout, context, f"99.9 % of points within {model_mm['p999']:.2f} mm")
@@ -158,23 +158,23 @@ def _draw_report(layout: bpy.types.UILayout, context: bpy.types.Context, rig: Sc
     header.label(text="Error by Body Part")
     if body is None:
         return
-    partitions = sorted(report["partitions"], key=lambda p: -p["held_out"]["max"])
-    shown = partitions if context.window_manager.fdda.show_all_partitions else partitions[:SHOWN_PARTITIONS]
+    partitions = sorted(report["partitions"], key=lambda partition: -partition["held_out"]["max"])
+    shown_partitions = partitions if context.window_manager.fdda.show_all_partitions else partitions[:SHOWN_PARTITIONS]
     names, means, p999s, maxima = _table_columns(body.box())
     for column, text in ((names, "Body Part"), (means, "Mean"), (p999s, "99.9 %"), (maxima, "Max")):
         column.label(text=text)
-    for p in shown:
-        names.label(text=short_bone_name(rig.armature_object, p["joint"]))
-        means.label(text=f"{p['held_out']['mean']:.3f}")
-        p999s.label(text=f"{p['held_out']['p999']:.2f}")
-        maxima.label(text=f"{p['held_out']['max']:.2f}")
+    for partition in shown_partitions:
+        names.label(text=short_bone_name(rig.armature_object, partition["joint"]))
+        means.label(text=f"{partition['held_out']['mean']:.3f}")
+        p999s.label(text=f"{partition['held_out']['p999']:.2f}")
+        maxima.label(text=f"{partition['held_out']['max']:.2f}")
     if len(partitions) > SHOWN_PARTITIONS:
         text = f"Show All {len(partitions)} Body Parts"
         body.prop(context.window_manager.fdda, "show_all_partitions", text=text, toggle=True)
 
 
 def _table_columns(layout: bpy.types.UILayout) -> list[bpy.types.UILayout]:
-    """Return a column for names and three right-aligned columns for numbers."""
+    """Return the columns of a table: one for names, and three right-aligned ones for numbers."""
     split = layout.split(factor=0.4)
     columns = [split.column(align=True)]
     right = split.row(align=True)
@@ -195,17 +195,17 @@ def _describe_goal(goal: dict) -> tuple[str, str]:
 
 
 def _read_report(path: Path) -> dict | None:
-    """Return the report next to a model, read again after a change; None without a valid one."""
+    """Return a training report, None without a valid one. It is read again after a change of the file."""
     try:
-        stamp = os.stat(path).st_mtime_ns
+        modified_ns = os.stat(path).st_mtime_ns
     except OSError:
         return None
-    if path not in _report_cache or _report_cache[path][0] != stamp:
+    if path not in _report_cache or _report_cache[path][0] != modified_ns:
         try:
             report = read_report(path)
         except TrainingError:
             report = None
-        _report_cache[path] = (stamp, report)
+        _report_cache[path] = (modified_ns, report)
     return _report_cache[path][1]
 
 

@@ -2,4 +2,4 @@
 """Blender properties of mesh objects, actions and the session, and the preferences."""
 
 MODULES: tuple[str, ...] = ("character", "session", "view", "binding", "preferences")
-"""The modules of this package in the order of their dependencies. Each lists its classes in `CLASSES`."""
+"""Names of the modules of this package, in the order of their dependencies. Each lists its classes in `CLASSES`."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Properties of a mesh object with a model, saved in the .blend file: `Object.fdda`."""
+"""Properties of a mesh object that has a model: `Object.fdda`, which is saved in the .blend file."""
 
 import bpy
 from bpy.props import (
@@ -21,13 +21,13 @@ INSERTABLE = OVERRIDABLE | {"USE_INSERTION"}
 """Options of collections to which a library override may add entries."""
 
 
-def _apply(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
+def _on_update(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
     from ..runtime.binding import on_property_update
 
     on_property_update(binding.id_data)
 
 
-def _apply_mask(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
+def _on_mask_update(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None:
     from ..runtime.binding import on_mask_update
 
     on_mask_update(binding.id_data)
@@ -35,7 +35,7 @@ def _apply_mask(binding: "FDDA_PG_binding", _context: bpy.types.Context) -> None
 
 @not_animatable
 class FDDA_PG_modifier(bpy.types.PropertyGroup):
-    """A modifier of the rig, and its visibility before the model replaced it."""
+    """Visibility of a modifier of the rig before the model replaced it."""
 
     uid: IntProperty(override=OVERRIDABLE)
     show_viewport: BoolProperty(override=OVERRIDABLE)
@@ -44,7 +44,7 @@ class FDDA_PG_modifier(bpy.types.PropertyGroup):
 
 @not_animatable
 class FDDA_PG_model(bpy.types.PropertyGroup):
-    """A model of the Model Library: its file, or the text datablock that contains it."""
+    """A model of the Model Library, stored in a file or packed in a text datablock."""
 
     name: StringProperty(name="Name", description="Name of the model", override=OVERRIDABLE)
     path: StringProperty(
@@ -65,7 +65,7 @@ class FDDA_PG_model(bpy.types.PropertyGroup):
 
 @not_animatable
 class FDDA_PG_binding(bpy.types.PropertyGroup):
-    """A model bound to a mesh object."""
+    """The model that is bound to a mesh object, its Model Library, and the settings of the character."""
 
     is_bound: BoolProperty(name="Bound", description="A model is bound to this object", override=OVERRIDABLE)
     model: StringProperty(
@@ -90,7 +90,7 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
             ("FDDA", "Model", "The model"),
         ),
         default="RIG",
-        update=_apply,
+        update=_on_update,
         options={"ANIMATABLE"},
         override=OVERRIDABLE,
     )
@@ -101,7 +101,7 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
         max=1,
         default=1,
         subtype="FACTOR",
-        update=_apply,
+        update=_on_update,
         options={"ANIMATABLE"},
         override=OVERRIDABLE,
     )
@@ -111,19 +111,19 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
             "Vertex group that limits the model: at a weight of 1 the model is used, at 0 and outside the group linear "
             "skinning, in between a blend. Empty to use the model everywhere"
         ),
-        update=_apply_mask,
+        update=_on_mask_update,
         override=OVERRIDABLE,
     )
     invert_mask: BoolProperty(
         name="Invert Mask",
         description="Use the model outside the vertex group instead of inside",
-        update=_apply_mask,
+        update=_on_mask_update,
         override=OVERRIDABLE,
     )
     use_in_render: BoolProperty(
         name="Use in Render",
         description="Use the model in final renders too, instead of the rig",
-        update=_apply,
+        update=_on_update,
         override=OVERRIDABLE,
     )
     status: StringProperty(
@@ -131,7 +131,8 @@ class FDDA_PG_binding(bpy.types.PropertyGroup):
     )
 
     is_playing: BoolProperty(
-        description="The modifiers of the rig are switched off and `modifiers` says how they were", override=OVERRIDABLE
+        description="The modifiers of the rig are off, and `modifiers` stores their former visibility",
+        override=OVERRIDABLE,
     )
     modifiers: CollectionProperty(type=FDDA_PG_modifier, override=INSERTABLE)
 
@@ -145,7 +146,7 @@ CLASSES = (FDDA_PG_modifier, FDDA_PG_model, FDDA_PG_binding)
 
 
 def register() -> None:
-    """Add the property of objects."""
+    """Register `Object.fdda`."""
     bpy.types.Object.fdda = PointerProperty(type=FDDA_PG_binding, override=OVERRIDABLE)
 
 

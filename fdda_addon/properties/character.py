@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Settings of a character and of actions, saved with the file, and the paths that follow from them.
+"""Settings of characters and actions, saved in the .blend file, and the paths that follow from them.
 
-The mesh object has those of the character in `Object.fdda.settings`, an action its own in `Action.fdda`.
+The settings of a character are `Object.fdda.settings` of its mesh object; those of an action are `Action.fdda`.
 """
 
 from pathlib import Path
@@ -40,7 +40,7 @@ def _suggested_controls(control: "FDDA_PG_control", _context: bpy.types.Context,
 
 
 def _shorten_data_path(control: "FDDA_PG_control", _context: bpy.types.Context) -> None:
-    """Replace a full data path that was pasted by the name of its control."""
+    """Replace a pasted full data path with the name of its control."""
     from ..scene.control_names import control_at
 
     armature_object = armature_of(control.id_data)
@@ -71,7 +71,7 @@ class FDDA_PG_control(bpy.types.PropertyGroup):
 
 @not_animatable
 class FDDA_PG_character(bpy.types.PropertyGroup):
-    """Settings of poses, recording and training of a character."""
+    """Settings of the poses, the recording and the training of a character."""
 
     poses: IntProperty(
         name="Poses", description="Number of random poses to record", default=POSES, min=0, soft_max=10000
@@ -218,7 +218,7 @@ CLASSES = (FDDA_PG_bone, FDDA_PG_control, FDDA_PG_character, FDDA_PG_action)
 
 
 def register() -> None:
-    """Add the property of actions; `binding` adds `Object.fdda`."""
+    """Register `Action.fdda`; `binding` registers `Object.fdda`."""
     bpy.types.Action.fdda = PointerProperty(type=FDDA_PG_action)
 
 
@@ -228,14 +228,14 @@ def unregister() -> None:
 
 
 def default_recording(mesh_object: bpy.types.Object) -> str:
-    """Return the folder of the recording where the user chooses none, relative to the .blend file."""
+    """Return the default folder of the recording, relative to the .blend file."""
     return f"//{_file_name(mesh_object)}_recording"
 
 
 def default_model(mesh_object: bpy.types.Object) -> str:
-    """Return the file of the model where the user chooses none, relative to the .blend file.
+    """Return the default file of the model, relative to the .blend file.
 
-    It is in a folder of its own: the trainer writes its report beside the model.
+    The model has a separate folder, because the trainer writes its report next to the model.
     """
     name = _file_name(mesh_object)
     return f"//{name}_model/{name}.onnx"
@@ -247,7 +247,7 @@ def recording_folder(mesh_object: bpy.types.Object) -> Path:
     Raises:
         OutputError: the path is relative to a .blend file that has not been saved.
     """
-    return _path(mesh_object.fdda.settings.recording, default_recording(mesh_object), "recording", "Folder")
+    return _resolve_path(mesh_object.fdda.settings.recording, default_recording(mesh_object), "recording", "Folder")
 
 
 def model_file(mesh_object: bpy.types.Object) -> Path:
@@ -256,11 +256,11 @@ def model_file(mesh_object: bpy.types.Object) -> Path:
     Raises:
         OutputError: the path is relative to a .blend file that has not been saved.
     """
-    return _path(mesh_object.fdda.settings.model, default_model(mesh_object), "model", "Model file")
+    return _resolve_path(mesh_object.fdda.settings.model, default_model(mesh_object), "model", "Model file")
 
 
 def trained_file(mesh_object: bpy.types.Object) -> Path | None:
-    """Return the model file that a training of the character has written, None without one."""
+    """Return the model file that a training of the character has written; None if there is none."""
     try:
         path = model_file(mesh_object)
     except OutputError:
@@ -269,12 +269,12 @@ def trained_file(mesh_object: bpy.types.Object) -> Path | None:
 
 
 def _file_name(mesh_object: bpy.types.Object) -> str:
-    """Return a file name from the names of the .blend file and the mesh, unique among the files of a folder."""
+    """Return a file name made of the names of the .blend file and the mesh, so that characters do not share files."""
     file, name = Path(bpy.data.filepath).stem, mesh_object.name
     return bpy.path.clean_name(name if file in ("", name) else f"{file}_{name}")
 
 
-def _path(chosen: str, default: str, what: str, field: str) -> Path:
-    if not bpy.data.filepath and (not chosen or chosen.startswith("//")):
-        raise OutputError(f"Save the .blend file first ({what}s are stored next to it), or choose a {field}.")
-    return resolve_path(chosen or default)
+def _resolve_path(stored_path: str, default: str, kind: str, field: str) -> Path:
+    if not bpy.data.filepath and (not stored_path or stored_path.startswith("//")):
+        raise OutputError(f"Save the .blend file first ({kind}s are stored next to it), or choose a {field}.")
+    return resolve_path(stored_path or default)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The preferences of the add-on: folders of models, and the Python for training."""
+"""The preferences of the add-on: packing of models, trusted folders, and the Python for training."""
 
 import os
 from pathlib import Path
@@ -14,7 +14,7 @@ from ..training.environment.check_result import CheckResult
 from ..training.environment.folder import EXTENSION, FolderState, creation_obstacle, environment_folder
 
 MODULE = EXTENSION or __package__.partition(".")[0]
-"""Name under which Blender stores the preferences. Without installation there are none."""
+"""Name under which Blender stores the preferences of the installed extension. A script has no preferences."""
 
 LEVEL_ICONS = {"INFO": "CHECKMARK", "WARNING": "INFO", "ERROR": "ERROR"}
 STATE_LABELS = {
@@ -104,13 +104,13 @@ def trusted_folders() -> list[Path]:
 
 
 def preferences() -> FDDA_AP_preferences | None:
-    """Return the preferences, None without an installed extension."""
+    """Return the preferences; None if the add-on was started from a script."""
     addon = bpy.context.preferences.addons.get(MODULE)
     return addon.preferences if addon else None
 
 
 def wheels_folder() -> str:
-    """Return the folder under Offline Packages, empty without one."""
+    """Return the folder in the field Offline Packages; empty if none is chosen."""
     settings = preferences()
     return settings.wheels_folder if settings else ""
 
@@ -124,7 +124,7 @@ def draw_check(layout: bpy.types.UILayout) -> None:
 
 
 def draw_own_environment(layout: bpy.types.UILayout, settings: FDDA_AP_preferences) -> None:
-    """Draw state, buttons and progress of the training environment."""
+    """Draw the state of the training environment, its buttons, and the progress of its job."""
     state = session.environment_state()
     name_part, value_part = _split_row(layout)
     name_part.label(text="Training Environment")
@@ -138,12 +138,12 @@ def draw_own_environment(layout: bpy.types.UILayout, settings: FDDA_AP_preferenc
         _, row = _split_row(layout)
         row = row.row(align=True)
         reason = creation_obstacle(settings.wheels_folder)
-        again = state is not FolderState.MISSING
-        create = row.row()
-        create.enabled = not reason
-        text = "Reinstall" if again else "Install Training Environment (3 GB)"
-        create.operator("fdda.create_trainer_environment", text=text, icon="IMPORT")
-        if again:
+        is_installed = state is not FolderState.MISSING
+        install_button = row.row()
+        install_button.enabled = not reason
+        text = "Reinstall" if is_installed else "Install Training Environment (3 GB)"
+        install_button.operator("fdda.create_trainer_environment", text=text, icon="IMPORT")
+        if is_installed:
             row.operator("fdda.remove_trainer_environment", text="", icon="TRASH")
         row.operator("fdda.open_trainer_log", text="", icon="TEXT")
         if reason:
@@ -153,7 +153,7 @@ def draw_own_environment(layout: bpy.types.UILayout, settings: FDDA_AP_preferenc
 
 
 def _split_row(layout: bpy.types.UILayout) -> tuple[bpy.types.UILayout, bpy.types.UILayout]:
-    """Return the two parts of a row that is split as Blender splits properties: name and value."""
+    """Return the parts for name and value of a row, split as Blender splits the rows of properties."""
     split = layout.split(factor=0.4)
     left, right = split.row(), split.row()
     left.alignment = "RIGHT"
@@ -172,15 +172,15 @@ def draw_job(layout: bpy.types.UILayout, job: JobState) -> None:
         row.operator("fdda.cancel_trainer_environment", text="", icon="CANCEL")
 
 
-def draw_check_result(layout: bpy.types.UILayout, answer: CheckResult | None) -> None:
+def draw_check_result(layout: bpy.types.UILayout, result: CheckResult | None) -> None:
     """Draw the result of a check, if there is one."""
-    if answer is None:
+    if result is None:
         return
     box = layout.box()
-    draw_lines(box, answer.message, LEVEL_ICONS[answer.level], alert=answer.level == "ERROR")
+    draw_lines(box, result.message, LEVEL_ICONS[result.level], alert=result.level == "ERROR")
     column = box.column(align=True)
     column.active = False
-    for line in answer.details:
+    for line in result.details:
         draw_lines(column, line, "BLANK1")
 
 
@@ -193,8 +193,8 @@ def draw_lines(layout: bpy.types.UILayout, text: str, icon: str = "NONE", alert:
     width = int(((region.width if region else 600) / scale - 90) / 6.3)
     column = layout.column(align=True)
     column.alert = alert
-    for number, line in enumerate(textwrap.wrap(text, max(width, 30)) or [""]):
-        column.label(text=line, icon=icon if number == 0 or icon == "NONE" else "BLANK1")
+    for index, line in enumerate(textwrap.wrap(text, max(width, 30)) or [""]):
+        column.label(text=line, icon=icon if index == 0 or icon == "NONE" else "BLANK1")
 
 
 def _preferred_python() -> str:
@@ -206,13 +206,13 @@ CLASSES = (FDDA_PG_folder, FDDA_AP_preferences)
 
 
 def register() -> None:
-    """Make the settings of the preferences known to the packages below."""
+    """Pass the functions that read the preferences to lower packages, which cannot import this module."""
     choice.preferred_python = _preferred_python
     folder_trust.trusted_folders = trusted_folders
 
 
 def unregister() -> None:
-    """Undo `register`, and clear the result of the check."""
+    """Undo `register`, and clear the result of the last check."""
     session.store_result(None)
     choice.preferred_python = None
     folder_trust.trusted_folders = list

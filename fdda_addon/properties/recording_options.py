@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Settings of a recording from the properties of a character."""
+"""Converts the properties of a character to the settings of a recording."""
 
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from ..rig.pose_setter import TargetSettings
 
 ALL_SHAPE_KEYS = "shape_keys"
-"""Name that means all shape keys without drivers (`scene.controls.parse_controls`)."""
+"""Name of an extra input that stands for all shape keys without drivers (`scene.controls.parse_controls`)."""
 
 
 def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingSettings":
@@ -45,7 +45,7 @@ def recording_settings(scene_rig: SceneRig, resume: bool = False) -> "RecordingS
 
 
 def target_settings(settings: FDDA_PG_character) -> "TargetSettings":
-    """Return the target object of a character, and the frames that a simulation needs."""
+    """Return the settings of the target object of a character."""
     from ..rig.pose_setter import TargetSettings
 
     if not settings.target:
@@ -53,8 +53,8 @@ def target_settings(settings: FDDA_PG_character) -> "TargetSettings":
     return TargetSettings(settings.target, settings.pre_roll, settings.max_settle_frames)
 
 
-def copy_sampling_settings(settings: FDDA_PG_character, other: FDDA_PG_character) -> None:
-    """Copy the settings of poses and recording from another mesh; keep paths and training settings."""
+def copy_sampling_settings(settings: FDDA_PG_character, source: FDDA_PG_character) -> None:
+    """Copy the settings of poses and recording from another mesh, but not its paths and training settings."""
     for name in (
         "poses",
         "seed",
@@ -66,18 +66,18 @@ def copy_sampling_settings(settings: FDDA_PG_character, other: FDDA_PG_character
         "mirror",
         "min_partition_vertices",
     ):
-        setattr(settings, name, getattr(other, name))
-    for name, values in (("sampled_bones", ("name",)), ("controls", ("name", "has_range", "low", "high"))):
+        setattr(settings, name, getattr(source, name))
+    for name, attributes in (("sampled_bones", ("name",)), ("controls", ("name", "has_range", "low", "high"))):
         collection = getattr(settings, name)
         collection.clear()
-        for entry in getattr(other, name):
-            new = collection.add()
-            for value in values:
-                setattr(new, value, getattr(entry, value))
+        for entry in getattr(source, name):
+            copied_entry = collection.add()
+            for attribute in attributes:
+                setattr(copied_entry, attribute, getattr(entry, attribute))
 
 
 def _sample_options(settings: FDDA_PG_character, actions: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the choice of bones in the syntax of `poses.sampling.parse_sample_selection`."""
+    """Return the bones that random poses move, in the syntax of `poses.sampling.parse_sample_selection`."""
     if settings.sample == "COLLECTION":
         if not settings.bone_collection:
             raise RigError(

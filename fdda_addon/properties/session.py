@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""State of the sidebar, which is not saved with the file: `WindowManager.fdda`."""
+"""State of the sidebar: `WindowManager.fdda`, which is not saved in the .blend file."""
 
 from contextlib import suppress
 
@@ -15,14 +15,14 @@ from .recording_options import recording_settings
 
 
 def _show_random_pose(session: "FDDA_PG_session", number: int) -> None:
-    """Show the random pose whose number, from 1, was entered in the sidebar."""
+    """Show the random pose with the number that was entered in the sidebar; the first has number 1."""
     from ..recording.preview import show_random_pose
 
     context, job = bpy.context, current()
     rig = cached_active_rig(context)
     if rig is None or context.mode not in {"OBJECT", "POSE"} or (job is not None and job.changes_scene):
         return
-    # The section Rig shows the problem if there is nothing to pose.
+    # If no random pose can be shown, the section Rig shows the reason.
     with suppress(FDDAError):
         show_random_pose(rig, recording_settings(rig), number - 1)
         session.pose_index = number - 1
@@ -31,7 +31,7 @@ def _show_random_pose(session: "FDDA_PG_session", number: int) -> None:
 
 @not_animatable
 class FDDA_PG_session(bpy.types.PropertyGroup):
-    """What the sidebar shows."""
+    """State of the sidebar: the shown mesh, the active entries of lists, and the previewed pose."""
 
     mesh: StringProperty(name="Mesh", description="Mesh of the active armature that the sidebar shows")
     all_meshes: BoolProperty(
@@ -49,7 +49,7 @@ class FDDA_PG_session(bpy.types.PropertyGroup):
         get=lambda session: session.pose_index + 1,
         set=_show_random_pose,
     )
-    bone_index: IntProperty(name="Joint")
+    bone_index: IntProperty(name="Bone")
     action_index: IntProperty(name="Action")
     show_all_partitions: BoolProperty(
         name="Show All", description="List all body parts of the model, not only the worst"
@@ -60,7 +60,7 @@ CLASSES = (FDDA_PG_session,)
 
 
 def register() -> None:
-    """Add the property of the window manager."""
+    """Register `WindowManager.fdda`."""
     bpy.types.WindowManager.fdda = PointerProperty(type=FDDA_PG_session)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Settings of the section "Compare with Rig", not saved with the file: `WindowManager.fdda_view`."""
+"""Settings of the section "Compare with Rig": `WindowManager.fdda_view`, which is not saved in the .blend file."""
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty
@@ -12,15 +12,15 @@ def _redraw(_view: "FDDA_PG_view", _context: bpy.types.Context) -> None:
     redraw_views()
 
 
-def show_graph(shown: bool) -> None:
+def show_graph(is_shown: bool) -> None:
     """Show or hide the error graph in the timeline."""
     from ..evaluation import timeline
 
-    (timeline.start if shown else timeline.stop)()
+    (timeline.start if is_shown else timeline.stop)()
 
 
 class FDDA_PG_view(bpy.types.PropertyGroup):
-    """Settings of the evaluation and of the colors in the viewport."""
+    """Settings of the evaluation, of the colors in the viewport, and of the markers and graph in the timeline."""
 
     source: EnumProperty(
         name="Compare On",
@@ -79,7 +79,7 @@ CLASSES = (FDDA_PG_view,)
 
 
 def register() -> None:
-    """Add the property of the window manager."""
+    """Register `WindowManager.fdda_view`."""
     bpy.types.WindowManager.fdda_view = PointerProperty(type=FDDA_PG_view)
 
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Starts the trainer in a Python of its own, and makes that Python's environment."""
+"""Starts the trainer in another Python, and installs the environment of that Python."""

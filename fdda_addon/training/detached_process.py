@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Detached trainings, which continue after Blender has closed.
+"""Detached trainings, which continue when Blender quits, crashes, or opens another file.
 
-The messages of such a training are written to a file in the user's folder of the add-on, by the path of its model. So
-another file may be opened, and Blender may be closed or crash. When the character is opened again, the training is
-read from its first message, also where it has ended. Files beside a model are untrusted and never name a process.
+The trainer writes its messages to a file in the add-on's user folder, whose name depends on the path of the model. When
+the character is opened again, Blender reads all messages from the first one, even if the training has ended meanwhile.
+Files next to a model are untrusted, so the process id is not stored there.
 """
 
 import contextlib
@@ -26,22 +26,22 @@ from .process import Training
 
 POLL_SECONDS = 0.1
 _child_processes: dict[int, subprocess.Popen] = {}
-"""Child processes of this Blender by process id, whose exit status must be collected."""
+"""Trainer processes that this Blender has started, by process id. Only their exit status can be read."""
 
 
 class DetachedTraining(Training):
-    """A training that continues after the block when it was detached; otherwise it ends with the block."""
+    """A training that continues after its `with` block if `detach` was called; otherwise it ends with the block."""
 
     def __init__(self, arguments: list[str], model: Path):
         """Start the trainer.
 
         Args:
             arguments: of `python -m trainer`.
-            model: the file to write; one training at a time.
+            model: the file to write. Only one training at a time may write it.
 
         Raises:
             TrainingError: the interpreter cannot be started.
-            OutputError: the folder for its messages cannot be written.
+            OutputError: the files of the process cannot be written.
         """
         self._files, self._is_detached = _ProcessFiles(model), False
         super().__init__(arguments)
@@ -49,7 +49,7 @@ class DetachedTraining(Training):
         try:
             self._files.write_process_id(self._process.pid)
         except OutputError:
-            # Without its process id the training cannot be attached again.
+            # Without its process id no Blender could attach to the training.
             self.__exit__()
             raise
 
@@ -72,23 +72,23 @@ class DetachedTraining(Training):
             )
 
     def _read(self) -> None:
-        offset, rest = 0, b""
+        offset, incomplete_line = 0, b""
         while not self._is_detached:
-            # Polled before reading, so that all output of an ended process is read.
+            # Checked before reading, so that all output of an ended process is read.
             is_alive = self._process.poll() is None
             try:
                 with self._files.messages.open("rb") as file:
                     file.seek(offset)
                     chunk = file.read()
             except PermissionError:
-                # On Windows, while `is_running` of another thread accesses the file.
+                # On Windows, `is_running` in another thread may have the file open.
                 time.sleep(POLL_SECONDS)
                 continue
             except OSError:
                 # Another Blender that follows the same training has read its end and removed the files.
                 break
             offset += len(chunk)
-            *lines, rest = (rest + chunk).split(b"\n")
+            *lines, incomplete_line = (incomplete_line + chunk).split(b"\n")
             for line in lines:
                 self._lines.put(line.decode("utf-8", "replace"))
             if not is_alive and not chunk:
@@ -97,7 +97,7 @@ class DetachedTraining(Training):
         self._lines.put(None)
 
     def detach(self) -> None:
-        """Let the training continue after the block."""
+        """Let the training continue after the `with` block."""
         self._is_detached = True
         if self._finalizer is not None:
             self._finalizer.detach()
@@ -112,10 +112,10 @@ class DetachedTraining(Training):
 
 
 class AttachedTraining(DetachedTraining):
-    """A detached training, attached and read from its first message."""
+    """A detached training to which this Blender has attached. It is read from its first message."""
 
     def __init__(self, model: Path):
-        """Attach to the training of a model, for which `is_detached` is true."""
+        """Attach to the training of a model for which `is_detached` is true."""
         self._files, self._is_detached = _ProcessFiles(model), False
         self._stop_file, self._errors = self._files.stop_file, self._files.errors()
         pid = self._files.process_id
@@ -124,12 +124,12 @@ class AttachedTraining(DetachedTraining):
 
 
 def is_detached(model: Path) -> bool:
-    """Return whether a model has a detached training whose end was not read yet."""
+    """Return whether a model has a detached training that runs, or whose end no Blender has read."""
     return _ProcessFiles(model).process_id > 0
 
 
 class _ProcessFiles:
-    """Files of a detached training: process id, messages, stderr and stop file."""
+    """Files of a detached training: process id, messages, stderr, and the stop file."""
 
     def __init__(self, model: Path):
         name = hashlib.sha256(os.path.normcase(model.resolve()).encode("utf-8", "surrogateescape")).hexdigest()[:24]
@@ -139,10 +139,10 @@ class _ProcessFiles:
         self._errors = self._path.with_suffix(".errors")
 
     def new_messages(self) -> BinaryIO:
-        """Create the file for messages, which the process keeps locked while it runs.
+        """Create the file for messages. The trainer inherits its lock and holds it while it runs.
 
         Raises:
-            OutputError: it cannot be written.
+            OutputError: the file cannot be written.
         """
         file = self._new(self.messages)
         if sys.platform != "win32":
@@ -153,11 +153,15 @@ class _ProcessFiles:
         return file
 
     def new_errors(self) -> TextIO:
-        """Create the file for stderr; raises as `new_messages`."""
+        """Create the file for stderr.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
         return io.TextIOWrapper(self._new(self._errors), encoding="utf-8", errors="replace")
 
     def errors(self) -> TextIO:
-        """Open the stderr of the process."""
+        """Open the file with the stderr of the process; return an empty file if it is missing."""
         try:
             return self._errors.open(encoding="utf-8", errors="replace")
         except OSError:
@@ -171,19 +175,23 @@ class _ProcessFiles:
             raise OutputError(f"Cannot write '{path}': {os_error_text(error)}; make room there.") from error
 
     def write_process_id(self, process_id: int) -> None:
-        """Write the process id; raises OutputError."""
+        """Write the process id.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
         write_json(self._path, {"process": process_id})
 
     @property
     def process_id(self) -> int:
-        """Process id, 0 where there is none."""
+        """Return the process id; 0 without a detached training."""
         try:
             return int(json.loads(self._path.read_text(encoding="utf-8"))["process"]) * self.messages.is_file()
         except (OSError, ValueError, KeyError, TypeError):
             return 0
 
     def is_running(self) -> bool:
-        """Return whether a process has the messages open, because the process id may be reused."""
+        """Return whether a process has the file of messages open. Its id may have been reused by another process."""
         if sys.platform == "win32":
             # Windows cannot rename an open file.
             try:
@@ -209,7 +217,7 @@ class _ProcessFiles:
 
 
 class _ForeignProcess:
-    """Process of another Blender with the interface that `Training` uses; its exit status is unknown."""
+    """A process that another Blender has started, with the methods that `Training` uses. Its exit status is unknown."""
 
     stdout = None
 
@@ -220,20 +228,20 @@ class _ForeignProcess:
         return None if self._files.is_running() else "ended"
 
     def wait(self, seconds: float = float("inf")) -> None:
-        end = time.monotonic() + seconds
+        deadline = time.monotonic() + seconds
         while self.poll() is None:
-            if time.monotonic() > end:
+            if time.monotonic() > deadline:
                 raise subprocess.TimeoutExpired(str(self.pid), seconds)
             time.sleep(POLL_SECONDS)
 
     def terminate(self) -> None:
-        self._send(signal.SIGTERM)
+        self._send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
-        self._send(getattr(signal, "SIGKILL", signal.SIGTERM))
+        self._send_signal(getattr(signal, "SIGKILL", signal.SIGTERM))
 
-    def _send(self, number: int) -> None:
+    def _send_signal(self, signal_number: int) -> None:
         # The process id may be reused by another process.
         if self._files.is_running():
             with contextlib.suppress(OSError):
-                os.kill(self.pid, number)
+                os.kill(self.pid, signal_number)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The process of the trainer: starting, reading of messages and cancelling.
+"""Starts the trainer in another process, reads its messages, and cancels it.
 
-torch runs outside of Blender's process, because it has its own threads and libraries and Blender's Python lacks it.
+torch runs outside of Blender's process, because it has its own threads and libraries, and Blender's Python lacks it.
 """
 
 import os
@@ -29,11 +29,11 @@ from .environment.subprocesses import UTF8_OUTPUT, popen_options
 from .process_exit import explain_exit_status
 
 KILL_AFTER_SECONDS = 20.0
-"""Time after which a trainer that was asked to stop is killed."""
+"""Time after which a canceled trainer that still runs is killed."""
 READER_JOIN_SECONDS = 1.0
 POLL_SECONDS = 0.05
 MIN_FREE_BYTES = 1 << 16
-"""A disk with less free space counts as full."""
+"""Free space below which a disk counts as full."""
 
 
 def trainer_python() -> str:
@@ -44,12 +44,12 @@ def trainer_python() -> str:
 def trainer_command(
     arguments: list[str], python: str | None = None, module: str = "trainer"
 ) -> tuple[list[str], dict[str, str]]:
-    """Return command line and environment of the trainer for `subprocess`.
+    """Return the command line and the environment variables that start the trainer.
 
     Args:
-        arguments: of `python -m trainer`.
-        python: the interpreter, `trainer_python()` when left out.
-        module: the module to run.
+        arguments: arguments of `python -m trainer`.
+        python: path of the interpreter; None for `trainer_python()`.
+        module: name of the module to run.
     """
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     # -P, so that a folder `trainer` in the current folder is not run instead.
@@ -58,11 +58,12 @@ def trainer_command(
 
 
 class TrainerProcess:
-    """Context manager for a process of the trainer, which ends with the block.
+    """Context manager for a trainer process, which ends with the `with` block.
 
     Attributes:
-        module: that `python -m` runs.
-        failure_message, loss_advice: parts of error messages where the process has none.
+        module: name of the module that `python -m` runs.
+        failure_message: error message if the process gives none.
+        loss_advice: end of the error message if the process ended without a result.
     """
 
     module = "trainer"
@@ -74,8 +75,8 @@ class TrainerProcess:
         """Start the process.
 
         Args:
-            arguments: of the module.
-            python: the interpreter, `trainer_python()` when left out.
+            arguments: arguments of the module.
+            python: path of the interpreter; None for `trainer_python()`.
 
         Raises:
             TrainingError: the interpreter cannot be started.
@@ -88,7 +89,7 @@ class TrainerProcess:
         except OSError as error:
             raise temporary_folder_error(error) from error
         environment |= {STOP_FILE_VARIABLE: str(self._stop_file), **UTF8_OUTPUT}
-        # Ctrl-C may arrive between the start of the process and the block that ends it.
+        # Ctrl-C may arrive between the start of the process and the `with` block that ends it.
         self._finalizer = weakref.finalize(self, Path.touch, self._stop_file)
         try:
             self._process = self._start(command, environment)
@@ -101,7 +102,7 @@ class TrainerProcess:
         self._start_reader()
 
     def _new_stop_file(self) -> Path:
-        # The name cannot be guessed, and the file does not exist until the trainer is asked to stop.
+        # The file exists only after a cancellation. Its random name keeps other users from creating it.
         return Path(tempfile.gettempdir(), f"fdda-stop-{secrets.token_hex(12)}")
 
     def _new_errors(self) -> TextIO:
@@ -121,8 +122,8 @@ class TrainerProcess:
         )
 
     def _start_reader(self) -> None:
-        self._cancelled_at: float | None = None
-        # In a thread, because Blender must not block on a line.
+        self._canceled_at: float | None = None
+        # In a thread, because reading a line blocks and Blender must not.
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -133,32 +134,32 @@ class TrainerProcess:
         self._lines.put(None)
 
     def cancel(self) -> None:
-        """Ask the trainer to stop without waiting; `messages` ends when it has stopped."""
-        if self._cancelled_at is not None:
+        """Request the trainer to stop, without waiting. `messages` ends when the trainer has stopped."""
+        if self._canceled_at is not None:
             return
-        self._cancelled_at = time.monotonic()
+        self._canceled_at = time.monotonic()
         try:
             self._stop_file.touch()
         except OSError:
-            # A full disk. On Windows this gives it no time.
+            # The disk is full. On Windows `terminate` ends the process at once.
             self._process.terminate()
 
     def messages(self, wait: bool = True) -> Iterator[Message | None]:
-        """Yield the messages of the trainer until it has finished or was cancelled.
+        """Yield the messages of the trainer until it has finished or was canceled.
 
         Args:
-            wait: block until the next message; otherwise yield None while there is none.
+            wait: whether to block until the next message; if not, yield None while there is no message.
 
         Raises:
             WrongUsageError: the options of the trainer are wrong.
-            TrainingError: the trainer failed, or ended without a last message, unless it was cancelled.
+            TrainingError: the trainer failed, or ended without a last message and without a cancellation.
         """
-        last = None
+        last_message = None
         while True:
-            if self._cancelled_at is not None and time.monotonic() > self._cancelled_at + KILL_AFTER_SECONDS:
+            if self._canceled_at is not None and time.monotonic() > self._canceled_at + KILL_AFTER_SECONDS:
                 self._process.kill()
             try:
-                # With a short timeout, because a blocked thread gets no Ctrl-C on Windows.
+                # A short timeout, because on Windows a blocked thread receives no Ctrl-C.
                 line = self._lines.get(block=wait, timeout=POLL_SECONDS)
             except queue.Empty:
                 if not wait:
@@ -175,30 +176,30 @@ class TrainerProcess:
                 kind = TrainingDiedError if message.values.get("try_again") is True else TrainingError
                 raise kind(str(message.values.get("text", self.failure_message)))
             yield message
-            last = message
+            last_message = message
         while self._process.poll() is None:
             if wait:
                 time.sleep(POLL_SECONDS)
             else:
                 yield None
         status = self._process.wait()
-        if self._cancelled_at is not None:
+        if self._canceled_at is not None:
             return
-        if status == WrongUsageError.exit_status and last is None:
+        if status == WrongUsageError.exit_status and last_message is None:
             raise WrongUsageError(self._error_text().strip())
-        if last is None or not last.type.is_last:
+        if last_message is None or not last_message.type.is_last:
             if status == INTERRUPTED:
-                # It was stopped while starting.
+                # The trainer was interrupted before its first message.
                 yield Message(MessageType.CANCELLED)
                 return
             raise self._exit_error(status)
 
     def _exit_error(self, status: int | None) -> TrainingError:
-        text = self._error_text().strip().splitlines()
-        reason = f" ({text[-1].strip()})" if text else ""
-        process_exit = explain_exit_status(status, not text)
+        error_lines = self._error_text().strip().splitlines()
+        reason = f" ({error_lines[-1].strip()})" if error_lines else ""
+        process_exit = explain_exit_status(status, not error_lines)
         if status == TRY_AGAIN and (full_folder := self._find_full_disk()):
-            # It could not write its message.
+            # The trainer could not write its error message.
             return TrainingDiedError(f"The disk of '{full_folder}' is full; {self.loss_advice} when there is room.")
         kind = TrainingDiedError if process_exit.is_machine_fault else TrainingError
         if advice := runtime_advice(reason):
@@ -206,7 +207,7 @@ class TrainerProcess:
         return kind(f"The trainer {process_exit.text}{reason}; {self.loss_advice}.")
 
     def _find_full_disk(self) -> Path | None:
-        """Return a folder of the process whose disk is full; None where there is none."""
+        """Return a folder that the trainer writes to and whose disk is full; None if no disk is full."""
         for folder in (self._stop_file.parent, Path(tempfile.gettempdir())):
             with suppress(OSError):
                 if shutil.disk_usage(folder).free < MIN_FREE_BYTES:
@@ -227,7 +228,7 @@ class TrainerProcess:
                 with suppress(subprocess.TimeoutExpired):
                     self._process.wait(KILL_AFTER_SECONDS)
         finally:
-            # Also after another Ctrl-C.
+            # Reached also if Ctrl-C interrupts the wait.
             if self._process.poll() is None:
                 self._process.kill()
                 self._process.wait()
@@ -235,7 +236,7 @@ class TrainerProcess:
                 self._finalizer.detach()
             with suppress(OSError):
                 self._stop_file.unlink(missing_ok=True)
-        # A child process of the trainer may keep the pipe open; then the reader thread stays.
+        # A child process of the trainer may keep the pipe open; then the reader thread continues.
         self._reader.join(READER_JOIN_SECONDS)
         if not self._reader.is_alive() and self._process.stdout is not None:
             self._process.stdout.close()
@@ -243,8 +244,13 @@ class TrainerProcess:
 
 
 class Training(TrainerProcess):
-    """The process of a training."""
+    """Context manager for the process of a training."""
 
     def __init__(self, arguments: list[str], python: str | None = None):
-        """Start the trainer with recording, model and settings as arguments, as `TrainerProcess` does."""
+        """Start the trainer.
+
+        Args:
+            arguments: recording, model and options of `python -m trainer`.
+            python: path of the interpreter; None for `trainer_python()`.
+        """
         super().__init__(["--messages", *arguments], python)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Explanation of the exit status of a process on Linux, macOS or Windows."""
+"""Explains the exit status of a process on Linux, macOS or Windows."""
 
 import os
 from typing import NamedTuple
@@ -20,7 +20,7 @@ _WINDOWS_CRASHES = {
     0xC0000409: "aborted",
     0xE06D7363: "an exception of C++",
 }
-"""Exit statuses of crashed processes on Windows."""
+"""Descriptions of the exit statuses of crashed processes on Windows."""
 _MISSING_DLL_STATUSES = {0xC0000135, 0xC0000139, 0xC0000142}
 _CONSOLE_CLOSED_STATUS = 0xC000013A
 _TERMINATED_STATUSES = {1, 15}
@@ -31,7 +31,7 @@ class ProcessExit(NamedTuple):
     """How a process ended.
 
     Attributes:
-        text: continues the sentence "The trainer …".
+        text: predicate of a sentence that begins with "The trainer".
         is_machine_fault: whether it crashed or was terminated, so that the same command may work later.
     """
 
@@ -43,8 +43,8 @@ def explain_exit_status(status: int | None, is_silent: bool) -> ProcessExit:
     """Explain the exit status of a process that ended without a last message.
 
     Args:
-        status: exit status, signed or unsigned; None where it is unknown.
-        is_silent: whether it wrote nothing to stderr, as a failing Python would.
+        status: exit status, signed or unsigned; None if it is unknown.
+        is_silent: whether the process wrote nothing to stderr; a Python that fails writes its exception.
     """
     if status is None:
         return ProcessExit("was ended before it was done" if is_silent else "ended before it was done", is_silent)

@@ -98,7 +98,7 @@ def test_an_error_is_its_outcome_and_a_bug_is_raised():
     run = broken.begin()
     with pytest.raises(ZeroDivisionError):
         until(lambda: run.work(0.01))
-    assert run.state.outcome == "Fetching broke off; the system console says why." and current(ENVIRONMENT) is None
+    assert run.state.outcome == "Fetching failed; see the system console." and current(ENVIRONMENT) is None
 
 
 def test_a_timer_looks_after_it(work, capsys):

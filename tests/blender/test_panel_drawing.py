@@ -114,7 +114,7 @@ def test_a_section_of_a_bound_model(bound: bpy.types.Object, name: str):
     bpy.ops.fdda.measure_model(frames=5)
     bpy.ops.fdda.color_mesh(colors="ERRORS")
     playback._confidence_value.compute_now(bound)
-    models._problems.compute_now(bound)
+    models._problem_values.compute_now(bound)
     texts = [text for _, text, _ in draw(name)]
     expected = {"playback": "Confidence in This Pose", "evaluation": "Max Color (mm)", "models": "Matches this rig"}
     assert expected.get(name, texts[0]) in texts

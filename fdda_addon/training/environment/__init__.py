@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The Python that trains: whether it can, and an environment of the add-on's own for those who have none.
+"""The Python that trains.
 
-`choice` says which Python trains, `check` asks it, with an `answer`; `folder` is where the environment of the add-on
-lies, `bases` finds a Python to make it from, `creation` makes it; `session` keeps what was found
-out, for panels to draw.
+`choice` selects it and `check` checks it, with a `CheckResult`. `folder` is the folder of the add-on's environment,
+`interpreters` finds a Python to create it from, `creation` installs it. `session` caches results for panels.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Check whether a Python can train: its version, torch and the other packages, the device."""
+"""Checks whether a Python can train: its version, its packages, and the device that torch would use."""
 
 import json
 import os
@@ -14,9 +14,9 @@ from .subprocesses import UTF8_OUTPUT, popen_options
 
 MIN_VERSION = (3, 11)
 TIMEOUT_SECONDS = 180.0
-"""torch takes half a minute to load from a cold or remote disk."""
+"""Time limit of the check. torch takes half a minute to load from a slow disk."""
 
-# Runs in any Python, also an ancient one. The last line is the report; libraries may print before it.
+# Runs in any Python, including old versions. The last output line is the report; libraries may print lines before it.
 _PROBE_SCRIPT = """
 import json, sys
 answer = {"version": list(sys.version_info[:3]), "packages": {}, "broken": {}}
@@ -43,11 +43,11 @@ def check(python: str, advice: str) -> CheckResult:
 
     Args:
         python: path of the interpreter.
-        advice: end of the error message, what to do.
+        advice: end of the error message, which tells the user what to do.
     """
     command = [python, "-c", _PROBE_SCRIPT, *PACKAGES]
     try:
-        # -c imports from the current folder, where the trainer's modules are.
+        # With -c Python imports from the current folder, which must contain the trainer's modules.
         result = subprocess.run(
             command,
             stdin=subprocess.DEVNULL,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Choice of the Python that trains."""
+"""Selects the Python that trains."""
 
 import enum
 import os
@@ -13,14 +13,14 @@ from .check_result import CheckResult
 from .folder import environment_python, interpreter_path
 
 PYTHON_VARIABLE = "FDDA_TRAINER_PYTHON"
-"""Environment variable with the Python that has torch, used where the preferences name none."""
+"""Environment variable with the path of a Python that has torch, used if the preferences name none."""
 
 preferred_python: Callable[[], str] | None = None
-"""Returns the interpreter or virtual environment of the preferences; set by `preferences`."""
+"""Function that returns the interpreter or virtual environment in the preferences. `preferences` sets it."""
 
 
 class Origin(enum.Enum):
-    """Where the choice of the trainer's Python comes from; the value is advice for a wrong choice."""
+    """Where the path of the trainer's Python comes from. The value is the advice if that Python cannot train."""
 
     PREFERENCES = "choose another Python in the add-on's preferences, or leave that field empty"
     VARIABLE = f"set {PYTHON_VARIABLE} to a Python that has torch"
@@ -31,7 +31,7 @@ class Origin(enum.Enum):
 
 
 class TrainerPython(NamedTuple):
-    """The interpreter that runs the trainer, and where its choice comes from."""
+    """Path of the interpreter that runs the trainer, and where the path comes from."""
 
     path: str
     origin: Origin
@@ -40,17 +40,17 @@ class TrainerPython(NamedTuple):
 def select_python() -> TrainerPython:
     """Select the Python that runs the trainer.
 
-    The first of: the preferences, the environment variable, the add-on's environment, and this Python. The add-on's
-    environment exists only where bpy can be imported.
+    The first of these that exists is used: the path in the preferences, the path in the environment variable, the
+    add-on's environment, this Python. The add-on's environment is found only if bpy can be imported.
     """
     if preferred_python is not None and (preferred := preferred_python()):
         folder = Path(preferred)
         return TrainerPython(str(interpreter_path(folder)) if folder.is_dir() else preferred, Origin.PREFERENCES)
-    if named := os.environ.get(PYTHON_VARIABLE):
-        return TrainerPython(named, Origin.VARIABLE)
+    if variable_path := os.environ.get(PYTHON_VARIABLE):
+        return TrainerPython(variable_path, Origin.VARIABLE)
     with suppress(ImportError):
-        if own := environment_python():
-            return TrainerPython(own, Origin.OWN)
+        if environment_path := environment_python():
+            return TrainerPython(environment_path, Origin.OWN)
     return TrainerPython(sys.executable, Origin.THIS)
 
 

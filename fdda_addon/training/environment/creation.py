@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Installation of the training environment: a virtual environment with pinned packages, and a log."""
+"""Installs the training environment, a virtual environment with pinned package versions, and writes a log."""
 
 import os
 import re
@@ -33,20 +33,20 @@ from .interpreters import Interpreter, find_interpreters, query_interpreter
 from .subprocesses import clean_environment, popen_options
 
 MIN_FREE_GB = 9 if sys.platform.startswith("linux") else 2
-"""Free disk space for packages and downloads; on Linux with CUDA."""
+"""Free disk space that the packages and downloads need. On Linux they include CUDA."""
 TEMPORARY_FOLDER_NAME = "fdda-12345678"
-"""Example of the name of the temporary folder on Windows."""
+"""Name of the temporary folder on Windows, with an example of its random suffix."""
 MIN_PIP_WITH_RAW_PROGRESS = (24, 1)
 
 
 class EnvironmentCreation:
-    """Installation of an environment by `steps`, which `cancel` ends from another thread.
+    """Installation of the training environment. `steps` installs it; `cancel` cancels from another thread.
 
     Args:
-        folder: of the environment, which is removed first.
-        log: file for the output of all steps.
-        wheels: folder of wheels; the package index of pip's settings by default.
-        base: path of the Python to use; a suitable one is searched by default.
+        folder: folder of the environment. An existing environment is removed first.
+        log: file for the output of all commands.
+        wheels: folder of wheels; None for the package index in the settings of pip.
+        base: path of the Python to create the environment from; empty to search for a suitable one.
     """
 
     def __init__(self, folder: Path, log: Path, wheels: Path | None = None, base: str = ""):
@@ -96,7 +96,7 @@ class EnvironmentCreation:
         yield result
 
     def cancel(self) -> None:
-        """End the installation soon; thread-safe."""
+        """Cancel the installation. Thread-safe."""
         with self._lock:
             self._cancelled = True
             if self._process is not None:
@@ -112,17 +112,17 @@ class EnvironmentCreation:
                 "has torch."
             )
         if self.wheels is None:
-            free = shutil.disk_usage(self.folder.parent).free / 1e9
-            if free < MIN_FREE_GB:
+            free_gb = shutil.disk_usage(self.folder.parent).free / 1e9
+            if free_gb < MIN_FREE_GB:
                 raise TrainerEnvironmentError(
-                    f"The training environment needs {MIN_FREE_GB} GB and '{self.folder.parent}' has {free:.1f} GB "
+                    f"The training environment needs {MIN_FREE_GB} GB and '{self.folder.parent}' has {free_gb:.1f} GB "
                     "left; make room, or choose an existing Python that has torch."
                 )
         elif not self.wheels.is_dir():
             raise TrainerEnvironmentError(f"'{self.wheels}' is no folder; choose the folder that holds the packages.")
 
     def _check_wheels(self, interpreter: Interpreter, log: IO[str]) -> None:
-        """Check for missing wheels first, which pip would report late and as a conflict of versions."""
+        """Check that no wheel is missing. pip would report one late, and as a version conflict."""
         pinned = [
             line
             for line in requirements_file(interpreter.version).read_text(encoding="utf-8").splitlines()
@@ -151,7 +151,7 @@ class EnvironmentCreation:
             )
 
     def _find_interpreters(self, log: IO[str]) -> list[Interpreter]:
-        """Find suitable interpreters, the best first."""
+        """Return the suitable interpreters, the best first."""
         if self.base:
             queried = query_interpreter([self.base])
             if queried is None:
@@ -167,7 +167,7 @@ class EnvironmentCreation:
         return suitable
 
     def _create_venv(self, interpreters: list[Interpreter], log: IO[str]) -> Iterator[Progress]:
-        """Create the virtual environment with the first interpreter that can; return that interpreter."""
+        """Create the virtual environment with the first interpreter that succeeds, and return that interpreter."""
         for interpreter in interpreters:
             yield Progress(f"making it from {interpreter}", 0, 0)
             command = [interpreter.path, "-I", "-m", "venv", "--clear", str(self.folder)]
@@ -189,7 +189,7 @@ class EnvironmentCreation:
 
     @contextmanager
     def _temporary(self) -> Iterator[Path]:
-        """Make a temporary folder on the disk, because /tmp may be in memory; on Windows with a short path."""
+        """Create a temporary folder on the disk, because /tmp may be in memory; on Windows with a short path."""
         if os.name == "nt":
             path = Path(tempfile.mkdtemp(prefix=TEMPORARY_FOLDER_NAME[:-8]))
         else:
@@ -202,7 +202,8 @@ class EnvironmentCreation:
 
     def _install_with(self, temporary: Path, interpreter: Interpreter, log: IO[str]) -> Iterator[Progress]:
         packages = site_packages(self.folder, interpreter.version)
-        # A .pth file imports from the folder itself, because paths in site-packages are 18 characters longer.
+        # Packages are installed into the folder itself, because paths in site-packages are 18 characters longer.
+        # This .pth file makes Python import from there.
         (packages / "fdda.pth").write_text(os.path.relpath(self.folder, packages) + "\n", encoding="ascii")
         pip = [str(interpreter_path(self.folder)), "-I", "-m", "pip"]
         command = [*pip, "install", "--no-input", "--disable-pip-version-check", "--no-cache-dir"]
@@ -225,7 +226,7 @@ class EnvironmentCreation:
     def _pip_environment(self, temporary: Path) -> dict[str, str]:
         environment = clean_environment()
         if self.wheels is not None:
-            # Ignore pip's settings, which may add other sources.
+            # Ignore the settings of pip, which may name other sources of packages.
             environment = {name: value for name, value in environment.items() if not name.startswith("PIP_")}
             environment["PIP_CONFIG_FILE"] = os.devnull
         return environment | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary))
@@ -239,7 +240,10 @@ class EnvironmentCreation:
         return result
 
     def _run(self, command: list[str], log: IO[str], environment: dict[str, str] | None = None) -> Iterator[Progress]:
-        """Run one step outside of the folder, which Windows could not remove otherwise; return its exit status."""
+        """Run a command and return its exit status.
+
+        Its current folder is outside of the environment, which Windows could not remove otherwise.
+        """
         log.write(f"$ {subprocess.list2cmdline(command)}\n")
         self._last_lines = []
         with self._lock:
@@ -283,13 +287,13 @@ class EnvironmentCreation:
             yield Progress(line, 0, 0)
 
     def _error_line(self) -> str:
-        """Return the line that explains a failure best: pip's last error without a link to its manual."""
+        """Return the output line that explains a failure best: pip's last error that is no link to its manual."""
         errors = [line for line in self._last_lines if re.match("error:", line, re.IGNORECASE) and "http" not in line]
-        return (errors or self._last_lines or ["it said nothing"])[-1].removeprefix("ERROR: ").rstrip(".")
+        return (errors or self._last_lines or ["there was no output"])[-1].removeprefix("ERROR: ").rstrip(".")
 
     def _stop_if_cancelled(self) -> None:
         if self._cancelled:
-            state = "nothing is left of it" if self._has_changed_folder else "what was there stays"
+            state = "nothing was kept" if self._has_changed_folder else "the previous environment was kept"
             raise TrainerEnvironmentError(f"The installation of the training environment was canceled; {state}.")
 
 
@@ -307,7 +311,7 @@ def _open_log(log: Path) -> Iterator[IO[str]]:
 
 
 def _kill(process: subprocess.Popen) -> None:
-    """Kill a step and its child processes."""
+    """Kill the process of a command, and its child processes."""
     if process.poll() is not None:
         return
     if os.name == "nt":

@@ -16,22 +16,23 @@ from ...core.errors import TrainerEnvironmentError, os_error_text
 from ...core.path_limits import MAX_WINDOWS_PATH_LENGTH
 
 EXTENSION = __package__.rpartition(".fdda_addon")[0]
-"""The extension's module, "bl_ext.REPOSITORY.fdda"; empty where the add-on was imported and not installed."""
+"""Module name of the installed extension, "bl_ext.REPOSITORY.fdda"; empty if the add-on is not installed."""
 PACKAGES = ("torch", "onnx", "onnxruntime", "numpy", "scipy", "matplotlib")
 """Packages that the trainer imports."""
 COMPLETION_MARKER = "fdda-complete"
 MAX_WHEEL_PATH_LENGTH = 126
-"""Letters of the longest path in the wheels for Windows: a license in the dist-info of torch 2.15.0.
+"""Length of the longest path in the wheels for Windows, a license file of torch 2.15.0.
 
-In the folder where they are installed: `find . -printf '%P\\n' | awk '{print length}' | sort -n | tail -1`.
+To measure it in the folder of the installed packages:
+`find . -printf '%P\\n' | awk '{print length}' | sort -n | tail -1`.
 """
 PIP_TARGET = "/pip-target-12345678/lib/python"
-"""Subfolder of the temporary folder into which pip installs first."""
+"""Subfolder of the temporary folder, into which pip installs packages before it moves them."""
 ROOT = Path(__file__).parents[3]
 """Folder with the packages `fdda_addon` and `trainer`: the checkout, or the installed extension."""
 REQUIREMENTS = ROOT / "requirements"
 PINNED_REQUIREMENTS = {(3, 11): "python-3.11.txt", (3, 12): "python-3.11.txt", (3, 13): "python-3.13.txt"}
-"""Versions of Python for an environment, each with its file of pinned versions."""
+"""Versions of Python that an environment may have, each with the name of its file of pinned package versions."""
 OFFLINE = (
     "Blender's online access is off: allow it in Preferences > System > Network, choose a folder under Offline "
     "Packages, or choose an existing Python that has torch"
@@ -45,9 +46,9 @@ class FolderState(enum.Enum):
     INCOMPLETE = "incomplete"
     """Its installation was interrupted."""
     BROKEN = "broken"
-    """Its Python, or the base of it, is missing."""
+    """Its Python, or the Python that it was created from, is missing."""
     OUTDATED = "outdated"
-    """It has other package versions than this add-on requires, but can train."""
+    """It can train, but has other package versions than this add-on requires."""
     READY = "ready"
 
 
@@ -63,24 +64,24 @@ def user_folder() -> Path:
 def environment_folder() -> Path:
     """Return the folder of the environment, in the folder that Blender removes with the extension.
 
-    On Windows it has 91 letters beside the name of the user's folder, which may have 33: see `MAX_WHEEL_PATH_LENGTH`.
+    On Windows the path has 91 characters besides the user name, which may have up to 33 (see `MAX_WHEEL_PATH_LENGTH`).
     """
     return user_folder() / "trainer"
 
 
 def excess_path_length(folder: Path, temporary: Path) -> int:
-    """Return by how many characters paths of an environment exceed the limit of Windows, 0 for none.
+    """Return by how many characters the longest path of an environment exceeds the limit of Windows; 0 if it fits.
 
     Args:
-        folder: of the environment.
+        folder: folder of the environment.
         temporary: folder for temporary files during the installation.
     """
-    longest = max(len(str(folder)), len(str(temporary)) + len(PIP_TARGET)) + 1 + MAX_WHEEL_PATH_LENGTH
-    return max(0, longest - MAX_WINDOWS_PATH_LENGTH)
+    longest_path = max(len(str(folder)), len(str(temporary)) + len(PIP_TARGET)) + 1 + MAX_WHEEL_PATH_LENGTH
+    return max(0, longest_path - MAX_WINDOWS_PATH_LENGTH)
 
 
 def has_path_limit() -> bool:
-    """Whether this system refuses paths of more than `MAX_WINDOWS_PATH_LENGTH` letters."""
+    """Return whether this system rejects paths of more than `MAX_WINDOWS_PATH_LENGTH` characters."""
     if os.name != "nt":
         return False
     import winreg
@@ -111,12 +112,12 @@ def site_packages(folder: Path, version: tuple[int, int]) -> Path:
 
 
 def requirements_file(version: tuple[int, int]) -> Path:
-    """Return the file that pins every package for a version of Python that `PINNED_REQUIREMENTS` has."""
+    """Return the file of pinned package versions for a version of Python in `PINNED_REQUIREMENTS`."""
     return REQUIREMENTS / PINNED_REQUIREMENTS[version]
 
 
 def creation_obstacle(wheels: str) -> str:
-    """Return why the environment cannot be created now, empty where it can; `wheels`: folder of packages."""
+    """Return why the environment cannot be installed now; empty if it can. `wheels` is the folder of packages."""
     import bpy
 
     return "" if wheels or bpy.app.online_access else OFFLINE
@@ -132,17 +133,17 @@ def folder_state(folder: Path) -> FolderState:
         return FolderState.INCOMPLETE
     if not interpreter_path(folder).is_file():
         return FolderState.BROKEN
-    current = {
+    current_fingerprints = {
         _requirements_fingerprint(path) for path in set(map(requirements_file, PINNED_REQUIREMENTS)) if path.is_file()
     }
-    return FolderState.READY if marker and marker[0] in current else FolderState.OUTDATED
+    return FolderState.READY if marker and marker[0] in current_fingerprints else FolderState.OUTDATED
 
 
 def environment_python() -> str | None:
-    """Return the Python of the add-on's environment; None where it is missing or incomplete."""
+    """Return the Python of the add-on's environment; None if the environment is missing or incomplete."""
     folder = environment_folder()
-    complete = folder_state(folder) not in (FolderState.MISSING, FolderState.INCOMPLETE)
-    return str(interpreter_path(folder)) if complete else None
+    is_complete = folder_state(folder) not in (FolderState.MISSING, FolderState.INCOMPLETE)
+    return str(interpreter_path(folder)) if is_complete else None
 
 
 def write_completion_marker(folder: Path, version: tuple[int, int]) -> None:
@@ -153,10 +154,10 @@ def write_completion_marker(folder: Path, version: tuple[int, int]) -> None:
 
 
 def remove_environment(folder: Path) -> None:
-    """Remove an environment, its marker first, so that an interrupted removal leaves it incomplete.
+    """Remove an environment. The marker is removed first, so that an interrupted removal leaves it incomplete.
 
     Raises:
-        TrainerEnvironmentError: something cannot be removed.
+        TrainerEnvironmentError: a file cannot be removed.
     """
     import shutil
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Search for Python interpreters from which the training environment can be created.
+"""Searches for Python interpreters from which the training environment can be created.
 
-Every candidate is run, because a name may be a version manager's shim, or a Python without its venv module.
+Every candidate is run, because it may be a shim of a version manager, or lack the module venv.
 """
 
 import contextlib
@@ -18,10 +18,10 @@ from .folder import PINNED_REQUIREMENTS
 from .subprocesses import clean_environment, popen_options
 
 TIMEOUT_SECONDS = 30.0
-# Newest first, but those that Blender itself has before the one between.
+# The versions that Blender itself has come first.
 PREFERRED_VERSIONS = ("3.13", "3.11", "3.12")
 NO_DOWNLOAD_ENVIRONMENT = {"PYTHON_MANAGER_AUTOMATIC_INSTALL": "false"}
-"""Environment that keeps the launcher `py` from installing a missing Python."""
+"""Environment variables that keep the launcher `py` from installing a missing Python."""
 
 _PROBE_SCRIPT = """
 import json, sys
@@ -37,12 +37,12 @@ print(json.dumps([list(sys.version_info[:2]), sys.maxsize > 2**32, missing, sys.
 
 @dataclass(frozen=True)
 class Interpreter:
-    """A working Python.
+    """A Python interpreter that runs.
 
     Attributes:
-        path: of the executable.
+        path: path of the executable.
         version: major and minor version.
-        problem: why no environment can be created from it; empty for none.
+        problem: why no environment can be created from it; empty if one can.
     """
 
     path: str
@@ -54,21 +54,21 @@ class Interpreter:
 
 
 def find_interpreters(candidates: Iterator[list[str]] | None = None) -> Iterator[Interpreter]:
-    """Yield the working interpreters of this machine, each once, Blender's own first.
+    """Yield each interpreter of this machine that runs, Blender's own first.
 
     Args:
-        candidates: command lines to try; `default_candidates` by default.
+        candidates: command lines to try; None for `default_candidates`.
     """
-    seen = set()
+    yielded_paths = set()
     for command in default_candidates() if candidates is None else candidates:
         interpreter = query_interpreter(command)
-        if interpreter is not None and os.path.realpath(interpreter.path) not in seen:
-            seen.add(os.path.realpath(interpreter.path))
+        if interpreter is not None and os.path.realpath(interpreter.path) not in yielded_paths:
+            yielded_paths.add(os.path.realpath(interpreter.path))
             yield interpreter
 
 
 def query_interpreter(command: list[str]) -> Interpreter | None:
-    """Run a command line; return its interpreter, or None where it is no Python."""
+    """Run a command line, and return its interpreter; None if it starts no Python."""
     try:
         result = subprocess.run(
             [*command, "-I", "-c", _PROBE_SCRIPT],
@@ -94,7 +94,7 @@ def query_interpreter(command: list[str]) -> Interpreter | None:
 
 
 def default_candidates() -> Iterator[list[str]]:
-    """Yield command lines that may start a Python: Blender's own, those on PATH, those of installers."""
+    """Yield command lines that may start a Python: Blender's own, on PATH, and in the folders of installers."""
     if sys.executable:
         yield [sys.executable]
     yield from _windows_candidates() if os.name == "nt" else _unix_candidates()
@@ -102,7 +102,7 @@ def default_candidates() -> Iterator[list[str]]:
 
 def _unix_candidates() -> Iterator[list[str]]:
     yield from ([f"python{version}"] for version in PREFERRED_VERSIONS)
-    # On macOS the name in /usr/bin asks to install the developer tools.
+    # On macOS /usr/bin/python3 opens a dialog that installs the developer tools.
     if sys.platform != "darwin":
         yield from (["python3"], ["python"])
     home = Path.home()
@@ -146,8 +146,8 @@ def _windows_candidates() -> Iterator[list[str]]:
         if launcher := _find_on_path("py.exe"):
             yield [launcher, f"-{version}"]
     for name in (*(f"python{version}.exe" for version in PREFERRED_VERSIONS), "python3.exe", "python.exe"):
-        if found := _find_on_path(name):
-            yield [found]
+        if program := _find_on_path(name):
+            yield [program]
 
 
 def _registry_interpreters(version: str) -> Iterator[Path]:
@@ -175,7 +175,7 @@ def _subkeys(root: int, key: str) -> list[str]:
 
 
 def _find_on_path(name: str) -> str:
-    """Find a program on PATH; empty for none. Windows would search the current folder first."""
+    """Return the path of a program on PATH; empty if there is none. The current folder is not searched."""
     for folder in map(Path, filter(None, os.environ.get("PATH", "").split(os.pathsep))):
         path = folder / name
         if folder.is_absolute() and path.is_file() and not _is_store_app(path):
@@ -184,8 +184,9 @@ def _find_on_path(name: str) -> str:
 
 
 def _is_store_app(path: Path) -> bool:
-    """Return whether a program is an app of the Microsoft Store, whose python.exe may only open the store.
+    """Return whether a program comes from the Microsoft Store.
 
-    An installed one redirects its writes to AppData, and with them an environment in there.
+    Its python.exe may only open the store. If Python is installed from the store, Windows redirects what it writes to
+    AppData, and so the environment.
     """
     return "windowsapps" in (part.lower() for part in path.parts)
