@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line: one module per verb with its options and its `run`; `main` imports it."""
+"""The command line. Each verb has a module with its options and its `run`, which `main` imports."""

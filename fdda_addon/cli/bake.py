@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`bake RIG.blend MODEL.onnx OUT`: bakes an action of the model to a file that plays without the add-on."""
+"""`bake RIG.blend MODEL.onnx OUT`: bakes an action, deformed by the model, to a file that plays without the add-on."""
 
 import argparse
 from pathlib import Path
@@ -18,25 +18,26 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "out",
         metavar="OUT",
         type=Path,
-        help="a .pc2 file for the positions alone, or a .blend file for a copy of the rig's file that plays them, with "
-        "a .pc2 file beside it",
+        help="file to write: a .pc2 point cache, or a .blend file (a copy of RIG.blend with a .pc2 file next to it)",
     )
-    parser.add_argument("--action", default="", metavar="NAME", help="bake this action (default: what is animated)")
+    parser.add_argument(
+        "--action", default="", metavar="NAME", help="action to bake (default: the animation of the scene)"
+    )
     parser.add_argument(
         "--frames",
         type=int,
         nargs=2,
         metavar=("FIRST", "LAST"),
-        help="the frames (default: those of the action, else of the scene)",
+        help="frames to bake (default: the frames of the action, or else of the scene)",
     )
     parser.add_argument(
-        "--shape-keys", action="store_true", help="keep the positions in the .blend file, a shape key each frame"
+        "--shape-keys", action="store_true", help="store the positions in the .blend file, as one shape key per frame"
     )
     add_overwrite_option(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    # Before a file is opened, which may take long.
+    # Check the outputs before a file is opened, which may take long.
     frames = tuple(options.frames) if options.frames else None
     settings = BakeSettings(options.action, frames, options.shape_keys, options.overwrite)
     output_files(options.out, settings, (options.rig, options.model))
@@ -45,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
         for step in bake(scene_rig, options.model, options.out, settings):
             if isinstance(step, Progress):
                 progress.show(step.stage, step.done, step.total)
-    what = settings.action or "the scene"
+    animation_name = settings.action or "the scene"
     for path in step.files[1:]:
         print(f"{path}: the positions, to be kept beside {options.out.name}")
-    print(f"{options.out}: {len(step.frames)} frames of {what} ({step.frames[0]} to {step.frames[-1]})")
+    print(f"{options.out}: {len(step.frames)} frames of {animation_name} ({step.frames[0]} to {step.frames[-1]})")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`benchmark RIG.blend MODEL.onnx --json OUT.json`: measures the time of a frame."""
+"""`benchmark RIG.blend MODEL.onnx --json OUT.json`: measures the time per frame of rig, linear skinning and model."""
 
 import argparse
 from pathlib import Path
@@ -19,8 +19,10 @@ from .progress import ProgressPrinter
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_rig_options(parser)
     parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
-    parser.add_argument("--json", metavar="OUT.json", type=Path, required=True, help="where to write the times")
-    parser.add_argument("--frames", type=int, default=100, help="frames to time, each way (default 100)")
+    parser.add_argument("--json", metavar="OUT.json", type=Path, required=True, help="file to write the times to")
+    parser.add_argument(
+        "--frames", type=int, default=100, help="number of frames to measure with each deformation (default 100)"
+    )
     add_overwrite_option(parser)
 
 
@@ -35,6 +37,6 @@ def run(options: argparse.Namespace) -> None:
                 if isinstance(step, Progress):
                     progress.show(step.stage, step.done, step.total)
         benchmarks[name] = step
-    write_json(options.json, to_json_by_object({name: measured.to_json() for name, measured in benchmarks.items()}))
-    for name, measured in benchmarks.items():
-        print(with_heading(name, measured.table()))
+    write_json(options.json, to_json_by_object({name: result.to_json() for name, result in benchmarks.items()}))
+    for name, result in benchmarks.items():
+        print(with_heading(name, result.table()))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`bind RIG.blend MODEL.onnx OUT.blend`: saves a file in which a model, or each model of a folder, plays."""
+"""`bind RIG.blend MODEL.onnx OUT.blend`: saves a file in which a model, or each model of a folder, is bound."""
 
 import argparse
 import os
@@ -17,8 +17,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
     add_rig_options(parser)
     parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
-    parser.add_argument("out", metavar="OUT.blend", type=Path, help="where to save the bound file")
-    parser.add_argument("--use-in-render", action="store_true", help="final renders use the model too, not the rig")
+    parser.add_argument("out", metavar="OUT.blend", type=Path, help="file to save, with the bound model")
+    parser.add_argument(
+        "--use-in-render", action="store_true", help="use the model in final renders too, instead of the rig"
+    )
     add_overwrite_option(parser)
 
 
@@ -33,20 +35,20 @@ def run(options: argparse.Namespace) -> None:
     rigs_and_models = list(open_rigs(options).values())
     for scene_rig, model in rigs_and_models:
         _bind(scene_rig, model, options.use_in_render)
-    copied: dict[Path, Path] = {}
+    models_by_copy: dict[Path, Path] = {}
     try:
         for scene_rig, model in rigs_and_models:
-            model_path = _copy_model_beside(scene_rig, model, options.out)
-            if model_path != model:
-                copied[model_path] = model
+            copy_path = _copy_model_beside(scene_rig, model, options.out)
+            if copy_path != model:
+                models_by_copy[copy_path] = model
         save_copy(options.out)
     except BaseException:
-        for model_path in copied:
+        for copy_path in models_by_copy:
             with suppress(OSError):
-                remove_file(model_path)
+                remove_file(copy_path)
         raise
-    for model_path, model in copied.items():
-        print(f"{model_path}: a copy of {model}, beside the file that plays it")
+    for copy_path, model in models_by_copy.items():
+        print(f"{copy_path}: a copy of {model}, beside the file that plays it")
     for scene_rig, model in rigs_and_models:
         print(f"{options.out}: '{scene_rig.mesh_object.name}' plays {model.name}")
 
@@ -58,14 +60,14 @@ def _bind(scene_rig: "SceneRig", model: Path, use_in_render: bool) -> None:
     from ..runtime.binding import bind
 
     bind(scene_rig, model, use_in_render)
-    # Evaluate now, so that a model that cannot play is an error here.
+    # Evaluate now, so that a model that cannot play raises an error here.
     bpy.context.view_layer.update()
     if scene_rig.mesh_object.fdda.status:
         raise ModelError(scene_rig.mesh_object.fdda.status)
 
 
 def _copy_model_beside(scene_rig: "SceneRig", model: Path, out: Path) -> Path:
-    """Store the model's path relative to the bound file, and copy the model beside it where needed; return its path."""
+    """Copy the model next to the bound file if needed, store its path in the file, and return the path."""
     from ..core.output import atomic_write
     from ..models.entries import bound_entry
     from ..models.model_list import add_bound_model
@@ -75,7 +77,7 @@ def _copy_model_beside(scene_rig: "SceneRig", model: Path, out: Path) -> Path:
     binding = scene_rig.mesh_object.fdda
     add_bound_model(scene_rig.mesh_object)
     entry = bound_entry(scene_rig.mesh_object)
-    # Links may lead out of the folder, so both paths are resolved.
+    # Symbolic links may lead out of the folder, so both paths are resolved.
     entry.path = binding.model = stored_path(out.parent / model_path.resolve().relative_to(out.resolve().parent))
     if model_path.exists():
         return model
@@ -85,10 +87,10 @@ def _copy_model_beside(scene_rig: "SceneRig", model: Path, out: Path) -> Path:
 
 
 def bound_model_path(model: Path, out: Path) -> Path:
-    """Return where the model of a bound file must be, because a bound file follows no path out of its folder.
+    """Return the path that the model of a bound file must have. A bound file loads no model outside of its folder.
 
     Returns:
-        The model itself where it is in the folder or below, else a path in the folder.
+        The path of the model if it is in the folder of the bound file or below, else a path in this folder.
 
     Raises:
         OutputError: another file with that name exists.
@@ -97,11 +99,12 @@ def bound_model_path(model: Path, out: Path) -> Path:
 
     if model.resolve().is_relative_to(out.resolve().parent):
         return model
-    copy = out.parent / model.name
-    if copy.name == out.name:
+    copy_path = out.parent / model.name
+    if copy_path.name == out.name:
         raise OutputError(f"Cannot write '{out}': the copy of the model beside it has that name; give another name.")
-    if os.path.lexists(copy) and not (copy.is_file() and copy.read_bytes() == model.read_bytes()):
+    if os.path.lexists(copy_path) and not (copy_path.is_file() and copy_path.read_bytes() == model.read_bytes()):
         raise OutputError(
-            f"Cannot put the model beside '{out}': there is another '{copy.name}'; remove it or choose another folder."
+            f"Cannot put the model beside '{out}': there is another '{copy_path.name}'; remove it or choose another "
+            "folder."
         )
-    return copy
+    return copy_path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`build-arm OUT.blend`: the example rig."""
+"""`build-arm OUT.blend`: builds the example rig, an arm."""
 
 import argparse
 from pathlib import Path
@@ -8,7 +8,7 @@ from pathlib import Path
 def add_options(parser: argparse.ArgumentParser) -> None:
     from .outputs import add_overwrite_option
 
-    parser.add_argument("out", metavar="OUT.blend", type=Path, help="where to save the rig")
+    parser.add_argument("out", metavar="OUT.blend", type=Path, help="file to save the rig to")
     parser.add_argument(
         "--density", type=int, choices=(1, 2, 3), default=1, help="about 1,450, 10,000 or 50,000 vertices (default 1)"
     )

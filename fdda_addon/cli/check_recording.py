@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`check-recording RECORDING`: checks a recording before training."""
+"""`check-recording RECORDING`: checks a recording for problems before training."""
 
 import argparse
 from pathlib import Path
@@ -9,8 +9,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     from .outputs import add_overwrite_option
 
     parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
-    parser.add_argument("--strict", action="store_true", help="let warnings be errors")
-    parser.add_argument("--json", metavar="OUT.json", type=Path, help="write the warnings")
+    parser.add_argument("--strict", action="store_true", help="treat warnings as errors")
+    parser.add_argument("--json", metavar="OUT.json", type=Path, help="file to write the warnings to")
     add_overwrite_option(parser)
 
 
@@ -18,7 +18,7 @@ def run(options: argparse.Namespace) -> None:
     """Print the warnings, one per line.
 
     Raises:
-        RecordingError: the recording cannot be read, or there are warnings and they are errors.
+        RecordingError: the recording cannot be read, or --strict is given and there are warnings.
         OutputError: the file cannot be written.
     """
     from ..core.checks.recording import check_recording
@@ -40,4 +40,4 @@ def run(options: argparse.Namespace) -> None:
     if options.strict:
         raise_first_warning(warnings)
     if not warnings:
-        print(f"{options.recording}: nothing suspicious was found")
+        print(f"{options.recording}: no problems were found")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`check-trainer`: checks the Python that trains, as the preferences do."""
+"""`check-trainer`: checks the Python that trains, as Check Setup in the preferences does."""
 
 import argparse
 
@@ -8,18 +8,18 @@ from ..training.environment.choice import check_trainer_python
 
 
 def add_options(_parser: argparse.ArgumentParser) -> None:
-    """Declare no options."""
+    """Add no options: the verb has none."""
 
 
 def run(_options: argparse.Namespace) -> None:
     """Print the result of the check.
 
     Raises:
-        TrainerEnvironmentError: it cannot train.
+        TrainerEnvironmentError: the Python cannot train.
     """
-    answer = check_trainer_python()
-    for line in answer.details:
+    result = check_trainer_python()
+    for line in result.details:
         print(line)
-    if answer.level == "ERROR":
-        raise TrainerEnvironmentError(answer.message)
-    print(answer.message)
+    if result.level == "ERROR":
+        raise TrainerEnvironmentError(result.message)
+    print(result.message)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`evaluate RIG.blend MODEL.onnx --json OUT.json`: how far the model is from the rig."""
+"""`evaluate RIG.blend MODEL.onnx --json OUT.json`: measures the distance between the model and its rig."""
 
 import argparse
 from pathlib import Path
@@ -22,19 +22,29 @@ from .target import add_target_options, target_settings
 def add_options(parser: argparse.ArgumentParser) -> None:
     add_rig_options(parser)
     parser.add_argument("model", metavar="MODEL.onnx", type=Path, help="the model, or a folder of models")
-    parser.add_argument("--json", metavar="OUT.json", type=Path, required=True, help="where to write the errors")
+    parser.add_argument("--json", metavar="OUT.json", type=Path, required=True, help="file to write the errors to")
     parser.add_argument(
         "--poses",
         type=int,
         default=EVALUATION_POSES,
-        help=f"number of held-out poses (default {EVALUATION_POSES}), 0 for actions alone",
+        help=f"number of new random poses (default {EVALUATION_POSES}); 0 to compare actions and strips only",
     )
     parser.add_argument(
-        "--seed", type=int, default=EVALUATION_SEED, help=f"of the held-out poses (default {EVALUATION_SEED})"
+        "--seed", type=int, default=EVALUATION_SEED, help=f"random seed of these poses (default {EVALUATION_SEED})"
     )
-    parser.add_argument("--action", action="append", default=[], metavar="NAME", help="compare its frames as well")
     parser.add_argument(
-        "--strip", action="append", default=[], metavar="NAME", help="compare the frames of a strip of the NLA as well"
+        "--action",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="also compare all frames of this action; repeatable",
+    )
+    parser.add_argument(
+        "--strip",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="also compare all frames of this NLA strip; repeatable",
     )
     parser.add_argument(
         "--range-scale",
@@ -42,11 +52,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="X",
-        help="compare at X times the range as well",
+        help="also compare random poses within X times the rotation limits; repeatable",
     )
     add_target_options(parser)
     parser.add_argument(
-        "--heatmap", metavar="OUT.png", type=Path, help="draw rig, linear skinning and model as heat maps"
+        "--heatmap",
+        metavar="OUT.png",
+        type=Path,
+        help="picture to write, with rig, linear skinning and model as heat maps",
     )
     add_overwrite_option(parser)
 
@@ -82,9 +95,9 @@ def run(options: argparse.Namespace) -> None:
             from ..evaluation.pictures import draw_comparison, worst_poses
 
             ((name, (scene_rig, model)),) = rigs.items()
-            true = f"target '{options.target}'" if options.target else "true rig"
+            reference_name = f"target '{options.target}'" if options.target else "true rig"
             poses = worst_poses(evaluations[name].held_out)
-            draw_comparison(scene_rig, model, poses, picture, heat=True, true=true)
+            draw_comparison(scene_rig, model, poses, picture, heat=True, true=reference_name)
         content = to_json_by_object({name: evaluation.to_json() for name, evaluation in evaluations.items()})
         errors.write_text(to_json_text(content), encoding="utf-8")
     for name, evaluation in evaluations.items():
@@ -92,7 +105,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def run_evaluation(scene_rig: SceneRig, model: Path, settings: EvaluationSettings) -> Evaluation:
-    """Evaluate a model with progress on stderr."""
+    """Evaluate a model, and print the progress to stderr."""
     with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
         for step in evaluate(scene_rig, model, settings):
             if isinstance(step, Progress):
@@ -101,17 +114,17 @@ def run_evaluation(scene_rig: SceneRig, model: Path, settings: EvaluationSetting
 
 
 def table(evaluation: Evaluation) -> str:
-    """Format the errors as a text table, in mm."""
-    head = f"{'error in mm':<24}{'mean':>10}{'rms':>10}{'p99':>10}{'p99.9':>10}{'max':>10}"
-    lines = [head, "-" * len(head)]
-    random = [] if any(errors is evaluation.held_out for errors in evaluation.actions) else [evaluation.held_out]
-    for errors in (*random, *evaluation.scaled_ranges, *evaluation.named, *evaluation.actions):
+    """Return the errors as a text table, mm."""
+    heading = f"{'error in mm':<24}{'mean':>10}{'rms':>10}{'p99':>10}{'p99.9':>10}{'max':>10}"
+    lines = [heading, "-" * len(heading)]
+    random_errors = [] if any(errors is evaluation.held_out for errors in evaluation.actions) else [evaluation.held_out]
+    for errors in (*random_errors, *evaluation.scaled_ranges, *evaluation.named, *evaluation.actions):
         values = errors.to_json()
         lines.append(f"{errors.name}, {values['poses']} poses")
         for key, label in (("linear", "  linear skinning"), ("fdda", "  FDDA")):
             row = values[key]
-            figures = "".join(f"{row[name]:>10.4f}" for name in ("mean", "rms", "p99", "p999", "max"))
-            lines.append(f"{label:<24}{figures}")
+            cells = "".join(f"{row[name]:>10.4f}" for name in ("mean", "rms", "p99", "p999", "max"))
+            lines.append(f"{label:<24}{cells}")
         ratios = "".join(
             f"{100 * values['fdda'][name] / max(values['linear'][name], 1e-12):>9.1f}%"
             for name in ("mean", "rms", "p99", "p999", "max")
@@ -123,12 +136,15 @@ def table(evaluation: Evaluation) -> str:
 
 
 def _surface_lines(normals: dict, edges: dict) -> list[str]:
-    """Format errors of normals and of edge lengths, one line each."""
+    """Return a line with the errors of normals, and a line with the errors of edge lengths."""
     angles, lengths = [], []
-    for way, label in (("fdda", "FDDA"), ("linear", "linear skinning")):
-        angle, edge = normals[way], edges[way]
+    for method, label in (("fdda", "FDDA"), ("linear", "linear skinning")):
+        angle, edge = normals[method], edges[method]
         angles.append(f"{label} {angle['mean']:.3f}, p99 {angle['p99']:.2f}")
-        parts = ["-" if edge[part] is None else f"{100 * edge[part]:.3f}" for part in ("inside", "beside", "across")]
+        parts = [
+            "-" if edge[location] is None else f"{100 * edge[location]:.3f}"
+            for location in ("inside", "beside", "across")
+        ]
         ratio = "" if edge["ratio"] is None else f" ({edge['ratio']:.2f} times)"
         lengths.append(f"{label} {' / '.join(parts)}{ratio}")
     return [

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Opening of .blend files, with error messages in place of Blender's reports."""
+"""Opens .blend files, and raises FDDAErrors in place of Blender's reports."""
 
 import argparse
 from pathlib import Path
@@ -12,18 +12,18 @@ from ..scene.scene_rig import SceneRig, find_rig
 
 
 def add_rig_options(parser: argparse.ArgumentParser) -> None:
-    """Declare the rig file and its object."""
+    """Add the argument RIG.blend and the option --object."""
     add_rig_argument(parser)
-    parser.add_argument("--object", default="", metavar="NAME", help="the mesh object, when several have a rig")
+    parser.add_argument("--object", default="", metavar="NAME", help="mesh object to use, if several have a rig")
 
 
 def add_rig_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare the rig file."""
+    """Add the argument RIG.blend."""
     parser.add_argument("rig", metavar="RIG.blend", type=Path, help="the file with the rig")
 
 
 def open_rig(options: argparse.Namespace) -> SceneRig:
-    """Open a .blend file and find its rig.
+    """Open the .blend file of the options, and return its rig.
 
     Raises:
         FDDAError: the file cannot be opened, or has no rig.

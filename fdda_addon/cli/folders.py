@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Folders with a recording or a model for each of several meshes."""
+"""Handles folders that contain a recording or a model for each of several meshes."""
 
 import argparse
 from collections.abc import Sequence
@@ -14,33 +14,33 @@ from .files import open_file
 
 
 def mesh_folders(rigs: Sequence[SceneRig], folder: Path) -> list[tuple[SceneRig, Path]]:
-    """Return the subfolder of each mesh, named after its object.
+    """Return the rigs, each with a subfolder that is named after its mesh object.
 
     Raises:
         OutputError: two subfolders would have the same name.
     """
     names_by_folder: dict[str, str] = {}
-    rigs_and_models = []
+    rigs_and_folders = []
     for scene_rig in rigs:
         name = scene_rig.mesh_object.name
         folder_name = bpy.path.clean_name(name)
         # Some file systems ignore case.
-        if (other := names_by_folder.setdefault(folder_name.lower(), name)) != name:
+        if (other_name := names_by_folder.setdefault(folder_name.lower(), name)) != name:
             raise OutputError(
-                f"'{other}' and '{name}' would both be recorded into '{folder / folder_name}'; rename one of them."
+                f"'{other_name}' and '{name}' would both be recorded into '{folder / folder_name}'; rename one of them."
             )
-        rigs_and_models.append((scene_rig, folder / folder_name))
-    return rigs_and_models
+        rigs_and_folders.append((scene_rig, folder / folder_name))
+    return rigs_and_folders
 
 
 def open_rigs(options: argparse.Namespace) -> dict[str, tuple[SceneRig, Path]]:
-    """Open a file, and find the rig of a model, or the rigs of all models in a folder.
+    """Open the rig file, and find the rig of the model, or the rigs of all models in a folder.
 
     Returns:
-        Rig and model by name of the object; by "" for a single model file.
+        Rig and model, by name of the object. The name is empty for a single model file.
 
     Raises:
-        FDDAError: as `open_rig`; a model has no object name, or the file lacks this object.
+        FDDAError: the file cannot be opened or has no rig, a model has no object name, or its object is missing.
     """
     if not options.model.is_dir():
         open_file(options.rig)
@@ -65,26 +65,30 @@ def open_rigs(options: argparse.Namespace) -> dict[str, tuple[SceneRig, Path]]:
 
 
 def to_json_by_object(values: dict[str, dict]) -> dict:
-    """Return the JSON of values by object name; a single rig has no name."""
+    """Return the JSON of the values of all objects; the value itself of a single rig, which has no name."""
     return values.get("", {"objects": values})
 
 
 def with_heading(name: str, text: str) -> str:
-    """Prefix a text with the name of its rig; a single rig has no name."""
+    """Return a text below a heading with the name of its rig. A single rig has no name, and so no heading."""
     return f"'{name}':\n{text}" if name else text
 
 
 def _find_models_by_object(folder: Path) -> dict[str, Path]:
-    """Find the models in a folder and its subfolders, by name of their object."""
+    """Return the models in a folder and its subfolders, by name of their object."""
     paths = sorted([*folder.glob("*.onnx"), *folder.glob("*/*.onnx")])
     if not paths:
-        raise ModelError(f"The folder '{folder}' holds no model; give one that train made of several recordings.")
-    rigs_and_models: dict[str, Path] = {}
+        raise ModelError(
+            f"The folder '{folder}' contains no model; give a folder that train has written for several recordings."
+        )
+    models_by_object: dict[str, Path] = {}
     for path in paths:
         name = read_model_info(path).object_name
         if not name:
-            raise ModelError(f"'{path}' does not say of which object it is; give it by itself, with --object NAME.")
-        if name in rigs_and_models:
-            raise ModelError(f"'{rigs_and_models[name]}' and '{path}' are both models of '{name}'; remove one of them.")
-        rigs_and_models[name] = path
-    return rigs_and_models
+            raise ModelError(f"'{path}' has no object name; give this file instead of the folder, with --object NAME.")
+        if name in models_by_object:
+            raise ModelError(
+                f"'{models_by_object[name]}' and '{path}' are both models of '{name}'; remove one of them."
+            )
+        models_by_object[name] = path
+    return models_by_object

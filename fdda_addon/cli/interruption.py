@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Handling of Ctrl-C and other stop signals while a verb runs.
+"""Handles Ctrl-C and other stop signals while a verb runs.
 
 Blender catches and prints exceptions in handlers, in update functions of properties and while it registers classes.
-numpy converts an exception during its import to an ImportError. So a signal that arrives there is repeated until the
-verb has left that code.
+numpy converts an exception during its import to an ImportError. A signal that arrives in
+such code is therefore repeated until this code has returned.
 """
 
 import threading
@@ -15,60 +15,60 @@ from types import FrameType
 from ..core.stop_signals import handle_stop_signals, restore_handlers
 
 RETRY_SECONDS = 0.01
-_ADDON = __name__.rsplit(".", 2)[0]
-_MAIN = f"{_ADDON}.cli.main"
-_REGISTRATION_UPDATES_AND_DRAWING = {
-    f"{_ADDON}.{name}" for name in ("registration", "properties.binding", "evaluation.overlay")
+_ADDON_PACKAGE = __name__.rsplit(".", 2)[0]
+_MAIN_MODULE = f"{_ADDON_PACKAGE}.cli.main"
+_FIXED_CALLBACK_MODULES = {
+    f"{_ADDON_PACKAGE}.{name}" for name in ("registration", "properties.binding", "evaluation.overlay")
 }
 
-_called_by_blender: set[str] = set(_REGISTRATION_UPDATES_AND_DRAWING)
-"""Names of modules whose functions Blender calls."""
-_pending = 0
-"""Number of a signal that is delayed, 0 for none."""
+_callback_modules: set[str] = set(_FIXED_CALLBACK_MODULES)
+"""Names of modules with functions that Blender calls."""
+_pending_signal = 0
+"""Number of the delayed signal; 0 without one."""
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise KeyboardInterrupt(signal) for stop signals in the block, as soon as Blender cannot catch it."""
+    """Raise KeyboardInterrupt(signal) for stop signals in the block, as soon as the exception cannot get lost."""
     if threading.current_thread() is not threading.main_thread():
         # Only the main thread can install signal handlers.
         yield
         return
-    global _pending
-    _pending = 0
-    previous = handle_stop_signals(_on_request)
+    global _pending_signal
+    _pending_signal = 0
+    previous_handlers = handle_stop_signals(_on_signal)
     try:
         yield
     finally:
-        restore_handlers(previous)
+        restore_handlers(previous_handlers)
 
 
 def set_callback_modules(modules: Iterable[str]) -> None:
-    """Set the modules whose functions Blender calls, in which no KeyboardInterrupt is raised."""
-    global _called_by_blender
-    _called_by_blender = {*modules} | _REGISTRATION_UPDATES_AND_DRAWING
+    """Set the modules with functions that Blender calls. In these no KeyboardInterrupt is raised."""
+    global _callback_modules
+    _callback_modules = {*modules} | _FIXED_CALLBACK_MODULES
 
 
 def raise_pending() -> None:
-    """Raise the KeyboardInterrupt of a delayed signal, if there is one, after imports."""
-    global _pending
-    if _pending:
-        number, _pending = _pending, 0
-        raise KeyboardInterrupt(number)
+    """Raise the KeyboardInterrupt of a delayed signal, if there is one. Called after imports."""
+    global _pending_signal
+    if _pending_signal:
+        signal_number, _pending_signal = _pending_signal, 0
+        raise KeyboardInterrupt(signal_number)
 
 
-def _repeat() -> None:
-    if _pending:
-        interrupt_main(_pending)
+def _repeat_signal() -> None:
+    if _pending_signal:
+        interrupt_main(_pending_signal)
 
 
-def _on_request(number: int, frame: FrameType | None) -> None:
-    global _pending
-    _pending = number
-    while frame is not None and frame.f_globals.get("__name__") != _MAIN:
+def _on_signal(signal_number: int, frame: FrameType | None) -> None:
+    global _pending_signal
+    _pending_signal = signal_number
+    while frame is not None and frame.f_globals.get("__name__") != _MAIN_MODULE:
         is_import = frame.f_code.co_filename.startswith("<frozen importlib")
-        if is_import or frame.f_globals.get("__name__") in _called_by_blender:
-            timer = threading.Timer(RETRY_SECONDS, _repeat)
+        if is_import or frame.f_globals.get("__name__") in _callback_modules:
+            timer = threading.Timer(RETRY_SECONDS, _repeat_signal)
             timer.daemon = True
             timer.start()
             return

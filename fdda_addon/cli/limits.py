@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`limits RIG.blend OUT.blend --action NAME`: sets the range of motion of a rig from actions."""
+"""`limits RIG.blend OUT.blend --action NAME`: sets the rotation limits of a rig to the motion in actions."""
 
 import argparse
 import math
@@ -12,13 +12,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     from .outputs import add_overwrite_option
 
     add_rig_options(parser)
-    parser.add_argument("out", metavar="OUT.blend", type=Path, help="where to save the file with the limits")
-    parser.add_argument("--action", action="append", required=True, metavar="NAME", help="an action to measure")
+    parser.add_argument("out", metavar="OUT.blend", type=Path, help="file to save the rig with the limits to")
+    parser.add_argument(
+        "--action",
+        action="append",
+        required=True,
+        metavar="NAME",
+        help="action whose motion sets the limits; repeatable",
+    )
     parser.add_argument(
         "--margin",
         type=float,
         default=DEFAULT_MARGIN,
-        help=f"part of the width of a range that is added at each end (default {DEFAULT_MARGIN})",
+        help=f"ratio of the width of each range to add at both ends (default {DEFAULT_MARGIN})",
     )
     add_overwrite_option(parser)
 
@@ -40,5 +46,5 @@ def run(options: argparse.Namespace) -> None:
     save_copy(options.out)
     for line in describe_limits(scene_rig.armature_object, limits):
         print(line)
-    bones = len({limit.bone for limit in limits if not limit.reason_unset})
-    print(f"{options.out}: '{scene_rig.armature_object.name}' states the ranges of {bones} bones")
+    bone_count = len({limit.bone for limit in limits if not limit.reason_unset})
+    print(f"{options.out}: set the limits of {bone_count} bones of '{scene_rig.armature_object.name}'")

@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line of the add-on, which runs a verb.
+"""The command line of the add-on: parses the arguments and runs a verb.
 
-Exit status: 0 done, 1 failed with one sentence on stderr, 2 wrong usage, 75 failed because of the machine (disk,
-memory, a killed process), so that the command may work later, 130 interrupted.
+Exit status:
+- 0: success.
+- 1: failure, with one sentence on stderr.
+- 2: wrong usage.
+- 75: failure of the machine (disk, memory, a killed process); the same command may succeed later.
+- 130: interrupted.
 """
 
 import argparse
@@ -16,20 +20,20 @@ from .interruption import interruptible
 
 VERBS = {
     "build-arm": ("build_arm", "build the example rig: an arm with a hand"),
-    "limits": ("limits", "set the range of motion of a rig from actions"),
-    "record": ("record", "record random poses of a rig and their residuals"),
+    "limits": ("limits", "set the rotation limits of a rig to the motion in actions"),
+    "record": ("record", "record how a rig deforms its mesh in random poses and actions"),
     "merge-recordings": ("merge_recordings", "join the shards of a recording"),
-    "check-recording": ("check_recording", "say what is suspicious about a recording"),
-    "check-trainer": ("check_trainer", "say whether the Python that trains has what it needs, and on which device"),
+    "check-recording": ("check_recording", "check a recording for problems before training"),
+    "check-trainer": ("check_trainer", "check the Python that trains, and show its device"),
     "train": ("train", "train a model on a recording"),
-    "bind": ("bind", "let a model play in place of a rig"),
-    "evaluate": ("evaluate", "compare a model with its rig on poses that training never saw"),
-    "benchmark": ("benchmark", "time a whole frame of rig, linear skinning and model"),
+    "bind": ("bind", "save a file in which a model replaces the modifiers of a rig"),
+    "evaluate": ("evaluate", "compare a model with its rig on poses that are in no recording"),
+    "benchmark": ("benchmark", "measure the time per frame of rig, linear skinning and model"),
     "farm": ("farm", "record, train and bind many characters on many machines"),
-    "bake": ("bake", "write an action as the model shows it, to play without the add-on"),
+    "bake": ("bake", "write the deformed mesh of an action to a file that plays without the add-on"),
 }
 SUBPROCESS_VERBS = {"train", "farm"}
-"""Verbs whose options are parsed by the process that they start."""
+"""Verbs that start another process, which parses their options."""
 VERBS_WITHOUT_BLENDER = {"merge-recordings"}
 """Verbs that need no Blender."""
 
@@ -60,7 +64,7 @@ def _run(arguments: list[str], program: str) -> int:
     for name, (module_name, summary) in VERBS.items():
         subparser = verbs.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
         if name == verb and verb not in SUBPROCESS_VERBS:
-            # Other verbs are not imported, so that a verb starts fast.
+            # The modules of other verbs are not imported, so that the verb starts fast.
             import_module(f".{module_name}", __package__).add_options(subparser)
     try:
         if verb in SUBPROCESS_VERBS:
@@ -76,7 +80,7 @@ def _run(arguments: list[str], program: str) -> int:
             module.run(options)
         return 0
     except SystemExit as usage:
-        # A wrong option must not end Blender.
+        # argparse raises SystemExit for a wrong option, which must not end Blender.
         return int(usage.code or 0)
     except FDDAError as error:
         status = exit_status(error)

@@ -8,9 +8,9 @@ from pathlib import Path
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "shards", metavar="SHARD", type=Path, nargs="+", help="folders that record --shard made, in any order"
+        "shards", metavar="SHARD", type=Path, nargs="+", help="folders that record --shard has written, in any order"
     )
-    parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording that they make")
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder to write the merged recording to")
 
 
 def run(options: argparse.Namespace) -> None:

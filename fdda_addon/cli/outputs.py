@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The option `--overwrite` for outputs that `core.output.check_outputs` refuses."""
+"""Adds the option `--overwrite`, for outputs that `core.output.check_outputs` refuses to overwrite."""
 
 import argparse
 
 
 def add_overwrite_option(parser: argparse.ArgumentParser) -> None:
-    """Declare `--overwrite`."""
+    """Add the option --overwrite."""
     parser.add_argument(
         "--overwrite",
         action="store_true",
-        help="overwrite input files and files of another kind",
+        help="allow overwriting of input files and of files of another kind",
     )

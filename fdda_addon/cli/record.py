@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`record RIG.blend RECORDING`: records random poses and their residuals, or adds poses where a model is worst.
+"""`record RIG.blend RECORDING`: records how a rig deforms its mesh, or adds poses at the worst errors of a model.
 
-With `--all`, or with several `--object`, the meshes share the poses, each with a recording of its own in the folder.
+With `--all`, or with several `--object`, all meshes are recorded in the same poses, each into a subfolder of RECORDING.
 """
 
 import argparse
@@ -29,93 +29,108 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME",
-        help="the mesh object, when several have a rig; given several times, each is recorded into a folder of its own",
+        help="mesh object to record, if several have a rig; repeatable, each with a subfolder of RECORDING",
     )
     parser.add_argument(
         "--all",
         action="store_true",
-        help="record every mesh that an armature deforms, each into a folder of its own in RECORDING",
+        help="record all meshes that an armature deforms, each into a subfolder of RECORDING",
     )
     parser.add_argument("recording", metavar="RECORDING", type=Path, help="folder of the recording")
     parser.add_argument(
         "--poses", type=int, help=f"number of random poses (default {POSES}, with --refine {REFINEMENT_POSES})"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the random poses (default 0)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of the poses (default 0)")
     parser.add_argument(
         "--spread",
         type=float,
         default=SPREAD,
-        help=f"standard deviation as a part of half the range (default {SPREAD})",
+        help=f"how far random poses spread over the limits, from their middle (default {SPREAD})",
     )
     parser.add_argument(
         "--margin",
         type=float,
         default=MARGIN,
         metavar="F",
-        help="draw a quarter of the random poses from F times the range of motion, locked axes turned too, for a model "
-        f"that knows what is beyond; 1 for none (default {MARGIN:g})",
-    )
-    parser.add_argument("--action", action="append", default=[], metavar="NAME", help="record its frames as well")
-    parser.add_argument(
-        "--strip", action="append", default=[], metavar="NAME", help="record the frames of a strip of the NLA as well"
+        help="take a quarter of the random poses from limits wider by this factor, and rotate locked axes too, "
+        f"so that the model stays accurate beyond the limits; 1 to stay within the limits (default {MARGIN:g})",
     )
     parser.add_argument(
-        "--mirror", action="store_true", help="record the frames of actions and strips a second time, mirrored"
+        "--action",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="also record all frames of this action; repeatable",
+    )
+    parser.add_argument(
+        "--strip",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="also record all frames of this NLA strip; repeatable",
+    )
+    parser.add_argument(
+        "--mirror",
+        action="store_true",
+        help="record the frames of actions and strips a second time, with left and right swapped",
     )
     parser.add_argument(
         "--sample",
         action="append",
         default=[],
         metavar="WHAT",
-        help="what the random poses move, in place of the bones that have weights: collection:NAME, action:NAME (what "
-        "it keys, in its range), bone:NAME or selected; may be given several times",
+        help="bones that random poses move, instead of the deforming bones: collection:NAME, action:NAME (the bones "
+        "that the action keys, in the ranges that it uses), bone:NAME or selected; repeatable",
     )
     parser.add_argument(
         "--control",
         action="append",
         default=[],
         metavar="NAME[=LOW:HIGH]",
-        help="a number that deforms the mesh beside the joints: the name of a shape key, shape_keys for all of them, "
-        "or OWNER/PATH; those that drivers of the mesh read are found by themselves; may be given several times",
+        help="extra input of the model besides bones: the name of a shape key, shape_keys for all shape keys, or "
+        "OWNER/PATH; inputs that drivers of the mesh read are detected automatically; repeatable",
     )
     parser.add_argument(
         "--fit-linear",
         choices=("hard", "smooth"),
         default="",
-        help="fit the skin weights of linear skinning to the poses: one joint a vertex, or at most four",
+        help="fit the skin weights of linear skinning to the poses: one bone per vertex, or at most four (smooth)",
     )
     parser.add_argument(
         "--min-partition-vertices",
         type=int,
         default=MIN_PARTITION_VERTICES,
         metavar="N",
-        help=f"merge partitions of fewer vertices into others, 0 for none (default {MIN_PARTITION_VERTICES})",
+        help=f"merge body parts with fewer vertices into a neighbor; 0: none (default {MIN_PARTITION_VERTICES})",
     )
-    parser.add_argument("--resume", action="store_true", help="continue what was interrupted; nothing is done twice")
-    parser.add_argument(
-        "--overwrite", action="store_true", help="replace the recording that is in the folder, whole or damaged"
-    )
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted recording")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing recording, even if it is damaged")
     parser.add_argument(
         "--shard",
         type=_parse_shard,
         metavar="K/N",
-        help="record part K of N of the poses; all parts, joined by merge-recordings, are the recording of one run",
+        help="record only part K of N of the poses; merge-recordings joins all parts to one recording",
     )
     parser.add_argument(
-        "--detect-influences", action="store_true", help="find which joints move what, once for all shards; no poses"
+        "--detect-influences",
+        action="store_true",
+        help="only detect which joints influence which partitions, once for all shards",
     )
     parser.add_argument(
-        "--influences", metavar="FOLDER", type=Path, help="take them from what --detect-influences made of the same rig"
+        "--influences",
+        metavar="FOLDER",
+        type=Path,
+        help="use the influences in this folder, which --detect-influences has written for the same rig",
     )
     add_target_options(parser)
     add_repeatability_option(parser)
     parser.add_argument(
-        "--refine", metavar="MODEL.onnx", type=Path, help="add poses to the recording where this model is worst"
+        "--refine", metavar="MODEL.onnx", type=Path, help="add poses at the worst errors of this model to the recording"
     )
 
 
 def _parse_shard(text: str) -> tuple[int, int]:
-    """Parse number and count of a shard such as "2/8".
+    """Parse index and count of a shard, such as "2/8".
 
     Raises:
         argparse.ArgumentTypeError: the text is invalid.
@@ -141,7 +156,7 @@ def run(options: argparse.Namespace) -> None:
 
     if (options.poses or 0) < 0 or options.seed < 0 or options.min_partition_vertices < 0:
         raise WrongUsageError("--poses, --seed and --min-partition-vertices must be 0 or more.")
-    # Wider is uniform already, and most draws would fall outside and be drawn again.
+    # At 10 the distribution is uniform. Above, most values would lie outside of the range and be drawn again.
     if not 0 < options.spread <= 10:
         raise WrongUsageError("--spread must be more than 0 and at most 10.")
     if not 1 <= options.margin <= MAX_MARGIN:
@@ -196,12 +211,14 @@ def run(options: argparse.Namespace) -> None:
                     print(line)
             if repeatability := read_info(index).repeatability:
                 print(repeatability.sentence())
-        done = "influences" if options.detect_influences else f"{step.total} poses{' added' if options.refine else ''}"
-        print(f"{recording}: {done} in {seconds:.1f} s")
+        result_text = (
+            "influences" if options.detect_influences else f"{step.total} poses{' added' if options.refine else ''}"
+        )
+        print(f"{recording}: {result_text} in {seconds:.1f} s")
 
 
 def _find_rigs(options: argparse.Namespace) -> "list[tuple[SceneRig, Path]]":
-    """Find the meshes to record, each with the folder of its recording."""
+    """Return the rigs to record, each with the folder of its recording."""
     from ..scene.scene_rig import find_rig, find_rigs
     from .folders import mesh_folders
 

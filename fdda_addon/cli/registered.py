@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Registration of the add-on while a verb runs in Blender."""
+"""Registers the add-on while a verb runs in Blender."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +10,7 @@ from .interruption import raise_pending, set_callback_modules
 
 @contextmanager
 def registered() -> Iterator[None]:
-    """Register the add-on inside of the block; it stays registered where Blender had enabled it."""
+    """Register the add-on for a `with` block. It stays registered if it was before."""
     was_registered = registration.is_registered()
     registration.register()
     set_callback_modules(handler.__module__ for _, handler in registration.handler_table())

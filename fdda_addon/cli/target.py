@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Options of a target, an object whose surface is recorded in place of the rig's own."""
+"""Options of a target object, whose surface is recorded instead of that of the rig's mesh."""
 
 import argparse
 import math
@@ -14,51 +14,51 @@ if TYPE_CHECKING:
 
 
 def add_repeatability_option(parser: argparse.ArgumentParser) -> None:
-    """Declare `--repeatability-poses`."""
+    """Add the option --repeatability-poses."""
     parser.add_argument(
         "--repeatability-poses",
         type=int,
         default=REPEATABILITY_POSES,
         metavar="N",
-        help="approach N of the poses that settle, or of the frames of actions, from another direction as well, to say "
-        f"how close a model of a simulation can come (default {REPEATABILITY_POSES})",
+        help="show N settled poses or frames of actions again, coming from another pose, to measure how closely a "
+        f"simulation repeats its shape (default {REPEATABILITY_POSES})",
     )
 
 
 def add_target_options(parser: argparse.ArgumentParser) -> None:
-    """Declare `--target` and its settings."""
+    """Add the option --target and the options of its settings."""
     parser.add_argument(
         "--target",
         default="",
         metavar="OBJECT",
-        help="the surface is what this object shows, which has the same vertices: a copy with other modifiers, a "
-        "cache, a simulation",
+        help="record the surface of this object instead; it has the same vertices, and may be a copy with other "
+        "modifiers, a point cache or a simulation",
     )
     parser.add_argument(
         "--pre-roll",
         type=int,
         default=0,
         metavar="N",
-        help="let a simulated target go from the rest pose to the first frame of an action in the N frames before it",
+        help="N frames before an action in which a simulated target moves from the rest pose to the first frame",
     )
     parser.add_argument(
         "--max-settle-frames",
         type=int,
         default=0,
         metavar="N",
-        help="hold each random pose until a simulated target is at rest, for N frames at most",
+        help="hold each random pose for up to N frames, until a simulated target comes to rest",
     )
     parser.add_argument(
         "--rest-threshold-mm",
         type=float,
         default=REST_THRESHOLD_MM,
         metavar="X",
-        help=f"at rest is a target of which no vertex moves by more mm a frame (default {REST_THRESHOLD_MM})",
+        help=f"a target is at rest if no vertex moves more than X mm per frame (default {REST_THRESHOLD_MM})",
     )
 
 
 def target_settings(options: argparse.Namespace) -> "TargetSettings":
-    """Make the settings of the target from the options.
+    """Return the settings of the target from the options.
 
     Raises:
         WrongUsageError: the options are invalid.
@@ -75,7 +75,7 @@ def target_settings(options: argparse.Namespace) -> "TargetSettings":
             "more than 0."
         )
     if (options.pre_roll or options.max_settle_frames) and not options.target:
-        raise WrongUsageError("--pre-roll and --max-settle-frames are about a target; give --target OBJECT.")
+        raise WrongUsageError("--pre-roll and --max-settle-frames need a target; give --target OBJECT.")
     return TargetSettings(
         options.target, options.pre_roll, options.max_settle_frames, options.rest_threshold_mm, repeatability_poses
     )
@@ -84,7 +84,7 @@ def target_settings(options: argparse.Namespace) -> "TargetSettings":
 def requested_poses(scene_rig: "SceneRig", options: argparse.Namespace) -> int | None:
     """Return the number of random poses; None for the default.
 
-    A target that depends on frames has no random poses where actions or strips are given.
+    A target that depends on the frame has no random poses by default if actions or strips are given.
     """
     from ..core.recording.target import POSE
     from ..rig.target import find_target

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`train RECORDING MODEL.onnx …`: starts the trainer with its own options in the Python that has torch.
+"""`train RECORDING MODEL.onnx …`: starts the trainer, which parses the options, in the Python that has torch.
 
 RECORDING may be a folder of recordings; then MODEL.onnx is a folder of models. With `--refine RIG.blend` the verb adds
-poses where the model is worst and trains again, while the goal is missed and more poses help.
+poses at the worst errors and continues the training, until the goal is met or more poses no longer help.
 """
 
 import argparse
@@ -38,19 +38,24 @@ def run(arguments: list[str]) -> int:
     options, trainer_arguments = parser.parse_known_args(arguments)
     if options.refine is None:
         if options.object or options.poses is not None:
-            raise WrongUsageError("--object and --poses say how to refine; give --refine RIG.blend with them.")
+            raise WrongUsageError("--object and --poses are options of --refine; give --refine RIG.blend too.")
         return _train(trainer_arguments)[0]
     return _train_to_goal(trainer_arguments, options)
 
 
 def _refinement_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("train", usage=argparse.SUPPRESS, add_help=False, allow_abbrev=False)
-    group = parser.add_argument_group("until the accuracy goal is met, with --goal-mm")
+    group = parser.add_argument_group("options to train until the accuracy goal (--goal-mm) is met")
     group.add_argument(
-        "--refine", metavar="RIG.blend", type=Path, help="add poses of this rig where the model is worst, and train on"
+        "--refine",
+        metavar="RIG.blend",
+        type=Path,
+        help="add poses of this rig at the worst errors, and continue the training",
     )
-    group.add_argument("--object", default="", metavar="NAME", help="the mesh object, when several have a rig")
-    group.add_argument("--poses", type=int, metavar="N", help=f"poses to add each time (default {REFINEMENT_POSES})")
+    group.add_argument("--object", default="", metavar="NAME", help="mesh object to use, if several have a rig")
+    group.add_argument(
+        "--poses", type=int, metavar="N", help=f"number of poses to add in each round (default {REFINEMENT_POSES})"
+    )
     return parser
 
 
@@ -82,7 +87,7 @@ def _train(arguments: list[str]) -> tuple[int, dict]:
 
 
 def _finished_line(values: dict) -> str:
-    """Describe a trained model."""
+    """Return a line about a trained model."""
     return f"{values['model']}: trained in {values['seconds']:.1f} s, held-out error {values['held_out_mm']:.4f} mm"
 
 
@@ -91,27 +96,27 @@ def _train_to_goal(arguments: list[str], options: argparse.Namespace) -> int:
     if len(arguments) < 2 or any(argument.startswith("-") for argument in arguments[:2]):
         raise WrongUsageError("With --refine, give RECORDING and MODEL.onnx before the training settings.")
     if not any(argument.partition("=")[0] == GOAL for argument in arguments):
-        raise WrongUsageError(f"--refine trains until an accuracy goal is met; say which with {GOAL}.")
+        raise WrongUsageError(f"--refine trains until an accuracy goal is met; give the goal with {GOAL}.")
     recording, model = map(Path, arguments[:2])
     if recordings_in(recording):
         raise WrongUsageError(
             f"--refine takes one mesh, and '{recording}' holds recordings of several; give one of them, its model and "
             "--object NAME."
         )
-    # A training that refines nothing needs no Blender.
+    # Imported here, because a training without refinement needs no Blender.
     from .registered import registered
 
     with registered():
-        # Open the rig first, so that a wrong path or object is an error at once.
+        # Open the rig now, so that a wrong path or object raises an error before the training.
         _open_rig(options)
         for round_index in range(MAX_ROUNDS):
             if round_index:
                 _refine(recording, model, options, round_index)
-            warm = [WARM_START] if round_index and WARM_START not in arguments else []
-            status, values = _train([*arguments, *warm])
+            warm_start_option = [WARM_START] if round_index and WARM_START not in arguments else []
+            status, values = _train([*arguments, *warm_start_option])
             if status or values.get("verdict") != Verdict.MISSED.value:
                 return status
-    print(f"The goal is not met after {MAX_ROUNDS} rounds; run the command again with {WARM_START} to go on.")
+    print(f"The goal is not met after {MAX_ROUNDS} rounds; run the command again with {WARM_START} to continue.")
     return 0
 
 
@@ -132,4 +137,4 @@ def _refine(recording: Path, model: Path, options: argparse.Namespace, round_ind
     with ProgressPrinter() as progress, model_disabled(scene_rig.mesh_object):
         for step in refine(scene_rig, recording, model, RefinementSettings(seed=round_index, **pose_options)):
             progress.show(step.stage, step.done, step.total)
-    print(f"{recording}: {step.total} poses added where the model is worst")
+    print(f"{recording}: added {step.total} poses at the worst errors of the model")

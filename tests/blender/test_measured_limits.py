@@ -239,7 +239,7 @@ def test_command_line(tmp_path, capsys):
     bpy.ops.wm.save_as_mainfile(filepath=str(source))
     assert run("limits", source, out, "--action", WAVE, "--margin", "0") == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[-1] == f"{out}: 'figure_rig' states the ranges of 3 bones"
+    assert lines[-1] == f"{out}: set the limits of 3 bones of 'figure_rig'"
     assert "spine: moves X 0.0 to 20.0 mm, moves Y 0.0 to 49.9 mm, turns X 0.0 to 5.7°, turns Y 0.0 to 22.9°" in lines
     assert "arm.R: turns X 0.0 to 17.1°, turns Y 0.0 to 5.7°, scales Y 1.00 to 1.10" in lines
     bpy.ops.wm.open_mainfile(filepath=str(out))

@@ -59,7 +59,7 @@ def test_nothing_is_suspicious_about_the_arm(tmp_path, capsys):
     assert run("record", tmp_path / "arm.blend", tmp_path / "recording", "--poses", 300) == 0
     capsys.readouterr()
     assert run("check-recording", tmp_path / "recording", "--strict") == 0
-    assert capsys.readouterr().out == f"{tmp_path / 'recording'}: nothing suspicious was found\n"
+    assert capsys.readouterr().out == f"{tmp_path / 'recording'}: no problems were found\n"
 
 
 def test_an_armature_beside_its_mesh(tmp_path):

@@ -158,7 +158,7 @@ def test_training_until_a_target_is_met(elbow, recording, tmp_path, capfd):
     read, info = read_recording(recording), read_model_info(model)
     added = [s.poses for s in read.info.sampling.sources if s.kind == REFINED]
     assert added and set(added) == {40}
-    assert f"{recording}: 40 poses added where the model is worst" in out.out
+    assert f"{recording}: added 40 poses at the worst errors of the model" in out.out
     assert ("The goal is met" in out.err) == (info.held_out_mm["p999"] <= reached / 2)
     assert info.training["warm_start"] and info.training["training_poses"] == len(read.pose_matrices) - 15 - 8
 
@@ -166,7 +166,7 @@ def test_training_until_a_target_is_met(elbow, recording, tmp_path, capfd):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--refine", "RIG"], "say which with --goal-mm"),
+        (["--refine", "RIG"], "give the goal with --goal-mm"),
         (["--object", "elbow"], "give --refine RIG.blend with them"),
     ],
 )

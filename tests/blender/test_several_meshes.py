@@ -248,7 +248,7 @@ def test_a_model_of_an_object_that_is_not_there(two, tmp_path, capfd):
 def test_folders_that_are_not_what_is_asked_for(two, tmp_path, capfd):
     refuse = Refusal(tmp_path, capfd)
     (tmp_path / "empty").mkdir()
-    assert "holds no model" in refuse("bind", two.rig, tmp_path / "empty", tmp_path / "b.blend")
+    assert "contains no model" in refuse("bind", two.rig, tmp_path / "empty", tmp_path / "b.blend")
     assert "give a folder for the models" in refuse("train", two.recordings, tmp_path / "m.onnx")
     sentence = refuse("evaluate", two.rig, two.models, "--json", tmp_path / "e.json", "--object", "hat")
     assert f"'{two.models}' has no model of 'hat'; it has those of 'elbow', 'sleeve'." in sentence
