@@ -20,7 +20,7 @@ spec.loader.exec_module(windows_run)
 @pytest.mark.parametrize("small", (True, False))
 @pytest.mark.parametrize("line", windows_run.PYTHONS)
 def test_files_that_the_script_runs_exist(line: str, small: bool):
-    paths = [arguments[0] for _, arguments in windows_run.parts(line, small)]
+    paths = [arguments[0] for _, arguments in windows_run.process_arguments(line, small)]
     assert len(paths) > 1 and [path for path in paths if not (ROOT / path).exists()] == []
 
 
@@ -39,7 +39,7 @@ def test_outcomes_in_the_report_are_counted(tmp_path: Path):
     report = tmp_path / "report.xml"
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--junit-xml={report}", test_file]
     assert subprocess.run(command, cwd=tmp_path, capture_output=True, check=False).returncode == 1
-    counts, failed = windows_run.outcome(report)
+    counts, failed = windows_run.read_outcomes(report)
     assert counts == {"passed": 1, "failed": 2, "skipped": 1}
     assert failed == ("test_it::test_fails[a - b]", "test_it::test_errs")
 

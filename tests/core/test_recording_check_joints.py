@@ -84,11 +84,13 @@ def test_controls_that_change_nothing_are_reported(clean_recording):
     )
 
 
-def with_additional_joint(recording: Recording, joint: Joint, local: np.ndarray, is_sampled: bool = True) -> Recording:
+def with_additional_joint(
+    recording: Recording, joint: Joint, local_transforms: np.ndarray, is_sampled: bool = True
+) -> Recording:
     """Return the recording with one additional joint that has no weights.
 
     Args:
-        local: (N, 4, 4) transforms of the joint relative to its rest pose.
+        local_transforms: (N, 4, 4) transforms of the joint relative to its rest pose.
         is_sampled: whether the joint has a channel of random poses.
     """
     rig = recording.rig
@@ -98,7 +100,7 @@ def with_additional_joint(recording: Recording, joint: Joint, local: np.ndarray,
         recording.pose_matrices[:, joint.parent]
         @ np.linalg.inv(rest_matrices[joint.parent])
         @ rest_matrices[-1]
-        @ local
+        @ local_transforms
     )
     matrices = np.concatenate([recording.pose_matrices, joint_matrices[:, None]], axis=1).astype(np.float32)
     sampling = recording.info.sampling

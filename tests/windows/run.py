@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`python tests/windows/run.py [--small] [5.2|4.5 ...]`: run tests in Python for Windows, under Wine.
+"""`python tests/windows/run.py [--small] [5.2|4.5 ...]`: run the tests in Python for Windows, under Wine.
 
-`setup/windows/setup` makes what this needs. Each file of the Blender tier runs in a process of its own: one that ends
-Blender does not end the others. The other tiers run in a process each. Their output goes to out/windows. The last lines
-are the counts of each tier and the tests that failed.
+`setup/windows/setup` creates the environment for it. Each file of the Blender tier runs in a separate process, because
+a crash of Blender must not end the other files. Each other tier runs in one process. The output is in out/windows. The
+last lines are the counts of each tier and the tests that failed.
 
-Exit status: 0 all passed, 1 some did not, 2 wrong usage, 3 with --small: Windows is not set up, nothing was run.
+Exit status: 0 all tests passed, 1 some tests failed, 2 wrong usage, 3 nothing was run, because with --small Windows is
+not set up.
 """
 
 import argparse
@@ -21,15 +22,15 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parents[2]
-RUN = ROOT / "setup" / "windows" / "run"
-OUT = ROOT / "out" / "windows"
+RUN_SCRIPT = ROOT / "setup" / "windows" / "run"
+OUTPUT_FOLDER = ROOT / "out" / "windows"
 PYTHONS = {"5.2": "3.13", "4.5": "3.11"}
-SECONDS = 1200
-"""What a process may take; on a quiet machine with 2 cores the longest takes a third of it."""
-NO_TESTS = 5
-"""The exit status of pytest where no test is for this platform."""
-OUTCOMES = {"error": "failed", "failure": "failed", "skipped": "skipped"}
-"""What a test has in a report of pytest's, and the word for it here; one without any has passed."""
+PROCESS_TIMEOUT_SECONDS = 1200
+"""Time limit of a process; on an idle machine with 2 cores the longest process takes a third of it."""
+NO_TESTS_STATUS = 5
+"""Exit status of pytest if a file has no test for this platform."""
+OUTCOME_BY_TAG = {"error": "failed", "failure": "failed", "skipped": "skipped"}
+"""Outcome of a test by its XML tag in the report of pytest; a test without these tags has passed."""
 
 # Of the Blender tier: writing, training, playing and rendering. The others show nothing more about Windows.
 BLENDER = (
@@ -70,17 +71,24 @@ sys.argv[1:] = ["is-current", sys.prefix, "everything"]
 runpy.run_path("setup/environment.py", run_name="__main__")
 """
 
-# What fails because of Wine, with the reason. On Windows these should pass.
+# Tests that fail because of Wine, with the reason. They should pass on Windows.
 _CTRL_BREAK = "Wine does not send Ctrl-Break to the group of another process."
-OF_WINE: dict[str, str] = {
+FAILURES_OF_WINE: dict[str, str] = {
     "tests/blender/test_command_process.py::test_an_interrupted_recording_resumes": _CTRL_BREAK,
     "tests/blender/test_command_process.py::test_an_interrupted_training_leaves_neither_model_nor_trainer": _CTRL_BREAK,
 }
 
 
 @dataclass(frozen=True)
-class Result:
-    """What a process of pytest came to."""
+class ProcessResult:
+    """The outcome of one process of pytest.
+
+    Attributes:
+        line: LTS line of Blender.
+        tier: name of the tier.
+        counts: numbers of tests by outcome.
+        failed: names of the tests that failed.
+    """
 
     line: str
     tier: str
@@ -88,7 +96,7 @@ class Result:
     failed: tuple[str, ...]
 
 
-def parts(line: str, small: bool) -> Iterator[tuple[str, tuple[str, ...]]]:
+def process_arguments(line: str, small: bool) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield the tier and the arguments of pytest for each process on an LTS line."""
     if small:
         yield from SMALL.items()
@@ -102,64 +110,76 @@ def parts(line: str, small: bool) -> Iterator[tuple[str, tuple[str, ...]]]:
         yield "trainer", ("tests/trainer",)
 
 
-def run(line: str, tier: str, arguments: tuple[str, ...]) -> Result:
-    """Run pytest in the Python of `line` and print a line about it."""
-    log = OUT / line / f"{Path(arguments[0]).stem}.log"
-    report = log.with_suffix(".xml")
-    log.parent.mkdir(parents=True, exist_ok=True)
-    report.unlink(missing_ok=True)
+def run_process(line: str, tier: str, arguments: tuple[str, ...]) -> ProcessResult:
+    """Run pytest in the Python of an LTS line and print a line with the counts."""
+    log_path = OUTPUT_FOLDER / line / f"{Path(arguments[0]).stem}.log"
+    report_path = log_path.with_suffix(".xml")
+    log_path.parent.mkdir(parents=True, exist_ok=True)
+    report_path.unlink(missing_ok=True)
     options = ["-q", "--tb=short", "-p", "no:cacheprovider", "-m", "not slow"]
-    options += [f"--junit-xml={report.relative_to(ROOT)}", *(f"--deselect={test}" for test in OF_WINE)]
-    command = ["timeout", "--kill-after=10", str(SECONDS), RUN, PYTHONS[line], "-m", "pytest", *arguments, *options]
+    options += [f"--junit-xml={report_path.relative_to(ROOT)}", *(f"--deselect={test}" for test in FAILURES_OF_WINE)]
+    command = [
+        "timeout",
+        "--kill-after=10",
+        str(PROCESS_TIMEOUT_SECONDS),
+        RUN_SCRIPT,
+        PYTHONS[line],
+        "-m",
+        "pytest",
+        *arguments,
+        *options,
+    ]
     environment = {**os.environ, "PYTHONUTF8": "1"}
-    environment.pop("FDDA_TRAINER_PYTHON", None)  # that of Linux
-    begin = time.monotonic()
-    with log.open("wb") as file:
-        status = subprocess.run(command, cwd=ROOT, env=environment, stdout=file, stderr=file, check=False).returncode
-    counts, failed = outcome(report) if report.is_file() else (Counter(), ())
-    if status not in (0, NO_TESTS) and not failed:
+    environment.pop("FDDA_TRAINER_PYTHON", None)  # is a Python of Linux
+    start_time = time.monotonic()
+    with log_path.open("wb") as log_file:
+        status = subprocess.run(
+            command, cwd=ROOT, env=environment, stdout=log_file, stderr=log_file, check=False
+        ).returncode
+    counts, failed = read_outcomes(report_path) if report_path.is_file() else (Counter(), ())
+    if status not in (0, NO_TESTS_STATUS) and not failed:
         counts["failed"] += 1
-        failed = (f"{arguments[0]}: the process ended with status {status}, see {log.relative_to(ROOT)}",)
-    told = ", ".join(f"{number} {word}" for word, number in counts.items()) or "nothing"
-    print(f"{line}  {arguments[0]:<45} {told}  ({time.monotonic() - begin:.0f} s)", flush=True)
-    return Result(line, tier, counts, failed)
+        failed = (f"{arguments[0]}: the process ended with status {status}, see {log_path.relative_to(ROOT)}",)
+    summary = ", ".join(f"{number} {word}" for word, number in counts.items()) or "nothing"
+    print(f"{line}  {arguments[0]:<45} {summary}  ({time.monotonic() - start_time:.0f} s)", flush=True)
+    return ProcessResult(line, tier, counts, failed)
 
 
-def outcome(report: Path) -> tuple[Counter, tuple[str, ...]]:
+def read_outcomes(report_path: Path) -> tuple[Counter, tuple[str, ...]]:
     """Return the counts by outcome in a report of pytest's, and the names of the tests that failed."""
     counts, failed = Counter(), []
-    for case in ElementTree.parse(report).iter("testcase"):
-        found = {child.tag for child in case}
-        word = next((word for tag, word in OUTCOMES.items() if tag in found), "passed")
-        counts[word] += 1
-        if word == "failed":
+    for case in ElementTree.parse(report_path).iter("testcase"):
+        tags = {child.tag for child in case}
+        outcome = next((outcome for tag, outcome in OUTCOME_BY_TAG.items() if tag in tags), "passed")
+        counts[outcome] += 1
+        if outcome == "failed":
             failed.append(f"{case.get('classname')}::{case.get('name')}")
     return counts, tuple(failed)
 
 
-def run_line(line: str, small: bool) -> list[Result]:
-    """Run all parts on one LTS line, one after the other."""
-    return [run(line, tier, arguments) for tier, arguments in parts(line, small)]
+def run_line(line: str, small: bool) -> list[ProcessResult]:
+    """Run all processes of one LTS line, one after the other."""
+    return [run_process(line, tier, arguments) for tier, arguments in process_arguments(line, small)]
 
 
-def print_summary(results: list[Result]) -> None:
-    """Print the counts of each tier, then the tests that failed and those that Wine cannot run."""
-    tiers: dict[tuple[str, str], Counter] = {}
+def print_summary(results: list[ProcessResult]) -> None:
+    """Print the counts of each tier, then the tests that failed and the tests that Wine cannot run."""
+    counts_by_tier: dict[tuple[str, str], Counter] = {}
     for result in results:
-        tiers.setdefault((result.line, result.tier), Counter()).update(result.counts)
+        counts_by_tier.setdefault((result.line, result.tier), Counter()).update(result.counts)
     print()
-    for (line, tier), counts in sorted(tiers.items(), reverse=True):
+    for (line, tier), counts in sorted(counts_by_tier.items(), reverse=True):
         print(f"{line}  {tier:<12} {', '.join(f'{number} {word}' for word, number in counts.items())}")
     for result in results:
         for test in result.failed:
             print(f"failed on {result.line}: {test}")
-    for test, reason in OF_WINE.items():
+    for test, reason in FAILURES_OF_WINE.items():
         print(f"not run: {test}: {reason}")
 
 
 def is_set_up(line: str) -> bool:
-    """Whether setup/windows/setup has finished for `line`, with the pins of this tree."""
-    return not subprocess.run([RUN, PYTHONS[line], "-c", IS_CURRENT], cwd=ROOT, capture_output=True).returncode
+    """Return whether setup/windows/setup has finished for an LTS line, with the requirements of this working tree."""
+    return not subprocess.run([RUN_SCRIPT, PYTHONS[line], "-c", IS_CURRENT], cwd=ROOT, capture_output=True).returncode
 
 
 def main() -> int:
@@ -173,7 +193,7 @@ def main() -> int:
     if options.small and not all(map(is_set_up, lines)):
         print("Windows is not tested: it is not set up here, or with other requirements; make test-windows does both.")
         return 3
-    # The lines have a Wine each, and run side by side.
+    # Each line has its own Wine, so the lines run in parallel.
     with ThreadPoolExecutor() as pool:
         results = [result for each in pool.map(lambda line: run_line(line, options.small), lines) for result in each]
     print_summary(results)
