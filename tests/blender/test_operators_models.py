@@ -291,13 +291,13 @@ def test_what_the_section_says_of_the_models(bound, elbow):
 
     bpy.context.view_layer.objects.active = bound
     checks.check_now(find_rig())
-    assert section._problems.compute_now(bound) == {}
+    assert section._problem_values.compute_now(bound) == {}
     bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints[0].max_x += 0.1
     checks.check_now(find_rig())
-    ((icon, sentence),) = section._problems.compute_now(bound).values()
+    ((icon, sentence),) = section._problem_values.compute_now(bound).values()
     assert icon == "INFO" and sentence.startswith("The range of motion of 'lower' has changed")
     bound.fdda.models[0].path = "//away.onnx"
-    ((icon, sentence),) = section._problems.compute_now(bound).values()
+    ((icon, sentence),) = section._problem_values.compute_now(bound).values()
     assert icon == "ERROR" and f"cannot be read: {systems.NOT_FOUND}; find it, or choose another." in sentence
 
 

@@ -233,7 +233,7 @@ def test_cancelled_it_ends_at_once_and_leaves_nothing(user: Path, wheels: Path):
     wait_for(lambda: run.work(0), 10)
     assert process is None or process.poll() is not None
     assert current(ENVIRONMENT) is None and run.state.outcome == session.notice.message
-    assert session.notice.level == "WARNING" and "was canceled; nothing is left of it" in session.notice.message
+    assert session.notice.level == "WARNING" and "was canceled; nothing was kept" in session.notice.message
     assert session.environment_state() is FolderState.MISSING
     assert not bpy.ops.fdda.cancel_trainer_environment.poll()
 
@@ -241,7 +241,7 @@ def test_cancelled_it_ends_at_once_and_leaves_nothing(user: Path, wheels: Path):
 def test_cancelled_before_it_begins_it_leaves_what_is_there(own: Path, wheels: Path):
     job = EnvironmentCreation(own, folder.log_path(), wheels, sys.executable)
     job.cancel()
-    with pytest.raises(TrainerEnvironmentError, match="was canceled; what was there stays"):
+    with pytest.raises(TrainerEnvironmentError, match="was canceled; the previous environment was kept"):
         list(job.steps())
     assert session.environment_state() is FolderState.READY
 
