@@ -35,10 +35,8 @@ class FDDA_OT_preview_pose(PoseOperator, bpy.types.Operator):
 
         rig, session = self.rig(context), context.window_manager.fdda
         start = self.number if self.number >= 0 else session.pose_index
-        index = max(0, start + self.step)
-        show_random_pose(rig, recording_settings(rig), index)
-        session.pose_index = index
-        return f"Random pose {index + 1}."
+        session.pose_index = show_random_pose(rig, recording_settings(rig), max(0, start + self.step))
+        return f"Random pose {session.pose_index + 1}."
 
 
 class FDDA_OT_rest_pose(PoseOperator, bpy.types.Operator):

@@ -24,8 +24,7 @@ def _show_random_pose(session: "FDDA_PG_session", number: int) -> None:
         return
     # If no random pose can be shown, the section Rig shows the reason.
     with suppress(FDDAError):
-        show_random_pose(rig, recording_settings(rig), number - 1)
-        session.pose_index = number - 1
+        session.pose_index = show_random_pose(rig, recording_settings(rig), number - 1)
         undo.push_undo_soon("Preview Pose")
 
 
@@ -66,5 +65,5 @@ def register() -> None:
 
 def unregister() -> None:
     """Undo `register`."""
-    undo.unregister()
+    undo.cancel_push()
     del bpy.types.WindowManager.fdda
