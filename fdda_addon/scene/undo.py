@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Undo steps for changes that Blender adds none for: those that a property of the window manager makes."""
+"""Adds undo steps for changes that Blender adds no step for: those that a property of the window manager makes."""
 
 import bpy
+from bpy.app.handlers import persistent
 
-PUSH_SECONDS = 0.3
-"""A number that is dragged changes many times; all of that is one step."""
+PUSH_DELAY_SECONDS = 0.3
+"""Time without a change before a step is added, because a number that is dragged changes many times."""
 
 _message = ""
 
 
 def push_undo_soon(message: str) -> None:
-    """Add an undo step once no other change has followed for a moment.
+    """Add an undo step when no other change has followed for `PUSH_DELAY_SECONDS`.
 
     Args:
         message: name of the step in Blender's undo history.
@@ -19,19 +20,23 @@ def push_undo_soon(message: str) -> None:
     _message = message
     if bpy.app.background:
         return
-    if bpy.app.timers.is_registered(_push):
-        bpy.app.timers.unregister(_push)
-    bpy.app.timers.register(_push, first_interval=PUSH_SECONDS)
+    cancel_push()
+    bpy.app.timers.register(_push_undo, first_interval=PUSH_DELAY_SECONDS)
 
 
-def _push() -> None:
+def _push_undo() -> None:
     windows = bpy.context.window_manager.windows
     if windows:
         with bpy.context.temp_override(window=windows[0]):
             bpy.ops.ed.undo_push(message=_message)
 
 
-def unregister() -> None:
-    """Add no step any more."""
-    if bpy.app.timers.is_registered(_push):
-        bpy.app.timers.unregister(_push)
+@persistent
+def cancel_push(*_: object) -> None:
+    """Cancel the step that is to be added."""
+    if bpy.app.timers.is_registered(_push_undo):
+        bpy.app.timers.unregister(_push_undo)
+
+
+HANDLERS = {"undo_pre": cancel_push, "redo_pre": cancel_push}
+"""An undo discards the change. A step that is added afterwards would remove the steps that redo needs."""

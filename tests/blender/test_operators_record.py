@@ -21,7 +21,9 @@ from fdda_addon.jobs import job
 from fdda_addon.operators.rig import measured_cost
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.properties.character import model_file
+from fdda_addon.recording.plan import RecordingSettings, make_recording_margin
 from fdda_addon.rig.reading import read_rig
+from fdda_addon.scene import undo
 from fdda_addon.scene.scene_rig import SceneRig
 
 from .conftest import ELBOW, ELBOW_RIG
@@ -173,6 +175,39 @@ class TestPoses:
         bpy.ops.ed.undo_push()
         bpy.ops.ed.undo()
         assert bpy.data.objects[ELBOW_RIG].pose.bones["lower"].rotation_euler[0] == pytest.approx(angle)
+
+    def test_poses_of_the_margin_are_shown_as_they_are_recorded(self, saved):
+        settings = saved.mesh_object.fdda.settings
+        settings.poses, settings.margin = 8, 2.0
+        recording_settings = RecordingSettings(poses=8, margin=2.0)
+        channels = sampled_channels(saved, read_rig(saved))
+        margin = make_recording_margin(saved, recording_settings, channels)
+        bones = saved.armature_object.pose.bones
+        for number, expected_channels in ((5, channels), (6, margin.channels), (7, margin.channels)):
+            bpy.ops.fdda.preview_pose(number=number)
+            shown = [bones[c.name].rotation_euler[c.axis] for c in expected_channels]
+            np.testing.assert_allclose(shown, sample_pose(expected_channels, 0, number), atol=1e-6)
+
+    def test_a_preview_ends_at_the_last_random_pose(self, saved):
+        session = bpy.context.window_manager.fdda
+        saved.mesh_object.fdda.settings.poses = 8
+        bpy.ops.fdda.preview_pose(number=8)
+        assert session.pose_index == 7
+        bpy.ops.fdda.preview_pose(step=1)
+        assert session.pose_index == 7
+        session.preview_pose = 100
+        assert session.preview_pose == 8
+
+    @pytest.mark.parametrize("operator", ["undo", "redo"])
+    def test_an_undo_cancels_the_step_that_is_to_be_added(self, saved, operator):
+        bpy.ops.fdda.preview_pose(number=1)
+        for name in ("first", "second"):
+            bpy.ops.ed.undo_push(message=name)
+        if operator == "redo":
+            bpy.ops.ed.undo()
+        bpy.app.timers.register(undo._push_undo, first_interval=60)
+        getattr(bpy.ops.ed, operator)()
+        assert not bpy.app.timers.is_registered(undo._push_undo)
 
     def test_nothing_to_pose(self, saved):
         for bone in saved.armature_object.pose.bones:
