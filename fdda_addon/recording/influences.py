@@ -22,6 +22,7 @@ from ..core.skinning import LinearSkinning
 from ..poses.bone_channels import control_name
 from ..poses.sampling import is_moved_by_constraints
 from ..rig.reading import PoseEvaluator
+from ..rig.sources import split_bone_path
 from ..scene.armature import Poser, clear_pose
 from ..scene.controls import ControlReader, is_driven, owner_of, set_control
 from ..scene.scene_rig import SceneRig
@@ -153,7 +154,7 @@ def _follows_control_bones(scene_rig: SceneRig, rig: Rig, channels: tuple[Channe
     bones = scene_rig.armature_object.pose.bones
     animation = scene_rig.armature_object.animation_data
     paths = [curve.data_path for curve in (animation.drivers if animation else ())]
-    driven = {path.split('"')[1] for path in paths if '"' in path}
+    driven = {bone for bone, _ in map(split_bone_path, paths) if bone}
     others = [name for name in rig.joint_names if name not in sampled and name != STATIC_JOINT]
     if any(name not in rig.joint_names for name in sampled if name in bones):
         return True

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Override of joints: sets each joint alone, with constraints and drivers of bones muted."""
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -11,10 +10,10 @@ from mathutils import Matrix
 
 from ..core.errors import RigError
 from ..core.rig import STATIC_JOINT, Joint
+from ..rig.sources import is_transform_channel, split_bone_path
 from ..scene.armature import PoseMatrixReader, rest_matrices
 from ..scene.scene_rig import MIN_VOLUME, SceneRig, is_flat
 
-_TRANSFORM_PATH = re.compile(r'pose\.bones\["(?P<bone>(?:[^"\\]|\\.)*)"\]\.(?:location|rotation_\w+|scale)')
 _CHAIN_CONSTRAINTS = {"IK", "SPLINE_IK"}
 """Constraints that also move ancestors of their bone."""
 
@@ -48,7 +47,9 @@ class JointOverride:
         is_singular = np.abs(np.linalg.det(matrices[:, :3, :3])) < MIN_VOLUME
         if is_flat(armature_object) or is_singular.any():
             name = armature_object.name if is_flat(armature_object) else self._joints[int(is_singular.argmax())].name
-            raise RigError(f"'{name}' has a scale of zero in some pose; look for a constraint or driver that sets it.")
+            raise RigError(
+                f"'{name}' has a scale of zero in some pose; look for the key, constraint or driver that sets it."
+            )
         return self._relative(matrices)
 
     def _relative(self, matrices: np.ndarray) -> np.ndarray:
@@ -101,10 +102,10 @@ def override_joints(
     animation = armature_object.animation_data
     names = {joint.name for joint in joints}
     bones = [bone for bone in armature_object.pose.bones if bone.name in names]
-    ancestors_and_self = {parent_matrix.name for bone in bones for parent_matrix in (bone, *bone.parent_recursive)}
+    joints_and_ancestors = {ancestor.name for bone in bones for ancestor in (bone, *bone.parent_recursive)}
 
     def is_overridden(name: str) -> bool:
-        return not others_follow or name in ancestors_and_self
+        return not others_follow or name in joints_and_ancestors
 
     constraints = [
         constraint
@@ -115,9 +116,8 @@ def override_joints(
     drivers = [
         curve
         for curve in (animation.drivers if animation else ())
-        if (match := _TRANSFORM_PATH.fullmatch(curve.data_path))
-        and is_overridden(bpy.utils.unescape_identifier(match["bone"]))
-        and not curve.mute
+        for bone, channel_path in [split_bone_path(curve.data_path)]
+        if bone and is_transform_channel(channel_path) and is_overridden(bone) and not curve.mute
     ]
     override = JointOverride(scene_rig, joints)
     for item in (*constraints, *drivers):

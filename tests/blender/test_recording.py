@@ -10,13 +10,14 @@ import pytest
 from mathutils import Matrix
 
 from fdda_addon.core.errors import RecordingError, RigError
-from fdda_addon.core.poses import sample_pose
+from fdda_addon.core.poses import ROTATION, Channel, sample_pose
 from fdda_addon.core.progress import Progress
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.skinning import LinearSkinning
 from fdda_addon.poses.sampling import sampled_channels
 from fdda_addon.recording.appender import BATCH_POSES
+from fdda_addon.recording.influences import _follows_control_bones
 from fdda_addon.recording.plan import RecordingSettings
 from fdda_addon.recording.run import record
 from fdda_addon.rig.reading import PoseReader, read_rig
@@ -115,6 +116,15 @@ def test_influences_of_the_elbow(fresh, tmp_path):
     """The upper half is smoothed by the bend below, and neither sees the shoulder turn."""
     recording = recorded(fresh, tmp_path / "r", poses=3)
     assert [(p.joint, p.influencing) for p in recording.partitions] == [(0, (1,)), (1, (1,))]
+
+
+def test_a_driven_joint_is_found_by_a_name_with_quotes(fresh):
+    armature_object, name = fresh.armature_object, 'lo"wer'
+    armature_object.data.bones["lower"].name = name
+    channels = (Channel("upper", ROTATION, 0, -1.0, 1.0),)
+    assert not _follows_control_bones(fresh, read_rig(fresh), channels)
+    armature_object.pose.bones[name].driver_add("location", 0)
+    assert _follows_control_bones(fresh, read_rig(fresh), channels)
 
 
 def test_rounding_far_from_the_origin_is_no_influence(fresh, tmp_path):
