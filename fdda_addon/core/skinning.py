@@ -113,7 +113,7 @@ class LinearSkinning:
             flat = np.abs(np.linalg.det(pose_matrices[:, :, :3, :3].astype(np.float64))).min(axis=0)
             raise RigError(
                 f"Bone '{self.rig.joint_names[int(flat.argmin())]}' has a scale of zero in some pose; "
-                "look for a constraint or driver that sets it."
+                "look for the key, constraint or driver that sets it."
             ) from error
         ordered = np.take(np.asarray(positions, np.float32), self._order, axis=1)
         for partition, block, values in self._iterate_partitions(ordered):

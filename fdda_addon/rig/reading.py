@@ -190,7 +190,10 @@ class PoseReader:
         if relation != self._relation:
             for scene_object in (mesh_object, armature_object):
                 if is_flat(scene_object):
-                    raise RigError(f"'{scene_object.name}' has a scale of zero in some pose; give it another there.")
+                    raise RigError(
+                        f"'{scene_object.name}' has a scale of zero in some pose; look for the key, constraint or "
+                        "driver that sets it."
+                    )
             self._set_relation(relation)
         matrices = self._matrix_reader.read(armature_object)
         if self._left is not None:

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -134,6 +135,14 @@ def test_model_chapter_names_every_key(folder):
     keys = set(value) | {key for name in ("joints", "partitions") for key in value[name][0]}
     keys |= set(value["fingerprint"]) | set(value["held_out_mm"]) | set(value["training_ranges"])
     assert [key for key in sorted(keys) if not named(chapter("Model"), key)] == []
+
+
+def test_metadata_table_names_every_key_of_a_partition():
+    from fdda_addon.core.model import ModelPartition
+
+    section = chapter("Model").partition("### Partitions of a model\n")[2].partition("\n#")[0]
+    keys = [field.name for field in fields(ModelPartition)]
+    assert [key for key in keys if not named(section, key)] == []
 
 
 @pytest.mark.parametrize("name", ["evaluation", "benchmark"])

@@ -145,4 +145,7 @@ def test_a_scale_of_zero_is_not_recorded(rig, capsys, tmp_path):
     bpy.context.scene.frame_set(1)
     save_copy(tmp_path / "flat.blend")
     assert run("record", tmp_path / "flat.blend", tmp_path / "flat", "--poses", 0, "--action", action) == 1
-    assert "has a scale of zero in some pose; give it another there." in capsys.readouterr().err
+    assert (
+        "has a scale of zero in some pose; look for the key, constraint or driver that sets it."
+        in capsys.readouterr().err
+    )

@@ -84,7 +84,9 @@ def test_local_residuals_do_not_depend_on_the_motion_of_the_whole_rig(rig):
 def test_local_residuals_with_a_joint_scale_of_zero_are_refused(rig):
     poses = random_poses(1)
     poses[0, 2, :3, :3] = 0
-    with pytest.raises(RigError, match=r"^Bone '.*' has a scale of zero in some pose; look for a constraint or driver"):
+    with pytest.raises(
+        RigError, match=r"^Bone '.*' has a scale of zero in some pose; look for the key, constraint or driver"
+    ):
         LinearSkinning(rig).local_residuals(poses, np.zeros((1, VERTEX_COUNT, 3), np.float32))
 
 
