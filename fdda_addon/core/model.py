@@ -272,7 +272,7 @@ def check_model(data: bytes, name: Path | str) -> ModelInfo:
         raise ModelError(f"'{name}' asks for inputs that no rig gives ({', '.join(extra)}); train it again.")
     try:
         check_inputs_and_outputs(contents, inputs, outputs)
-        check_graph(contents, info.budget(), len(data), outputs)
+        check_graph(contents, info.budget(), len(data), outputs, len(info.partitions))
     except ValueError as error:
         raise ModelError(f"The model '{name}' is refused: {error}; give one that train made.") from error
     if contents.metadata.get(CHECKSUM_KEY) != contents.checksum:

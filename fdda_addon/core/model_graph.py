@@ -45,33 +45,41 @@ def compute_budget(joints: int, controls: int, partitions: Sequence[tuple[int, i
     """Compute the budget of a character's model.
 
     Args:
-        joints, controls: how many.
-        partitions: of each the vertices, the components, and the joints and controls that influence it.
-        training: settings of the training, as the metadata has them.
+        joints, controls: numbers of joints and of controls.
+        partitions: for each partition the numbers of its vertices, its components, and its influencing joints and
+            controls.
+        training: settings of the training in the metadata.
 
     Raises:
-        ValueError: the settings are none; a clause about the model.
+        ValueError: the settings are invalid; the text is a clause about the model.
     """
-    vertices, shapes, seen = map(list, zip(*partitions, strict=True))
+    vertex_counts, component_counts, input_counts = map(list, zip(*partitions, strict=True))
     # Joints relative to their parents, and relative to main joints.
-    features = 16 * joints + 3 * controls + 3 * sum(seen)
-    widths = [(FEATURES_PER_JOINT + 3) * max(seen), *_read_hidden_units(training), max(shapes)]
-    network = sum(one * other for one, other in pairwise(widths))
-    rows = 4 * (joints + sum(own + 2 * joints for own in shapes))
-    values = 3 * sum(vertices) + 4 * features + len(shapes) * (sum(widths) + 9 * max(shapes)) + 3 * rows
-    matrices = sum(own * (8 * joints + 3 * basis) for own, basis, _ in partitions)
-    constants = matrices + len(shapes) * (network + sum(widths) + 2 * features) + 4 * features
+    features = 16 * joints + 3 * controls + 3 * sum(input_counts)
+    layer_units = [(FEATURES_PER_JOINT + 3) * max(input_counts), *_read_hidden_units(training), max(component_counts)]
+    network_weights = sum(inputs * outputs for inputs, outputs in pairwise(layer_units))
+    matrix_elements = 4 * (joints + sum(count + 2 * joints for count in component_counts))
+    values = (
+        3 * sum(vertex_counts)
+        + 4 * features
+        + len(partitions) * (sum(layer_units) + 9 * max(component_counts))
+        + 3 * matrix_elements
+    )
+    partition_matrices = sum(vertices * (8 * joints + 3 * components) for vertices, components, _ in partitions)
+    constants = (
+        partition_matrices + len(partitions) * (network_weights + sum(layer_units) + 2 * features) + 4 * features
+    )
     return Budget(values, constants)
 
 
 def _read_hidden_units(training: dict) -> list[int]:
-    """Read the numbers of units of the hidden layers."""
-    units = training.get("hidden", DEFAULT_HIDDEN_UNITS)
-    if not isinstance(units, list) or len(units) > MAX_HIDDEN_LAYERS:
+    """Read the number of units of each hidden layer."""
+    layer_units = training.get("hidden", DEFAULT_HIDDEN_UNITS)
+    if not isinstance(layer_units, list) or len(layer_units) > MAX_HIDDEN_LAYERS:
         raise ValueError("its networks have hidden layers that are none")
-    if not all(type(own) is int and 0 < own <= MAX_LAYER_UNITS for own in units):
+    if not all(type(units) is int and 0 < units <= MAX_LAYER_UNITS for units in layer_units):
         raise ValueError("its networks have hidden layers that are none")
-    return units
+    return layer_units
 
 
 def check_inputs_and_outputs(contents: OnnxContents, inputs: dict[str, Shape], outputs: dict[str, Shape]) -> None:
@@ -92,7 +100,9 @@ def check_inputs_and_outputs(contents: OnnxContents, inputs: dict[str, Shape], o
         raise ValueError(f"its output '{positions}' does not fit its {shape[0]} vertices")
 
 
-def check_graph(contents: OnnxContents, budget: Budget, size: int, outputs: dict[str, Shape]) -> None:
+def check_graph(
+    contents: OnnxContents, budget: Budget, size: int, outputs: dict[str, Shape], partition_count: int
+) -> None:
     """Check that a graph has only what `train` writes, and costs no more than its metadata explains.
 
     Args:
@@ -100,6 +110,7 @@ def check_graph(contents: OnnxContents, budget: Budget, size: int, outputs: dict
         budget: by its metadata.
         size: of the file in bytes.
         outputs: shapes of the outputs without the dimension of poses, by name.
+        partition_count: number of partitions of the model.
 
     Raises:
         ValueError: a clause about the graph.
@@ -108,12 +119,13 @@ def check_graph(contents: OnnxContents, budget: Budget, size: int, outputs: dict
         raise ValueError(f"it has {contents.unsupported[0]}, which train does not write")
     if budget.values > 2 * size + 16 * FREE_ELEMENTS:
         raise ValueError(f"its metadata tells of a character that {size} bytes cannot hold")
-    partitions = outputs.get("confidence", (1,))[0]
-    if len(contents.nodes) > min(MAX_NODES, BASE_NODES + NODES_PER_PARTITION * partitions):
-        raise ValueError(f"it has {len(contents.nodes)} nodes, more than its {partitions} partitions explain")
-    held = sum(len(constant.data) for constant in contents.constants.values())
-    if held > ITEM_BYTES[1] * COST_FACTOR * (budget.constants + FREE_ELEMENTS):
-        raise ValueError(f"its constants have {held} bytes, more than its joints, vertices and shapes explain")
+    if len(contents.nodes) > min(MAX_NODES, BASE_NODES + NODES_PER_PARTITION * partition_count):
+        raise ValueError(f"it has {len(contents.nodes)} nodes, more than its {partition_count} partitions explain")
+    constant_bytes = sum(len(constant.data) for constant in contents.constants.values())
+    if constant_bytes > ITEM_BYTES[1] * COST_FACTOR * (budget.constants + FREE_ELEMENTS):
+        raise ValueError(
+            f"its constants have {constant_bytes} bytes, more than its joints, vertices and components explain"
+        )
     single, batch = (compute_graph_cost(contents, poses) for poses in (1, BATCH_POSES))
     _check_cost(single, budget, size, 1)
     _check_cost(batch, budget, size, BATCH_POSES)
@@ -126,7 +138,8 @@ def check_graph(contents: OnnxContents, budget: Budget, size: int, outputs: dict
 def _check_cost(cost: GraphCost, budget: Budget, size: int, poses: int) -> None:
     if cost.elements > COST_FACTOR * poses * (budget.values + FREE_ELEMENTS):
         raise ValueError(
-            f"it computes {cost.elements} numbers for {poses} poses, more than its joints, vertices and shapes explain"
+            f"it computes {cost.elements} numbers for {poses} poses, more than its joints, vertices and components "
+            "explain"
         )
     # A constant is used once per pose and axis.
     if cost.products > COST_FACTOR * poses * (size + 64 * (budget.values + FREE_ELEMENTS)):

@@ -243,7 +243,7 @@ def _add_node(node: OnnxNode, constants: dict[str, OnnxConstant], known: set[str
     elements = sum(math.prod(shape) for shape in found)
     if elements > MAX_ELEMENTS:
         raise ValueError(
-            f"a {node.operator} gives {elements} numbers, more than its joints, vertices and shapes explain"
+            f"a {node.operator} gives {elements} numbers, more than its joints, vertices and components explain"
         )
     cost.elements += elements
     if node.operator in MATRIX_PRODUCT_OPERATORS:

@@ -107,12 +107,12 @@ def test_a_growing_pose_is_refused():
             )
         )
         input_name = f"square_{repetition}"
-    assert "more than its joints, vertices and shapes explain" in assert_refused(
+    assert "more than its joints, vertices and components explain" in assert_refused(
         tiny_model(nodes=nodes, initializers=tensors)
     )
     nodes[2].op_type = "Add"
     assert_refused(
-        tiny_model(nodes=nodes[:6], initializers=tensors), "more than its joints, vertices and shapes explain"
+        tiny_model(nodes=nodes[:6], initializers=tensors), "more than its joints, vertices and components explain"
     )
 
 
@@ -137,7 +137,9 @@ def test_a_product_of_poses_with_each_other_is_refused():
 def test_large_unexplained_constants_are_refused():
     large_tensor = numpy_helper.from_array(np.zeros(4_000_000, np.float32), "big")
     assert_refused(
-        tiny_model(initializers=[large_tensor]), "its constants have 16000", "more than its joints, vertices and shapes"
+        tiny_model(initializers=[large_tensor]),
+        "its constants have 16000",
+        "more than its joints, vertices and components",
     )
 
 

@@ -126,7 +126,7 @@ def test_shards_of_other_recordings_are_refused(shards, tmp_path):
     np.save(shards[3] / "rest_positions.npy", rest_positions + np.float32(1e-6))
     assert "differently (rest_positions); record" in merge_error(shards, path)
     record_limb(tmp_path / "whole", POSE_COUNT)
-    assert "is not a shard, but a complete recording" in merge_error([*shards[:3], tmp_path / "whole"], path)
+    assert "is not a shard, but a recording of all poses" in merge_error([*shards[:3], tmp_path / "whole"], path)
 
 
 def test_an_incomplete_shard_is_refused(shards, tmp_path):

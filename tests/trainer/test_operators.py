@@ -70,5 +70,5 @@ def test_a_larger_character_is_explained_by_its_numbers(trained):
     value["training"]["hidden"] = [8]
     text.value = json.dumps(value)
     model.metadata_props.remove(next(prop for prop in model.metadata_props if prop.key == CHECKSUM_KEY))
-    with pytest.raises(ModelError, match="more than its joints, vertices and shapes explain"):
+    with pytest.raises(ModelError, match="more than its joints, vertices and components explain"):
         check_model(model.SerializeToString(), "m.onnx")

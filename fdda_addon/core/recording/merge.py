@@ -82,45 +82,51 @@ def _open_in_order(paths: Sequence[Path]) -> list[Recording]:
     for path in paths:
         if "shard" not in read_index(path):
             raise RecordingError(
-                f"'{path}' is not a shard, but a complete recording; give folders that record --shard made."
+                f"'{path}' is not a shard, but a recording of all poses; give folders that record --shard made."
             )
-    shards_in_order = [open_recording(path) for path in paths]
-    _check_same_recording(shards_in_order)
-    total = shards_in_order[0].info.shard.total
+    recordings = [open_recording(path) for path in paths]
+    _check_same_recording(recordings)
+    total = recordings[0].info.shard.total
     shards_in_order = sorted(
-        (shard for shard in shards_in_order if shard.info.poses), key=lambda shard: shard.info.shard.first
+        (recording for recording in recordings if recording.info.poses), key=lambda shard: shard.info.shard.first
     )
-    done = 0
-    for before, shard in zip([None, *shards_in_order], shards_in_order, strict=False):
-        first = shard.info.shard.first
-        if first < done:
-            raise RecordingError(f"'{before.path}' and '{shard.path}' have poses in common; give each shard once.")
-        if first > done:
+    covered_count = 0
+    for previous_shard, shard in zip([None, *shards_in_order], shards_in_order, strict=False):
+        first_pose = shard.info.shard.first
+        if first_pose < covered_count:
+            raise RecordingError(
+                f"'{previous_shard.path}' and '{shard.path}' have poses in common; give each shard once."
+            )
+        if first_pose > covered_count:
             break
-        done += shard.info.poses
-    if done < total:
-        later = [shard for shard in shards_in_order if shard.info.shard.first > done]
-        until = later[0].info.shard.first if later else total
+        covered_count += shard.info.poses
+    if covered_count < total:
+        later_shards = [shard for shard in shards_in_order if shard.info.shard.first > covered_count]
+        gap_end = later_shards[0].info.shard.first if later_shards else total
         raise RecordingError(
-            f"Poses {done:,} to {until - 1:,} of {total:,} are in none of the {len(paths)} shards; give all of them."
+            f"Poses {covered_count:,} to {gap_end - 1:,} of {total:,} are in none of the {len(paths)} shards; give all "
+            "of them."
         )
     return shards_in_order
 
 
-def _check_same_recording(shards_in_order: Sequence[Recording]) -> None:
-    indexes = [{k: v for k, v in read_index(shard.path).items() if k not in SHARD_KEYS} for shard in shards_in_order]
-    for shard, index in zip(shards_in_order, indexes, strict=True):
-        different = find_different_keys(indexes[0], index)
-        if shard.info.shard.total != shards_in_order[0].info.shard.total:
-            different.append("poses")
-        if not different:
-            fixed = [name for name in array_shapes(0, 0, 0, 0, faces=1) if name not in STREAMED_ARRAY_NAMES]
-            arrays = ([getattr(shard.rig, name) for shard in (shards_in_order[0], shard)] for name in fixed)
-            different = [name for name, pair in zip(fixed, arrays, strict=True) if not np.array_equal(*pair)]
-        if different:
+def _check_same_recording(shards: Sequence[Recording]) -> None:
+    """Raise RecordingError where shards were recorded with different rigs or options."""
+    first_shard = shards[0]
+    indexes = [{k: v for k, v in read_index(shard.path).items() if k not in SHARD_KEYS} for shard in shards]
+    for shard, index in zip(shards, indexes, strict=True):
+        different_keys = find_different_keys(indexes[0], index)
+        if shard.info.shard.total != first_shard.info.shard.total:
+            different_keys.append("poses")
+        if not different_keys:
+            names = [name for name in array_shapes(0, 0, 0, 0, faces=1) if name not in STREAMED_ARRAY_NAMES]
+            different_keys = [
+                name for name in names if not np.array_equal(getattr(first_shard.rig, name), getattr(shard.rig, name))
+            ]
+        if different_keys:
             raise RecordingError(
-                f"'{shards_in_order[0].path}' and '{shard.path}' are shards of different recordings: they were "
-                f"recorded differently ({', '.join(different)}); record all shards with the same rig and options."
+                f"'{first_shard.path}' and '{shard.path}' are shards of different recordings: they were recorded "
+                f"differently ({', '.join(different_keys)}); record all shards with the same rig and options."
             )
 
 
