@@ -140,7 +140,8 @@ def select_surface_frames(
     candidates.sort(key=lambda candidate: (candidate.partition, candidate.vertex))
     surface_frames = next(frames for count, frames in smoothed.surface_frames(candidates) if count == iterations)
     lengths, explained = _fit(surface_frames, candidates, poses)
-    if explained.max() < MIN_BEST_EXPLAINED_VARIANCE or np.median(explained) < MIN_EXPLAINED_VARIANCE:
+    # Not inverted: a comparison with NaN is False.
+    if not (explained.max() >= MIN_BEST_EXPLAINED_VARIANCE and np.median(explained) >= MIN_EXPLAINED_VARIANCE):
         return NO_SURFACE_FRAMES
     return replace(surface_frames, lengths=lengths).subset(explained >= MIN_EXPLAINED_VARIANCE)
 

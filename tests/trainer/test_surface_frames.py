@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Surface frames: selected where a rig smooths, with its smoothing, and nowhere else; the graph computes the same."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from fdda_addon.core.partition import make_partitions
 from fdda_addon.core.recording.reader import Recording, read_recording
 from fdda_addon.core.report import checkpoint_path
 from fdda_addon.core.skinning import LinearSkinning
+from trainer import surface_frame_fit
 from trainer.__main__ import main
 from trainer.checkpoint import read_checkpoint
 from trainer.config import TrainingConfig
@@ -114,6 +116,18 @@ def test_a_rig_that_smooths_in_part_has_none(tmp_path, recording):
     assert select(replace(recording, residuals=residuals)) is NO_SURFACE_FRAMES
 
 
+def test_a_vertex_without_a_measure_selects_nothing(recording, monkeypatch):
+    fit = surface_frame_fit._fit
+
+    def fit_with_nan(*arguments) -> tuple[np.ndarray, np.ndarray]:
+        lengths, explained = fit(*arguments)
+        explained[0] = np.nan
+        return lengths, explained
+
+    monkeypatch.setattr(surface_frame_fit, "_fit", fit_with_nan)
+    assert select(recording) is NO_SURFACE_FRAMES
+
+
 def test_a_stop_request_cancels_the_selection(recording):
     split = split_recording(recording, TrainingConfig())
     with pytest.raises(Cancelled):
@@ -176,13 +190,15 @@ def test_the_graph_agrees_with_pytorch_in_other_rigs(tmp_path, way):
     assert "surface_frame_features" in {node.name for node in onnx.load(tmp_path / "tube.onnx").graph.node}
 
 
-def test_a_warm_start_keeps_the_surface_frames(recording, surface_frames, trained, capsys):
+def test_a_warm_start_keeps_the_surface_frames(recording, surface_frames, trained, tmp_path, capsys):
+    for file in (trained, checkpoint_path(trained)):
+        shutil.copy(file, tmp_path)
     last = read_checkpoint(checkpoint_path(trained)).surface_frames
     for name, array in vars(surface_frames).items():
         assert np.array_equal(getattr(last, name), array), name
     offered = inputs_with_surface_frames(recording.rig, recording.partitions, last).columns
     assert [len(own) % 3 for own in offered] == [0] * JOINTS
-    assert main([str(recording.path), str(trained), *QUICK, "--warm-start"]) == 0
+    assert main([str(recording.path), str(tmp_path / trained.name), *QUICK, "--warm-start"]) == 0
     assert (
         f"The rig smooths: networks take surface frames of {len(surface_frames)} vertices as inputs."
         in capsys.readouterr().out
