@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """AdamW on a one-cycle schedule, without `torch.optim`.
 
-The first step of an optimizer of `torch.optim` imports PyTorch's compiler, which takes longer than `import torch` and
-is of no use here. These are the same numbers as those of `torch.optim.AdamW(fused=True)` with `OneCycleLR`.
+The first step of an optimizer of `torch.optim` imports PyTorch's compiler, which a training does not need. This class
+computes the same numbers as `torch.optim.AdamW(fused=True)` with `OneCycleLR`.
 """
 
 import math
@@ -13,13 +13,15 @@ import torch
 BETA_2 = 0.999
 EPSILON = 1e-8
 MIN_BETA_1, MAX_BETA_1 = 0.85, 0.95
-"""Beta 1 falls while the learning rate rises, and the other way round."""
+"""Limits of beta 1, which falls while the learning rate rises, and rises while it falls."""
 INITIAL_RATE_DIVISOR = 25.0
 FINAL_RATE_DIVISOR = 25.0 * 1e4
 
 
 class OneCycleAdamW:
-    """AdamW whose learning rate rises to its largest value and falls to almost zero, along halves of a cosine.
+    """The optimizer AdamW with a learning rate that rises to its maximum and falls to almost zero.
+
+    Both parts of the cycle follow half a period of a cosine.
 
     References:
         Loshchilov and Hutter, Decoupled Weight Decay Regularization, 2019; Smith and Topin, Super-Convergence, 2018.
@@ -31,33 +33,35 @@ class OneCycleAdamW:
         learning_rate: float,
         weight_decay: float,
         total_steps: int,
-        warm_up: float,
+        warm_up_fraction: float,
     ):
-        """Start before the first step.
+        """Prepare the first step.
 
         Args:
-            parameters: all of them have a gradient at each step.
-            learning_rate: the largest.
-            weight_decay: relative to the learning rate.
-            total_steps: the length of the cycle.
-            warm_up: share of the steps in which the learning rate rises.
+            parameters: the tensors to optimize; each must have a gradient at every step.
+            learning_rate: the maximum of the cycle.
+            weight_decay: factor of the weight decay; each step multiplies it by the learning rate.
+            total_steps: number of steps of the cycle.
+            warm_up_fraction: part of the steps in which the learning rate rises.
         """
         self._parameters = list(parameters)
         self._learning_rate, self._weight_decay = learning_rate, weight_decay
-        self._total_steps, self._warm_up = total_steps, warm_up
+        self._total_steps, self._warm_up_fraction = total_steps, warm_up_fraction
         self._means = [torch.zeros_like(parameter) for parameter in self._parameters]
         self._mean_squares = [torch.zeros_like(parameter) for parameter in self._parameters]
-        self._step_counts = [torch.zeros((), device=parameter.device) for parameter in self._parameters]
+        self._step_counts = [
+            torch.zeros((), dtype=torch.float32, device=parameter.device) for parameter in self._parameters
+        ]
         self._step = 0
 
     def zero_grad(self) -> None:
-        """Drop the gradients."""
+        """Set all gradients to None."""
         for parameter in self._parameters:
             parameter.grad = None
 
     @torch.no_grad()
     def step(self) -> None:
-        """Move the parameters by their gradients."""
+        """Update the parameters with their gradients."""
         learning_rate, beta_1 = self.schedule(self._step)
         self._step += 1
         torch._foreach_add_(self._step_counts, 1)
@@ -78,18 +82,19 @@ class OneCycleAdamW:
         )
 
     def schedule(self, step: int) -> tuple[float, float]:
-        """Return the learning rate and beta 1 of a step; 0 is the first."""
-        peak, end = self._warm_up * self._total_steps - 1, self._total_steps - 1
+        """Return the learning rate and beta 1 of a step; step 0 is the first."""
+        peak_step, last_step = self._warm_up_fraction * self._total_steps - 1, self._total_steps - 1
         initial_rate = self._learning_rate / INITIAL_RATE_DIVISOR
         final_rate = self._learning_rate / FINAL_RATE_DIVISOR
-        if step <= peak:
-            fraction = step / peak
+        if step <= peak_step:
+            fraction = step / peak_step if peak_step else 1.0
             rates, betas = (initial_rate, self._learning_rate), (MAX_BETA_1, MIN_BETA_1)
         else:
-            fraction = (step - peak) / (end - peak)
+            fraction = (step - peak_step) / (last_step - peak_step)
             rates, betas = (self._learning_rate, final_rate), (MIN_BETA_1, MAX_BETA_1)
-        return _along_cosine(*rates, fraction), _along_cosine(*betas, fraction)
+        return _interpolate_cosine(*rates, fraction), _interpolate_cosine(*betas, fraction)
 
 
-def _along_cosine(start: float, end: float, fraction: float) -> float:
+def _interpolate_cosine(start: float, end: float, fraction: float) -> float:
+    """Interpolate along half a period of a cosine; `fraction` 0 gives `start`, 1 gives `end`."""
     return end + (start - end) / 2.0 * (1 + math.cos(math.pi * fraction))

@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Compares the optimizer with PyTorch's, in a process of its own: PyTorch's compiler crashes beside Blender."""
 
+import itertools
+
 import torch
 
 from trainer.optimizer import OneCycleAdamW
 
 TOTAL_STEPS = (1, 2, 7, 60)
+WARM_UP_FRACTIONS = (0.15, 0.4)
 
 
-def compare(total_steps: int) -> None:
+def compare(total_steps: int, warm_up_fraction: float) -> None:
     """Assert that both move the same parameters by the same gradients to the same bits."""
     generator = torch.Generator().manual_seed(0)
     start = [torch.randn(shape, generator=generator) for shape in ((4, 3, 5), (4, 1, 5))]
     ours, theirs = ([torch.nn.Parameter(values.clone()) for values in start] for _ in range(2))
-    optimizer = OneCycleAdamW(ours, 0.01, 0.02, total_steps, 0.15)
+    optimizer = OneCycleAdamW(ours, 0.01, 0.02, total_steps, warm_up_fraction)
     reference = torch.optim.AdamW(theirs, lr=0.01, weight_decay=0.02, fused=True)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(reference, 0.01, total_steps=total_steps, pct_start=0.15)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(reference, 0.01, total_steps=total_steps, pct_start=warm_up_fraction)
     for _ in range(total_steps):
         gradients = [torch.randn(values.shape, generator=generator) for values in start]
         for parameters in (ours, theirs):
@@ -28,6 +31,6 @@ def compare(total_steps: int) -> None:
 
 
 if __name__ == "__main__":
-    for total_steps in TOTAL_STEPS:
-        compare(total_steps)
+    for total_steps, warm_up_fraction in itertools.product(TOTAL_STEPS, WARM_UP_FRACTIONS):
+        compare(total_steps, warm_up_fraction)
     print("equal")
