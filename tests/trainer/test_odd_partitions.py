@@ -23,9 +23,9 @@ from .chain import chain_angles, chain_info, chain_rig, pose_chain
 from .conftest import QUICK, run_page
 
 POSES, JOINTS = 120, 4
-UNMOVED_JOINT = JOINTS
+STATIC_JOINT_INDEX = JOINTS
 MERGED, TAKEN_IN_BY = 3, 2
-INFLUENCING = {0: (0, 1), 1: (0, 1, 2, 3), TAKEN_IN_BY: (2, 3), UNMOVED_JOINT: (0, 1)}
+INFLUENCING = {0: (0, 1), 1: (0, 1, 2, 3), TAKEN_IN_BY: (2, 3), STATIC_JOINT_INDEX: (0, 1)}
 
 
 def odd_rig() -> Rig:
@@ -33,7 +33,7 @@ def odd_rig() -> Rig:
     rig = chain_rig(JOINTS)
     skin_joints, skin_weights = rig.skin_joints.copy(), rig.skin_weights.copy()
     start = rig.rest_positions[:, 2] < 0.1
-    skin_joints[start], skin_weights[start] = [UNMOVED_JOINT, 0], [1, 0]
+    skin_joints[start], skin_weights[start] = [STATIC_JOINT_INDEX, 0], [1, 0]
     rest = np.append(rig.rest_matrices, np.eye(4, dtype=np.float32)[None], axis=0)
     joints = (*rig.joints, Joint(STATIC_JOINT, -1))
     return replace(rig, joints=joints, rest_matrices=rest, skin_joints=skin_joints, skin_weights=skin_weights)
@@ -78,7 +78,7 @@ def test_every_partition_approximates_unseen_poses(model):
     for partition in partitions:
         assert error[:, partition.vertices].mean() < 0.1 * linear[:, partition.vertices].mean()
     main_joint = main_joints(rig.skin_joints, rig.skin_weights)
-    for joint in (MERGED, UNMOVED_JOINT):
+    for joint in (MERGED, STATIC_JOINT_INDEX):
         own = main_joint == joint
         assert own.sum() > 5 and error[:, own].mean() < 0.1 * linear[:, own].mean()
 
@@ -103,7 +103,7 @@ def test_the_code_of_the_page_on_recordings_reads_it(model):
     assert shape == "(90, 3)" and float(residual.removesuffix(" mm\n")) == pytest.approx(expected, rel=1e-4)
 
 
-def test_trust_is_one_where_nothing_moves_that_did_not(model):
+def test_confidence_is_one_where_only_recorded_joints_move(model):
     assert (Network(model).confidence(odd_poses(odd_rig(), 10, 0)) == 1).all()
 
 
@@ -112,11 +112,13 @@ def test_what_follows_no_bone_sees_the_joints_that_influence_it():
     partitions = odd_partitions(rig)
     inputs = inputs_of_rig(rig, partition_centers(rig, partitions), partitions)
     seen = [(a, b) for a, b in zip(inputs.pair_references.tolist(), inputs.pair_points.tolist(), strict=True)]
-    assert (UNMOVED_JOINT, 1) in seen, "two joints move the second bone against what follows none"
-    assert (1, UNMOVED_JOINT) in seen and (2, UNMOVED_JOINT) not in seen, "the root does not influence the third"
+    assert (STATIC_JOINT_INDEX, 1) in seen, "two joints move the second bone against what follows none"
+    assert (1, STATIC_JOINT_INDEX) in seen and (2, STATIC_JOINT_INDEX) not in seen, (
+        "the root does not influence the third"
+    )
     skin = skin_matrices(odd_poses(rig, 3, 0), rig.rest_matrices)
-    assert joint_regression(rig, partitions[3], skin).joints.tolist() == [UNMOVED_JOINT, 0, 1]
-    assert joint_regression(rig, partitions[0], skin).joints.tolist() == [0, 1, UNMOVED_JOINT]
+    assert joint_regression(rig, partitions[3], skin).joints.tolist() == [STATIC_JOINT_INDEX, 0, 1]
+    assert joint_regression(rig, partitions[0], skin).joints.tolist() == [0, 1, STATIC_JOINT_INDEX]
     assert joint_regression(rig, partitions[2], skin).joints.tolist() == [2, 1, 3]
 
 

@@ -192,7 +192,7 @@ def changed_checkpoint(trained: Path, path: Path, **changes) -> Path:
         lambda own: np.zeros_like(own),
     ],
 )
-def test_damaged_borders_are_refused(trained, tmp_path, change):
+def test_damaged_partition_indices_are_refused(trained, tmp_path, change):
     with np.load(checkpoint_path(trained)) as arrays:
         own = arrays["partition_indices"]
     with pytest.raises(TrainingError, match="its arrays contradict each other"):

@@ -57,7 +57,6 @@ def result(studied):
     return json.loads((studied / "study.json").read_text(encoding="utf-8"))
 
 
-@pytest.mark.slow
 def test_every_configuration_is_trained_with_every_seed(result):
     found = [(c["units"], c["layers"], c["activation"]) for c in result["configurations"]]
     assert found == [(8, 2, "silu"), (8, 2, "relu"), (24, 2, "silu"), (24, 2, "relu")]

@@ -131,7 +131,8 @@ def test_another_recording_of_the_rig_is_refused(model, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "damage", ["cut", "text", "packed", "sizes", "nan", "types", pytest.param("pipe", marks=systems.named_pipes)]
+    "damage",
+    ["cut", "text", "packed", "version", "sizes", "nan", "types", pytest.param("pipe", marks=systems.named_pipes)],
 )
 def test_a_damaged_checkpoint_is_refused(recording, model, capsys, damage):
     path = checkpoint_path(model)
@@ -145,6 +146,12 @@ def test_a_damaged_checkpoint_is_refused(recording, model, capsys, damage):
         content["1/basis_mean"] = np.zeros(1 << 22, np.float32)
         np.savez_compressed(path, **content)
         assert zipfile.is_zipfile(path)
+    elif damage == "version":
+        with np.load(path) as arrays:
+            content = dict(arrays)
+        about = json.loads(content["about"].tobytes()) | {"version": 2}
+        content["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
+        np.savez(path, **content)
     elif damage == "pipe":
         path.unlink()
         os.mkfifo(path)
@@ -160,6 +167,8 @@ def test_a_damaged_checkpoint_is_refused(recording, model, capsys, damage):
         assert "it is not a regular file" in text
     elif damage == "text":
         assert "another file is there, which is not the checkpoint of a training" in text
+    elif damage == "version":
+        assert "cannot be used (version 2); train without --warm-start" in text
     else:
         assert "cannot be used" in text and "train without --warm-start" in text
     assert model.read_bytes() == before
