@@ -60,7 +60,7 @@ class Checkpoint:
     Attributes:
         fingerprint: of the rig.
         controls: names of the rig's controls.
-        holdout: fingerprint of the held-out and validation poses (`data.holdout_fingerprint`).
+        holdout: fingerprint of the held-out and validation poses (`splitting.holdout_fingerprint`).
         hidden, activation: of the networks.
         history: held-out errors of this training and its predecessors, oldest first: `{"poses", "p999"}`, in mm.
         partitions: in the order of the recording.
@@ -178,11 +178,11 @@ def _read(arrays: np.lib.npyio.NpzFile) -> Checkpoint:
         tuple({"poses": int(entry["poses"]), "p999": float(entry["p999"])} for entry in about["history"]),
         tuple(partitions),
         _read_surface_frames(arrays),
-        _read_partition_of(arrays["partition_indices"], partitions),
+        _read_partition_indices(arrays["partition_indices"], partitions),
     )
 
 
-def _read_partition_of(partition_indices: np.ndarray, partitions: list[PartitionCheckpoint]) -> np.ndarray:
+def _read_partition_indices(partition_indices: np.ndarray, partitions: list[PartitionCheckpoint]) -> np.ndarray:
     if partition_indices.dtype != np.int64 or partition_indices.ndim != 1 or partition_indices.min(initial=0) < 0:
         raise ValueError(CONTRADICTION)
     sizes = [len(partition.basis_mean) for partition in partitions]

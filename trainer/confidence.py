@@ -20,9 +20,8 @@ from fdda_addon.core.skinning import SkinBlock
 MARGIN_RATIO = 0.1
 """Margin of the box on each side, as a part of the range."""
 FADE_RATIO = 6.0
-"""Fade width, as a part of the range. Wide: the residual at the end of the range approximates those outside. Before
-there was a linear fit, the arm's mean error at 3 times the range of motion was 51 % of linear skinning's, and 92 % with
-a fade width of 0.15."""
+"""Fade width, as a part of the range. It is large because the residual at the end of the range is a good approximation
+outside of it: docs/experiments.md, Margin around the range of motion."""
 MIN_MARGINS = (0.01, 0.001)
 MIN_FADE_WIDTHS = (4.0, 0.2)
 """Minimum margin and fade width: of rotation elements, no unit; of translations, as a part of the character's size. A

@@ -12,6 +12,7 @@ from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.skinning import skin_matrices
 
 from .basis import FINE_TOLERANCE_FACTOR, Basis, allocate_components, make_basis
+from .blocks import BLOCK_ELEMENTS
 from .half_rotations import regression_matrices
 from .inputs import NetworkInputs
 from .joint_fit import JointFit, JointRegression, joint_regression
@@ -23,8 +24,6 @@ MARGIN_POSE_WEIGHT = 0.1
 components are meant for the range of motion."""
 MIN_FEATURE_SPREAD = 1e-5
 """A feature whose standard deviation over the training poses is smaller counts as constant: meters, or no unit."""
-BLOCK_ELEMENTS = 1 << 22
-"""Residuals are summed in blocks of at most this many coordinates, so that float64 needs little memory."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Tests whether a surface that is simulated, or read from a file, depends on the direction of gravity.
 
-The joints of such a surface cannot be moved to find its influences. With all ancestor joints as inputs, gravity is
-learned; without gravity the model gets worse, because frames of one action correlate with the extra inputs by chance.
-docs/simulations.md has both cases. So the recorded poses decide, by kernel ridge regression with cross-validation:
-training both networks would take as long as the training itself.
+The influences of such a surface cannot be found by moving its joints. With all ancestor joints as inputs, a network
+learns the effect of gravity. Where gravity has no effect, the extra inputs make the model worse, because they correlate
+by chance within one action. docs/simulations.md has both cases. The decision uses the recorded poses: kernel ridge
+regression with cross-validation compares the inputs, because training two networks would take twice as long.
 """
 
 from dataclasses import replace

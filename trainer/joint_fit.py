@@ -14,6 +14,7 @@ import numpy as np
 from fdda_addon.core.partition import Partition
 from fdda_addon.core.rig import Rig
 
+from .blocks import BLOCK_ELEMENTS
 from .inputs import joints_on_path, static_joints
 
 RIDGE = 1e-6
@@ -24,8 +25,6 @@ MIN_EQUATIONS_PER_UNKNOWN = 4
 """Least ratio of equations to unknowns of a vertex: with few equations the regression explains everything."""
 MIN_SINGULAR_VALUE_RATIO = 1e-5
 """Directions with singular values below this part of the largest are ignored."""
-BLOCK_ELEMENTS = 1 << 22
-"""Residuals are fitted in blocks of at most this many coordinates."""
 
 
 @dataclass(frozen=True)

@@ -219,10 +219,11 @@ class _Loop:
                     f"{config.learning_rate:g}."
                 )
             training = (training_mm / pose_count).tolist()
-            for curve, *errors_mm in zip(curves, training, validation, worst_mm.tolist(), strict=True):
-                curve.training_mm.append(errors_mm[0])
-                curve.validation_mm.append(float(errors_mm[1]))
-                curve.worst_mm.append(errors_mm[2])
+            errors_mm = zip(curves, training, validation.tolist(), worst_mm.tolist(), strict=True)
+            for curve, training_error, validation_error, worst_error in errors_mm:
+                curve.training_mm.append(training_error)
+                curve.validation_mm.append(validation_error)
+                curve.worst_mm.append(worst_error)
             if on_epoch:
                 means = [
                     (float(errors @ learning_vertex_counts) + constant_mm) / vertex_counts.sum()

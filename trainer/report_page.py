@@ -14,6 +14,8 @@ from .error_causes import CAUSES
 from .report_style import STYLE
 
 MAX_PICTURE_BYTES = 256 << 20
+STATISTIC_LABELS = {"mean": "mean", "rms": "rms", "p99": "99 %", "p999": "99.9 %", "max": "max"}
+"""Table heading of each statistic of errors, by its key in reports and evaluations."""
 
 
 def render_html(report: dict, pictures: Sequence[Path] = (), evaluation: dict | None = None) -> str:
@@ -105,17 +107,14 @@ def _evaluation(evaluation: dict | None) -> str:
     if not evaluation:
         return ""
     rows = "".join(
-        f"<tr><td>{name}</td>" + "".join(f"<td>{_mm(evaluation[key][k])}</td>" for k in STATISTICS) + "</tr>"
+        f"<tr><td>{name}</td>" + "".join(f"<td>{_mm(evaluation[key][k])}</td>" for k in STATISTIC_LABELS) + "</tr>"
         for key, name in (("fdda", "FDDA"), ("linear", "linear skinning"))
     )
-    heads = "".join(f"<th>{STATISTICS[k]}</th>" for k in STATISTICS)
+    heads = "".join(f"<th>{STATISTIC_LABELS[k]}</th>" for k in STATISTIC_LABELS)
     return (
         f"<h2>Evaluation against the true rig</h2><p>{evaluation['poses']:,} poses that training never saw.</p>"
         f'<div class="scroll"><table><thead><tr><th></th>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'
     )
-
-
-STATISTICS = {"mean": "mean", "rms": "rms", "p99": "99 %", "p999": "99.9 %", "max": "max"}
 
 
 def _errors(report: dict) -> str:
@@ -216,7 +215,9 @@ def _table(partitions: list[dict], fdda: dict, linear: dict, report: dict) -> st
     controlled = bool(report.get("controls"))
     heads = "<th>partition</th><th>vertices</th><th>joints</th>" + "<th>controls</th>" * controlled
     heads += "<th>inputs</th><th>components</th><th>train mean</th>"
-    heads += "".join(f"<th>{name}</th>" for name in STATISTICS.values()) + "<th>linear mean</th><th>of linear</th>"
+    heads += (
+        "".join(f"<th>{name}</th>" for name in STATISTIC_LABELS.values()) + "<th>linear mean</th><th>of linear</th>"
+    )
     rows = []
     for p in partitions:
         influencing = escape(", ".join(p["influencing"])) or "none"
@@ -225,14 +226,14 @@ def _table(partitions: list[dict], fdda: dict, linear: dict, report: dict) -> st
             f'<tr><td title="{f"with {merged}" if merged else ""}">{_joint(p)}</td><td>{p["vertices"]:,}</td>'
             f'<td title="{influencing}">{len(p["influencing"])}</td>{_controls(p) if controlled else ""}'
             f"<td>{p['features']}</td><td>{p['basis']}</td><td>{p['training']['mean']:.4f}</td>"
-            + "".join(f"<td>{p['held_out'][k]:.4f}</td>" for k in STATISTICS)
+            + "".join(f"<td>{p['held_out'][k]:.4f}</td>" for k in STATISTIC_LABELS)
             + f"<td>{p['linear']['mean']:.3f}</td><td>{_share(p['held_out']['mean'], p['linear']['mean'])}</td></tr>"
         )
     total = (
         f'<tr class="total"><td>all</td><td>{report["vertices"]:,}</td><td>{report["joints"]}</td>'
         + (f"<td>{len(report['controls'])}</td>" if controlled else "")
         + f"<td></td><td>{sum(p['basis'] for p in partitions)}</td><td>{report['fdda']['training']['mean']:.4f}</td>"
-        + "".join(f"<td>{fdda[k]:.4f}</td>" for k in STATISTICS)
+        + "".join(f"<td>{fdda[k]:.4f}</td>" for k in STATISTIC_LABELS)
         + f"<td>{linear['mean']:.3f}</td><td>{_share(fdda['mean'], linear['mean'])}</td></tr>"
     )
     return (

@@ -14,11 +14,11 @@ from fdda_addon.core.errors import TrainingError, os_error_text
 from fdda_addon.core.input_file import read_input
 
 from .charts import MIN_AXIS_MM
+from .report_page import STATISTIC_LABELS
 
 MAX_BYTES = 256 << 20
 MAX_EDGE_MM = 1e12
 """Maximum bin edge of the histogram, mm."""
-STATISTICS = ("mean", "rms", "p99", "p999", "max")
 
 
 def check_drawable(report: dict, path: Path) -> None:
@@ -63,7 +63,8 @@ def read_evaluation(path: Path) -> dict:
     except (ValueError, RecursionError) as error:
         raise TrainingError(f"The evaluation '{path}' cannot be read ({error}); evaluate again.") from error
     try:
-        numbers = [evaluation["poses"], *(evaluation[way][name] for way in ("fdda", "linear") for name in STATISTICS)]
+        statistics = (evaluation[method][name] for method in ("fdda", "linear") for name in STATISTIC_LABELS)
+        numbers = [evaluation["poses"], *statistics]
     except (KeyError, TypeError) as error:
         raise TrainingError(f"The evaluation '{path}' is damaged: it lacks its errors; evaluate again.") from error
     if not all(type(number) in (int, float) and math.isfinite(float(number)) for number in numbers):

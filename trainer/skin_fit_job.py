@@ -15,12 +15,10 @@ from fdda_addon.core.rig import Rig
 from fdda_addon.core.skin_fit import INFLUENCES, FitReport, SkinFit
 from fdda_addon.core.skinning import LinearSkinning
 
+from .blocks import BLOCK_ELEMENTS
 from .process import Cancelled
 from .progress import MessageSink
 from .skin_solver import SkinSolver
-
-BLOCK_ELEMENTS = 1 << 22
-"""Positions are compared in blocks of at most this many coordinates."""
 
 
 def fit_folder(

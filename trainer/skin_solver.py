@@ -15,6 +15,8 @@ from fdda_addon.core.recording.fit_folder import FitPoses
 from fdda_addon.core.skin_fit import INFLUENCES
 from fdda_addon.core.skinning import skin_matrices
 
+from .blocks import BLOCK_ELEMENTS
+
 RIG_CANDIDATES = 4
 """Number of candidates from the rig's own weights of a vertex, the heaviest first."""
 SINGLE_CANDIDATES = 8
@@ -32,8 +34,6 @@ MIN_WEIGHT = 1e-3
 """Smaller weights are removed in any case."""
 MIN_RIDGE_RATIO = 1e-12
 """Minimum ridge, as a part of the errors: less would be lost in the rounding of the products."""
-BLOCK_ELEMENTS = 1 << 22
-"""Vertices are fitted in blocks; the largest array has at most about this many elements."""
 
 
 class SkinSolver:

@@ -15,13 +15,13 @@ import numpy as np
 
 from fdda_addon.core.rig import Rig
 
+from .blocks import BLOCK_ELEMENTS
+
 FEATURES_PER_SURFACE_FRAME = 3
 MIN_SQUARED_LENGTH = 1e-18
 """Added to squared lengths before a division: a joint that is scaled to zero gives finite values."""
 MAX_JOINT_ENTRIES = 1 << 12
 """Maximum of joints times surface frames: each frame of the animation reads one value of each joint per tangent."""
-BLOCK_ELEMENTS = 1 << 22
-"""Poses are evaluated in blocks of at most this many coordinates."""
 
 
 @dataclass(frozen=True)
