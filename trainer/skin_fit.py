@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from fdda_addon.core.skin_fit import KINDS
+from fdda_addon.core.skin_fit import FIT_KINDS
 from fdda_addon.core.terminal import escape_unencodable_output
 
 from .process import StopRequest, missing_package, run_with_messages
@@ -21,7 +21,7 @@ def main(arguments: list[str] | None = None) -> int:
     escape_unencodable_output()
     parser = argparse.ArgumentParser("trainer.skin_fit", description="Fit skin weights to the poses in a folder.")
     parser.add_argument("folder", type=Path, help="folder that record made")
-    parser.add_argument("kind", choices=KINDS, help="one joint per vertex, or at most four")
+    parser.add_argument("kind", choices=FIT_KINDS, help="one joint per vertex, or at most four")
     parser.add_argument("--metres-per-unit", type=float, default=1.0, help="length of a mesh unit in meters")
     options = parser.parse_args(arguments)
     sink, stop = JsonMessageSink(), StopRequest()
