@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-# Every target is a line or two that a person could type; `setup/environment` is what they have in common.
-# .venv holds everything on the newer Python that runs, .venv-4.5 and .venv-5.2 one Blender LTS line without the trainer.
+# Every target runs one or two commands that a person could type. `setup/environment` makes the virtual environments:
+# .venv has all packages, on the newer Python of this machine; .venv-4.5 and .venv-5.2 have one Blender LTS line each,
+# without the trainer's packages; .venv-farm has the packages of the farm.
 
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
@@ -8,87 +9,87 @@ PYTHON_4.5 = 3.11
 PYTHON_5.2 = 3.13
 OTHER_LINE = $$(.venv/bin/python -c 'import sys; print("4.5" if sys.version_info >= (3, 13) else "5.2")')
 
-# A process for each core, of which each runs whole files: there is one Blender to a process.
-SIDE_BY_SIDE = -n auto --maxprocesses 4 --dist loadfile
-FAST = -m "not slow"
+# One process per core, at most four. Each runs whole files, as a process can hold one Blender.
+IN_PARALLEL = -n auto --maxprocesses 4 --dist loadfile
+NOT_SLOW = -m "not slow"
 
-# Where torch is. Blender's Python, or a line's environment, starts this one for training.
+# The Python with torch. The add-on starts it for trainings, also from an environment that has no torch.
 export FDDA_TRAINER_PYTHON ?= $(CURDIR)/.venv/bin/python
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*  ## /\1\t/p' $(MAKEFILE_LIST) | while IFS='	' read -r name text; do printf '  make %-14s %s\n' "$$name" "$$text"; done
-	@echo '  PYTHON=/path/to/python3.13 or 3.11 names the Python to use; otherwise one that runs is looked for.'
+	@echo '  PYTHON=/path/to/python3.13 (or 3.11) is the Python for the environments; without it, setup/environment searches for one.'
 
 .venv:
 	@setup/environment .venv everything
 
-demo: .venv  ## the arm from rig to playback, into out/demo
+demo: .venv  ## record, train, bind and play the arm, into out/demo
 	.venv/bin/python benchmarks/demo.py out/demo
 
-test: test-core test-trainer test-blender  ## all three tiers of tests, on one Blender LTS line
+test: test-core test-trainer test-blender  ## run the core, trainer and Blender tests on one Blender LTS line, without the slow ones
 
-test-core: .venv  ## the tests that need no Blender and take seconds
-	.venv/bin/python -m pytest $(SIDE_BY_SIDE) tests/core tests/contract
+test-core: .venv  ## run the tests that need no Blender and take seconds
+	.venv/bin/python -m pytest $(IN_PARALLEL) tests/core tests/contract
 
-test-trainer: .venv  ## the tests of the training, export and report
-	.venv/bin/python -m pytest $(SIDE_BY_SIDE) tests/trainer $(FAST)
+test-trainer: .venv  ## run the tests of the training, export and report
+	.venv/bin/python -m pytest $(IN_PARALLEL) tests/trainer $(NOT_SLOW)
 
-test-blender: .venv  ## the tests that run in Blender
-	.venv/bin/python -m pytest $(SIDE_BY_SIDE) tests/blender $(FAST)
+test-blender: .venv  ## run the tests that need Blender
+	.venv/bin/python -m pytest $(IN_PARALLEL) tests/blender $(NOT_SLOW)
 
-test-slow: .venv  ## the tests that make test leaves out: whole trainings, simulations, most characters, a short soak
-	.venv/bin/python -m pytest $(SIDE_BY_SIDE) -m slow tests/trainer tests/blender
+test-slow: .venv  ## run the tests that make test leaves out: whole trainings, simulations, most characters, a short soak
+	.venv/bin/python -m pytest $(IN_PARALLEL) -m slow tests/trainer tests/blender
 
-test-examples: .venv  ## the examples of docs/formats.md, in Python and in Chromium (CHROMIUM=/path/to/chromium)
+test-examples: .venv  ## run the tests of the examples in docs/formats.md, in Python and in Chromium (CHROMIUM=/path/to/chromium)
 	.venv/bin/python -m pytest tests/examples
 
-farm: .venv-farm  ## what characters.toml says, on this machine or a cluster (PLAN=characters.toml, OPTIONS="--workers 2")
+farm: .venv-farm  ## record, train and bind the characters of a plan, on this machine or a cluster (PLAN=characters.toml, OPTIONS="--workers 2")
 	.venv-farm/bin/python -m fdda_addon farm $(or $(PLAN),$(error PLAN=characters.toml names the characters, see docs/farm.md)) $(OPTIONS)
 
 .venv-farm:
 	@setup/environment .venv-farm farm
 
-test-farm: .venv-farm  ## the tests of the farm: its graph on a cluster, and what render farms take
+test-farm: .venv-farm  ## run the tests of the farm: on a local cluster, and its jobs for OpenJD and Flamenco
 	.venv-farm/bin/python -m pytest tests/farm
 
-test-gui: package  ## press the buttons of the sidebar in a Blender with a window (BLENDER=/path/to/blender), into out/gui
+test-gui: package  ## press the buttons of the sidebar in a Blender with a window, into out/gui (BLENDER=/path/to/blender)
 	.venv/bin/python tests/gui/run.py out/gui $(BLENDER)
 
-test-windows: .venv  ## the tests in Python for Windows under Wine, as root on Debian (LINE=5.2: on one LTS line; 40 minutes)
+test-windows: .venv  ## run the tests in Python for Windows under Wine, as root on Debian (LINE=5.2: only that LTS line; 40 minutes)
 	setup/windows/setup $(PYTHON_$(LINE))
 	.venv/bin/python setup/package.py windows-x64
 	.venv/bin/python tests/windows/run.py $(LINE)
 
-test-all: test test-slow test-examples test-farm  ## every test on both LTS lines, the soak, and the window last
+test-all: test test-slow test-examples test-farm  ## run all tests on one LTS line, those that depend on Blender on the other, then soak and test-gui; not test-windows
 	@$(MAKE) test-line LINE=$(OTHER_LINE) MARKS=
 	@$(MAKE) soak
 	@$(MAKE) test-gui
 
-# What differs between versions of Blender; empty for all tests.
+# Select the tests that depend on the Blender version; an empty MARKS selects all.
 test-line: MARKS = -m "not slow and not one_blender_version"
-test-line: .venv-line .venv  ## the core tier, and of the Blender tier what differs between versions, on LINE=4.5 or LINE=5.2
-	.venv-$(LINE)/bin/python -m pytest $(SIDE_BY_SIDE) tests/core tests/contract
-	.venv-$(LINE)/bin/python -m pytest $(SIDE_BY_SIDE) $(MARKS) tests/blender
+test-line: .venv-line .venv  ## run the core tests and the Blender tests that depend on the Blender version, on LINE=4.5 or LINE=5.2
+	.venv-$(LINE)/bin/python -m pytest $(IN_PARALLEL) tests/core tests/contract
+	.venv-$(LINE)/bin/python -m pytest $(IN_PARALLEL) $(MARKS) tests/blender
 
 .venv-line:
 	@setup/environment .venv-$(LINE) blender $(or $(PYTHON_$(LINE)),$(error LINE is 4.5 or 5.2))
 
-bench: .venv  ## time the arm at three densities, and other rigs: RIGS="a.blend b.blend"; into out/bench
+bench: .venv  ## time the arm at three mesh densities and other rigs, into out/bench (RIGS="a.blend b.blend")
 	.venv/bin/python benchmarks/bench.py out/bench $(addprefix --rig ,$(RIGS))
 
 sampling: .venv  ## compare ways to choose poses, into out/sampling (20 minutes)
 	.venv/bin/python benchmarks/sampling.py out/sampling
 
-soak: .venv  ## hostile files, kills, full disks, frames, undo: what held and what fell short, into out/soak (20 minutes at most)
+soak: .venv  ## test damaged files, kills, full disks, many frames and undo, into out/soak (20 minutes at most)
 	.venv/bin/python benchmarks/soak.py out/soak $(OPTIONS)
 
-faults: .venv  ## seed faults into a copy of the code and say which tests catch them, into out/faults (OPTIONS="--only ID"; 30 minutes)
+faults: .venv  ## seed faults into a copy of the code and list the tests that catch them, into out/faults (OPTIONS="--only ID"; 30 minutes)
 	.venv/bin/python benchmarks/faults.py out/faults $(OPTIONS)
 
 study: .venv  ## compare sizes and activations of the networks, into out/study (30 minutes)
 	.venv/bin/python benchmarks/study.py out/study
 
-simulation: .venv  ## learn flesh that Blender simulates, for docs/simulations.md, into out/simulation (20 minutes)
+simulation: .venv  ## learn a simulated deformation, for docs/simulations.md, into out/simulation (20 minutes)
 	.venv/bin/python benchmarks/simulation.py out/simulation
 
 characters: .venv  ## record, train, bind and compare every kind of character on both LTS lines, for docs/characters.md
@@ -96,31 +97,31 @@ characters: .venv  ## record, train, bind and compare every kind of character on
 	.venv/bin/python benchmarks/characters.py out/characters
 	.venv-$(OTHER_LINE)/bin/python benchmarks/characters.py out/characters
 
-pictures: demo  ## make the README's pictures again, from those of the demo
+pictures: demo  ## render the README's pictures again from the demo's pictures
 	.venv/bin/python docs/pictures/make_pictures.py out/demo/pictures
 
-map: .venv  ## draw the layers of the code again, for docs/development.md
+map: .venv  ## draw the diagram of the code's layers for docs/development.md again
 	.venv/bin/python docs/pictures/make_map.py docs/pictures/map.svg
 
 fixtures:  ## build the rigs in blend_fixtures again, with the oldest Blender under test
 	@$(MAKE) .venv-line LINE=4.5
 	.venv-4.5/bin/python blend_fixtures/make_fixtures.py
 
-lint: .venv  ## ruff's checks and formatting, and words that the field does not use
+lint: .venv  ## check the code with ruff, and code and documents for retired words
 	.venv/bin/ruff check
 	.venv/bin/ruff format --check
 	.venv/bin/python setup/retired_words.py
 
-package: .venv  ## dist/fdda_addon-VERSION.zip, to install in Blender (PLATFORM=all: all platforms)
+package: .venv  ## build dist/fdda_addon-VERSION.zip, to install in Blender (PLATFORM=all: all platforms)
 	.venv/bin/python setup/package.py $(PLATFORM)
 
-requirements: .venv  ## pin again in requirements/ what pyproject.toml asks for
+requirements: .venv  ## pin the packages that pyproject.toml names, and their dependencies, in requirements/
 	for version in 3.11 3.13 3.14; do .venv/bin/uv pip compile --quiet --no-annotate \
 		--python-version $$version --python-platform x86_64-manylinux_2_28 --custom-compile-command 'make requirements' \
 		--group blender --group trainer --group test --group farm --group lint --group setup \
 		--output-file requirements/python-$$version.txt || exit; done
 
-clean:  ## remove what was built and the environments
+clean:  ## remove all built files and the environments
 	rm -rf .venv .venv-* .venv.lock out dist .pytest_cache .ruff_cache examples/web/node_modules examples/web/dist
 
-.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-examples test-gui test-windows test-all test-line bench sampling soak faults study simulation characters pictures map fixtures lint package requirements clean
+.PHONY: help .venv .venv-line .venv-farm demo farm test-farm test test-core test-trainer test-blender test-slow test-examples test-gui test-windows test-all test-line bench sampling soak faults study simulation characters pictures map fixtures lint package requirements clean

@@ -9,6 +9,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -21,10 +22,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "benchmarks" / "seeded_faults.toml"
 MAX_SECONDS = 400
-"""A test process that takes longer is ended; it counts as hung."""
+"""Time limit of one test run. A run that exceeds it is killed and counts as hung."""
 TESTS_FAILED = 1
-"""Exit status of pytest; others except 0 say that the tests did not run to their end."""
-FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
+"""Exit status of pytest when a test failed. With any other status but 0, pytest did not run all tests."""
+FAILED_TEST = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 CRASHED, HUNG = "the process ended", "the process hung"
 
 
@@ -34,7 +35,7 @@ class Fault:
 
     Attributes:
         id: unique.
-        kind: what is wrong, in a few words.
+        kind: short description of the fault.
         file: path in the repository.
         old: text that occurs exactly once in the file.
         new: the text that replaces it.
@@ -88,6 +89,8 @@ def copy_checkout(folder: Path) -> None:
     """Copy the tracked files of the checkout into a folder and link its environment."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
     for name in filter(None, listed.decode().split("\0")):
+        if not (ROOT / name).is_file():
+            continue  # A file that was deleted is tracked until the commit.
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(ROOT / name, target)
@@ -113,48 +116,73 @@ def first_failure(folder: Path, tests: Sequence[str]) -> str:
     command.append(f"--basetemp={folder / 'out' / 'tests'}")
     environment = {
         **os.environ,
-        # The byte code of a file is found by its time in seconds and its size, which a fault may leave as they were.
+        # Python compares the size of a source file, and its time in whole seconds, to decide whether its byte code is
+        # current. A fault may change neither.
         "PYTHONDONTWRITEBYTECODE": "1",
         "FDDA_TRAINER_PYTHON": str(python),
-        # As beside other processes: the elbow of the Blender tier is made once, by the code without a fault.
+        # With the name of a pytest-xdist worker, the Blender tests reuse the elbow that the run without a fault made.
         "PYTEST_XDIST_WORKER": "gw0",
     }
-    try:
-        result = subprocess.run(
-            command, cwd=folder, env=environment, capture_output=True, text=True, errors="replace", timeout=MAX_SECONDS
-        )
-    except subprocess.TimeoutExpired:
+    status, output = run_command(command, folder, environment, MAX_SECONDS)
+    if status is None:
         return HUNG
-    if result.returncode == 0:
+    if status == 0:
         return ""
-    if found := FAILED.search(result.stdout):
-        return found.group(1)
-    if result.returncode > TESTS_FAILED:
-        raise ValueError(f"pytest ended with {result.returncode}: {(result.stdout + result.stderr)[-2000:]}")
+    if failed_test := FAILED_TEST.search(output):
+        return failed_test.group(1)
+    if status > TESTS_FAILED:
+        raise ValueError(f"pytest ended with status {status}: {output[-2000:]}")
     return CRASHED
 
 
-def seed(fault: Fault, folder: Path, every_test: bool) -> Outcome:
+def run_command(
+    command: Sequence[str], folder: Path, environment: dict[str, str], max_seconds: float
+) -> tuple[int | None, str]:
+    """Run a command in a session of its own; at the timeout, kill it with all processes of the session.
+
+    Returns:
+        The exit status, None at the timeout; and the output with the errors.
+    """
+    process = subprocess.Popen(
+        command,
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        start_new_session=True,
+    )
+    try:
+        output, _ = process.communicate(timeout=max_seconds)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        return None, ""
+    return process.returncode, output
+
+
+def seed_and_test(fault: Fault, folder: Path, run_tiers: bool) -> Outcome:
     """Seed one fault, run its tests and restore the file.
 
     Args:
         fault: the fault.
         folder: the copy of the checkout.
-        every_test: run all tests of the tiers where the named files do not catch the fault.
+        run_tiers: run the whole tiers of the named files where these do not catch the fault.
     """
     file, started = folder / fault.file, time.perf_counter()
     text = file.read_text(encoding="utf-8")
     file.write_text(fault.applied(text), encoding="utf-8")
     try:
         test = first_failure(folder, fault.tests)
-        if not test and every_test:
+        if not test and run_tiers:
             test = first_failure(folder, sorted({str(Path(name).parent) for name in fault.tests}))
     finally:
         file.write_text(text, encoding="utf-8")
     return Outcome(fault.id, fault.kind, fault.file, bool(test), test, round(time.perf_counter() - started, 1))
 
 
-def markdown(outcomes: Sequence[Outcome]) -> str:
+def format_table(outcomes: Sequence[Outcome]) -> str:
     """Format a table with one row per fault."""
     lines = ["| fault | kind | caught by | s |", "|---|---|---|---|"]
     for outcome in outcomes:
@@ -164,7 +192,7 @@ def markdown(outcomes: Sequence[Outcome]) -> str:
 
 
 def main() -> int:
-    """Seed the faults; returns the exit status."""
+    """Seed the faults; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("out", type=Path, help="folder of faults.json")
     parser.add_argument("--only", nargs="+", metavar="ID", help="seed only these faults")
@@ -183,12 +211,12 @@ def main() -> int:
             print(f"Without any fault, {test} fails.")
             return 1
         for fault in faults:
-            outcomes.append(seed(fault, folder, options.all_tests))
+            outcomes.append(seed_and_test(fault, folder, options.all_tests))
             row = outcomes[-1]
             print(f"{row.id}: {row.test or 'NOT CAUGHT'}, {row.seconds:.0f} s", file=sys.stderr, flush=True)
             text = json.dumps([asdict(outcome) for outcome in outcomes], indent=1)
             (options.out / "faults.json").write_text(text + "\n", encoding="utf-8")
-    print(markdown(outcomes))
+    print(format_table(outcomes))
     missed = [outcome.id for outcome in outcomes if not outcome.caught]
     print(f"{len(outcomes)} faults, {len(missed)} not caught{': ' if missed else ''}{', '.join(missed)}")
     return int(bool(missed))

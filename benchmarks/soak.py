@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Does to files, processes and characters what must not harm them, and prints what held and what fell short:
+"""Test the add-on with many damaged files, killed processes and random actions, and count the cases that fail:
 
     python benchmarks/soak.py out/soak [--seed 1] [--part NAME ...] [--scale 1.0]
 
-Each part runs in processes of its own, which are watched: one that dies is a crash, one that says nothing for longer
-than 30 seconds hangs, and the part goes on behind it. What is done follows from the seed alone. Exit status 1 where
-something fell short; every case is a line of out/soak/cases.jsonl.
+Each part runs in separate processes. A process that dies is counted as a crash, a process that prints nothing for more
+than 30 seconds as a hang; the part then continues with the next case. The seed alone determines the cases. The exit
+status is 1 where a case failed. Each case is a line of out/soak/cases.jsonl.
 """
 
 import argparse
@@ -16,37 +16,38 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.soaking.cases import FELL_SHORT, PLAYED, REFUSED, Case, heard  # noqa: E402
+from benchmarks.soaking.cases import FAILED, PASSED, REFUSED, Case, parse_case  # noqa: E402
 
 CASE_TIMEOUT_SECONDS = 30
 START_TIMEOUT_SECONDS = 120
-"""Seconds until the first case: Blender and torch are loaded."""
+"""Time limit of the first case, which includes loading Blender and torch."""
 MAX_GROWTH_MB = 60
-"""What a part may take more of memory in its second half than in its first, per process."""
+"""How much the memory of a process may grow during the second half of a part."""
 MAX_SHOWN_CASES = 12
 
 
 @dataclass(frozen=True)
 class SoakPart:
-    """A part of the soak: its name, how many cases, and how many a process."""
+    """A part of the soak test: its name, its number of cases, and how many cases one process runs."""
 
     name: str
     count: int
-    each: int
+    cases_per_process: int
 
 
+DISKS = "disks"
 SOAK_PARTS = (
     SoakPart("models", 3000, 750),
     SoakPart("recordings", 2000, 500),
     SoakPart("kills", 45, 45),
-    SoakPart("disks", 40, 40),
+    SoakPart(DISKS, 40, 40),
     SoakPart("outputs", 60, 60),
     SoakPart("signals", 20, 20),
     SoakPart("frames", 10_000, 10_000),
@@ -61,8 +62,18 @@ SOAK_PARTS = (
 )
 
 
-def run_part(part: str, folder: Path, seed: int, first: int, end: int) -> None:
-    """Be the process of a part."""
+def select_parts(names: Sequence[str] | None) -> list[SoakPart]:
+    """Return the parts of these names, or all parts that this user can run."""
+    if names:
+        return [part for part in SOAK_PARTS if part.name in names]
+    if os.geteuid() == 0:
+        return list(SOAK_PARTS)
+    print(f"{DISKS}: left out, only root can mount a disk", flush=True)
+    return [part for part in SOAK_PARTS if part.name != DISKS]
+
+
+def run_part(part: str, folder: Path, seed: int, first_case: int, end_case: int) -> None:
+    """Run cases of a part in this process, which then ends."""
     if part == "recordings":
         from benchmarks.soaking.recordings import run
     elif part == "signals":
@@ -71,7 +82,7 @@ def run_part(part: str, folder: Path, seed: int, first: int, end: int) -> None:
         from benchmarks.soaking.models import run
     elif part == "outputs":
         from benchmarks.soaking.outputs import run
-    elif part in ("kills", "disks"):
+    elif part in ("kills", DISKS):
         from benchmarks.soaking import interruptions
 
         run = interruptions.run_kills if part == "kills" else interruptions.run_full_disks
@@ -87,17 +98,17 @@ def run_part(part: str, folder: Path, seed: int, first: int, end: int) -> None:
         from benchmarks.soaking import playback
 
         run = getattr(playback, f"run_{part}")
-    run(folder, seed, first, end)
+    run(folder, seed, first_case, end_case)
     sys.stdout.flush()
-    # What Blender does at its end is not what is measured here.
+    # Blender's own shutdown is not part of the test.
     os._exit(0)
 
 
-def watch_part(part: SoakPart, folder: Path, seed: int, hear: Callable[[Case], None]) -> None:
-    """Run a part, process by process; crashes and hangs become cases."""
-    place = 0
-    while place < part.count:
-        end = min(place + part.each, part.count)
+def watch_part(part: SoakPart, folder: Path, seed: int, add_case: Callable[[Case], None]) -> None:
+    """Run a part, process by process; a crash or a hang is added as a failed case."""
+    case_index = 0
+    while case_index < part.count:
+        end_case = min(case_index + part.cases_per_process, part.count)
         command = [
             sys.executable,
             __file__,
@@ -106,28 +117,28 @@ def watch_part(part: SoakPart, folder: Path, seed: int, hear: Callable[[Case], N
             str(seed),
             "--work",
             part.name,
-            str(place),
-            str(end),
+            str(case_index),
+            str(end_case),
         ]
         with open(folder / f"{part.name}.log", "a", encoding="utf-8") as log:
             process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, errors="replace")
             lines: queue.Queue[str] = queue.Queue()
             threading.Thread(target=_read_lines, args=(process, lines), daemon=True).start()
-            patience, began = START_TIMEOUT_SECONDS, place
-            while line := _next_line(lines, patience):
-                if case := heard(line):
-                    hear(case)
-                    place, patience = place + 1, CASE_TIMEOUT_SECONDS + 10
+            timeout_seconds, first_case = START_TIMEOUT_SECONDS, case_index
+            while line := _next_line(lines, timeout_seconds):
+                if case := parse_case(line):
+                    add_case(case)
+                    case_index, timeout_seconds = case_index + 1, CASE_TIMEOUT_SECONDS + 10
             if process.poll() is None and line is None:
                 process.kill()
-                problem = f"it hung for {patience} s"
+                problem = f"it hung for {timeout_seconds} s"
             else:
-                problem = f"it ended with {process.wait()}" if process.wait() or place < end else ""
+                problem = f"it ended with status {process.wait()}" if process.wait() or case_index < end_case else ""
         if problem:
-            print(f"  {part.name} {place}: {problem}", flush=True)
-            hear(Case(part.name, f"{part.name} {seed}/{place}", FELL_SHORT, problem, 0, 0, 0))
-            place += 1
-        elif place == began:
+            print(f"  {part.name} {case_index}: {problem}", flush=True)
+            add_case(Case(part.name, f"{part.name} {seed}/{case_index}", FAILED, problem, 0, 0, 0))
+            case_index += 1
+        elif case_index == first_case:
             return
 
 
@@ -137,98 +148,108 @@ def _read_lines(process: subprocess.Popen, lines: "queue.Queue[str]") -> None:
     lines.put("")
 
 
-def _next_line(lines: "queue.Queue[str]", patience: float) -> str | None:
+def _next_line(lines: "queue.Queue[str]", timeout_seconds: float) -> str | None:
+    """Return the next line; empty where the process has ended, None at the timeout."""
     try:
-        return lines.get(timeout=patience)
+        return lines.get(timeout=timeout_seconds)
     except queue.Empty:
         return None
 
 
 def build_elbow_files(folder: Path) -> None:
-    """The elbow: its file, two recordings, its model and its bound file, where they are not there yet."""
+    """Build the files of the elbow that do not exist yet: rig, two recordings, model and bound file."""
     import bpy
 
     import fdda_addon
     from benchmarks.stress_playback import _bound_elbow
-    from fdda_addon.cli.main import main as run
+    from fdda_addon.cli.main import main as run_verb
 
     fdda_addon.register()
     _bound_elbow(folder)
-    short = folder / "short recording"
-    if not short.exists() and run(["record", str(folder / "elbow.blend"), str(short), "--poses", "40"], "fdda"):
+    recording = folder / "short recording"
+    command = ["record", str(folder / "elbow.blend"), str(recording), "--poses", "40"]
+    if not recording.exists() and run_verb(command, "fdda"):
         sys.exit(1)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     fdda_addon.unregister()
 
 
-def table(cases: list[Case]) -> str:
-    """A line for each part: cases, refused, held, fell short, and what they took."""
+def format_table(cases: list[Case]) -> str:
+    """Format a table with a row for each part: numbers of cases, times, memory and position errors."""
     lines = [
-        "| part | cases | refused | held | fell short | slowest, s | peak of a case, MB | memory grew, MB | off, mm |",
+        "| part | cases | refused | passed | failed | slowest, s | peak per case, MB | memory growth, MB | "
+        "deviation, mm |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for name in dict.fromkeys(case.part for case in cases):
-        own = [case for case in cases if case.part == name]
-        counts = [sum(case.outcome == outcome for case in own) for outcome in (REFUSED, PLAYED, FELL_SHORT)]
-        off = max((case.off for case in own), default=0) * 1000
+        part_cases = [case for case in cases if case.part == name]
+        counts = [sum(case.outcome == outcome for case in part_cases) for outcome in (REFUSED, PASSED, FAILED)]
+        error_mm = max((case.error_m for case in part_cases), default=0) * 1000
         lines.append(
-            f"| {name} | {len(own):,} | " + " | ".join(f"{count:,}" for count in counts) + f" | "
-            f"{max(case.seconds for case in own):.1f} | {max(case.peak_mb for case in own):.0f} | "
-            f"{round(growth_mb(own))} | {off:.2g} |"
+            f"| {name} | {len(part_cases):,} | " + " | ".join(f"{count:,}" for count in counts) + f" | "
+            f"{max(case.seconds for case in part_cases):.1f} | {max(case.peak_mb for case in part_cases):.0f} | "
+            f"{round(memory_growth_mb(part_cases))} | {error_mm:.2g} |"
         )
     return "\n".join(lines)
 
 
-def growth_mb(cases: list[Case]) -> float:
-    """MB that a part holds at its end beyond what it held at its half; what is loaded once is loaded by then."""
-    held = [case.memory_mb for case in cases if case.memory_mb]
-    half = len(held) // 2
+def memory_growth_mb(cases: list[Case]) -> float:
+    """Return how much the memory of a part grows in its second half, when libraries and files are already loaded."""
+    memory_mb = [case.memory_mb for case in cases if case.memory_mb]
+    half = len(memory_mb) // 2
     if half < 5:
         return 0.0
-    # Each process begins anew: the median of the last tenth against that behind the half.
-    part = max(1, len(held) // 10)
-    middle, last = sorted(held[half : half + part]), sorted(held[-part:])
+    # Memory varies from case to case: compare medians of a tenth of the cases each.
+    count = max(1, len(memory_mb) // 10)
+    middle, last = sorted(memory_mb[half : half + count]), sorted(memory_mb[-count:])
     return last[len(last) // 2] - middle[len(middle) // 2]
 
 
 def main() -> int:
+    """Run the soak test; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--part", action="append", choices=[part.name for part in SOAK_PARTS], help="only this one")
-    parser.add_argument("--scale", type=float, default=1.0, help="of the numbers of cases")
+    parser.add_argument(
+        "--part",
+        action="append",
+        choices=[part.name for part in SOAK_PARTS],
+        help="run only this part; may be repeated",
+    )
+    parser.add_argument("--scale", type=float, default=1.0, help="factor for the numbers of cases")
     parser.add_argument("--work", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
     folder = options.folder.absolute()
     if options.work:
-        name, first, end = options.work
-        run_part(name, folder, options.seed, int(first), int(end))
+        name, first_case, end_case = options.work
+        run_part(name, folder, options.seed, int(first_case), int(end_case))
     folder.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     build_elbow_files(folder)
     cases: list[Case] = []
     with open(folder / "cases.jsonl", "w", encoding="utf-8") as file:
 
-        def hear(case: Case) -> None:
+        def add_case(case: Case) -> None:
             cases.append(case)
             file.write(json.dumps(asdict(case)) + "\n")
 
-        for part in SOAK_PARTS:
-            if not options.part or part.name in options.part:
-                began = time.perf_counter()
-                count = part.count if part.name == "paths" else max(1, round(part.count * options.scale))
-                watch_part(SoakPart(part.name, count, part.each), folder, options.seed, hear)
-                print(f"{part.name}: {time.perf_counter() - began:.0f} s", flush=True)
-    print(table(cases))
-    bad = [case for case in cases if case.outcome == FELL_SHORT]
-    for case in bad[:MAX_SHOWN_CASES]:
+        for part in select_parts(options.part):
+            part_started = time.perf_counter()
+            count = part.count if part.name == "paths" else max(1, round(part.count * options.scale))
+            watch_part(SoakPart(part.name, count, part.cases_per_process), folder, options.seed, add_case)
+            print(f"{part.name}: {time.perf_counter() - part_started:.0f} s", flush=True)
+    print(format_table(cases))
+    failed_cases = [case for case in cases if case.outcome == FAILED]
+    for case in failed_cases[:MAX_SHOWN_CASES]:
         print(f"{case.name}: {case.text}")
     names = dict.fromkeys(case.part for case in cases)
-    grown = [name for name in names if growth_mb([c for c in cases if c.part == name]) > MAX_GROWTH_MB]
-    for name in grown:
+    growing = [name for name in names if memory_growth_mb([c for c in cases if c.part == name]) > MAX_GROWTH_MB]
+    for name in growing:
         print(f"{name}: memory grows")
-    print(f"{len(cases):,} cases, {len(bad)} fell short; seed {options.seed}, {time.perf_counter() - started:.0f} s")
-    return int(bool(bad or grown))
+    print(
+        f"{len(cases):,} cases, {len(failed_cases)} failed; seed {options.seed}, {time.perf_counter() - started:.0f} s"
+    )
+    return int(bool(failed_cases or growing))
 
 
 if __name__ == "__main__":

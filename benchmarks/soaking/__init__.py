@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The parts of `benchmarks/soak.py`, each a process that says a line for every case."""
+"""The parts of `benchmarks/soak.py`, each of which runs in its own process and prints a line per case."""

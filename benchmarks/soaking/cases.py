@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One case of a soak: what was done, what came of it, what it took; and how a part tells its parent."""
+"""Cases of the soak test: run one, measure its time and memory, and pass its result to the parent process."""
 
 import contextlib
 import json
@@ -13,31 +13,31 @@ from pathlib import Path
 
 from fdda_addon.core.errors import FDDAError
 
-REFUSED, PLAYED, FELL_SHORT = "refused", "held", "fell short"
+REFUSED, PASSED, FAILED = "refused", "passed", "failed"
 MARK = "soak: "
-"""Before the JSON of a case, on a line of stdout."""
-LONGEST_SENTENCE = 1500
+"""Beginning of an output line that holds the JSON of a case."""
+MAX_SENTENCE_CHARACTERS = 1500
 MAX_MB = 1024
-"""What a refused file may take of memory at its peak."""
+"""Limit of the peak memory of a case, above the memory that the process used before."""
 MAX_SECONDS = 30
 
 
-class ShortfallError(Exception):
-    """A case did not do what it must; the text says what."""
+class CaseFailedError(Exception):
+    """The result of a case is wrong; the message says how."""
 
 
 @dataclass
 class Case:
-    """One case.
+    """Result of one case.
 
     Attributes:
-        part, name: what was done.
-        outcome: `REFUSED`, `PLAYED` or `FELL_SHORT`.
-        text: the sentence of a refusal, or what fell short.
-        seconds: it took.
-        peak_mb: of memory at its highest, above what the process had before.
-        memory_mb: of memory that the process has afterwards.
-        off: largest distance in metres of what was shown from what the model says.
+        part, name: part of the soak test, and name of the case.
+        outcome: `REFUSED`, `PASSED` or `FAILED`.
+        text: the error message of a refused case, or the reason of a failed one.
+        seconds: duration.
+        peak_mb: peak memory above the memory that the process used before.
+        memory_mb: memory of the process afterwards.
+        error_m: largest distance between a shown and an expected position, meters.
     """
 
     part: str
@@ -47,63 +47,64 @@ class Case:
     seconds: float
     peak_mb: float
     memory_mb: float
-    off: float = 0.0
+    error_m: float = 0.0
 
 
-def attempt(part: str, name: str, action: Callable[[], float | None]) -> Case:
-    """Do something that holds, or is refused in a sentence; gives the case."""
-    started, before = time.perf_counter(), _start_peak()
-    off = 0.0
+def run_case(part: str, name: str, action: Callable[[], float | None]) -> Case:
+    """Run an action that must either work or be refused with an error message; return its case."""
+    started, memory_before_mb = time.perf_counter(), _reset_peak()
+    error_m = 0.0
     try:
-        off = action() or 0.0
-        outcome, text = PLAYED, ""
+        error_m = action() or 0.0
+        outcome, text = PASSED, ""
     except FDDAError as error:
         text = str(error)
-        outcome = REFUSED if is_sentence(text) else FELL_SHORT
-    except ShortfallError as error:
-        outcome, text = FELL_SHORT, str(error)
+        outcome = REFUSED if is_sentence(text) else FAILED
+    except CaseFailedError as error:
+        outcome, text = FAILED, str(error)
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
             raise
-        outcome, text = FELL_SHORT, f"{error!r} {traceback.format_exc(limit=-3)}"
-    seconds, peak = time.perf_counter() - started, _peak_mb() - before
-    if outcome != FELL_SHORT and (peak > MAX_MB or seconds > MAX_SECONDS):
-        outcome, text = FELL_SHORT, f"it took {peak:.0f} MB and {seconds:.0f} s; {text}"
-    return Case(part, name, outcome, text, seconds, peak, memory_mb(), off)
+        outcome, text = FAILED, f"{error!r} {traceback.format_exc(limit=-3)}"
+    seconds, peak_mb = time.perf_counter() - started, _peak_mb() - memory_before_mb
+    if outcome != FAILED and (peak_mb > MAX_MB or seconds > MAX_SECONDS):
+        outcome, text = FAILED, f"it took {peak_mb:.0f} MB and {seconds:.0f} s; {text}"
+    return Case(part, name, outcome, text, seconds, peak_mb, memory_mb(), error_m)
 
 
 def is_sentence(text: str) -> bool:
-    """Whether a text is one line of a readable length that ends as a sentence does, and steers no terminal."""
-    return len(text) <= LONGEST_SENTENCE and re.fullmatch(r"[^\x00-\x1f\x7f]+[.)]", text) is not None
+    """Return whether a text is one line of limited length, without control characters, that ends like a sentence."""
+    return len(text) <= MAX_SENTENCE_CHARACTERS and re.fullmatch(r"[^\x00-\x1f\x7f]+[.)]", text) is not None
 
 
-def say(case: Case) -> None:
-    """Tell the parent."""
+def print_case(case: Case) -> None:
+    """Print a case as a line for the parent process."""
     print(MARK + json.dumps(asdict(case)), flush=True)
 
 
-def heard(line: str) -> Case | None:
-    """The case of a line of a part, None for any other line."""
+def parse_case(line: str) -> Case | None:
+    """Parse a line that `print_case` printed; return None for any other line."""
     return Case(**json.loads(line.removeprefix(MARK))) if line.startswith(MARK) else None
 
 
 def memory_mb() -> float:
-    """What the process holds in memory now."""
-    return _status("VmRSS")
+    """Return the memory of this process, MB."""
+    return _read_process_status("VmRSS")
 
 
-def _start_peak() -> float:
-    """Measure the peak of memory from now on; gives what is held now."""
+def _reset_peak() -> float:
+    """Reset the peak of the memory; return the memory of this process, MB."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
-    return _status("VmRSS")
+    return _read_process_status("VmRSS")
 
 
 def _peak_mb() -> float:
-    return _status("VmHWM")
+    return _read_process_status("VmHWM")
 
 
-def _status(name: str) -> float:
+def _read_process_status(name: str) -> float:
+    """Read a value from /proc/self/status, MB; 0 where the system is not Linux."""
     if not os.path.exists("/proc/self/status"):
         return 0.0
     (line,) = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name)]

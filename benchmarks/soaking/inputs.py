@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Characters whose surface depends on time or on a second armature, at random: refused, or the model is told.
+"""Soak test of characters whose surface depends on time or on a second armature.
 
-A model is a function of the pose and the controls of its recording. So a recorded character falls short where two
-surfaces differ and what a model is told of them does not.
+A model is a function of the pose and the controls of its recording. The recording must therefore be refused, or the
+model's inputs must differ wherever two surfaces differ.
 """
 
 import shutil
@@ -20,43 +20,50 @@ from fdda_addon.recording.run import record
 from fdda_addon.rig.reading import PoseEvaluator
 from fdda_addon.scene.scene_rig import SceneRig, find_rig
 
-from .cases import ShortfallError, attempt, say
+from .cases import CaseFailedError, print_case, run_case
 
 SETTINGS = RecordingSettings(poses=4, influence_poses=1)
-SAME_INPUT, SAME_SURFACE = 1e-4, 1e-4
-"""Inputs, no unit or mesh units, and metres, that differ by less are the same."""
+SAME_INPUT_TOLERANCE, SAME_SURFACE_TOLERANCE = 1e-4, 1e-4
+"""Inputs (mesh units or no unit) and surfaces (meters) that differ by less count as equal."""
 FRAMES = (1, 9, 23, 30)
-STACKS = [build for build in stacks.STACKS if build is not stacks.subdivided]
-WAYS = ("keys", "frame", "scene", "property")
+STACK_BUILDERS = [build for build in stacks.STACKS if build is not stacks.subdivided]
+TIME_DEPENDENCIES = ("keys", "frame", "scene", "property")
 
 
-def run_time(folder: Path, seed: int, first: int, end: int) -> None:
-    """A random number of a random stack depends on time; every fifth case is a character of `in_time` as it is."""
-    _run("time", folder, seed, first, end, _build_in_time, _all_frames)
+def run_time(folder: Path, seed: int, first_case: int, end_case: int) -> None:
+    """Let a random property of a random modifier stack depend on time; every fifth case is a character of `in_time`."""
+    _run("time", folder, seed, first_case, end_case, _build_time_dependent, _visit_frames)
 
 
-def run_armatures(folder: Path, seed: int, first: int, end: int) -> None:
-    """Second armatures with random locks, modes, limits and actions, moved at random."""
-    _run("second armature", folder, seed, first, end, _build_second_armature, _all_moves)
+def run_armatures(folder: Path, seed: int, first_case: int, end_case: int) -> None:
+    """Move second armatures that have random locks, rotation modes, limits and actions."""
+    _run("second armature", folder, seed, first_case, end_case, _build_second_armature, _move_second_armature)
 
 
 def _run(
-    part: str, folder: Path, seed: int, first: int, end: int, build: Callable[..., str], poses: Callable[..., object]
+    part: str,
+    folder: Path,
+    seed: int,
+    first_case: int,
+    end_case: int,
+    build_character: Callable[..., str],
+    visit_poses: Callable[..., object],
 ) -> None:
     fdda_addon.register()
-    for number in range(first, end):
-        random = np.random.default_rng((seed, number))
+    for case_index in range(first_case, end_case):
+        random = np.random.default_rng((seed, case_index))
         bpy.ops.wm.read_factory_settings(use_empty=True)
         fdda_addon.register()
-        name = build(random)
+        name = build_character(random)
 
         def action(random: np.random.Generator = random) -> float:
-            return _record_and_compare(folder / f"{part} recording", lambda rig: poses(rig, random))
+            return _record_and_compare(folder / f"{part} recording", lambda rig: visit_poses(rig, random))
 
-        say(attempt(part, f"{part} {seed}/{number} ({name})", action))
+        print_case(run_case(part, f"{part} {seed}/{case_index} ({name})", action))
 
 
-def _record_and_compare(path: Path, poses: Callable[[SceneRig], object]) -> float:
+def _record_and_compare(path: Path, visit_poses: Callable[[SceneRig], object]) -> float:
+    """Record a character, then compare the surfaces of poses with equal inputs; return the largest distance, meters."""
     shutil.rmtree(path, ignore_errors=True)
     rig = find_rig("elbow")
     for _ in record(rig, path, SETTINGS):
@@ -66,54 +73,54 @@ def _record_and_compare(path: Path, poses: Callable[[SceneRig], object]) -> floa
     if animation:
         animation.action = None
     rig.armature_object.pose.bones["lower"].rotation_euler[0] = 1.0
-    evaluator, told = PoseEvaluator(rig, recording.rig), []
-    for _ in poses(rig):
-        pose, shown, controls = evaluator.evaluate()
-        told.append((np.append(pose, controls), shown))
-    apart = 0.0
-    for number, (inputs, shown) in enumerate(told):
-        for other_inputs, other in told[:number]:
-            if np.abs(inputs - other_inputs).max() < SAME_INPUT:
-                apart = max(apart, float(np.linalg.norm(shown - other, axis=1).max()))
-    if apart > SAME_SURFACE:
-        raise ShortfallError(f"recorded, and two surfaces of one input are {apart * 1000:.1f} mm apart")
-    return apart
+    evaluator, samples = PoseEvaluator(rig, recording.rig), []
+    for _ in visit_poses(rig):
+        pose, positions, controls = evaluator.evaluate()
+        samples.append((np.append(pose, controls), positions))
+    distance_m = 0.0
+    for index, (inputs, positions) in enumerate(samples):
+        for other_inputs, other_positions in samples[:index]:
+            if np.abs(inputs - other_inputs).max() < SAME_INPUT_TOLERANCE:
+                distance_m = max(distance_m, float(np.linalg.norm(positions - other_positions, axis=1).max()))
+    if distance_m > SAME_SURFACE_TOLERANCE:
+        raise CaseFailedError(f"recorded, but two surfaces with equal inputs are {distance_m * 1000:.1f} mm apart")
+    return distance_m
 
 
-def _all_frames(_rig: SceneRig, _random: np.random.Generator) -> object:
+def _visit_frames(_rig: SceneRig, _random: np.random.Generator) -> object:
     for frame in FRAMES:
         bpy.context.scene.frame_set(frame)
         yield
 
 
-def _build_in_time(random: np.random.Generator) -> str:
+def _build_time_dependent(random: np.random.Generator) -> str:
     if random.random() < 0.2:
         builders = (*in_time.REFUSED, *in_time.TOLD, *in_time.HARMLESS)
         build = builders[random.integers(len(builders))]
         build()
         return build.__name__
-    owners = []
-    while not owners:
+    properties = []
+    while not properties:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         fdda_addon.register()
-        build = STACKS[random.integers(len(STACKS))]
+        build = STACK_BUILDERS[random.integers(len(STACK_BUILDERS))]
         build()
-        owners = _owners()
-    owner, path = owners[random.integers(len(owners))]
-    way = str(random.choice(WAYS))
-    old = getattr(owner, path)
-    high = old + float(random.uniform(0.05, 1.0))
-    if way == "keys":
-        in_time.key(owner, path, old, high)
+        properties = _animatable_properties()
+    owner, path = properties[random.integers(len(properties))]
+    dependency = str(random.choice(TIME_DEPENDENCIES))
+    start_value = getattr(owner, path)
+    end_value = start_value + float(random.uniform(0.05, 1.0))
+    if dependency == "keys":
+        in_time.key(owner, path, start_value, end_value)
     else:
-        _drive(owner, path, way, old, high - old)
+        _add_driver(owner, path, dependency, start_value, end_value - start_value)
     bpy.context.scene.frame_set(1)
-    return f"{way} of {path} in {build.__name__}"
+    return f"{dependency} of {path} in {build.__name__}"
 
 
-def _owners() -> list[tuple[bpy.types.bpy_struct, str]]:
-    """Numbers that may move the surface, or may not."""
-    found = []
+def _animatable_properties() -> list[tuple[bpy.types.bpy_struct, str]]:
+    """List the animatable numbers of all modifiers and shape keys, each as its owner and name."""
+    properties = []
     for scene_object in bpy.context.scene.objects:
         structs = [*scene_object.modifiers]
         keys = getattr(scene_object.data, "shape_keys", None)
@@ -124,27 +131,28 @@ def _owners() -> list[tuple[bpy.types.bpy_struct, str]]:
                     path = f"{struct.path_from_id()}.{prop.identifier}"
                     animation = struct.id_data.animation_data
                     if path not in {curve.data_path for curve in (animation.drivers if animation else ())}:
-                        found.append((struct, prop.identifier))
-    return found
+                        properties.append((struct, prop.identifier))
+    return properties
 
 
-def _drive(owner: bpy.types.bpy_struct, path: str, way: str, start: float, change: float) -> None:
+def _add_driver(owner: bpy.types.bpy_struct, path: str, dependency: str, start: float, change: float) -> None:
+    """Drive a property from a start value by a change over 30 frames."""
     driver = owner.driver_add(path).driver
-    part = "min(1, frame / 30)"
-    if way == "scene":
+    progress = "min(1, frame / 30)"
+    if dependency == "scene":
         variable = driver.variables.new()
         variable.name, variable.targets[0].id_type = "now", "SCENE"
         variable.targets[0].id, variable.targets[0].data_path = bpy.context.scene, "frame_current"
-        part = "min(1, now / 30)"
-    elif way == "property":
+        progress = "min(1, now / 30)"
+    elif dependency == "property":
         holder = bpy.data.objects.new("holder", None)
         bpy.context.scene.collection.objects.link(holder)
-        holder["part"] = 0.0
-        in_time.key(holder, '["part"]', 0.0, 1.0)
+        holder["progress"] = 0.0
+        in_time.key(holder, '["progress"]', 0.0, 1.0)
         variable = driver.variables.new()
-        variable.name, variable.targets[0].id, variable.targets[0].data_path = "part", holder, '["part"]'
-        part = "part"
-    driver.expression = f"{start} + {change} * {part}"
+        variable.name, variable.targets[0].id, variable.targets[0].data_path = "progress", holder, '["progress"]'
+        progress = "progress"
+    driver.expression = f"{start} + {change} * {progress}"
 
 
 def _build_second_armature(random: np.random.Generator) -> str:
@@ -155,15 +163,15 @@ def _build_second_armature(random: np.random.Generator) -> str:
     bone.rotation_mode = str(random.choice(["QUATERNION", "AXIS_ANGLE", "XYZ", "ZYX"]))
     for locks in (bone.lock_location, bone.lock_rotation, bone.lock_scale):
         for axis in range(3):
-            # Mostly locked: else nearly all are refused.
+            # With few locks, nearly all recordings would be refused.
             locks[axis] = random.random() < 0.85
     if random.random() < 0.3:
         in_time.key(bone, "location", (0.0, 0.0, 0.0), (0.0, 0.02, 0.02))
     return f"{bone.rotation_mode} in {build.__name__}"
 
 
-def _all_moves(_rig: SceneRig, random: np.random.Generator) -> object:
-    """Move the bones of the second armature in all that is not locked."""
+def _move_second_armature(_rig: SceneRig, random: np.random.Generator) -> object:
+    """Move the bones of the second armature along all unlocked axes, yielding after each pose."""
     for _ in range(6):
         for bone in bpy.data.objects[second_armature.MUSCLES].pose.bones:
             for axis in range(3):

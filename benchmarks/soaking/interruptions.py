@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Kills and full disks: what was complete is so, what resumes is bit-identical, what was there before still is."""
+"""Soak test of killed verbs and full disks.
+
+Complete poses and existing files must survive, and a resumed recording must be bit-identical to an uninterrupted one.
+"""
 
 import ctypes
 import os
@@ -17,50 +20,52 @@ from fdda_addon.core.model import read_model
 from fdda_addon.core.recording.index import read_index
 from fdda_addon.core.recording.reader import read_recording
 
-from .cases import ShortfallError, attempt, is_sentence, say
+from .cases import CaseFailedError, is_sentence, print_case, run_case
 
 ROOT = Path(__file__).resolve().parents[2]
 POSES = 40
-TRAINING = ("--epochs", "3", "--hidden", "4", "4")
-KINDS = ("record", "train", "write")
-DISKS = ("record", "train", "bind", "evaluate")
-NO_ROOM = 75
-WRITE = """
+TRAINING_OPTIONS = ("--epochs", "3", "--hidden", "4", "4")
+KILLED_PROCESSES = ("record", "train", "write")
+DISK_VERBS = ("record", "train", "bind", "evaluate")
+DISK_FULL_STATUS = 75
+WRITER_SCRIPT = """
 import sys
 from pathlib import Path
 from fdda_addon.core.recording.reader import read_recording
 from fdda_addon.core.recording.writer import RecordingWriter
 source, path = map(Path, sys.argv[1:])
-found = read_recording(source)
+recording = read_recording(source)
 print("ready", flush=True)
-with RecordingWriter(path, found.rig, found.partitions, found.info, resume=path.exists()) as writer:
-    while writer.complete < len(found.pose_matrices):
-        part = slice(writer.complete, writer.complete + 1)
-        writer.append(found.pose_matrices[part], found.residuals[part])
+with RecordingWriter(path, recording.rig, recording.partitions, recording.info, resume=path.exists()) as writer:
+    while writer.complete < len(recording.pose_matrices):
+        poses = slice(writer.complete, writer.complete + 1)
+        writer.append(recording.pose_matrices[poses], recording.residuals[poses])
 """
 
 
-def run_kills(folder: Path, seed: int, first: int, end: int) -> None:
-    """Kill verbs at random moments and go on."""
-    for number in range(first, end):
-        random, kind = np.random.default_rng((seed, number)), KINDS[number % len(KINDS)]
+def run_kills(folder: Path, seed: int, first_case: int, end_case: int) -> None:
+    """Kill verbs and a recording writer at random moments, and resume them."""
+    for case_index in range(first_case, end_case):
+        random = np.random.default_rng((seed, case_index))
+        kind = KILLED_PROCESSES[case_index % len(KILLED_PROCESSES)]
         action = {"record": _kill_record, "train": _kill_train, "write": _kill_writer}[kind]
-        say(attempt("kills", f"kill {seed}/{number} ({kind})", lambda a=action, r=random: a(folder, r)))
+        print_case(run_case("kills", f"kill {seed}/{case_index} ({kind})", lambda a=action, r=random: a(folder, r)))
 
 
-def run_full_disks(folder: Path, seed: int, first: int, end: int) -> None:
+def run_full_disks(folder: Path, seed: int, first_case: int, end_case: int) -> None:
     """Run verbs on disks of random sizes."""
-    for number in range(first, end):
-        random, verb = np.random.default_rng((seed, number)), DISKS[number % len(DISKS)]
-        say(attempt("full disks", f"full disk {seed}/{number} ({verb})", lambda v=verb, r=random: _fill(folder, v, r)))
+    for case_index in range(first_case, end_case):
+        random, verb = np.random.default_rng((seed, case_index)), DISK_VERBS[case_index % len(DISK_VERBS)]
+        name = f"full disk {seed}/{case_index} ({verb})"
+        print_case(run_case("full disks", name, lambda v=verb, r=random: _run_on_small_disk(folder, v, r)))
 
 
-def _command(*arguments: object) -> list[str]:
+def _verb_command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "fdda_addon", *map(str, arguments)]
 
 
-def _killed(command: list[str], seconds: float) -> bool:
-    """Start a process and kill it after so many seconds; whether it was still at work."""
+def _run_and_kill(command: list[str], seconds: float) -> bool:
+    """Run a command and kill it after a number of seconds; return whether it was still running."""
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     try:
         output, _ = process.communicate(timeout=seconds)
@@ -69,14 +74,14 @@ def _killed(command: list[str], seconds: float) -> bool:
         process.communicate()
         return True
     if process.returncode:
-        raise ShortfallError(f"exit status {process.returncode}: {output.decode()[-300:]}")
+        raise CaseFailedError(f"exit status {process.returncode}: {output.decode()[-300:]}")
     return False
 
 
-def _same_arrays(recording: Path, whole: Path) -> None:
-    for path in whole.glob("*.npy"):
+def _check_same_arrays(recording: Path, reference: Path) -> None:
+    for path in reference.glob("*.npy"):
         if path.read_bytes() != (recording / path.name).read_bytes():
-            raise ShortfallError(f"{path.name} is not what one run records")
+            raise CaseFailedError(f"{path.name} differs from that of an uninterrupted recording")
 
 
 def _kill_record(folder: Path, random: np.random.Generator) -> None:
@@ -86,41 +91,41 @@ def _kill_record(folder: Path, random: np.random.Generator) -> None:
         if recording.exists() and (recording / "recording.json").exists():
             read_index(recording)
         resume = ("--resume",) if recording.exists() else ()
-        command = _command("record", folder / "elbow.blend", recording, "--poses", POSES, *resume)
-        if not _killed(command, float(random.uniform(0.5, 2.5))):
+        command = _verb_command("record", folder / "elbow.blend", recording, "--poses", POSES, *resume)
+        if not _run_and_kill(command, float(random.uniform(0.5, 2.5))):
             break
     if not (recording / "recording.json").exists() or read_index(recording)["complete"] < POSES:
         resume = ("--resume",) if recording.exists() else ()
-        command = _command("record", folder / "elbow.blend", recording, "--poses", POSES, *resume)
-        if _killed(command, 60):
-            raise ShortfallError("the resumed recording does not end")
+        command = _verb_command("record", folder / "elbow.blend", recording, "--poses", POSES, *resume)
+        if _run_and_kill(command, 60):
+            raise CaseFailedError("the resumed recording does not end")
     read_recording(recording)
-    _same_arrays(recording, folder / "short recording")
+    _check_same_arrays(recording, folder / "short recording")
 
 
 def _kill_train(folder: Path, random: np.random.Generator) -> None:
-    place = folder / "killed training"
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir()
-    model = place / "m.onnx"
-    had = bool(random.integers(2))
-    if had:
+    output = folder / "killed training"
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir()
+    model = output / "m.onnx"
+    has_old_model = bool(random.integers(2))
+    if has_old_model:
         shutil.copy(folder / "elbow.onnx", model)
-    before = model.read_bytes() if had else b""
-    command = [sys.executable, "-m", "trainer", str(folder / "short recording"), str(model), *TRAINING]
-    finished = not _killed(command, float(random.uniform(0.2, 6)))
+    old_data = model.read_bytes() if has_old_model else b""
+    command = [sys.executable, "-m", "trainer", str(folder / "short recording"), str(model), *TRAINING_OPTIONS]
+    has_finished = not _run_and_kill(command, float(random.uniform(0.2, 6)))
     if model.exists():
         _, data = read_model(model)
-        if finished and had and data == before:
-            raise ShortfallError("it has finished and the model is the old one")
-    elif had or finished:
-        raise ShortfallError("the model is gone")
+        if has_finished and has_old_model and data == old_data:
+            raise CaseFailedError("the training has finished, but the file is still the old model")
+    elif has_old_model or has_finished:
+        raise CaseFailedError("there is no model")
 
 
 def _kill_writer(folder: Path, random: np.random.Generator) -> None:
     recording = folder / "killed writing"
     shutil.rmtree(recording, ignore_errors=True)
-    command = [sys.executable, "-c", WRITE, str(folder / "recording"), str(recording)]
+    command = [sys.executable, "-c", WRITER_SCRIPT, str(folder / "recording"), str(recording)]
     for _ in range(3):
         process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         process.stdout.readline()
@@ -131,39 +136,40 @@ def _kill_writer(folder: Path, random: np.random.Generator) -> None:
             process.communicate()
             continue
         if process.returncode:
-            raise ShortfallError(f"it cannot be gone on with: exit status {process.returncode}")
+            raise CaseFailedError(f"the recording cannot be resumed: exit status {process.returncode}")
         break
-    if _killed(command, 60):
-        raise ShortfallError("the resumed recording does not end")
+    if _run_and_kill(command, 60):
+        raise CaseFailedError("the resumed recording does not end")
     read_recording(recording)
-    _same_arrays(recording, folder / "recording")
+    _check_same_arrays(recording, folder / "recording")
 
 
 @contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[Path]:
-    """A disk of its own of so many bytes; needs root.
+    """Mount an empty disk with a size in bytes; needs root.
 
     Raises:
-        ShortfallError: it cannot be mounted.
+        CaseFailedError: it cannot be mounted.
     """
     folder.mkdir(exist_ok=True)
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.mount(b"tmpfs", os.fsencode(folder), b"tmpfs", 0, f"size={size}".encode()):
-        raise ShortfallError("no disk can be mounted here: only root may")
+        raise CaseFailedError("only root can mount a disk")
     try:
         yield folder
     finally:
         libc.umount2(os.fsencode(folder), 2)
 
 
-def _fill(folder: Path, verb: str, random: np.random.Generator) -> None:
-    largest = {"record": 400e3, "train": 600e3, "bind": 2e6, "evaluate": 12e3}[verb]
-    size = int(random.uniform(4096, largest))
+def _run_on_small_disk(folder: Path, verb: str, random: np.random.Generator) -> None:
+    max_bytes = {"record": 400e3, "train": 600e3, "bind": 2e6, "evaluate": 12e3}[verb]
+    size = int(random.uniform(4096, max_bytes))
     with small_disk(folder / "small disk", size) as disk:
-        old = {"record": None, "train": disk / "m.onnx", "bind": disk / "b.blend", "evaluate": disk / "e.json"}[verb]
+        # A refused recording may leave its complete poses, to be resumed.
+        may_leave_files = verb == "record"
         commands = {
             "record": ("record", folder / "elbow.blend", disk / "r", "--poses", POSES),
-            "train": ("train", folder / "short recording", disk / "m.onnx", *TRAINING),
+            "train": ("train", folder / "short recording", disk / "m.onnx", *TRAINING_OPTIONS),
             "bind": ("bind", folder / "elbow.blend", folder / "elbow.onnx", disk / "b.blend"),
             "evaluate": (
                 "evaluate",
@@ -176,16 +182,16 @@ def _fill(folder: Path, verb: str, random: np.random.Generator) -> None:
             ),
         }
         result = subprocess.run(
-            _command(*commands[verb]), cwd=ROOT, capture_output=True, text=True, check=False, timeout=60
+            _verb_command(*commands[verb]), cwd=ROOT, capture_output=True, text=True, check=False, timeout=60
         )
-        left = sorted(str(path.relative_to(disk)) for path in disk.rglob("*"))
-        if result.returncode not in (0, NO_ROOM):
-            raise ShortfallError(f"exit status {result.returncode}: {result.stderr[-300:]}")
+        remaining_files = sorted(str(path.relative_to(disk)) for path in disk.rglob("*"))
+        if result.returncode not in (0, DISK_FULL_STATUS):
+            raise CaseFailedError(f"exit status {result.returncode}: {result.stderr[-300:]}")
         if "Traceback" in result.stderr + result.stdout:
-            raise ShortfallError(f"a traceback: {result.stderr[-300:]}")
-        if result.returncode == NO_ROOM:
+            raise CaseFailedError(f"a traceback: {result.stderr[-300:]}")
+        if result.returncode == DISK_FULL_STATUS:
             sentence = result.stderr.strip().splitlines()[-1]
             if not is_sentence(sentence):
-                raise ShortfallError(f"no sentence: {sentence[:300]}")
-            if old is not None and left:
-                raise ShortfallError(f"it is refused ({sentence}) and leaves {left}")
+                raise CaseFailedError(f"the error message is not one sentence: {sentence[:300]}")
+            if remaining_files and not may_leave_files:
+                raise CaseFailedError(f"the verb was refused ({sentence}) but left {remaining_files}")

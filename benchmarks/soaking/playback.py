@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Frames, undo steps, loads and binds, and every way to evaluate, against what the model says of the same pose."""
+"""Soak test of frames, undo steps, loads, binds and evaluation paths.
+
+Each compares the shown mesh with the model's output for the same pose.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,87 +17,85 @@ from tests.blender.conftest import ELBOW, ELBOW_RIG, evaluated, pose, predicted
 from tests.blender.test_evaluations import FRAMES, export_alembic, export_usd, keyed, read_back, shown_in
 from tests.blender.test_renders import render_positions, set_camera, still
 
-from .cases import ShortfallError, attempt, say
+from .cases import CaseFailedError, print_case, run_case
 
-EXACT = 0.0
-NEAR = 1e-6
-"""Metres: what a file's own precision, or a space in between, may take."""
+MAX_FILE_ERROR_M = 1e-6
+"""Error limit of exported files, whose precision and coordinate systems differ, meters."""
 
 
-def run_frames(folder: Path, seed: int, first: int, end: int) -> None:
-    """Frames and subframes at random."""
-    bound, random = open_bound(folder), np.random.default_rng((seed, first))
+def run_frames(folder: Path, seed: int, first_case: int, end_case: int) -> None:
+    """Go to random frames and subframes."""
+    bound, random = open_bound(folder), np.random.default_rng((seed, first_case))
 
-    def frame() -> float:
+    def set_random_frame() -> float:
         subframe = float(random.random()) if random.random() < 0.3 else 0.0
         bpy.context.scene.frame_set(int(random.integers(1, 31)), subframe=subframe)
-        return _off(bound, folder)
+        return _model_error_m(bound, folder)
 
-    repeat("frames", first, end, frame)
+    repeat("frames", first_case, end_case, set_random_frame)
 
 
-def run_undo(folder: Path, seed: int, first: int, end: int) -> None:
-    """Poses, modes and copies, each with an undo step; undone and done again at random."""
+def run_undo(folder: Path, seed: int, first_case: int, end_case: int) -> None:
+    """Change poses and modes with undo steps, and undo and redo them at random."""
     open_bound(folder)
-    random = np.random.default_rng((seed, first))
+    random = np.random.default_rng((seed, first_case))
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     bpy.ops.ed.undo_push(message="start")
 
-    def step() -> float:
-        kind = random.integers(10)
-        if kind < 5:
+    def change_or_undo() -> float:
+        action = random.integers(10)
+        if action < 5:
             bone = bpy.data.objects[ELBOW_RIG].pose.bones[str(random.choice(["upper", "lower"]))]
             bone.rotation_euler[0] = float(random.uniform(-1, 1))
             bpy.context.view_layer.update()
             bpy.ops.ed.undo_push(message="pose")
-        elif kind == 5:
+        elif action == 5:
             bpy.data.objects[ELBOW].fdda.mode = str(random.choice(["RIG", "LINEAR", "FDDA"]))
             bpy.context.view_layer.update()
             bpy.ops.ed.undo_push(message="mode")
-        elif kind < 8:
+        elif action < 8:
             bpy.ops.ed.undo() if bpy.ops.ed.undo.poll() else None
         else:
             bpy.ops.ed.redo() if bpy.ops.ed.redo.poll() else None
         bpy.context.view_layer.update()
         mesh_object = bpy.data.objects[ELBOW]
-        return _off(mesh_object, folder) if mesh_object.fdda.mode == "FDDA" else 0.0
+        return _model_error_m(mesh_object, folder) if mesh_object.fdda.mode == "FDDA" else 0.0
 
-    repeat("undo steps", first, end, step)
+    repeat("undo steps", first_case, end_case, change_or_undo)
 
 
-def run_loads(folder: Path, seed: int, first: int, end: int) -> None:
-    """A file opened, its model bound, played, unbound and bound again; and a bound file opened, in turn."""
-    turn = [first]
+def run_loads(folder: Path, seed: int, first_case: int, end_case: int) -> None:
+    """Alternately open a bound file, and open a rig, bind its model, unbind it and bind it again."""
+    load_index = first_case
 
     def load() -> float:
-        turn[0] += 1
-        if turn[0] % 2:
-            return max(_off(open_bound(folder), folder), 0.0)
+        nonlocal load_index
+        load_index += 1
+        if load_index % 2:
+            return _model_error_m(open_bound(folder), folder)
         bpy.ops.wm.open_mainfile(filepath=str(folder / "elbow.blend"))
         rig = find_rig()
         bind(rig, folder / "elbow.onnx")
-        bpy.context.scene.frame_set(turn[0] % 30)
-        off = _off(rig.mesh_object, folder)
+        bpy.context.scene.frame_set(load_index % 30)
+        error_m = _model_error_m(rig.mesh_object, folder)
         unbind(rig.mesh_object)
         bind(find_rig(), folder / "elbow.onnx")
         bpy.context.view_layer.update()
-        return max(off, _off(find_rig().mesh_object, folder))
+        return max(error_m, _model_error_m(find_rig().mesh_object, folder))
 
-    repeat("loads and binds", first, end, load)
-
-
-def run_paths(folder: Path, seed: int, first: int, end: int) -> None:
-    """Each way to evaluate; where renders show the rig, what it shows is compared with the rig."""
-    ways = [*_WAYS.items()]
-    for number in range(first, min(end, len(ways))):
-        name, way = ways[number]
-        say(attempt("evaluation paths", name, lambda w=way: w(folder)))
+    repeat("loads and binds", first_case, end_case, load)
 
 
-def repeat(part: str, first: int, end: int, action: Callable[[], float]) -> None:
-    """Do something again and again, a case each; it returns how far it was off."""
-    for number in range(first, end):
-        say(attempt(part, f"{part} {number}", action))
+def run_paths(folder: Path, seed: int, first_case: int, end_case: int) -> None:
+    """Evaluate the mesh in every way that Blender offers; where renders show the rig, compare with the rig."""
+    for name, run_path in [*EVALUATION_PATHS.items()][first_case:end_case]:
+        print_case(run_case("evaluation paths", name, lambda r=run_path: r(folder)))
+
+
+def repeat(part: str, first_case: int, end_case: int, action: Callable[[], float]) -> None:
+    """Run an action once per case; it returns its largest error, meters."""
+    for case_index in range(first_case, end_case):
+        print_case(run_case(part, f"{part} {case_index}", action))
 
 
 def open_bound(folder: Path) -> bpy.types.Object:
@@ -104,88 +105,89 @@ def open_bound(folder: Path) -> bpy.types.Object:
     return bpy.data.objects[ELBOW]
 
 
-def _off(mesh_object: bpy.types.Object, folder: Path, limit: float = EXACT) -> float:
-    """How far what the window shows is from what the model says."""
+def _model_error_m(mesh_object: bpy.types.Object, folder: Path) -> float:
+    """Return the distance between the shown mesh and the model's output, meters; any distance fails the case."""
     if mesh_object.fdda.status:
-        raise ShortfallError(mesh_object.fdda.status)
-    return _apart(evaluated(mesh_object), predicted(mesh_object, folder / "elbow.onnx"), limit)
+        raise CaseFailedError(mesh_object.fdda.status)
+    return _distance_m(evaluated(mesh_object), predicted(mesh_object, folder / "elbow.onnx"), 0.0)
 
 
-def _apart(shown: np.ndarray, expected: np.ndarray, limit: float = NEAR) -> float:
-    off = float(np.linalg.norm(shown - expected, axis=1).max())
-    if not off <= limit:
-        raise ShortfallError(f"it is {off} m off")
-    return off
+def _distance_m(shown: np.ndarray, expected: np.ndarray, max_distance_m: float) -> float:
+    """Return the largest distance between two arrays of positions, meters; fail the case where it is too large."""
+    distance_m = float(np.linalg.norm(shown - expected, axis=1).max())
+    if not distance_m <= max_distance_m:
+        raise CaseFailedError(f"the mesh is {distance_m} m from the expected positions")
+    return distance_m
 
 
-def _frames(folder: Path) -> float:
-    bound, off = open_bound(folder), 0.0
-    for number in range(1, 31):
-        bpy.context.scene.frame_set(number, subframe=0.5 * (number % 2))
-        off = max(off, _off(bound, folder))
-    return off
+def _check_frames(folder: Path) -> float:
+    bound, error_m = open_bound(folder), 0.0
+    for frame in range(1, 31):
+        bpy.context.scene.frame_set(frame, subframe=0.5 * (frame % 2))
+        error_m = max(error_m, _model_error_m(bound, folder))
+    return error_m
 
 
-def _by_hand(folder: Path) -> float:
-    bound, off = open_bound(folder), 0.0
+def _check_poses(folder: Path) -> float:
+    bound, error_m = open_bound(folder), 0.0
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     for angle in np.linspace(-1, 1, 21):
         pose(angle=float(angle))
-        off = max(off, _off(bound, folder))
-    return off
+        error_m = max(error_m, _model_error_m(bound, folder))
+    return error_m
 
 
-def _view_layers_and_scenes(folder: Path) -> float:
-    bound, off = open_bound(folder), 0.0
+def _check_view_layers_and_scenes(folder: Path) -> float:
+    bound, error_m = open_bound(folder), 0.0
     layer, scene = bpy.context.scene.view_layers.new("second"), bpy.data.scenes.new("second")
     for name in (ELBOW, ELBOW_RIG):
         scene.collection.objects.link(bpy.data.objects[name])
-    for number in FRAMES:
-        bpy.context.scene.frame_set(number)
+    for frame in FRAMES:
+        bpy.context.scene.frame_set(frame)
         layer.update()
         expected = predicted(bound, folder / "elbow.onnx")
-        scene.frame_set(number)
+        scene.frame_set(frame)
         for graph in (layer.depsgraph, scene.view_layers[0].depsgraph):
-            off = max(off, _apart(shown_in(graph, bound), expected, EXACT))
-    return off
+            error_m = max(error_m, _distance_m(shown_in(graph, bound), expected, 0.0))
+    return error_m
 
 
-def _instances(folder: Path) -> float:
-    bound, off = open_bound(folder), 0.0
+def _check_instances(folder: Path) -> float:
+    bound, error_m = open_bound(folder), 0.0
     collection = bpy.data.collections.new("character")
     collection.objects.link(bound)
     empty = bpy.data.objects.new("instance", None)
     empty.instance_type, empty.instance_collection, empty.location.x = "COLLECTION", collection, 2
     bpy.context.scene.collection.objects.link(empty)
-    for number in FRAMES:
-        bpy.context.scene.frame_set(number)
+    for frame in FRAMES:
+        bpy.context.scene.frame_set(frame)
         graph = bpy.context.evaluated_depsgraph_get()
-        found = [i.object.data for i in graph.object_instances if i.is_instance and i.object.original == bound]
+        meshes = [i.object.data for i in graph.object_instances if i.is_instance and i.object.original == bound]
         expected = predicted(bound, folder / "elbow.onnx")
-        for mesh in found:
-            off = max(off, _apart(np.array([v.co[:] for v in mesh.vertices], np.float32), expected, EXACT))
-        if not found:
-            raise ShortfallError("there is no instance")
-    return off
+        for mesh in meshes:
+            error_m = max(error_m, _distance_m(np.array([v.co[:] for v in mesh.vertices], np.float32), expected, 0.0))
+        if not meshes:
+            raise CaseFailedError("there is no instance")
+    return error_m
 
 
-def _linked(folder: Path) -> float:
+def _check_linked(folder: Path) -> float:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     fdda_addon.register()
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
-    with bpy.data.libraries.load(str(folder / "bound.blend"), link=True) as (_, wanted):
-        wanted.objects = [ELBOW, ELBOW_RIG]
-    for linked in wanted.objects:
-        bpy.context.scene.collection.objects.link(linked)
-    off = 0.0
-    for number in FRAMES:
-        bpy.context.scene.frame_set(number)
-        off = max(off, _off(wanted.objects[0], folder))
-    return off
+    with bpy.data.libraries.load(str(folder / "bound.blend"), link=True) as (_, linked):
+        linked.objects = [ELBOW, ELBOW_RIG]
+    for linked_object in linked.objects:
+        bpy.context.scene.collection.objects.link(linked_object)
+    error_m = 0.0
+    for frame in FRAMES:
+        bpy.context.scene.frame_set(frame)
+        error_m = max(error_m, _model_error_m(linked.objects[0], folder))
+    return error_m
 
 
-def _still(engine: str, use_in_render: bool) -> Callable[[Path], float]:
-    def way(folder: Path) -> float:
+def _check_still(engine: str, use_in_render: bool) -> Callable[[Path], float]:
+    def check(folder: Path) -> float:
         bound = open_bound(folder)
         set_camera()
         scene = bpy.context.scene
@@ -200,49 +202,53 @@ def _still(engine: str, use_in_render: bool) -> Callable[[Path], float]:
             bound.fdda.mode = "FDDA"
         plain = render_positions(bound, expected, folder / "plain.png")
         if not np.array_equal(still(folder / "still.png"), plain):
-            raise ShortfallError("the picture is not that of a plain mesh")
+            raise CaseFailedError("the picture differs from that of a mesh with the expected positions")
         return 0.0
 
-    return way
+    return check
 
 
-def _export(
+def _check_export(
     export: Callable[[Path, str], None], suffix: str, mode: str, use_in_render: bool
 ) -> Callable[[Path], float]:
-    def way(folder: Path) -> float:
+    def check(folder: Path) -> float:
         bound = keyed(open_bound(folder))
         bound.fdda.use_in_render = use_in_render
         expected = {}
-        for number in FRAMES:
-            bpy.context.scene.frame_set(number)
+        for frame in FRAMES:
+            bpy.context.scene.frame_set(frame)
             bound.fdda.mode = "FDDA" if mode == "VIEWPORT" or use_in_render else "RIG"
-            expected[number] = evaluated(bound)
+            expected[frame] = evaluated(bound)
             bound.fdda.mode = "FDDA"
         path = folder / f"exported{suffix}"
         export(path, mode)
-        return max(_apart(positions, expected[number]) for number, positions in read_back(path).items())
+        return max(
+            _distance_m(positions, expected[frame], MAX_FILE_ERROR_M) for frame, positions in read_back(path).items()
+        )
 
-    return way
+    return check
 
 
 _ENGINES = ("BLENDER_WORKBENCH", "CYCLES")
 _EXPORTS = {".abc": export_alembic, ".usdc": export_usd}
-_WAYS: dict[str, Callable[[Path], float]] = {
-    "frames and subframes": _frames,
-    "poses by hand": _by_hand,
-    "view layers and scenes": _view_layers_and_scenes,
-    "instances of a collection": _instances,
-    "linked from a library": _linked,
+EVALUATION_PATHS: dict[str, Callable[[Path], float]] = {
+    "frames and subframes": _check_frames,
+    "poses by hand": _check_poses,
+    "view layers and scenes": _check_view_layers_and_scenes,
+    "instances of a collection": _check_instances,
+    "linked from a library": _check_linked,
     **{
-        f"still, {engine}, {'model' if use else 'rig'} in renders": _still(engine, use)
+        f"still, {engine}, {'model' if use_in_render else 'rig'} in renders": _check_still(engine, use_in_render)
         for engine in _ENGINES
-        for use in (False, True)
+        for use_in_render in (False, True)
     },
     **{
-        f"{suffix} as for {mode}, {'model' if use else 'rig'} in renders": _export(export, suffix, mode, use)
+        f"{suffix} as for {mode}, {'model' if use_in_render else 'rig'} in renders": _check_export(
+            export, suffix, mode, use_in_render
+        )
         for suffix, export in _EXPORTS.items()
         for mode in ("VIEWPORT", "RENDER")
-        for use in (False, True)
+        for use_in_render in (False, True)
     },
 }
-PATHS = len(_WAYS)
+"""Ways in which Blender evaluates a mesh, each with a function that returns its largest error, meters."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Cancels and kills trainings at random moments: they end by themselves, soon, and leave a whole model or none."""
+"""Soak test of stopped trainings: they end soon without being killed, and leave a complete model or none."""
 
 import os
 import shutil
@@ -15,66 +15,70 @@ from fdda_addon.core.model import read_model
 from fdda_addon.core.stop_signals import INTERRUPTED
 from fdda_addon.training import detached_process, process
 
-from .cases import ShortfallError, attempt, say
+from .cases import CaseFailedError, print_case, run_case
 
 ROOT = Path(__file__).resolve().parents[2]
-TRAINING = ("--epochs", "10", "--hidden", "4", "4")
-SECONDS = 20
-"""A training that is asked to stop at a random moment has ended after so long."""
-KINDS = ("cancelled", "followed", "interrupted", "killed")
+TRAINING_OPTIONS = ("--epochs", "10", "--hidden", "4", "4")
+MAX_STOP_SECONDS = 20
+"""Time limit for a training to end after its verb was stopped."""
+OUTPUT_FILE_COUNT = 4
+"""Files of a finished training: model, two reports, checkpoint."""
+STOP_KINDS = ("canceled", "attached", "interrupted", "killed")
 
 
-def run(folder: Path, seed: int, first: int, end: int) -> None:
-    """Stop trainings in four ways: by the sidebar, by another Blender, by a signal to the verb, by its death."""
+def run(folder: Path, seed: int, first_case: int, end_case: int) -> None:
+    """Stop trainings in four ways: from the sidebar, from another Blender, by a signal to the verb, by killing it."""
     detached_process.user_folder = lambda: folder / "user"
-    for number in range(first, end):
-        random, kind = np.random.default_rng((seed, number)), KINDS[number % len(KINDS)]
-        action = {"cancelled": _cancel, "followed": _follow, "interrupted": _interrupt, "killed": _kill}[kind]
-        say(attempt("signals", f"signal {seed}/{number} ({kind})", lambda a=action, r=random: _stop(folder, a, r)))
+    stop_functions = {"canceled": _cancel, "attached": _cancel_attached, "interrupted": _interrupt, "killed": _kill}
+    for case_index in range(first_case, end_case):
+        random, kind = np.random.default_rng((seed, case_index)), STOP_KINDS[case_index % len(STOP_KINDS)]
+        name, stop = f"signal {seed}/{case_index} ({kind})", stop_functions[kind]
+        print_case(run_case("signals", name, lambda s=stop, r=random: _check_stop(folder, s, r)))
 
 
-def _stop(folder: Path, action, random: np.random.Generator) -> None:
-    place = folder / "stopped training"
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir()
-    model = place / "m.onnx"
-    had = bool(random.integers(2))
-    if had:
+def _check_stop(folder: Path, stop, random: np.random.Generator) -> None:
+    output = folder / "stopped training"
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir()
+    model = output / "m.onnx"
+    has_old_model = bool(random.integers(2))
+    if has_old_model:
         shutil.copy(folder / "elbow.onnx", model)
-    before = model.read_bytes() if had else b""
-    status = action([str(folder / "short recording"), str(model), *TRAINING], model, random)
+    old_data = model.read_bytes() if has_old_model else b""
+    status = stop([str(folder / "short recording"), str(model), *TRAINING_OPTIONS], model, random)
     if status not in (INTERRUPTED, 0):
-        raise ShortfallError(f"exit status {status}")
-    left = sorted(path.name for path in place.iterdir())
-    if status == INTERRUPTED and (left != ["m.onnx"] * had or (had and model.read_bytes() != before)):
-        raise ShortfallError(f"it was stopped and left {left}")
-    if status == 0 and len(left) != 4:
-        raise ShortfallError(f"it was done and left {left}")
+        raise CaseFailedError(f"exit status {status}")
+    files = sorted(path.name for path in output.iterdir())
+    is_unchanged = files == ["m.onnx"] * has_old_model and (not has_old_model or model.read_bytes() == old_data)
+    if status == INTERRUPTED and not is_unchanged:
+        raise CaseFailedError(f"the training was stopped, but changed its output: {files}")
+    if status == 0 and len(files) != OUTPUT_FILE_COUNT:
+        raise CaseFailedError(f"the training finished, but its output is {files}")
     if model.exists():
         read_model(model)
     for path in (folder / "user").rglob("*"):
         if path.is_file():
-            raise ShortfallError(f"'{path}' is left")
+            raise CaseFailedError(f"'{path}' was not removed")
 
 
 def _cancel(arguments: list[str], _model: Path, random: np.random.Generator) -> int:
     with process.Training(arguments) as training:
-        _wait(training, random)
-        return _cancelled(training)
+        _wait_for_random_moment(training, random)
+        return _cancel_and_wait(training)
 
 
-def _follow(arguments: list[str], model: Path, random: np.random.Generator) -> int:
+def _cancel_attached(arguments: list[str], model: Path, random: np.random.Generator) -> int:
     with detached_process.DetachedTraining(arguments, model) as training:
         training.detach()
     popen = detached_process._child_processes.pop(training._process.pid)
-    with detached_process.AttachedTraining(model) as followed:
-        _wait(followed, random)
-        _cancelled(followed)
+    with detached_process.AttachedTraining(model) as attached:
+        _wait_for_random_moment(attached, random)
+        _cancel_and_wait(attached)
     return popen.wait()
 
 
-def _wait(training: process.Training, random: np.random.Generator) -> None:
-    """Until a moment of its start, or a moment after its first message."""
+def _wait_for_random_moment(training: process.Training, random: np.random.Generator) -> None:
+    """Wait for a random time after the start of a training or after its first message."""
     if random.integers(2):
         time.sleep(float(random.uniform(0, 4)))
     else:
@@ -82,53 +86,53 @@ def _wait(training: process.Training, random: np.random.Generator) -> None:
         time.sleep(float(random.exponential(0.5)))
 
 
-def _cancelled(training: process.Training) -> int | None:
+def _cancel_and_wait(training: process.Training) -> int | None:
     training.cancel()
-    began = time.monotonic()
+    started = time.monotonic()
     for _ in training.messages():
         pass
-    if (seconds := time.monotonic() - began) > process.KILL_AFTER_SECONDS:
-        raise ShortfallError(f"it was killed after {seconds:.0f} s")
+    if (seconds := time.monotonic() - started) > process.KILL_AFTER_SECONDS:
+        raise CaseFailedError(f"the training did not end and was killed after {seconds:.0f} s")
     return training._process.wait()
 
 
 def _interrupt(arguments: list[str], model: Path, random: np.random.Generator) -> int:
-    requests = ("CTRL_BREAK_EVENT",) if os.name == "nt" else ("SIGINT", "SIGTERM", "SIGHUP")
-    verb = _verb(arguments)
+    signal_names = ("CTRL_BREAK_EVENT",) if os.name == "nt" else ("SIGINT", "SIGTERM", "SIGHUP")
+    verb = _start_verb(arguments)
     time.sleep(float(random.uniform(0, 6)))
-    verb.send_signal(getattr(signal, str(random.choice(requests))))
+    verb.send_signal(getattr(signal, str(random.choice(signal_names))))
     _, errors = verb.communicate()
     if b"Traceback" in errors:
-        raise ShortfallError(f"a traceback: {errors.decode(errors='replace')[-300:]}")
-    _gone(model)
+        raise CaseFailedError(f"a traceback: {errors.decode(errors='replace')[-300:]}")
+    _wait_for_trainer_end(model)
     return verb.returncode
 
 
 def _kill(arguments: list[str], model: Path, random: np.random.Generator) -> int:
-    verb = _verb(arguments)
+    verb = _start_verb(arguments)
     time.sleep(float(random.uniform(0, 6)))
     verb.kill()
     verb.communicate()
-    _gone(model)
-    return 0 if len(list(model.parent.iterdir())) == 4 else INTERRUPTED
+    _wait_for_trainer_end(model)
+    return 0 if len(list(model.parent.iterdir())) == OUTPUT_FILE_COUNT else INTERRUPTED
 
 
-def _verb(arguments: list[str]) -> subprocess.Popen:
-    own = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP} if os.name == "nt" else {}
+def _start_verb(arguments: list[str]) -> subprocess.Popen:
+    options = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP} if os.name == "nt" else {}
     command = [sys.executable, "-m", "fdda_addon", "train", *arguments]
-    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **own)
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
 
 
-def _gone(model: Path) -> None:
-    """Wait for the trainer of a model, whose verb is gone; where the system lists processes as Linux does."""
-    end = time.monotonic() + SECONDS
-    while any(str(model).encode() in line for line in map(_command, Path("/proc").glob("[0-9]*/cmdline"))):
-        if time.monotonic() > end:
-            raise ShortfallError(f"the trainer goes on {SECONDS} s after its verb")
+def _wait_for_trainer_end(model: Path) -> None:
+    """Wait until the trainer of a model has ended; without /proc, do not wait."""
+    deadline = time.monotonic() + MAX_STOP_SECONDS
+    while any(str(model).encode() in line for line in map(_read_command_line, Path("/proc").glob("[0-9]*/cmdline"))):
+        if time.monotonic() > deadline:
+            raise CaseFailedError(f"the trainer still runs {MAX_STOP_SECONDS} s after its verb")
         time.sleep(0.1)
 
 
-def _command(path: Path) -> bytes:
+def _read_command_line(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError:

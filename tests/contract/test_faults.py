@@ -2,11 +2,14 @@
 """The seeded faults match the code: the text of each fault occurs once in its file, and its tests exist."""
 
 import ast
+import os
 import re
+import sys
+import time
 
 import pytest
 
-from benchmarks.faults import ROOT, Fault, read_faults
+from benchmarks.faults import ROOT, Fault, copy_checkout, read_faults, run_command
 
 FAULTS = read_faults()
 
@@ -35,3 +38,36 @@ def test_the_development_page_lists_each_fault():
         r"^\| `([\w-]+)` \| .* \| `([\w/.]+)` \| \d+ \|$", page.partition("### Seeded faults")[2], re.MULTILINE
     )
     assert rows == [(fault.id, fault.tests[0]) for fault in FAULTS]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="make faults needs a POSIX system")
+def test_the_timeout_kills_the_child_processes_of_a_test_run(tmp_path):
+    script = (
+        "import pathlib, subprocess, sys; child = subprocess.Popen(['sleep', '60']);"
+        "pathlib.Path('pid').write_text(str(child.pid)); child.wait()"
+    )
+    assert run_command([sys.executable, "-c", script], tmp_path, dict(os.environ), 2)[0] is None
+    process = int((tmp_path / "pid").read_text())
+    deadline = time.monotonic() + 20
+    while _is_running(process):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    # A killed process without a parent that waits for it stays as a zombie.
+    return "(zombie)" not in open(f"/proc/{process}/status").read() if os.path.isdir("/proc") else True
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="make faults needs a POSIX system")
+def test_the_copy_of_the_checkout_leaves_out_a_deleted_file(tmp_path, monkeypatch):
+    (tmp_path / "checkout" / ".venv").mkdir(parents=True)
+    (tmp_path / "checkout" / "kept.py").write_text("pass")
+    monkeypatch.setattr("benchmarks.faults.ROOT", tmp_path / "checkout")
+    monkeypatch.setattr("subprocess.run", lambda *_, **__: type("Result", (), {"stdout": b"kept.py\0deleted.py\0"}))
+    copy_checkout(tmp_path / "copy")
+    assert sorted(path.name for path in (tmp_path / "copy").iterdir()) == [".venv", "kept.py", "out"]
