@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Recording and training of many characters on many machines: a task graph of verbs, for several engines.
+"""Recording and training of many characters on many machines, as a graph of tasks that run verbs.
 
-It needs neither Blender nor the add-on's Blender half in its own process: every verb runs in a process of its own.
+Several engines can run the graph: Dask, OpenJD and Flamenco. The farm imports no Blender, because each verb runs in its
+own process.
 """

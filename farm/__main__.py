@@ -1,8 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The command line of the farm: `python -m fdda_addon farm characters.toml`, or `python -m farm characters.toml`.
 
-Exit status: 0 all characters are done, 1 one failed, each with a sentence, 2 wrong usage, 75 it ended for a reason of
-the machines', so that the same command goes on, 130 interrupted, 143 and 129 ended by SIGTERM and SIGHUP.
+Exit status:
+
+    0    all characters are done
+    1    a character failed; a message gives the reason
+    2    wrong usage
+    75   a machine was the reason, such as a full disk; run the same command again to continue
+    130  interrupted by Ctrl-C
+    143  ended by SIGTERM
+    129  ended by SIGHUP
 """
 
 import argparse
@@ -12,12 +19,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from fdda_addon.core.errors import TRY_AGAIN, FDDAError, WrongUsageError, exit_status, machine_fault_sentence
+from fdda_addon.core.stop_signals import INTERRUPTED
 
 if TYPE_CHECKING:
     from .characters import Plan
     from .tasks import Task
 
-INTERRUPTED = 130
 WINDOWS = "win32"
 
 
@@ -34,45 +41,59 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         print(f"Error: {text}", file=sys.stderr)
         return TRY_AGAIN
-    except KeyboardInterrupt as stop:
-        with contextlib.suppress(OSError):  # The terminal may be the one that was closed.
+    except KeyboardInterrupt as interrupt:
+        with contextlib.suppress(OSError):  # The terminal may be closed.
             print("Interrupted; run the same command to go on.", file=sys.stderr, flush=True)
-        return getattr(stop, "exit_status", INTERRUPTED)
+        return getattr(interrupt, "exit_status", INTERRUPTED)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("farm", description="Record, train and bind many characters on many machines.")
     parser.add_argument("plan", metavar="characters.toml", type=Path, help="the characters (docs/farm.md)")
     parser.add_argument(
-        "--report", metavar="OUT.html", type=Path, help="the page (default: report.html beside the plan)"
+        "--report",
+        metavar="OUT.html",
+        type=Path,
+        help="write the report to this page (default: report.html beside the plan)",
     )
     parser.add_argument(
-        "--only", action="append", default=[], metavar="NAME", help="this character alone; may be given again"
+        "--only", action="append", default=[], metavar="NAME", help="run only this character; may be repeated"
     )
     parser.add_argument(
         "--overwrite",
         action="store_true",
-        help="write over files of another kind, and over a bound file that somebody has changed",
+        help="also replace files of another kind and bound files that were edited",
     )
-    what = parser.add_argument_group("in place of running it").add_mutually_exclusive_group()
-    what.add_argument("--task", metavar="NAME", help="do one task, for engines that have the graph from below")
-    what.add_argument("--list", action="store_true", help="list the tasks, and which are up to date")
-    what.add_argument("--dry-run", action="store_true", help="say how long it will take, by what was measured so far")
-    what.add_argument("--report-only", action="store_true", help="write the page of what is there")
-    what.add_argument("--openjd", metavar="OUT.json", type=Path, help="write the graph as an OpenJD job template")
-    what.add_argument("--flamenco", metavar="OUT.json", type=Path, help="write it as a job for Flamenco's job type")
+    mode = parser.add_argument_group("instead of running all tasks").add_mutually_exclusive_group()
+    mode.add_argument("--task", metavar="NAME", help="run one task; for engines that run the exported graph")
+    mode.add_argument("--list", action="store_true", help="list the tasks and whether they are up to date")
+    mode.add_argument("--dry-run", action="store_true", help="estimate the duration from measured times")
+    mode.add_argument("--report-only", action="store_true", help="write the report of existing results")
+    mode.add_argument("--openjd", metavar="OUT.json", type=Path, help="write the graph as an OpenJD job template")
+    mode.add_argument("--flamenco", metavar="OUT.json", type=Path, help="write the graph as a job for Flamenco")
     cluster = parser.add_argument_group("cluster")
     cluster.add_argument(
         "--scheduler",
         default="",
         metavar="tcp://…",
-        help="use the cluster that is there; dask for the one that Dask's configuration names",
+        help="use a running cluster; dask: the cluster that Dask's configuration names",
     )
     cluster.add_argument(
-        "--workers", default="", metavar="N", help="of the local cluster; with --dry-run a list, 1,8,64"
+        "--workers",
+        default="",
+        metavar="N",
+        help="number of workers of the local cluster; with --dry-run a list such as 1,8,64",
     )
-    cluster.add_argument("--host", default="127.0.0.1", help="what the local scheduler listens on (default 127.0.0.1)")
-    cluster.add_argument("--dashboard-port", type=int, default=8787, metavar="N", help="default 8787; 0 for any")
+    cluster.add_argument(
+        "--host", default="127.0.0.1", help="address that the local scheduler listens on (default 127.0.0.1)"
+    )
+    cluster.add_argument(
+        "--dashboard-port",
+        type=int,
+        default=8787,
+        metavar="N",
+        help="port of the dashboard (default 8787; 0: any free port)",
+    )
     return parser
 
 
@@ -91,7 +112,7 @@ def _run(options: argparse.Namespace) -> int:
     plan = read_plan(options.plan)
     tasks = make_tasks(plan)
     if options.task:
-        return _run_one(plan, tasks, options)
+        return _run_one_task(plan, tasks, options)
     if unknown := sorted(set(options.only) - {character.name for character in plan.characters}):
         raise WrongUsageError(f"The plan has no character '{unknown[0]}'.")
     if options.only:
@@ -103,18 +124,18 @@ def _run(options: argparse.Namespace) -> int:
 
         return print_estimate(plan.farm, tasks, _parse_counts(options.workers))
     page = options.report or plan.path.with_name("report.html")
-    report = [(page, FARM_PAGE), (page.with_suffix(".json"), FARM_REPORT)]
+    report_files = [(page, FARM_PAGE), (page.with_suffix(".json"), FARM_REPORT)]
     if options.report_only:
         from .report import write_report
 
-        check_farm_outputs(plan, tasks.values(), report, options.overwrite)
+        check_farm_outputs(plan, tasks.values(), report_files, options.overwrite)
         write_report(plan, tasks, {}, page)
         print(f"{page}: the report")
         return 0
     if not options.list:
-        check_farm_outputs(plan, tasks.values(), report, options.overwrite, runs=True)
+        check_farm_outputs(plan, tasks.values(), report_files, options.overwrite, runs_tasks=True)
         check_folder_writable(plan.farm.work)
-    return _run_all(options, plan, tasks, page)
+    return _run_all_tasks(options, plan, tasks, page)
 
 
 def _write_graph(plan: "Plan", tasks: dict[str, "Task"], options: argparse.Namespace) -> int:
@@ -137,15 +158,15 @@ def _parse_counts(text: str) -> list[int]:
     return counts
 
 
-def _run_one(plan: "Plan", tasks: dict[str, "Task"], options: argparse.Namespace) -> int:
-    """Run one task for another engine, which has run its dependencies."""
+def _run_one_task(plan: "Plan", tasks: dict[str, "Task"], options: argparse.Namespace) -> int:
+    """Run one task for an engine that has already run its dependencies."""
     from .outputs import check_farm_outputs
     from .run import AGAIN, SUCCESS_STATES, run_task
 
     name = options.task
     if name not in tasks:
         raise WrongUsageError(f"The plan has no task '{name}'; --list names them.")
-    check_farm_outputs(plan, [tasks[name]], (), options.overwrite, runs=True)
+    check_farm_outputs(plan, [tasks[name]], (), options.overwrite, runs_tasks=True)
     outcome = run_task(plan.farm, tasks, name, options.overwrite)
     print(f"{name}: {outcome.state}{f', {outcome.sentence}' if outcome.sentence else ''}")
     if outcome.state in SUCCESS_STATES:
@@ -154,10 +175,11 @@ def _run_one(plan: "Plan", tasks: dict[str, "Task"], options: argparse.Namespace
     return TRY_AGAIN if outcome.state == AGAIN else 1
 
 
-def _run_all(options: argparse.Namespace, plan: "Plan", tasks: dict[str, "Task"], page: Path) -> int:
+def _run_all_tasks(options: argparse.Namespace, plan: "Plan", tasks: dict[str, "Task"], page: Path) -> int:
+    """Run all outdated tasks on a cluster and write the report; return the exit status."""
     from fdda_addon.core.temporary import check_temporary_folder
 
-    from .cluster import connect_cluster, local_workers, run_on
+    from .cluster import connect_cluster, count_local_workers, run_tasks_on
     from .fingerprints import InputFingerprints, outdated_tasks
     from .report import write_report
     from .run import AGAIN, FAILED, SUCCESS_STATES, Outcome
@@ -170,14 +192,14 @@ def _run_all(options: argparse.Namespace, plan: "Plan", tasks: dict[str, "Task"]
         return 0
     for outcome in outcomes.values():
         _print_outcome(outcome, len(outcomes), len(names) + len(unreadable))
-    workers = _parse_counts(options.workers)[0] if options.workers else local_workers()
+    workers = _parse_counts(options.workers)[0] if options.workers else count_local_workers()
     try:
         if names:
             check_temporary_folder()
             plan.farm.work.mkdir(parents=True, exist_ok=True)
             with connect_cluster(plan.farm, options.scheduler, workers, options.host, options.dashboard_port) as client:
                 print(f"{len(names)} of {len(tasks)} tasks to do; {client.dashboard_link} shows them", flush=True)
-                for outcome in run_on(client, plan.farm, tasks, names, options.overwrite):
+                for outcome in run_tasks_on(client, plan.farm, tasks, names, options.overwrite):
                     outcomes[outcome.task] = outcome
                     _print_outcome(outcome, len(outcomes), len(names) + len(unreadable))
     finally:
@@ -189,20 +211,20 @@ def _run_all(options: argparse.Namespace, plan: "Plan", tasks: dict[str, "Task"]
     return 1 if FAILED in states or AGAIN not in states else TRY_AGAIN
 
 
-def _print_outcome(outcome, done: int, total: int) -> None:
+def _print_outcome(outcome, finished_count: int, total_count: int) -> None:
     seconds = f" in {outcome.seconds:.1f} s" if outcome.seconds else ""
     text = f": {outcome.sentence}" if outcome.sentence else ""
-    print(f"[{done}/{total}] {outcome.task} {outcome.state}{seconds}{text}", flush=True)
+    print(f"[{finished_count}/{total_count}] {outcome.task} {outcome.state}{seconds}{text}", flush=True)
 
 
-def program() -> NoReturn:
-    """Run the farm as a program, and end its child processes with it."""
+def run_program() -> NoReturn:
+    """Run the command line, then end all child processes and this process."""
     if sys.platform == WINDOWS:
         sys.exit(main())
-    from .stopping import end_all_when_done
+    from .stopping import run_and_end_processes
 
-    end_all_when_done(main)
+    run_and_end_processes(main)
 
 
 if __name__ == "__main__":
-    program()
+    run_program()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The plan of a farm, `characters.toml`: rigs, settings of recording and training, accuracy goals. docs/farm.md."""
+"""Reading and validation of the plan of a farm, `characters.toml` (docs/farm.md)."""
 
 import math
 import re
@@ -10,12 +10,13 @@ from typing import Any
 
 from fdda_addon.core.errors import FDDAError
 from fdda_addon.core.poses import MAX_MARGIN
+from fdda_addon.core.skin_fit import KINDS as SKIN_FIT_KINDS
 
 MAX_PLAN_BYTES = 4 << 20
 MAX_SHARDS, MAX_ROUNDS = 1000, 20
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
-"""Names of characters are names of folders on any disk, and parts of the names of tasks."""
-SETTING = re.compile(r"[a-z][a-z0-9_]*")
+CHARACTER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+"""Valid names of characters. A name is also the name of a folder and part of task names."""
+TRAIN_SETTING = re.compile(r"[a-z][a-z0-9_]*")
 
 
 class PlanError(FDDAError):
@@ -27,15 +28,15 @@ class Farm:
     """Settings of all characters.
 
     Attributes:
-        work: folder of what tasks hand on to each other; every machine sees it under the same path.
-        python: Python with the `bpy` wheel, empty for the one that runs the task.
-        blender: program that runs the verbs in place of `python`, with the add-on enabled; empty for none.
-        trainer_python: Python that trains, empty for the one that the add-on finds.
-        threads: of one training. The result of a training depends on it, so it is fixed and not the machine's.
-        gpu: trainings need a GPU and run only where there is one.
-        retries: how often a task is run again that failed for a reason of the machine's.
-        retry_seconds: what a worker waits before that.
-        pictures: draw a heat map of each character for the report.
+        work: folder of the files that tasks exchange; it has the same path on all machines.
+        python: Python with the `bpy` wheel; empty for the Python that runs the task.
+        blender: Blender program, with the add-on enabled, that runs the verbs instead of `python`; empty for none.
+        trainer_python: Python for trainings; empty for the one that the add-on finds.
+        threads: threads of one training. They affect its result, so they do not depend on the machine.
+        gpu: whether trainings run only on machines with a GPU.
+        retries: how often a task is repeated that failed because of its machine.
+        retry_seconds: how long a worker waits before it repeats a task.
+        pictures: whether to draw a heat map of each character for the report.
     """
 
     work: Path
@@ -54,20 +55,20 @@ class Character:
     """Settings of one character.
 
     Attributes:
-        name: of the character; letters, digits, - and _.
-        rig: the .blend file.
+        name: name of the character: letters, digits, - and _.
+        rig: .blend file of the rig.
         output: folder of the bound file, its models and their reports.
-        objects: names of the mesh objects; empty for the only one of the file.
-        depends: files that the rig's file links, so that a change of them is noticed.
-        poses, seed, spread, margin, actions, strips, mirror, sample, controls, fit_linear, min_partition_vertices: as
-            of `record`.
-        shards: how many parts the poses are recorded in.
-        train: settings of the training by name, as of `train`.
-        goal_mm: what 99.9 % of the vertices of held-out poses are to be within; 0 for no goal.
-        rounds: how often at most poses are added where the model is worst, while the goal is missed.
-        refine_poses: how many each time.
-        evaluate_poses: held-out poses that the error is measured on.
-        use_in_render: final renders use the model too.
+        objects: names of the mesh objects; empty where the file has only one.
+        depends: files that the rig's file links. A change of them outdates the tasks of the character.
+        poses, seed, spread, margin, actions, strips, mirror, sample, controls, fit_linear, min_partition_vertices:
+            options of `record`.
+        shards: number of tasks that the poses are divided among.
+        train: options of `train` by name.
+        goal_mm: accuracy goal for 99.9 % of the vertices of held-out poses, mm; 0 for no goal.
+        rounds: maximum number of rounds that add poses where the error is largest, until the goal is met.
+        refine_poses: number of poses that a round adds.
+        evaluate_poses: number of held-out poses that measure the error.
+        use_in_render: whether final renders use the model too.
     """
 
     name: str
@@ -116,17 +117,17 @@ def read_plan(path: Path) -> Plan:
     """Read and check a plan.
 
     Raises:
-        PlanError: it cannot be read, or says what makes no sense; names where.
+        PlanError: the plan cannot be read or is invalid; the message names the section.
     """
     path = path.absolute()
     try:
         if path.stat().st_size > MAX_PLAN_BYTES:
-            raise PlanError(f"'{path}' is larger than {MAX_PLAN_BYTES >> 20} MB; it is no plan.")
+            raise PlanError(f"'{path}' is larger than {MAX_PLAN_BYTES >> 20} MB; this is not a plan.")
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise PlanError(f"Cannot read the plan '{path}': {error.strerror}; give the path of a .toml file.") from error
     except (ValueError, RecursionError) as error:
-        raise PlanError(f"The plan '{path}' is no TOML: {error}.") from error
+        raise PlanError(f"The plan '{path}' is not TOML: {error}.") from error
     return _read_plan(path, values)
 
 
@@ -137,32 +138,32 @@ def _read_plan(path: Path, values: dict) -> Plan:
     sections = {name: values.get(name, {}) for name in section_names}
     for name, section in sections.items():
         if not isinstance(section, dict):
-            raise PlanError(f"[{name}] in '{path.name}' is no section; write its keys below [{name}].")
-    values_given = sections["characters"]
-    if not values_given:
+            raise PlanError(f"[{name}] in '{path.name}' is not a section; write its keys below [{name}].")
+    character_sections = sections["characters"]
+    if not character_sections:
         raise PlanError(f"'{path.name}' has no characters; add a section [characters.NAME] with rig and output.")
-    folder, taken = path.parent, {}
+    folder, used_values = path.parent, {}
     farm = Farm(**{"work": folder / "farm", **_read_fields(Farm, sections["farm"], "[farm]", folder)})
     characters = []
-    for name, own in values_given.items():
+    for name, settings in character_sections.items():
         section = f"[characters.{name}]"
-        if not NAME.fullmatch(name):
+        if not CHARACTER_NAME.fullmatch(name):
             raise PlanError(
                 f"{section}: a character's name has only letters, digits, - and _, at most 64, and not {name!r}."
             )
-        if not isinstance(own, dict):
-            raise PlanError(f"{section} is no section; write rig and output below it.")
-        merged = {**sections["defaults"], **own}
-        if lacks := [key for key in ("rig", "output") if key not in merged]:
-            raise PlanError(f"{section} lacks {' and '.join(lacks)}.")
+        if not isinstance(settings, dict):
+            raise PlanError(f"{section} is not a section; write rig and output below it.")
+        merged = {**sections["defaults"], **settings}
+        if missing_keys := [key for key in ("rig", "output") if key not in merged]:
+            raise PlanError(f"{section} lacks {' and '.join(missing_keys)}.")
         character = Character(name, **_read_fields(Character, merged, section, folder))
         _check_character(character, section)
-        for what in (("name", name.lower()), ("output", character.output)):
-            if what in taken:
+        for key_value in (("name", name.lower()), ("output", character.output)):
+            if key_value in used_values:
                 raise PlanError(
-                    f"{section} has the same {what[0]} as [characters.{taken[what]}]; give it one of its own."
+                    f"{section} has the same {key_value[0]} as [characters.{used_values[key_value]}]; give it its own."
                 )
-            taken[what] = name
+            used_values[key_value] = name
         characters.append(character)
     return Plan(path, farm, tuple(characters))
 
@@ -172,53 +173,54 @@ def _check_character(character: Character, section: str) -> None:
         raise PlanError(f"{section}: two of the objects would have the same folder; rename one of them.")
     if not character.poses and not character.actions and not character.strips:
         raise PlanError(f"{section}: there is nothing to record; give poses or actions.")
-    if character.fit_linear not in ("", "hard", "smooth"):
-        raise PlanError(f"{section}: fit_linear is hard or smooth, and not {character.fit_linear!r}.")
+    if character.fit_linear not in ("", *SKIN_FIT_KINDS):
+        kinds = " or ".join(SKIN_FIT_KINDS)
+        raise PlanError(f"{section}: fit_linear is {kinds}, and not {character.fit_linear!r}.")
     for key, value in character.train.items():
-        if not SETTING.fullmatch(key) or key in ("messages", "warm_start", "goal_mm"):
+        if not TRAIN_SETTING.fullmatch(key) or key in ("messages", "warm_start", "goal_mm"):
             raise PlanError(
                 f"{section}: train cannot have {key!r}; it takes settings of train, and goal_mm stands beside it."
             )
         values = value if isinstance(value, list) else [value]
-        if not values or not all(isinstance(one, int | float | str) for one in values):
+        if not values or not all(isinstance(item, int | float | str) for item in values):
             raise PlanError(f"{section}: train.{key} is {value!r}; give a number, a text, or a list of them.")
         if isinstance(value, bool) and not value:
             raise PlanError(f"{section}: train.{key} is false; leave it out.")
 
 
-def _read_fields(kind: type, values_given: dict, section: str, folder: Path) -> dict:
+def _read_fields(kind: type, settings: dict, section: str, folder: Path) -> dict:
     """Read the fields of a dataclass, and check their types."""
     types = {each.name: each.type for each in fields(kind) if each.name != "name"}
-    found = {}
-    for key, value in values_given.items():
+    values = {}
+    for key, value in settings.items():
         if key not in types:
             raise PlanError(f"{section} has the key {key!r}; known are {', '.join(sorted(types))}.")
-        found[key] = _read_value(key, value, types[key], section, folder)
-    return found
+        values[key] = _read_value(key, value, types[key], section, folder)
+    return values
 
 
 def _read_value(key: str, value: Any, kind: Any, section: str, folder: Path) -> Any:
     if kind in (tuple[str, ...], tuple[Path, ...]):
         if not isinstance(value, list):
             raise PlanError(f'{section}: {key} is a list of texts, such as ["a"], and not {value!r}.')
-        return tuple(_read_value(key, one, kind.__args__[0], section, folder) for one in value)
+        return tuple(_read_value(key, item, kind.__args__[0], section, folder) for item in value)
     if kind is Path:
         return (folder / _read_text(key, value, section)).absolute()
     if kind is str:
         return _read_text(key, value, section)
     if kind is bool or kind == dict[str, Any]:
-        wanted = bool if kind is bool else dict
-        if not isinstance(value, wanted):
+        expected_type = bool if kind is bool else dict
+        if not isinstance(value, expected_type):
             raise PlanError(
-                f"{section}: {key} is {'true or false' if wanted is bool else 'a section'}, and not {value!r}."
+                f"{section}: {key} is {'true or false' if kind is bool else 'a section'}, and not {value!r}."
             )
         return value
     is_whole = kind in (int, int | None)
     if isinstance(value, bool) or not isinstance(value, int if is_whole else int | float) or not math.isfinite(value):
         raise PlanError(f"{section}: {key} is a {'whole ' if is_whole else ''}number, and not {value!r}.")
-    low, high = MIN_VALUES.get(key, 0), MAX_VALUES.get(key, 10**9)
-    if not low <= value <= high:
-        raise PlanError(f"{section}: {key} is from {low:,} to {high:,}, and not {value!r}.")
+    minimum, maximum = MIN_VALUES.get(key, 0), MAX_VALUES.get(key, 10**9)
+    if not minimum <= value <= maximum:
+        raise PlanError(f"{section}: {key} is from {minimum:,} to {maximum:,}, and not {value!r}.")
     return value
 
 

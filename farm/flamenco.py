@@ -12,12 +12,12 @@ from .fingerprints import ROOT
 from .tasks import Task
 
 JOB_TYPE = "fdda-characters"
-"""Flamenco calls a job type as its file, with - for _."""
-PRIORITY = 50
+"""Name of the job type: Flamenco takes the name of the script, with - for _."""
+JOB_PRIORITY = 50
 
 
 def write_job(plan: Plan, tasks: dict[str, Task], path: Path) -> int:
-    """Write the job of a plan for `POST /api/v3/jobs` of the manager; return the exit status.
+    """Write the job of a plan as a file for `POST /api/v3/jobs` of Flamenco's manager; return the exit status.
 
     Raises:
         OutputError: the file cannot be written.
@@ -28,12 +28,12 @@ def write_job(plan: Plan, tasks: dict[str, Task], path: Path) -> int:
 
 
 def make_job(plan: Plan, tasks: dict[str, Task]) -> dict:
-    """Make the job. A job type cannot read files, so the graph is one of its settings."""
+    """Make the job. A Flamenco job type cannot read files, so the graph is a setting of the job."""
     graph = [{"name": task.name, "kind": task.kind, "after": list(task.after)} for task in tasks.values()]
     return {
         "name": f"FDDA {plan.path.stem}",
         "type": JOB_TYPE,
-        "priority": PRIORITY,
+        "priority": JOB_PRIORITY,
         "submitter_platform": {"darwin": "darwin", "win32": "windows"}.get(sys.platform, "linux"),
         "metadata": {"project": "FDDA"},
         "settings": {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks of what a farm may overwrite: no inputs, no files of another kind, no bound file that was edited."""
+"""Checks that the farm overwrites no inputs, no files of another kind, and no bound file that was edited."""
 
 import os
 from collections.abc import Iterable
@@ -23,87 +23,91 @@ PUBLISHED_KINDS = {
     **{".blend": BLEND, ".onnx": MODEL, ".png": PICTURE, "report.json": REPORT},
     **{"report.html": PAGE, "evaluation.json": EVALUATION},
 }
-"""By the whole name, or by its ending."""
+"""Kinds of published files, by file name or by suffix."""
 
 
 def check_farm_outputs(
     plan: Plan,
     tasks: Iterable[Task],
-    own: Iterable[tuple[Path, FileKind]],
+    farm_files: Iterable[tuple[Path, FileKind]],
     overwrite: bool = False,
-    runs: bool = False,
+    runs_tasks: bool = False,
 ) -> None:
-    """Check before the work that the farm overwrites no other data.
+    """Check before any work that the farm overwrites no files of the user.
 
     Args:
-        plan: whose files are read.
-        tasks: of the plan, with what they publish.
-        own: what the farm itself writes, and of which kind that is.
-        overwrite: the user said that files of another kind may be written over; those that are read never are.
-        runs: the tasks are to run, and write as well.
+        plan: the plan, which names the files that the farm reads.
+        tasks: tasks of the plan, which name the files that they publish.
+        farm_files: files that the farm itself writes, with their kinds.
+        overwrite: whether the user allows to replace files of another kind. Inputs are never replaced.
+        runs_tasks: whether the tasks will run, and write files as well.
 
     Raises:
-        PlanError: a file that is read or written lies where a task keeps its own.
-        OutputError: as `core.output.check_outputs`.
+        PlanError: an input or an output is inside the folder of a task.
+        OutputError: an output would replace a file; see `core.output.check_outputs`.
     """
-    tasks, own = list(tasks), list(own)
-    read = [plan.path, *(path for each in plan.characters for path in (each.rig, *each.depends))]
-    published = [(place, published_kind(name)) for task in tasks for name, place in task.publishes]
-    kept = {
+    tasks, farm_files = list(tasks), list(farm_files)
+    inputs = [plan.path, *(path for each in plan.characters for path in (each.rig, *each.depends))]
+    published = [(destination, published_kind(name)) for task in tasks for name, destination in task.publishes]
+    task_paths = {
         os.path.realpath(path): path for task in tasks for path in (task.folder, task.manifest, task.log, task.lock)
     }
-    for path in (*read, *(path for path, _ in (*own, *published))):
-        real = Path(os.path.realpath(path))
-        if taken := next((kept[str(one)] for one in (real, *real.parents) if str(one) in kept), None):
-            raise PlanError(f"'{path}' lies where the farm keeps '{taken}'; move it, or give [farm] another work.")
-    places: set[str] = set()
-    for path, _ in (*own, *published):
-        place = os.path.realpath(path)
-        if place in places:
+    for path in (*inputs, *(path for path, _ in (*farm_files, *published))):
+        real_path = Path(os.path.realpath(path))
+        folders = map(str, (real_path, *real_path.parents))
+        if task_path := next((task_paths[folder] for folder in folders if folder in task_paths), None):
+            raise PlanError(f"'{path}' lies where the farm keeps '{task_path}'; move it, or give [farm] another work.")
+    real_outputs: set[str] = set()
+    for path, _ in (*farm_files, *published):
+        real_output = os.path.realpath(path)
+        if real_output in real_outputs:
             raise OutputError(
                 f"Cannot write '{path}': two files would have this name; give each character an output of its own, and "
-                "the report another place."
+                "the report another folder."
             )
-        places.add(place)
-    _check_files([*own, *(published if runs else ())], read, overwrite)
+        real_outputs.add(real_output)
+    _check_files([*farm_files, *(published if runs_tasks else ())], inputs, overwrite)
 
 
 def check_published(task: Task, overwrite: bool = False) -> None:
-    """Check before a task that its published files overwrite no other data.
+    """Check before a task runs that its published files overwrite no files of the user.
 
     Raises:
-        OutputError: a file is there that is of another kind, is read, or is a bound file that somebody has changed.
+        OutputError: an existing file is of another kind, is an input, or is a bound file that was edited.
     """
-    _check_files([(place, published_kind(name)) for name, place in task.publishes], task.files, overwrite)
+    outputs = [(destination, published_kind(name)) for name, destination in task.publishes]
+    _check_files(outputs, task.files, overwrite)
     manifest = None if overwrite else read_manifest(task)
-    # Of the other files nobody makes anything: they are made again.
-    bound = [(name, place) for name, place in task.publishes if published_kind(name) is BLEND and os.path.exists(place)]
-    for name, place in bound if manifest else ():
-        if os.path.getsize(place) and digest_file(place) != manifest.outputs.get(name):
+    # Only bound files are edited by users; other files may be overwritten.
+    bound_files = [
+        (name, path) for name, path in task.publishes if published_kind(name) is BLEND and os.path.exists(path)
+    ]
+    for name, path in bound_files if manifest else ():
+        if os.path.getsize(path) and digest_file(path) != manifest.outputs.get(name):
             raise OutputError(
-                f"Cannot write '{place}': somebody has changed it since the farm made it; move it, or --overwrite."
+                f"Cannot write '{path}': it was edited since the farm wrote it; move it, or use --overwrite."
             )
 
 
 def check_task_folder_free(task: Task) -> None:
-    """Check that the folder of a task has no files from elsewhere, which would be removed.
+    """Check that no other program made the folder of a task, because the farm would remove its files.
 
     Raises:
-        OutputError: there are.
+        OutputError: the folder exists, or its manifest or log is of another kind.
     """
     if os.path.lexists(task.folder):
-        raise OutputError(f"'{task.folder}' is there, and not from the farm; move it, or give [farm] another work.")
+        raise OutputError(f"The farm did not make '{task.folder}'; move it, or give [farm] another work.")
     check_outputs([(task.manifest, MANIFEST), (task.log, LOG)])
 
 
-def _check_files(outputs: list[tuple[Path, FileKind]], read: Iterable[Path], overwrite: bool) -> None:
+def _check_files(outputs: list[tuple[Path, FileKind]], inputs: Iterable[Path], overwrite: bool) -> None:
     for path, _ in outputs:
-        if os.path.exists(path) and any(os.path.exists(one) and os.path.samefile(path, one) for one in read):
+        if os.path.exists(path) and any(os.path.exists(file) and os.path.samefile(path, file) for file in inputs):
             raise OutputError(f"Cannot write '{path}': the farm reads it; give another name, or another output.")
-        # A folder that is not there yet is made when there is something to put into it.
+        # A missing folder is made later, when its first file is written.
         if not os.path.isdir(path.parent):
             check_folder_writable(path.parent)
-    check_outputs([one for one in outputs if os.path.isdir(one[0].parent)], (), overwrite)
+    check_outputs([output for output in outputs if os.path.isdir(output[0].parent)], (), overwrite)
 
 
 def published_kind(name: str) -> FileKind:

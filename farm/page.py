@@ -32,24 +32,24 @@ dt { font-weight: 600; } dd { margin: 0; overflow-wrap: anywhere; }
 figure { margin: 0; } figure img { width: 100%; border-radius: 8px; display: block; }
 figcaption { font-size: 13px; color: var(--soft); }
 """
-NOTHING = '<td class="soft">&ndash;</td>'
+EMPTY_CELL = '<td class="soft">&ndash;</td>'
 
 
 def render_page(report: dict, pictures: dict[str, list[tuple[str, bytes]]]) -> str:
     """Return the page as HTML.
 
     Args:
-        report: what `report.json` holds.
-        pictures: by the name of a character, PNG files each with a name.
+        report: content of `report.json`.
+        pictures: for each character, the name of each model and its PNG file.
     """
     title = f"{escape(str(report['plan']))}: characters"
     parts = [
-        _head(report),
-        _failures(report),
-        _errors(report),
+        _summary_cards(report),
+        _failures_list(report),
+        _errors_table(report),
         _times_table(report),
-        _warnings(report),
-        _pictures(pictures),
+        _warnings_list(report),
+        _heat_maps(pictures),
     ]
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
@@ -58,43 +58,53 @@ def render_page(report: dict, pictures: dict[str, list[tuple[str, bytes]]]) -> s
     )
 
 
-def _head(report: dict) -> str:
+def _summary_cards(report: dict) -> str:
     characters = report["characters"].values()
-    states = [own["state"] for own in characters]
-    seconds = sum(sum(own["seconds"].values()) for own in characters)
+    states = [character["state"] for character in characters]
+    seconds = sum(sum(character["seconds"].values()) for character in characters)
     cards = [
         (f"{states.count('done')} of {len(states)}", "characters are done", ""),
         (str(states.count("failed")), "failed", "bad" if "failed" in states else ""),
-        (str(sum(_misses_goal(own) for own in characters)), "done, and miss their goal", ""),
-        (str(sum(own["ran_now"] for own in characters)), "tasks ran now, the others were up to date", ""),
-        (format_duration(seconds).removeprefix("about "), "of processes, one after the other", ""),
-        (f"{max((own['peak_mb'] for own in characters), default=0):,.0f} MB", "most memory of a process", ""),
+        (str(sum(_misses_goal(character) for character in characters)), "done, but miss their goal", ""),
+        (
+            str(sum(character["ran_now"] for character in characters)),
+            "tasks ran now, the others were up to date",
+            "",
+        ),
+        (format_duration(seconds).removeprefix("about "), "total time of all processes", ""),
+        (
+            f"{max((character['peak_mb'] for character in characters), default=0):,.0f} MB",
+            "largest memory of a process",
+            "",
+        ),
     ]
-    shown = "".join(
+    cards_html = "".join(
         f'<div class="card {kind}"><b>{escape(value)}</b><span>{text}</span></div>' for value, text, kind in cards
     )
     name, written = escape(str(report["plan"])), escape(str(report["written"]))
-    return f'<h1>{name}</h1><p>Written {written}.</p><div class="cards">{shown}</div>'
+    return f'<h1>{name}</h1><p>Written {written}.</p><div class="cards">{cards_html}</div>'
 
 
-def _misses_goal(own: dict) -> bool:
-    return any(own["goal_mm"] and model["fdda"].get("p999", 0) > own["goal_mm"] for model in own["models"])
+def _misses_goal(character: dict) -> bool:
+    return any(
+        character["goal_mm"] and model["fdda"].get("p999", 0) > character["goal_mm"] for model in character["models"]
+    )
 
 
-def _failures(report: dict) -> str:
+def _failures_list(report: dict) -> str:
     rows = [
         f"<dt>{escape(failure['task'])}</dt><dd><span class='bad'>{escape(failure['state'])}</span>: "
         f"{escape(failure['sentence'])}</dd>"
-        for own in report["characters"].values()
-        for failure in own["failures"]
+        for character in report["characters"].values()
+        for failure in character["failures"]
     ]
-    return f"<h2>What failed</h2><dl>{''.join(rows)}</dl>" if rows else ""
+    return f"<h2>Failed tasks</h2><dl>{''.join(rows)}</dl>" if rows else ""
 
 
-def _errors(report: dict) -> str:
-    head = "".join(
-        f"<th{kind}>{text}</th>"
-        for text, kind in (
+def _errors_table(report: dict) -> str:
+    header = "".join(
+        f"<th{attribute}>{text}</th>"
+        for text, attribute in (
             ("", ""),
             ("", ' class="text"'),
             ("vertices", ""),
@@ -102,86 +112,86 @@ def _errors(report: dict) -> str:
                 (text, "")
                 for text in ("mean", "p99.9", "max", "linear skinning: mean", "p99.9", "goal p99.9", "rounds")
             ),
-            ("against the last run: mean", ""),
+            ("change from the last run: mean", ""),
             ("p99.9", ""),
         )
     )
-    rows = "".join(_error_rows(name, own) for name, own in report["characters"].items())
+    rows = "".join(_error_rows(name, character) for name, character in report["characters"].items())
     return (
-        "<h2>Errors</h2><p>Millimetres, on held-out poses: the model, and linear skinning, against the rig.</p>"
-        f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+        "<h2>Errors</h2><p>Distances of the model and of linear skinning from the rig on held-out poses, mm.</p>"
+        f'<div class="scroll"><table><thead><tr>{header}</tr></thead><tbody>{rows}</tbody></table></div>'
     )
 
 
-def _error_rows(name: str, own: dict) -> str:
-    kinds = {"done": "good", "failed": "bad"}
-    state = f'<td class="text {kinds.get(own["state"], "soft")}">{escape(own["state"])}</td>'
-    if not own["models"]:
-        return f"<tr><td>{escape(name)}</td>{state}{NOTHING * 10}</tr>"
-    before = {model["name"]: model for model in (own.get("before") or {}).get("models") or []}
+def _error_rows(name: str, character: dict) -> str:
+    css_class = {"done": "good", "failed": "bad"}.get(character["state"], "soft")
+    state = f'<td class="text {css_class}">{escape(character["state"])}</td>'
+    if not character["models"]:
+        return f"<tr><td>{escape(name)}</td>{state}{EMPTY_CELL * 10}</tr>"
+    last_models = {model["name"]: model for model in (character.get("before") or {}).get("models") or []}
     rows = []
-    for model in own["models"]:
-        shown = name if len(own["models"]) == 1 else f"{name}: {model['name']}"
-        fdda, linear, goal = model["fdda"], model["linear"], own["goal_mm"]
+    for model in character["models"]:
+        label = name if len(character["models"]) == 1 else f"{name}: {model['name']}"
+        fdda, linear, goal = model["fdda"], model["linear"], character["goal_mm"]
         is_met = bool(goal) and fdda.get("p999", 0) <= goal
         verdict = f'<td class="{"good" if is_met else "bad"}">{goal:g} {"met" if is_met else "missed"}</td>'
-        last = before.get(model["name"], {}).get("fdda", {})
+        last_errors = last_models.get(model["name"], {}).get("fdda", {})
         cells = [
             f"<td>{model['vertices']:,}</td>",
-            *(_mm(fdda.get(key)) for key in ("mean", "p999", "max")),
-            *(_mm(linear.get(key)) for key in ("mean", "p999")),
-            verdict if goal else NOTHING,
-            f"<td>{model['round']} of {model['rounds'] - 1}</td>" if model["rounds"] > 1 else NOTHING,
-            *(_change(fdda.get(key), last.get(key)) for key in ("mean", "p999")),
+            *(_millimeter_cell(fdda.get(key)) for key in ("mean", "p999", "max")),
+            *(_millimeter_cell(linear.get(key)) for key in ("mean", "p999")),
+            verdict if goal else EMPTY_CELL,
+            f"<td>{model['round']} of {model['rounds'] - 1}</td>" if model["rounds"] > 1 else EMPTY_CELL,
+            *(_change_cell(fdda.get(key), last_errors.get(key)) for key in ("mean", "p999")),
         ]
-        rows.append(f"<tr><td>{escape(shown)}</td>{state}{''.join(cells)}</tr>")
+        rows.append(f"<tr><td>{escape(label)}</td>{state}{''.join(cells)}</tr>")
     return "".join(rows)
 
 
-def _mm(value: float | None) -> str:
-    return NOTHING if value is None else f"<td>{value:.3f}</td>"
+def _millimeter_cell(value: float | None) -> str:
+    return EMPTY_CELL if value is None else f"<td>{value:.3f}</td>"
 
 
-def _change(value: float | None, last: float | None) -> str:
-    if value is None or not last:
-        return NOTHING
-    part = value / last - 1
-    kind = "soft" if abs(part) < 0.02 else "bad" if part > 0 else "good"
-    return f'<td class="{kind}">{100 * part:+.0f} %</td>'
+def _change_cell(value: float | None, last_value: float | None) -> str:
+    if value is None or not last_value:
+        return EMPTY_CELL
+    change = value / last_value - 1
+    css_class = "soft" if abs(change) < 0.02 else "bad" if change > 0 else "good"
+    return f'<td class="{css_class}">{100 * change:+.0f} %</td>'
 
 
 def _times_table(report: dict) -> str:
-    head = "".join(f"<th>{kind}</th>" for kind in KINDS)
+    header = "".join(f"<th>{kind}</th>" for kind in KINDS)
     rows = []
-    for name, own in report["characters"].items():
-        seconds = [own["seconds"].get(kind, 0) for kind in KINDS]
-        last = sum(((own.get("before") or {}).get("seconds") or {}).values())
-        cells = "".join(f"<td>{value:,.1f}</td>" if value else NOTHING for value in seconds)
+    for name, character in report["characters"].items():
+        seconds = [character["seconds"].get(kind, 0) for kind in KINDS]
+        last_seconds = sum(((character.get("before") or {}).get("seconds") or {}).values())
+        cells = "".join(f"<td>{value:,.1f}</td>" if value else EMPTY_CELL for value in seconds)
         rows.append(
-            f"<tr><td>{escape(name)}</td>{cells}<td>{sum(seconds):,.1f}</td>{_change(sum(seconds), last)}"
-            f"<td>{own['peak_mb']:,.0f}</td><td>{own['ran_now']} of {own['tasks']}</td></tr>"
+            f"<tr><td>{escape(name)}</td>{cells}<td>{sum(seconds):,.1f}</td>{_change_cell(sum(seconds), last_seconds)}"
+            f"<td>{character['peak_mb']:,.0f}</td><td>{character['ran_now']} of {character['tasks']}</td></tr>"
         )
     return (
-        "<h2>Times</h2><p>Seconds of the processes of each kind of task, when it was last run.</p>"
-        f'<div class="scroll"><table><thead><tr><th></th>{head}<th>all</th><th>against the last run</th>'
+        "<h2>Times</h2><p>Seconds of the processes of each kind of task in its last run.</p>"
+        f'<div class="scroll"><table><thead><tr><th></th>{header}<th>total</th><th>change from the last run</th>'
         f"<th>peak MB</th><th>ran now</th></tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
     )
 
 
-def _warnings(report: dict) -> str:
+def _warnings_list(report: dict) -> str:
     rows = [
         f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>"
-        for name, own in report["characters"].items()
-        for model in own["models"]
+        for name, character in report["characters"].items()
+        for model in character["models"]
         for text in model["warnings"]
     ]
-    return f"<h2>Warnings</h2><p>What is suspicious about the recordings.</p><dl>{''.join(rows)}</dl>" if rows else ""
+    return f"<h2>Warnings</h2><p>Possible problems of the recordings.</p><dl>{''.join(rows)}</dl>" if rows else ""
 
 
-def _pictures(pictures: dict[str, list[tuple[str, bytes]]]) -> str:
+def _heat_maps(pictures: dict[str, list[tuple[str, bytes]]]) -> str:
     figures = []
-    for character, own in pictures.items():
-        for name, content in own:
+    for character, named_pictures in pictures.items():
+        for name, content in named_pictures:
             text = escape(character if name == character else f"{character}: {name}")
             data = base64.b64encode(content).decode("ascii")
             figures.append(
@@ -190,6 +200,6 @@ def _pictures(pictures: dict[str, list[tuple[str, bytes]]]) -> str:
     if not figures:
         return ""
     return (
-        "<h2>Heat maps</h2><p>Rig, linear skinning and model; the color is the distance from the rig.</p>"
+        "<h2>Heat maps</h2><p>The rig, linear skinning and the model; the color shows the distance from the rig.</p>"
         f'<div class="pictures">{"".join(figures)}</div>'
     )

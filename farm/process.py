@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Running of a verb in its own process."""
+"""Runs a verb in its own process, with a lock and a log file."""
 
 import contextlib
 import fcntl
@@ -18,31 +18,31 @@ from fdda_addon.core.errors import TRY_AGAIN, FDDAError
 
 from .characters import Farm
 from .fingerprints import ROOT
+from .stopping import SIGNAL_STATUS_OFFSET
 
-WAIT_SECONDS = 0.05
-SIGNAL_STATUS_OFFSET = 128
+POLL_SECONDS = 0.05
 MAX_LOG_TAIL_BYTES = 64 << 10
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 DASK_VARIABLES = ("MALLOC_TRIM_THRESHOLD_",)
-"""What Dask sets for its workers and a verb is not to inherit. With it freed memory above 64 kB goes back to the
-system, and comes back page by page: a training takes a fifth longer, an evaluation of 50,618 vertices a third."""
-MAXRSS_PER_MB = 1024 if sys.platform != "darwin" else 1024 * 1024
-"""What the system counts peak memory in, in parts of a MB: kB on Linux, bytes on macOS."""
+"""Variables that Dask sets for its workers and that verbs must not inherit. This one makes the C library return freed
+memory above 64 kB to the system. A training then takes a fifth longer, an evaluation of 50,618 vertices a third."""
+MAXRSS_UNITS_PER_MB = 1024 if sys.platform != "darwin" else 1024 * 1024
+"""The unit of `ru_maxrss` is kB on Linux and bytes on macOS."""
 
 
 class VerbError(FDDAError):
-    """A verb failed, and will fail again."""
+    """A verb failed, and would fail again on any machine."""
 
 
 class TryAgainError(FDDAError):
-    """A verb failed because of the machine."""
+    """A verb failed because of its machine, and may succeed later."""
 
     exit_status = TRY_AGAIN
 
 
 @dataclass(frozen=True)
 class ProcessResult:
-    """Wall-clock time of a verb, and the largest memory of its processes."""
+    """Wall-clock time of a verb, and the peak memory of its largest process."""
 
     seconds: float
     peak_mb: float
@@ -52,8 +52,9 @@ class ProcessResult:
 def hold_lock(path: Path) -> Iterator[int]:
     """Wait for the lock of a task and hold it; yield its file descriptor, which child processes inherit.
 
-    The system releases the lock when its last process ends. A verb whose worker was killed keeps running and holds the
-    lock. Another worker with the same task waits for the lock and finds the task done.
+    The system releases the lock when the last process that has the descriptor ends. A verb whose worker was killed
+    continues and still holds the lock. Another worker with the same task waits for the lock, and then finds the task
+    done.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -94,23 +95,23 @@ def run_verb(
     """Run a verb until it ends.
 
     Args:
-        farm: how it is run.
-        verb: its name and options.
-        folder: that relative paths are in.
-        log: what it prints is added to this file.
-        lock: a descriptor that its process holds as well (`hold_lock`).
-        is_wanted: asked now and then; the verb is ended once it says no.
+        farm: settings of the farm.
+        verb: name and options of the verb.
+        folder: working directory of the verb.
+        log: file to which the output of the verb is appended.
+        lock: file descriptor from `hold_lock`, which the verb inherits.
+        is_wanted: called repeatedly; when it returns False, the verb is terminated.
 
     Raises:
-        VerbError: it failed, with its own sentence.
-        TryAgainError: the machine is to blame, or a signal ended it.
+        VerbError: the verb failed; the message is its own.
+        TryAgainError: the verb failed because of the machine, or a signal ended it.
     """
     command = verb_command(farm, verb)
     started = time.monotonic()
     with open(log, "ab") as output:
         output.write(f"$ {shlex.join(verb)}\n".encode())
         output.flush()
-        begin = output.tell()
+        start_offset = output.tell()
         try:
             process = subprocess.Popen(
                 command,
@@ -120,50 +121,50 @@ def run_verb(
                 stdout=output,
                 stderr=output,
                 pass_fds=(lock,),
-                # Ctrl-C is for whoever started the farm; it ends what it started itself.
+                # Ctrl-C must only reach the farm, which then ends its verbs itself.
                 start_new_session=True,
             )
         except OSError as error:
             raise VerbError(f"'{command[0]}' cannot be started ({error.strerror}); see [farm] in the plan.") from error
         try:
-            status, usage = _wait(process.pid, is_wanted)
+            status, usage = _wait_for_exit(process.pid, is_wanted)
         except BaseException:
             _terminate(process.pid)
             raise
     process.returncode = code = os.waitstatus_to_exitcode(status)
     if code < 0 or code > SIGNAL_STATUS_OFFSET:
-        # Of a verb that tidied up first, or of a shell around it.
+        # A verb that handled the signal, or a shell around it, exits with 128 plus the signal's number.
         raise TryAgainError(f"{verb[0]} was ended by signal {-code if code < 0 else code - SIGNAL_STATUS_OFFSET}.")
     if code:
-        sentence = _last_error_line(log, begin) or f"{verb[0]} ended with status {code}; see '{log}'."
+        sentence = _last_error_line(log, start_offset) or f"{verb[0]} ended with status {code}; see '{log}'."
         raise (TryAgainError if code == TRY_AGAIN else VerbError)(sentence)
-    return ProcessResult(time.monotonic() - started, usage.ru_maxrss / MAXRSS_PER_MB)
+    return ProcessResult(time.monotonic() - started, usage.ru_maxrss / MAXRSS_UNITS_PER_MB)
 
 
-def _wait(process: int, is_wanted: Callable[[], bool]) -> tuple[int, resource.struct_rusage]:
+def _wait_for_exit(process_id: int, is_wanted: Callable[[], bool]) -> tuple[int, resource.struct_rusage]:
     """Wait for a verb; return its status and resource usage."""
     is_terminated = False
     while True:
-        ended, status, usage = os.wait4(process, os.WNOHANG)
-        if ended:
+        ended_process_id, status, usage = os.wait4(process_id, os.WNOHANG)
+        if ended_process_id:
             return status, usage
         if not is_terminated and not is_wanted():
             is_terminated = True
-            _terminate(process)
-        time.sleep(WAIT_SECONDS)
+            _terminate(process_id)
+        time.sleep(POLL_SECONDS)
 
 
-def _terminate(process: int) -> None:
+def _terminate(process_id: int) -> None:
     """Send SIGTERM to a verb and its child processes."""
     with contextlib.suppress(OSError):
-        os.killpg(process, signal.SIGTERM)
+        os.killpg(process_id, signal.SIGTERM)
 
 
-def _last_error_line(log: Path, begin: int) -> str:
-    """Return the last error line of a log."""
+def _last_error_line(log: Path, start_offset: int) -> str:
+    """Return the last error message that a log has after an offset, or its last line."""
     with open(log, "rb") as file:
         file.seek(0, os.SEEK_END)
-        file.seek(max(begin, file.tell() - MAX_LOG_TAIL_BYTES))
+        file.seek(max(start_offset, file.tell() - MAX_LOG_TAIL_BYTES))
         lines = [line.strip() for line in file.read().decode("utf-8", "replace").splitlines() if line.strip()]
     errors = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
     return (errors or lines or [""])[-1][:2000]

@@ -3,13 +3,15 @@
 
     influences → record 1 … N → merge → train 0 → evaluate 0 → refine 1 → train 1 → evaluate 1 → … → bind
 
-for each character, and from train 0 on for each of its meshes. A round that is not needed, because the goal is met,
-ends at once. The graph is the same for all engines: a task is run by its name, wherever the plan and its files are.
+for each character. The tasks from train 0 to the last evaluate exist once per mesh. The tasks of a round are skipped
+when the goal is met. All engines use the same graph: they run a task by its name, on any machine with the plan.
 """
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+from fdda_addon.core.report import CHECKPOINT_SUFFIX, REPORT_HTML, REPORT_JSON
 
 from .characters import Character, Farm, Plan, folder_of_mesh
 
@@ -17,9 +19,9 @@ INFLUENCES, RECORD, MERGE, TRAIN, EVALUATE, REFINE, BIND = KINDS = (
     *("influences", "record", "merge", "train", "evaluate", "refine", "bind"),
 )
 RECORDING, EVALUATION, PICTURE = "recording", "evaluation.json", "heat_map.png"
-REPORT = ("report.json", "report.html")
-CHECKPOINT = ".checkpoint.npz"
+REPORT = (REPORT_JSON, REPORT_HTML)
 PICTURE_POSES = 20
+"""Number of held-out poses whose errors the heat map shows."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +29,9 @@ class Round:
     """Condition of a round: it is skipped where the previous round was skipped or met the goal.
 
     Attributes:
-        evaluate: name of the task that measured the model of the round before.
-        train: name of the task that trained it, whose report says whether more poses help.
-        goal_mm: what the error has to be within.
+        evaluate: name of the task that measured the model of the previous round.
+        train: name of the task that trained this model. Its report tells whether more poses help.
+        goal_mm: accuracy goal for 99.9 % of the vertices, mm.
     """
 
     evaluate: str
@@ -39,23 +41,23 @@ class Round:
 
 @dataclass(frozen=True)
 class Task:
-    """Verbs in their own processes, whose files are in the folder of the task.
+    """A node of the graph: verbs that run in their own processes and write into the folder of the task.
 
     Attributes:
-        name: "hero/record-2"; parts of the path of its folder below `work`.
+        name: name such as "hero/record-2", which is also the path of its folder below `work`.
         kind: one of `KINDS`.
-        character: its name.
-        folder: of its files, absolute.
-        verbs: command lines of the verbs, one after the other; where no Blender is needed as well.
-        outputs: names in the folder that are there when it is done.
-        after: names of the tasks that have to be done first.
-        files: files from outside that it reads, absolute.
-        copies: what is copied first, from the outputs of the tasks before into the folder of this one.
-        publishes: what is copied last, from the folder to its place outside: (name in the folder, absolute path).
-        round: of a task in a round after the first.
-        choices: of `bind`: for each model that is bound, its name in the folder and the tasks (train, evaluate) of each
-            round, of which the best is taken.
-        poses: how many poses it evaluates or learns from; what it costs follows from that.
+        character: name of the character.
+        folder: absolute path of its folder.
+        verbs: name and arguments of each verb, in the order in which they run.
+        outputs: names of files and folders in its folder that exist when the task is done.
+        after: names of the tasks that it depends on.
+        files: absolute paths of external files that it reads.
+        copies: (source, name): files of earlier tasks that are copied into the folder before the verbs run.
+        publishes: (name, absolute path): outputs that are copied to their destination after the verbs.
+        round: condition of a task in a round after the first.
+        choices: only for `bind`: for each bound model, its name in the folder and the tasks (train, evaluate) of each
+            round. The model with the smallest error is bound.
+        poses: number of poses that it evaluates or learns from, which determines its duration.
     """
 
     name: str
@@ -74,17 +76,17 @@ class Task:
 
     @property
     def manifest(self) -> Path:
-        """Path of the manifest, written when the task is done."""
+        """Path of the manifest, which is written when the task is done."""
         return self.folder.with_name(f"{self.folder.name}.json")
 
     @property
     def log(self) -> Path:
-        """Path of the output of its verbs."""
+        """Path of the log, the output of its verbs."""
         return self.folder.with_name(f"{self.folder.name}.log")
 
     @property
     def lock(self) -> Path:
-        """Path of the lock, held while any of its processes runs."""
+        """Path of the lock, which is held while a process of the task runs."""
         return self.folder.with_name(f"{self.folder.name}.lock")
 
     def to_json(self) -> dict:
@@ -95,11 +97,11 @@ class Task:
 def _to_plain(value: object) -> object:
     if isinstance(value, Path):
         return str(value)
-    return [_to_plain(one) for one in value] if isinstance(value, tuple) else value
+    return [_to_plain(item) for item in value] if isinstance(value, tuple) else value
 
 
 def make_tasks(plan: Plan) -> dict[str, Task]:
-    """Make the tasks of a plan by name, in an order that respects their dependencies."""
+    """Make the tasks of a plan by name, each after its dependencies."""
     tasks: dict[str, Task] = {}
     for character in plan.characters:
         for task in _TaskBuilder(plan.farm, character).build_all():
@@ -112,10 +114,11 @@ class _TaskBuilder:
 
     def __init__(self, farm: Farm, character: Character):
         self._farm, self._character = farm, character
-        self._several = len(character.objects) > 1
+        self._has_several_meshes = len(character.objects) > 1
         self._files = (character.rig, *character.depends)
 
     def build_all(self) -> Iterable[Task]:
+        """Yield the tasks of the character, each after its dependencies."""
         character = self._character
         influences = self._make_task(INFLUENCES, self._record_verb("--detect-influences"), (RECORDING,))
         influence_options = ("--influences", str(influences.folder / RECORDING))
@@ -133,21 +136,22 @@ class _TaskBuilder:
         merge = self._make_task(MERGE, merge_verb, (RECORDING,), after=shards, files=(), poses=character.poses)
         yield from (influences, *shards, merge)
         rounds_by_mesh = []
-        for name in character.objects if self._several else (character.objects or ("",)):
+        for name in character.objects if self._has_several_meshes else (character.objects or ("",)):
             rounds = list(self._make_rounds(name, merge))
             yield from (task for tasks in rounds for task in tasks)
             rounds_by_mesh.append((name, [(tasks[-2], tasks[-1]) for tasks in rounds]))
         yield self._make_bind(rounds_by_mesh)
 
     def _record_verb(self, *options: str) -> tuple[str, ...]:
+        """Return the command line of `record` with the settings of the character and more options."""
         character = self._character
-        lists = {
+        values_by_option = {
             "--object": character.objects,
             "--action": character.actions,
             "--strip": character.strips,
             "--sample": character.sample,
+            "--control": character.controls,
         }
-        lists["--control"] = character.controls
         min_vertices = (
             ()
             if character.min_partition_vertices is None
@@ -167,7 +171,7 @@ class _TaskBuilder:
             *("--spread", repr(float(character.spread)), *(("--mirror",) if character.mirror else ()), *min_vertices),
             *(("--margin", repr(float(character.margin))) if character.margin != 1 else ()),
             *(("--fit-linear", character.fit_linear) if character.fit_linear else ()),
-            *(f"{option}={value}" for option, values in lists.items() for value in values),
+            *(f"{option}={value}" for option, values in values_by_option.items() for value in values),
             *options,
         )
 
@@ -181,7 +185,7 @@ class _TaskBuilder:
         files: tuple[Path, ...] | None = None,
         **values: object,
     ) -> Task:
-        parts = (self._character.name, *([folder_of_mesh(mesh)] if mesh and self._several else []), name)
+        parts = (self._character.name, *([folder_of_mesh(mesh)] if mesh and self._has_several_meshes else []), name)
         verbs = verbs if isinstance(verbs[0], tuple) else (verbs,)
         return Task(
             "/".join(parts),
@@ -198,41 +202,49 @@ class _TaskBuilder:
     def _make_rounds(self, mesh: str, merge: Task) -> Iterable[tuple[Task, ...]]:
         """Yield the tasks of each round of a mesh; the last two are training and evaluation."""
         character, model = self._character, f"{self._model_name(mesh)}.onnx"
-        of_mesh = (f"--object={mesh}",) if mesh else ()
-        recording, before, condition = merge.folder / RECORDING, (), None
-        if self._several:
+        object_option = (f"--object={mesh}",) if mesh else ()
+        recording, previous_round, condition = merge.folder / RECORDING, (), None
+        if self._has_several_meshes:
             recording /= folder_of_mesh(mesh)
         recording_task, refine_tasks, last_model = merge, (), None
         for index in range(1 + (character.rounds if character.goal_mm else 0)):
             if index:
-                condition = Round(before[1].name, before[0].name, character.goal_mm)
-                last_model = before[0].folder / model
-                verb = ("record", str(character.rig), RECORDING, "--resume", "--refine", str(last_model), *of_mesh)
+                condition = Round(previous_round[1].name, previous_round[0].name, character.goal_mm)
+                last_model = previous_round[0].folder / model
+                verb = (
+                    "record",
+                    str(character.rig),
+                    RECORDING,
+                    "--resume",
+                    "--refine",
+                    str(last_model),
+                    *object_option,
+                )
                 options = ("--poses", str(character.refine_poses), "--seed", str(index))
                 recording_task = self._make_task(
                     f"{REFINE}-{index}",
                     (*verb, *options),
                     (RECORDING,),
-                    after=(*before, recording_task),
+                    after=(*previous_round, recording_task),
                     mesh=mesh,
                     copies=((recording, RECORDING),),
                     round=condition,
                     poses=character.refine_poses,
                 )
                 recording, refine_tasks = recording_task.folder / RECORDING, (recording_task,)
-            checkpoint = model.removesuffix(".onnx") + CHECKPOINT
+            checkpoint = model.removesuffix(".onnx") + CHECKPOINT_SUFFIX
             train = self._make_task(
                 f"{TRAIN}-{index}",
                 ("train", str(recording), model, *_train_options(character), *(("--warm-start",) if index else ())),
                 (model, checkpoint, *REPORT),
-                after=(*before[:1], recording_task),
+                after=(*previous_round[:1], recording_task),
                 mesh=mesh,
                 files=(),
                 copies=((last_model.with_name(checkpoint), checkpoint),) if index else (),
                 round=condition,
                 poses=character.poses + index * character.refine_poses,
             )
-            evaluate_options = ("--json", EVALUATION, "--poses", str(character.evaluate_poses), *of_mesh)
+            evaluate_options = ("--json", EVALUATION, "--poses", str(character.evaluate_poses), *object_option)
             evaluate = self._make_task(
                 f"{EVALUATE}-{index}",
                 ("evaluate", str(character.rig), str(train.folder / model), *evaluate_options),
@@ -242,26 +254,26 @@ class _TaskBuilder:
                 round=condition,
                 poses=character.evaluate_poses,
             )
-            before = (train, evaluate)
+            previous_round = (train, evaluate)
             yield (*refine_tasks, train, evaluate)
 
     def _model_name(self, mesh: str) -> str:
-        return folder_of_mesh(mesh) if self._several else self._character.name
+        return folder_of_mesh(mesh) if self._has_several_meshes else self._character.name
 
     def _make_bind(self, rounds_by_mesh: list[tuple[str, list[tuple[Task, Task]]]]) -> Task:
         """Make the task that binds the best model of each mesh and publishes it."""
         character, blend = self._character, f"{self._character.name}.blend"
         names = [self._model_name(mesh) for mesh, _ in rounds_by_mesh]
-        model_paths = [f"models/{name}/{name}.onnx" if self._several else f"{name}.onnx" for name in names]
-        model = "models" if self._several else model_paths[0]
-        of_mesh = tuple(f"--object={name}" for name in character.objects) if len(character.objects) == 1 else ()
+        model_paths = [f"models/{name}/{name}.onnx" if self._has_several_meshes else f"{name}.onnx" for name in names]
+        model = "models" if self._has_several_meshes else model_paths[0]
+        object_option = tuple(f"--object={name}" for name in character.objects) if len(character.objects) == 1 else ()
         verbs = [
             (
                 "bind",
                 str(character.rig),
                 model,
                 blend,
-                *of_mesh,
+                *object_option,
                 *(("--use-in-render",) if character.use_in_render else ()),
             )
         ]
@@ -292,7 +304,7 @@ class _TaskBuilder:
 
 
 def _train_options(character: Character) -> tuple[str, ...]:
-    """Return the options of `train`."""
+    """Return the command-line options of `train` from the settings of a character."""
     options = ["--goal-mm", repr(float(character.goal_mm))] if character.goal_mm else []
     for key, value in character.train.items():
         values = value if isinstance(value, list) else [value]

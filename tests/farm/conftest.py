@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A farm of the elbow, small enough for a test: its plan, and its tasks done in this process one after the other."""
+"""Plans of a small farm with the elbow, and functions that run their tasks in this process."""
 
 import shutil
 import textwrap
@@ -14,7 +14,7 @@ from farm.tasks import KINDS, make_tasks
 
 ROOT = Path(__file__).resolve().parents[2]
 ELBOW = ROOT / "blend_fixtures" / "elbow.blend"
-SMALL = """
+SMALL_SETTINGS = """
 [farm]
 retry_seconds = 0.1
 pictures = false
@@ -25,7 +25,7 @@ evaluate_poses = 4
 refine_poses = 6
 train = { epochs = 2, hidden = [8] }
 """
-ONE = """
+ONE_CHARACTER = """
 [characters.elbow]
 rig = "elbow.blend"
 output = "out/elbow"
@@ -33,29 +33,30 @@ output = "out/elbow"
 
 
 @pytest.fixture
-def written(tmp_path: Path) -> Callable[[str], Plan]:
-    """Writes a plan beside the elbow's file, and reads it."""
+def write_plan(tmp_path: Path) -> Callable[[str], Plan]:
+    """Return a function that writes a plan beside a copy of the elbow's file and reads it."""
 
-    def write(text: str = ONE, head: str = SMALL) -> Plan:
+    def write(characters: str = ONE_CHARACTER, settings: str = SMALL_SETTINGS) -> Plan:
         if not (tmp_path / "elbow.blend").exists():
             shutil.copyfile(ELBOW, tmp_path / "elbow.blend")
         path = tmp_path / "characters.toml"
-        path.write_text(textwrap.dedent(head + text))
+        path.write_text(textwrap.dedent(settings + characters))
         return read_plan(path)
 
     return write
 
 
-def do_all(plan: Plan, kinds: tuple[str, ...] = KINDS) -> dict[str, Outcome]:
-    """All tasks of a plan, or those of some kinds, in this process."""
+def run_tasks(plan: Plan, kinds: tuple[str, ...] = KINDS) -> dict[str, Outcome]:
+    """Run the tasks of a plan, or those of some kinds, in this process; return their outcomes by name."""
     tasks = make_tasks(plan)
     return {name: run_task(plan.farm, tasks, name) for name, task in tasks.items() if task.kind in kinds}
 
 
-def states(outcomes: dict[str, Outcome]) -> dict[str, str]:
+def states_by_task(outcomes: dict[str, Outcome]) -> dict[str, str]:
+    """Return the state of each outcome by the name of its task."""
     return {name: outcome.state for name, outcome in outcomes.items()}
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder, by path."""
+def read_all_files(folder: Path) -> dict[str, bytes]:
+    """Read all files below a folder, by relative path."""
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}

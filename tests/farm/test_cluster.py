@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The farm on a local cluster of Dask: real workers, real verbs, one broken rig, and what listens where."""
+"""Tests of the farm on a local Dask cluster with real workers and verbs, and of its command line."""
 
 import json
 import re
@@ -13,21 +13,21 @@ from farm.__main__ import main
 from farm.fingerprints import check_outputs
 from farm.tasks import make_tasks
 
-from .conftest import ONE, ROOT
+from .conftest import ONE_CHARACTER, ROOT
 
-TWO = (
-    ONE
+THREE_CHARACTERS = (
+    ONE_CHARACTER
     + 'actions = ["elbow_wave"]\ngoal_mm = 1000.0\nrounds = 1\n'
     + '[characters.broken]\nrig = "broken.blend"\noutput = "out/broken"\n'
-    + '[characters.gone]\nrig = "gone.blend"\noutput = "out/gone"\n'
+    + '[characters.missing]\nrig = "missing.blend"\noutput = "out/missing"\n'
 )
 
 
 @pytest.fixture
-def farm_started(written, tmp_path):
-    """A farm of one character that is good and two that are not, as a process of its own."""
-    plan = written(TWO)
-    (tmp_path / "broken.blend").write_text("no blend file")
+def started_farm(write_plan, tmp_path):
+    """Start a farm of one valid rig, one broken file and one missing file in its own process."""
+    plan = write_plan(THREE_CHARACTERS)
+    (tmp_path / "broken.blend").write_text("not a .blend file")
     command = [sys.executable, "-m", "fdda_addon", "farm", plan.path, "--workers", "2", "--dashboard-port", "0"]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     yield plan, process
@@ -37,39 +37,39 @@ def farm_started(written, tmp_path):
     process.wait()
 
 
-def listening(process: psutil.Process) -> set[str]:
-    """Addresses that a process and those that it started listen on."""
-    found = set()
-    for one in [process, *process.children(recursive=True)]:
+def listening_addresses(process: psutil.Process) -> set[str]:
+    """Return the addresses that a process and its child processes listen on."""
+    addresses = set()
+    for each in [process, *process.children(recursive=True)]:
         try:
-            found |= {c.laddr.ip for c in one.net_connections("inet") if c.status == psutil.CONN_LISTEN}
+            addresses |= {c.laddr.ip for c in each.net_connections("inet") if c.status == psutil.CONN_LISTEN}
         except psutil.NoSuchProcess:
             continue
-    return found
+    return addresses
 
 
-def test_a_farm(farm_started, tmp_path):
-    plan, process = farm_started
+def test_a_farm_finishes_valid_characters_and_reports_failed_ones(started_farm, tmp_path):
+    plan, process = started_farm
     addresses: set[str] = set()
     lines = []
     for line in process.stdout:
         lines.append(line)
-        addresses |= listening(psutil.Process(process.pid))
+        addresses |= listening_addresses(psutil.Process(process.pid))
     text = "".join(lines)
     assert process.wait() == 1, text
-    assert addresses == {"127.0.0.1"}, "nobody else may send code to the scheduler"
+    assert addresses == {"127.0.0.1"}, "other machines must not reach the scheduler, because it runs code"
     for task in make_tasks(plan).values():
         if task.character == "elbow":
             check_outputs(task)
     assert re.search(r"elbow/refine-1 not needed: 99.9 % of the vertices are within", text)
     assert re.search(r"broken/influences failed: Blender cannot open '.*broken.blend'", text)
     assert "broken/record-1 blocked: 'broken/influences' is not done." in text
-    assert "gone/bind failed: There is no file" in text
+    assert "missing/bind failed: There is no file" in text
     report = json.loads((tmp_path / "report.json").read_text())["characters"]
-    assert {name: own["state"] for name, own in report.items()} == {
+    assert {name: character["state"] for name, character in report.items()} == {
         "elbow": "done",
         "broken": "failed",
-        "gone": "failed",
+        "missing": "failed",
     }
     assert [failure["task"] for failure in report["broken"]["failures"]] == ["broken/influences"]
     page = (tmp_path / "report.html").read_text()
@@ -77,8 +77,8 @@ def test_a_farm(farm_started, tmp_path):
     assert (tmp_path / "out/elbow/elbow.blend").is_file()
 
 
-def test_a_farm_that_is_up_to_date_starts_nothing(written, capsys, monkeypatch):
-    plan = written()
+def test_a_farm_that_is_up_to_date_runs_no_task(write_plan, capsys, monkeypatch):
+    plan = write_plan()
     monkeypatch.setattr("farm.fingerprints.is_up_to_date", lambda task, key: True)
     assert main([str(plan.path)]) == 0
     out = capsys.readouterr().out
@@ -86,7 +86,7 @@ def test_a_farm_that_is_up_to_date_starts_nothing(written, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("options", "status", "words"),
+    ("options", "status", "message"),
     [
         (["--task", "elbow/bake"], 2, "The plan has no task 'elbow/bake'; --list names them."),
         (["--only", "hero"], 2, "The plan has no character 'hero'."),
@@ -95,19 +95,20 @@ def test_a_farm_that_is_up_to_date_starts_nothing(written, capsys, monkeypatch):
         (["--list", "--dry-run"], 2, "not allowed with"),
     ],
 )
-def test_what_cannot_be_done(written, capsys, monkeypatch, options, status, words):
+def test_wrong_options_and_unreachable_schedulers_end_with_a_message(
+    write_plan, capsys, monkeypatch, options, status, message
+):
     monkeypatch.setattr("farm.cluster.CONNECT_SECONDS", 2)
-    plan = written()
+    plan = write_plan()
     try:
-        found = main([str(plan.path), *options])
-    except SystemExit as usage:
-        found = usage.code
-    captured = capsys.readouterr()
-    assert found == status and words in captured.err
+        exit_status = main([str(plan.path), *options])
+    except SystemExit as usage_error:
+        exit_status = usage_error.code
+    assert exit_status == status and message in capsys.readouterr().err
 
 
-def test_one_task_and_the_list(written, capsys):
-    plan = written()
+def test_the_list_shows_a_finished_task_as_up_to_date(write_plan, capsys):
+    plan = write_plan()
     assert main([str(plan.path), "--task", "elbow/influences"]) == 0
     assert capsys.readouterr().out == "elbow/influences: done\n"
     assert main([str(plan.path), "--list"]) == 0

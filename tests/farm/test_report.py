@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report of all characters: errors, what failed, what changed, and nothing that a name could break."""
+"""Tests of the report of all characters: errors, failures, changes, and escaping of names."""
 
 import json
 from html.parser import HTMLParser
@@ -10,13 +10,13 @@ from farm.report import write_report
 from farm.run import FAILED, Outcome
 from farm.tasks import make_tasks
 
-from .conftest import ONE
+from .conftest import ONE_CHARACTER
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def bound(plan, mean: float, key: str = "first") -> None:
-    """As if everything had run."""
+def write_results(plan, mean: float, key: str = "first") -> None:
+    """Write the manifests and results of all tasks, as if they had run."""
     for task in make_tasks(plan).values():
         task.folder.mkdir(parents=True, exist_ok=True)
         notes = {"bound": {"elbow.onnx": "elbow/train-0"}} if task.kind == "bind" else {}
@@ -29,39 +29,40 @@ def bound(plan, mean: float, key: str = "first") -> None:
     (folder / "heat_map.png").write_bytes(PNG)
 
 
-def test_what_changed_against_the_last_run(written):
-    plan = written(ONE + "goal_mm = 0.5\nrounds = 0\n")
+def test_the_report_compares_errors_with_the_last_run(write_plan):
+    plan = write_plan(ONE_CHARACTER + "goal_mm = 0.5\nrounds = 0\n")
     page, tasks = plan.path.with_name("report.html"), make_tasks(plan)
-    read = lambda: json.loads(page.with_suffix(".json").read_text())["characters"]["elbow"]  # noqa: E731
-    bound(plan, 0.1)
+    read_report = lambda: json.loads(page.with_suffix(".json").read_text())["characters"]["elbow"]  # noqa: E731
+    write_results(plan, 0.1)
     write_report(plan, tasks, {}, page)
-    assert read()["state"] == "done" and read()["before"] is None
-    bound(plan, 0.05, "second")
+    assert read_report()["state"] == "done" and read_report()["before"] is None
+    write_results(plan, 0.05, "second")
     write_report(plan, tasks, {}, page)
-    assert read()["before"]["models"][0]["fdda"]["mean"] == 0.1
+    assert read_report()["before"]["models"][0]["fdda"]["mean"] == 0.1
     assert "-50 %" in page.read_text() and "0.5 met" in page.read_text()
-    # A run that changes nothing is compared with the same.
+    # A run without changes keeps the comparison of the last run.
     write_report(plan, tasks, {}, page)
-    assert read()["before"]["models"][0]["fdda"]["mean"] == 0.1
+    assert read_report()["before"]["models"][0]["fdda"]["mean"] == 0.1
 
 
-def test_what_failed_is_said_and_escaped(written):
-    plan = written()
+def test_a_failure_is_reported_and_escaped(write_plan):
+    plan = write_plan()
     page, tasks = plan.path.with_name("report.html"), make_tasks(plan)
-    bound(plan, 0.1)
+    write_results(plan, 0.1)
     sentence = "'<script>alert(1)</script>' & more."
     write_report(plan, tasks, {"elbow/train-0": Outcome("elbow/train-0", FAILED, sentence)}, page)
     text = page.read_text()
     assert "&#x27;&lt;script&gt;alert(1)&lt;/script&gt;&#x27; &amp; more." in text and "<script" not in text
-    own = json.loads(page.with_suffix(".json").read_text())["characters"]["elbow"]
-    assert own["state"] == "failed" and own["failures"][0]["sentence"] == sentence and own["models"] == []
+    character = json.loads(page.with_suffix(".json").read_text())["characters"]["elbow"]
+    assert character["state"] == "failed" and character["models"] == []
+    assert character["failures"][0]["sentence"] == sentence
 
 
-def test_the_page_is_whole(written):
-    """Every tag that is opened is closed, and nothing is fetched."""
-    plan = written(ONE + "goal_mm = 0.5\nrounds = 0\n")
+def test_the_page_is_well_formed_and_self_contained(write_plan):
+    """All tags are closed, and no file is loaded from elsewhere."""
+    plan = write_plan(ONE_CHARACTER + "goal_mm = 0.5\nrounds = 0\n")
     page, tasks = plan.path.with_name("report.html"), make_tasks(plan)
-    bound(plan, 0.1)
+    write_results(plan, 0.1)
     write_report(plan, tasks, {}, page)
     text, open_tags, sources = page.read_text(), [], []
 
@@ -79,11 +80,11 @@ def test_the_page_is_whole(written):
     assert "Bones &lt;flip&gt; &amp; turn." in text and "0.5 missed" in text
 
 
-def test_a_report_that_is_damaged_is_no_last_run(written):
-    plan = written()
+def test_a_damaged_last_report_is_ignored(write_plan):
+    plan = write_plan()
     page, tasks = plan.path.with_name("report.html"), make_tasks(plan)
     page.with_suffix(".json").write_text('{"format": "fdda-farm-report", "version": 1, "characters": {"elbow": 3}}')
     write_report(plan, tasks, {}, page)
-    own = json.loads(page.with_suffix(".json").read_text())["characters"]["elbow"]
-    assert own["state"] == "not done" and own["before"] is None
+    character = json.loads(page.with_suffix(".json").read_text())["characters"]["elbow"]
+    assert character["state"] == "not done" and character["before"] is None
     assert render_page({"plan": "p", "written": "now", "characters": {}}, {}).startswith("<!doctype html>")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tasks: done once, gone on with after a kill, made again when what they depend on changes; real verbs in processes."""
+"""Tests of running tasks with real verbs: once, again after a kill, and again after a change of their inputs."""
 
 import json
 import os
@@ -22,25 +22,25 @@ from fdda_addon.core.errors import TRY_AGAIN
 from fdda_addon.core.model import read_model_info
 from fdda_addon.core.recording.reader import read_recording
 
-from .conftest import ELBOW, ONE, ROOT, SMALL, contents, do_all, states
+from .conftest import ELBOW, ONE_CHARACTER, ROOT, SMALL_SETTINGS, read_all_files, run_tasks, states_by_task
 
-ROUNDS = ONE + "goal_mm = 0.001\nrounds = 1\n"
+CHARACTER_WITH_ROUNDS = ONE_CHARACTER + "goal_mm = 0.001\nrounds = 1\n"
 
 
 @pytest.fixture(scope="module")
 def elbow_farm(tmp_path_factory):
-    """The elbow's farm, done once: its folder, to be copied, and what became of the tasks."""
+    """Run all tasks of the elbow's farm once; return its plan and the outcomes."""
     folder = tmp_path_factory.mktemp("farm")
     (folder / "elbow.blend").write_bytes(ELBOW.read_bytes())
 
-    (folder / "characters.toml").write_text(SMALL + ROUNDS)
+    (folder / "characters.toml").write_text(SMALL_SETTINGS + CHARACTER_WITH_ROUNDS)
     plan = read_plan(folder / "characters.toml")
-    return plan, do_all(plan)
+    return plan, run_tasks(plan)
 
 
-def test_all_tasks_of_a_character(elbow_farm):
+def test_all_tasks_of_a_character_run_and_the_best_model_is_bound(elbow_farm):
     plan, outcomes = elbow_farm
-    assert set(states(outcomes).values()) == {DONE}, outcomes
+    assert set(states_by_task(outcomes).values()) == {DONE}, outcomes
     out = plan.characters[0].output
     assert {"elbow.blend", "elbow.onnx", "report.html", "report.json", "evaluation.json"} <= set(os.listdir(out))
     refined = read_recording(plan.farm.work / "elbow/refine-1/recording")
@@ -56,88 +56,93 @@ def test_all_tasks_of_a_character(elbow_farm):
     assert (out / "elbow.onnx").read_bytes() == (plan.farm.work / f"elbow/train-{best}/elbow.onnx").read_bytes()
 
 
-def test_nothing_is_done_twice(elbow_farm):
+def test_tasks_that_are_up_to_date_change_no_file(elbow_farm):
     plan, _ = elbow_farm
-    before = contents(plan.farm.work)
+    old_files = read_all_files(plan.farm.work)
     tasks = make_tasks(plan)
     assert outdated_tasks(tasks, InputFingerprints(plan.farm, tasks)) == ([], {})
-    assert set(states(do_all(plan)).values()) == {UP_TO_DATE}
-    assert contents(plan.farm.work) == before
+    assert set(states_by_task(run_tasks(plan)).values()) == {UP_TO_DATE}
+    assert read_all_files(plan.farm.work) == old_files
 
 
-def test_a_lost_file_is_made_again_with_what_it_needs_alone(elbow_farm):
+def test_a_lost_file_is_made_again_only_when_a_task_needs_it(elbow_farm):
     plan, _ = elbow_farm
     tasks = make_tasks(plan)
     fingerprints = InputFingerprints(plan.farm, tasks)
-    lost = plan.farm.work / "elbow/evaluate-1/evaluation.json"
-    kept = lost.read_bytes()
-    lost.unlink()
-    # What is done needs nothing before it: bind is.
+    lost_file = plan.farm.work / "elbow/evaluate-1/evaluation.json"
+    old_content = lost_file.read_bytes()
+    lost_file.unlink()
+    # bind is done, so no task needs the evaluation.
     assert outdated_tasks(tasks, fingerprints) == ([], {})
     (plan.characters[0].output / "elbow.blend").unlink()
     assert outdated_tasks(tasks, fingerprints)[0] == ["elbow/evaluate-1", "elbow/bind"]
     assert run_task(plan.farm, tasks, "elbow/evaluate-1").state == DONE
-    assert json.loads(lost.read_bytes())["fdda"] == json.loads(kept)["fdda"]
+    assert json.loads(lost_file.read_bytes())["fdda"] == json.loads(old_content)["fdda"]
     assert run_task(plan.farm, tasks, "elbow/bind").state == DONE
 
 
-def test_what_was_changed_is_not_used(elbow_farm):
+def test_a_changed_output_is_refused_and_made_again(elbow_farm):
     plan, _ = elbow_farm
     tasks = make_tasks(plan)
     model = plan.farm.work / "elbow/train-1/elbow.onnx"
-    kept = model.read_bytes()
-    model.write_bytes(kept[:-1] + b"x")
+    old_model = model.read_bytes()
+    model.write_bytes(old_model[:-1] + b"x")
     tasks["elbow/evaluate-1"].manifest.unlink()
     outcome = run_task(plan.farm, tasks, "elbow/evaluate-1")
     assert outcome.state == FAILED
-    assert f"'{model}' is not what 'elbow/train-1' left" in outcome.sentence and "it is made again" in outcome.sentence
+    assert f"'{model}' was changed since 'elbow/train-1' wrote it" in outcome.sentence
     tasks["elbow/bind"].manifest.unlink()
     assert outdated_tasks(tasks, InputFingerprints(plan.farm, tasks))[0] == [
         f"elbow/{name}" for name in ("train-1", "evaluate-1", "bind")
     ]
-    made = [run_task(plan.farm, tasks, f"elbow/{name}").state for name in ("train-1", "evaluate-1", "bind")]
-    assert made == [DONE] * 3
-    assert model.read_bytes() == kept, "the same recording and settings give the same bytes"
+    new_states = [run_task(plan.farm, tasks, f"elbow/{name}").state for name in ("train-1", "evaluate-1", "bind")]
+    assert new_states == [DONE] * 3
+    assert model.read_bytes() == old_model, "the same recording and settings give the same bytes"
 
 
-def test_a_goal_that_is_met_ends_the_rounds(elbow_farm):
+def test_the_rounds_end_when_the_goal_is_met(elbow_farm):
     plan, _ = elbow_farm
     plan.path.write_text(plan.path.read_text().replace("goal_mm = 0.001", "goal_mm = 1000.0"))
 
-    found = states(do_all(read_plan(plan.path)))
-    assert {name: state for name, state in found.items() if "-1" in name and "record" not in name} == {
+    states = states_by_task(run_tasks(read_plan(plan.path)))
+    assert {name: state for name, state in states.items() if "-1" in name and "record" not in name} == {
         f"elbow/{name}-1": NOT_NEEDED for name in ("refine", "train", "evaluate")
     }
-    assert found["elbow/record-1"] == found["elbow/merge"] == UP_TO_DATE
-    assert found["elbow/train-0"] == found["elbow/bind"] == DONE
+    assert states["elbow/record-1"] == states["elbow/merge"] == UP_TO_DATE
+    assert states["elbow/train-0"] == states["elbow/bind"] == DONE
 
 
-def test_keys_follow_what_a_task_depends_on(written, tmp_path):
-    def keys(text: str, head: str = "") -> dict[str, str]:
-        plan = written(text, head)
+def test_a_changed_setting_changes_the_fingerprints_of_dependent_tasks(write_plan, tmp_path):
+    def fingerprints(characters: str, settings: str = "") -> dict[str, str]:
+        plan = write_plan(characters, settings)
         tasks = make_tasks(plan)
         return {name: InputFingerprints(plan.farm, tasks).of_task(name) for name in tasks}
 
-    first = keys(ONE)
+    old_fingerprints = fingerprints(ONE_CHARACTER)
 
-    def changed(text: str, head: str = "") -> set[str]:
-        return {name for name, key in keys(text, head).items() if first.get(name) != key}
+    def changed(characters: str, settings: str = "") -> set[str]:
+        new_fingerprints = fingerprints(characters, settings)
+        return {name for name, key in new_fingerprints.items() if old_fingerprints.get(name) != key}
 
-    everything, recorded = set(first), {name for name in first if "record" in name or "influences" in name}
-    assert changed(ONE) == changed(ONE + 'shards = 4\n[characters.other]\nrig = "elbow.blend"\noutput = "o"') - {
-        name for name in keys(ONE + '[characters.other]\nrig = "elbow.blend"\noutput = "o"') if "other" in name
+    all_tasks = set(old_fingerprints)
+    assert changed(ONE_CHARACTER) == changed(
+        ONE_CHARACTER + 'shards = 4\n[characters.other]\nrig = "elbow.blend"\noutput = "o"'
+    ) - {
+        name
+        for name in fingerprints(ONE_CHARACTER + '[characters.other]\nrig = "elbow.blend"\noutput = "o"')
+        if "other" in name
     }
-    assert changed(ONE + "seed = 3") == everything
-    assert changed(ONE + "train = { epochs = 5 }") == {"elbow/train-0", "elbow/evaluate-0", "elbow/bind"}
-    assert changed(ONE, "[farm]\nthreads = 2") == {"elbow/train-0", "elbow/evaluate-0", "elbow/bind"}
-    assert changed(ONE + "use_in_render = true") == {"elbow/bind"}
-    assert changed(ONE, '[farm]\nwork = "elsewhere"') == set(), "what was done may be moved"
+    assert changed(ONE_CHARACTER + "seed = 3") == all_tasks
+    assert changed(ONE_CHARACTER + "train = { epochs = 5 }") == {"elbow/train-0", "elbow/evaluate-0", "elbow/bind"}
+    assert changed(ONE_CHARACTER, "[farm]\nthreads = 2") == {"elbow/train-0", "elbow/evaluate-0", "elbow/bind"}
+    assert changed(ONE_CHARACTER + "use_in_render = true") == {"elbow/bind"}
+    assert changed(ONE_CHARACTER, '[farm]\nwork = "elsewhere"') == set(), "the work folder may be moved"
     with open(tmp_path / "elbow.blend", "ab") as file:
         file.write(b"x")
-    assert changed(ONE) == everything >= recorded
+    assert changed(ONE_CHARACTER) == all_tasks
 
 
-KILLED = """
+WORKER_SCRIPT = """
 import sys
 from pathlib import Path
 from farm.characters import read_plan
@@ -148,78 +153,79 @@ print(run_task(plan.farm, make_tasks(plan), sys.argv[2]).state)
 """
 
 
-def started(plan, name: str) -> subprocess.Popen:
-    """A worker that does one task."""
+def start_worker(plan, name: str) -> subprocess.Popen:
+    """Start a process that runs one task."""
     return subprocess.Popen(
-        [sys.executable, "-c", KILLED, plan.path, name], cwd=ROOT, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", WORKER_SCRIPT, plan.path, name], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
 
 
-def wait_for(what, seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < end
+def wait_until(condition, max_seconds: float = 60) -> None:
+    deadline = time.monotonic() + max_seconds
+    while not condition():
+        assert time.monotonic() < deadline
         time.sleep(0.02)
 
 
-def complete(path: Path) -> int:
+def count_complete_poses(recording: Path) -> int:
     try:
-        return json.loads((path / "recording.json").read_text())["complete"]
+        return json.loads((recording / "recording.json").read_text())["complete"]
     except FileNotFoundError:
         return 0
 
 
-@pytest.mark.parametrize("with_verb", [False, True])
-def test_a_worker_that_is_killed_loses_nothing(written, with_verb):
-    """Its verb goes on, and whoever is next waits for it; or it is killed too, and its poses are gone on with."""
-    plan = written(ONE + "poses = 4000\nshards = 1")
+@pytest.mark.parametrize("kills_verb", [False, True])
+def test_a_killed_worker_loses_no_poses(write_plan, kills_verb):
+    """A verb that survives its worker continues, and the next worker waits for it; a killed verb is resumed."""
+    plan = write_plan(ONE_CHARACTER + "poses = 4000\nshards = 1")
     tasks = make_tasks(plan)
     assert run_task(plan.farm, tasks, "elbow/influences").state == DONE
     task = tasks["elbow/record-1"]
-    worker = started(plan, task.name)
+    worker = start_worker(plan, task.name)
     recording = task.folder / "recording"
-    wait_for(lambda: complete(recording))
-    if with_verb:
+    wait_until(lambda: count_complete_poses(recording))
+    if kills_verb:
         children = Path(f"/proc/{worker.pid}/task/{worker.pid}/children").read_text().split()
     worker.kill()
     worker.wait()
-    if with_verb:
+    if kills_verb:
         for child in children:
             os.kill(int(child), signal.SIGKILL)
-    before = complete(recording)
-    assert 0 < before < 4000 and read_manifest(task) is None
+    pose_count = count_complete_poses(recording)
+    assert 0 < pose_count < 4000 and read_manifest(task) is None
     assert run_task(plan.farm, tasks, task.name).state == DONE
-    last = task.log.read_text().rpartition("$ record")[2]
-    first = next(int(line.split()[1]) for line in last.splitlines() if line.startswith("poses: "))
-    assert first >= before and complete(recording) == 4000, "no pose is recorded twice"
+    last_log = task.log.read_text().rpartition("$ record")[2]
+    first_count = next(int(line.split()[1]) for line in last_log.splitlines() if line.startswith("poses: "))
+    assert first_count >= pose_count and count_complete_poses(recording) == 4000, "no pose is recorded twice"
 
 
-def test_two_workers_take_turns(written):
-    plan = written()
-    workers = [started(plan, "elbow/influences") for _ in range(2)]
+def test_the_second_of_two_workers_finds_the_task_done(write_plan):
+    plan = write_plan()
+    workers = [start_worker(plan, "elbow/influences") for _ in range(2)]
     assert sorted(worker.communicate()[0].strip() for worker in workers) == ["done", "up to date"]
 
 
-def test_a_lock_is_free_when_its_last_process_is_gone(tmp_path):
-    done = []
+def test_a_lock_is_released_when_its_last_process_ends(tmp_path):
+    acquired_locks = []
     with hold_lock(tmp_path / "lock") as lock:
         sleeper = subprocess.Popen(["sleep", "0.5"], pass_fds=(lock,))
-    waiting = threading.Thread(target=lambda: done.append(hold_lock(tmp_path / "lock").__enter__()))
-    waiting.start()
+    waiting_thread = threading.Thread(target=lambda: acquired_locks.append(hold_lock(tmp_path / "lock").__enter__()))
+    waiting_thread.start()
     time.sleep(0.1)
-    assert not done and sleeper.poll() is None
-    waiting.join(20)
-    assert done and sleeper.wait() == 0
+    assert not acquired_locks and sleeper.poll() is None
+    waiting_thread.join(20)
+    assert acquired_locks and sleeper.wait() == 0
 
 
-def ended(tmp_path: Path, monkeypatch, code: str) -> None:
+def run_code_as_verb(tmp_path: Path, monkeypatch, code: str) -> None:
+    """Run Python code in place of a verb."""
     monkeypatch.setattr(process, "verb_command", lambda farm, verb: [sys.executable, "-c", code])
     with hold_lock(tmp_path / "lock") as lock:
         run_verb(None, ("record",), tmp_path, tmp_path / "log", lock)
 
 
 @pytest.mark.parametrize(
-    ("code", "error", "words"),
+    ("code", "error", "message"),
     [
         (
             "import sys; print('poses: 1 of 2'); print('Error: No rig.', file=sys.stderr); sys.exit(1)",
@@ -232,14 +238,14 @@ def ended(tmp_path: Path, monkeypatch, code: str) -> None:
         ("import sys; sys.exit(3)", VerbError, "record ended with status 3; see"),
     ],
 )
-def test_how_a_verb_ended(tmp_path, monkeypatch, code, error, words):
+def test_the_exit_status_of_a_verb_determines_its_error(tmp_path, monkeypatch, code, error, message):
     monkeypatch.setattr(process, "verb_environment", lambda farm, verb: dict(os.environ))
     with pytest.raises(error) as raised:
-        ended(tmp_path, monkeypatch, code)
-    assert str(raised.value).startswith(words) and type(raised.value) is error
+        run_code_as_verb(tmp_path, monkeypatch, code)
+    assert str(raised.value).startswith(message) and type(raised.value) is error
 
 
-def test_what_a_verb_inherits(tmp_path, monkeypatch):
+def test_a_verb_inherits_the_environment_except_threads_and_dask_variables(tmp_path, monkeypatch):
     monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "65536")
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.setenv("OF_THE_USER", "yes")
@@ -250,29 +256,29 @@ def test_what_a_verb_inherits(tmp_path, monkeypatch):
     assert "MALLOC_TRIM_THRESHOLD_" not in {*training, *recording}, "it slows verbs down by a third"
 
 
-def test_a_rig_that_is_broken_fails_with_its_sentence(written, tmp_path):
-    plan = written(
-        '[characters.bad]\nrig = "bad.blend"\noutput = "out"\n[characters.gone]\nrig = "gone.blend"\noutput = "o"'
+def test_a_broken_or_missing_rig_fails_with_a_message(write_plan, tmp_path):
+    plan = write_plan(
+        '[characters.bad]\nrig = "bad.blend"\noutput = "out"\n[characters.missing]\nrig = "missing.blend"\noutput = "o"'
     )
-    (tmp_path / "bad.blend").write_text("no blend file")
+    (tmp_path / "bad.blend").write_text("not a .blend file")
     tasks = make_tasks(plan)
     outcome = run_task(plan.farm, tasks, "bad/influences")
     assert outcome.state == FAILED and "Blender cannot open" in outcome.sentence
     names, unreadable = outdated_tasks(tasks, InputFingerprints(plan.farm, tasks))
-    assert "bad/influences" in names and list(unreadable) == ["gone/bind"]
+    assert "bad/influences" in names and list(unreadable) == ["missing/bind"]
     assert (
-        unreadable["gone/bind"]
-        == f"There is no file '{tmp_path / 'gone.blend'}' (No such file or directory); see the plan."
+        unreadable["missing/bind"]
+        == f"There is no file '{tmp_path / 'missing.blend'}' (No such file or directory); see the plan."
     )
 
 
-def test_a_disk_that_is_full_is_tried_again(written, monkeypatch):
-    """Where the farm itself writes: what verbs say is in their exit status."""
-    plan = written()
+def test_a_full_disk_is_tried_again(write_plan, monkeypatch):
+    """The test covers files that the farm itself writes; verbs report a full disk with their exit status."""
+    plan = write_plan()
 
-    def full(*_: object) -> None:
+    def raise_disk_full(*_: object) -> None:
         raise OSError(28, "No space left on device", "somewhere")
 
-    monkeypatch.setattr("farm.run._prepare", full)
+    monkeypatch.setattr("farm.run._prepare_folder", raise_disk_full)
     outcome = run_task(plan.farm, make_tasks(plan), "elbow/influences")
     assert (outcome.state, outcome.sentence) == (AGAIN, "'somewhere': No space left on device.")
