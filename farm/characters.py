@@ -10,7 +10,7 @@ from typing import Any
 
 from fdda_addon.core.errors import FDDAError
 from fdda_addon.core.poses import MAX_MARGIN
-from fdda_addon.core.skin_fit import KINDS as SKIN_FIT_KINDS
+from fdda_addon.core.skin_fit import FIT_KINDS
 
 MAX_PLAN_BYTES = 4 << 20
 MAX_SHARDS, MAX_ROUNDS = 1000, 20
@@ -173,8 +173,8 @@ def _check_character(character: Character, section: str) -> None:
         raise PlanError(f"{section}: two of the objects would have the same folder; rename one of them.")
     if not character.poses and not character.actions and not character.strips:
         raise PlanError(f"{section}: there is nothing to record; give poses or actions.")
-    if character.fit_linear not in ("", *SKIN_FIT_KINDS):
-        kinds = " or ".join(SKIN_FIT_KINDS)
+    if character.fit_linear not in ("", *FIT_KINDS):
+        kinds = " or ".join(FIT_KINDS)
         raise PlanError(f"{section}: fit_linear is {kinds}, and not {character.fit_linear!r}.")
     for key, value in character.train.items():
         if not TRAIN_SETTING.fullmatch(key) or key in ("messages", "warm_start", "goal_mm"):
