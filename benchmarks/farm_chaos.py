@@ -33,6 +33,7 @@ sys.path.insert(0, str(ROOT))
 from farm.characters import Plan, read_plan  # noqa: E402
 from farm.fingerprints import check_outputs, read_manifest  # noqa: E402
 from farm.tasks import MERGE, RECORD, REFINE, TRAIN, make_tasks  # noqa: E402
+from fdda_addon.core.output import is_temporary_name  # noqa: E402
 
 NAMESPACE_VARIABLE = "FDDA_CHAOS_INSIDE"
 DISK_MB = 400
@@ -247,8 +248,12 @@ def differences(calm: Plan, storm: Plan) -> list[str]:
         pair = [hashlib.sha256((c.output / f"{c.name}.onnx").read_bytes()).digest() for c in (own, other)]
         if pair[0] != pair[1]:
             wrong.append(f"the bound models of {own.name} differ")
-    halves = [path for path in storm.farm.work.rglob("*") if re.match(r"\.(new|old)-|\.fdda-[0-9a-f]{12}", path.name)]
-    return wrong + [f"half a file was left: {path}" for path in halves]
+    partial_paths = [
+        path
+        for path in storm.farm.work.rglob("*")
+        if is_temporary_name(path.name) or path.name.startswith((".new-", ".old-"))
+    ]
+    return wrong + [f"a partial file was left: {path}" for path in partial_paths]
 
 
 def find_repeated_poses(name: str, log: Path) -> list[str]:

@@ -8,7 +8,7 @@ every network is offered all joints that were recorded, and finds out which matt
 alone.
 
 Trains on poses 0 to 699 of eight partitions and measures on poses 700 to 1000, which no setting was chosen on: with
-`--choose` it measures on a fifth of the 700 instead, the rest of which it trains on. Errors are in centimetres, as
+`--choose` it measures on a fifth of the 700 instead, the rest of which it trains on. Errors are in centimeters, as
 published. Exits with 0 and says so where the data is missing.
 """
 
@@ -70,7 +70,7 @@ class ReferencePartition:
     Attributes:
         data: as the trainer takes it.
         joint: index of the main joint.
-        poses: (N, J, 4, 4) float64 pose matrices of the joints that are known, metres.
+        poses: (N, J, 4, 4) float64 pose matrices of the joints that are known, meters.
     """
 
     data: PartitionData
@@ -106,7 +106,7 @@ def read_partition(name: str, joints: dict[str, np.ndarray], residuals: np.ndarr
             joint = parent_of(joint)
         names += reversed(chain)
     poses = np.tile(np.eye(4), (len(residuals), len(names), 1, 1))
-    # Where the surface is was not recorded: three points around each joint stand for it, a centimetre off.
+    # Where the surface is was not recorded: three points, a centimeter from each joint, stand in for it.
     points = np.tile(np.eye(3) * CM, (len(names), 1, 1))
     for joint, local in joints.items():
         place = names.index(joint)
@@ -170,7 +170,7 @@ def run(folder: Path, config: TrainingConfig, choose: bool, listed: bool) -> dic
         rows.append(
             {
                 "partition": ready.name,
-                "shapes": len(ready.basis.components),
+                "components": len(ready.basis.components),
                 "linear_mean": linear,
                 "mean": mean,
                 "max": largest,
@@ -195,11 +195,13 @@ def run(folder: Path, config: TrainingConfig, choose: bool, listed: bool) -> dic
 def print_table(result: dict) -> None:
     print(f"Errors in cm over poses {result['poses']}; relu: the published 2x128 ReLU networks over 700-1000.")
     print(
-        f"{'partition':10} {'shapes':>6} {'linear':>8} {'mean':>8} {'max':>8} {'relu mean':>10} {'relu max':>9} {'':>6}"
+        f"{'partition':10} {'components':>10} {'linear':>8} {'mean':>8} {'max':>8} "
+        f"{'relu mean':>10} {'relu max':>9} {'':>6}"
     )
-    for row in [*result["partitions"], {"partition": "all", "shapes": "", **result["all"]}]:
+    for row in [*result["partitions"], {"partition": "all", "components": "", **result["all"]}]:
         print(
-            f"{row['partition']:10} {row['shapes']:>6} {row['linear_mean']:8.4f} {row['mean']:8.4f} {row['max']:8.4f} "
+            f"{row['partition']:10} {row['components']:>10} "
+            f"{row['linear_mean']:8.4f} {row['mean']:8.4f} {row['max']:8.4f} "
             f"{row['relu_mean']:10.4f} {row['relu_max']:9.4f} {100 * row['mean'] / row['relu_mean']:5.1f} %"
         )
     print(f"{result['seconds']:.1f} s")

@@ -35,7 +35,7 @@ class Material:
     Attributes:
         whole: the training recording.
         training, held_out: both recordings, cut down to the partitions.
-        inputs: what their networks see besides surface_frames, which follow from the split.
+        inputs: of the networks, without surface frames, which depend on the split.
     """
 
     whole: Recording

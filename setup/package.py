@@ -38,7 +38,7 @@ ALL = "all"
 PYTHONS = ("3.11", "3.13")
 SYSTEM_PYTHONS = ("3.14",)
 # What a zip may have at most: it is downloaded by hand, and kept a second time where it is installed.
-LARGEST_MB = 60
+MAX_PACKAGE_MB = 60
 
 INIT = '''# SPDX-License-Identifier: GPL-3.0-or-later
 """The extension's entry: Blender calls `register` and `unregister`."""
@@ -137,9 +137,9 @@ def check_size(package: Path) -> None:
         PackageError: it is.
     """
     size = package.stat().st_size / 1e6
-    if size > LARGEST_MB:
+    if size > MAX_PACKAGE_MB:
         raise PackageError(
-            f"{package.name} has {size:.0f} MB and may have {LARGEST_MB}; look for what is too much in dist/stage."
+            f"{package.name} has {size:.0f} MB and may have {MAX_PACKAGE_MB}; look for what is too much in dist/stage."
         )
 
 
