@@ -15,8 +15,9 @@ from .benchmark import playing, skinning_only, time_frames
 ROUNDS = 4
 FRAMES_PER_ROUND = 5
 
-PLAYBACK_MS = ((1_476, 0.50), (9_960, 0.51), (50_618, 0.73))
-"""Vertex counts, and the time of a frame with a model beyond that of the Armature modifier alone, ms."""
+PLAYBACK_MS, PLAYBACK_MS_PER_VERTEX = 0.26, 4.7e-6
+"""Coefficients of the line that fits the time of a frame with a model beyond that of the Armature modifier alone, ms.
+They are fitted to "Frame times" in docs/benchmarks.md (`make bench`)."""
 MIN_CLEAR_SPEEDUP = 1.3
 """Smallest estimated speed-up that is reported as one."""
 
@@ -38,7 +39,7 @@ class RigCost:
     @property
     def model(self) -> float:
         """Estimate the time of a frame with a model, ms."""
-        return self.linear + estimated_playback(self.vertices)
+        return self.linear + estimate_playback_ms(self.vertices)
 
     @property
     def sentence(self) -> str:
@@ -51,13 +52,9 @@ class RigCost:
         return "Not worth it here: this rig is faster than a model."
 
 
-def estimated_playback(vertices: int) -> float:
-    """Estimate the time of playback in a frame, ms, by linear interpolation and extrapolation of `PLAYBACK_MS`."""
-    counts, times = np.array(PLAYBACK_MS).T
-    if vertices <= counts[-1]:
-        return float(np.interp(vertices, counts, times))
-    slope = (times[-1] - times[-2]) / (counts[-1] - counts[-2])
-    return float(times[-1] + slope * (vertices - counts[-1]))
+def estimate_playback_ms(vertex_count: int) -> float:
+    """Estimate how much longer a frame takes with a model than with the Armature modifier alone, ms."""
+    return PLAYBACK_MS + PLAYBACK_MS_PER_VERTEX * vertex_count
 
 
 def measure(scene_rig: SceneRig) -> Iterator[Progress | RigCost]:

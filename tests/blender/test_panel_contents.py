@@ -2,6 +2,7 @@
 """What the sections from rig to training draw, as far as that shows without a window."""
 
 import json
+import re
 from pathlib import Path
 
 import bpy
@@ -17,10 +18,12 @@ from fdda_addon.panels.section import format_duration, panel_rig
 from fdda_addon.panels.training import _read_report
 from fdda_addon.properties.character import model_file, recording_folder
 from fdda_addon.scene.scene_rig import SceneRig
-from fdda_addon.timing.rig_cost import PLAYBACK_MS, RigCost, estimated_playback
+from fdda_addon.timing.rig_cost import RigCost, estimate_playback_ms
 
 from .conftest import ELBOW
 from .scene_state import fresh_elbow
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -195,29 +198,35 @@ class TestTraining:
         assert not (tmp_path / "m.onnx").exists()
 
 
-class TestCost:
-    @pytest.mark.parametrize("vertices, milliseconds", PLAYBACK_MS)
-    def test_the_estimate_is_what_was_measured(self, vertices, milliseconds):
-        assert estimated_playback(vertices) == pytest.approx(milliseconds)
+def documented_frame_times() -> list[tuple[int, float, float, float]]:
+    """Read the table "Frame times" of docs/benchmarks.md.
 
-    def test_the_estimate_grows_between_and_beyond(self):
-        between = [estimated_playback(count) for count in (100, 5_000, 20_000, 100_000, 200_000)]
-        assert between == sorted(between)
-        assert between[4] - between[3] == pytest.approx(
-            2 * (estimated_playback(100_000) - estimated_playback(50_000)), rel=0.05
-        )
+    Returns:
+        For each rig its number of vertices, and the times of a frame with the rig, with the Armature modifier alone
+        and with FDDA, ms.
+    """
+    lines = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8").split("## Frame times")[1].splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    vertex_counts = [int(re.search(r", ([\d,]+)", heading)[1].replace(",", "")) for heading in rows[0][1:]]
+    cells_by_label = {label: cells for label, *cells in rows}
+    labels = ("rig, ms", "Armature modifier alone, ms", "FDDA, ms")
+    return list(zip(vertex_counts, *([float(cell) for cell in cells_by_label[label]] for label in labels), strict=True))
+
+
+class TestRigCost:
+    @pytest.mark.parametrize("vertex_count, rig_ms, armature_ms, fdda_ms", documented_frame_times())
+    def test_estimate_is_close_to_the_documented_benchmark(self, vertex_count, rig_ms, armature_ms, fdda_ms):
+        assert estimate_playback_ms(vertex_count) == pytest.approx(fdda_ms - armature_ms, abs=0.2)
+        cost = RigCost(vertex_count, rig_ms, armature_ms)
+        assert rig_ms / cost.model == pytest.approx(rig_ms / fdda_ms, rel=0.3)
+        assert cost.sentence.startswith("Worth it")
 
     @pytest.mark.parametrize(
-        "vertices, rig, linear, words",
-        [
-            (9_960, 5.17, 0.29, "Worth it: about 6.5x faster"),
-            (50_618, 29.60, 0.98, "Worth it: about 17.3x faster"),
-            (1_476, 0.71, 0.14, "Little difference"),
-            (1_476, 0.40, 0.14, "Not worth it here"),
-        ],
+        "rig_ms, sentence_start",
+        [(0.80, "Worth it: about 2."), (0.40, "Little difference"), (0.20, "Not worth it here")],
     )
-    def test_the_figures_of_the_benchmark_come_out_again(self, vertices, rig, linear, words):
-        assert RigCost(vertices, rig, linear).sentence.startswith(words)
+    def test_sentence_follows_the_estimated_ratio(self, rig_ms, sentence_start):
+        assert RigCost(1_476, rig_ms, 0.10).sentence.startswith(sentence_start)
 
 
 @pytest.mark.parametrize(
