@@ -15,6 +15,7 @@ from ..runtime.binding import bind, unbind
 from ..runtime.opened_model import read_matching_rig
 from ..scene.scene_rig import SceneRig
 from ..scene.stored_paths import absolute_path, stored_path_for
+from ..timing import frame_times
 from .entries import active_entry, bound_entry, bound_model_name, is_bound
 
 _info_cache: dict[tuple, ModelInfo] = {}
@@ -43,6 +44,7 @@ def add_model(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGr
             )
             if was_bound and is_changed:
                 last_evaluation.remove(mesh_object)
+                frame_times.remove(mesh_object)
                 registry.reset_players()
                 mesh_object.update_tag()
             return entry

@@ -52,3 +52,8 @@ def get(mesh_object: bpy.types.Object) -> FrameTimes | None:
     """Return the times with the bound model; None if they were not measured."""
     times = _frame_times.get(mesh_object.session_uid)
     return times if times and times.model == mesh_object.fdda.model else None
+
+
+def remove(mesh_object: bpy.types.Object) -> None:
+    """Remove the times of an object, because its model has changed."""
+    _frame_times.pop(mesh_object.session_uid, None)

@@ -12,6 +12,7 @@ from fdda_addon.core.errors import ModelError
 from fdda_addon.models.entries import bound_entry, format_file_size
 from fdda_addon.runtime import packed_model
 from fdda_addon.runtime.binding import bind
+from fdda_addon.timing import frame_times
 
 from .. import systems
 from .conftest import ELBOW, ELBOW_RIG, assert_plays, pose, write_edited
@@ -268,6 +269,8 @@ def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_pa
     path = tmp_path / "second.onnx"
     bpy.ops.fdda.bind(filepath=str(path))
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
+    bpy.ops.fdda.measure_model(frames=5)
+    assert frame_times.get(bound) is not None
     pose(angle=1.3)
     before = assert_plays(bound, path)
 
@@ -281,7 +284,8 @@ def test_a_model_that_is_trained_anew_plays_at_once(bound, elbow, second, tmp_pa
     bpy.context.view_layer.update()
     after = assert_plays(bound, path)
     np.testing.assert_allclose(after, 2 * before, atol=1e-5)
-    assert last_evaluation.get(bound) is None and len(bound.fdda.models) == 2
+    assert last_evaluation.get(bound) is None and frame_times.get(bound) is None
+    assert len(bound.fdda.models) == 2
 
 
 def test_what_the_section_says_of_the_models(bound, elbow):
