@@ -88,7 +88,7 @@ def clear_all() -> None:
     overlay.stop()
 
 
-def painted(mesh_object: bpy.types.Object) -> str:
+def paint_kind(mesh_object: bpy.types.Object) -> str:
     """Return what the colors of a mesh show, `ERRORS` or `PARTITIONS`; empty if it has none."""
     paint = _painted.get(mesh_object.session_uid)
     return paint.kind if paint else ""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Stores the last evaluation of each mesh object for the session, for the sidebar, the viewport and the timeline."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import bpy
@@ -56,6 +56,7 @@ class LastEvaluation:
     total: "dict[str, ErrorStatistics]"
     partitions: tuple[PartitionErrors, ...]
     channels: "tuple[Channel, ...]"
+    _cached_errors: "dict[tuple[str, str], np.ndarray]" = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def poses(self) -> int:
@@ -86,7 +87,11 @@ class LastEvaluation:
         errors = self.errors[method]
         if statistic == "pose":
             return None if pose is None or not 0 <= pose < len(errors) else errors[pose]
-        return errors.mean(axis=0) if statistic == "mean" else errors.max(axis=0)
+        # Cached, because viewports ask at every redraw and there are millions of errors.
+        key = (method, statistic)
+        if key not in self._cached_errors:
+            self._cached_errors[key] = errors.mean(axis=0) if statistic == "mean" else errors.max(axis=0)
+        return self._cached_errors[key]
 
     def worst(self, count: int) -> list[tuple[int, float]]:
         """Return index and largest error in mm of the poses with the largest errors of the model, the worst first."""

@@ -36,7 +36,8 @@ void main()
 
 _handles: list[object] = []
 _shader: gpu.types.GPUShader | None = None
-_triangles: dict[int, tuple[tuple[int, int], gpu.types.GPUIndexBuf]] = {}
+_triangles: dict[int, tuple[tuple[int, int, int], gpu.types.GPUIndexBuf]] = {}
+"""By the session id of a mesh object: what identifies its mesh (`_triangles_of`), and the cached triangles."""
 
 
 @dataclass(frozen=True)
@@ -103,20 +104,29 @@ def overlay_mesh(context: bpy.types.Context, mesh_object: bpy.types.Object, colo
     """
     evaluated = mesh_object.evaluated_get(context.evaluated_depsgraph_get())
     mesh = evaluated.data
-    if evaluated.mode == "EDIT" or len(mesh.vertices) != len(colors):
+    if evaluated.mode == "EDIT":
+        # Edits such as Rotate Edge change the triangles without changing the counts.
+        _triangles.pop(mesh_object.session_uid, None)
+        return None
+    if len(mesh.vertices) != len(colors):
         return None
     positions, normals = mesh_positions(mesh), read(mesh.vertex_normals, VECTOR_ELEMENT)
     return OverlayMesh(positions, normals, colors, _triangles_of(mesh_object, mesh), evaluated.matrix_world.copy())
 
 
 def _triangles_of(mesh_object: bpy.types.Object, mesh: bpy.types.Mesh) -> gpu.types.GPUIndexBuf:
-    """Return the triangles of a mesh, cached until its counts change: computing them takes longer than drawing."""
-    counts = (len(mesh.vertices), len(mesh.loops))
+    """Return the triangles of an evaluated mesh, cached because computing them takes longer than drawing them.
+
+    Args:
+        mesh_object: the original object. Other mesh data or another number of vertices or loops replaces the cache.
+        mesh: the evaluated mesh.
+    """
+    mesh_key = (mesh_object.data.session_uid, len(mesh.vertices), len(mesh.loops))
     cached = _triangles.get(mesh_object.session_uid)
-    if cached is None or cached[0] != counts:
+    if cached is None or cached[0] != mesh_key:
         mesh.calc_loop_triangles()
         triangles = read(mesh.loop_triangles, TRIANGLE_ELEMENT)
-        cached = _triangles[mesh_object.session_uid] = (counts, gpu.types.GPUIndexBuf(type="TRIS", seq=triangles))
+        cached = _triangles[mesh_object.session_uid] = (mesh_key, gpu.types.GPUIndexBuf(type="TRIS", seq=triangles))
     return cached[1]
 
 

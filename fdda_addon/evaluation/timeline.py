@@ -65,10 +65,10 @@ def _active_evaluation() -> last_evaluation.LastEvaluation | None:
     if active is None:
         return None
     if active.type == "ARMATURE":
-        meshes = [o for o in bpy.context.scene.objects if o.type == "MESH" and armature_of(o) == active]
-    else:
-        meshes = [active]
-    return next((last for o in meshes if (last := last_evaluation.get(o)) is not None), None)
+        # Few objects have an evaluation, and finding the armature of an object takes longer.
+        evaluations = ((o, last_evaluation.get(o)) for o in bpy.context.scene.objects)
+        return next((last for o, last in evaluations if last is not None and armature_of(o) == active), None)
+    return last_evaluation.get(active)
 
 
 def _draw() -> None:

@@ -153,7 +153,7 @@ def _draw_colors(
     if body is None:
         return
     heat_map = loaded_heat_map()
-    painted_colors = heat_map.painted(mesh_object) if heat_map else ""
+    painted_colors = heat_map.paint_kind(mesh_object) if heat_map else ""
     row = body.row(align=True)
     for colors, text in (("NONE", "None"), ("ERRORS", "Heat Map"), ("PARTITIONS", "Body Parts")):
         button = row.row(align=True)

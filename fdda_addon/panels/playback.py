@@ -41,7 +41,7 @@ def mask_problem(mesh_object: bpy.types.Object) -> str:
 def _read_confidence(mesh_object: bpy.types.Object) -> object:
     from ..runtime.confidence import partition_confidence
 
-    return partition_confidence(mesh_object) or "This model has no confidence values."
+    return partition_confidence(mesh_object) or "No confidence values: the model has none, or the pose cannot be read."
 
 
 _confidence_value = TimedValue(_read_confidence, 0.2)

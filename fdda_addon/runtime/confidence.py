@@ -10,8 +10,8 @@ from ..scene.controls import ControlReader
 from ..scene.scene_rig import SceneRig, armature_of
 from . import model_files
 
-_cache: dict[int, tuple[object, bytes, list[tuple[str, float]] | None]] = {}
-"""By the session id of the mesh object: the model, its inputs and the result of the last call."""
+_cached_call: tuple[object, bytes, list[tuple[str, float]] | None] | None = None
+"""The model, its inputs and the result of the last call that ran a model."""
 
 
 def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float]] | None:
@@ -21,6 +21,7 @@ def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float
         Name of the main joint and confidence, 0 to 1, of each partition, in ascending order of confidence; None if the
         model has no such output, or the pose cannot be read.
     """
+    global _cached_call
     armature_object = armature_of(mesh_object)
     if armature_object is None or not mesh_object.fdda.is_bound:
         return None
@@ -37,16 +38,14 @@ def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float
         pose_matrices = PoseReader(scene_rig, names, network.info.rest_matrices).read(*evaluated)
         controls = ControlReader(scene_rig, network.info.controls).read(scene_rig, depsgraph)
         inputs = pose_matrices.tobytes() + controls.tobytes()
-        cached = _cache.get(mesh_object.session_uid)
-        if cached is None or cached[0] is not network or cached[1] != inputs:
+        if _cached_call is None or _cached_call[0] is not network or _cached_call[1] != inputs:
             confidence = network.confidence(pose_matrices[None], controls[None])
             values = None
             if confidence is not None:
                 partitions = zip(network.info.partitions, confidence[0].tolist(), strict=True)
                 values = sorted(((names[p.joint], value) for p, value in partitions), key=lambda pair: pair[1])
-            _cache.clear()
-            cached = _cache[mesh_object.session_uid] = (network, inputs, values)
-        return cached[2]
+            _cached_call = (network, inputs, values)
+        return _cached_call[2]
     except FDDAError:
         # Playback reports the error itself.
         return None

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The operators of the section Compare with Rig: figures, colors and markers are those of the evaluation itself."""
 
+from types import SimpleNamespace
+
 import bpy
 import numpy as np
 import pytest
 
 from fdda_addon.core.metrics import error_statistics, heat_colors
 from fdda_addon.core.partition import make_partitions
-from fdda_addon.evaluation import heat_map, last_evaluation, markers
+from fdda_addon.evaluation import heat_map, last_evaluation, markers, overlay
 from fdda_addon.evaluation.run import EvaluationSettings, evaluate, evaluate_action
 from fdda_addon.rig.reading import read_rig
 from fdda_addon.runtime.binding import model_disabled
@@ -75,7 +77,7 @@ def test_what_cannot_be_evaluated_says_why(active):
 
 def test_colors_are_those_of_the_report(active, evaluated_action, view):
     bpy.ops.fdda.color_mesh()
-    assert heat_map.painted(active) == "ERRORS"
+    assert heat_map.paint_kind(active) == "ERRORS"
     errors = evaluated_action.errors
     assert view.range_mm == pytest.approx(np.percentile(errors["fdda"].mean(axis=0), 99.5) * 1000, rel=0.06)
     view.range_mm = 10.0
@@ -87,7 +89,7 @@ def test_colors_are_those_of_the_report(active, evaluated_action, view):
     expected = np.percentile(errors["linear"].max(axis=0), 99.5) * 1000
     assert view.range_mm == pytest.approx(expected, rel=0.06)
     bpy.ops.fdda.color_mesh(colors="NONE")
-    assert heat_map.colors_of(active) is None and heat_map.painted(active) == ""
+    assert heat_map.colors_of(active) is None and heat_map.paint_kind(active) == ""
 
 
 def test_colors_follow_the_timeline(active, evaluated_action, view):
@@ -101,6 +103,35 @@ def test_colors_follow_the_timeline(active, evaluated_action, view):
     bpy.context.scene.frame_set(evaluated_action.first_frame + evaluated_action.poses)
     assert heat_map.colors_of(active) is None
     refused(bpy.ops.fdda.fit_color_range, "choose another frame, or show the mean")
+
+
+def test_mean_and_largest_errors_are_computed_once(active, evaluated_action):
+    for statistic in ("mean", "max"):
+        errors = evaluated_action.vertex_errors("fdda", statistic)
+        assert evaluated_action.vertex_errors("fdda", statistic) is errors
+        np.testing.assert_array_equal(errors, getattr(evaluated_action.errors["fdda"], statistic)(axis=0))
+        assert evaluated_action.vertex_errors("linear", statistic) is not errors
+
+
+def test_overlay_follows_edited_and_replaced_faces(active, monkeypatch):
+    monkeypatch.setattr(overlay, "gpu", SimpleNamespace(types=SimpleNamespace(GPUIndexBuf=lambda type, seq: seq)))
+    monkeypatch.setattr(overlay, "_triangles", {})
+    colors = np.zeros((len(active.data.vertices), 3), np.float32)
+
+    def drawn_triangles() -> np.ndarray:
+        bpy.context.view_layer.update()
+        return overlay.overlay_mesh(bpy.context, active, colors).triangles
+
+    original = drawn_triangles()
+    assert drawn_triangles() is original
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.context.view_layer.update()
+    assert overlay.overlay_mesh(bpy.context, active, colors) is None
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert drawn_triangles() is not original
+    edited = drawn_triangles()
+    active.data = active.data.copy()
+    assert drawn_triangles() is not edited
 
 
 def test_partitions_in_color(active):

@@ -313,7 +313,7 @@ def _show_colors(colors: str, folder: Path) -> Iterator[float]:
     across = {"ERRORS": 0.5, "PARTITIONS": 0.85}[colors]
     yield from sidebar.press_button(f"fdda.color_mesh(colors='{colors}')", across)
     yield from wait_until(
-        lambda: extension_module("evaluation.heat_map").painted(arm_object()) == colors,
+        lambda: extension_module("evaluation.heat_map").paint_kind(arm_object()) == colors,
         5,
         f"the button does not show {colors}",
     )
