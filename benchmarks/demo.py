@@ -17,7 +17,7 @@ from fdda_addon.cli.files import open_file
 from fdda_addon.cli.main import main as run_verb
 from fdda_addon.core.output import write_json
 from fdda_addon.evaluation.picture import View
-from fdda_addon.evaluation.pictures import draw_comparison, draw_partitions, pictured
+from fdda_addon.evaluation.pictures import draw_comparison, draw_partitions, make_pictured_pose
 from fdda_addon.evaluation.run import Evaluation, EvaluationSettings, NamedPose
 from fdda_addon.scene.scene_rig import find_rig
 from fdda_addon.training.process import trainer_command
@@ -109,8 +109,8 @@ def _evaluate(rig: Path, model: Path, out: Path, pictures: Path) -> Evaluation:
 
     pictures.mkdir(exist_ok=True)
     drive = evaluation.actions[0]
-    action_poses = [pictured(drive, frame - 1, f"{name}, frame {frame}") for frame, name in FRAMES.items()]
-    beyond = [pictured(errors, 0, errors.name) for errors in evaluation.named]
+    action_poses = [make_pictured_pose(drive, frame - 1, f"{name}, frame {frame}") for frame, name in FRAMES.items()]
+    beyond = [make_pictured_pose(errors, 0, errors.name) for errors in evaluation.named]
     draw_partitions(scene_rig, pictures / "1_partitions.png", VIEW)
     for heat, prefix, kind in ((False, 2, "comparison"), (True, 3, "heat_map")):
         draw_comparison(scene_rig, model, action_poses, pictures / f"{prefix}_{kind}.png", heat, view=VIEW)

@@ -97,7 +97,7 @@ def run(options: argparse.Namespace) -> None:
             ((name, (scene_rig, model)),) = rigs.items()
             reference_name = f"target '{options.target}'" if options.target else "true rig"
             poses = worst_poses(evaluations[name].held_out)
-            draw_comparison(scene_rig, model, poses, picture, heat=True, true=reference_name)
+            draw_comparison(scene_rig, model, poses, picture, heat=True, reference_label=reference_name)
         content = to_json_by_object({name: evaluation.to_json() for name, evaluation in evaluations.items()})
         errors.write_text(to_json_text(content), encoding="utf-8")
     for name, evaluation in evaluations.items():

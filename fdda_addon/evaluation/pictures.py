@@ -11,6 +11,7 @@ from ..core.partition import make_merged_partitions, partition_colors
 from ..core.skinning import LinearSkinning
 from ..rig.reading import read_rig
 from ..runtime.opened_model import open_model
+from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
 from .picture import Cell, View, draw
 from .run import PoseErrors
@@ -35,7 +36,7 @@ class PicturedPose:
     controls: np.ndarray
 
 
-def pictured(errors: PoseErrors, index: int, name: str = "") -> PicturedPose:
+def make_pictured_pose(errors: PoseErrors, index: int, name: str = "") -> PicturedPose:
     """Return one of the poses of an evaluation for a picture."""
     return PicturedPose(
         name or f"{errors.name} {index}", errors.pose_matrices[index], errors.positions[index], errors.controls[index]
@@ -46,7 +47,7 @@ def worst_poses(errors: PoseErrors) -> list[PicturedPose]:
     """Return the poses with the median, the 90th percentile and the largest mean error."""
     order = np.argsort(errors.fdda.mean(axis=1))
     ranks = {"median pose": len(order) // 2, "90th percentile": int(len(order) * 0.9), "worst pose": len(order) - 1}
-    return [pictured(errors, int(order[rank]), name) for name, rank in ranks.items()]
+    return [make_pictured_pose(errors, int(order[rank]), name) for name, rank in ranks.items()]
 
 
 def draw_partitions(scene_rig: SceneRig, path: Path, view: View = View()) -> None:  # noqa: B008 - frozen
@@ -70,7 +71,7 @@ def draw_comparison(
     heat: bool,
     title: str = "",
     view: View = View(),  # noqa: B008 - frozen
-    true: str = "true rig",
+    reference_label: str = "true rig",
 ) -> None:
     """Draw the rig, linear skinning and the model side by side, with a row for each pose.
 
@@ -82,7 +83,7 @@ def draw_comparison(
         heat: color each vertex by its distance from the rig.
         title: title of the picture; empty for a default.
         view: the view direction.
-        true: label of the positions of the poses.
+        reference_label: label of the positions of the poses.
 
     Raises:
         ModelError: the model cannot be read, or is of another rig.
@@ -90,20 +91,24 @@ def draw_comparison(
     """
     opened = open_model(scene_rig, model)
     network, skinning = opened.network, LinearSkinning(opened.linear_rig)
-    rows = []
+    mask, rows = read_mask(scene_rig.mesh_object), []
     for pose in poses:
         linear = skinning.positions(pose.pose_matrices[None])[0]
         fdda = network.positions(pose.pose_matrices[None], pose.controls[None])[0].copy()
-        cells = [(pose.positions, f"{pose.name}: {true}"), (linear, "linear skinning"), (fdda, "FDDA")]
+        if mask is not None:
+            fdda = mask.blended(linear, fdda)
+        cells = [(pose.positions, f"{pose.name}: {reference_label}"), (linear, "linear skinning"), (fdda, "FDDA")]
         rows.append(
             [_cell(positions, pose.positions, label, heat, network.info.metres_per_unit) for positions, label in cells]
         )
-    title = title or (f"Distance from the {true}" if heat else f"{true[0].upper()}{true[1:]}, linear skinning and FDDA")
+    if not title:
+        capitalized = f"{reference_label[0].upper()}{reference_label[1:]}"
+        title = f"Distance from the {reference_label}" if heat else f"{capitalized}, linear skinning and FDDA"
     draw(scene_rig.mesh_object.data, rows, path, title, view, heat_scale=heat, sculpted=not heat)
 
 
-def _cell(positions: np.ndarray, true: np.ndarray, label: str, heat: bool, metres_per_unit: float) -> Cell:
-    errors = distances(positions, true, metres_per_unit)
+def _cell(positions: np.ndarray, reference: np.ndarray, label: str, heat: bool, metres_per_unit: float) -> Cell:
+    errors = distances(positions, reference, metres_per_unit)
     if errors.any():
         label += f"  mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.1f} mm"
     colors = heat_colors(errors) if heat else np.tile(np.float32(SURFACE_COLOR), (len(positions), 1))

@@ -5,10 +5,12 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.evaluation import last_evaluation
+from fdda_addon.evaluation import last_evaluation, pictures
+from fdda_addon.evaluation.run import evaluate_action
 from fdda_addon.panels.playback import mask_problem
 from fdda_addon.rig.reading import read_model_rig
 from fdda_addon.runtime import registry
+from fdda_addon.runtime.binding import model_disabled
 from fdda_addon.runtime.network import Network
 from fdda_addon.runtime.player import Player
 from fdda_addon.scene import mask as masks
@@ -16,6 +18,7 @@ from fdda_addon.scene.scene_rig import SceneRig, armature_of
 
 from .baked_files import read_pc2
 from .conftest import ELBOW, assert_plays, evaluated, pose
+from .scene_state import drain
 from .test_player_batch import animate, crowd_of
 
 GROUP = "learned"
@@ -188,6 +191,20 @@ def test_what_is_evaluated_is_what_is_shown(masked):
         bpy.context.view_layer.update()
         pose_index = last_evaluation.get(masked).pose_at(frame)
         assert np.abs(errors["fdda"][pose_index] - apart).max() < 1e-5
+
+
+def test_picture_shows_the_masked_model(masked, elbow, tmp_path, monkeypatch):
+    drawn_rows = []
+    monkeypatch.setattr(pictures, "draw", lambda mesh, rows, *_, **options: drawn_rows.extend(rows))
+    scene_rig = SceneRig(masked, armature_of(masked))
+    with model_disabled(masked):
+        evaluation = drain(evaluate_action(scene_rig, elbow.model, "elbow_wave"))
+    posed = pictures.make_pictured_pose(evaluation.held_out, 11)
+    pictures.draw_comparison(scene_rig, elbow.model, [posed], tmp_path / "heat_map.png", heat=True)
+    ((_, _, model_cell),) = drawn_rows
+    errors = np.linalg.norm(model_cell.positions - posed.positions, axis=1)
+    np.testing.assert_allclose(errors, evaluation.held_out.fdda[11], atol=1e-6)
+    assert np.abs(model_cell.positions - Network(elbow.model).positions(posed.pose_matrices[None])[0]).max() > 1e-4
 
 
 def test_members_of_a_crowd_have_masks_of_their_own(bound):
