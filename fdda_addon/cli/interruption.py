@@ -17,9 +17,7 @@ from ..core.stop_signals import handle_stop_signals, restore_handlers
 RETRY_SECONDS = 0.01
 _ADDON_PACKAGE = __name__.rsplit(".", 2)[0]
 _MAIN_MODULE = f"{_ADDON_PACKAGE}.cli.main"
-_FIXED_CALLBACK_MODULES = {
-    f"{_ADDON_PACKAGE}.{name}" for name in ("registration", "properties.binding", "evaluation.overlay")
-}
+_FIXED_CALLBACK_MODULES = {f"{_ADDON_PACKAGE}.{name}" for name in ("registration", "properties.binding")}
 
 _callback_modules: set[str] = set(_FIXED_CALLBACK_MODULES)
 """Names of modules with functions that Blender calls."""
