@@ -84,7 +84,7 @@ def bench(name: str, rig: Path, folder: Path, poses: int) -> dict:
 
 
 ROWS = (
-    ("true rig, ms", lambda r: f"{_median(r, 'rig'):.2f}"),
+    ("rig, ms", lambda r: f"{_median(r, 'rig'):.2f}"),
     ("Armature modifier alone, ms", lambda r: f"{_median(r, 'linear'):.2f}"),
     ("FDDA, ms", lambda r: f"{_median(r, 'fdda'):.2f}"),
     ("floor: FDDA with constant positions, ms", lambda r: f"{_median(r, 'floor'):.2f}"),

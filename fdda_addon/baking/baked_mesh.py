@@ -17,7 +17,7 @@ from ..scene.mesh import rest_positions
 from ..scene.stored_paths import stored_path
 from ..scene.temporary_state import temporary_attributes
 
-MODIFIER_NAME = "FDDA Bake"
+BAKE_MODIFIER_NAME = "FDDA Bake"
 BASIS = "Basis"
 
 
@@ -69,7 +69,7 @@ def play_point_cache(mesh_object: bpy.types.Object, stack: ModifierStack, path: 
         first: frame of the first sample.
     """
     index = _remove_deformation(mesh_object, stack)
-    modifier = mesh_object.modifiers.new(MODIFIER_NAME, "MESH_CACHE")
+    modifier = mesh_object.modifiers.new(BAKE_MODIFIER_NAME, "MESH_CACHE")
     # A new modifier is not the last where another one is pinned to the end.
     mesh_object.modifiers.move(mesh_object.modifiers.find(modifier.name), index)
     modifier.cache_format, modifier.filepath = "PC2", stored_path(path)

@@ -97,12 +97,12 @@ def bind_entry(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> None:
     mesh_object.fdda.model_index = list(mesh_object.fdda.models).index(entry)
 
 
-def _bind(scene_rig: SceneRig, path: Path, packed_model: bpy.types.Text | None = None) -> None:
+def _bind(scene_rig: SceneRig, path: Path, packed_text: bpy.types.Text | None = None) -> None:
     """Bind a model as `bind_entry` does, without changing the list."""
     mesh_object, binding = scene_rig.mesh_object, scene_rig.mesh_object.fdda
     use_in_render = binding.use_in_render
     previous = (binding.model, binding.packed, binding.mode) if binding.is_bound else None
-    bind(scene_rig, path, use_in_render, packed_model)
+    bind(scene_rig, path, use_in_render, packed_text)
     # Evaluate now, so that a model that cannot play is an error here and not at the next frame.
     bpy.context.view_layer.update()
     if problem := binding.status:
@@ -177,7 +177,7 @@ def pack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pa
 
 def _repack_if_changed(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path) -> bool:
     """Pack the file of a packed model again where it has changed; return whether it has."""
-    if entry.packed.get(packed_model.KEY) == read_model(path)[1]:
+    if entry.packed.get(packed_model.PACKED_MODEL_KEY) == read_model(path)[1]:
         return False
     pack_entry(mesh_object, entry, path)
     packed_model.remove_unused()

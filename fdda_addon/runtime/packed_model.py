@@ -14,7 +14,7 @@ from ..core.errors import ModelError
 from ..core.model import MAX_BYTES, check_model
 from .network import Network
 
-KEY = "fdda_model"
+PACKED_MODEL_KEY = "fdda_model"
 """Custom property of a text datablock that holds a model."""
 MAX_PROPERTY_BYTES = (1 << 31) - 1
 """Blender's limit for a custom property."""
@@ -41,8 +41,11 @@ def pack(name: str, data: bytes) -> bpy.types.Text:
         raise ModelError(f"'{name}' is larger than 2 GB and cannot be packed; leave it beside the file.")
     text = bpy.data.texts.new(name)
     text.use_fake_user = False
-    text.write(f"The FDDA model {name}, {len(data)} bytes, is kept in the custom property '{KEY}' of this text.\n")
-    text[KEY] = data
+    text.write(
+        f"The FDDA model {name}, {len(data)} bytes, is stored in the custom property '{PACKED_MODEL_KEY}' of this "
+        "text.\n"
+    )
+    text[PACKED_MODEL_KEY] = data
     return text
 
 
@@ -52,7 +55,7 @@ def read(text: bpy.types.Text) -> bytes:
     Raises:
         ModelError: the text holds no model.
     """
-    data = text.get(KEY)
+    data = text.get(PACKED_MODEL_KEY)
     if not isinstance(data, bytes):
         raise ModelError(f"The text '{text.name}' does not hold a model any more; choose the model's file again.")
     return data
@@ -79,5 +82,5 @@ def release_unused(used: set[int]) -> None:
 
 def remove_unused() -> None:
     """Remove the text datablocks of models that no object uses any more."""
-    for text in [text for text in bpy.data.texts if KEY in text and text.users == 0]:
+    for text in [text for text in bpy.data.texts if PACKED_MODEL_KEY in text and text.users == 0]:
         bpy.data.texts.remove(text)

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import bpy
 
-from . import modifier_switch, playback_modifier, registry, rig_check
+from . import modifier_switch, playback_modifier, registry, rig_signature
 from .depsgraph_changes import DepsgraphChanges, changed_meshes
 from .evaluation_threads import keep_thread_state
 from .mode_override import overridden_mode
@@ -151,7 +151,7 @@ def _check_object(mesh_object: bpy.types.Object, geometry_changed: bool, beyond_
         beyond_pose and not player.has_same_skin(mesh_object)
     ):
         registry.remove_player(uid)
-    elif mesh_object.mode not in rig_check.STABLE_MODES:
+    elif mesh_object.mode not in rig_signature.STABLE_MODES:
         registry.edited_objects.add(mesh_object.session_uid)
 
 
@@ -159,7 +159,7 @@ def _check_rigs(changes: DepsgraphChanges) -> None:
     """Check the rigs whose armature or mesh has changed, and those whose mesh was in an edit mode."""
     for mesh, beyond_positions in changes.meshes.items():
         if beyond_positions:
-            rig_check.invalidate(mesh)
+            rig_signature.invalidate(mesh)
     edited = registry.edited_objects
     for uid, player in list(registry.players.items()):
         armature_change = changes.armatures.get(player.signature.armature)
@@ -172,7 +172,7 @@ def _check_rigs(changes: DepsgraphChanges) -> None:
         with registry.isolated_errors(mesh_object):
             if armature_change is not None and not player.has_same_bones(mesh_object, compare_parents=armature_change):
                 registry.remove_player(uid)
-            elif mesh_object.mode not in rig_check.STABLE_MODES:
+            elif mesh_object.mode not in rig_signature.STABLE_MODES:
                 edited.add(player.object_uid)
             elif (
                 mesh_change
@@ -181,8 +181,8 @@ def _check_rigs(changes: DepsgraphChanges) -> None:
             ):
                 if player.object_uid in edited:
                     edited.discard(player.object_uid)
-                    rig_check.invalidate(player.signature.mesh)
-                player.signature = rig_check.RigSignature.read(player.scene_rig(mesh_object))
+                    rig_signature.invalidate(player.signature.mesh)
+                player.signature = rig_signature.RigSignature.read(player.scene_rig(mesh_object))
                 player.check_rig(mesh_object)
 
 

@@ -19,7 +19,7 @@ from ..scene.controls import ControlReader
 from ..scene.mask import mask_key, read_mask
 from ..scene.mesh import set_mesh_positions
 from ..scene.scene_rig import SceneRig, armature_of
-from . import driver, rig_check
+from . import driver, rig_signature
 from .mode_override import overridden_mode
 from .model_files import network_of
 from .network import Execution
@@ -80,7 +80,7 @@ class Player:
         scene_rig = self.scene_rig(mesh_object)
         self._armature_uid = scene_rig.armature_object.session_uid
         self._check_vertex_count(mesh_object)
-        self.signature = rig_check.RigSignature.read(scene_rig)
+        self.signature = rig_signature.RigSignature.read(scene_rig)
         self.check_rig(mesh_object)
         self._pose_reader = self._create_pose_reader(scene_rig)
         self._control_reader = ControlReader(scene_rig, info.controls)
@@ -140,12 +140,12 @@ class Player:
             armature_object is not None
             and armature_object.session_uid == self._armature_uid
             and mesh_object.data.session_uid == self.signature.mesh
-            and self.signature.skin[0] == rig_check.armature_modifier_settings(mesh_object)
+            and self.signature.skin[0] == rig_signature.armature_modifier_settings(mesh_object)
         )
 
     def has_same_skin(self, mesh_object: bpy.types.Object) -> bool:
         """Return whether the object has the same vertex groups and Armature modifier settings."""
-        return self.signature.skin == rig_check.skin_signature(mesh_object)
+        return self.signature.skin == rig_signature.skin_signature(mesh_object)
 
     def has_same_bones(self, mesh_object: bpy.types.Object, compare_parents: bool) -> bool:
         """Return whether its armature has the same bones in the same order, with the same rest pose."""
@@ -153,21 +153,21 @@ class Player:
         if armature_object is None:
             return False
         armature = armature_object.data
-        return rig_check.bone_signature(armature) == self.signature.bones and not (
-            compare_parents and rig_check.parent_names(armature) != self.signature.parents
+        return rig_signature.bone_signature(armature) == self.signature.bones and not (
+            compare_parents and rig_signature.parent_names(armature) != self.signature.parents
         )
 
     def has_same_rest_positions(self, mesh_object: bpy.types.Object) -> bool:
         """Return whether its vertices have the same rest positions."""
-        return rig_check.rest_digest(mesh_object.data) == self.signature.rest
+        return rig_signature.rest_digest(mesh_object.data) == self.signature.rest
 
     def check_rig(self, mesh_object: bpy.types.Object) -> None:
         """Check that the rig is the one that the model was trained for.
 
         Raises:
-            FDDAError: as `rig_check.check`.
+            FDDAError: as `rig_signature.check`.
         """
-        rig_check.check(self.scene_rig(mesh_object), self.network, self.signature)
+        rig_signature.check(self.scene_rig(mesh_object), self.network, self.signature)
 
     @property
     def has_mask(self) -> bool:

@@ -19,7 +19,8 @@ from .player import Player
 
 MIN_BATCH_SIZE = 4
 """Players in a batch; with fewer, one call for each costs less than waiting for all."""
-MAX_KEPT_EXECUTIONS = 4
+MAX_EXECUTIONS_IN_USE = 4
+"""Executions that a batch keeps besides a new one: arrays of which a member still shows positions."""
 BATCH_DRIVER_KEY = "fdda_batch_driver"
 """Custom property that marks batch drivers."""
 
@@ -112,7 +113,7 @@ class PlayerBatch:
         for execution in self._executions:
             if len(execution.poses) == pose_count and id(execution) not in in_use:
                 return execution
-        self._executions = [e for e in self._executions if id(e) in in_use][-MAX_KEPT_EXECUTIONS:]
+        self._executions = [e for e in self._executions if id(e) in in_use][-MAX_EXECUTIONS_IN_USE:]
         self._executions.append(Execution(self.network, pose_count))
         return self._executions[-1]
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import bpy
 
 from ..core.errors import FDDAError, ModelError
-from . import modifier_switch, playback_modifier, position_buffer, rig_check
+from . import modifier_switch, playback_modifier, position_buffer, rig_signature
 from .mode_override import uses_model
 from .player import Player
 from .player_batch import PlayerBatches, is_batch_driver
@@ -58,7 +58,7 @@ def reset_players() -> None:
 
 def reset_rigs() -> None:
     """Create all players and check all rigs again: names may refer to other datablocks now."""
-    rig_check.invalidate_all()
+    rig_signature.invalidate_all()
     reset_players()
 
 
@@ -119,7 +119,7 @@ def _scan_object(mesh_object: bpy.types.Object, used_buffers: set[int]) -> None:
     player = players.get(buffer.session_uid)
     if player is None or player.object_uid != mesh_object.session_uid:
         players[buffer.session_uid] = Player(mesh_object, buffer)
-        if mesh_object.mode not in rig_check.STABLE_MODES:
+        if mesh_object.mode not in rig_signature.STABLE_MODES:
             edited_objects.add(mesh_object.session_uid)
     else:
         # Blender redirects the driver when what it reads is given a library override.

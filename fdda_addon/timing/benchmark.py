@@ -90,7 +90,7 @@ class Benchmark:
                 name: {"median": _round(np.median(t)), "p90": _round(np.percentile(t, 90))} for name, t in self._times()
             },
             "ratio": _round(self.ratio),
-            "pays": self.ratio > 1,
+            "is_faster": self.ratio > 1,
             "constant_bytes": self.constant_bytes,
         }
 
@@ -100,17 +100,17 @@ class Benchmark:
     def table(self) -> str:
         """Format the times as text, with a verdict."""
         labels = {
-            "rig": "true rig",
+            "rig": "rig",
             "linear": "Armature modifier alone",
             "fdda": "FDDA",
-            "floor": "FDDA, constant positions",
+            "floor": "FDDA without running the model",
             "inference": "the model alone, one pose",
         }
-        lines = [f"{self.vertices} vertices, ms a frame{'median':>12}{'p90':>10}"]
+        lines = [f"{f'{self.vertices} vertices, ms per frame':<33}{'median':>10}{'p90':>10}"]
         for setup, times in self._times():
-            lines.append(f"  {labels[setup]:<27}{np.median(times):>10.3f}{np.percentile(times, 90):>10.3f}")
+            lines.append(f"  {labels[setup]:<31}{np.median(times):>10.3f}{np.percentile(times, 90):>10.3f}")
         if self.constant_bytes:
-            lines.append(f"  {'a frame reads of the model, MB':<31}{self.constant_bytes / 1e6:>6.2f}")
+            lines.append(f"  {'model data read per frame, MB':<31}{self.constant_bytes / 1e6:>10.2f}")
         lines.append(f"  {verdict(float(np.median(self.rig)), float(np.median(self.fdda)))}")
         return "\n".join(lines)
 
@@ -140,7 +140,7 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
     mesh_object = scene_rig.mesh_object
     opened = open_model(scene_rig, model or model_files.network_of(mesh_object))
     channels = model_channels(scene_rig, opened.rig, opened.network.info)
-    with playing(scene_rig, channels) as played, temporary_binding(scene_rig, model):
+    with temporary_animation(scene_rig, channels) as played, temporary_binding(scene_rig, model):
         setups = {
             "rig": model_disabled,
             "linear": skinning_only,
@@ -169,7 +169,7 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
 
 
 @contextmanager
-def playing(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> Iterator[range]:
+def temporary_animation(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> Iterator[range]:
     """Play the action of an armature, or `random_action` if it has none; restore pose and animation afterwards.
 
     Yields:

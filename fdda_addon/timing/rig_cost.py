@@ -10,7 +10,7 @@ from ..core.progress import Progress
 from ..rig.modifier_stack import check_evaluable
 from ..runtime.binding import model_disabled
 from ..scene.scene_rig import SceneRig
-from .benchmark import playing, skinning_only, time_frames
+from .benchmark import skinning_only, temporary_animation, time_frames
 
 ROUNDS = 4
 FRAMES_PER_ROUND = 5
@@ -72,7 +72,7 @@ def measure(scene_rig: SceneRig) -> Iterator[Progress | RigCost]:
     with model_disabled(mesh_object):
         check_evaluable(scene_rig)
         times: dict[str, list[float]] = {"rig": [], "linear": []}
-        with playing(scene_rig) as frames:
+        with temporary_animation(scene_rig) as frames:
             for round_index in range(ROUNDS):
                 first = round_index * FRAMES_PER_ROUND
                 times["rig"] += time_frames(frames, first, FRAMES_PER_ROUND)

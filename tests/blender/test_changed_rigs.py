@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fdda_addon.rig.reading import read_model_rig
-from fdda_addon.runtime import rig_check
+from fdda_addon.runtime import rig_signature
 from fdda_addon.runtime.model_files import network_of
 from fdda_addon.scene.scene_rig import find_rig
 
@@ -137,7 +137,7 @@ def test_objects_that_move_on_their_own_play_on(bound, elbow):
     bpy.data.objects[ELBOW_RIG].rotation_euler = (0.2, 0.1, 0.4)
     bpy.context.view_layer.update()
     bound.data.update()
-    rig_check.invalidate_all()
+    rig_signature.invalidate_all()
     pose(angle=1.1)
     assert_plays(bound, elbow.model)
 
@@ -269,8 +269,8 @@ def test_playback_and_posing_read_no_rig(bound, elbow, monkeypatch):
     driver.type = "SUM"
     pose(angle=0.2)
     pose(angle=0.3)
-    monkeypatch.setattr(rig_check, "read_model_rig", None)
-    monkeypatch.setattr(rig_check, "rest_digest", None)
+    monkeypatch.setattr(rig_signature, "read_model_rig", None)
+    monkeypatch.setattr(rig_signature, "rest_digest", None)
     for step in range(5):
         bpy.context.scene.frame_set(step)
         pose(angle=0.1 * step)

@@ -187,7 +187,7 @@ def test_benchmark(elbow, tmp_path, capfd):
     path = tmp_path / "b.json"
     assert run("benchmark", elbow.rig, elbow.model, "--json", path, "--frames", 12) == 0
     report = json.loads(path.read_text())
-    ways = ["rig", "linear", "fdda", "floor", "inference"]
+    methods = ["rig", "linear", "fdda", "floor", "inference"]
     assert list(report) == [
         "unit",
         "vertices",
@@ -195,20 +195,20 @@ def test_benchmark(elbow, tmp_path, capfd):
         "blender",
         "processor",
         "cores",
-        *ways,
+        *methods,
         "ratio",
-        "pays",
+        "is_faster",
         "constant_bytes",
     ]
     assert (report["unit"], report["vertices"], report["frames"]) == ("ms", 300, 15)
     assert report["blender"] == bpy.app.version_string
-    for way in ways:
-        assert 0 < report[way]["median"] <= report[way]["p90"]
+    for method in methods:
+        assert 0 < report[method]["median"] <= report[method]["p90"]
     assert report["linear"]["median"] < report["rig"]["median"]
     assert report["ratio"] == pytest.approx(report["rig"]["median"] / report["fdda"]["median"], rel=0.05)
     out = capfd.readouterr().out
-    assert report["pays"] == (report["ratio"] > 1) == ("x faster than the rig." in out)
-    assert report["pays"] != ("Not worth it here" in out)
+    assert report["is_faster"] == (report["ratio"] > 1) == ("x faster than the rig." in out)
+    assert report["is_faster"] != ("Not worth it here" in out)
     assert report["constant_bytes"] == Network(elbow.model).info.constant_bytes > 10_000
     assert f"{report['constant_bytes'] / 1e6:.2f}" in out
 

@@ -169,14 +169,14 @@ def test_removing_a_packed_model_deletes_it(packed_elbow):
 
 
 def test_a_packed_model_passes_the_same_checks(packed_elbow, elbow):
-    packed_elbow.fdda.packed[packed_model.KEY] = b"\x08\x08" + elbow.model.read_bytes()[:100]
+    packed_elbow.fdda.packed[packed_model.PACKED_MODEL_KEY] = b"\x08\x08" + elbow.model.read_bytes()[:100]
     path = elbow.bound.with_name("damaged.blend")
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
     bpy.ops.wm.open_mainfile(filepath=str(path))
     mesh_object = bpy.data.objects[ELBOW]
     bpy.context.view_layer.update()
     assert "is not a model" in mesh_object.fdda.status and mesh_object.fdda.mode == "RIG"
-    del mesh_object.fdda.packed[packed_model.KEY]
+    del mesh_object.fdda.packed[packed_model.PACKED_MODEL_KEY]
     with pytest.raises(ModelError, match="does not hold a model any more"):
         packed_model.read(mesh_object.fdda.packed)
     with pytest.raises(ModelError, match="is not a model"):

@@ -75,8 +75,8 @@ def test_off_leaves_nothing(active):
         return {kind: len(getattr(bpy.data, kind)) for kind in ("objects", "meshes", "node_groups", "collections")}
 
     before = counts()
-    for way in ("BESIDE", "OVERLAY", "NONE"):
-        bpy.ops.fdda.show_rig(placement=way)
+    for placement in ("BESIDE", "OVERLAY", "NONE"):
+        bpy.ops.fdda.show_rig(placement=placement)
     assert before == counts()
     assert side_by_side.display_mode(active) == "NONE" and not comparisons()
     bpy.ops.fdda.show_rig(placement="BESIDE")
