@@ -29,7 +29,7 @@ from fdda_addon.scene.armature import Poser, clear_pose
 from fdda_addon.scene.mesh import evaluated_positions
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier, find_rig
 from fdda_addon.scene.temporary_state import temporary_pose
-from fdda_addon.timing.benchmark import benchmark, random_action
+from fdda_addon.timing.benchmark import benchmark, key_random_poses
 
 ROUNDS = 5
 CROWD = 20
@@ -78,7 +78,7 @@ def crowd(bound: str) -> dict:
     first = next(o for o in bpy.data.objects if o.fdda.is_bound)
     armature_object = armature_modifier(first).object
     if armature_object.animation_data is None or armature_object.animation_data.action is None:
-        random_action(SceneRig(first, armature_object))
+        key_random_poses(SceneRig(first, armature_object))
     one = _frame_times(60)
     empty = _without_play(first)
     for number in range(1, CROWD):

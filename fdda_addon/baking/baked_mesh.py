@@ -18,7 +18,9 @@ from ..scene.stored_paths import stored_path
 from ..scene.temporary_state import temporary_attributes
 
 BAKE_MODIFIER_NAME = "FDDA Bake"
-BASIS = "Basis"
+"""Name of the Mesh Cache modifier of a baked mesh."""
+BASIS_KEY_NAME = "Basis"
+"""Name of the shape key with the rest positions."""
 
 
 def check_local(mesh_object: bpy.types.Object) -> None:
@@ -36,85 +38,90 @@ def check_local(mesh_object: bpy.types.Object) -> None:
 
 @contextmanager
 def temporary_copy(mesh_object: bpy.types.Object) -> Iterator[bpy.types.Object]:
-    """Replace a mesh object in the file by a copy with the same name, without a model; restore it afterwards.
+    """Replace a mesh object in the file by an unbound copy with the same name; restore the object afterwards.
 
-    Changes of the copy do not affect the object, except changes of its mesh.
+    Changes of the copy do not affect the object, but both share one mesh.
 
     Args:
         mesh_object: a local object, not in edit mode, whose model does not play.
+
+    Yields:
+        The copy.
     """
     name = mesh_object.name
     # Local, because modifiers of a library override cannot be removed.
-    copy = mesh_object.copy().make_local()
-    unbind(copy)
+    object_copy = mesh_object.copy().make_local()
+    unbind(object_copy)
     # With a fake user the original object would be saved too.
     with temporary_attributes(mesh_object, use_fake_user=False):
-        mesh_object.user_remap(copy)
+        mesh_object.user_remap(object_copy)
         try:
-            mesh_object.name, copy.name = f"{name} rig", name
-            yield copy
+            mesh_object.name, object_copy.name = f"{name} rig", name
+            yield object_copy
         finally:
-            copy.user_remap(mesh_object)
-            _remove(copy)
+            object_copy.user_remap(mesh_object)
+            _remove_object(object_copy)
             mesh_object.name = name
 
 
-def play_point_cache(mesh_object: bpy.types.Object, stack: ModifierStack, path: Path, first: int) -> None:
-    """Replace the modifiers of the rig by a Mesh Cache modifier; downstream modifiers stay.
+def play_point_cache(mesh_object: bpy.types.Object, stack: ModifierStack, path: Path, first_frame: int) -> None:
+    """Replace the modifiers of the rig by a Mesh Cache modifier; the modifiers after the rig stay.
 
     Args:
         mesh_object: the object to change.
-        stack: its modifiers.
-        path: path of the point cache; a saved file stores it relative to itself.
-        first: frame of the first sample.
+        stack: the modifier stack of the object.
+        path: path of the point cache. A saved .blend file stores it as a relative path.
+        first_frame: frame of the first sample.
     """
     index = _remove_deformation(mesh_object, stack)
     modifier = mesh_object.modifiers.new(BAKE_MODIFIER_NAME, "MESH_CACHE")
-    # A new modifier is not the last where another one is pinned to the end.
+    # A new modifier is not the last one if another modifier is pinned to the end of the stack.
     mesh_object.modifiers.move(mesh_object.modifiers.find(modifier.name), index)
     modifier.cache_format, modifier.filepath = "PC2", stored_path(path)
     modifier.time_mode, modifier.play_mode = "FRAME", "SCENE"
-    modifier.frame_start, modifier.frame_scale = first, 1.0
+    modifier.frame_start, modifier.frame_scale = first_frame, 1.0
     modifier.interpolation, modifier.deform_mode = "LINEAR", "OVERWRITE"
-    # Blender's own axes, without any conversion.
+    # The point cache uses Blender's axes, so they must not be converted.
     modifier.forward_axis, modifier.up_axis = "POS_Y", "POS_Z"
 
 
-def play_shape_keys(mesh_object: bpy.types.Object, stack: ModifierStack, positions: np.ndarray, first: int) -> None:
-    """Replace the modifiers of the rig by absolute shape keys, one for each frame; downstream modifiers stay.
+def play_shape_keys(
+    mesh_object: bpy.types.Object, stack: ModifierStack, positions: np.ndarray, first_frame: int
+) -> None:
+    """Replace the modifiers of the rig by absolute shape keys, one for each frame; the modifiers after the rig stay.
 
     Args:
-        mesh_object: the object to change; it gets a mesh of its own.
-        stack: its modifiers.
-        positions: (N, V, 3) float32, mesh-object space, mesh units.
-        first: frame of the first positions.
+        mesh_object: the object to change; it gets a copy of its mesh.
+        stack: the modifier stack of the object.
+        positions: (N, V, 3) float32, positions in N frames, mesh-object space, mesh units.
+        first_frame: the first of these frames.
     """
     _remove_deformation(mesh_object, stack)
-    rest = rest_positions(mesh_object.data)
+    basis_positions = rest_positions(mesh_object.data)
     mesh_object.data = mesh_object.data.copy()
     mesh_object.shape_key_clear()
     mesh_object.show_only_shape_key = False
     if mesh_object.parent_type in {"ARMATURE", "LATTICE"}:
-        # Such a parent deforms an object that has no modifier for it.
+        # Such a parent deforms an object that has no modifier for the parent.
         mesh_object.parent_type = "OBJECT"
-    write(mesh_object.shape_key_add(name=BASIS, from_mix=False).data, COORDINATE_ELEMENT, rest)
-    keys = mesh_object.data.shape_keys
-    keys.use_relative = False
+    write(mesh_object.shape_key_add(name=BASIS_KEY_NAME, from_mix=False).data, COORDINATE_ELEMENT, basis_positions)
+    shape_keys = mesh_object.data.shape_keys
+    shape_keys.use_relative = False
     for eval_time, frame_positions in enumerate(positions, 1):
         # Blender gives a new absolute key the current evaluation time.
-        keys.eval_time, frame = eval_time, first + eval_time - 1
+        shape_keys.eval_time, frame = eval_time, first_frame + eval_time - 1
         key = mesh_object.shape_key_add(name=f"Frame {frame}", from_mix=False)
         key.interpolation = "KEY_LINEAR"
         write(key.data, COORDINATE_ELEMENT, np.ascontiguousarray(frame_positions, np.float32))
-        # Interpolation between only the first and the last frame would show rounding errors in long actions.
-        keys.keyframe_insert("eval_time", frame=frame)
-    for curve in animation_curves(keys.animation_data.action):
+        # With keyframes in the first and last frame alone, rounding errors would show in long actions.
+        shape_keys.keyframe_insert("eval_time", frame=frame)
+    for curve in animation_curves(shape_keys.animation_data.action):
         for point in curve.keyframe_points:
             point.interpolation = "LINEAR"
 
 
-def _remove(mesh_object: bpy.types.Object) -> None:
-    """Delete an object, its mesh, and the action of its shape keys, if nothing else uses them."""
+def _remove_object(mesh_object: bpy.types.Object) -> None:
+    """Remove an object from the file; remove its mesh and the action of its shape keys if nothing else uses them."""
     mesh = mesh_object.data
     animation = mesh.shape_keys.animation_data if mesh.shape_keys else None
     action = animation.action if animation else None
@@ -126,7 +133,7 @@ def _remove(mesh_object: bpy.types.Object) -> None:
 
 
 def _remove_deformation(mesh_object: bpy.types.Object, stack: ModifierStack) -> int:
-    """Remove the modifiers of the rig; return the index that follows them."""
+    """Remove the modifiers of the rig, and return the index of the first modifier after them."""
     for name in stack.replaced:
         mesh_object.modifiers.remove(mesh_object.modifiers[name])
     return stack.insert_index - len(stack.replaced)

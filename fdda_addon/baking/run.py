@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bakes an action: writes the output of a model for each frame to a file that plays without the add-on."""
+"""Bakes an action: writes the positions of a model in each frame to a file that plays without the add-on."""
 
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -33,10 +33,11 @@ from .baked_mesh import check_local, play_point_cache, play_shape_keys, temporar
 
 POINT_CACHE_SUFFIX, BLEND_SUFFIX = ".pc2", ".blend"
 MAX_FRAME = 1048574
-"""Largest frame number of Blender; the smallest is its negative."""
+"""Largest frame number of Blender; the smallest frame number is -MAX_FRAME."""
 MAX_BATCH_FRAMES = 32
 MAX_BATCH_BYTES = 6 << 20
-"""Limits of the frames for which the model runs at once, so that no step takes long."""
+"""Limits of a batch of frames for which the model runs at once: the number of frames, and the size of their positions.
+They keep each step of the generator short."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +46,9 @@ class BakeSettings:
 
     Attributes:
         action: name of the action; empty for the animation of the scene.
-        frames: first and last frame; None for those of the action, or of the scene.
-        shape_keys: write the positions as shape keys into the .blend file, instead of a point cache beside it.
-        overwrite: as in `core.output.check_outputs`.
+        frames: first and last frame; None for the frames of the action, or of the scene if there is no action.
+        shape_keys: whether to write the positions as shape keys into the .blend file, instead of into a point cache.
+        overwrite: whether to replace existing files (`core.output.check_outputs`).
         strength: 0 for linear skinning alone, 1 for the model; None for the strength of the object in each frame.
     """
 
@@ -60,18 +61,23 @@ class BakeSettings:
 
 @dataclass(frozen=True)
 class Bake:
-    """The result of a bake: the frames and the written files, the file with the mesh first."""
+    """The result of a bake.
+
+    Attributes:
+        frames: the baked frames.
+        files: paths of the written files; the file with the mesh is the first.
+    """
 
     frames: range
     files: tuple[Path, ...]
 
 
 def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSettings) -> Iterator[Progress | Bake]:
-    """Bake an action, as a generator that works while it is iterated.
+    """Bake an action, as a generator that does its work while it is iterated.
 
     A .pc2 file contains the positions in mesh-object space. A .blend file is a copy of the open file in which the mesh
-    plays them from a point cache beside it, or from shape keys. The scene is restored when the generator ends, is
-    closed, or raises, and no file is left incomplete.
+    plays the positions from a point cache beside the file, or from shape keys. The scene is restored when the generator
+    ends, is closed, or raises, and no incomplete file is left.
 
     Args:
         scene_rig: the rig.
@@ -80,17 +86,17 @@ def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSe
         settings: settings of the bake.
 
     Yields:
-        Progress, and the Bake at the end.
+        Progress, and finally the Bake.
 
     Raises:
-        WrongUsageError: `out` has another extension, or there are no frames.
-        RigError: there is no such action, or the rig cannot be posed or replaced.
+        WrongUsageError: `out` has another extension, or the range of frames is empty or invalid.
+        RigError: there is no action of this name, or the rig cannot be posed or replaced.
         ModelError: the model cannot be read, or was trained for another rig.
         OutputError: a file cannot be written.
     """
     files = output_files(out, settings, [model.path if isinstance(model, Network) else model])
     action = find_action(settings.action) if settings.action else None
-    frames = _frames(action, settings.frames)
+    frames = _select_frames(action, settings.frames)
     if out.suffix == BLEND_SUFFIX:
         check_local(scene_rig.mesh_object)
     with model_disabled(scene_rig.mesh_object), ExitStack() as exit_stack:
@@ -117,11 +123,14 @@ def bake(scene_rig: SceneRig, model: Path | Network, out: Path, settings: BakeSe
 
 
 def output_files(out: Path, settings: BakeSettings, inputs: Iterable[Path]) -> tuple[Path, ...]:
-    """Return the files that a bake writes, the file with the mesh first, and check that they can be written.
+    """Return the paths of the files that a bake writes, and check that the files can be written.
 
     Args:
         out, settings: as for `bake`.
-        inputs: files that are read, besides the open file.
+        inputs: paths of the files that the bake reads, besides the open file.
+
+    Returns:
+        The paths; the file with the mesh is the first.
 
     Raises:
         WrongUsageError: the extension is not .pc2 or .blend, or shape keys are requested in a .pc2 file.
@@ -131,8 +140,8 @@ def output_files(out: Path, settings: BakeSettings, inputs: Iterable[Path]) -> t
         raise WrongUsageError(f"'{out}' ends in neither .pc2 nor .blend; give it the extension of what to write.")
     if settings.shape_keys and out.suffix != BLEND_SUFFIX:
         raise WrongUsageError(f"Shape keys are written into a .blend file; give '{out}' that extension.")
-    with_cache = out.suffix == BLEND_SUFFIX and not settings.shape_keys
-    files = (out, out.with_suffix(POINT_CACHE_SUFFIX)) if with_cache else (out,)
+    has_point_cache = out.suffix == BLEND_SUFFIX and not settings.shape_keys
+    files = (out, out.with_suffix(POINT_CACHE_SUFFIX)) if has_point_cache else (out,)
     kinds = {BLEND_SUFFIX: file_kind.BLEND, POINT_CACHE_SUFFIX: file_kind.POINT_CACHE}
     check_outputs(
         [(path, kinds[path.suffix]) for path in files], [Path(bpy.data.filepath), *inputs], settings.overwrite
@@ -140,7 +149,7 @@ def output_files(out: Path, settings: BakeSettings, inputs: Iterable[Path]) -> t
     return files
 
 
-def _frames(action: bpy.types.Action | None, frames: tuple[int, int] | None) -> range:
+def _select_frames(action: bpy.types.Action | None, frames: tuple[int, int] | None) -> range:
     scene = bpy.context.scene
     if frames is None:
         return range(scene.frame_start, scene.frame_end + 1) if action is None else action_frames(action)
@@ -153,10 +162,10 @@ def _frames(action: bpy.types.Action | None, frames: tuple[int, int] | None) -> 
 
 
 class FrameReader:
-    """Reads the inputs of a model in frames, and runs the model for several frames at once."""
+    """Reads the inputs of a model frame by frame, and runs the model for several frames at once."""
 
     def __init__(self, scene_rig: SceneRig, opened: OpenedModel, strength: float | None = None):
-        """Prepare to read frames.
+        """Prepare to read the inputs of a model.
 
         Args:
             scene_rig: the rig; its modifiers may be off.
@@ -179,7 +188,7 @@ class FrameReader:
         """Read the inputs of the model in a frame.
 
         Returns:
-            Pose matrices (J, 4, 4) in mesh-object space and controls (C,), both float32, and the strength.
+            Pose matrices, (J, 4, 4) float32, mesh-object space; controls, (C,) float32; and the strength.
         """
         bpy.context.scene.frame_set(frame)
         depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -189,10 +198,10 @@ class FrameReader:
         return pose_matrices, self._control_reader.read(self.scene_rig, depsgraph), np.float32(strength)
 
     def positions(self, inputs: list[tuple[np.ndarray, ...]]) -> np.ndarray:
-        """Run the model.
+        """Run the model for several frames.
 
         Args:
-            inputs: the inputs of N frames, as `read` returns them.
+            inputs: for each of N frames, the inputs that `read` returns.
 
         Returns:
             (N, V, 3) float32, mesh-object space, mesh units; valid until the next call.
@@ -213,28 +222,29 @@ class FrameReader:
 
 
 def _write_frames(path: Path, reader: FrameReader, frames: range) -> Iterator[Progress]:
-    """Write a point cache; the frame is as before afterwards."""
-    scene, count = bpy.context.scene, reader.network.info.vertex_count
-    frame, subframe = scene.frame_current, scene.frame_subframe
-    batch_size = max(1, min(MAX_BATCH_FRAMES, MAX_BATCH_BYTES // (12 * count)))
+    """Write a point cache, and restore the current frame."""
+    scene, vertex_count = bpy.context.scene, reader.network.info.vertex_count
+    original_frame, original_subframe = scene.frame_current, scene.frame_subframe
+    bytes_per_frame = 12 * vertex_count
+    batch_size = max(1, min(MAX_BATCH_FRAMES, MAX_BATCH_BYTES // bytes_per_frame))
     scene_rig = reader.scene_rig
-    visible = temporary_visibility((scene_rig.mesh_object, scene_rig.armature_object))
-    with open(path, "wb") as file, visible, _deformation_disabled(scene_rig.mesh_object):
-        writer = PointCacheWriter(file, count, frames.start, len(frames))
-        inputs = []
-        for done, number in enumerate(frames, 1):
-            inputs.append(reader.read(number))
-            if len(inputs) == batch_size or done == len(frames):
-                writer.append(reader.positions(inputs))
-                inputs.clear()
-            yield Progress("frames", done, len(frames))
+    visible_objects = temporary_visibility((scene_rig.mesh_object, scene_rig.armature_object))
+    with open(path, "wb") as file, visible_objects, _deformation_disabled(scene_rig.mesh_object):
+        writer = PointCacheWriter(file, vertex_count, frames.start, len(frames))
+        batch_inputs = []
+        for frame_count, frame in enumerate(frames, 1):
+            batch_inputs.append(reader.read(frame))
+            if len(batch_inputs) == batch_size or frame_count == len(frames):
+                writer.append(reader.positions(batch_inputs))
+                batch_inputs.clear()
+            yield Progress("frames", frame_count, len(frames))
         writer.finish()
-    scene.frame_set(frame, subframe=subframe)
+    scene.frame_set(original_frame, subframe=original_subframe)
 
 
 @contextmanager
 def _temporary_action(armature_object: bpy.types.Object, action: bpy.types.Action | None) -> Iterator[None]:
-    """Assign an action to an armature in place of its animation, None to keep that; restore everything afterwards."""
+    """Replace the animation of an armature by an action, or keep it if the action is None; restore it afterwards."""
     with temporary_pose(armature_object, [action] if action else (), keep_animation=action is None):
         if action is not None:
             clear_pose(armature_object)
@@ -244,13 +254,15 @@ def _temporary_action(armature_object: bpy.types.Object, action: bpy.types.Actio
 
 @contextmanager
 def _deformation_disabled(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """Switch the deformation of a mesh off, which takes most of the time of a frame: only the pose is read."""
-    with ExitStack() as stack:
+    """Switch the deformation of a mesh off in the block, to save its time where only the pose is read."""
+    with ExitStack() as exit_stack:
         for modifier in mesh_object.modifiers:
-            stack.enter_context(temporary_attributes(modifier, show_viewport=False))
+            exit_stack.enter_context(temporary_attributes(modifier, show_viewport=False))
         if mesh_object.data.shape_keys is not None:
-            # A pinned shape key is copied, not mixed.
-            stack.enter_context(temporary_attributes(mesh_object, show_only_shape_key=True, active_shape_key_index=0))
+            # Blender copies a pinned shape key instead of mixing all shape keys.
+            exit_stack.enter_context(
+                temporary_attributes(mesh_object, show_only_shape_key=True, active_shape_key_index=0)
+            )
         yield
 
 

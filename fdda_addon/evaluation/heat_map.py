@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Shows errors as a heat map, or partitions, as colors over meshes in the viewport.
+"""Colors meshes in the viewport: by the errors of a model (heat map), or by partition.
 
-The colors are drawn over the evaluated meshes, so they follow the animation and change nothing in the file. They last
-for the session; without a window nothing is drawn.
+The colors are drawn over the evaluated meshes, so they follow the animation and change nothing in the file. They are
+kept for the session. Without a window nothing is drawn.
 """
 
 from contextlib import suppress
@@ -24,28 +24,29 @@ from ..scene.viewport import redraw_views
 from . import last_evaluation, overlay
 
 ERRORS, PARTITIONS = "ERRORS", "PARTITIONS"
+"""Kinds of colors."""
 BONE_COLOR, SELECTED_COLOR, ACTIVE_COLOR = (0.75, 0.75, 0.75, 1.0), (0.3, 0.85, 1.0, 1.0), (1.0, 1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Paint:
-    """What the colors of a mesh show.
+    """The colors of a mesh.
 
     Attributes:
         kind: `ERRORS` or `PARTITIONS`.
-        colors: (V, 3) float32, sRGB, colors of partitions; None for errors, whose colors depend on the frame.
-        partitions: number of partitions.
+        partition_colors: (V, 3) float32, sRGB; None for errors, whose colors depend on the frame.
+        partition_count: number of partitions; 0 for errors.
     """
 
     kind: str
-    colors: np.ndarray | None = None
-    partitions: int = 0
+    partition_colors: np.ndarray | None = None
+    partition_count: int = 0
 
 
-_painted: dict[int, Paint] = {}
-"""Paints by the session ids of mesh objects."""
-_hidden: set[int] = set()
-"""Session ids of painted objects whose colors could not be drawn."""
+_paints: dict[int, Paint] = {}
+"""The colors of meshes, by the session ids of mesh objects."""
+_hidden_uids: set[int] = set()
+"""Session ids of the objects whose colors could not be drawn."""
 
 
 def paint_errors(mesh_object: bpy.types.Object) -> None:
@@ -54,11 +55,11 @@ def paint_errors(mesh_object: bpy.types.Object) -> None:
 
 
 def paint_partitions(scene_rig: SceneRig, min_partition_vertices: int = MIN_PARTITION_VERTICES) -> None:
-    """Show the partitions of the bound model as colors; without a readable model, those of a recording of the rig.
+    """Show the partitions of the bound model as colors; without a readable model, the partitions of the rig.
 
     Args:
         scene_rig: the rig.
-        min_partition_vertices: least number of vertices of a partition in a recording.
+        min_partition_vertices: smallest number of vertices in a partition of the rig.
 
     Raises:
         RigError: the rig cannot be read.
@@ -67,45 +68,45 @@ def paint_partitions(scene_rig: SceneRig, min_partition_vertices: int = MIN_PART
     partitions = make_merged_partitions(rig, min_partition_vertices)
     if scene_rig.mesh_object.fdda.is_bound:
         with suppress(ModelError):
-            opened = open_model(scene_rig, network_of(scene_rig.mesh_object))
-            # Fitted skin weights result in other partitions than those of the rig.
-            partitions = opened.network.info.partitions_of(opened.linear_rig)
+            opened_model = open_model(scene_rig, network_of(scene_rig.mesh_object))
+            # Fitted skin weights result in other partitions than the skin weights of the rig.
+            partitions = opened_model.network.info.partitions_of(opened_model.linear_rig)
     colors = partition_colors(partitions, rig.vertex_count)
     _paint(scene_rig.mesh_object, Paint(PARTITIONS, colors, len(partitions)))
 
 
 def clear(mesh_object: bpy.types.Object) -> None:
     """Remove the colors of a mesh."""
-    _painted.pop(mesh_object.session_uid, None)
-    if not _painted:
+    _paints.pop(mesh_object.session_uid, None)
+    if not _paints:
         overlay.stop()
     redraw_views()
 
 
 def clear_all() -> None:
     """Remove the colors of all meshes."""
-    _painted.clear()
+    _paints.clear()
     overlay.stop()
 
 
 def paint_kind(mesh_object: bpy.types.Object) -> str:
-    """Return what the colors of a mesh show, `ERRORS` or `PARTITIONS`; empty if it has none."""
-    paint = _painted.get(mesh_object.session_uid)
+    """Return the kind of the colors of a mesh, `ERRORS` or `PARTITIONS`; empty if the mesh has no colors."""
+    paint = _paints.get(mesh_object.session_uid)
     return paint.kind if paint else ""
 
 
 def is_hidden(mesh_object: bpy.types.Object) -> bool:
-    """Return whether the colors of a mesh could not be drawn: it is edited, or a modifier changes its topology."""
-    return mesh_object.session_uid in _hidden
+    """Return whether the colors of a mesh could not be drawn, because of edit mode or a changed topology."""
+    return mesh_object.session_uid in _hidden_uids
 
 
 def colors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
     """Return the colors of a mesh at the current frame, (V, 3) float32, sRGB; None if there are none."""
-    paint = _painted.get(mesh_object.session_uid)
+    paint = _paints.get(mesh_object.session_uid)
     if paint is None:
         return None
     if paint.kind == PARTITIONS:
-        return paint.colors
+        return paint.partition_colors
     errors = errors_of(mesh_object)
     return None if errors is None else heat_colors(errors, bpy.context.window_manager.fdda_view.range_mm / 1000)
 
@@ -120,68 +121,68 @@ def errors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
 
 
 def fitting_range_mm(mesh_object: bpy.types.Object) -> float:
-    """Return the range of the heat map in mm that fits the shown errors: nearly the largest error."""
+    """Return a range of the heat map in mm that covers almost all shown errors; 0 if there are none."""
     errors = errors_of(mesh_object)
     return 0.0 if errors is None else float(f"{np.percentile(errors, 99.5) * 1000:.2g}")
 
 
 def _paint(mesh_object: bpy.types.Object, paint: Paint) -> None:
-    _painted[mesh_object.session_uid] = paint
+    _paints[mesh_object.session_uid] = paint
     if not bpy.app.background:
         overlay.start(_overlay_meshes, _legend, _overlay_bones)
     redraw_views()
 
 
 def _overlay_meshes(context: bpy.types.Context) -> list["overlay.OverlayMesh"]:
-    """Return the meshes to draw, and forget the paints of removed objects."""
-    existing = {o.session_uid: o for o in bpy.data.objects if o.session_uid in _painted}
-    for uid in _painted.keys() - existing.keys():
-        del _painted[uid]
-    meshes, hidden = [], set()
-    for uid, mesh_object in existing.items():
+    """Return the meshes to draw, and remove the colors of removed objects."""
+    painted_objects = {o.session_uid: o for o in bpy.data.objects if o.session_uid in _paints}
+    for removed_uid in _paints.keys() - painted_objects.keys():
+        del _paints[removed_uid]
+    meshes, hidden_uids = [], set()
+    for uid, mesh_object in painted_objects.items():
         colors = colors_of(mesh_object)
         if colors is None or not mesh_object.visible_get(view_layer=context.view_layer):
             continue
         mesh = overlay.overlay_mesh(context, mesh_object, colors)
         if mesh is None:
-            hidden.add(uid)
+            hidden_uids.add(uid)
         else:
             meshes.append(mesh)
-    if hidden != _hidden:
-        _hidden.clear()
-        _hidden.update(hidden)
-        # A draw handler must not request a redraw itself.
+    if hidden_uids != _hidden_uids:
+        _hidden_uids.clear()
+        _hidden_uids.update(hidden_uids)
+        # A draw handler must not request a redraw itself, so a timer does.
         bpy.app.timers.register(redraw_views, first_interval=0)
     return meshes
 
 
 def _overlay_bones(context: bpy.types.Context) -> list["overlay.OverlayBone"]:
-    """Return the bones to draw: those of armatures in pose mode, which the colors of the mesh would hide."""
+    """Return the bones of armatures in pose mode, to draw them over the colors, which would hide them."""
     bones = []
     for mesh_object in context.view_layer.objects:
-        armature_object = armature_of(mesh_object) if mesh_object.session_uid in _painted else None
+        armature_object = armature_of(mesh_object) if mesh_object.session_uid in _paints else None
         if armature_object is None or armature_object.mode != "POSE":
             continue
-        matrix, active = armature_object.matrix_world, armature_object.data.bones.active
+        matrix, active_bone = armature_object.matrix_world, armature_object.data.bones.active
         for bone in armature_object.pose.bones:
             if is_bone_hidden(bone):
                 continue
-            color = ACTIVE_COLOR if bone.bone == active else (SELECTED_COLOR if is_selected(bone) else BONE_COLOR)
+            color = ACTIVE_COLOR if bone.bone == active_bone else (SELECTED_COLOR if is_selected(bone) else BONE_COLOR)
             bones.append(overlay.OverlayBone(tuple(matrix @ bone.head), tuple(matrix @ bone.tail), color))
     return bones
 
 
 def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:
-    """Return the lines of the legend, and the range of the heat map in mm, None if no errors are shown."""
-    painted_objects = {o.session_uid: o for o in context.view_layer.objects if o.session_uid in _painted}
-    active = context.view_layer.objects.active
-    active_painted = painted_objects.get(active.session_uid) if active else None
-    mesh_object = active_painted or next(iter(painted_objects.values()), None)
+    """Return the lines of the legend, and the range of the heat map in mm; the range is None if no errors are shown."""
+    painted_objects = {o.session_uid: o for o in context.view_layer.objects if o.session_uid in _paints}
+    active_object = context.view_layer.objects.active
+    active_painted_object = painted_objects.get(active_object.session_uid) if active_object else None
+    mesh_object = active_painted_object or next(iter(painted_objects.values()), None)
     if mesh_object is None:
         return [], None
-    paint = _painted[mesh_object.session_uid]
+    paint = _paints[mesh_object.session_uid]
     if paint.kind == PARTITIONS:
-        return [f"{mesh_object.name}: {paint.partitions} body parts"], None
+        return [f"{mesh_object.name}: {paint.partition_count} body parts"], None
     last, view = last_evaluation.get(mesh_object), context.window_manager.fdda_view
     if last is None:
         return [], None
@@ -190,8 +191,8 @@ def _legend(context: bpy.types.Context) -> tuple[list[str], float | None]:
     description = _describe_errors(last, view.statistic, context.scene.frame_current, view.pose)
     if errors is None:
         return [f"{mesh_object.name}, {method}: {description}"], None
-    numbers = f"mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.2f} mm"
-    return [f"{mesh_object.name}, {method}: {description}", numbers], view.range_mm
+    statistics = f"mean {errors.mean() * 1000:.2f} mm, max {errors.max() * 1000:.2f} mm"
+    return [f"{mesh_object.name}, {method}: {description}", statistics], view.range_mm
 
 
 def _describe_errors(last: last_evaluation.LastEvaluation, statistic: str, frame: int, pose: int) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Stores the last evaluation of each mesh object for the session, for the sidebar, the viewport and the timeline."""
+"""Stores the last evaluation of each mesh object until Blender ends, for the sidebar, the viewport and the timeline."""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -13,19 +13,27 @@ if TYPE_CHECKING:  # Blender starts without numpy.
     from ..core.poses import Channel
     from .run import Evaluation
 
-MAX_STORED = 4
-"""The errors of a dense mesh take some hundred megabytes."""
+MAX_STORED_EVALUATIONS = 4
+"""Largest number of stored evaluations, because the errors of a dense mesh take much memory."""
 MIN_FRAMES_APART = 10
-"""Least distance between worst frames: closer ones belong to the same movement."""
+"""Smallest distance between two worst frames; closer frames belong to the same movement."""
 METHODS = ("fdda", "linear")
+"""The methods whose errors are evaluated: the model, and linear skinning alone."""
 
 _evaluations: dict[int, "LastEvaluation"] = {}
-"""Evaluations by the session ids of mesh objects, the oldest first."""
+"""The stored evaluations, by the session ids of mesh objects, in the order of their age."""
 
 
 @dataclass(frozen=True)
 class PartitionErrors:
-    """Errors of one partition: name of its main joint, number of vertices, statistics in mm."""
+    """Errors of one partition.
+
+    Attributes:
+        joint: name of the main joint of the partition.
+        vertices: number of vertices.
+        fdda: statistics of the errors of the model, mm.
+        linear: statistics of the errors of linear skinning, mm.
+    """
 
     joint: str
     vertices: int
@@ -43,7 +51,7 @@ class LastEvaluation:
         first_frame: first frame of the action; 0 for random poses.
         seed: seed of the random poses.
         errors: (N, V) float32, metres, for each of `METHODS`.
-        total: statistics of all vertices, for each of `METHODS`.
+        total: statistics of the errors of all vertices, mm, for each of `METHODS`.
         partitions: errors of the partitions, in descending order of the largest error of the model.
         channels: channels of the random poses.
     """
@@ -78,8 +86,8 @@ class LastEvaluation:
 
         Args:
             method: one of `METHODS`.
-            statistic: "mean" or "max" over the poses, or "pose" for those of one pose.
-            pose: index of the pose.
+            statistic: "mean" or "max" over all poses, or "pose" for the errors in one pose.
+            pose: index of this pose.
 
         Returns:
             (V,) float32, metres; None if there is no such pose.
@@ -94,7 +102,7 @@ class LastEvaluation:
         return self._cached_errors[key]
 
     def worst(self, count: int) -> list[tuple[int, float]]:
-        """Return index and largest error in mm of the poses with the largest errors of the model, the worst first."""
+        """Return the poses with the largest errors of the model, worst first, as pairs of index and error in mm."""
         from ..core.metrics import worst_poses
 
         errors = self.errors["fdda"]
@@ -113,10 +121,11 @@ def store(
     """Summarize and store an evaluation.
 
     Args:
-        mesh_object: the object that was evaluated.
-        evaluation: the evaluation; its `held_out` poses are stored.
+        mesh_object: the mesh object of the evaluation.
+        evaluation: the evaluation; the errors on its `held_out` poses are stored.
         model: file name of the model.
-        action, first_frame: the action that was compared and its first frame; empty for random poses.
+        action: name of the action that was compared; empty for random poses.
+        first_frame: first frame of the action; 0 for random poses.
         seed: seed of the random poses.
     """
     from ..core.metrics import error_statistics
@@ -131,7 +140,7 @@ def store(
         for partition in evaluation.partitions
     ]
     partitions.sort(key=lambda partition: -partition.fdda.max)
-    last = LastEvaluation(
+    stored_evaluation = LastEvaluation(
         action,
         model,
         first_frame,
@@ -142,14 +151,14 @@ def store(
         evaluation.channels,
     )
     _evaluations.pop(mesh_object.session_uid, None)
-    while len(_evaluations) >= MAX_STORED:
+    while len(_evaluations) >= MAX_STORED_EVALUATIONS:
         del _evaluations[next(iter(_evaluations))]
-    _evaluations[mesh_object.session_uid] = last
-    return last
+    _evaluations[mesh_object.session_uid] = stored_evaluation
+    return stored_evaluation
 
 
 def get(mesh_object: bpy.types.Object) -> LastEvaluation | None:
-    """Return the last evaluation of an object; None if there was none in this session."""
+    """Return the last evaluation of an object; None if it was not evaluated in this session."""
     return _evaluations.get(mesh_object.session_uid)
 
 

@@ -15,7 +15,8 @@ from ..scene.arrays import TRIANGLE_ELEMENT, VECTOR_ELEMENT, read
 from ..scene.mesh import mesh_positions
 
 DEPTH_OFFSET = 2e-5
-"""Offset of the colors towards the viewer, in depth: enough to cover the mesh, too little to show through others."""
+"""Offset of the colors towards the viewer, in depth: large enough to cover the mesh itself, too small to cover other
+objects in front of it."""
 BONE_WIDTH_PIXELS = 3
 VERTEX_SHADER = """
 void main()
@@ -47,8 +48,8 @@ class OverlayMesh:
     Attributes:
         positions, normals: (V, 3) float32, object space.
         colors: (V, 3) float32, sRGB.
-        triangles: its triangles.
-        matrix: `matrix_world` of the object.
+        triangles: vertex indices of the triangles.
+        matrix: transform from object space to world space.
     """
 
     positions: np.ndarray
@@ -75,18 +76,18 @@ def start(
     """Start drawing in all viewports.
 
     Args:
-        get_meshes: returns the meshes, at each redraw.
-        get_legend: returns lines of text, and the range of a heat map in mm or None.
-        get_bones: returns the bones, which are drawn over the meshes.
+        get_meshes: called at each redraw; returns the meshes to draw.
+        get_legend: called at each redraw; returns the lines of the legend, and the range of a heat map in mm or None.
+        get_bones: called at each redraw; returns the bones to draw over the meshes.
     """
     if not _handles:
-        add = bpy.types.SpaceView3D.draw_handler_add
-        _handles.append(add(_draw_view, (get_meshes, get_bones), "WINDOW", "POST_VIEW"))
-        _handles.append(add(_draw_legend, (get_legend,), "WINDOW", "POST_PIXEL"))
+        add_handler = bpy.types.SpaceView3D.draw_handler_add
+        _handles.append(add_handler(_draw_view, (get_meshes, get_bones), "WINDOW", "POST_VIEW"))
+        _handles.append(add_handler(_draw_legend, (get_legend,), "WINDOW", "POST_PIXEL"))
 
 
 def stop() -> None:
-    """Stop drawing, and free GPU resources, which must not outlive their context."""
+    """Stop drawing, and free the GPU resources, which must be freed before Blender's GPU context."""
     global _shader
     _shader = None
     while _handles:
@@ -135,7 +136,7 @@ def _draw_view(
     get_bones: Callable[[bpy.types.Context], list[OverlayBone]],
 ) -> None:
     context = bpy.context
-    shader, view = _mesh_shader(), context.region_data
+    shader, region_view = _mesh_shader(), context.region_data
     gpu.state.depth_test_set("LESS_EQUAL")
     gpu.state.depth_mask_set(True)
     try:
@@ -146,8 +147,8 @@ def _draw_view(
                 vertices.attr_fill(name, values)
             batch = gpu.types.GPUBatch(type="TRIS", buf=vertices, elem=mesh.triangles)
             shader.bind()
-            shader.uniform_float("transform", view.perspective_matrix @ mesh.matrix)
-            towards_viewer = (view.view_matrix @ mesh.matrix).to_3x3().inverted_safe().col[2].normalized()
+            shader.uniform_float("transform", region_view.perspective_matrix @ mesh.matrix)
+            towards_viewer = (region_view.view_matrix @ mesh.matrix).to_3x3().inverted_safe().col[2].normalized()
             shader.uniform_float("towards", towards_viewer)
             shader.uniform_float("offset", DEPTH_OFFSET)
             batch.draw(shader)
@@ -164,6 +165,7 @@ def _draw_bones(context: bpy.types.Context, bones: list[OverlayBone]) -> None:
     shader.uniform_float("viewportSize", (context.region.width, context.region.height))
     for color in {bone.color for bone in bones}:
         ends = [end for bone in bones if bone.color == color for end in (bone.head, bone.tail)]
+        # A wider dark line below each bone outlines it.
         for width, line_color in ((BONE_WIDTH_PIXELS + 2, (0, 0, 0, 0.6)), (BONE_WIDTH_PIXELS, color)):
             shader.uniform_float("lineWidth", width * context.preferences.system.ui_scale)
             shader.uniform_float("color", line_color)
@@ -171,7 +173,10 @@ def _draw_bones(context: bpy.types.Context, bones: list[OverlayBone]) -> None:
 
 
 def _vertex_format(names: Iterable[str]) -> gpu.types.GPUVertFormat:
-    """Create a vertex format with three floats for each name; in Blender 5.2 a shader does not provide it."""
+    """Create a vertex format with three floats for each attribute name.
+
+    Blender 5.2 does not derive the format from the shader.
+    """
     vertex_format = gpu.types.GPUVertFormat()
     for name in names:
         vertex_format.attr_add(id=name, comp_type="F32", len=3, fetch_mode="FLOAT")
@@ -204,10 +209,10 @@ def _draw_legend(get_legend: Callable[[bpy.types.Context], tuple[list[str], floa
     if not lines:
         return
     ui_scale = context.preferences.system.ui_scale
-    regions = [r for r in context.area.regions if r.width > 1]
-    left = 24 * ui_scale + sum(r.width for r in regions if r.type == "TOOLS")
-    # Above the Adjust Last Operation panel.
-    bottom = 30 * ui_scale + sum(r.height for r in regions if r.type == "HUD")
+    visible_regions = [region for region in context.area.regions if region.width > 1]
+    left = 24 * ui_scale + sum(region.width for region in visible_regions if region.type == "TOOLS")
+    # The region HUD is the Adjust Last Operation panel; the legend is above it.
+    bottom = 30 * ui_scale + sum(region.height for region in visible_regions if region.type == "HUD")
     blf.size(0, 12 * ui_scale)
     blf.enable(0, blf.SHADOW)
     blf.shadow(0, 5, 0, 0, 0, 0.9)
@@ -225,12 +230,12 @@ def _draw_color_scale(left: float, bottom: float, ui_scale: float, range_mm: flo
     strip_bottom = bottom + 18 * ui_scale
     _draw_strip(left, strip_bottom, height, height, np.tile(np.float32(NO_ERROR_COLOR), (2, 1)))
     _draw_text("none", left - 2 * ui_scale, bottom)
-    start = left + 44 * ui_scale
+    scale_left = left + 44 * ui_scale
     strip_colors = heat_colors(np.linspace(NO_ERROR_METRES, range_mm / 1000, 64), range_mm / 1000)
-    _draw_strip(start, strip_bottom, width, height, strip_colors)
+    _draw_strip(scale_left, strip_bottom, width, height, strip_colors)
     for fraction, text in ((0, "0"), (0.5, f"{range_mm / 2:.4g}"), (1, f"{range_mm:.4g} mm and more")):
         half_width = blf.dimensions(0, text.split(" ")[0])[0] / 2
-        _draw_text(text, start + fraction * width - half_width, bottom)
+        _draw_text(text, scale_left + fraction * width - half_width, bottom)
 
 
 def _draw_strip(left: float, bottom: float, width: float, height: float, colors: np.ndarray) -> None:

@@ -96,7 +96,7 @@ def draw_comparison(
         linear = skinning.positions(pose.pose_matrices[None])[0]
         fdda = network.positions(pose.pose_matrices[None], pose.controls[None])[0].copy()
         if mask is not None:
-            fdda = mask.blended(linear, fdda)
+            fdda = mask.blend(linear, fdda)
         cells = [(pose.positions, f"{pose.name}: {reference_label}"), (linear, "linear skinning"), (fdda, "FDDA")]
         rows.append(
             [_cell(positions, pose.positions, label, heat, network.info.metres_per_unit) for positions, label in cells]

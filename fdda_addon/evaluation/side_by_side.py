@@ -15,23 +15,27 @@ from ..scene.draw_cache import draw_cached
 
 BESIDE, OVERLAY, NONE = "BESIDE", "OVERLAY", "NONE"
 DISTANCE_IN_WIDTHS = 1.15
-"""Distance between character and copy, in widths of the character."""
+"""Default distance between character and copy, in widths of the character."""
 
-_object_count = -1
+_checked_object_count = -1
+"""Number of objects in the file when comparison objects were last checked."""
 
 
 def find(mesh_object: bpy.types.Object) -> bpy.types.Object | None:
     """Find the comparison object of a mesh object; return None if there is none."""
-    return next((other for other in comparisons() if other[COMPARISON_KEY] == mesh_object), None)
+    return next(
+        (comparison_object for comparison_object in comparisons() if comparison_object[COMPARISON_KEY] == mesh_object),
+        None,
+    )
 
 
 @draw_cached
 def display_mode(mesh_object: bpy.types.Object) -> str:
     """Return how the rig of a mesh object is shown: `BESIDE`, `OVERLAY` or `NONE`."""
-    other = find(mesh_object)
-    if other is None:
+    comparison_object = find(mesh_object)
+    if comparison_object is None:
         return NONE
-    return OVERLAY if other.display_type == "WIRE" else BESIDE
+    return OVERLAY if comparison_object.display_type == "WIRE" else BESIDE
 
 
 def show(mesh_object: bpy.types.Object, mode: str, distance: float = 0.0) -> None:
@@ -40,7 +44,7 @@ def show(mesh_object: bpy.types.Object, mode: str, distance: float = 0.0) -> Non
     Args:
         mesh_object: the bound object.
         mode: `BESIDE`, `OVERLAY`, or `NONE` to hide the rig.
-        distance: distance to the side, along the X axis of the world, in its units; 0 for a default.
+        distance: distance of `BESIDE` along the X axis of the world, Blender units; 0 for the default.
     """
     from ..runtime.binding import unbind
 
@@ -48,35 +52,35 @@ def show(mesh_object: bpy.types.Object, mode: str, distance: float = 0.0) -> Non
     if mode == NONE:
         return
     # Local, because modifiers of a library override cannot be removed.
-    other = mesh_object.copy().make_local()
-    other.is_runtime_data = True
-    unbind(other)
-    other.fdda.models.clear()
-    other[COMPARISON_KEY] = mesh_object
-    other.name = f"{mesh_object.name} rig, to compare"
-    other.hide_select = other.hide_render = True
-    bpy.context.scene.collection.objects.link(other)
+    comparison_object = mesh_object.copy().make_local()
+    comparison_object.is_runtime_data = True
+    unbind(comparison_object)
+    comparison_object.fdda.models.clear()
+    comparison_object[COMPARISON_KEY] = mesh_object
+    comparison_object.name = f"{mesh_object.name} rig, to compare"
+    comparison_object.hide_select = comparison_object.hide_render = True
+    bpy.context.scene.collection.objects.link(comparison_object)
     if mode == OVERLAY:
-        other.display_type, other.show_in_front = "WIRE", True
+        comparison_object.display_type, comparison_object.show_in_front = "WIRE", True
     else:
-        _move_aside(other, mesh_object, distance or DISTANCE_IN_WIDTHS * _width(mesh_object))
+        _move_aside(comparison_object, mesh_object, distance or DISTANCE_IN_WIDTHS * _width(mesh_object))
 
 
 def hide(mesh_object: bpy.types.Object) -> None:
-    """Remove the comparison object of a mesh object."""
+    """Remove the comparison object of a mesh object, if there is one."""
     _remove(find(mesh_object))
 
 
 def hide_all() -> None:
     """Remove all comparison objects of the open file."""
-    for other in comparisons():
-        _remove(other)
+    for comparison_object in comparisons():
+        _remove(comparison_object)
 
 
-def _remove(other: bpy.types.Object | None) -> None:
-    if other is not None:
+def _remove(comparison_object: bpy.types.Object | None) -> None:
+    if comparison_object is not None:
         # Its mesh belongs to the character.
-        bpy.data.objects.remove(other)
+        bpy.data.objects.remove(comparison_object)
 
 
 def _width(mesh_object: bpy.types.Object) -> float:
@@ -86,26 +90,26 @@ def _width(mesh_object: bpy.types.Object) -> float:
     return max(x_values) - min(x_values)
 
 
-def _move_aside(other: bpy.types.Object, mesh_object: bpy.types.Object, distance: float) -> None:
-    """Move an object to the side with modifiers: a transform would change how its armature deforms it."""
+def _move_aside(comparison_object: bpy.types.Object, mesh_object: bpy.types.Object, distance: float) -> None:
+    """Move an object to the side by modifiers, because a transform would change how its armature deforms it."""
     offset = mesh_object.matrix_world.to_3x3().inverted_safe() @ Vector((distance, 0, 0))
     for axis, component in zip("XYZ", offset, strict=True):
         if abs(component) > 1e-6 * offset.length:
-            modifier = other.modifiers.new(f"Aside {axis}", "DISPLACE")
+            modifier = comparison_object.modifiers.new(f"Aside {axis}", "DISPLACE")
             modifier.direction, modifier.space, modifier.mid_level, modifier.strength = axis, "LOCAL", 0.0, component
 
 
 @persistent
 def _on_depsgraph_update_post(*_: object) -> None:
-    """Remove the comparison objects of removed objects."""
-    global _object_count
-    if _object_count == len(bpy.data.objects):
+    """Remove the comparison objects whose mesh objects were removed."""
+    global _checked_object_count
+    if _checked_object_count == len(bpy.data.objects):
         return
-    for other in comparisons():
-        compared = other[COMPARISON_KEY]
-        if compared is None or not compared.users_scene:
-            _remove(other)
-    _object_count = len(bpy.data.objects)
+    for comparison_object in comparisons():
+        compared_object = comparison_object[COMPARISON_KEY]
+        if compared_object is None or not compared_object.users_scene:
+            _remove(comparison_object)
+    _checked_object_count = len(bpy.data.objects)
 
 
 HANDLERS = {"depsgraph_update_post": _on_depsgraph_update_post}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Draws the error of a model by frame as a graph in the timeline and the dope sheet."""
+"""Draws a graph of the largest error of a model in each frame, in the timeline and the dope sheet."""
 
 import weakref
 
@@ -12,21 +12,21 @@ from ..scene.scene_rig import armature_of
 from . import last_evaluation
 
 GRAPH_HEIGHT, GRAPH_BOTTOM = 34, 18
-"""Height of the graph, and its distance from the bottom of the region, in pixels at a UI scale of 1."""
+"""Height of the graph, and its distance from the bottom of the region, in pixels, for a resolution scale of 1."""
 FILL_COLOR, LINE_COLOR = (0.9, 0.3, 0.2, 0.35), (1.0, 0.45, 0.3, 0.9)
 
 _handles: list[object] = []
 _cached_curve: list[object] = []
-"""The last evaluation whose errors were computed, and the errors."""
+"""A weak reference to the last evaluation whose errors were computed, and the errors by frame."""
 _cached_batches: list[object] = []
-"""The evaluation and the rectangle of the last GPU batches, and the batches."""
+"""A weak reference to the evaluation of the last GPU batches, the rectangle of the graph, and the batches."""
 
 
 def start() -> None:
     """Start drawing the errors of evaluations."""
     if not _handles and not bpy.app.background:
-        add = bpy.types.SpaceDopeSheetEditor.draw_handler_add
-        _handles.append(add(_draw, (), "WINDOW", "POST_PIXEL"))
+        add_handler = bpy.types.SpaceDopeSheetEditor.draw_handler_add
+        _handles.append(add_handler(_draw, (), "WINDOW", "POST_PIXEL"))
     redraw()
 
 
@@ -47,44 +47,47 @@ def redraw() -> None:
                 area.tag_redraw()
 
 
-def errors_by_frame(last: last_evaluation.LastEvaluation) -> list[tuple[int, float]]:
-    """Return frame and largest error of the model in mm for each compared frame; empty for random poses."""
-    if not last.name:
+def errors_by_frame(evaluation: last_evaluation.LastEvaluation) -> list[tuple[int, float]]:
+    """Return pairs of frame and largest error of the model in mm for each compared frame; empty for random poses."""
+    if not evaluation.name:
         return []
     # Cached, because the timeline is redrawn in every frame and there are millions of errors.
-    if not _cached_curve or _cached_curve[0]() is not last:
-        largest = last.errors["fdda"].max(axis=1) * 1000
-        curve = [(last.first_frame + index, float(error)) for index, error in enumerate(largest)]
-        _cached_curve[:] = weakref.ref(last), curve
+    if not _cached_curve or _cached_curve[0]() is not evaluation:
+        errors_mm = evaluation.errors["fdda"].max(axis=1) * 1000
+        curve = [(evaluation.first_frame + index, float(error)) for index, error in enumerate(errors_mm)]
+        _cached_curve[:] = weakref.ref(evaluation), curve
     return _cached_curve[1]
 
 
 def _active_evaluation() -> last_evaluation.LastEvaluation | None:
-    """Return the evaluation of the active mesh, or of a mesh of the active armature."""
-    active = bpy.context.view_layer.objects.active
-    if active is None:
+    """Return the last evaluation of the active mesh, or of a mesh that the active armature deforms."""
+    active_object = bpy.context.view_layer.objects.active
+    if active_object is None:
         return None
-    if active.type == "ARMATURE":
+    if active_object.type == "ARMATURE":
         # Few objects have an evaluation, and finding the armature of an object takes longer.
         evaluations = ((o, last_evaluation.get(o)) for o in bpy.context.scene.objects)
-        return next((last for o, last in evaluations if last is not None and armature_of(o) == active), None)
-    return last_evaluation.get(active)
+        return next(
+            (evaluation for o, evaluation in evaluations if evaluation is not None and armature_of(o) == active_object),
+            None,
+        )
+    return last_evaluation.get(active_object)
 
 
 def _draw() -> None:
-    last = _active_evaluation()
-    curve = errors_by_frame(last) if last is not None else []
+    evaluation = _active_evaluation()
+    curve = errors_by_frame(evaluation) if evaluation is not None else []
     if len(curve) < 2:
         return
     context = bpy.context
     scale, view = context.preferences.system.ui_scale, context.region.view2d
-    largest = max(error for _, error in curve) or 1.0
+    max_error_mm = max(error for _, error in curve) or 1.0
     bottom, height = GRAPH_BOTTOM * scale, GRAPH_HEIGHT * scale
-    # The view maps frames linearly, so two frames define the positions of all.
-    (first, _), (last_frame, _) = curve[0], curve[-1]
-    left, right = (view.view_to_region(frame, 0, clip=False)[0] for frame in (first, last_frame))
+    # The view maps frames linearly, so the positions of two frames define the positions of all frames.
+    (first_frame, _), (last_frame, _) = curve[0], curve[-1]
+    left, right = (view.view_to_region(frame, 0, clip=False)[0] for frame in (first_frame, last_frame))
     shader = gpu.shader.from_builtin("UNIFORM_COLOR")
-    batches = _batches(last, (left, right, bottom, height), shader)
+    batches = _batches(evaluation, (left, right, bottom, height), shader)
     gpu.state.blend_set("ALPHA")
     for batch, color in zip(batches, (FILL_COLOR, LINE_COLOR), strict=True):
         shader.uniform_float("color", color)
@@ -93,27 +96,31 @@ def _draw() -> None:
     blf.size(0, 11 * scale)
     blf.color(0, 1, 1, 1, 0.9)
     blf.position(0, 8 * scale, bottom + 3 * scale, 0)
-    blf.draw(0, f"FDDA: max error per frame, up to {largest:.2f} mm")
+    blf.draw(0, f"FDDA: max error per frame, up to {max_error_mm:.2f} mm")
 
 
 def _batches(
-    last: last_evaluation.LastEvaluation, rectangle: tuple[float, float, float, float], shader: gpu.types.GPUShader
+    evaluation: last_evaluation.LastEvaluation,
+    rectangle: tuple[float, float, float, float],
+    shader: gpu.types.GPUShader,
 ) -> tuple[gpu.types.GPUBatch, ...]:
-    """Return the GPU batches of the area below the graph and of the graph, cached until one of the arguments changes.
+    """Return the GPU batches of the area below the graph and of its line, cached until one of the arguments changes.
 
     Args:
-        last: the evaluation.
-        rectangle: left and right end, bottom and height of the graph, pixels.
-        shader: the shader.
+        evaluation: the evaluation.
+        rectangle: left end, right end, bottom and height of the graph, pixels.
+        shader: the shader that draws the batches.
     """
-    if not _cached_batches or _cached_batches[0]() is not last or _cached_batches[1] != rectangle:
+    if not _cached_batches or _cached_batches[0]() is not evaluation or _cached_batches[1] != rectangle:
         left, right, bottom, height = rectangle
-        curve = errors_by_frame(last)
-        largest, step = max(error for _, error in curve) or 1.0, (right - left) / (len(curve) - 1)
-        points = [(left + n * step, bottom + height * error / largest) for n, (_, error) in enumerate(curve)]
+        curve = errors_by_frame(evaluation)
+        max_error_mm, step = max(error for _, error in curve) or 1.0, (right - left) / (len(curve) - 1)
+        points = [
+            (left + index * step, bottom + height * error / max_error_mm) for index, (_, error) in enumerate(curve)
+        ]
         area = [corner for x, y in points for corner in ((x, bottom), (x, y))]
         _cached_batches[:] = (
-            weakref.ref(last),
+            weakref.ref(evaluation),
             rectangle,
             (
                 batch_for_shader(shader, "TRI_STRIP", {"pos": area}),

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The models of a mesh object: the list it keeps, which of them is bound, and whether they still fit the rig."""
+"""The model list of a mesh object, the bound model, and changes of the rig since training."""

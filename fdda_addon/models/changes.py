@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Changes of a rig since a model of it was trained."""
+"""Finds changes of a rig since a model of the rig was trained."""
 
 from dataclasses import dataclass
 
@@ -13,64 +13,66 @@ from ..rig.reading import read_model_rig
 from ..scene.scene_rig import SceneRig
 from .model_list import entry_info
 
+MAX_LISTED_BONES = 3
+"""Number of bones that `RigChanges.sentence` names."""
+
 
 @dataclass(frozen=True)
-class Changes:
-    """Changes of a rig since a model of it was trained.
+class RigChanges:
+    """Changes of a rig since a model of the rig was trained.
 
     Attributes:
-        model: name of the model.
-        clauses: changes that prevent playback ("the skin weights differ").
-        limits: bones whose range of motion has changed; the model plays, but outside of its training poses.
+        model_name: name of the model.
+        blocking_changes: changes that prevent playback, each as a clause such as "the skin weights differ".
+        bones_with_changed_range: names of the bones whose range of motion has changed. The model plays, but may be less
+            exact in the new range.
     """
 
-    model: str
-    clauses: tuple[str, ...] = ()
-    limits: tuple[str, ...] = ()
+    model_name: str
+    blocking_changes: tuple[str, ...] = ()
+    bones_with_changed_range: tuple[str, ...] = ()
 
     @property
     def prevents_playback(self) -> bool:
-        """Whether the changes prevent playback."""
-        return bool(self.clauses)
+        """Return whether the changes prevent playback."""
+        return bool(self.blocking_changes)
 
     @property
     def sentence(self) -> str:
-        """One sentence with the changes and what to do; empty without changes."""
-        if self.clauses:
+        """Return the changes and what to do as text; empty without changes."""
+        if self.blocking_changes:
             return (
-                f"{self.model} is of this rig as it was before: {'; '.join(self.clauses)}. Undo the change, or record "
-                "and train again."
+                f"{self.model_name} was trained for an earlier state of this rig: {'; '.join(self.blocking_changes)}. "
+                "Undo the change, or record and train again."
             )
-        if not self.limits:
+        names = self.bones_with_changed_range
+        if not names:
             return ""
-        bones = ", ".join(f"'{bone}'" for bone in self.limits[:3])
-        more = f" and {len(self.limits) - 3} more" if len(self.limits) > 3 else ""
+        quoted_names = ", ".join(f"'{name}'" for name in names[:MAX_LISTED_BONES])
+        more = f" and {len(names) - MAX_LISTED_BONES} more" if len(names) > MAX_LISTED_BONES else ""
         return (
-            f"The range of motion of {bones}{more} has changed since {self.model} was trained: it plays, but may be "
-            "less exact there. Record and train again."
+            f"The range of motion of {quoted_names}{more} has changed since {self.model_name} was trained: it plays, "
+            "but may be less exact there. Record and train again."
         )
 
 
-def compare_with_model(name: str, info: ModelInfo, rig: Rig, channels: tuple[Channel, ...]) -> Changes:
+def compare_with_model(name: str, info: ModelInfo, rig: Rig, channels: tuple[Channel, ...]) -> RigChanges:
     """Compare a rig and its range of motion with those that a model was trained for.
 
     Args:
-        name, info: the model.
-        rig: with the joints of the model (`rig.reading.read_model_rig`).
-        channels: of the rig as it stands. The ranges of control bones and those of actions were chosen by the user and
-            are not compared.
+        name, info: name and metadata of the model.
+        rig: the rig with the joints of the model (`rig.reading.read_model_rig`).
+        channels: the current channels of the rig. Ranges of control bones and of actions are chosen by the user and
+            not compared.
     """
-    clauses = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
-    covers_joints = all(c.name in rig.joint_names and c.kind != ROTATION_VECTOR for c in info.limits)
-    return Changes(
-        name,
-        tuple(clauses),
-        tuple(bones_with_changed_range(info.limits, channels)) if info.limits and covers_joints else (),
-    )
+    blocking_changes = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
+    has_joint_ranges = all(c.name in rig.joint_names and c.kind != ROTATION_VECTOR for c in info.limits)
+    changed_bones = bones_with_changed_range(info.limits, channels) if info.limits and has_joint_ranges else ()
+    return RigChanges(name, tuple(blocking_changes), tuple(changed_bones))
 
 
-def find_changes(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> Changes:
-    """Find the changes of a rig since a model of its list was trained.
+def find_changes(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> RigChanges:
+    """Find the changes of a rig since a model in the list of its mesh was trained.
 
     Raises:
         FDDAError: the rig or the model cannot be read.

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Entries in the list of models of a mesh object, for drawing: reads no files and needs no numpy."""
+"""The entries in the model list of a mesh object, for panels. Nothing here reads files or imports numpy."""
 
 import bpy
 
 
 def active_entry(mesh_object: bpy.types.Object) -> bpy.types.PropertyGroup | None:
-    """Return the active entry of the list; None where the list is empty."""
+    """Return the active entry of the list; None if the list is empty."""
     binding = mesh_object.fdda
     if not binding.models:
         return None
@@ -19,7 +19,7 @@ def is_bound(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> b
 
 
 def bound_entry(mesh_object: bpy.types.Object) -> bpy.types.PropertyGroup | None:
-    """Return the entry of the bound model; None where it is not in the list."""
+    """Return the entry of the bound model; None if the model is not in the list."""
     return next((entry for entry in mesh_object.fdda.models if is_bound(mesh_object, entry)), None)
 
 
@@ -29,6 +29,6 @@ def bound_model_name(mesh_object: bpy.types.Object) -> str:
     return entry.name if entry else bpy.path.display_name_from_filepath(mesh_object.fdda.model)
 
 
-def format_file_size(count: int) -> str:
-    """Format a size in bytes: "1.3 MB"."""
-    return f"{count / 1e6:.1f} MB" if count >= 1e5 else f"{count / 1e3:.1f} kB"
+def format_file_size(byte_count: int) -> str:
+    """Format a number of bytes as text such as "1.3 MB"."""
+    return f"{byte_count / 1e6:.1f} MB" if byte_count >= 1e5 else f"{byte_count / 1e3:.1f} kB"

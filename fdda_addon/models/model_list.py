@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The list of models of a mesh object: adding, binding, packing and removing of models."""
+"""The model list of a mesh object: adds, binds, packs and removes models."""
 
 import os
 from pathlib import Path
@@ -19,20 +19,24 @@ from ..timing import frame_times
 from .entries import active_entry, bound_entry, bound_model_name, is_bound
 
 _info_cache: dict[tuple, ModelInfo] = {}
+"""Metadata of models, by the session id of the text of a packed model, or else by the path, modification time and size
+of a file."""
 
 
 def add_model(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGroup:
-    """Add a model to the list of its mesh and make it active.
+    """Add a model file to the list of a mesh object and make its entry active.
+
+    If the list already has the file, the existing entry is used. If the file has changed, a packed model is packed
+    again, and a bound model is loaded again.
 
     Returns:
-        The entry, an existing one for the same file. A changed file is packed again where it is packed, and loaded
-        again where it is bound.
+        The entry.
 
     Raises:
-        ModelError: a packed model changed, and its file cannot be read or is no model.
+        ModelError: the entry is packed, and the file cannot be read or is not a model.
     """
     binding = mesh_object.fdda
-    model_files.allow(path)
+    model_files.allow_path(path)
     for index, entry in enumerate(binding.models):
         if absolute_path(mesh_object, entry.path) == Path(os.path.normpath(path.absolute())):
             binding.model_index = index
@@ -56,7 +60,7 @@ def add_model(mesh_object: bpy.types.Object, path: Path) -> bpy.types.PropertyGr
 
 
 def add_bound_model(mesh_object: bpy.types.Object) -> None:
-    """Add the bound model to the list where a script or the command line has bound it."""
+    """Add the bound model to the list if it is missing there, because a script or the command line has bound it."""
     binding = mesh_object.fdda
     if binding.is_bound and bound_entry(mesh_object) is None:
         entry = binding.models.add()
@@ -77,10 +81,10 @@ def require_active_entry(mesh_object: bpy.types.Object) -> bpy.types.PropertyGro
 
 
 def check_matches_rig(scene_rig: SceneRig, path: Path) -> None:
-    """Check that a file is a model of this rig.
+    """Check that a file is a model that was trained for a rig.
 
     Raises:
-        FDDAError: it is no model, or of another rig.
+        FDDAError: the file is not a model, or the model was trained for another rig.
     """
     read_matching_rig(scene_rig, path, read_model_info(path))
 
@@ -89,7 +93,7 @@ def bind_entry(scene_rig: SceneRig, entry: bpy.types.PropertyGroup) -> None:
     """Bind a model of the list in place of the bound one.
 
     Raises:
-        FDDAError: as `bind`, or the model cannot play; the previous model is bound again.
+        FDDAError: as `bind`, or because the model cannot play. The previous model is bound again.
     """
     mesh_object = scene_rig.mesh_object
     _bind(scene_rig, entry_path(mesh_object, entry), entry.packed)
@@ -101,17 +105,17 @@ def _bind(scene_rig: SceneRig, path: Path, packed_text: bpy.types.Text | None = 
     """Bind a model as `bind_entry` does, without changing the list."""
     mesh_object, binding = scene_rig.mesh_object, scene_rig.mesh_object.fdda
     use_in_render = binding.use_in_render
-    previous = (binding.model, binding.packed, binding.mode) if binding.is_bound else None
+    previous_binding = (binding.model, binding.packed, binding.mode) if binding.is_bound else None
     bind(scene_rig, path, use_in_render, packed_text)
-    # Evaluate now, so that a model that cannot play is an error here and not at the next frame.
+    # Evaluate now, so that a model that cannot play raises the error here and not in the next frame.
     bpy.context.view_layer.update()
     if problem := binding.status:
-        is_changed = previous is not None and previous[:2] != (binding.model, binding.packed)
+        has_other_model = previous_binding is not None and previous_binding[:2] != (binding.model, binding.packed)
         unbind(mesh_object)
-        if is_changed:
-            model, packed_before, mode = previous
-            bind(scene_rig, absolute_path(mesh_object, model), use_in_render, packed_before)
-            binding.model, binding.mode = model, mode
+        if has_other_model:
+            previous_model, previous_text, previous_mode = previous_binding
+            bind(scene_rig, absolute_path(mesh_object, previous_model), use_in_render, previous_text)
+            binding.model, binding.mode = previous_model, previous_mode
         raise ModelError(problem)
 
 
@@ -119,23 +123,23 @@ def relink(scene_rig: SceneRig, path: Path) -> None:
     """Bind the new location of the bound model, and update its entry.
 
     Raises:
-        FDDAError: as `bind_entry`; the list is unchanged.
+        FDDAError: as `bind_entry`. The list is unchanged.
     """
     mesh_object = scene_rig.mesh_object
     entry = bound_entry(mesh_object)
     index = list(mesh_object.fdda.models).index(entry) if entry else -1
     _bind(scene_rig, path)
-    model_files.allow(path)
+    model_files.allow_path(path)
     if index < 0:
         add_model(mesh_object, path)
         return
     entry, mesh_object.fdda.model_index = mesh_object.fdda.models[index], index
     entry.path, entry.packed, entry.packed_bytes = mesh_object.fdda.model, None, 0
-    packed_model.remove_unused()
+    packed_model.remove_unused_texts()
 
 
 def remove_entry(mesh_object: bpy.types.Object, index: int) -> str:
-    """Remove a model from the list, and unbind it where it is bound; return its name. Its file is kept.
+    """Remove a model from the list, unbind it if it is bound, and return its name. Its file stays on disk.
 
     Raises:
         ModelError: the entry belongs to the library of an override.
@@ -145,13 +149,13 @@ def remove_entry(mesh_object: bpy.types.Object, index: int) -> str:
     name = entry.name
     override = mesh_object.override_library
     if override is not None and override.reference is not None and index < len(override.reference.fdda.models):
-        file = Path(override.reference.library.filepath).name
-        raise ModelError(f"The model '{name}' is in the list of '{file}'; remove it there, or unbind it here.")
+        library_name = Path(override.reference.library.filepath).name
+        raise ModelError(f"The model '{name}' is in the list of '{library_name}'; remove it there, or unbind it here.")
     if is_bound(mesh_object, entry):
         unbind(mesh_object)
     binding.models.remove(index)
     binding.model_index = max(0, min(binding.model_index, len(binding.models) - 1))
-    packed_model.remove_unused()
+    packed_model.remove_unused_texts()
     return name
 
 
@@ -159,36 +163,37 @@ def pack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, pa
     """Pack a model of the list into the .blend file; return its size in bytes.
 
     Args:
-        mesh_object, entry: the model.
-        path: of its file; None for the path of the entry.
+        mesh_object: the mesh object with the list.
+        entry: the entry of the model.
+        path: path of the model file; None for the path of the entry.
 
     Raises:
-        ModelError: its file cannot be read or is no model.
+        ModelError: the file cannot be read or is not a model.
     """
     path = path or entry_path(mesh_object, entry)
-    bound = is_bound(mesh_object, entry)
+    was_bound = is_bound(mesh_object, entry)
     data = read_model(path)[1]
     entry.packed, entry.packed_bytes = packed_model.pack(path.name, data), len(data)
-    if bound:
+    if was_bound:
         mesh_object.fdda.packed = entry.packed
         registry.reset_players()
     return len(data)
 
 
 def _repack_if_changed(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path) -> bool:
-    """Pack the file of a packed model again where it has changed; return whether it has."""
+    """Pack the file of a packed model again if the file has changed, and return whether it has changed."""
     if entry.packed.get(packed_model.PACKED_MODEL_KEY) == read_model(path)[1]:
         return False
     pack_entry(mesh_object, entry, path)
-    packed_model.remove_unused()
+    packed_model.remove_unused_texts()
     return True
 
 
 def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, path: Path) -> None:
-    """Write a packed model to a file, and use this file from now on.
+    """Write a packed model to a file, and use the file instead of the packed model.
 
     Raises:
-        ModelError: the packed data is no valid model.
+        ModelError: the packed data is not a valid model.
         OutputError: the file cannot be written, or another file exists.
     """
     data = packed_model.read(entry.packed)
@@ -199,17 +204,17 @@ def unpack_entry(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup, 
             raise OutputError(f"There is another file '{path}'; choose another name.")
         with atomic_write(path) as temporary:
             temporary.write_bytes(data)
-    bound = is_bound(mesh_object, entry)
+    was_bound = is_bound(mesh_object, entry)
     entry.path, entry.packed, entry.packed_bytes = stored_path_for(mesh_object, path), None, 0
-    model_files.allow(path)
-    if bound:
+    model_files.allow_path(path)
+    if was_bound:
         mesh_object.fdda.model, mesh_object.fdda.packed = entry.path, None
         registry.reset_players()
-    packed_model.remove_unused()
+    packed_model.remove_unused_texts()
 
 
 def entry_path(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) -> Path:
-    """Return the path of the model of an entry, or its path before packing.
+    """Return the path of the model file of an entry; for a packed model, the path that it was packed from.
 
     Raises:
         ModelError: the path in a saved file leads out of the file's folder.
@@ -230,15 +235,15 @@ def entry_info(mesh_object: bpy.types.Object, entry: bpy.types.PropertyGroup) ->
         return _info_cache[key]
     path = entry_path(mesh_object, entry)
     try:
-        status = os.stat(path)
+        file_status = os.stat(path)
     except OSError as error:
         raise ModelError(
             f"The model '{path}' cannot be read: {os_error_text(error)}; find it, or choose another."
         ) from error
-    key = (path, status.st_mtime_ns, status.st_size)
+    key = (path, file_status.st_mtime_ns, file_status.st_size)
     if key not in _info_cache:
-        for old in [old for old in _info_cache if old[0] == path]:
-            del _info_cache[old]
+        for outdated_key in [other_key for other_key in _info_cache if other_key[0] == path]:
+            del _info_cache[outdated_key]
         _info_cache[key] = read_model_info(path)
     return _info_cache[key]
 

@@ -18,39 +18,40 @@ from .opened_model import open_model
 
 
 def bind(
-    scene_rig: SceneRig, model: Path, use_in_render: bool = False, packed_text: bpy.types.Text | None = None
+    scene_rig: SceneRig, model_path: Path, use_in_render: bool = False, packed_text: bpy.types.Text | None = None
 ) -> None:
     """Bind a model to a rig and play it.
 
     Args:
         scene_rig: the rig.
-        model: path of the model, in any folder; a saved file stores it relative to itself.
-        use_in_render: final renders use the model too.
-        packed_text: the text datablock that holds the model (`packed_model`); `model` is then its original path.
+        model_path: path of the model file, in any folder. A saved .blend file stores it as a relative path.
+        use_in_render: whether final renders show the model instead of the rig.
+        packed_text: the text datablock that holds a packed model (`packed_model`); `model_path` is then the path that
+            the model was packed from.
 
     Raises:
-        ModelError: the file is no model, or was trained for another rig. The scene is unchanged.
+        ModelError: the file is not a model, or the model was trained for another rig. The scene is unchanged.
         RigError: the rig cannot be read, a model cannot replace its modifiers, or the object is linked.
     """
     mesh_object = scene_rig.mesh_object
     _check_editable(mesh_object)
     if mesh_object.mode == "EDIT":
         raise RigError(f"'{mesh_object.name}' is in edit mode; leave it first.")
-    model = model.absolute()
-    network = model_files.load_network(model) if packed_text is None else packed_model.load(packed_text)
+    model_path = model_path.absolute()
+    network = model_files.load_network(model_path) if packed_text is None else packed_model.load(packed_text)
     with model_disabled(mesh_object):
-        opened = open_model(scene_rig, network)
+        opened_model = open_model(scene_rig, network)
         stack = check_stack(mesh_object)
-        check_time_inputs(scene_rig, opened.rig.controls, stack)
+        check_time_inputs(scene_rig, opened_model.rig.controls, stack)
     if mesh_object.fdda.is_bound:
         unbind(mesh_object)
 
     if packed_text is None:
-        model_files.allow(model)
-    # The modifiers after the last deforming one stay on and work on the model's output.
+        model_files.allow_path(model_path)
+    # Modifiers after the last deforming modifier stay on and change the positions of the model.
     playback_modifier.add_modifier(mesh_object, stack.insert_index)
     binding = mesh_object.fdda
-    binding.model = stored_path_for(mesh_object, model)
+    binding.model = stored_path_for(mesh_object, model_path)
     binding.packed = packed_text
     binding.use_in_render = use_in_render
     binding.is_bound = True
@@ -77,8 +78,8 @@ def unbind(mesh_object: bpy.types.Object) -> None:
             mesh_object.modifiers.remove(modifier)
         if buffer is not None and buffer not in playback_modifier.used_buffers():
             position_buffer.remove_buffer(buffer)
-    for name in ("is_bound", "model", "packed", "use_in_render", "status"):
-        binding.property_unset(name)
+    for property_name in ("is_bound", "model", "packed", "use_in_render", "status"):
+        binding.property_unset(property_name)
     registry.reset_players()
 
 
@@ -92,13 +93,13 @@ def _check_editable(mesh_object: bpy.types.Object) -> None:
 
 
 def on_property_update(mesh_object: bpy.types.Object) -> None:
-    """Apply the changed properties of a bound object; the next evaluation shows them."""
+    """Apply the changed properties of a bound object; the next evaluation shows the result."""
     if mesh_object.fdda.is_bound:
         was_playing = mesh_object.fdda.is_playing
         modifier_switch.switch_modifiers(mesh_object)
         if mesh_object.fdda.is_playing != was_playing:
             registry.recreate_player(mesh_object)
-            # At once: a handler that sets the mode may run after ours, and a render evaluates no third time.
+            # Scan now: a handler that sets the mode may run after ours, and a render does not evaluate a third time.
             registry.scan()
         mesh_object.update_tag()
 
@@ -111,7 +112,7 @@ def on_mask_update(mesh_object: bpy.types.Object) -> None:
 
 @contextmanager
 def temporary_mode(mesh_object: bpy.types.Object, mode: str) -> Iterator[None]:
-    """Show a bound object in a mode, whatever drives or keys its own, and restore its binding afterwards."""
+    """Show a bound object in a mode, even if its mode is keyed or driven, and restore its binding afterwards."""
     binding = mesh_object.fdda
     previous_mode = binding.mode
     try:
@@ -136,32 +137,32 @@ def model_disabled(mesh_object: bpy.types.Object) -> Iterator[None]:
 
 
 @contextmanager
-def temporary_binding(scene_rig: SceneRig, model: Path | None) -> Iterator[None]:
+def temporary_binding(scene_rig: SceneRig, model_path: Path | None) -> Iterator[None]:
     """Play a model, and restore the binding of the object afterwards.
 
     Args:
         scene_rig: the rig.
-        model: path of the model; None to keep the bound model and show the rig.
+        model_path: path of the model file; None to keep the bound model and show the rig.
 
     Raises:
         FDDAError: as `bind`.
     """
     binding = scene_rig.mesh_object.fdda
-    if model is None:
+    if model_path is None:
         with model_disabled(scene_rig.mesh_object):
             yield
         return
-    previous = None
+    previous_arguments = None
     if binding.is_bound:
-        path = Path(binding.model) if binding.packed else model_files.model_path(scene_rig.mesh_object)
-        previous = (path, binding.use_in_render, binding.packed)
-    mode, stored_path = binding.mode, binding.model
-    bind(scene_rig, model)
+        previous_path = Path(binding.model) if binding.packed else model_files.model_path(scene_rig.mesh_object)
+        previous_arguments = (previous_path, binding.use_in_render, binding.packed)
+    previous_mode, previous_stored_path = binding.mode, binding.model
+    bind(scene_rig, model_path)
     try:
         yield
     finally:
         unbind(scene_rig.mesh_object)
-        if previous is not None:
-            bind(scene_rig, *previous)
-            binding.model = stored_path
-            binding.mode = mode
+        if previous_arguments is not None:
+            bind(scene_rig, *previous_arguments)
+            binding.model = previous_stored_path
+            binding.mode = previous_mode

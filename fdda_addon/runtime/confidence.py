@@ -15,11 +15,11 @@ _cached_call: tuple[object, bytes, list[tuple[str, float]] | None] | None = None
 
 
 def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float]] | None:
-    """Evaluate the confidence of each partition in the evaluated pose; runs the model once for each pose.
+    """Evaluate the confidence of each partition in the evaluated pose. The model runs once for each new pose.
 
     Returns:
-        Name of the main joint and confidence, 0 to 1, of each partition, in ascending order of confidence; None if the
-        model has no such output, or the pose cannot be read.
+        For each partition the name of its main joint and its confidence, 0 to 1, in ascending order of confidence.
+        None if the model has no such output, or if the pose cannot be read.
     """
     global _cached_call
     armature_object = armature_of(mesh_object)
@@ -27,25 +27,25 @@ def partition_confidence(mesh_object: bpy.types.Object) -> list[tuple[str, float
         return None
     try:
         network = model_files.network_of(mesh_object)
-        names = tuple(joint.name for joint in network.info.joints)
-        if any(name not in armature_object.data.bones for name in names if name != STATIC_JOINT):
+        joint_names = network.info.joint_names
+        if any(name not in armature_object.data.bones for name in joint_names if name != STATIC_JOINT):
             return None
         depsgraph = bpy.context.evaluated_depsgraph_get()
-        evaluated = [o.evaluated_get(depsgraph) for o in (mesh_object, armature_object)]
-        if not all(o.is_evaluated for o in evaluated):
+        evaluated_objects = [o.evaluated_get(depsgraph) for o in (mesh_object, armature_object)]
+        if not all(o.is_evaluated for o in evaluated_objects):
             return None
         scene_rig = SceneRig(mesh_object, armature_object)
-        pose_matrices = PoseReader(scene_rig, names, network.info.rest_matrices).read(*evaluated)
+        pose_matrices = PoseReader(scene_rig, joint_names, network.info.rest_matrices).read(*evaluated_objects)
         controls = ControlReader(scene_rig, network.info.controls).read(scene_rig, depsgraph)
         inputs = pose_matrices.tobytes() + controls.tobytes()
         if _cached_call is None or _cached_call[0] is not network or _cached_call[1] != inputs:
             confidence = network.confidence(pose_matrices[None], controls[None])
-            values = None
+            named_confidences = None
             if confidence is not None:
-                partitions = zip(network.info.partitions, confidence[0].tolist(), strict=True)
-                values = sorted(((names[p.joint], value) for p, value in partitions), key=lambda pair: pair[1])
-            _cached_call = (network, inputs, values)
+                names = (joint_names[partition.joint] for partition in network.info.partitions)
+                named_confidences = sorted(zip(names, confidence[0].tolist(), strict=True), key=lambda pair: pair[1])
+            _cached_call = (network, inputs, named_confidences)
         return _cached_call[2]
     except FDDAError:
-        # Playback reports the error itself.
+        # Playback reports this error too, where the user sees it.
         return None

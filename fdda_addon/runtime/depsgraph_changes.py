@@ -2,9 +2,9 @@
 """Reads from a dependency graph which parts of rigs an evaluation has changed.
 
 Blender does not document these rules; they were observed on 4.5 and 5.2. Edited data are also reported as transformed
-(`is_updated_transform`), although data have no transform. A mesh whose shape keys are driven is not reported so, nor
-one of which only positions were written. Posing reports an armature's data so in any case, and the armature object only
-when it was edited or moved.
+(`is_updated_transform`), although data have no transform. A mesh is not reported as transformed if its shape keys are
+driven, or if only positions were written. Posing reports the armature data as transformed; the armature object is
+reported only if it was edited or moved.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,10 @@ class DepsgraphChanges:
     """Parts of rigs that an evaluation has changed.
 
     Attributes:
-        mesh_objects: mesh objects; whether the geometry changed; whether anything besides the pose may have changed.
-        armatures: session ids of armature data; whether the parents of bones may have changed too.
-        meshes: session ids of meshes; whether more than the rest positions may have changed.
+        mesh_objects: for each changed mesh object: the object, whether its geometry changed, and whether anything
+            besides its pose may have changed.
+        armatures: by the session id of each changed armature: whether the parents of its bones may have changed too.
+        meshes: by the session id of each changed mesh: whether more than its rest positions may have changed.
     """
 
     mesh_objects: list[tuple[bpy.types.Object, bool, bool]]
@@ -29,27 +30,28 @@ class DepsgraphChanges:
 
     @staticmethod
     def read(depsgraph: bpy.types.Depsgraph) -> "DepsgraphChanges":
-        """Read the changes of an evaluation right after it."""
+        """Read the changes of the evaluation that has just ended."""
         changes = DepsgraphChanges([], {}, changed_meshes(depsgraph))
-        # Changed relations of the scene: on 4.5 nothing else reports that a vertex group was removed.
+        # On Blender 4.5 only changed relations of the scene report that a vertex group was removed.
         relations_changed = depsgraph.id_type_updated("SCENE")
         for update in depsgraph.updates:
-            datablock, is_geometry, is_transform = update.id, update.is_updated_geometry, update.is_updated_transform
+            datablock = update.id
+            geometry_changed, transform_changed = update.is_updated_geometry, update.is_updated_transform
             if isinstance(datablock, Object):
-                original = datablock.original
-                if original.type == "MESH":
-                    beyond_pose = relations_changed or is_transform or not is_geometry
-                    changes.mesh_objects.append((original, is_geometry, beyond_pose))
-                elif original.type == "ARMATURE" and is_geometry and is_transform:
-                    changes.armatures[original.data.session_uid] = True
+                original_object = datablock.original
+                if original_object.type == "MESH":
+                    changed_beyond_pose = relations_changed or transform_changed or not geometry_changed
+                    changes.mesh_objects.append((original_object, geometry_changed, changed_beyond_pose))
+                elif original_object.type == "ARMATURE" and geometry_changed and transform_changed:
+                    changes.armatures[original_object.data.session_uid] = True
             elif isinstance(datablock, Armature):
-                uid, is_posed = datablock.original.session_uid, is_geometry and is_transform
-                changes.armatures[uid] = changes.armatures.get(uid, False) or not is_posed
+                armature_uid, is_only_posed = datablock.original.session_uid, geometry_changed and transform_changed
+                changes.armatures[armature_uid] = changes.armatures.get(armature_uid, False) or not is_only_posed
         return changes
 
 
 def changed_meshes(depsgraph: bpy.types.Depsgraph) -> dict[int, bool]:
-    """Read `DepsgraphChanges.meshes` alone; in most frames they are empty and nothing else is needed."""
+    """Read only `DepsgraphChanges.meshes`: in most frames there are none, and nothing else has to be read."""
     meshes: dict[int, bool] = {}
     driven_keys, edited_keys = [], []
     for update in depsgraph.updates:
@@ -62,11 +64,11 @@ def changed_meshes(depsgraph: bpy.types.Depsgraph) -> dict[int, bool]:
                 edited_keys.append(datablock)
             else:
                 driven_keys.append(datablock)
-    for key in driven_keys:
-        uid = key.original.user.session_uid
-        if meshes.get(uid) is False:
-            del meshes[uid]
-    for key in edited_keys:
+    for shape_keys in driven_keys:
+        mesh_uid = shape_keys.original.user.session_uid
+        if meshes.get(mesh_uid) is False:
+            del meshes[mesh_uid]
+    for shape_keys in edited_keys:
         # Blender does not report the mesh when only a driver or an action of its shape keys has changed.
-        meshes[key.original.user.session_uid] = True
+        meshes[shape_keys.original.user.session_uid] = True
     return meshes

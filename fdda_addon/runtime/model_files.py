@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Loads each model once, and decides which paths in a .blend file may be followed to a model."""
+"""Loads each model once, and decides from which of the paths in a .blend file a model may be loaded."""
 
 import os
 from pathlib import Path
@@ -13,13 +13,13 @@ from . import packed_model
 from .network import Network
 
 _networks: dict[Path, tuple[tuple, Network]] = {}
-"""By the path of the model: modification time and size of the file, and what was loaded from it."""
+"""By the path of each model file: its modification time and size, and the model that was loaded from it."""
 _chosen_paths: set[Path] = set()
-"""The models that the user chose in this session."""
+"""Paths of the models that the user chose in this session."""
 
 
 def network_of(mesh_object: bpy.types.Object) -> Network:
-    """Return the model of a bound object: the one that is packed into the .blend file, else the one in its file.
+    """Return the model of a bound object: its packed model if there is one, else the model in its file.
 
     Raises:
         ModelError: the model cannot be loaded.
@@ -44,13 +44,14 @@ def load_network(path: Path) -> Network:
     return _networks[path][1]
 
 
-def release_unused() -> None:
+def release_unused_networks() -> None:
     """Free the models that no object of the open file is bound to."""
-    bound = [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]
-    used = {absolute_path(o, o.fdda.model) for o in bound if o.fdda.packed is None}
-    for path in _networks.keys() - used:
+    bound_objects = [o for o in bpy.data.objects if o.type == "MESH" and o.fdda.is_bound]
+    used_paths = {absolute_path(o, o.fdda.model) for o in bound_objects if o.fdda.packed is None}
+    for path in _networks.keys() - used_paths:
         del _networks[path]
-    packed_model.release_unused({o.fdda.packed.session_uid for o in bound if o.fdda.packed is not None})
+    used_texts = {o.fdda.packed.session_uid for o in bound_objects if o.fdda.packed is not None}
+    packed_model.release_unused_networks(used_texts)
 
 
 def model_path(mesh_object: bpy.types.Object) -> Path:
@@ -62,30 +63,30 @@ def model_path(mesh_object: bpy.types.Object) -> Path:
     return allowed_path(mesh_object, mesh_object.fdda.model)
 
 
-def allowed_path(mesh_object: bpy.types.Object, stored: str) -> Path:
-    """Return the absolute path of a model if it may be followed.
+def allowed_path(mesh_object: bpy.types.Object, stored_path: str) -> Path:
+    """Return the absolute path of a model if a model may be loaded from there.
 
     Args:
         mesh_object: the object that stores the path.
-        stored: the path as it is stored.
+        stored_path: the path as the object stores it.
 
     Raises:
         ModelError: the path leads out of the folder of the saved file, and the user has neither chosen the model nor
             trusted its folder.
     """
-    path = absolute_path(mesh_object, stored)
-    library = path_owner(mesh_object, stored).library
-    file = str(resolve_path(library.filepath)) if library else bpy.data.filepath
+    path = absolute_path(mesh_object, stored_path)
+    library = path_owner(mesh_object, stored_path).library
+    blend_path = str(resolve_path(library.filepath)) if library else bpy.data.filepath
     # Resolved, because a path relative to the open file may contain "..".
-    in_folder = not file or path.resolve().is_relative_to(Path(file).resolve().parent)
-    if not (in_folder or path.resolve() in _chosen_paths or is_trusted(path)):
+    is_in_folder = not blend_path or path.resolve().is_relative_to(Path(blend_path).resolve().parent)
+    if not (is_in_folder or path.resolve() in _chosen_paths or is_trusted(path)):
         raise ModelError(
-            f"The model '{path}' lies outside the folder of '{Path(file).name}' and is not followed; "
+            f"The model '{path}' lies outside the folder of '{Path(blend_path).name}' and is not followed; "
             "choose it again and pack it, move it beside the file, or add its folder in the preferences."
         )
     return path
 
 
-def allow(model: Path) -> None:
-    """Allow a model that the user chose in this session to be in any folder."""
-    _chosen_paths.add(model.resolve())
+def allow_path(model_path: Path) -> None:
+    """Allow loading a model that the user chose in this session from any folder."""
+    _chosen_paths.add(model_path.resolve())

@@ -6,19 +6,19 @@ import bpy
 from ..rig.modifier_stack import deforming_modifiers
 from ..scene.temporary_state import animated_paths
 from . import playback_modifier
-from .mode_override import overridden_mode, uses_model
+from .mode_override import overriding_mode, uses_model
 
 
 def animated_settings(mesh_object: bpy.types.Object) -> frozenset[str]:
-    """Return which of "mode", and of "show_viewport" and "show_render" of the FDDA modifier, are keyed or driven."""
-    paths = animated_paths(mesh_object)
-    if not paths:
+    """Return which settings are keyed or driven: "mode", and "show_viewport" and "show_render" of the FDDA modifier."""
+    all_paths = animated_paths(mesh_object)
+    if not all_paths:
         return frozenset()
     modifier = playback_modifier.find_modifier(mesh_object)
-    settings = {"fdda.mode": "mode"}
+    settings_by_path = {"fdda.mode": "mode"}
     if modifier is not None:
-        settings |= {modifier.path_from_id(name): name for name in ("show_viewport", "show_render")}
-    return frozenset(settings[path] for path in paths & settings.keys())
+        settings_by_path |= {modifier.path_from_id(name): name for name in ("show_viewport", "show_render")}
+    return frozenset(settings_by_path[path] for path in all_paths & settings_by_path.keys())
 
 
 def evaluated_uses_model(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsgraph, animated: frozenset[str]) -> bool:
@@ -26,32 +26,32 @@ def evaluated_uses_model(evaluated: bpy.types.Object, depsgraph: bpy.types.Depsg
 
     Args:
         evaluated: the evaluated object.
-        depsgraph: the graph that evaluated it.
+        depsgraph: the dependency graph that evaluated the object.
         animated: the result of `animated_settings`.
     """
-    visibility = "show_render" if depsgraph.mode == "RENDER" else "show_viewport"
-    if visibility in animated:
+    visibility_setting = "show_render" if depsgraph.mode == "RENDER" else "show_viewport"
+    if visibility_setting in animated:
         modifier = playback_modifier.find_modifier(evaluated)
-        if modifier is not None and not getattr(modifier, visibility):
+        if modifier is not None and not getattr(modifier, visibility_setting):
             return False
     return evaluated.fdda.mode != "RIG"
 
 
 def apply_visibility(mesh_object: bpy.types.Object, animated: frozenset[str]) -> None:
-    """Set the mode from the visibility of the FDDA modifier, which the user may have changed: off shows the rig.
+    """Set the mode from the visibility of the FDDA modifier, in case the user has changed it; hidden shows the rig.
 
     Args:
         mesh_object: the bound object.
-        animated: the result of `animated_settings`; the user does not set these.
+        animated: the result of `animated_settings`. Changes of these settings are not the user's.
     """
     binding, modifier = mesh_object.fdda, playback_modifier.find_modifier(mesh_object)
-    if modifier is None or overridden_mode(mesh_object.session_uid):
+    if modifier is None or overriding_mode(mesh_object.session_uid):
         return
     if modifier.show_viewport != binding.is_playing:
         if "show_viewport" in animated:
             return
         if "mode" in animated:
-            # Keyframes or drivers would set the mode back, so set the visibility instead.
+            # Keyframes or drivers would reset the mode, so set the visibility instead.
             modifier.show_viewport = binding.is_playing
         else:
             binding.mode = "FDDA" if modifier.show_viewport else "RIG"
@@ -84,15 +84,15 @@ def disconnect(modifier: bpy.types.NodesModifier) -> None:
         playback_modifier.set_buffer(modifier, None)
 
 
-def switch_modifiers(mesh_object: bpy.types.Object, playing: bool | None = None) -> None:
-    """Switch the modifiers of a bound object to those of its rig or to the FDDA modifier.
+def switch_modifiers(mesh_object: bpy.types.Object, show_model: bool | None = None) -> None:
+    """Switch a bound object between the modifiers of its rig and the FDDA modifier.
 
-    While a model plays, the modifiers of the rig are off in the viewport, and in renders if the user chose so. Their
-    visibility is stored in the object's properties, and mode RIG restores it.
+    While a model plays, the modifiers of the rig are off in the viewport, and in renders if the user chose so. The
+    object's properties store their visibility, and mode RIG restores it.
 
     Args:
         mesh_object: the bound object.
-        playing: whether the model plays; None to follow the mode.
+        show_model: whether to show the model; None to follow the mode.
     """
     binding = mesh_object.fdda
     modifier = playback_modifier.find_modifier(mesh_object)
@@ -100,16 +100,16 @@ def switch_modifiers(mesh_object: bpy.types.Object, playing: bool | None = None)
         binding.status = "The FDDA modifier was removed; bind the model again."
         binding.mode = "RIG"
         return
-    if playing is None:
-        playing = uses_model(mesh_object)
-    if playing and not binding.is_playing:
+    if show_model is None:
+        show_model = uses_model(mesh_object)
+    if show_model and not binding.is_playing:
         _store_visibility(mesh_object)
-    elif not playing and binding.is_playing:
+    elif not show_model and binding.is_playing:
         _restore_visibility(mesh_object)
     if modifier is not None:
-        modifier.show_viewport = playing
-        modifier.show_render = playing and binding.use_in_render
-    if playing:
+        modifier.show_viewport = show_model
+        modifier.show_render = show_model and binding.use_in_render
+    if show_model:
         binding.status = ""
         for stored, rig_modifier in _stored_modifiers(mesh_object):
             rig_modifier.show_viewport = False
@@ -141,11 +141,11 @@ def _restore_visibility(mesh_object: bpy.types.Object) -> None:
     mesh_object.fdda.modifiers.clear()
     mesh_object.fdda.is_playing = False
     if mesh_object.data.shape_keys is not None:
-        # The player has muted the evaluated shape keys.
+        # The player has muted the evaluated shape keys, and Blender has to copy them again.
         mesh_object.data.shape_keys.update_tag()
 
 
 def _stored_modifiers(mesh_object: bpy.types.Object) -> list[tuple]:
-    """Return the stored visibility of each modifier of the rig, with the modifier."""
-    by_uid = {modifier.persistent_uid: modifier for modifier in mesh_object.modifiers}
-    return [(stored, by_uid[stored.uid]) for stored in mesh_object.fdda.modifiers if stored.uid in by_uid]
+    """Return the modifiers of the rig whose visibility is stored, as pairs of stored visibility and modifier."""
+    modifiers = {modifier.persistent_uid: modifier for modifier in mesh_object.modifiers}
+    return [(stored, modifiers[stored.uid]) for stored in mesh_object.fdda.modifiers if stored.uid in modifiers]

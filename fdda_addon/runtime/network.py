@@ -21,18 +21,18 @@ from ..core.model import (
 from ..core.native_library import runtime_advice
 from ..core.rig import Rig
 
-MULTITHREADED_VERTICES = 100_000
-"""From this number of vertices on, a second thread gains more time than it costs."""
+MIN_MULTITHREADED_VERTICES = 100_000
+"""Smallest number of vertices for which several threads run the model; starting them takes time too."""
 MAX_THREADS = 4
 MAX_KEPT_EXECUTIONS = 4
-"""Executions that `Network.positions` keeps, one for each number of poses."""
+"""Largest number of executions that `Network.positions` keeps, one for each number of poses."""
 
 
 class Network:
     """A model that is loaded into ONNX Runtime.
 
     Attributes:
-        path: path of the file.
+        path: path of the model file.
         info: metadata of the model.
     """
 
@@ -40,17 +40,17 @@ class Network:
         """Load a model.
 
         Args:
-            path: path of the file.
+            path: path of the model file.
             data: the bytes of a model that is not in a file; `path` is then its name in error messages.
 
         Raises:
-            ModelError: the file is no model, or ONNX Runtime refuses it.
+            ModelError: the file is not a model, or ONNX Runtime refuses it.
         """
         self.path = path
         self.info, data = read_model(path) if data is None else (check_model(data, path), data)
         self._skin = read_skin(data, self.info, path)
         try:
-            # Imported here so that Blender starts without it.
+            # Imported here so that Blender starts without ONNX Runtime.
             import onnxruntime
         except ImportError as error:
             version = ".".join(map(str, sys.version_info[:2]))
@@ -61,14 +61,14 @@ class Network:
             raise ModelError(f"ONNX Runtime cannot be loaded by Python {version} ({error}); {advice}.") from error
         onnxruntime.set_default_logger_severity(3)
         onnxruntime.disable_telemetry_events()
-        options = onnxruntime.SessionOptions()
-        is_large = self.info.vertex_count >= MULTITHREADED_VERTICES
-        options.intra_op_num_threads = min(MAX_THREADS, os.cpu_count() or 1) if is_large else 1
-        options.inter_op_num_threads = 1
+        session_options = onnxruntime.SessionOptions()
+        is_large = self.info.vertex_count >= MIN_MULTITHREADED_VERTICES
+        session_options.intra_op_num_threads = min(MAX_THREADS, os.cpu_count() or 1) if is_large else 1
+        session_options.inter_op_num_threads = 1
         # Threads that spin between frames would take processor time from Blender.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        session_options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
-            self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+            self._session = onnxruntime.InferenceSession(data, session_options, providers=["CPUExecutionProvider"])
         except Exception as error:  # ONNX Runtime's exceptions have no other common base.
             raise ModelError(
                 f"ONNX Runtime refuses the model '{path}' ({_first_line(error)}); train it again."
@@ -84,7 +84,7 @@ class Network:
 
         Returns:
             (N, V, 3) float32, mesh-object space, mesh units. The next call with the same number of poses overwrites
-            this array, so that a frame needs no new memory.
+            this array, so that playback allocates no memory for each frame.
 
         Raises:
             ModelError: the model fails, or the values of its controls are missing.
@@ -101,7 +101,7 @@ class Network:
         return execution.run()
 
     def confidence(self, pose_matrices: np.ndarray, controls: np.ndarray | None = None) -> np.ndarray | None:
-        """Evaluate the confidence of each partition; it takes as long as the positions, so not for every frame.
+        """Evaluate the confidence of each partition. This takes as long as `positions`, too long for each frame.
 
         Args:
             pose_matrices, controls: as for `positions`.
@@ -119,10 +119,14 @@ class Network:
             inputs[CONTROLS_INPUT] = np.asarray(self._check_controls(controls, len(pose_matrices)), np.float32)
         try:
             (confidence,) = self._session.run([CONFIDENCE_OUTPUT], inputs)
-        except Exception as error:  # As above.
+        except Exception as error:  # ONNX Runtime's exceptions have no other common base.
             raise ModelError(f"The model '{self.path}' failed ({_first_line(error)}); train it again.") from error
-        if confidence.shape != (len(pose_matrices), len(self.info.partitions)):
-            raise ModelError(f"The model '{self.path}' gives confidence of another shape than it says; train it again.")
+        expected_shape = (len(pose_matrices), len(self.info.partitions))
+        if confidence.shape != expected_shape:
+            raise ModelError(
+                f"The model '{self.path}' returns confidence of shape {confidence.shape}, not {expected_shape}; "
+                "train it again."
+            )
         return confidence
 
     def linear_rig(self, rig: Rig) -> Rig:
@@ -134,18 +138,18 @@ class Network:
 
     def _check_controls(self, controls: np.ndarray | None, pose_count: int) -> np.ndarray:
         """Return the values of the controls, (N, C), if they have the shape that the model takes."""
-        expected = (pose_count, len(self.info.controls))
+        expected_shape = (pose_count, len(self.info.controls))
         shape = None if controls is None else np.shape(controls)
-        if shape != expected:
+        if shape != expected_shape:
             raise ModelError(
-                f"The model '{self.path}' has {expected[1]} controls and takes their values as an array {expected}; "
-                f"it was given {'none' if shape is None else shape}."
+                f"The model '{self.path}' has {expected_shape[1]} controls and takes their values as an array "
+                f"{expected_shape}; it was given {'none' if shape is None else shape}."
             )
         return controls
 
 
 class Execution:
-    """Input and output arrays for a number of poses, bound to a session; several threads can run one model at a time.
+    """Input and output arrays of a model for a fixed number of poses. Each thread can run the model on its own arrays.
 
     Attributes:
         poses: (N, J, 4, 4) float32, pose matrices, mesh-object space, mesh units. Set them before `run`.
@@ -159,13 +163,13 @@ class Execution:
         self.poses = np.zeros((pose_count, len(info.joints), 4, 4), np.float32)
         self.controls = np.zeros((pose_count, len(info.controls)), np.float32)
         self.positions = np.empty((pose_count, info.vertex_count, 3), np.float32)
-        self._binding = self._session.io_binding()
-        self._binding.bind_input(POSE_INPUT, "cpu", 0, np.float32, self.poses.shape, self.poses.ctypes.data)
+        self._io_binding = self._session.io_binding()
+        self._io_binding.bind_input(POSE_INPUT, "cpu", 0, np.float32, self.poses.shape, self.poses.ctypes.data)
         if info.controls:
             address = self.controls.ctypes.data
-            self._binding.bind_input(CONTROLS_INPUT, "cpu", 0, np.float32, self.controls.shape, address)
+            self._io_binding.bind_input(CONTROLS_INPUT, "cpu", 0, np.float32, self.controls.shape, address)
         address = self.positions.ctypes.data
-        self._binding.bind_output(POSITIONS_OUTPUT, "cpu", 0, np.float32, self.positions.shape, address)
+        self._io_binding.bind_output(POSITIONS_OUTPUT, "cpu", 0, np.float32, self.positions.shape, address)
 
     def run(self) -> np.ndarray:
         """Run the model on `poses` and `controls`, and return `positions`.
@@ -174,8 +178,8 @@ class Execution:
             ModelError: the model fails.
         """
         try:
-            self._session.run_with_iobinding(self._binding)
-        except Exception as error:  # As above.
+            self._session.run_with_iobinding(self._io_binding)
+        except Exception as error:  # ONNX Runtime's exceptions have no other common base.
             raise ModelError(f"The model '{self._path}' failed ({_first_line(error)}); train it again.") from error
         return self.positions
 

@@ -17,7 +17,7 @@ class OpenedModel:
 
     Attributes:
         network: the loaded model.
-        rig: the rig of the scene, with the joints, controls and unit of the model, and the skin weights of its mesh.
+        rig: the rig of the scene, with the joints, controls and unit of the model, and the skin weights of the mesh.
     """
 
     network: Network
@@ -33,7 +33,7 @@ def open_model(scene_rig: SceneRig, model: Path | Network) -> OpenedModel:
     """Open a model for a rig.
 
     Args:
-        scene_rig: the rig, with the deformation that was recorded.
+        scene_rig: the rig; its modifiers are on, as they were while it was recorded.
         model: path of the model, or the loaded model.
 
     Raises:
@@ -45,7 +45,7 @@ def open_model(scene_rig: SceneRig, model: Path | Network) -> OpenedModel:
 
 
 def read_matching_rig(scene_rig: SceneRig, path: Path, info: ModelInfo) -> Rig:
-    """Read a rig with the joints and controls of a model, and check that it is the one that the model was trained for.
+    """Read a rig with the joints and controls of a model, and check that the model was trained for this rig.
 
     Args:
         scene_rig: the rig.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Packs models into the .blend file.
 
-The bytes are a custom property of a text datablock, which Blender never evaluates: those of a mesh object would be
-copied with each evaluated copy. The text explains what it is. The objects that use the model point to it, so Blender
-appends and links it with them, and removes it with the last of them.
+The bytes are a custom property of a text datablock, because Blender never evaluates texts. A custom property of a mesh
+object would be copied with each evaluated copy. The text itself says where its model is. The objects that use the model
+point to the text, so Blender appends and links it with them, and removes it with the last object.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ MAX_PROPERTY_BYTES = (1 << 31) - 1
 """Blender's limit for a custom property."""
 
 _networks: dict[int, Network] = {}
-"""The loaded models by the session ids of their text datablocks."""
+"""The loaded models, by the session ids of their text datablocks."""
 
 
 def pack(name: str, data: bytes) -> bpy.types.Text:
@@ -34,7 +34,7 @@ def pack(name: str, data: bytes) -> bpy.types.Text:
         The text datablock.
 
     Raises:
-        ModelError: the bytes are no model, or too large.
+        ModelError: the bytes are not a model, or too large.
     """
     check_model(data, name)
     if len(data) > min(MAX_BYTES, MAX_PROPERTY_BYTES):
@@ -62,25 +62,25 @@ def read(text: bpy.types.Text) -> bytes:
 
 
 def load(text: bpy.types.Text) -> Network:
-    """Load a packed model, once.
+    """Load a packed model, or return the loaded one.
 
     Raises:
-        ModelError: the text holds no model, or one that is refused.
+        ModelError: the text holds no model, or an invalid one.
     """
     if text.session_uid not in _networks:
         network = Network(Path(text.name), read(text))
-        release_unused({other.session_uid for other in bpy.data.texts})
+        release_unused_networks({other_text.session_uid for other_text in bpy.data.texts})
         _networks[text.session_uid] = network
     return _networks[text.session_uid]
 
 
-def release_unused(used: set[int]) -> None:
-    """Free all loaded models except those of the texts with these session ids."""
-    for uid in _networks.keys() - used:
-        del _networks[uid]
+def release_unused_networks(used_text_uids: set[int]) -> None:
+    """Free the loaded models of all texts except the texts with these session ids."""
+    for text_uid in _networks.keys() - used_text_uids:
+        del _networks[text_uid]
 
 
-def remove_unused() -> None:
+def remove_unused_texts() -> None:
     """Remove the text datablocks of models that no object uses any more."""
     for text in [text for text in bpy.data.texts if PACKED_MODEL_KEY in text and text.users == 0]:
         bpy.data.texts.remove(text)

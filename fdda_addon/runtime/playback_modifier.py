@@ -36,7 +36,7 @@ def add_modifier(mesh_object: bpy.types.Object, index: int) -> bpy.types.NodesMo
     modifier.show_in_editmode = True
     modifier.show_on_cage = False
     modifier.show_expanded = False
-    # A new modifier is not the last where another one is pinned to the end.
+    # A new modifier is not the last one if another modifier is pinned to the end of the stack.
     mesh_object.modifiers.move(mesh_object.modifiers.find(modifier.name), index)
     return modifier
 
@@ -52,7 +52,7 @@ def has_playback_group(modifier: bpy.types.Modifier) -> bool:
 
 
 def is_from_library(modifier: bpy.types.NodesModifier) -> bool:
-    """Return whether a library override has a modifier from its library."""
+    """Return whether a modifier of a library override comes from its library."""
     return modifier.id_data.override_library is not None and modifier.is_override_data
 
 
@@ -74,11 +74,11 @@ def used_buffers() -> set[bpy.types.Object]:
     return {buffer for modifier in modifiers if (buffer := buffer_of(modifier)) is not None}
 
 
-def _buffer_socket(group: bpy.types.NodeTree) -> str:
-    for item in group.interface.items_tree:
+def _buffer_socket(node_group: bpy.types.NodeTree) -> str:
+    for item in node_group.interface.items_tree:
         if item.item_type == "SOCKET" and item.in_out == "INPUT" and item.socket_type == "NodeSocketObject":
             return item.identifier
-    raise KeyError(f"the node group '{group.name}' has no input for the positions")
+    raise KeyError(f"the node group '{node_group.name}' has no input for the positions")
 
 
 def _ensure_node_group() -> bpy.types.NodeTree:
@@ -86,48 +86,48 @@ def _ensure_node_group() -> bpy.types.NodeTree:
 
     It leaves the mesh unchanged if the position buffer is missing or has another number of vertices.
     """
-    for group in bpy.data.node_groups:
-        if PLAYBACK_GROUP_KEY in group and group.library is None:
-            return group
-    group = bpy.data.node_groups.new(GROUP_NAME, "GeometryNodeTree")
-    group[PLAYBACK_GROUP_KEY] = True
-    group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
-    group.interface.new_socket("Positions", in_out="INPUT", socket_type="NodeSocketObject")
-    group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    for node_group in bpy.data.node_groups:
+        if PLAYBACK_GROUP_KEY in node_group and node_group.library is None:
+            return node_group
+    node_group = bpy.data.node_groups.new(GROUP_NAME, "GeometryNodeTree")
+    node_group[PLAYBACK_GROUP_KEY] = True
+    node_group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    node_group.interface.new_socket("Positions", in_out="INPUT", socket_type="NodeSocketObject")
+    node_group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
 
     def add_node(node_type: str, column: int, row: int, **settings: str) -> bpy.types.Node:
-        node = group.nodes.new(node_type)
+        node = node_group.nodes.new(node_type)
         node.location = (200 * column, -200 * row)
         for name, value in settings.items():
             setattr(node, name, value)
         return node
 
-    inputs = add_node("NodeGroupInput", 0, 0)
+    group_input = add_node("NodeGroupInput", 0, 0)
     object_info = add_node("GeometryNodeObjectInfo", 1, 1, transform_space="ORIGINAL")
     position = add_node("GeometryNodeInputPosition", 1, 2)
-    index = add_node("GeometryNodeInputIndex", 1, 3)
-    sample = add_node("GeometryNodeSampleIndex", 2, 1, data_type="FLOAT_VECTOR", domain="POINT")
+    vertex_index = add_node("GeometryNodeInputIndex", 1, 3)
+    sample_index = add_node("GeometryNodeSampleIndex", 2, 1, data_type="FLOAT_VECTOR", domain="POINT")
     mesh_size, buffer_size = (add_node("GeometryNodeAttributeDomainSize", 2, row) for row in (2, 3))
     set_position = add_node("GeometryNodeSetPosition", 3, 0)
-    equal = add_node("FunctionNodeCompare", 3, 2, data_type="INT", operation="EQUAL")
-    first, second = (socket for socket in equal.inputs if socket.type == "INT")
+    compare_sizes = add_node("FunctionNodeCompare", 3, 2, data_type="INT", operation="EQUAL")
+    mesh_size_socket, buffer_size_socket = (socket for socket in compare_sizes.inputs if socket.type == "INT")
     switch = add_node("GeometryNodeSwitch", 4, 0, input_type="GEOMETRY")
-    outputs = add_node("NodeGroupOutput", 5, 0)
-    for source, target in (
-        (inputs.outputs["Geometry"], set_position.inputs["Geometry"]),
-        (inputs.outputs["Positions"], object_info.inputs["Object"]),
-        (object_info.outputs["Geometry"], sample.inputs["Geometry"]),
-        (position.outputs["Position"], sample.inputs["Value"]),
-        (index.outputs["Index"], sample.inputs["Index"]),
-        (sample.outputs["Value"], set_position.inputs["Position"]),
-        (inputs.outputs["Geometry"], mesh_size.inputs["Geometry"]),
+    group_output = add_node("NodeGroupOutput", 5, 0)
+    for output_socket, input_socket in (
+        (group_input.outputs["Geometry"], set_position.inputs["Geometry"]),
+        (group_input.outputs["Positions"], object_info.inputs["Object"]),
+        (object_info.outputs["Geometry"], sample_index.inputs["Geometry"]),
+        (position.outputs["Position"], sample_index.inputs["Value"]),
+        (vertex_index.outputs["Index"], sample_index.inputs["Index"]),
+        (sample_index.outputs["Value"], set_position.inputs["Position"]),
+        (group_input.outputs["Geometry"], mesh_size.inputs["Geometry"]),
         (object_info.outputs["Geometry"], buffer_size.inputs["Geometry"]),
-        (mesh_size.outputs["Point Count"], first),
-        (buffer_size.outputs["Point Count"], second),
-        (equal.outputs["Result"], switch.inputs["Switch"]),
-        (inputs.outputs["Geometry"], switch.inputs["False"]),
+        (mesh_size.outputs["Point Count"], mesh_size_socket),
+        (buffer_size.outputs["Point Count"], buffer_size_socket),
+        (compare_sizes.outputs["Result"], switch.inputs["Switch"]),
+        (group_input.outputs["Geometry"], switch.inputs["False"]),
         (set_position.outputs["Geometry"], switch.inputs["True"]),
-        (switch.outputs["Output"], outputs.inputs["Geometry"]),
+        (switch.outputs["Output"], group_output.inputs["Geometry"]),
     ):
-        group.links.new(source, target)
-    return group
+        node_group.links.new(output_socket, input_socket)
+    return node_group

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A player: reads the evaluated pose of one bound object, runs its model and writes the positions."""
+"""The player of a bound object: reads its evaluated pose, runs its model and writes the positions."""
 
 import threading
 from collections.abc import Iterator, Sequence
@@ -20,12 +20,12 @@ from ..scene.mask import mask_key, read_mask
 from ..scene.mesh import set_mesh_positions
 from ..scene.scene_rig import SceneRig, armature_of
 from . import driver, rig_signature
-from .mode_override import overridden_mode
+from .mode_override import overriding_mode
 from .model_files import network_of
 from .network import Execution
 
 VIEWPORT_KEY = "fdda_viewport"
-"""Custom property of the evaluated mesh objects of a viewport; it is removed with the evaluated copy."""
+"""Custom property that marks the evaluated mesh objects of a viewport. Blender removes it with the evaluated copy."""
 
 
 class ModelInputs(NamedTuple):
@@ -47,20 +47,20 @@ class Player:
 
     Attributes:
         object_uid: session id of the object.
-        network: its model.
-        signature: the rig's signature when it was last checked.
-        error: the exception that stopped playback during an evaluation.
-        needs_recreation: its armature has other bones now.
-        new_inputs: inputs that the model has to run for; None while they are unchanged.
-        has_moved: it had new inputs since the last update of the batches, which resets this.
-        execution: the execution whose arrays hold its positions.
-        depsgraphs: keys of the dependency graphs that have evaluated its buffer (`playback`).
-        needs_viewport_record: it was evaluated with shape keys, perhaps for a viewport (`VIEWPORT_KEY`).
-        lock: held from `read_pose` to `write_positions`.
+        network: the model of the object.
+        signature: signature of the rig at its last check.
+        error: the exception that stopped playback during an evaluation; None if there was none.
+        needs_recreation: whether the armature has other bones than those that the player reads.
+        new_inputs: inputs for which the model has to run; None if the inputs are unchanged.
+        has_moved: whether there were new inputs since the last update of the batches, which resets it.
+        execution: the execution whose arrays hold the positions.
+        depsgraph_keys: keys of the dependency graphs that have evaluated the position buffer (`playback`).
+        needs_viewport_record: whether an evaluated object has shape keys and is not marked by `VIEWPORT_KEY`.
+        lock: the lock that is held from `read_pose` to `write_positions`.
     """
 
     skips_models = False
-    """Keep the positions that were shown last instead of running models (`playback.without_model_runs`)."""
+    """Whether players keep their last positions instead of running models (`playback.without_model_runs`)."""
 
     def __init__(self, mesh_object: bpy.types.Object, buffer: bpy.types.Object):
         """Create the player of a bound object.
@@ -89,7 +89,7 @@ class Player:
         self.execution = self._single_execution = Execution(self.network, 1)
         self.new_inputs: ModelInputs | None = None
         self.has_moved = False
-        self.depsgraphs: set[tuple[str, int, str]] = set()
+        self.depsgraph_keys: set[tuple[str, int, str]] = set()
         self.needs_viewport_record = False
         # A render may evaluate on another thread while the window does.
         self.lock = threading.Lock()
@@ -97,7 +97,7 @@ class Player:
         self._positions: np.ndarray | None = None
         self._reported_warning = self._warning = ""
         self.execution.poses[0] = info.rest_matrices
-        # The handlers have run already when the first pose is played, so check the model's output here.
+        # The first pose is played after the handlers have run, so check the output of the model here.
         self._check_finite(self.execution.run())
         self.update_driver(mesh_object, buffer)
 
@@ -120,7 +120,7 @@ class Player:
         return driver.dependency_inputs(self.scene_rig(mesh_object), self.network.info.joint_names)
 
     def find_object(self) -> bpy.types.Object | None:
-        """Find the object, also when it was renamed; return None when it was removed or is no longer bound."""
+        """Find the object, even if it was renamed; return None if it was removed or is no longer bound."""
         mesh_object = bpy.data.objects.get(self._name)
         if mesh_object is None or mesh_object.session_uid != self.object_uid:
             mesh_object = next((o for o in bpy.data.objects if o.session_uid == self.object_uid), None)
@@ -139,7 +139,7 @@ class Player:
         return (
             armature_object is not None
             and armature_object.session_uid == self._armature_uid
-            and mesh_object.data.session_uid == self.signature.mesh
+            and mesh_object.data.session_uid == self.signature.mesh_uid
             and self.signature.skin[0] == rig_signature.armature_modifier_settings(mesh_object)
         )
 
@@ -148,7 +148,7 @@ class Player:
         return self.signature.skin == rig_signature.skin_signature(mesh_object)
 
     def has_same_bones(self, mesh_object: bpy.types.Object, compare_parents: bool) -> bool:
-        """Return whether its armature has the same bones in the same order, with the same rest pose."""
+        """Return whether the armature of the object has the same bones in the same order, with the same rest pose."""
         armature_object = armature_of(mesh_object)
         if armature_object is None:
             return False
@@ -158,8 +158,8 @@ class Player:
         )
 
     def has_same_rest_positions(self, mesh_object: bpy.types.Object) -> bool:
-        """Return whether its vertices have the same rest positions."""
-        return rig_signature.rest_digest(mesh_object.data) == self.signature.rest
+        """Return whether the vertices of the object have the same rest positions."""
+        return rig_signature.rest_digest(mesh_object.data) == self.signature.rest_digest
 
     def check_rig(self, mesh_object: bpy.types.Object) -> None:
         """Check that the rig is the one that the model was trained for.
@@ -175,25 +175,25 @@ class Player:
         return self._mask is not None
 
     def update_mask(self, mesh_object: bpy.types.Object, weights_changed: bool) -> bool:
-        """Read the mask of the object again where it may have changed.
+        """Read the mask of the object again if it may have changed.
 
         Args:
             mesh_object: the object.
-            weights_changed: its vertex groups may have other weights.
+            weights_changed: whether weights of its vertex groups may have changed.
 
         Returns:
-            Whether the mask changed, so that the pose has to be played again.
+            Whether the mask has changed, so that the pose has to be played again.
         """
-        key = mask_key(mesh_object)
-        if key == self._mask_key and not (weights_changed and self._mask is not None):
+        new_key = mask_key(mesh_object)
+        if new_key == self._mask_key and not (weights_changed and self._mask is not None):
             return False
-        mask = read_mask(mesh_object)
+        new_mask = read_mask(mesh_object)
         with self.lock:
-            self._mask_key, previous, self._mask = key, self._mask, mask
-            if mask == previous:
+            self._mask_key, previous_mask, self._mask = new_key, self._mask, new_mask
+            if new_mask == previous_mask:
                 return False
-            self._blend = None if self._blend is None else self._blend.with_mask(mask)
-            # The positions that are shown have the previous mask.
+            self._blend = None if self._blend is None else self._blend.with_mask(new_mask)
+            # The shown positions have the previous mask.
             self._shown_inputs = None
         return True
 
@@ -218,7 +218,7 @@ class Player:
 
     @contextmanager
     def capture_errors(self) -> Iterator[None]:
-        """Store any exception in `error`: a getter would lose it, and SystemExit would end Blender."""
+        """Store any exception of the block in `error`: a getter would lose it, and SystemExit would end Blender."""
         try:
             yield
         except FDDAError as error:
@@ -256,8 +256,8 @@ class Player:
             # Animators hide a character with a scale of zero.
             return False
         controls = self._control_reader.values(owners)
-        # In mode RIG the modifiers are just being switched, so the strength does not matter.
-        strength = 0.0 if (overridden_mode(self.object_uid) or binding.mode) == "LINEAR" else binding.strength
+        # In mode RIG the modifiers are about to be switched, so the strength does not matter.
+        strength = 0.0 if (overriding_mode(self.object_uid) or binding.mode) == "LINEAR" else binding.strength
         inputs = pose_matrices.tobytes(), controls.tobytes(), strength
         if inputs != self._shown_inputs and not (Player.skips_models and self._positions is not None):
             self._warning = ""
@@ -272,30 +272,30 @@ class Player:
 
     def run_model(self) -> None:
         """Run the model for `new_inputs` alone."""
-        # An exception leaves nothing shown, so the next evaluation tries again.
+        # After an exception no inputs count as shown, so the next evaluation tries again.
         self._shown_inputs, shown_inputs = None, self._shown_inputs
         self.execution = self._single_execution
         if self.new_inputs.strength > 0:
             self.execution.poses[0] = self.new_inputs.pose_matrices
             self.execution.controls[0] = self.new_inputs.controls
             self.execution.run()
-        self.take_positions(self.execution, 0)
+        self.set_positions(self.execution, 0)
         self._shown_inputs = shown_inputs
 
-    def take_positions(self, execution: Execution, index: int) -> None:
-        """Take the positions of `new_inputs` from one pose of an execution, without copying them."""
-        self.execution, self._positions = execution, execution.positions[index]
+    def set_positions(self, execution: Execution, pose_index: int) -> None:
+        """Use the positions of one pose of an execution, without copying them, as the positions of `new_inputs`."""
+        self.execution, self._positions = execution, execution.positions[pose_index]
         self._check_finite(self._positions)
         strength = self.new_inputs.strength
         if strength < 1 or self._mask is not None:
-            model_positions = execution.positions[index : index + 1]
+            model_positions = execution.positions[pose_index : pose_index + 1]
             pose_matrices, strengths = self.new_inputs.pose_matrices[None], np.array([strength], np.float32)
             self._positions = self._blend.apply(model_positions, pose_matrices, strengths)[0]
 
     def write_positions(self, buffer: bpy.types.Object, mesh_object: bpy.types.Object) -> None:
-        """Write the positions to an evaluated position buffer, also unchanged ones: evaluation may have reset them."""
+        """Write the positions to an evaluated position buffer, even unchanged: an evaluation may have reset them."""
         set_mesh_positions(buffer.data, self._positions)
-        # A bake also comes here where renders show the rig, and needs the shape keys.
+        # A bake may evaluate the buffer while renders show the rig, and then needs the shape keys.
         if mesh_object.data.shape_keys is not None:
             if VIEWPORT_KEY in mesh_object:
                 _mute_shape_keys(mesh_object)
@@ -316,12 +316,12 @@ class Player:
         skin_matrices = pose_matrices @ np.linalg.inv(info.rest_matrices)
         is_finite = np.isfinite(skin_matrices).all(axis=(1, 2))
         for joint in np.flatnonzero(~is_finite):
-            parent = info.joints[joint].parent  # Repaired already: parents come before their children.
+            parent = info.joints[joint].parent  # Already repaired, because parents come before their children.
             skin_matrices[joint] = skin_matrices[parent] if parent >= 0 else np.eye(4)
-        first_name = info.joints[int(np.argmin(is_finite))].name
+        first_joint_name = info.joints[int(np.argmin(is_finite))].name
         self._warning = (
-            f"The pose of the joint '{first_name}' of '{armature_name}' is not a number; what it moves follows the "
-            "joint above."
+            f"The pose of the joint '{first_joint_name}' of '{armature_name}' is not a number; what it moves follows "
+            "the joint above."
         )
         return (skin_matrices @ info.rest_matrices).astype(np.float32)
 
@@ -368,12 +368,12 @@ class Player:
 
 
 def _mute_shape_keys(mesh_object: bpy.types.Object) -> None:
-    """Mute the shape keys of an evaluated object: Blender mixes them whether anything reads them or not.
+    """Mute the shape keys of an evaluated object, because Blender mixes them even if no modifier reads the result.
 
-    Only for viewports in which the model is on: whatever shows the rig has its shape keys. The user's settings come
-    back when Blender copies the shape keys again. Shape keys that another object shares stay as they are.
+    This is only done in viewports that show the model; everything that shows the rig needs its shape keys. The user's
+    settings are restored when Blender copies the shape keys again. Shape keys that another object shares stay unmuted.
     """
-    keys = mesh_object.data.shape_keys
-    # A muted first key means that all were muted since they were copied, or that the user muted it.
-    if keys is not None and not keys.key_blocks[0].mute and mesh_object.original.data.users == 1:
-        write(keys.key_blocks, MUTE_ELEMENT, np.ones(len(keys.key_blocks), bool))
+    shape_keys = mesh_object.data.shape_keys
+    # If the first key is muted, all keys were muted since Blender copied them, or the user muted it.
+    if shape_keys is not None and not shape_keys.key_blocks[0].mute and mesh_object.original.data.users == 1:
+        write(shape_keys.key_blocks, MUTE_ELEMENT, np.ones(len(shape_keys.key_blocks), bool))

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Batches: players of one model that move in the same frames run the model once for all their poses.
+"""Batches of players: players of one model that move in the same frames run the model once for all their poses.
 
-The position buffers of a batch depend on one batch driver: an object whose driver reads the inputs of all members and
-whose getter plays them. Blender then evaluates all members whenever one of them moves, so a batch exists only while
-frames change. It starts with the second frame in which the same players move, and ends when only some of them do.
+The position buffers of a batch depend on one batch driver: an object whose driver reads the inputs of all members, and
+whose getter plays all members. Blender then evaluates all members whenever one of them moves, so a batch exists only
+while frames change. It starts with the second frame in which the same players move, and ends when only some of them
+move.
 """
 
 from collections.abc import Mapping
@@ -18,9 +19,9 @@ from .network import Execution, Network
 from .player import Player
 
 MIN_BATCH_SIZE = 4
-"""Players in a batch; with fewer, one call for each costs less than waiting for all."""
+"""Smallest number of players in a batch."""
 MAX_EXECUTIONS_IN_USE = 4
-"""Executions that a batch keeps besides a new one: arrays of which a member still shows positions."""
+"""Largest number of executions that a batch keeps because members still show their positions."""
 BATCH_DRIVER_KEY = "fdda_batch_driver"
 """Custom property that marks batch drivers."""
 
@@ -31,11 +32,11 @@ def is_batch_driver(scene_object: bpy.types.Object) -> bool:
 
 
 class PlayerBatch:
-    """Players that one batch driver plays.
+    """A group of players that one batch driver plays.
 
     Attributes:
-        network: the model of all of them.
-        members: the players by the session ids of their position buffers.
+        network: the model of all players.
+        members: the players, by the session ids of their position buffers.
     """
 
     def __init__(self, network: Network, members: Mapping[int, Player]):
@@ -46,11 +47,17 @@ class PlayerBatch:
         """Create the batch driver and make the position buffers of all members depend on it."""
         objects = {o.session_uid: o for o in bpy.data.objects}
         batch_driver = bpy.data.objects.new("FDDA batch", None)
-        # A fake user protects it from Purge.
+        # A fake user protects the batch driver from Purge Unused Data.
         batch_driver.is_runtime_data, batch_driver.use_fake_user, batch_driver[BATCH_DRIVER_KEY] = True, True, True
         members = [(player, player.find_object(), objects[uid]) for uid, player in self.members.items()]
-        pose_inputs = [i for player, mesh_object, buffer in members for i in player.pose_inputs(mesh_object, buffer)]
-        dependencies = [i for player, mesh_object, _ in members for i in player.dependency_inputs(mesh_object)]
+        pose_inputs = [
+            pose_input
+            for player, mesh_object, buffer in members
+            for pose_input in player.pose_inputs(mesh_object, buffer)
+        ]
+        dependencies = [
+            dependency for player, mesh_object, _ in members for dependency in player.dependency_inputs(mesh_object)
+        ]
         driver.set_driver_inputs(batch_driver, [driver.playback_input(batch_driver), *pose_inputs, *dependencies])
         for uid in self.members:
             driver.set_driver_inputs(objects[uid], [("SINGLE_PROP", batch_driver, "location[0]")])
@@ -68,52 +75,54 @@ class PlayerBatch:
                     player.error = error
 
     def play(self, batch_driver: bpy.types.Object) -> None:
-        """Write the positions of all members; each member stores its own exception."""
-        with ExitStack() as stack:
-            shown = []
+        """Write the positions of all members. Each member stores its own exception."""
+        with ExitStack() as exit_stack:
+            posed_members = []
             input_count = sum(player.pose_input_count for player in self.members.values())
             inputs = iter(driver.evaluated_inputs(batch_driver, input_count))
             for player in self.members.values():
-                stack.enter_context(player.lock)
+                exit_stack.enter_context(player.lock)
                 buffer, mesh_object, armature_object, *owners = islice(inputs, player.pose_input_count)
                 with player.capture_errors():
                     if buffer is not None and player.read_pose(mesh_object, armature_object, owners):
-                        shown.append((player, buffer, mesh_object))
-            self._run_model([player for player, _, _ in shown if player.new_inputs is not None])
-            for player, buffer, mesh_object in shown:
+                        posed_members.append((player, buffer, mesh_object))
+            self._run_model([player for player, _, _ in posed_members if player.new_inputs is not None])
+            for player, buffer, mesh_object in posed_members:
                 with player.capture_errors():
                     player.write_positions(buffer, mesh_object)
 
     def _run_model(self, players: list[Player]) -> None:
-        """Run the model for players with new inputs: once for those that show it, else for each by itself."""
-        batched = [player for player in players if player.new_inputs.strength > 0]
-        if len(batched) > 1:
-            execution = self._free_execution(len(batched))
-            for index, player in enumerate(batched):
+        """Run the model for players with new inputs: once for all with a strength above 0, alone for each other one."""
+        batched_players = [player for player in players if player.new_inputs.strength > 0]
+        if len(batched_players) > 1:
+            execution = self._find_free_execution(len(batched_players))
+            for index, player in enumerate(batched_players):
                 execution.poses[index] = player.new_inputs.pose_matrices
                 execution.controls[index] = player.new_inputs.controls
             try:
                 execution.run()
             except FDDAError:
-                # Run by itself, each player stores its own error.
-                batched = []
-            for index, player in enumerate(batched):
+                # Each player runs the model alone below, and stores its own error.
+                batched_players = []
+            for index, player in enumerate(batched_players):
                 with player.capture_errors():
-                    player.take_positions(execution, index)
+                    player.set_positions(execution, index)
         else:
-            batched = []
+            batched_players = []
         for player in players:
-            if player not in batched:
+            if player not in batched_players:
                 with player.capture_errors():
                     player.run_model()
 
-    def _free_execution(self, pose_count: int) -> Execution:
-        """Return an execution for a number of poses whose positions no member shows."""
-        in_use = {id(player.execution) for player in self.members.values()}
+    def _find_free_execution(self, pose_count: int) -> Execution:
+        """Find or create an execution for a number of poses, such that no member shows positions of the execution."""
+        used_ids = {id(player.execution) for player in self.members.values()}
         for execution in self._executions:
-            if len(execution.poses) == pose_count and id(execution) not in in_use:
+            if len(execution.poses) == pose_count and id(execution) not in used_ids:
                 return execution
-        self._executions = [e for e in self._executions if id(e) in in_use][-MAX_EXECUTIONS_IN_USE:]
+        self._executions = [execution for execution in self._executions if id(execution) in used_ids][
+            -MAX_EXECUTIONS_IN_USE:
+        ]
         self._executions.append(Execution(self.network, pose_count))
         return self._executions[-1]
 
@@ -122,50 +131,50 @@ class PlayerBatches:
     """The batches of the open file.
 
     Attributes:
-        by_driver: the batches by the session ids of their batch drivers.
+        by_driver: the batches, by the session ids of their batch drivers.
     """
 
     def __init__(self) -> None:
         self.by_driver: dict[int, PlayerBatch] = {}
-        self._moved_before: dict[Network, set[int]] = {}
+        self._previous_moved_uids: dict[Network, set[int]] = {}
 
     def clear(self) -> None:
-        """Forget all batches; their drivers are removed by the next scan."""
+        """Clear the table of batches; the next scan removes their batch drivers."""
         self.by_driver.clear()
-        self._moved_before.clear()
+        self._previous_moved_uids.clear()
 
     def update(self, players: Mapping[int, Player], frame_changed: bool) -> int:
-        """Batch the players that moved in this frame and in the one before; unbatch all others.
+        """Batch the players that moved in this frame and in the frame before, and unbatch all others.
 
         Args:
-            players: all players by the session ids of their position buffers.
-            frame_changed: the evaluation was of another frame.
+            players: all players, by the session ids of their position buffers.
+            frame_changed: whether another frame was evaluated.
 
         Returns:
             The change in the number of objects in the file.
         """
         previous_count = len(self.by_driver)
-        moved: dict[Network, dict[int, Player]] = {}
+        moved_players: dict[Network, dict[int, Player]] = {}
         for uid, player in players.items():
             if player.has_moved:
                 player.has_moved = False
-                moved.setdefault(player.network, {})[uid] = player
+                moved_players.setdefault(player.network, {})[uid] = player
         for driver_uid, player_batch in list(self.by_driver.items()):
-            moved_members = moved.get(player_batch.network, {})
+            moved_members = moved_players.get(player_batch.network, {})
             if moved_members and not (frame_changed and moved_members.keys() == player_batch.members.keys()):
                 self._unbatch(driver_uid)
-        for network, members in moved.items():
+        for network, members in moved_players.items():
             if not frame_changed or len(members) < MIN_BATCH_SIZE:
-                self._moved_before.pop(network, None)
-            elif self._moved_before.get(network) != members.keys():
-                self._moved_before[network] = set(members)
+                self._previous_moved_uids.pop(network, None)
+            elif self._previous_moved_uids.get(network) != members.keys():
+                self._previous_moved_uids[network] = set(members)
             elif not any(player_batch.network is network for player_batch in self.by_driver.values()):
                 player_batch = PlayerBatch(network, members)
                 self.by_driver[player_batch.batch().session_uid] = player_batch
         return len(self.by_driver) - previous_count
 
     def unbatch(self, buffer_uid: int) -> None:
-        """End the batch that plays a position buffer, if there is one."""
+        """End the batch that plays a position buffer, given by its session id, if there is such a batch."""
         for driver_uid in [uid for uid, player_batch in self.by_driver.items() if buffer_uid in player_batch.members]:
             self._unbatch(driver_uid)
 

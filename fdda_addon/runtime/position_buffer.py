@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The position buffer of a bound mesh object: an object whose evaluated mesh holds the vertex positions of the model.
 
-Object and mesh are runtime data, local, and in no scene. Blender never saves them; `playback` creates missing ones.
+Object and mesh are local runtime data and in no scene. Blender never saves them. `registry.scan` creates missing
+buffers.
 """
 
 import bpy
@@ -14,7 +15,7 @@ BUFFER_KEY = "fdda_position_buffer"
 
 
 def create_buffer(mesh_object: bpy.types.Object) -> bpy.types.Object:
-    """Create a position buffer with the vertices of a mesh object, at their rest positions."""
+    """Create a position buffer with as many vertices as a mesh object, at the rest positions of its mesh."""
     name = f"{mesh_object.name} {MODIFIER_NAME} positions"
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(mesh_object.data.vertices))
@@ -31,7 +32,7 @@ def is_buffer(scene_object: bpy.types.Object) -> bool:
 
 
 def remove_buffer(buffer: bpy.types.Object | None) -> None:
-    """Delete a position buffer and its mesh."""
+    """Remove a position buffer and its mesh from the file; a linked buffer stays."""
     if buffer is not None and buffer.library is None:
         mesh = buffer.data
         bpy.data.objects.remove(buffer)

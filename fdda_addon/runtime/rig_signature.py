@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Checks that a rig is still the one that its model was trained for.
+"""Checks that a model was trained for the current state of its rig.
 
-Everything that a fingerprint covers is read when a model starts to play, and again when Blender reports that armature
-or mesh were changed. Reading the weights of 50,000 vertices takes 0.2 s, so a quick `RigSignature` is compared first.
+The rig is read when a model starts to play, and again when Blender reports a changed armature or mesh. Reading all skin
+weights takes long, so a `RigSignature` is compared first, which is quick to read.
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from ..scene.scene_rig import SceneRig, armature_modifier
 from .network import Network
 
 STABLE_MODES = ("OBJECT", "POSE")
-"""Modes of an object in which its mesh does not change; in the others the user is editing it."""
+"""Modes of an object in which its mesh does not change; in the other modes the user is editing the mesh."""
 
 _BONE_PROPERTIES = (
     Element("matrix_local", np.float32, (16,)),
@@ -37,28 +37,28 @@ _ARMATURE_MODIFIER_PROPERTIES = ("use_vertex_groups", "use_bone_envelopes", "ver
 """The properties of an Armature modifier that skin weights depend on."""
 
 _passed_checks: dict[int, tuple] = {}
-"""By the session id of a mesh object: what its model requires, and the signature of the rig that passed the check."""
+"""By the session id of a mesh object: the rig that its model requires, and the signature of the rig that passed."""
 
 
 @dataclass(frozen=True)
 class RigSignature:
-    """The parts of a rig that are quick to read. While they and the mesh are unchanged, so is the whole rig.
+    """The parts of a rig that are quick to read. If they and the mesh are unchanged, the whole rig is unchanged.
 
     Attributes:
-        armature, mesh: session ids of the data.
-        bones: names in their order, rest matrices, and the properties that skinning depends on.
-        parents: names of the bones' parents.
+        armature_uid, mesh_uid: session ids of the armature data and of the mesh.
+        bones: names of the bones in their order, rest matrices, and the bone properties that skinning depends on.
+        parents: name of the parent of each bone.
         skin: settings of the Armature modifier, and names of the vertex groups.
-        rest: digest of the rest positions.
-        deformation: what deforms the mesh besides the armature.
+        rest_digest: digest of the rest positions.
+        deformation: everything besides the armature that deforms the mesh (`rig.deformation`).
     """
 
-    armature: int
-    mesh: int
+    armature_uid: int
+    mesh_uid: int
     bones: tuple
     parents: tuple
     skin: tuple
-    rest: str
+    rest_digest: str
     deformation: dict
 
     @staticmethod
@@ -79,7 +79,7 @@ class RigSignature:
 def bone_signature(armature: bpy.types.Armature) -> tuple:
     """Read `RigSignature.bones`."""
     values = [read(armature.bones, element) for element in _BONE_PROPERTIES]
-    # The other B-Bone settings are slow to read, and most armatures have no B-Bones.
+    # The settings of B-Bones are slow to read, and most armatures have no B-Bones.
     b_bones = str(read_b_bones(armature)) if (values[_SEGMENTS_INDEX] > 1).any() else ""
     return (*armature.bones.keys(), *(value.tobytes() for value in values), b_bones)
 
@@ -101,20 +101,20 @@ def armature_modifier_settings(mesh_object: bpy.types.Object) -> tuple:
 
 
 def rest_digest(mesh: bpy.types.Mesh) -> str:
-    """Read `RigSignature.rest`."""
+    """Read `RigSignature.rest_digest`."""
     return Fingerprint.digest(rest_positions(mesh))
 
 
 def check(scene_rig: SceneRig, network: Network, signature: RigSignature) -> None:
-    """Check that a rig is the one that a model was trained for.
+    """Check that a model was trained for a rig.
 
     Args:
-        scene_rig: the rig; not checked while its mesh is being edited.
+        scene_rig: the rig. It is not checked while the user edits its mesh.
         network: the model.
         signature: the signature of the rig.
 
     Raises:
-        ModelError: names the differences.
+        ModelError: the model was trained for another rig; the message lists the differences.
         RigError: the rig cannot be read.
     """
     mesh_object, info = scene_rig.mesh_object, network.info
@@ -125,31 +125,31 @@ def check(scene_rig: SceneRig, network: Network, signature: RigSignature) -> Non
         return
     rig = read_model_rig(scene_rig, info)
     rig = replace(rig, rest_matrices=_align_rest_matrices(rig, info.joint_names, info.rest_matrices))
-    changes = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
-    if changes:
+    differences = rig_differences(info.joints, info.rest_matrices, info.vertex_count, info.fingerprint, rig)
+    if differences:
         raise ModelError(
             f"The rig of '{mesh_object.name}' is not the one that its model '{network.path.name}' was trained for: "
-            f"{'; '.join(changes)}; undo the change, or record and train again."
+            f"{'; '.join(differences)}; undo the change, or record and train again."
         )
     _passed_checks[mesh_object.session_uid] = required
 
 
-def invalidate(mesh: int) -> None:
-    """Read the rigs of a mesh, given by its session id, again at their next check."""
-    for uid in [uid for uid, (*_, signature) in _passed_checks.items() if signature.mesh == mesh]:
+def invalidate(mesh_uid: int) -> None:
+    """Discard the passed checks of a mesh, given by its session id, so that the next check reads the whole rig."""
+    for uid in [uid for uid, (*_, signature) in _passed_checks.items() if signature.mesh_uid == mesh_uid]:
         del _passed_checks[uid]
 
 
 def invalidate_all() -> None:
-    """Read all rigs again at their next check."""
+    """Discard all passed checks, so that the next check of each rig reads the whole rig."""
     _passed_checks.clear()
 
 
 def _align_rest_matrices(rig: Rig, joint_names: tuple[str, ...], rest_matrices: np.ndarray) -> np.ndarray:
-    """Express the rest matrices of a rig as if its armature had the same transform relative to the mesh as in a model.
+    """Transform the rest matrices of a rig so that its armature lies relative to the mesh as it did in the recording.
 
-    Animation moves mesh and armature objects separately, which does not change the rig. The first joint gives the
-    difference between the two transforms.
+    Animation may move the mesh object and the armature object separately, which does not change the rig. The first
+    joint defines the difference between the two transforms.
 
     Args:
         rig: the rig.
@@ -159,9 +159,10 @@ def _align_rest_matrices(rig: Rig, joint_names: tuple[str, ...], rest_matrices: 
     Returns:
         (J, 4, 4) float32, mesh-object space.
     """
-    moving = [joint for joint, name in enumerate(rig.joint_names) if name != STATIC_JOINT]
-    if rig.joint_names != joint_names or not moving or rest_matrices_match(rest_matrices, rig):
+    bone_joints = [joint for joint, name in enumerate(rig.joint_names) if name != STATIC_JOINT]
+    if rig.joint_names != joint_names or not bone_joints or rest_matrices_match(rest_matrices, rig):
         return rig.rest_matrices
-    aligned, expected = rig.rest_matrices.astype(np.float64), rest_matrices.astype(np.float64)
-    aligned[moving] = expected[moving[0]] @ np.linalg.inv(aligned[moving[0]]) @ aligned[moving]
-    return aligned.astype(np.float32)
+    rig_matrices, model_matrices = rig.rest_matrices.astype(np.float64), rest_matrices.astype(np.float64)
+    first = bone_joints[0]
+    rig_matrices[bone_joints] = model_matrices[first] @ np.linalg.inv(rig_matrices[first]) @ rig_matrices[bone_joints]
+    return rig_matrices.astype(np.float32)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Times frames of a rig, of linear skinning and of a model in turn, so that the ratios hold on a noisy machine."""
+"""Times frames of a rig, of linear skinning and of a model.
+
+The variants are measured alternately, so that other work on the machine slows all of them and their ratios stay right.
+"""
 
 import os
 import platform
@@ -27,27 +30,28 @@ from ..scene.armature import Poser, clear_pose
 from ..scene.comparison import hidden_comparisons
 from ..scene.scene_rig import SceneRig, armature_modifier
 from ..scene.temporary_state import assign_action, temporary_attributes, temporary_pose
-from .frame_times import FrameTimes, verdict
+from .frame_times import FrameTimes, compare_times
 
 ROUNDS = 5
-"""Number of times that each setup is measured, in turn."""
+"""Number of rounds. Each round measures all variants, one after the other."""
 WARM_UP_FRAMES = 3
-RANDOM_POSES, KEY_STEP = 20, 5
-"""Number of random poses that animate a rig without an action, and the frames between them."""
+"""Number of frames before each measurement that are not timed."""
+RANDOM_POSE_COUNT, KEY_STEP_FRAMES = 20, 5
+"""Number of random poses that animate a rig without an action, and the number of frames from one to the next."""
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Times of `scene.frame_set`, with everything that it evaluates, in milliseconds.
+    """Times of `scene.frame_set`, including everything that it evaluates, in milliseconds.
 
     Attributes:
         vertices: number of vertices of the mesh.
-        frames: number of frames for each setup.
+        frames: number of timed frames of each variant.
         rig: times with all modifiers of the rig.
         linear: times with the Armature modifier alone.
         fdda: times with the model.
         floor: times as for `fdda`, without running the model.
-        inference: times of the model alone, for one pose.
+        inference: times of one run of the model for one pose, outside of Blender's evaluation.
         constant_bytes: size of the constants of the model's graph, which each frame reads; 0 if unknown.
     """
 
@@ -61,13 +65,13 @@ class Benchmark:
     constant_bytes: int
 
     def frame_times(self, model: str) -> FrameTimes:
-        """Return the medians.
+        """Return the median times.
 
         Args:
             model: path of the model, as its binding stores it.
         """
         return FrameTimes(
-            **{setup: float(np.median(times)) for setup, times in self._times()},
+            **{variant: float(np.median(times)) for variant, times in self._times_by_variant().items()},
             constant_bytes=self.constant_bytes,
             model=model,
         )
@@ -87,18 +91,19 @@ class Benchmark:
             "processor": platform.processor() or platform.machine(),
             "cores": os.cpu_count(),
             **{
-                name: {"median": _round(np.median(t)), "p90": _round(np.percentile(t, 90))} for name, t in self._times()
+                variant: {"median": _round(np.median(times)), "p90": _round(np.percentile(times, 90))}
+                for variant, times in self._times_by_variant().items()
             },
             "ratio": _round(self.ratio),
             "is_faster": self.ratio > 1,
             "constant_bytes": self.constant_bytes,
         }
 
-    def _times(self) -> list[tuple[str, list[float]]]:
-        return [(setup, getattr(self, setup)) for setup in ("rig", "linear", "fdda", "floor", "inference")]
+    def _times_by_variant(self) -> dict[str, list[float]]:
+        return {variant: getattr(self, variant) for variant in ("rig", "linear", "fdda", "floor", "inference")}
 
     def table(self) -> str:
-        """Format the times as text, with a verdict."""
+        """Format the times as a table, followed by a sentence that compares rig and model."""
         labels = {
             "rig": "rig",
             "linear": "Armature modifier alone",
@@ -107,11 +112,11 @@ class Benchmark:
             "inference": "the model alone, one pose",
         }
         lines = [f"{f'{self.vertices} vertices, ms per frame':<33}{'median':>10}{'p90':>10}"]
-        for setup, times in self._times():
-            lines.append(f"  {labels[setup]:<31}{np.median(times):>10.3f}{np.percentile(times, 90):>10.3f}")
+        for variant, times in self._times_by_variant().items():
+            lines.append(f"  {labels[variant]:<31}{np.median(times):>10.3f}{np.percentile(times, 90):>10.3f}")
         if self.constant_bytes:
             lines.append(f"  {'model data read per frame, MB':<31}{self.constant_bytes / 1e6:>10.2f}")
-        lines.append(f"  {verdict(float(np.median(self.rig)), float(np.median(self.fdda)))}")
+        lines.append(f"  {compare_times(float(np.median(self.rig)), float(np.median(self.fdda)))}")
         return "\n".join(lines)
 
 
@@ -120,14 +125,14 @@ def _round(value: float) -> float:
 
 
 def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[Progress | Benchmark]:
-    """Time a rig and a model, as a generator that works while it is iterated.
+    """Time a rig and a model, as a generator that does its work while it is iterated.
 
     It plays the action of the armature, or random poses if there is none, and restores the scene afterwards.
 
     Args:
         scene_rig: the rig.
         model: path of the model; None for the bound model.
-        frames: number of frames to time for each setup.
+        frames: number of frames to time for each variant.
 
     Yields:
         Progress, and the Benchmark at the end.
@@ -138,22 +143,24 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
     """
     check_evaluable(scene_rig)
     mesh_object = scene_rig.mesh_object
-    opened = open_model(scene_rig, model or model_files.network_of(mesh_object))
-    channels = model_channels(scene_rig, opened.rig, opened.network.info)
-    with temporary_animation(scene_rig, channels) as played, temporary_binding(scene_rig, model):
-        setups = {
+    opened_model = open_model(scene_rig, model or model_files.network_of(mesh_object))
+    channels = model_channels(scene_rig, opened_model.rig, opened_model.network.info)
+    with temporary_animation(scene_rig, channels) as animation_frames, temporary_binding(scene_rig, model):
+        show_variant = {
             "rig": model_disabled,
             "linear": skinning_only,
             "fdda": partial(temporary_mode, mode="FDDA"),
-            "floor": _floor,
+            "floor": _playback_without_model_runs,
         }
-        times: dict[str, list[float]] = {setup: [] for setup in setups}
+        times: dict[str, list[float]] = {variant: [] for variant in show_variant}
         frames_per_round = max(1, -(-frames // ROUNDS))
+        step_count, total_steps = 0, ROUNDS * len(show_variant)
         for round_index in range(ROUNDS):
-            for setup_number, (setup, prepare) in enumerate(setups.items(), 1):
-                with prepare(mesh_object):
-                    times[setup] += time_frames(played, round_index * frames_per_round, frames_per_round)
-                yield Progress("benchmark", round_index * len(setups) + setup_number, ROUNDS * len(setups))
+            for variant, show in show_variant.items():
+                with show(mesh_object):
+                    times[variant] += time_frames(animation_frames, round_index * frames_per_round, frames_per_round)
+                step_count += 1
+                yield Progress("benchmark", step_count, total_steps)
         network = model_files.network_of(mesh_object)
         pose_matrices = network.info.rest_matrices[None]
         controls = np.zeros((1, len(network.info.controls)), np.float32)
@@ -170,62 +177,64 @@ def benchmark(scene_rig: SceneRig, model: Path | None, frames: int) -> Iterator[
 
 @contextmanager
 def temporary_animation(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> Iterator[range]:
-    """Play the action of an armature, or `random_action` if it has none; restore pose and animation afterwards.
+    """Assign the action of an armature, or `key_random_poses` if it has none; restore pose and animation afterwards.
 
     Yields:
         The frames of the action.
     """
     animation = scene_rig.armature_object.animation_data
-    own_action = animation.action if animation else None
-    with hidden_comparisons(), temporary_pose(scene_rig.armature_object, [own_action] if own_action else []):
-        action = own_action or random_action(scene_rig, channels)
+    original_action = animation.action if animation else None
+    with hidden_comparisons(), temporary_pose(scene_rig.armature_object, [original_action] if original_action else []):
+        action = original_action or key_random_poses(scene_rig, channels)
         assign_action(scene_rig.armature_object, action)
         try:
             yield action_frames(action)
         finally:
             scene_rig.armature_object.animation_data.action = None
-            if action != own_action:
+            if action != original_action:
                 bpy.data.actions.remove(action)
 
 
-def random_action(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> bpy.types.Action:
-    """Key random poses on the armature, `KEY_STEP` frames apart, and return its action.
+def key_random_poses(scene_rig: SceneRig, channels: tuple[Channel, ...] = ()) -> bpy.types.Action:
+    """Key random poses on the armature, `KEY_STEP_FRAMES` frames apart, and return its action.
 
     Args:
         scene_rig: the rig.
-        channels: the channels of the poses, except controls; empty for those of the rig.
+        channels: the channels of the poses, without controls; empty for the sampled channels of the rig.
     """
     armature_object = scene_rig.armature_object
     channels = [c for c in channels or sampled_channels(scene_rig, read_rig(scene_rig)) if c.kind != CONTROL]
     clear_pose(armature_object)
     poser = Poser(scene_rig, channels)
-    paths = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
-    for index in range(RANDOM_POSES):
+    rotation_paths = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
+    for index in range(RANDOM_POSE_COUNT):
         poser.set(sample_pose(channels, 0, index))
         for name, kind in {(channel.name, channel.kind) for channel in channels}:
             bone = armature_object.pose.bones[name]
-            path = paths.get(bone.rotation_mode, "rotation_euler") if kind in {ROTATION, ROTATION_VECTOR} else kind
-            bone.keyframe_insert(path, frame=1 + index * KEY_STEP)
+            is_rotation = kind in {ROTATION, ROTATION_VECTOR}
+            path = rotation_paths.get(bone.rotation_mode, "rotation_euler") if is_rotation else kind
+            bone.keyframe_insert(path, frame=1 + index * KEY_STEP_FRAMES)
     return armature_object.animation_data.action
 
 
-def time_frames(played: range, first: int, count: int) -> list[float]:
+def time_frames(animation_frames: range, first_index: int, count: int) -> list[float]:
     """Time frames of an animation after some warm-up frames.
 
     Args:
-        played: frames of the animation.
-        first: index of the first frame; indices wrap around.
-        count: number of frames.
+        animation_frames: frames of the animation.
+        first_index: index of the first timed frame in the animation. After its end the animation starts again.
+        count: number of frames to time.
 
     Returns:
-        Milliseconds of each frame.
+        Milliseconds of each timed frame.
     """
     scene = bpy.context.scene
 
-    def frame_call(index: int) -> Callable[[], None]:
-        return lambda: scene.frame_set(played[index % len(played)])
+    def make_call(index: int) -> Callable[[], None]:
+        return lambda: scene.frame_set(animation_frames[index % len(animation_frames)])
 
-    return _time_calls([frame_call(first + offset) for offset in range(-WARM_UP_FRAMES, count)])[WARM_UP_FRAMES:]
+    calls = [make_call(first_index + offset) for offset in range(-WARM_UP_FRAMES, count)]
+    return _time_calls(calls)[WARM_UP_FRAMES:]
 
 
 def _time_calls(calls: list[Callable[[], object]]) -> list[float]:
@@ -240,23 +249,25 @@ def _time_calls(calls: list[Callable[[], object]]) -> list[float]:
 
 @contextmanager
 def skinning_only(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """Show Blender's own linear skinning: the Armature modifier alone, with pinned shape keys."""
-    skinning = armature_modifier(mesh_object)
-    if skinning is None:
+    """Show Blender's own linear skinning in the block: the Armature modifier alone, with the first shape key pinned."""
+    skin_modifier = armature_modifier(mesh_object)
+    if skin_modifier is None:
         raise RigError(f"'{mesh_object.name}' has no Armature modifier: there is no linear skinning to time.")
-    with model_disabled(mesh_object), ExitStack() as stack:
+    with model_disabled(mesh_object), ExitStack() as exit_stack:
         for modifier in deforming_modifiers(mesh_object):
-            if modifier != skinning:
-                stack.enter_context(temporary_attributes(modifier, show_viewport=False))
-        stack.enter_context(temporary_attributes(skinning, use_deform_preserve_volume=False))
+            if modifier != skin_modifier:
+                exit_stack.enter_context(temporary_attributes(modifier, show_viewport=False))
+        exit_stack.enter_context(temporary_attributes(skin_modifier, use_deform_preserve_volume=False))
         if mesh_object.data.shape_keys:
-            stack.enter_context(temporary_attributes(mesh_object, show_only_shape_key=True, active_shape_key_index=0))
+            exit_stack.enter_context(
+                temporary_attributes(mesh_object, show_only_shape_key=True, active_shape_key_index=0)
+            )
         yield
 
 
 @contextmanager
-def _floor(mesh_object: bpy.types.Object) -> Iterator[None]:
-    """Play without running the model."""
+def _playback_without_model_runs(mesh_object: bpy.types.Object) -> Iterator[None]:
+    """Play the bound model in the block without running it."""
     with temporary_mode(mesh_object, "FDDA"):
         bpy.context.view_layer.update()
         with playback.without_model_runs():

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import bpy
 
 _frame_times: dict[int, "FrameTimes"] = {}
+"""Frame times, by the session ids of mesh objects."""
 
 
 @dataclass(frozen=True)
@@ -17,8 +18,8 @@ class FrameTimes:
         linear: time with the Armature modifier alone.
         fdda: time with the model.
         floor: time as for `fdda`, without running the model.
-        inference: time of the model alone, for one pose.
-        constant_bytes: size of the constants that the model reads in a frame; 0 if unknown.
+        inference: time of one run of the model for one pose, outside of Blender's evaluation.
+        constant_bytes: size of the constants of the model's graph, which each frame reads; 0 if unknown.
         model: path of the model, as its binding stores it.
     """
 
@@ -32,28 +33,28 @@ class FrameTimes:
 
     @property
     def sentence(self) -> str:
-        """Return the verdict."""
-        return verdict(self.rig, self.fdda)
+        """Return a sentence that compares rig and model."""
+        return compare_times(self.rig, self.fdda)
 
 
-def verdict(rig: float, fdda: float) -> str:
-    """Tell whether a model is faster than the rig, given their milliseconds per frame."""
-    if fdda >= rig:
+def compare_times(rig_ms: float, fdda_ms: float) -> str:
+    """Return a sentence that compares rig and model, given their milliseconds per frame."""
+    if fdda_ms >= rig_ms:
         return "Not worth it here: this rig is faster than the model."
-    return f"{rig / fdda:.1f}x faster than the rig."
+    return f"{rig_ms / fdda_ms:.1f}x faster than the rig."
 
 
 def store(mesh_object: bpy.types.Object, times: FrameTimes) -> None:
-    """Store the times with the bound model."""
+    """Store the frame times of an object with its bound model."""
     _frame_times[mesh_object.session_uid] = times
 
 
 def get(mesh_object: bpy.types.Object) -> FrameTimes | None:
-    """Return the times with the bound model; None if they were not measured."""
+    """Return the frame times of an object with its bound model; None if they were not measured."""
     times = _frame_times.get(mesh_object.session_uid)
     return times if times and times.model == mesh_object.fdda.model else None
 
 
 def remove(mesh_object: bpy.types.Object) -> None:
-    """Remove the times of an object, because its model has changed."""
+    """Remove the frame times of an object, because its model has changed."""
     _frame_times.pop(mesh_object.session_uid, None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Measures the time of a frame of a rig, and estimates that of a model before there is one."""
+"""Measures the time of a frame with a rig, and estimates the time with a model before a model is trained."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,13 +13,14 @@ from ..scene.scene_rig import SceneRig
 from .benchmark import skinning_only, temporary_animation, time_frames
 
 ROUNDS = 4
+"""Number of rounds. Each round measures the rig and its Armature modifier alone, one after the other."""
 FRAMES_PER_ROUND = 5
 
 PLAYBACK_MS, PLAYBACK_MS_PER_VERTEX = 0.26, 4.7e-6
 """Coefficients of the line that fits the time of a frame with a model beyond that of the Armature modifier alone, ms.
 They are fitted to "Frame times" in docs/benchmarks.md (`make bench`)."""
 MIN_CLEAR_SPEEDUP = 1.3
-"""Smallest estimated speed-up that is reported as one."""
+"""Smallest estimated ratio of the frame times of rig and model at which the model is called faster."""
 
 
 @dataclass(frozen=True)
@@ -38,16 +39,16 @@ class RigCost:
 
     @property
     def model(self) -> float:
-        """Estimate the time of a frame with a model, ms."""
+        """Return the estimated time of a frame with a model, ms."""
         return self.linear + estimate_playback_ms(self.vertices)
 
     @property
     def sentence(self) -> str:
-        """Tell whether a model would be faster."""
-        gain = self.rig / self.model
-        if gain >= MIN_CLEAR_SPEEDUP:
-            return f"Worth it: about {gain:.1f}x faster."
-        if gain >= 1 / MIN_CLEAR_SPEEDUP:
+        """Return a sentence that says whether a model would be faster than the rig."""
+        speedup = self.rig / self.model
+        if speedup >= MIN_CLEAR_SPEEDUP:
+            return f"Worth it: about {speedup:.1f}x faster."
+        if speedup >= 1 / MIN_CLEAR_SPEEDUP:
             return "Little difference: a model takes about as long as this rig."
         return "Not worth it here: this rig is faster than a model."
 
@@ -58,7 +59,7 @@ def estimate_playback_ms(vertex_count: int) -> float:
 
 
 def measure(scene_rig: SceneRig) -> Iterator[Progress | RigCost]:
-    """Time a rig and its Armature modifier alone, in turn, as a generator that works while it is iterated.
+    """Time a rig and its Armature modifier alone, alternately, as a generator that works while it is iterated.
 
     It plays the action of the armature, or random poses if there is none, and restores the scene afterwards.
 
@@ -74,10 +75,10 @@ def measure(scene_rig: SceneRig) -> Iterator[Progress | RigCost]:
         times: dict[str, list[float]] = {"rig": [], "linear": []}
         with temporary_animation(scene_rig) as frames:
             for round_index in range(ROUNDS):
-                first = round_index * FRAMES_PER_ROUND
-                times["rig"] += time_frames(frames, first, FRAMES_PER_ROUND)
+                first_index = round_index * FRAMES_PER_ROUND
+                times["rig"] += time_frames(frames, first_index, FRAMES_PER_ROUND)
                 yield Progress("frames", 2 * round_index + 1, 2 * ROUNDS)
                 with skinning_only(mesh_object):
-                    times["linear"] += time_frames(frames, first, FRAMES_PER_ROUND)
+                    times["linear"] += time_frames(frames, first_index, FRAMES_PER_ROUND)
                 yield Progress("frames", 2 * round_index + 2, 2 * ROUNDS)
-    yield RigCost(len(mesh_object.data.vertices), *(float(np.median(times[setup])) for setup in ("rig", "linear")))
+    yield RigCost(len(mesh_object.data.vertices), *(float(np.median(times[variant])) for variant in ("rig", "linear")))

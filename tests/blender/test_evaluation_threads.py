@@ -72,7 +72,7 @@ def test_a_control_alone_is_played(bound, monkeypatch):
 
 
 def test_states_of_threads_that_end_are_few(monkeypatch):
-    monkeypatch.setattr(evaluation_threads, "_threads_with_state", {threading.get_ident()})
+    monkeypatch.setattr(evaluation_threads, "_thread_ids_with_state", {threading.get_ident()})
     count, ended = evaluation_threads.MAX_KEPT_STATES + 5, []
     # Threads that are there at once are told apart; the next one has the name of one that has ended.
     all_there = threading.Barrier(count)
@@ -89,4 +89,4 @@ def test_states_of_threads_that_end_are_few(monkeypatch):
     for thread in at_once:
         thread.join(10)
     assert len(ended) == count and not any(thread.is_alive() for thread in at_once)
-    assert len(evaluation_threads._threads_with_state) == evaluation_threads.MAX_KEPT_STATES
+    assert len(evaluation_threads._thread_ids_with_state) == evaluation_threads.MAX_KEPT_STATES

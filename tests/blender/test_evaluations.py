@@ -273,4 +273,4 @@ def test_graphs_are_known_by_what_they_are_of(bound, tmp_path):
     assert set(seen) == {("RENDER", False), ("VIEWPORT", True)}
     (player,) = registry.players.values()
     uid, name = bpy.context.scene.session_uid, bpy.context.view_layer.name
-    assert player.depsgraphs == {("RENDER", uid, name), ("VIEWPORT", uid, name)}
+    assert player.depsgraph_keys == {("RENDER", uid, name), ("VIEWPORT", uid, name)}

@@ -212,9 +212,12 @@ def test_an_evaluation_does_not_outlive_many_others(active):
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
     assert last_evaluation.get(active) is not None
     kept = last_evaluation._evaluations[active.session_uid]
-    for uid in range(-last_evaluation.MAX_STORED, 0):
+    for uid in range(-last_evaluation.MAX_STORED_EVALUATIONS, 0):
         last_evaluation._evaluations[uid] = kept
     bpy.ops.fdda.evaluate(source="RANDOM", poses=1)
-    assert len(last_evaluation._evaluations) <= last_evaluation.MAX_STORED and last_evaluation.get(active) is not None
-    for uid in range(-last_evaluation.MAX_STORED, 0):
+    assert (
+        len(last_evaluation._evaluations) <= last_evaluation.MAX_STORED_EVALUATIONS
+        and last_evaluation.get(active) is not None
+    )
+    for uid in range(-last_evaluation.MAX_STORED_EVALUATIONS, 0):
         last_evaluation._evaluations.pop(uid, None)

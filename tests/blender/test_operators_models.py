@@ -227,7 +227,9 @@ def test_a_stale_model_says_what_changed(bound, change, words):
     assert bpy.ops.fdda.check_model() == {"FINISHED"}
     bound.fdda.mode = "RIG"
     change()
-    refused(bpy.ops.fdda.check_model, "elbow is of this rig as it was before", words, "record and train again")
+    refused(
+        bpy.ops.fdda.check_model, "elbow was trained for an earlier state of this rig", words, "record and train again"
+    )
 
 
 def test_another_range_of_motion_is_told_and_prevents_nothing(bound, elbow):
@@ -238,7 +240,7 @@ def test_another_range_of_motion_is_told_and_prevents_nothing(bound, elbow):
     assert not find_changes(find_rig(), bound.fdda.models[0]).sentence
     bpy.data.objects[ELBOW_RIG].pose.bones["lower"].constraints[0].max_x += 0.1
     found = find_changes(find_rig(), bound.fdda.models[0])
-    assert found.limits == ("lower",) and not found.prevents_playback
+    assert found.bones_with_changed_range == ("lower",) and not found.prevents_playback
     assert "The range of motion of 'lower' has changed since elbow was trained" in found.sentence
     assert bpy.ops.fdda.check_model() == {"FINISHED"}
     pose(angle=0.1)

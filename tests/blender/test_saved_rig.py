@@ -102,7 +102,7 @@ def test_disabling_the_addon_gives_the_rig_back_and_enabling_it_plays(bound, elb
 
 
 def test_a_linked_character_plays(elbow):
-    model_files.allow(elbow.model)
+    model_files.allow_path(elbow.model)
     with bpy.data.libraries.load(str(elbow.bound), link=True) as (_, wanted):
         wanted.objects = [ELBOW, "elbow_rig"]
     for linked in wanted.objects:
