@@ -96,7 +96,7 @@ def _record_viewport_copies(depsgraph: bpy.types.Depsgraph) -> None:
 
 
 def _apply_animated_mode(mesh_object: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> None:
-    """Switch the modifiers of an object whose animated or driven_object mode now differs from what it shows."""
+    """Switch the modifiers of an object whose animated or driven mode now differs from what it shows."""
     global _is_switching
     evaluated, binding = mesh_object.evaluated_get(depsgraph), mesh_object.fdda
     animated = registry.animated_settings[mesh_object.session_uid]
