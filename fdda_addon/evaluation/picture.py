@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Renders pictures of meshes and labels in rows and columns, with Workbench, in a scene of its own.
 
-Blender renders everything, also the labels and the color scale, so this needs no window and no other library.
+Blender renders the meshes, the labels and the color scale, so a picture needs no window and no other library.
 """
 
 import ctypes.util
@@ -22,13 +22,14 @@ from ..scene.blend_file import blender_path
 from ..scene.mesh import set_mesh_positions, topology
 
 WIDTH_PIXELS = 1440
-CELL_MARGIN = 0.06
+CELL_MARGIN_RATIO = 0.06
 """Space between cells, relative to the width of a cell."""
-TEXT_SIZE = 0.0145
-"""Height of a line, relative to the width of the picture."""
+TEXT_SIZE_RATIO = 0.0145
+"""Height of a line of text, relative to the width of the picture."""
 BACKGROUND_COLOR = (0.13, 0.14, 0.15)
 TEXT_COLOR = (0.92, 0.92, 0.92)
 PNG_END = b"IEND\xae\x42\x60\x82"
+"""Last bytes of a complete PNG file."""
 
 
 @dataclass(frozen=True)
@@ -51,15 +52,15 @@ class View:
     """The view direction of a picture.
 
     Attributes:
-        azimuth, elevation: degrees. 0, 0 looks along +Y, at the front of a character; with a positive azimuth the
-            viewer is on the character's left.
+        azimuth, elevation: angles in degrees. With 0, 0 the viewer looks along +Y, at the front of a character. With a
+            positive azimuth the viewer is on the left of the character.
     """
 
     azimuth: float = 25.0
     elevation: float = 20.0
 
     def axes(self) -> np.ndarray:
-        """Return the directions right, up and towards the viewer, one in each row, (3, 3) float64."""
+        """Return the directions to the right, up and towards the viewer as rows, (3, 3) float64, world space."""
         azimuth, elevation = math.radians(self.azimuth), math.radians(self.elevation)
         towards = np.array(
             [math.sin(azimuth) * math.cos(elevation), -math.cos(azimuth) * math.cos(elevation), math.sin(elevation)]
@@ -85,11 +86,11 @@ def draw(
         path: path of the file.
         title: a line of text above all cells.
         view: the view direction.
-        heat_scale: add the color scale of the heat map at the bottom.
-        sculpted: use lighting that shows the shape, instead of one that shows the colors.
+        heat_scale: whether to add the color scale of the heat map at the bottom.
+        sculpted: whether to light the meshes so that their shape shows best, instead of their colors.
 
     Raises:
-        OutputError: the file cannot be written, or the machine lacks what Workbench needs.
+        OutputError: the file cannot be written, or the machine lacks a library that Workbench needs.
     """
     _check_can_render()
     picture = _Picture(view)
@@ -101,13 +102,13 @@ def draw(
 
 
 def _check_can_render() -> None:
-    """Check for EGL: without it, a render without a window ends the process, and Python cannot catch that."""
+    """Check for the library EGL: without it, a render without a window ends the process before Python can catch it."""
     if bpy.app.background and sys.platform == "linux" and ctypes.util.find_library("EGL") is None:
         raise OutputError("Pictures need the library EGL; install the package libegl1.")
 
 
 class _Picture:
-    """A scene that holds a picture. Positions are in the plane of the camera: x to the right, y up, metres."""
+    """The scene of a picture. Positions in it are relative to the camera: x to the right, y up, Blender units."""
 
     def __init__(self, view: View):
         self._axes = view.axes()
@@ -117,13 +118,13 @@ class _Picture:
         self._width = self._height = 0.0
 
     def compose(self, mesh: bpy.types.Mesh, rows: list[list[Cell]], title: str, heat_scale: bool) -> None:
-        """Lay out cells from the top left, the title above them and the color scale below."""
+        """Lay out the cells from the top left, with the title above and the color scale below the cells."""
         projections = [cell.positions @ self._axes.T for row in rows for cell in row]
         cell_size = np.max([np.ptp(projected[:, :2], axis=0) for projected in projections], axis=0)
         column_count = max(len(row) for row in rows)
-        gap = cell_size[0] * CELL_MARGIN
+        gap = cell_size[0] * CELL_MARGIN_RATIO
         self._width = column_count * (cell_size[0] + gap) + gap
-        text_size = self._width * TEXT_SIZE
+        text_size = self._width * TEXT_SIZE_RATIO
         step = np.array([cell_size[0] + gap, cell_size[1] + 3.2 * text_size])
         self._add_text(title, (gap, -2.0 * text_size), 1.3 * text_size)
         top = 3.2 * text_size
@@ -151,8 +152,8 @@ class _Picture:
 
     def _add_cell(self, factory: "_MeshFactory", cell: Cell, center: tuple[float, float]) -> None:
         projected = (cell.positions @ self._axes.T).astype(np.float32)
-        middle = (projected.max(axis=0) + projected.min(axis=0)) / 2
-        self._move(self._add_object("cell", factory.create(projected - middle, cell.colors)), *center)
+        center_of_bounds = (projected.max(axis=0) + projected.min(axis=0)) / 2
+        self._move(self._add_object("cell", factory.create(projected - center_of_bounds, cell.colors)), *center)
 
     def _add_text(self, text: str, position: tuple[float, float], size: float) -> None:
         curve = bpy.data.curves.new("text", "FONT")
@@ -171,9 +172,9 @@ class _Picture:
         left, width = x + 16 * text_size, self._width * 0.35
         strip_colors = heat_colors(np.linspace(HEAT_MAP_STOPS[0][0], HEAT_MAP_STOPS[-1][0], 64))
         self._add_strip((left, y - box_size), (width, box_size), strip_colors)
-        last = HEAT_MAP_STOPS[-1][0]
-        for metres, text in ((0.0, "error 0 cm"), (0.005, "0.5 cm"), (last, "1 cm and above")):
-            label_position = (left + width * metres / last - 0.6 * text_size, y - box_size - 1.2 * text_size)
+        max_metres = HEAT_MAP_STOPS[-1][0]
+        for metres, text in ((0.0, "error 0 cm"), (0.005, "0.5 cm"), (max_metres, "1 cm and above")):
+            label_position = (left + width * metres / max_metres - 0.6 * text_size, y - box_size - 1.2 * text_size)
             self._add_text(text, label_position, 0.9 * text_size)
 
     def _add_strip(self, position: tuple[float, float], size: tuple[float, float], colors: np.ndarray) -> None:
@@ -200,11 +201,12 @@ class _Picture:
         scene.render.image_settings.file_format = "PNG"
         scene.render.image_settings.color_mode = "RGB"
         scene.render.image_settings.compression = 90
-        # Dithering is noise, which does not compress.
+        # Dithering adds noise, which compresses badly.
         scene.render.dither_intensity = 0
         scene.render.use_file_extension = False
-        # A picture that is passed on must not reveal where it was made.
-        for name in [p.identifier for p in scene.render.bl_rna.properties if p.identifier.startswith("use_stamp_")]:
+        # Metadata in the picture would reveal paths and names of its maker.
+        property_names = [render_property.identifier for render_property in scene.render.bl_rna.properties]
+        for name in [name for name in property_names if name.startswith("use_stamp_")]:
             setattr(scene.render, name, False)
         scene.render.film_transparent = False
         scene.view_settings.view_transform = "Standard"

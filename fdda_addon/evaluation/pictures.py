@@ -21,7 +21,7 @@ SURFACE_COLOR = (0.78, 0.64, 0.55)
 
 @dataclass(frozen=True)
 class PicturedPose:
-    """A pose of a picture.
+    """A pose to show in a picture.
 
     Attributes:
         name: name of the pose.
@@ -37,7 +37,13 @@ class PicturedPose:
 
 
 def make_pictured_pose(errors: PoseErrors, index: int, name: str = "") -> PicturedPose:
-    """Return one of the poses of an evaluation for a picture."""
+    """Return one of the poses of an evaluation as a pose to show in a picture.
+
+    Args:
+        errors: the poses of the evaluation.
+        index: index of the pose.
+        name: name of the pose; empty for the name of the set and the index.
+    """
     return PicturedPose(
         name or f"{errors.name} {index}", errors.pose_matrices[index], errors.positions[index], errors.controls[index]
     )
@@ -51,7 +57,7 @@ def worst_poses(errors: PoseErrors) -> list[PicturedPose]:
 
 
 def draw_partitions(scene_rig: SceneRig, path: Path, view: View = View()) -> None:  # noqa: B008 - frozen
-    """Draw the rest pose with a color for each partition.
+    """Draw the rest pose with one color for each partition.
 
     Raises:
         OutputError: the file cannot be written.
@@ -77,16 +83,16 @@ def draw_comparison(
 
     Args:
         scene_rig: the rig.
-        model: path of the model, bound or not.
+        model: path of the model; it need not be bound.
         poses: the poses.
         path: path of the PNG file.
-        heat: color each vertex by its distance from the rig.
+        heat: whether to color each vertex by its distance from the rig.
         title: title of the picture; empty for a default.
         view: the view direction.
         reference_label: label of the positions of the poses.
 
     Raises:
-        ModelError: the model cannot be read, or is of another rig.
+        ModelError: the model cannot be read, or was trained for another rig.
         OutputError: the file cannot be written.
     """
     opened = open_model(scene_rig, model)

@@ -38,13 +38,18 @@ from ..scene.mask import read_mask
 from ..scene.scene_rig import SceneRig
 
 FIRST_HELD_OUT_INDEX = 1 << 33
-"""Index of the first held-out random pose. No recording reaches it, so the poses differ from those of any recording,
-even with the same seed."""
+"""Index of the first held-out random pose. No recording has so many poses, so the held-out poses differ from all
+recorded poses, even with the same seed."""
 
 
 @dataclass(frozen=True)
 class NamedPose:
-    """A pose that is given as Euler angles by bone: radians, in the bone's rotation order; other bones are at rest."""
+    """A pose that is defined by the rotations of some bones; the other bones are at rest.
+
+    Attributes:
+        name: name of the pose.
+        rotations: by the name of each bone: Euler angles in the rotation order of the bone, radians.
+    """
 
     name: str
     rotations: dict[str, tuple[float, float, float]]
@@ -55,13 +60,13 @@ class EvaluationSettings:
     """The poses of an evaluation.
 
     Attributes:
-        poses: number of random held-out poses; if 0, the first action or strip replaces them.
+        poses: number of random held-out poses; if 0, the frames of the first action or strip replace them.
         seed: seed of the random poses.
-        actions, strips: names of actions, and of strips of the NLA, whose frames are compared too.
-        range_scales: factors by which the range of motion is widened for further random poses, a quarter of `poses`
-            for each.
-        named: further poses, each compared on its own.
-        surface: compare normals and edges too, which takes longer than everything else.
+        actions, strips: names of actions and of NLA strips whose frames are compared too.
+        range_scales: factors that widen the range of motion for further random poses. Each factor has a quarter as many
+            poses as `poses`.
+        named: further poses, each with errors of its own.
+        surface: whether to compare normals and edges too, which takes longer than the rest of the evaluation.
         target: the target to compare with; by default the rig itself.
     """
 
@@ -77,7 +82,7 @@ class EvaluationSettings:
 
 @dataclass
 class PoseErrors:
-    """Errors of one set of poses.
+    """The errors on one set of poses.
 
     Attributes:
         name: name of the set.
@@ -85,8 +90,8 @@ class PoseErrors:
         positions: (N, V, 3) float32, positions of the rig, mesh-object space, mesh units.
         controls: (N, C) float32, values of the controls.
         fdda, linear: (N, V) float32, distances of the model and of linear skinning from the rig, metres.
-        fdda_surface, linear_surface: errors of normals and edges; None for a mesh without faces, or if they were not
-            compared.
+        fdda_surface, linear_surface: errors of normals and edges; None for a mesh without faces, or if the surface was
+            not compared.
     """
 
     name: str
@@ -110,12 +115,12 @@ class PoseErrors:
 
 @dataclass
 class Evaluation:
-    """The errors of a model.
+    """The errors of a model on all sets of poses.
 
     Attributes:
         partitions: partitions of the model.
         joints: names of the joints.
-        held_out: errors on the random poses; without any, on the first action or strip.
+        held_out: errors on the random poses; without random poses, on the first action or strip.
         actions: errors on each action and strip.
         scaled_ranges: errors on the random poses of each scaled range of motion.
         named: errors on each named pose.
@@ -165,9 +170,9 @@ class Evaluation:
 def evaluate(
     scene_rig: SceneRig, model: Path | Network, settings: EvaluationSettings
 ) -> Iterator[Progress | Evaluation]:
-    """Compare a model with its rig, as a generator that works while it is iterated.
+    """Compare a model with its rig, as a generator that does its work while it is iterated.
 
-    If the mesh object has a mask, the masked model is compared. The scene is restored when the generator ends, is
+    If the mesh object has a mask, the mask is applied to the model. The scene is restored when the generator ends, is
     closed, or raises.
 
     Args:
@@ -180,7 +185,7 @@ def evaluate(
 
     Raises:
         RigError: the rig cannot be evaluated.
-        ModelError: the model cannot be read, or is of another rig.
+        ModelError: the model cannot be read, or was trained for another rig.
     """
     clips = find_clips(scene_rig.armature_object, settings.actions, settings.strips)
     if not settings.poses and not clips:
@@ -225,7 +230,7 @@ def evaluate(
 def evaluate_action(
     scene_rig: SceneRig, model: Path | Network, name: str, target: TargetSettings = NO_TARGET
 ) -> Iterator[Progress | Evaluation]:
-    """Compare positions on the frames of one action, which replace the held-out poses, as `evaluate` does."""
+    """Compare only the positions, and only on the frames of one action, which become `Evaluation.held_out`."""
     settings = EvaluationSettings(poses=0, actions=(name,), surface=False, target=target)
     for step in evaluate(scene_rig, model, settings):
         if isinstance(step, Evaluation):
@@ -239,7 +244,7 @@ def _prepare(scene_rig: SceneRig, model: Path | Network, is_own: bool) -> tuple[
     Args:
         scene_rig: the rig.
         model: path of the model, or the loaded model.
-        is_own: the surface of the rig itself is compared, not that of a target.
+        is_own: whether the model is compared with the mesh of the rig itself, not with a target.
     """
     stack = check_evaluable(scene_rig)
     opened = open_model(scene_rig, model)
@@ -288,7 +293,7 @@ def _named_pose(scene_rig: SceneRig, pose: NamedPose, pose_setter: PoseSetter) -
 
 
 class _Comparison:
-    """Evaluates poses with the rig, the model and linear skinning, and counts them."""
+    """Compares rig, model and linear skinning in poses, and counts the poses for the progress."""
 
     def __init__(
         self,
@@ -309,7 +314,18 @@ class _Comparison:
             self._surface = SurfaceComparison(faces, rig.rest_positions, skinning.partitions)
 
     def compare(self, name: str, poses: Iterator[None]) -> Iterator[Progress]:
-        """Compare poses, one for each iteration of `poses`; yields progress and returns the PoseErrors."""
+        """Compare rig, model and linear skinning in a set of poses.
+
+        Args:
+            name: name of the set.
+            poses: iterator that sets the next pose in each iteration.
+
+        Yields:
+            Progress.
+
+        Returns:
+            The PoseErrors.
+        """
         all_matrices, all_positions, all_controls, fdda, linear, surface = [], [], [], [], [], []
         for _ in poses:
             pose_matrices, rig_positions, controls = self._evaluator.evaluate()
