@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Trains the networks of a recording and writes the model. `python -m trainer` is the way in.
+"""The trainer: trains the networks of a recording and writes the model. Run it with `python -m trainer`.
 
-Uses `fdda_addon.core`, torch, onnx and onnxruntime; neither bpy nor Blender. docs/method.md says how the
-defaults were chosen.
+It uses `fdda_addon.core`, torch, onnx and onnxruntime, but not Blender or bpy. docs/method.md explains the method.
 """

@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The command line of the trainer: `python -m trainer RECORDING MODEL.onnx`.
 
-Exit status: 0 done, 1 failed with one sentence on stderr, 2 wrong usage, 75 failed for lack of disk
-or memory, 130 interrupted.
+Exit status:
+    0: the model is written.
+    1: the training failed; stderr has one sentence.
+    2: the arguments are wrong.
+    75: the training failed because disk space or memory ran out.
+    130: the training was interrupted.
 """
 
 import argparse
@@ -14,7 +18,7 @@ from fdda_addon.core.temporary import check_temporary_folder
 from fdda_addon.core.terminal import escape_unencodable_output
 
 if __name__ == "__main__":
-    # Before the other imports: a request to stop before `main` would end in a traceback.
+    # Before the other imports: a signal during an import would otherwise end in a traceback.
     exit_on_stop_signal()
 
 from .config import add_options, config_from_arguments
@@ -24,32 +28,32 @@ from .progress import JsonMessageSink, MessageSink, TextMessageSink
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+    """Run the command line, and return the exit status."""
     escape_unencodable_output()
     options = _parser().parse_args(arguments)
     sink: MessageSink = JsonMessageSink() if options.messages else TextMessageSink()
-    stop = StopRequest()
-    return run_with_messages(lambda: _train(options, sink, stop), sink)
+    stop_request = StopRequest()
+    return run_with_messages(lambda: _train(options, sink, stop_request), sink)
 
 
-def _train(options: argparse.Namespace, sink: MessageSink, stop: StopRequest) -> None:
+def _train(options: argparse.Namespace, sink: MessageSink, stop_request: StopRequest) -> None:
     config = config_from_arguments(options)
-    check_temporary_folder()  # torch fails without one
+    check_temporary_folder()  # torch fails without a temporary folder.
     try:
         from fdda_addon.core.recording.folder import recordings_in
 
         from .batch import check_batch, train_models
 
-        # Files are checked before torch is loaded, which takes seconds.
+        # Files are checked first, because loading torch takes seconds.
         if recordings := recordings_in(options.recording):
             check_batch(recordings, options.model, options.overwrite)
         else:
             check_training_outputs(options.model, options.overwrite)
-        with stop.exit_immediately(sink):
+        with stop_request.exit_immediately(sink):
             from .training import train_model
     except ModuleNotFoundError as error:
         raise missing_package("Training", error) from error
-    settings = (config, sink, stop, options.warm_start, options.strict, options.overwrite)
+    settings = (config, sink, stop_request, options.warm_start, options.strict, options.overwrite)
     if recordings:
         train_models(recordings, options.model, *settings)
     else:

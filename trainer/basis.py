@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Principal components of a partition's local residuals, as many as a tolerance requires."""
+"""Principal components of a partition's local residuals. A tolerance determines their number."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 MAX_POSES = 1000
-"""Components are computed from at most this many poses; coefficients from all."""
+"""Maximum number of poses from which components are computed. Coefficients are computed for all poses."""
 MAX_COMPONENTS = 128
 NEGLIGIBLE_RMS_RATIO = 0.01
-"""Part of the rms residual that the components may always leave: networks have far larger errors."""
+"""Error that components may always leave, as a part of the rms residual. Errors of the networks are far larger."""
 MAX_ERROR_RATIO = 2.0
-"""Upper bound of a partition's error over its allowed error when partitions share the tolerance."""
+"""Maximum ratio of a partition's error to its allowed error when partitions share the tolerance."""
 FINE_TOLERANCE_FACTOR = 4.0
-"""Components are allocated from bases that are computed at a tolerance finer by this factor."""
+"""Factor by which the tolerance is divided to compute the bases from which components are allocated."""
 BLOCK_COLUMNS = 1 << 14
-"""The Gram matrix is summed over blocks of this many columns, so that float64 needs little memory."""
+"""Columns, or rows, of a block that is converted to float64, so that the sums need little memory."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Basis:
     Attributes:
         mean: (3 Vp,) float32, mesh units.
         components: (K, 3 Vp) float32, orthonormal rows, no unit. K is 0 when the mean alone is within the tolerance.
-        truncation_rms: rms distance over poses and vertices that the components leave of the residuals that they were
-            computed from, mesh units.
-        error_by_count: (K + 1,) float64, the same for the first 0, 1, ... K components.
+        truncation_rms: rms distance over poses and vertices between the residuals and their approximation by the
+            components, mesh units.
+        error_by_count: (K + 1,) float64, the truncation error of the first 0, 1, ... K components, mesh units.
     """
 
     mean: np.ndarray
@@ -39,99 +39,107 @@ class Basis:
     def coefficients(self, residuals: np.ndarray) -> np.ndarray:
         """Compute (N, K) float32 coefficients of (N, 3 Vp) residuals, both in mesh units.
 
-        The distance of two rows of coefficients is the distance of the residuals that they represent.
+        The distance between two rows of coefficients equals the distance between the residuals that they represent.
         """
-        # (x - mean) @ components.T without a copy of x.
+        # This equals (residuals - mean) @ components.T, without a copy of the residuals.
         return (residuals @ self.components.T - self.mean @ self.components.T).astype(np.float32)
 
     def residuals(self, coefficients: np.ndarray) -> np.ndarray:
         """Compute (N, 3 Vp) float32 residuals from (N, K) coefficients, both in mesh units."""
         return (coefficients @ self.components + self.mean).astype(np.float32)
 
-    def truncated(self, count: int) -> "Basis":
+    def truncate(self, count: int) -> "Basis":
         """Return the basis of the first `count` components."""
         errors = self.error_by_count
         return Basis(self.mean, self.components[:count], float(errors[count]), errors[: count + 1])
 
 
 def allocate_components(
-    errors: Sequence[np.ndarray], vertex_counts: Sequence[int], tolerance: float, units: int
+    errors: Sequence[np.ndarray], vertex_counts: Sequence[int], tolerance: float, parameters_per_component: int
 ) -> list[int]:
     """Allocate components to partitions so that their common rms error meets the tolerance.
 
     Each further component goes to the partition where it removes most error per model parameter. Partitions with simple
-    residuals get more than their own tolerance requires, those with complex residuals fewer. As in `make_basis`, a
-    partition may leave a hundredth of its residual where that is more than the tolerance.
+    residuals get more components than the tolerance requires of them alone, and partitions with complex residuals get
+    fewer. As in `make_basis`, the error of a partition may always be a hundredth of its residual.
 
     Args:
         errors: for each partition its `Basis.error_by_count`.
-        vertex_counts: of each partition.
-        tolerance: rms distance over poses and all vertices that may remain, mesh units.
-        units: parameters that a component adds to a network, beside three for each vertex.
+        vertex_counts: number of vertices of each partition.
+        tolerance: allowed rms error over poses and all vertices, mesh units.
+        parameters_per_component: parameters that a component adds to a network, besides three for each vertex.
 
     Returns:
         The number of components of each partition.
     """
     allowed_errors = [max(tolerance, NEGLIGIBLE_RMS_RATIO * float(partition_errors[0])) for partition_errors in errors]
     counts, gains = [], []
-    for index, (partition_errors, size, allowed) in enumerate(zip(errors, vertex_counts, allowed_errors, strict=True)):
-        is_enough = partition_errors <= MAX_ERROR_RATIO * allowed
-        counts.append(int(np.argmax(is_enough)) if is_enough.any() else len(partition_errors) - 1)
-        removed_squares = size * (partition_errors[:-1] ** 2 - partition_errors[1:] ** 2)[counts[-1] :]
-        gains += [(removed / (3 * size + units), index, removed) for removed in removed_squares.tolist()]
-    remaining = sum(
-        size * float(partition_errors[count]) ** 2
-        for partition_errors, size, count in zip(errors, vertex_counts, counts, strict=True)
+    for index, (partition_errors, vertex_count, allowed_error) in enumerate(
+        zip(errors, vertex_counts, allowed_errors, strict=True)
+    ):
+        is_allowed = partition_errors <= MAX_ERROR_RATIO * allowed_error
+        counts.append(int(np.argmax(is_allowed)) if is_allowed.any() else len(partition_errors) - 1)
+        removed_squares = vertex_count * (partition_errors[:-1] ** 2 - partition_errors[1:] ** 2)[counts[-1] :]
+        gains += [
+            (removed_square / (3 * vertex_count + parameters_per_component), index, removed_square)
+            for removed_square in removed_squares.tolist()
+        ]
+    remaining_squares = sum(
+        vertex_count * float(partition_errors[count]) ** 2
+        for partition_errors, vertex_count, count in zip(errors, vertex_counts, counts, strict=True)
     )
-    goal = sum(size * allowed**2 for size, allowed in zip(vertex_counts, allowed_errors, strict=True))
-    # The components of one partition stay in order: each removes no more than the one before it.
-    for _, index, removed in sorted(gains, key=lambda gain: -gain[0]):
-        if remaining <= goal:
+    allowed_squares = sum(
+        vertex_count * allowed_error**2
+        for vertex_count, allowed_error in zip(vertex_counts, allowed_errors, strict=True)
+    )
+    # The components of one partition are added in order, because each removes at most as much as the one before it.
+    for _, index, removed_square in sorted(gains, key=lambda gain: -gain[0]):
+        if remaining_squares <= allowed_squares:
             break
         counts[index] += 1
-        remaining -= removed
+        remaining_squares -= removed_square
     return counts
 
 
 def make_basis(
     residuals: np.ndarray, tolerance: float, rng: np.random.Generator, weights: np.ndarray | None = None
 ) -> Basis:
-    """Compute the principal components that bring the rms error to the tolerance.
+    """Compute as many principal components as the tolerance of the rms error requires.
 
-    Uses the eigenvectors of the Gram matrix of the poses, or of the covariance of the coordinates where those are
-    fewer: a singular value decomposition of the residuals takes longer than the training.
+    Uses the eigenvectors of the Gram matrix of the poses, or of the covariance matrix of the coordinates where there
+    are fewer coordinates than poses. A singular value decomposition of the residuals takes longer than the training.
 
     Args:
-        residuals: (N, 3 Vp) float32, the training poses of one partition, mesh units.
-        tolerance: rms distance over poses and vertices that may remain, mesh units.
+        residuals: (N, 3 Vp) float32, residuals of one partition in the training poses, mesh units.
+        tolerance: allowed rms error over poses and vertices, mesh units.
         rng: samples the poses when there are more than `MAX_POSES`.
         weights: (N,) weight of each pose; None for equal weights.
     """
     weights = np.ones(len(residuals)) if weights is None else weights
     mean = _weighted_mean(residuals, weights)
-    count, width = residuals.shape
-    if count > MAX_POSES and width > MAX_POSES:
-        rows = np.sort(rng.choice(count, MAX_POSES, replace=False))
-        residuals, weights, count = residuals[rows], weights[rows], MAX_POSES
-    use_gram = count <= width
-    roots = np.sqrt(weights)[:, None]
-    products = np.zeros((min(count, width),) * 2)
-    for block in _blocks(width if use_gram else count):
+    pose_count, coordinate_count = residuals.shape
+    if pose_count > MAX_POSES and coordinate_count > MAX_POSES:
+        sampled_poses = np.sort(rng.choice(pose_count, MAX_POSES, replace=False))
+        residuals, weights, pose_count = residuals[sampled_poses], weights[sampled_poses], MAX_POSES
+    use_gram = pose_count <= coordinate_count
+    weight_roots = np.sqrt(weights)[:, None]
+    gram = np.zeros((min(pose_count, coordinate_count),) * 2)
+    for block in _block_slices(coordinate_count if use_gram else pose_count):
         values = residuals[:, block] if use_gram else residuals[block]
-        centered = (values.astype(np.float64) - (mean[block] if use_gram else mean)) * roots[
+        centered = (values.astype(np.float64) - (mean[block] if use_gram else mean)) * weight_roots[
             slice(None) if use_gram else block
         ]
-        products += centered @ centered.T if use_gram else centered.T @ centered
-    eigenvalues, eigenvectors = np.linalg.eigh(products)
+        gram += centered @ centered.T if use_gram else centered.T @ centered
+    eigenvalues, eigenvectors = np.linalg.eigh(gram)
     eigenvalues, eigenvectors = np.maximum(eigenvalues[::-1], 0), eigenvectors[:, ::-1]
-    errors = np.sqrt(np.append(np.cumsum(eigenvalues[::-1])[::-1], 0) / (weights.sum() * width / 3))
+    errors = np.sqrt(np.append(np.cumsum(eigenvalues[::-1])[::-1], 0) / (weights.sum() * coordinate_count / 3))
     component_count = min(int(np.argmax(errors <= max(tolerance, NEGLIGIBLE_RMS_RATIO * errors[0]))), MAX_COMPONENTS)
     eigenvectors = eigenvectors[:, :component_count]
     if use_gram:
-        components = np.empty((width, component_count))
-        for block in _blocks(width):
-            # Block by block: a product with float64 would make a float64 copy of all residuals.
-            components[block] = ((residuals[:, block].astype(np.float64) - mean[block]) * roots).T @ eigenvectors
+        components = np.empty((coordinate_count, component_count))
+        for block in _block_slices(coordinate_count):
+            # Block by block, because a product with float64 makes a float64 copy of all residuals.
+            components[block] = ((residuals[:, block].astype(np.float64) - mean[block]) * weight_roots).T @ eigenvectors
         eigenvectors = np.linalg.qr(components)[0] if component_count else components
     components = np.ascontiguousarray(eigenvectors.T, np.float32)
     return Basis(mean, components, float(errors[component_count]), errors[: component_count + 1])
@@ -141,10 +149,10 @@ def _weighted_mean(residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
     if (weights == 1).all():
         return residuals.mean(axis=0, dtype=np.float64).astype(np.float32)
     total = np.zeros(residuals.shape[1])
-    for block in _blocks(residuals.shape[1]):
+    for block in _block_slices(residuals.shape[1]):
         total[block] = weights @ residuals[:, block].astype(np.float64)
     return (total / weights.sum()).astype(np.float32)
 
 
-def _blocks(length: int) -> list[slice]:
+def _block_slices(length: int) -> list[slice]:
     return [slice(start, start + BLOCK_COLUMNS) for start in range(0, length, BLOCK_COLUMNS)]

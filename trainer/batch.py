@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Trains a model on each of several recordings, one after the other."""
+"""Training on several recordings: one model for each recording, trained one after the other."""
 
 import time
 from collections.abc import Callable
@@ -17,30 +17,30 @@ from .progress import MessageSink
 
 
 class _BatchItemSink:
-    """Sends the end of each training as `MODEL_FINISHED`, and records its values."""
+    """Receives the messages of each training, sends its last one as `MODEL_FINISHED`, and stores the values of it."""
 
     def __init__(self, sink: MessageSink):
         self._sink = sink
-        self.finished: list[dict] = []
+        self.finished_values: list[dict] = []
 
     def send(self, kind: MessageType, **values) -> None:
         if kind is MessageType.FINISHED:
             kind = MessageType.MODEL_FINISHED
-            self.finished.append(values)
+            self.finished_values.append(values)
         self._sink.send(kind, **values)
 
 
 def check_batch(recordings: list[Path], folder: Path, overwrite: bool = False) -> None:
-    """Check recordings and outputs before the first training. Does not need torch.
+    """Check recordings and outputs before the first training. This needs no torch.
 
     Args:
-        recordings: folders.
-        folder: of the models.
+        recordings: folders of the recordings.
+        folder: folder of the models.
         overwrite: as in `check_training_outputs`.
 
     Raises:
         RecordingError: a recording is incomplete.
-        OutputError: the path is the name of a model, or a file cannot be written.
+        OutputError: `folder` is the path of a model file, or a file cannot be written.
     """
     if folder.suffix == ".onnx":
         raise OutputError(
@@ -75,11 +75,11 @@ def train_models(
     strict: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Train a model on each recording. Finished models stay when a later training fails.
+    """Train a model on each recording. Finished models are kept when a later training fails.
 
     Args:
         recordings: folders of complete recordings.
-        folder: of the models; that of recording NAME is FOLDER/NAME/NAME.onnx.
+        folder: folder of the models; the model of recording NAME is FOLDER/NAME/NAME.onnx.
         config, sink, should_stop, warm_start, strict, overwrite: as in `train_model`.
 
     Raises:
@@ -97,7 +97,7 @@ def train_models(
         try:
             train_model(recording, model, config, item_sink, should_stop, warm_start, strict, overwrite)
         finally:
-            # Only empty folders can be removed.
+            # A folder with files stays, because rmdir fails there.
             for created in (model.parent, folder):
                 with suppress(OSError):
                     created.rmdir()
@@ -106,5 +106,7 @@ def train_models(
         model=str(folder),
         models=len(recordings),
         seconds=round(time.perf_counter() - started, 2),
-        **{key: max(values[key] for values in item_sink.finished) for key in ("held_out_mm", "held_out_p999_mm")},
+        **{
+            key: max(values[key] for values in item_sink.finished_values) for key in ("held_out_mm", "held_out_p999_mm")
+        },
     )

@@ -27,10 +27,10 @@ READ_ERRORS = (
     *(OSError, ValueError, KeyError, AttributeError, OverflowError, EOFError, zipfile.BadZipFile, zlib.error),
     *(RuntimeError, IndexError, *NPY_HEADER_ERRORS),
 )
-"""What numpy and zipfile raise for a damaged file; RuntimeError where the archive is encrypted."""
-OTHER_PARTITIONS = "The checkpoint is of other partitions; train without --warm-start."
-CONTRADICTION = "its arrays contradict each other"
-NOT_FINITE = "its arrays hold values that are not numbers"
+"""Errors of numpy and zipfile on a damaged file; RuntimeError for an encrypted archive."""
+OTHER_PARTITIONS_SENTENCE = "The checkpoint is of other partitions; train without --warm-start."
+CONTRADICTION_CLAUSE = "its arrays contradict each other"
+NOT_FINITE_CLAUSE = "its arrays hold values that are not numbers"
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class PartitionCheckpoint:
     """The network of one partition, with the feature statistics and the basis that it was trained with.
 
     Attributes:
-        columns: (F',) int64, indices of its features among all features of `NetworkInputs`.
-        feature_mean, feature_scale: (F',) float32.
+        columns: (F',) int64, indices of the network's inputs among all features of `NetworkInputs`.
+        feature_mean, feature_scale: (F',) float32, statistics of these features over the training poses.
         basis_mean: (3 Vp,) float32, mesh units.
         basis_components: (K, 3 Vp) float32, orthonormal rows, no unit.
-        network: from standardized features to coefficients in mesh units.
+        network: maps standardized features to coefficients in mesh units.
     """
 
     columns: np.ndarray
@@ -58,13 +58,14 @@ class Checkpoint:
     """The state from which a training can be continued.
 
     Attributes:
-        fingerprint: of the rig.
+        fingerprint: fingerprint of the rig.
         controls: names of the rig's controls.
         holdout: fingerprint of the held-out and validation poses (`splitting.holdout_fingerprint`).
-        hidden, activation: of the networks.
-        history: held-out errors of this training and its predecessors, oldest first: `{"poses", "p999"}`, in mm.
-        partitions: in the order of the recording.
-        surface_frames: inputs of the networks.
+        hidden, activation: layers and activation of the networks, as in `TrainingConfig`.
+        history: pose count and held-out error of this training and its predecessors, oldest first:
+            `{"poses", "p999"}`, mm.
+        partitions: state of each partition, in the order of the recording.
+        surface_frames: surface frames that are inputs of the networks.
         partition_indices: (V,) int64, index of the partition of each vertex.
     """
 
@@ -79,14 +80,14 @@ class Checkpoint:
     partition_indices: np.ndarray
 
     def reassign(self, partitions: tuple[Partition, ...]) -> tuple[Partition, ...]:
-        """Assign the vertices of a recording's partitions as the checkpoint does.
+        """Assign the vertices of a recording to its partitions as in the checkpoint.
 
         Raises:
             TrainingError: the recording has other partitions.
         """
         vertex_count = sum(len(partition.vertices) for partition in partitions)
         if (len(self.partitions), len(self.partition_indices)) != (len(partitions), vertex_count):
-            raise TrainingError(OTHER_PARTITIONS)
+            raise TrainingError(OTHER_PARTITIONS_SENTENCE)
         return reassign_vertices(partitions, self.partition_indices)
 
 
@@ -96,14 +97,14 @@ def write_checkpoint(
     """Write the checkpoint of a training.
 
     Args:
-        path: of the file.
-        trained_model: the trained model.
+        path: path of the checkpoint file.
+        trained_model: the result of the training.
         holdout, hidden, history: as in `Checkpoint`.
 
     Raises:
         OSError: the file cannot be written.
     """
-    about = {
+    metadata = {
         "version": VERSION,
         "fingerprint": vars(trained_model.rig.fingerprint),
         "controls": [control.name for control in trained_model.rig.controls],
@@ -113,7 +114,7 @@ def write_checkpoint(
         "history": history,
         "partitions": len(trained_model.partitions),
     }
-    arrays = {"about": np.frombuffer(json.dumps(about).encode(), np.uint8)}
+    arrays = {"about": np.frombuffer(json.dumps(metadata).encode(), np.uint8)}
     arrays |= {f"surface_frames/{name}": array for name, array in vars(trained_model.inputs.surface_frames).items()}
     arrays["partition_indices"] = partition_indices(trained_model.partitions)
     for index, (prepared, network) in enumerate(zip(trained_model.prepared, trained_model.networks, strict=True)):
@@ -135,18 +136,18 @@ def read_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint.
 
     Raises:
-        TrainingError: there is none, or the file is damaged.
+        TrainingError: there is no checkpoint, or it is damaged.
     """
     try:
         with open_input(path) as file:
             size = os.fstat(file.fileno()).st_size
             with zipfile.ZipFile(file) as archive:
-                # Nothing is allocated that is larger than the file.
+                # An array that is larger than the file is refused before memory is allocated.
                 if any(member.file_size > size for member in archive.infolist()):
                     raise ValueError("it is packed")
             file.seek(0)
             with np.load(file, allow_pickle=False) as arrays:
-                return _read(arrays)
+                return _read_arrays(arrays)
     except FileNotFoundError as error:
         raise TrainingError(
             f"There is no checkpoint '{path}' to start from; train without --warm-start first."
@@ -155,13 +156,13 @@ def read_checkpoint(path: Path) -> Checkpoint:
         raise TrainingError(f"The checkpoint '{path}' cannot be used ({error}); train without --warm-start.") from error
 
 
-def _read(arrays: np.lib.npyio.NpzFile) -> Checkpoint:
-    about = json.loads(arrays["about"].tobytes())
-    if about["version"] != VERSION:
-        raise ValueError(f"version {about['version']!r}")
-    hidden = tuple(int(units) for units in about["hidden"])
+def _read_arrays(arrays: np.lib.npyio.NpzFile) -> Checkpoint:
+    metadata = json.loads(arrays["about"].tobytes())
+    if metadata["version"] != VERSION:
+        raise ValueError(f"version {metadata['version']!r}")
+    hidden = tuple(int(units) for units in metadata["hidden"])
     partitions = []
-    for index in range(int(about["partitions"])):
+    for index in range(int(metadata["partitions"])):
         names = ("columns", "feature_mean", "feature_scale", "basis_mean", "basis_components")
         values = {name: arrays[f"{index}/{name}"] for name in names}
         layers = range(1 if not len(values["basis_components"]) else len(hidden) + 1)
@@ -170,12 +171,12 @@ def _read(arrays: np.lib.npyio.NpzFile) -> Checkpoint:
         _check_partition(partition, hidden)
         partitions.append(partition)
     return Checkpoint(
-        Fingerprint.from_json(about["fingerprint"]),
-        tuple(str(name) for name in about["controls"]),
-        str(about["holdout"]),
+        Fingerprint.from_json(metadata["fingerprint"]),
+        tuple(str(name) for name in metadata["controls"]),
+        str(metadata["holdout"]),
         hidden,
-        str(about["activation"]),
-        tuple({"poses": int(entry["poses"]), "p999": float(entry["p999"])} for entry in about["history"]),
+        str(metadata["activation"]),
+        tuple({"poses": int(entry["poses"]), "p999": float(entry["p999"])} for entry in metadata["history"]),
         tuple(partitions),
         _read_surface_frames(arrays),
         _read_partition_indices(arrays["partition_indices"], partitions),
@@ -184,10 +185,10 @@ def _read(arrays: np.lib.npyio.NpzFile) -> Checkpoint:
 
 def _read_partition_indices(partition_indices: np.ndarray, partitions: list[PartitionCheckpoint]) -> np.ndarray:
     if partition_indices.dtype != np.int64 or partition_indices.ndim != 1 or partition_indices.min(initial=0) < 0:
-        raise ValueError(CONTRADICTION)
+        raise ValueError(CONTRADICTION_CLAUSE)
     sizes = [len(partition.basis_mean) for partition in partitions]
     if (3 * np.bincount(partition_indices, minlength=len(sizes))).tolist() != sizes:
-        raise ValueError(CONTRADICTION)
+        raise ValueError(CONTRADICTION_CLAUSE)
     return partition_indices
 
 
@@ -206,11 +207,11 @@ def _read_surface_frames(arrays: np.lib.npyio.NpzFile) -> SurfaceFrameFeatures:
         if array.dtype != (np.int64 if is_index else np.float64) or array.shape != shapes.get(
             name, (3, count, corners)
         ):
-            raise ValueError(CONTRADICTION)
+            raise ValueError(CONTRADICTION_CLAUSE)
         if not (np.abs(array) <= MAX_VALUE).all() or (is_index and array.min(initial=0) < 0):
-            raise ValueError(NOT_FINITE)
+            raise ValueError(NOT_FINITE_CLAUSE)
     if surface_frames.tangents.ndim != 4 or not (surface_frames.epsilons > 0).all():
-        raise ValueError(CONTRADICTION)
+        raise ValueError(CONTRADICTION_CLAUSE)
     return surface_frames
 
 
@@ -224,9 +225,9 @@ def _check_partition(partition: PartitionCheckpoint, hidden: tuple[int, ...]) ->
     arrays = [partition.feature_mean, partition.feature_scale, partition.basis_mean, partition.basis_components]
     for array in (*arrays, *network.weights, *network.biases):
         if array.dtype != np.float32 or not (np.abs(array) <= MAX_VALUE).all():
-            raise ValueError(NOT_FINITE)
+            raise ValueError(NOT_FINITE_CLAUSE)
     if partition.columns.dtype != np.int64 or partition.columns.ndim != 1:
-        raise ValueError(CONTRADICTION)
+        raise ValueError(CONTRADICTION_CLAUSE)
     feature_count, component_count = len(partition.columns), len(partition.basis_components)
     sizes = (feature_count, *hidden, component_count) if component_count else (feature_count, 0)
     if (
@@ -236,4 +237,4 @@ def _check_partition(partition: PartitionCheckpoint, hidden: tuple[int, ...]) ->
         or not (partition.feature_mean.shape == partition.feature_scale.shape == (feature_count,))
         or not (partition.feature_scale > 0).all()
     ):
-        raise ValueError(CONTRADICTION)
+        raise ValueError(CONTRADICTION_CLAUSE)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The confidence of a partition: how far a pose lies inside the range of the training poses.
+"""The confidence of a partition: 1 for a pose inside the range of the training poses, 0 for a pose far outside.
 
-The range of a joint is a box around its features in the training poses, with a margin; that of a control, around its
-values. The excess of a pose is its distance from the box, in units of a fade width that grows with the range. With e
-the excess over all joints and controls that count for a partition, its confidence is max(0, 1 - e^2)^2: exactly 1
-inside, 0 from one fade width on, smooth at both ends.
+The range of a joint is a box around its features in the training poses, with a margin. The range of a control is an
+interval around its values. The excess of a pose is its distance from the box, divided by a fade width that grows with
+the range. With e the excess over all joints and controls that count for a partition, the confidence is
+max(0, 1 - e^2)^2. It is exactly 1 inside the box, 0 beyond one fade width, and smooth between.
 """
 
 from dataclasses import dataclass, replace
@@ -24,11 +24,11 @@ FADE_RATIO = 6.0
 outside of it: docs/experiments.md, Margin around the range of motion."""
 MIN_MARGINS = (0.01, 0.001)
 MIN_FADE_WIDTHS = (4.0, 0.2)
-"""Minimum margin and fade width: of rotation elements, no unit; of translations, as a part of the character's size. A
-locked axis has no range, so they apply to it. Those of a control are the first of each, as a part of its recorded
-range."""
+"""Minimum margin and minimum fade width. The first is of rotation elements, without unit, and of controls, as a part of
+their recorded range. The second is of translations, as a part of the character's size. They apply to a locked axis,
+which has no range."""
 MIN_LOCKED_SPREAD = 1e-4
-"""A joint whose features spread less than this was locked in the recording (no unit, or meters)."""
+"""A joint was locked in the recording if its features spread less than this: rotations no unit, translations meters."""
 
 
 @dataclass(frozen=True)
@@ -36,24 +36,26 @@ class TrainingRange:
     """The range of the joints and controls in the training poses.
 
     Attributes:
-        low, high: (F,) float32, the box with its margin, of all features (`NetworkInputs`).
-        width: (12 J + C,) float32, fade width of the features of joints and controls; only these count.
-        counts: (P, 12 J + C) bool, the features that count for a partition: of all that influences it, and of adjacent
-            joints that were locked, whose effect is unknown.
+        low, high: (F,) float32, bounds of all features (`NetworkInputs`), with the margin.
+        fade_width: (12 J + C,) float32, fade width of the features of joints and controls. Other features have no
+            effect on the confidence.
+        counts: (P, 12 J + C) bool, the features that count for a partition: features of the joints and controls that
+            influence it, and of adjacent joints that were locked, because their effect is unknown.
         controls: C controls with their recorded ranges.
     """
 
     low: np.ndarray
     high: np.ndarray
-    width: np.ndarray
+    fade_width: np.ndarray
     counts: np.ndarray
     controls: tuple[Control, ...] = ()
 
     def confidence(self, features: np.ndarray) -> np.ndarray:
         """Compute the (N, P) float32 confidence of each partition from (N, F) features."""
-        size = len(self.width)
-        direct = features[:, :size]
-        excess = ((direct - np.clip(direct, self.low[:size], self.high[:size])) / self.width).astype(np.float64)
+        direct_count = len(self.fade_width)
+        direct_features = features[:, :direct_count]
+        clamped = np.clip(direct_features, self.low[:direct_count], self.high[:direct_count])
+        excess = ((direct_features - clamped) / self.fade_width).astype(np.float64)
         return (np.maximum(0, 1 - excess**2 @ self.counts.T) ** 2).astype(np.float32)
 
 
@@ -61,25 +63,25 @@ def measure_training_range(features: np.ndarray, rig: Rig, partitions: tuple[Par
     """Measure the range of the training poses.
 
     Args:
-        features: (n, F) float32 of the training poses, as from `NetworkInputs.features`.
-        rig, partitions: of the recording.
+        features: (n, F) float32, features of the training poses from `NetworkInputs.features`.
+        rig, partitions: rig and partitions of the recording.
     """
     low, high = features.min(axis=0), features.max(axis=0)
     spread, joint_columns = high - low, len(rig.joints) * FEATURES_PER_JOINT
     direct_columns = joint_columns + len(rig.controls)
     is_translation = (np.arange(len(low)) % 4 == 3) | (np.arange(len(low)) >= direct_columns)
-    min_margin, min_width = (
+    min_margin, min_fade_width = (
         np.where(is_translation, minimum[1] * rig.size, minimum[0]) for minimum in (MIN_MARGINS, MIN_FADE_WIDTHS)
     )
-    for minimum, ratio in ((min_margin, MIN_MARGINS[0]), (min_width, MIN_FADE_WIDTHS[0])):
+    for minimum, ratio in ((min_margin, MIN_MARGINS[0]), (min_fade_width, MIN_FADE_WIDTHS[0])):
         minimum[joint_columns:direct_columns] = [ratio * _control_range(control) for control in rig.controls]
     margin = np.maximum(MARGIN_RATIO * spread, min_margin)
-    width = np.maximum(FADE_RATIO * spread, min_width)[:direct_columns]
+    fade_width = np.maximum(FADE_RATIO * spread, min_fade_width)[:direct_columns]
     control_columns = slice(joint_columns, direct_columns)
     ranges = zip(rig.controls, low[control_columns].tolist(), high[control_columns].tolist(), strict=True)
     counts = [_counting_joints(spread, rig, partitions), _counting_controls(rig, partitions)]
     return TrainingRange(
-        *(array.astype(np.float32) for array in (low - margin, high + margin, width)),
+        *(array.astype(np.float32) for array in (low - margin, high + margin, fade_width)),
         np.concatenate(counts, axis=1),
         tuple(replace(control, low=minimum, high=maximum) for control, minimum, maximum in ranges),
     )
@@ -101,7 +103,10 @@ def _counting_joints(spread: np.ndarray, rig: Rig, partitions: tuple[Partition, 
 
 
 def _counting_controls(rig: Rig, partitions: tuple[Partition, ...]) -> np.ndarray:
-    """Return (P, C) bool. A control without a range counts for every partition: its effect was not recorded."""
+    """Return (P, C) bool, the controls that count for each partition.
+
+    A control without a range counts for every partition, because its effect was not recorded.
+    """
     counts = np.tile(np.array([control.low == control.high for control in rig.controls], bool), (len(partitions), 1))
     for index, partition in enumerate(partitions):
         counts[index, list(partition.controls)] = True
@@ -109,5 +114,8 @@ def _counting_controls(rig: Rig, partitions: tuple[Partition, ...]) -> np.ndarra
 
 
 def _control_range(control: Control) -> float:
-    """Return the recorded range of a control; without one its value, at least 1, the range of most sliders."""
+    """Return the recorded range of a control.
+
+    For a control without a range, return its absolute value, or 1 if that is smaller: the range of most sliders.
+    """
     return control.high - control.low or max(1.0, abs(control.low))

@@ -16,19 +16,19 @@ class TrainingConfig:
     """Settings of a training; docs/experiments.md has the measurements behind the defaults.
 
     Attributes:
-        seed: of the split, the initial weights, the order of the poses and the dropout.
-        tolerance_mm: rms distance over training poses and all vertices that the components may leave, mm.
+        seed: seed of the split, the initial weights, the order of the poses and the dropout.
+        tolerance_mm: rms error over training poses and all vertices that the components may leave, mm.
         hidden: units of each hidden layer of a network.
-        activation: of the hidden layers, one of `ACTIVATIONS`.
+        activation: activation of the hidden layers, one of `ACTIVATIONS`.
         epochs: passes over the training poses.
         batch_size: poses per step.
         learning_rate: maximum of the one-cycle schedule.
-        weight_decay: of AdamW, decoupled.
-        dropout: probability of a hidden unit to be dropped in a step.
+        weight_decay: decoupled weight decay of AdamW.
+        dropout: probability that a step drops a hidden unit.
         l1, l2: factors of the sums of absolute and of squared weights in the loss.
         averaging: decay of the exponential moving average of the weights; 0 for no average.
-        validation_fraction: part of the poses that selects the best weights and does not train.
-        held_out_fraction: part of the poses that measures the error, and neither trains nor selects weights.
+        validation_fraction: part of the poses that select the best weights; the networks are not trained on them.
+        held_out_fraction: part of the poses that measure the error, and are used for nothing else.
         goal_mm: distance that 99.9 % of the held-out vertices should not exceed, mm; 0 for no goal.
         patience: epochs without improvement of any partition after which the training stops; 0 for all epochs.
         include_unsettled: also use poses in which the target did not come to rest.
@@ -79,7 +79,7 @@ class TrainingConfig:
 
     @staticmethod
     def from_mapping(values: dict) -> "TrainingConfig":
-        """Make settings from names and values; missing settings keep their defaults.
+        """Create settings from names and values; missing settings have their defaults.
 
         Raises:
             TrainingError: a name is unknown or a value is impossible.
@@ -100,7 +100,7 @@ class TrainingConfig:
         return {**asdict(self), "hidden": list(self.hidden)}
 
 
-HELP = {
+OPTION_HELP = {
     "seed": "of the split, the initial weights and the order of the poses",
     "tolerance_mm": "rms error that the components may leave over the whole mesh, in mm",
     "hidden": "units of each hidden layer",
@@ -122,11 +122,11 @@ HELP = {
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add an option for each setting to a parser, `--batch-size` for `batch_size`."""
+    """Add an option for each setting to a parser, for example `--batch-size` for `batch_size`."""
     group = parser.add_argument_group("training settings")
     for field in fields(TrainingConfig):
         if isinstance(field.default, bool):
-            group.add_argument(f"--{field.name.replace('_', '-')}", action="store_true", help=HELP[field.name])
+            group.add_argument(f"--{field.name.replace('_', '-')}", action="store_true", help=OPTION_HELP[field.name])
             continue
         kind = {"hidden": int, "activation": str}.get(field.name, type(field.default))
         default = " ".join(map(str, field.default)) if field.name == "hidden" else field.default
@@ -137,12 +137,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             nargs="+" if field.name == "hidden" else None,
             choices=ACTIVATIONS if field.name == "activation" else None,
             metavar=None if field.name == "activation" else "N" if kind is int else "X",
-            help=f"{HELP[field.name]} (default: {default})",
+            help=f"{OPTION_HELP[field.name]} (default: {default})",
         )
 
 
 def config_from_arguments(arguments: argparse.Namespace) -> TrainingConfig:
-    """Make settings from the options that `add_options` added.
+    """Create settings from the options that `add_options` added.
 
     Raises:
         TrainingError: a value is impossible.

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Learning curves of a training."""
+"""The learning curves of a training."""
 
 from dataclasses import dataclass, field
 
 
 @dataclass
 class Curves:
-    """Errors of one partition by epoch, as rms distances over vertices, mm.
+    """Errors of one partition after each epoch: rms distances over the vertices, mm.
 
     Attributes:
         training_mm: mean over the training poses, with the current weights.
         validation_mm: mean over the validation poses, with the averaged weights.
         worst_mm: maximum over the validation poses, with the averaged weights.
-        best_epoch: of the lowest `validation_mm`; 1 is the first.
+        best_epoch: epoch with the lowest `validation_mm`; epoch 1 is the first.
     """
 
     training_mm: list[float] = field(default_factory=list)
@@ -23,7 +23,7 @@ class Curves:
 
 @dataclass(frozen=True)
 class Progress:
-    """Errors after an epoch, 1 is the first: means of the curves weighted by vertices, mm."""
+    """Errors after an epoch: means over the partitions, weighted by their vertices, mm. Epoch 1 is the first."""
 
     epoch: int
     epochs: int

@@ -20,24 +20,24 @@ from .low_rank import factorize, may_factorize
 from .splitting import Split
 
 MARGIN_POSE_WEIGHT = 0.1
-"""Weight of a pose of the margin in the basis, where other poses have 1: its residual is many times as large, and the
-components are meant for the range of motion."""
+"""Weight of a margin pose in the basis; other poses have weight 1. Its residual is many times as large as others, but
+the components are meant for the range of motion."""
 MIN_FEATURE_SPREAD = 1e-5
-"""A feature whose standard deviation over the training poses is smaller counts as constant: meters, or no unit."""
+"""A feature is constant if its standard deviation over the training poses is smaller: meters, or no unit."""
 
 
 @dataclass(frozen=True)
 class PartitionData:
-    """Features and residuals of one partition, from a recording or from elsewhere.
+    """Features and residuals of one partition, from a recording or another source.
 
     Attributes:
-        name: of the main joint.
+        name: name of the main joint.
         features: (N, F) float32, the features that are offered to the network; F may be 0.
-        read_residuals: returns the (N, Vp, 3) float32 local residuals, mesh units. Called once, so that not all
-            partitions are in memory at a time.
+        read_residuals: returns the (N, Vp, 3) float32 local residuals, mesh units. It is called once, so that only one
+            partition's residuals are in memory at a time.
         vertex_count: Vp.
         read_regression: returns the linear regression that is fitted first; called at most twice. None without joints.
-        min_spread: (F,) float64, least standard deviation of a feature that varies, or one value for all.
+        min_spread: (F,) float64, minimum standard deviation of a feature that varies, or one value for all features.
     """
 
     name: str
@@ -53,17 +53,17 @@ class PreparedPartition:
     """A partition that is ready to train.
 
     Attributes:
-        name: of the main joint.
+        name: name of the main joint.
         vertex_count: Vp.
         columns: (F',) int32, the offered features that vary over the training poses: the inputs of the network.
         feature_mean, feature_scale: (F',) float32, mean and standard deviation over the training poses.
         inputs: (N, F') float32, standardized features of all poses.
         fit: linear part of the residuals.
-        basis: of what the fit leaves of the residuals of the training poses.
-        coefficients: (N, K) float32, of all poses, mesh units.
+        basis: components of the training residuals that remain after the fit.
+        coefficients: (N, K) float32, coefficients of all poses, mesh units.
         residual_rms: rms distance from the mean over training poses and vertices, after the fit, mesh units.
-        validation_truncation: (n,) rms distance over the vertices that the basis leaves of each validation pose, mesh
-            units.
+        validation_truncation: (n,) rms distance over the vertices between the residuals of each validation pose and
+            their approximation by the basis, mesh units.
         validation: (n,) indices of the validation poses.
         mm_per_unit: millimeters per mesh unit.
         vertex_factors: (r, Vp) float32, right factor of fit and basis (`low_rank`); None where they are not factorized.
@@ -85,12 +85,12 @@ class PreparedPartition:
     vertex_factors: np.ndarray | None = None
 
     def with_components(self, count: int) -> "PreparedPartition":
-        """Return the partition with the first `count` components alone."""
+        """Return the partition with only the first `count` components."""
         removed = self.coefficients[self.validation, count:].astype(np.float64)
         squared = self.validation_truncation**2 + (removed**2).sum(axis=1) / self.vertex_count
         return replace(
             self,
-            basis=self.basis.truncated(count),
+            basis=self.basis.truncate(count),
             coefficients=np.ascontiguousarray(self.coefficients[:, :count]),
             validation_truncation=np.sqrt(squared),
         )
@@ -100,8 +100,8 @@ def residuals_of(recording: Recording, partition: Partition, poses: np.ndarray |
     """Read the local residuals of a partition's vertices in the space of its main joint.
 
     Args:
-        recording: of the rig.
-        partition: its vertices may have other main joints in the recording; their residuals are converted.
+        recording: recording with the residuals.
+        partition: partition to read. Residuals of vertices that have another main joint in the recording are converted.
         poses: (n,) indices; None for all.
 
     Returns:
@@ -126,13 +126,13 @@ def residuals_of(recording: Recording, partition: Partition, poses: np.ndarray |
 def partition_data(
     recording: Recording, partitions: Sequence[Partition], inputs: NetworkInputs, use_half_rotations: bool = False
 ) -> list[PartitionData]:
-    """Make the data of a recording's partitions.
+    """Create the data of a recording's partitions.
 
     Args:
-        recording: of the rig.
-        partitions: of the recording, possibly refined.
-        inputs: of the networks.
-        use_half_rotations: whether residuals are regressed on half-rotation matrices too.
+        recording: recording with the poses.
+        partitions: partitions of the recording, possibly refined.
+        inputs: input features of the networks.
+        use_half_rotations: whether residuals are also regressed on half-rotation matrices.
     """
     rig = recording.rig
     features = inputs.features(recording.pose_matrices, rig.rest_matrices, recording.controls)
@@ -155,16 +155,16 @@ def partition_data(
 def prepare_partition(
     partition: PartitionData, split: Split, tolerance_mm: float, seed: int, metres_per_unit: float = 1.0
 ) -> PreparedPartition:
-    """Standardize the features of a partition, fit its linear part, and convert what remains to coefficients.
+    """Standardize the features of a partition, fit its linear part, and convert the remainder to coefficients.
 
-    Only training poses determine the statistics, the fit and the basis. A partition without varying features gets no
-    components: its mean is its best approximation.
+    Only training poses determine the statistics, the fit and the basis. A partition without varying features has no
+    components, because its mean is its best approximation.
 
     Args:
         partition: data of all poses.
-        split: of the poses.
-        tolerance_mm: rms distance that the components may leave, mm.
-        seed: of the sample of poses from which a basis is computed.
+        split: split of the poses.
+        tolerance_mm: rms error that the components may leave, mm.
+        seed: seed of the sample of poses from which the basis is computed.
         metres_per_unit: as in `Rig`.
     """
     features = partition.features
@@ -209,15 +209,15 @@ def prepare_partitions(
     tolerance_mm: float,
     seed: int,
     metres_per_unit: float = 1.0,
-    units: int = 0,
+    last_hidden_units: int = 0,
     on_progress: Callable[[int], None] = lambda done: None,
 ) -> list[PreparedPartition]:
-    """Prepare partitions that share one tolerance (`allocate_components`), and factorize large ones.
+    """Prepare partitions that share one tolerance (`allocate_components`), and factorize large partitions.
 
     Args:
         partitions, split, tolerance_mm, seed, metres_per_unit: as in `prepare_partition`.
-        units: of the last hidden layer.
-        on_progress: called after each partition with the number of partitions that are read.
+        last_hidden_units: number of units in the last hidden layer.
+        on_progress: called after each partition with the number of partitions that are prepared.
     """
     prepared = []
     for partition in partitions:
@@ -226,17 +226,17 @@ def prepare_partitions(
         on_progress(len(prepared))
     errors, vertex_counts = [p.basis.error_by_count for p in prepared], [p.vertex_count for p in prepared]
     tolerance = tolerance_mm / (1000 * metres_per_unit)
-    counts = allocate_components(errors, vertex_counts, tolerance, units + 1)
+    counts = allocate_components(errors, vertex_counts, tolerance, last_hidden_units + 1)
     return [
-        _factorized(each.with_components(count), partition.read_regression, split, tolerance)
-        for each, count, partition in zip(prepared, counts, partitions, strict=True)
+        _factorized(partition_with_all_components.with_components(count), partition.read_regression, split, tolerance)
+        for partition_with_all_components, count, partition in zip(prepared, counts, partitions, strict=True)
     ]
 
 
 def _factorized(
     prepared: PreparedPartition, read_regression: Callable[[], JointRegression] | None, split: Split, tolerance: float
 ) -> PreparedPartition:
-    """Factorize a partition where that saves parameters; else return it unchanged."""
+    """Factorize a partition if that saves parameters; otherwise return it unchanged."""
     if not may_factorize(prepared.fit, prepared.basis):
         return prepared
     fit, basis, coefficients = prepared.fit, prepared.basis, prepared.coefficients
@@ -255,7 +255,7 @@ def _factorized(
 
 
 def _mean_square(residuals: np.ndarray, mean: np.ndarray, poses: np.ndarray) -> float:
-    """Return the mean over poses of the squared distance of (N, W) residuals from a mean (W,)."""
+    """Return the mean over poses of the squared distance between (N, W) residuals and their mean (W,)."""
     total, step = 0.0, max(1, BLOCK_ELEMENTS // residuals.shape[1])
     for start in range(0, len(poses), step):
         errors = residuals[poses[start : start + step]].astype(np.float64) - mean

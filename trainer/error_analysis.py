@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Analyzes the largest errors of each partition, to report what would lower them."""
+"""Analysis of the largest errors of each partition. The report shows what is likely to lower them."""
 
 from dataclasses import asdict, dataclass
 
@@ -17,17 +17,17 @@ from .splitting import Split
 from .trained_model import TrainedModel
 
 ANALYZED_FRACTION = 5e-3
-"""Part of a partition's held-out errors that is analyzed, the largest ones, at least one."""
+"""Part of a partition's held-out errors that is analyzed: the largest errors, at least one."""
 MAX_TRAINING_POSES = 2000
-"""Maximum number of training poses among which the nearest is searched."""
+"""Maximum number of training poses among which the nearest pose is searched."""
 MIN_TRUNCATION_FRACTION = 0.5
-"""Components are the cause where they leave at least this part of the squared error."""
+"""Too few components are the cause if they leave at least this part of the squared error."""
 MIN_GENERALIZATION_RATIO = 1.5
-"""Poses are the cause where held-out errors are at least this many times the training errors."""
+"""Too few poses are the cause if the held-out errors are at least this many times the training errors."""
 MIN_DISTANCE_RATIO = 1.5
-"""The poses are extreme where the nearest training pose is at least this many times as far as usual."""
+"""Poses are extreme if the nearest training pose is at least this many times as far as the median."""
 MIN_SPREAD_RATIO = 1e-3
-"""Features that spread less than this part of the largest spread are ignored."""
+"""Features are ignored if their standard deviation is below this part of the largest one."""
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,16 @@ class ErrorAnalysis:
     """The largest held-out errors of one partition.
 
     Attributes:
-        poses, vertices: numbers of different poses and vertices that have them.
-        truncation: part of their squares that the components do not represent.
-        boundary: how much more often they are at vertices with an edge to another partition; None where no vertex has
-            one, or the mesh has no faces.
-        joint: name of the influencing joint or control that is furthest from its mean in these poses; empty without
-            any.
-        extreme: distance of this joint from its mean, over the mean distance in all held-out poses.
-        distance: to the nearest training pose, over the median of all held-out poses.
-        generalization: 99.9th percentile of the held-out errors over that of the training errors.
+        poses, vertices: numbers of different poses and vertices with these errors.
+        truncation: part of the squared errors that the components do not represent.
+        boundary: ratio between the frequency of boundary vertices among these errors and among all vertices. A boundary
+            vertex has an edge to another partition. None if there is no boundary vertex.
+        joint: name of the influencing joint or control that is furthest from its mean in these poses; empty if nothing
+            influences the partition.
+        extreme: ratio between the distance of this joint from its mean in these poses and in all held-out poses.
+        distance: ratio between the distance of these poses to the nearest training pose and the median distance of all
+            held-out poses.
+        generalization: ratio between the 99.9th percentiles of the held-out errors and of the training errors.
         cause: key of `error_causes.CAUSES`.
     """
 
@@ -68,11 +69,11 @@ def analyze_errors(
     """Analyze the largest errors of each partition.
 
     Args:
-        recording: that was trained on.
+        recording: recording of the training.
         trained_model: the result of the training.
-        split: of the poses.
-        held_out: (n, V) float32 distances of the held-out poses, meters.
-        on_training: (m, V) float32 distances of some training poses, meters.
+        split: split of the poses.
+        held_out: (n, V) float32 errors of the held-out poses, meters.
+        on_training: (m, V) float32 errors of some training poses, meters.
     """
     rig = recording.rig
     training = split.training[:: max(1, len(split.training) // MAX_TRAINING_POSES)]
@@ -133,15 +134,15 @@ def _boundary_mask(recording: Recording, trained_model: TrainedModel) -> np.ndar
     starts, corners = recording.rig.face_starts, recording.rig.face_vertices
     if not len(starts):
         return None
-    owner = np.zeros(recording.rig.vertex_count, np.int64)
+    partition_index_of_vertex = np.zeros(recording.rig.vertex_count, np.int64)
     for index, partition in enumerate(trained_model.partitions):
-        owner[partition.vertices] = index
+        partition_index_of_vertex[partition.vertices] = index
     ends = np.append(starts[1:], len(corners))
-    following = np.arange(len(corners)) + 1
-    following[ends - 1] = starts
-    crosses = owner[corners] != owner[corners[following]]
-    is_boundary = np.zeros(len(owner), bool)
-    is_boundary[corners[crosses]] = is_boundary[corners[following][crosses]] = True
+    next_corner = np.arange(len(corners)) + 1
+    next_corner[ends - 1] = starts
+    crosses_boundary = partition_index_of_vertex[corners] != partition_index_of_vertex[corners[next_corner]]
+    is_boundary = np.zeros(len(partition_index_of_vertex), bool)
+    is_boundary[corners[crosses_boundary]] = is_boundary[corners[next_corner][crosses_boundary]] = True
     return is_boundary
 
 
@@ -151,13 +152,13 @@ def _most_extreme_joint(
     """Find the joint or control that is furthest from its mean in the analyzed poses.
 
     Args:
-        recording, partition: that the values are of.
-        values: (n, f) of the held-out poses, as from `_influencing_values`.
-        training_values: (m, f) of training poses.
+        recording, partition: recording and partition of the values.
+        values: (n, f) values of the held-out poses from `_influencing_values`.
+        training_values: (m, f) values of training poses.
         poses: indices of the analyzed poses among the n.
 
     Returns:
-        Its name, and its distance from the mean over the mean distance in all n poses.
+        The name, and the ratio between its distance from the mean in the analyzed poses and in all n poses.
     """
     names = [recording.rig.joint_names[joint] for joint in partition.influencing]
     widths = [FEATURES_PER_JOINT] * len(names) + [1] * len(partition.controls)
@@ -167,12 +168,12 @@ def _most_extreme_joint(
     squares = np.zeros(values.shape)
     offsets = (values - training_values.mean(axis=0, dtype=np.float64))[:, is_used]
     squares[:, is_used] = (offsets / spread[is_used]) ** 2
-    best, parts = ("", 1.0), np.split(squares, np.cumsum(widths), axis=1)
-    for name, columns in zip(names, parts[:-1], strict=True):
+    most_extreme, squares_by_name = ("", 1.0), np.split(squares, np.cumsum(widths), axis=1)
+    for name, columns in zip(names, squares_by_name[:-1], strict=True):
         distances = np.sqrt(columns.sum(axis=1))
         extreme = _ratio(float(distances[poses].mean()), float(distances.mean()))
-        best = max(best, (name, extreme), key=lambda pair: pair[1])
-    return best
+        most_extreme = max(most_extreme, (name, extreme), key=lambda pair: pair[1])
+    return most_extreme
 
 
 def _truncation_fraction(
@@ -187,7 +188,7 @@ def _truncation_fraction(
     """Return the part of the squared errors that fit and components do not represent.
 
     Args:
-        recording, partition, prepared: of the training.
+        recording, partition, prepared: recording, and the partition with its data.
         held_out: indices of the n held-out poses.
         poses, vertices: indices of the analyzed errors.
         errors: (n, Vp) distances, meters.

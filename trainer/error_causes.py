@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Probable causes of the largest errors of a partition. It is imported without torch, for the report page."""
+"""Probable causes of the largest errors of a partition. The report page imports this module without torch."""
 
 COMPONENTS, EXTREMES, POSES, STEEP, NONE = "components", "extremes", "poses", "steep", "none"
 CAUSES = {
@@ -9,4 +9,4 @@ CAUSES = {
     STEEP: "little: training poses have the same errors, so the rig flips there, or the networks are too small",
     NONE: "no cause stands out",
 }
-"""What helps, by cause."""
+"""For each cause, the change that is likely to lower the errors."""

@@ -35,21 +35,21 @@ from .half_rotations import regression_matrices
 from .trained_model import TrainedModel
 
 MAX_DIFFERENCE_METRES = 1e-5
-"""Largest allowed difference of a position from the reference, meters. It grows with rigs larger than a meter, and with
-rounding far from the origin."""
+"""Maximum difference of a position from the reference, meters. For rigs larger than a meter it is scaled by their size,
+and the rounding error of float32 far from the origin is added."""
 MAX_CONFIDENCE_DIFFERENCE = 1e-3
 MAX_SURFACE_POSES = 50
-"""Maximum number of poses in which normals are compared: at 50,000 vertices a pose takes a tenth of a second."""
+"""Maximum number of poses in which normals are compared. At 50,000 vertices a pose takes a tenth of a second."""
 BLOCK_ELEMENTS = 1 << 24
 """Poses are evaluated in blocks of at most this many coordinates."""
 
 
 @dataclass(frozen=True)
 class PositionErrors:
-    """Distances to the recorded positions, meters; vertices in mesh order.
+    """Distances to the recorded positions, meters, with the vertices in mesh order.
 
     Attributes:
-        fdda, linear: (n, V) float32, of the model and of linear skinning alone.
+        fdda, linear: (n, V) float32, errors of the model and of linear skinning alone.
     """
 
     fdda: np.ndarray
@@ -59,12 +59,12 @@ class PositionErrors:
 def reference_positions(
     trained_model: TrainedModel, pose_matrices: np.ndarray, controls: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the positions by core's features and linear skinning, and the networks in PyTorch.
+    """Compute the positions with the features and linear skinning of `core`, and with the networks in PyTorch.
 
     Args:
-        trained_model: with J joints, V vertices and P partitions.
+        trained_model: model with J joints, V vertices and P partitions.
         pose_matrices: (N, J, 4, 4), mesh-object space, mesh units.
-        controls: (N, C) values.
+        controls: (N, C) values of the controls.
 
     Returns:
         (N, V, 3) float32 positions, mesh-object space, mesh units, and (N, P) float32 confidence.
@@ -91,7 +91,7 @@ def open_session(model: bytes) -> onnxruntime.InferenceSession:
     """Create an ONNX Runtime session on the CPU.
 
     Raises:
-        TrainingError: ONNX Runtime refuses the model.
+        TrainingError: ONNX Runtime does not load the model.
     """
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
@@ -155,7 +155,7 @@ def check_parity(
         The largest difference of a position, meters.
 
     Raises:
-        TrainingError: the difference is too large, or the model gives values that are not finite.
+        TrainingError: the difference is too large, or the outputs are not finite.
     """
     max_difference, metres_per_unit = 0.0, recording.rig.metres_per_unit
     for block in _blocks(len(poses), recording.rig.vertex_count):
@@ -187,12 +187,12 @@ def check_parity(
 
 
 def model_info(recording: Recording, trained_model: TrainedModel, held_out: np.ndarray, training: dict) -> ModelInfo:
-    """Make the metadata of a model; the parity is 0 until it is measured.
+    """Create the metadata of a model; the parity is 0 until it is measured.
 
     Args:
-        recording: that was trained on.
+        recording: recording of the training.
         trained_model: the result of the training.
-        held_out: (n, V) distances of the held-out poses, meters.
+        held_out: (n, V) errors of the held-out poses, meters.
         training: settings and versions.
     """
     rig, low, high = recording.rig, trained_model.training_range.low, trained_model.training_range.high
@@ -223,10 +223,10 @@ class ExportedModel:
     """A model that has passed its checks.
 
     Attributes:
-        content: bytes of the file.
-        info: metadata.
+        content: bytes of the model file.
+        info: metadata of the model.
         held_out: errors on the held-out poses.
-        session: with the model loaded.
+        session: ONNX Runtime session with the model.
     """
 
     content: bytes
@@ -241,7 +241,7 @@ def build_model(
     """Build the model, check it against the trained networks, and measure its errors; nothing is written.
 
     Args:
-        recording: that was trained on.
+        recording: recording of the training.
         trained_model: the result of the training.
         held_out: indices of the held-out poses.
         training: settings and versions for the metadata.
@@ -269,7 +269,7 @@ def build_model(
 
 
 def write_model(path: Path, content: bytes) -> None:
-    """Write the model, and read its metadata as the add-on does.
+    """Write the model file, and check that the add-on can read its metadata.
 
     Raises:
         OSError: the file cannot be written.

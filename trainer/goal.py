@@ -7,11 +7,11 @@ from pathlib import Path
 from fdda_addon.core.report import Verdict
 
 MAX_IMPROVED_RATIO = 0.97
-"""More poses help when the error falls below this part of the lowest error before."""
+"""More poses help when the error is below this part of the lowest earlier error."""
 PATIENCE = 2
 """Number of trainings without improvement after which more poses no longer help."""
 UNDERFITTING_RATIO = 0.8
-"""Training error over held-out error above which the networks underfit, and more poses help little."""
+"""Ratio of training error to held-out error above which the networks underfit, so that more poses help little."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class GoalResult:
     """The result of a training relative to its accuracy goal.
 
     Attributes:
-        goal_mm: the goal.
+        goal_mm: the accuracy goal, mm.
         p999_mm: 99.9th percentile of the held-out errors.
         verdict: whether it meets the goal, and whether more poses may help.
         text: the verdict in sentences, with advice.
@@ -42,9 +42,9 @@ def evaluate_goal(
 
     Args:
         goal_mm: distance that 99.9 % of the held-out vertices should not exceed, mm.
-        history: held-out errors of all trainings, this one last: `{"poses", "p999"}`, mm.
+        history: pose count and held-out error of all trainings, this one last: `{"poses", "p999"}`, mm.
         training_p999_mm: 99.9th percentile of this training's errors on its training poses, mm.
-        recording, model: paths for the text.
+        recording, model: paths that the advice names.
     """
     p999 = history[-1]["p999"]
     comparison = f"99.9 % of the held-out vertices are within {p999:.3g} mm and the goal is {goal_mm:g} mm"

@@ -7,7 +7,7 @@ from onnx import helper, numpy_helper
 
 
 class GraphBuilder:
-    """Collects nodes and constants; each method returns the name of what it added."""
+    """Collects nodes and constants. Each method returns the name of the value that it added."""
 
     def __init__(self):
         self.nodes: list[onnx.NodeProto] = []
@@ -26,7 +26,7 @@ class GraphBuilder:
         return self._constant(name, np.asarray(value, np.int64))
 
     def short_integers(self, name: str, value: np.ndarray) -> str:
-        """Add an int32 constant, for large index arrays: each frame reads all of them."""
+        """Add an int32 constant. It is for large index arrays, because every evaluation reads all of them."""
         return self._constant(name, np.asarray(value, np.int32))
 
     def add(self, operator: str, inputs: list[str], output: str, **attributes) -> str:
@@ -35,7 +35,7 @@ class GraphBuilder:
         return output
 
     def join(self, values: list[str], output: str, axis: int) -> str:
-        """Concatenate values; a single one needs no node."""
+        """Concatenate values; a single value needs no node."""
         return self.add("Concat", values, output, axis=axis) if len(values) > 1 else values[0]
 
     def split(self, value: str, sizes: list[int], outputs: list[str], axis: int) -> list[str]:

@@ -22,19 +22,20 @@ from .splitting import Split
 MAX_POSES, MAX_COMPONENTS = 300, 16
 """Maximum numbers of poses, and of principal components of each partition's residuals."""
 FOLD_COUNT, CHUNK_COUNT = 5, 25
-"""Cross-validation folds, made of chunks of consecutive poses, as frames resemble adjacent frames."""
+"""Numbers of cross-validation folds and of chunks. Folds consist of chunks of consecutive poses, because adjacent
+frames are similar."""
 KERNEL_WIDTHS, RIDGES = (1.0, 3.0), (1e-4, 1e-2)
-"""Kernel widths in standard deviations of the features, and ridges; the best combination counts."""
+"""Kernel widths in standard deviations of the features, and ridges. The combination with the lowest error is used."""
 
 
 def drop_gravity_input(recording: Recording, split: Split) -> Recording:
     """Remove the joints that carry the direction of gravity from the influences, unless they improve the prediction.
 
-    Where the target follows the pose at once, influences were found by moving joints, and stay.
+    If the target depends on the pose alone, its influences were found by moving joints, and do not change.
 
     Args:
-        recording: any; only its partitions change.
-        split: of its poses; held-out poses are not used.
+        recording: the recording; only its partitions change.
+        split: split of its poses; held-out poses are not used.
     """
     target = recording.info.target
     if target is None or target.follows == POSE:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Half-rotation features: regressors, beside the skin matrices, for rigs that preserve volume.
+"""Half-rotation features: regressors for rigs that preserve volume, in addition to the skin matrices.
 
-Such a rig blends rotations: a point half-way between a joint and its parent rotates by half the angle. No linear
+Such a rig blends rotations: a point halfway between a joint and its parent rotates by half the angle. No linear
 combination of the two matrices does that. A half-rotation matrix is approximately proportional to the sine of half the
 angle, and needs no square root. Blending of rotations: Kavan and others, Geometric Skinning with Approximate Dual
 Quaternion Blending, 2008.
@@ -22,7 +22,7 @@ from .process import Cancelled
 MIN_DIVISOR = 1.0
 """Lower bound of 3 + tr R, which is at least 2 for a rotation."""
 MAX_POSES, MAX_VERTICES_PER_PARTITION = 800, 64
-"""Training poses and vertices on which the benefit is measured."""
+"""Maximum numbers of training poses and vertices on which the benefit is measured."""
 MAX_ERROR_RATIO = 0.7
 """Half-rotation features are used when the squared residual is below this part of the one without them."""
 
@@ -74,11 +74,11 @@ def regression_matrices(pose_matrices: np.ndarray, rig: Rig, use_half_rotations:
 def half_rotations_help(
     recording: Recording, training: np.ndarray, should_stop: Callable[[], bool] = lambda: False
 ) -> bool:
-    """Return whether half-rotation features lower the error enough to be worth their nodes in the graph.
+    """Return whether half-rotation features lower the error enough to justify their nodes in the graph.
 
     Args:
-        recording: of the rig.
-        training: (n,) indices of the training poses. Half of the evaluated ones are fitted, the others measured.
+        recording: recording with the residuals.
+        training: (n,) indices of the training poses. Half of the evaluated poses are fitted, the others are measured.
         should_stop: called before each partition.
 
     Raises:

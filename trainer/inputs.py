@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The input features of the networks: joint transforms, controls, positions of other partitions, and surface frames.
 
-A smoothed surface depends on where the surface around it is. From parent-relative transforms a network would have to
-learn the product of several of them. So it also takes the centers of nearby partitions in the space of its main joint
-and, where the rig smooths, surface frames (`surface_frames`). docs/experiments.md has the errors with and without.
+A smoothed surface depends on the positions of the surface around it. With parent-relative transforms alone, a network
+would have to learn products of several transforms. So its inputs also include the centers of nearby partitions in the
+space of its main joint and, if the rig smooths, surface frames (`surface_frames`). docs/experiments.md compares the
+errors with and without them.
 """
 
 from collections.abc import Sequence
@@ -34,7 +35,7 @@ class NetworkInputs:
         point_joints: (M,) int64, their joints b.
         pair_references, pair_points: (Q,) int64, joints a and indices of points y.
         columns: for each partition, (F_p,) int64 indices of the features that are offered to its network.
-        surface_frames: D of them.
+        surface_frames: D surface frames.
     """
 
     parents: np.ndarray
@@ -48,22 +49,22 @@ class NetworkInputs:
 
     @property
     def control_start(self) -> int:
-        """12 J, the first column of the controls."""
+        """First column of the controls, 12 J."""
         return len(self.parents) * FEATURES_PER_JOINT
 
     @property
     def pair_start(self) -> int:
-        """12 J + C, the first column of the pairs, which are functions of the joints."""
+        """First column of the pairs, 12 J + C. Pairs are functions of the joints."""
         return self.control_start + self.control_count
 
     @property
     def surface_frame_start(self) -> int:
-        """12 J + C + 3 Q, the first column of the surface frames, which are functions of the joints too."""
+        """First column of the surface frames, 12 J + C + 3 Q. Surface frames are functions of the joints."""
         return self.pair_start + FEATURES_PER_PAIR * len(self.pair_points)
 
     @property
     def feature_count(self) -> int:
-        """F."""
+        """Number of features, F."""
         return self.surface_frame_start + FEATURES_PER_SURFACE_FRAME * len(self.surface_frames)
 
     def length_mask(self) -> np.ndarray:
@@ -74,7 +75,7 @@ class NetworkInputs:
     def with_surface_frames(
         self, surface_frames: SurfaceFrameFeatures, partitions: Sequence[Partition]
     ) -> "NetworkInputs":
-        """Add surface frames, and offer each network those of its own partition."""
+        """Add surface frames, and offer each network the surface frames of its partition."""
         columns = []
         for partition, partition_columns in zip(partitions, self.columns, strict=True):
             indices = np.flatnonzero(surface_frames.main_joints == partition.joint)
@@ -135,14 +136,15 @@ def make_inputs(
 ) -> NetworkInputs:
     """Choose the inputs of the networks.
 
-    A partition takes the points of another joint when every moving joint on the path between the two influences it, and
-    there are at least two of these: a single one is covered by its transform relative to its parent.
+    The inputs of a partition include the points of another joint if every moving joint on the path between the two
+    joints influences the partition, and there are at least two of these. A single joint on the path is already
+    represented by its transform relative to its parent.
 
     Args:
         parents: (J,) parent index of each joint, -1 for a root.
         points: (J, S, 3) S points of each joint, in its space, mesh units; see `partition_centers`.
-        partitions: with their main joints, influencing joints and controls.
-        control_count: C.
+        partitions: partitions with their main joints, influencing joints and controls.
+        control_count: number of controls, C.
         static: joints that never move.
     """
     references, pair_points, columns = [], [], []

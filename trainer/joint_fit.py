@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Linear regression of a partition's residuals on the transforms of nearby joints.
 
-Most of what smoothing does near a joint is that vertices follow the joints on both sides in part. That is linear in the
-joints' transforms, so least squares finds it, and the networks learn the remainder: a fraction of the residual, and a
-smooth one. How much of delta mush is linear in this sense: Le and Lewis, Direct Delta Mush Skinning and Variants, 2019.
-For a rig that preserves volume the regression also takes half-rotation features (`half_rotations`).
+Near a joint, smoothing mostly makes vertices follow the joints on both sides in part. This motion is linear in the
+joints' transforms, so least squares finds it. The networks learn the remainder, which is small and smooth. Le and
+Lewis, Direct Delta Mush Skinning and Variants, 2019, show how much of delta mush is linear in this sense. For a rig
+that preserves volume, half-rotation features are also regressors (`half_rotations`).
 """
 
 from dataclasses import dataclass, replace
@@ -18,13 +18,13 @@ from .blocks import BLOCK_ELEMENTS
 from .inputs import joints_on_path, static_joints
 
 RIDGE = 1e-6
-"""Ridge as a part of the number of poses: joints that move alike share the fit, and no factor becomes large."""
+"""Ridge as a part of the number of poses. Joints that move alike share the fit, and factors stay small."""
 MAX_PRUNING_LOSS = 0.01
-"""Joints are removed, the least useful first, while the error grows by at most this part over that of all joints."""
+"""Joints are removed, the least useful first, as long as the error is at most this part larger than with all joints."""
 MIN_EQUATIONS_PER_UNKNOWN = 4
-"""Least ratio of equations to unknowns of a vertex: with few equations the regression explains everything."""
+"""Minimum ratio of equations to unknowns of a vertex. With fewer equations the regression explains any residual."""
 MIN_SINGULAR_VALUE_RATIO = 1e-5
-"""Directions with singular values below this part of the largest are ignored."""
+"""Directions are ignored if their singular value is below this part of the largest one."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class JointRegression:
     metres_per_unit: float = 1.0
 
     def main_joint_only(self) -> "JointRegression":
-        """Return the regression on the main joint alone, in whose space it never moves."""
+        """Return the regression on the main joint alone, which is constant in its own space."""
         return JointRegression(self.joints[:1], self.center, self.design[:, :, :4], self.metres_per_unit)
 
     def design_of(self, joints: np.ndarray) -> np.ndarray:
@@ -88,7 +88,7 @@ class JointRegression:
         return MIN_EQUATIONS_PER_UNKNOWN * width <= 3 * poses
 
     def column_space(self) -> np.ndarray:
-        """Return a (3 N, r) float64 orthonormal basis of what the joints explain of a vertex's local residuals."""
+        """Return a (3 N, r) float64 orthonormal basis of the local residuals that the joints explain."""
         flat = self.design.reshape(-1, self.design.shape[2])
         flat = flat / np.maximum(np.linalg.norm(flat, axis=0), np.finfo(np.float64).tiny)
         left_vectors, singular_values, _ = np.linalg.svd(flat, full_matrices=False)
@@ -102,7 +102,7 @@ class JointRegression:
             training: indices of the poses to fit.
 
         Returns:
-            The fit, and (N, Vp, 3) float32, what it leaves of the residuals of all poses, mesh units.
+            The fit, and the (N, Vp, 3) float32 remainder of the residuals of all poses, mesh units.
         """
         width = self.design.shape[2]
         gram, moments = np.zeros((width, width)), np.zeros((width, residuals.shape[1]))
@@ -139,7 +139,7 @@ class JointRegression:
 
 
 def _select_joints(gram: np.ndarray, moments: np.ndarray, total: float) -> np.ndarray:
-    """Select the joints to fit to by backward elimination.
+    """Select the joints of the fit by backward elimination.
 
     Args:
         gram, moments: (4 Jf, 4 Jf) and (4 Jf, Vp) of the normal equations, the ridge included.
@@ -157,20 +157,20 @@ def _select_joints(gram: np.ndarray, moments: np.ndarray, total: float) -> np.nd
         by_joint = inverse.reshape(-1, len(selected), 4)
         diagonal = np.einsum("iaib->iab", inverse.reshape(len(selected), 4, len(selected), 4))
         outer = np.einsum("iaw,wib->iab", (inverse @ moment_gram).reshape(len(selected), 4, -1), by_joint)
-        added = np.trace(np.linalg.solve(diagonal, outer), axis1=1, axis2=2)
-        worst = 1 + int(added[1:].argmin())
-        error += added[worst]
+        added_errors = np.trace(np.linalg.solve(diagonal, outer), axis1=1, axis2=2)
+        least_useful = 1 + int(added_errors[1:].argmin())
+        error += added_errors[least_useful]
         if error > max_error:
             break
-        removed = 4 * worst + np.arange(4)
-        inverse = inverse - inverse[:, removed] @ np.linalg.solve(diagonal[worst], inverse[removed])
+        removed = 4 * least_useful + np.arange(4)
+        inverse = inverse - inverse[:, removed] @ np.linalg.solve(diagonal[least_useful], inverse[removed])
         inverse, moment_gram = (np.delete(np.delete(array, removed, 0), removed, 1) for array in (inverse, moment_gram))
-        selected = np.delete(selected, worst)
+        selected = np.delete(selected, least_useful)
     return selected
 
 
 def joint_regression(rig: Rig, partition: Partition, matrices: np.ndarray) -> JointRegression:
-    """Make the regression of a rig's partition; `matrices` as in `make_joint_regression`."""
+    """Create the regression of a rig's partition; `matrices` as in `make_joint_regression`."""
     center = rig.rest_positions[partition.vertices].mean(axis=0, dtype=np.float64)
     regression = make_joint_regression(rig.parents, partition, matrices, center, static_joints(rig))
     return replace(regression, metres_per_unit=rig.metres_per_unit)
@@ -183,11 +183,11 @@ def make_joint_regression(
     center: np.ndarray,
     static: frozenset[int] = frozenset(),
 ) -> JointRegression:
-    """Make the regression on the joints that only influencing joints move relative to the main joint.
+    """Create the regression on all joints whose motion relative to the main joint depends on influencing joints alone.
 
     Args:
         parents: (J,) parent index of each joint, -1 for a root.
-        partition: with its main joint and the influencing joints.
+        partition: partition with its main joint and influencing joints.
         matrices: (N, J, 3, 4) skin matrices of all poses, mesh units, or (N, 2 J, 3, 4) followed by half-rotation
             matrices (`half_rotations.regression_matrices`). The rest pose may be any fixed pose.
         center: (3,) center of the partition where all skin matrices are the identity, mesh units.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The training loop: all partitions at once."""
+"""The training loop, which trains the networks of all partitions together."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,16 +23,16 @@ WARM_UP_FRACTION = 0.15
 RELEVANCE_EPOCH_FRACTIONS = (0.1, 0.2)
 """Inputs are rescaled by relevance after these parts of the epochs (`_Loop.rescale_inputs_by_relevance`)."""
 RELEVANCE_POSES = 1000
-"""Number of training poses on which relevance is measured, about."""
+"""Approximate number of training poses on which relevance is measured."""
 MIN_RELEVANCE = 1e-3
-"""Factor of an irrelevant input, where the root mean square over a partition's inputs is 1."""
+"""Minimum factor of an input. The root mean square of the factors of a partition's inputs is 1."""
 LOSS_EPSILON = 1e-6
-"""Added to squared relative errors: the loss is a distance without the kink at zero."""
+"""Added to squared relative errors, so that the loss, a distance, is smooth at zero."""
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """A network and curves for each partition; the network of a constant partition has no outputs."""
+    """Network and learning curves of each partition. The network of a constant partition has no outputs."""
 
     networks: tuple[Network, ...]
     curves: tuple[Curves, ...]
@@ -55,13 +55,13 @@ def train(
     """Train the networks of all partitions together.
 
     Args:
-        partitions: with inputs and coefficients of all poses of the split.
-        split: of the poses.
-        config: the settings; equal settings and data give equal weights on one machine.
-        device: to train on; None for `choose_device()`.
+        partitions: partitions with the inputs and coefficients of all poses.
+        split: split of the poses.
+        config: settings of the training. Equal settings and data give equal weights on one machine.
+        device: device to train on; None for `choose_device()`.
         on_epoch: called after every epoch.
         should_stop: called before every step.
-        initial: for each partition the network to start from, None for random weights.
+        initial: for each partition the network to start from, or None for random weights.
 
     Raises:
         Cancelled: `should_stop` returned True.
@@ -88,7 +88,7 @@ class _Loop:
 
     def __init__(self, partitions: list[PreparedPartition], split: Split, config: TrainingConfig, device: torch.device):
         self.partitions, self.config, self.device = partitions, config, device
-        # Coefficients in units of each partition's residual, so that one loss and one learning rate suit all.
+        # Coefficients are divided by the residual of their partition, so that one loss and one learning rate suit all.
         self.scales = [partition.residual_rms * np.sqrt(partition.vertex_count) for partition in partitions]
         inputs = [p.inputs for p in partitions]
         targets = [p.coefficients / scale for p, scale in zip(partitions, self.scales, strict=True)]
@@ -115,7 +115,7 @@ class _Loop:
         self._start_average()
         self.best = [average.clone() for average in self.averaged]
         self.best_mm = torch.full((len(partitions),), torch.inf, device=device)
-        # (P, F): product of all factors of the standardized features.
+        # (P, F) product of all factors by which the standardized features were rescaled.
         self.input_scales = torch.ones_like(self.x[:, 0])
 
     @torch.enable_grad()
@@ -147,9 +147,9 @@ class _Loop:
 
     @torch.no_grad()
     def start_from(self, networks: list[Network | None]) -> None:
-        """Replace the random weights by those of networks, given as from `best_networks`; None keeps random weights.
+        """Replace the random weights with the weights of trained networks. None keeps random weights.
 
-        Inputs are rescaled once and the first layer inversely, so that the outputs stay the same.
+        Inputs are rescaled once, and the first layer inversely, so that the outputs stay the same.
         """
         for index, (network, scale) in enumerate(zip(networks, self.scales, strict=True)):
             if network is None:
@@ -178,9 +178,9 @@ class _Loop:
         """Train for all epochs.
 
         Args:
-            curves: of the P partitions; extended after each epoch.
+            curves: learning curves of the P partitions; extended after each epoch.
             on_epoch, should_stop: as in `train`.
-            all_partitions: the P partitions and those without components, for the means of the progress.
+            all_partitions: the P partitions and the partitions without components; progress is a mean over all.
         """
         config, pose_count = self.config, self.x.shape[1]
         step_count = -(-pose_count // config.batch_size)
@@ -238,8 +238,8 @@ class _Loop:
         optimizer.zero_grad()
         difference = self.model(self.x[:, batch], generator) - self.y[:, batch]
         errors = difference.square().sum(dim=2)
-        # The mean distance is what the error is measured by, and is robust to outliers, unlike its square.
-        # A sum over partitions gives each network the gradient that it would have alone.
+        # The reported error is a mean distance, too. Unlike the mean square, it is robust to outliers.
+        # The sum over partitions gives each network the same gradient as if it were trained alone.
         loss = (errors + LOSS_EPSILON).sqrt().mean(dim=1).sum()
         if self.config.l1:
             loss = loss + self.config.l1 * sum(weight.abs().sum() for weight in self.model.weights)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Low-rank factors of a large partition: fewer parameters per vertex for everything but linear skinning.
 
-A joint of the fit has four parameters per vertex, a component three, and many of them are nearly dependent: the
-components of the elbow lie where its joint fit does. So the matrix of all joints and components is replaced by the
-product of a small matrix and few vertex factors, one parameter per vertex each: its truncated singular value
-decomposition, weighted by the training poses.
+A joint of the fit has four parameters per vertex, a component three, and many of them are nearly dependent: the fit and
+the components of an elbow affect the same vertices. So the matrix of all joints and components is replaced by the
+product of a small matrix and a few vertex factors with one parameter per vertex each. The product is the truncated
+singular value decomposition of the matrix, weighted by the training poses.
 """
 
 from dataclasses import dataclass, replace
@@ -15,9 +15,9 @@ from .basis import Basis
 from .joint_fit import JointFit, JointRegression
 
 TOLERANCE_RATIO = 0.1
-"""Error that the factorization may add, as a part of the tolerance of the basis."""
+"""Maximum error of the factorization, as a part of the tolerance of the basis."""
 PRODUCT_PARAMETERS = 6_000
-"""One more matrix product takes as long per frame as reading this many constants."""
+"""Number of constants that are read in the time of one more matrix product."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class LowRankFactors:
 
     Attributes:
         vertex_factors: (r, Vp) float32, orthonormal rows, no unit.
-        fit, basis: projected to the span of the vertex factors.
-        coefficients: (N, K) float32 of this basis, mesh units.
+        fit, basis: fit and basis, projected to the span of the vertex factors.
+        coefficients: (N, K) float32, coefficients for this basis, mesh units.
         error_rms: rms distance over training poses and vertices from the unfactorized fit and basis, mesh units.
     """
 
@@ -55,15 +55,15 @@ def factorize(
     """Factorize the fit and the basis of a partition.
 
     Args:
-        fit, basis: of the partition.
-        coefficients: (N, K) of all poses, mesh units.
-        regression: that made the fit.
+        fit, basis: fit and basis of the partition.
+        coefficients: (N, K) coefficients of all poses, mesh units.
+        regression: regression of which the fit is the result.
         training: indices of the training poses.
-        weights: of the training poses.
-        tolerance: rms distance over poses and vertices that the components may leave, mesh units.
+        weights: weights of the training poses.
+        tolerance: rms error over poses and vertices that the components may leave, mesh units.
 
     Returns:
-        The factors; None where they save fewer parameters than a further product costs.
+        The factors; None if they save fewer parameters than one more product costs.
     """
     row_count, vertex_count = _row_count(fit, basis), fit.factors.shape[1]
     inputs = _inputs(regression.design_of(fit.joints)[training], coefficients[training], weights)
@@ -108,7 +108,7 @@ def _parameters(fit: JointFit, basis: Basis, center: np.ndarray) -> np.ndarray:
 def _projected_basis(
     vertex_factors: np.ndarray, basis: Basis, coefficients: np.ndarray, error: float
 ) -> tuple[Basis, np.ndarray]:
-    """Project a basis to the span of the vertex factors and orthonormalize it; returns it with its coefficients."""
+    """Project a basis to the span of the vertex factors, orthonormalize it, and return it with its coefficients."""
     vertex_count, vertex_factors = vertex_factors.shape[1], vertex_factors.astype(np.float64)
     mean = _by_axis(basis.mean[None], vertex_count)[0] @ vertex_factors.T @ vertex_factors
     components = _by_axis(basis.components, vertex_count) @ vertex_factors.T

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Graph nodes that evaluate all networks at once.
 
-Networks differ in their numbers of inputs and outputs; in one batched product all would be padded to the largest. So
-the first and last layers are cut into chunks of equal size, as many for a network as it needs, and the outputs of the
-first layer's chunks are summed. The standardization of the features is folded into the weights and bias of the first
-layer, and the last bias into the mean residual.
+Networks differ in their numbers of inputs and outputs, and one batched product would pad all to the largest network. So
+first and last layers are cut into chunks of equal size. A network has as many chunks as its size requires, and the
+outputs of the first layer's chunks are summed. The standardization of the features is folded into the weights and bias
+of the first layer, and the last bias into the mean residual.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from .pose_nodes import VECTOR, Features
 from .trained_model import TrainedModel
 
 CHUNK_COST, SPLIT_COST = 800, 15_000
-"""Time of a chunk, and of the nodes that combine chunks, as the number of constants that are read in the same time."""
+"""Time of one chunk, and time of the nodes that combine chunks, as numbers of constants that are read in that time."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,8 @@ class Coefficients:
 
     Attributes:
         name: of the (N, ·) coefficients without the last bias, mesh units.
-        first: by index of each partition with components, position of its first coefficient; the others follow.
+        first: position of the first coefficient of each partition with components, by partition index. The other
+            coefficients of the partition follow.
     """
 
     name: str
@@ -41,13 +42,13 @@ def add_networks(
     """Add the nodes that evaluate the networks.
 
     Args:
-        graph: to add the nodes to.
+        graph: graph to which the nodes are added.
         features: layout of the features.
-        clamped: name of the (N, B, 3) features.
-        trained_model: to export.
+        clamped: name of the (N, B, 3) clamped features.
+        trained_model: model to export.
 
     Returns:
-        The coefficients; None where no partition has components.
+        The coefficients; None if no partition has components.
     """
     learned = [index for index, count in enumerate(trained_model.component_counts()) if count]
     if not learned:
@@ -114,7 +115,7 @@ def _add_last_layer(graph: GraphBuilder, values: str, layers: dict[int, np.ndarr
     """Add the last layers.
 
     Args:
-        graph: to add the nodes to.
+        graph: graph to which the nodes are added.
         values: name of the (L, N, H) values of the hidden units.
         layers: by partition index, (H, K) weights.
     """

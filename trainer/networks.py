@@ -22,8 +22,8 @@ class Network:
     """The trained network of one partition, in numpy.
 
     Attributes:
-        weights: one (in, out) float32 array a layer, from standardized features to coefficients in mesh units.
-        biases: one (out,) float32 array a layer.
+        weights: one (in, out) float32 array per layer, from standardized features to coefficients in mesh units.
+        biases: one (out,) float32 array per layer.
     """
 
     weights: tuple[np.ndarray, ...]
@@ -54,8 +54,8 @@ class PartitionNetworks(torch.nn.Module):
     are zero too, so they get no gradient.
 
     Attributes:
-        weights: tensors (P, in, out), one a layer.
-        biases: tensors (P, 1, out), one a layer.
+        weights: one tensor (P, in, out) per layer.
+        biases: one tensor (P, 1, out) per layer.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class PartitionNetworks(torch.nn.Module):
         Args:
             input_counts, output_counts: numbers of features and of components of the P partitions.
             hidden, activation, dropout: as in `TrainingConfig`.
-            generator: of the initial weights.
+            generator: random generator of the initial weights.
         """
         super().__init__()
         self.activation = ACTIVATION_FUNCTIONS[activation]
@@ -98,7 +98,7 @@ class PartitionNetworks(torch.nn.Module):
 
         Args:
             inputs: (P, n, F) standardized features, padded.
-            generator: of the dropout; None for no dropout.
+            generator: random generator of the dropout; None for no dropout.
 
         Returns:
             (P, n, K) coefficients in units of each partition's residual, padded.

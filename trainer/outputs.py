@@ -17,7 +17,7 @@ def check_training_outputs(model: Path, overwrite: bool) -> None:
     """Check before a training that its files can be written.
 
     Args:
-        model: path of the model.
+        model: path of the model file.
         overwrite: as in `core.output.check_outputs`.
 
     Raises:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Reassigns vertices between neighboring partitions where that reduces the size of the model.
 
-Each vertex starts in the partition of its main joint, whichever joint its residual follows. Near a boundary the
-components of the neighboring partition may represent it better: what moves together there belongs to one basis, and
-both partitions need fewer components. The refinement alternates between computing bases and reassigning vertices, as in
-subspace clustering (Bradley and Mangasarian, k-Plane Clustering, 2000). A partition keeps its main joint, space and
-inputs.
+Each vertex starts in the partition of its main joint, even if its residual depends on another joint. Near a boundary,
+the components of the neighboring partition may represent the residual better. If vertices that move together share one
+basis, both partitions need fewer components. The refinement alternates between computing bases and reassigning
+vertices, as in subspace clustering (Bradley and Mangasarian, k-Plane Clustering, 2000). A partition keeps its main
+joint, space and inputs.
 """
 
 from collections.abc import Callable
@@ -29,27 +29,27 @@ from .splitting import Split
 MAX_POSES = 300
 """Maximum number of training poses that are evaluated."""
 MAX_ELEMENTS = 1 << 26
-"""Fewer poses are evaluated where their residuals would have more coordinates than this."""
+"""Maximum number of residual coordinates of all evaluated poses; large meshes are evaluated in fewer poses."""
 MAX_ROUNDS = 8
 MAX_ROUND_SIZE_RATIO, MAX_SIZE_RATIO = 0.98, 0.9
-"""Size over the size before, at most: for another round, and for all rounds together. Where the painted weights are
-nearly as good, partitions stay as they are, and rounding does not decide."""
+"""Maximum ratio of the new size to the size before, for one more round and for all rounds together. If refinement gains
+less, partitions stay unchanged, so that the result does not depend on rounding."""
 REASSIGNMENT_EDGES = 2
 """Distance in edges within which a round reassigns vertices across a boundary."""
 COMPONENT_COST = 0.25
 """Cost of a component for a vertex, as a part of the squared residual that the last components remove. At 1, vertices
-with nearly no residual move for the cost alone, and boundaries are ragged. At 0, partitions with many components absorb
-vertices that need few."""
+with almost no residual move only because of this cost, and boundaries become ragged. At 0, partitions with many
+components take vertices that need few components."""
 MIN_LEVERAGE_DIVISOR = 0.1
-"""Lower bound of 1 - leverage of a pose, for poses that no other pose resembles."""
+"""Minimum of 1 - leverage of a pose, for poses that differ from all others."""
 
 
 @dataclass(frozen=True)
 class _Bases:
-    """Bases of the partitions in their current state.
+    """Bases of the current partitions.
 
     Attributes:
-        coefficients: by partition index, (n, K) float32, mesh units.
+        coefficients: (n, K) float32 coefficients by partition index, mesh units.
         gain: squared residual that one more model parameter removes where it removes most, square mesh units.
         size: parameters of the partitions' matrices, without the factors of the joint fit, and of the output layers.
     """
@@ -60,7 +60,7 @@ class _Bases:
 
 
 class _Refinement:
-    """The state of a refinement: the partition of each vertex, and what the nearby joints leave of the residuals.
+    """The state of a refinement: the partition of each vertex, and the residuals that nearby joints do not explain.
 
     Attributes:
         owner: (V,) int64, partition index of each vertex.
@@ -82,7 +82,7 @@ class _Refinement:
         self._column_spaces = {}
         for index, partition in enumerate(self._partitions):
             regression = joint_regression(rig, partition, matrices)
-            # A partition without inputs neither gains nor loses vertices.
+            # A partition without inputs keeps its vertices.
             if (partition.influencing or partition.controls) and regression.is_determined():
                 self._column_spaces[index] = regression.column_space().astype(np.float32)
         self._refinable = list(self._column_spaces)
@@ -109,7 +109,7 @@ class _Refinement:
         return unexplained.reshape(pose_count, 3, len(vertices)).transpose(0, 2, 1)
 
     def bases(self) -> _Bases:
-        """Compute the bases of the partitions in their current state."""
+        """Compute the bases of the current partitions."""
         bases, coefficients, size, rig = [], {}, 0, self._recording.rig
         vertices_of = [np.flatnonzero(self.owner == index) for index in self._refinable]
         for vertices in vertices_of:
@@ -122,7 +122,7 @@ class _Refinement:
         gain = 0.0
         for index, vertices, basis, count in zip(self._refinable, vertices_of, bases, counts, strict=True):
             unexplained = self._unexplained[:, vertices].reshape(len(self._poses), -1)
-            coefficients[index] = basis.truncated(count).coefficients(unexplained)
+            coefficients[index] = basis.truncate(count).coefficients(unexplained)
             joint_count = len(np.unique(rig.skin_joints[vertices][rig.skin_weights[vertices] > 0]))
             size += len(vertices) * (3 * count + 4 * joint_count) + self._units * count
             if count + 1 < len(basis.error_by_count):
@@ -164,7 +164,7 @@ class _Refinement:
             self._unexplained[:, added] = self._unexplained_by(index, added)
 
     def _costs(self, index: int, vertices: np.ndarray, bases: _Bases) -> np.ndarray:
-        """Return (v,) costs of vertices in a partition, square mesh units: residual, and a price for its components."""
+        """Return (v,) costs of vertices in a partition, square mesh units: squared residual plus components."""
         is_own = self.owner[vertices] == index
         unexplained = np.empty((len(self._poses), len(vertices), 3), np.float32)
         unexplained[:, is_own] = self._unexplained[:, vertices[is_own]]
@@ -177,7 +177,7 @@ class _Refinement:
         left_vectors = left_vectors[:, singular_values > MIN_SINGULAR_VALUE_RATIO * singular_values[0]]
         values = unexplained.reshape(len(unexplained), 3 * len(vertices)) * roots
         errors = values - left_vectors @ (left_vectors.T @ values)
-        # Leave-one-out error: a pose with a component of its own is no evidence for the vertex.
+        # Leave-one-out error: a component that only one pose needs does not show that the vertex belongs here.
         errors /= np.maximum(1 - (left_vectors**2).sum(axis=1), MIN_LEVERAGE_DIVISOR)[:, None]
         squares = (errors.reshape(unexplained.shape) ** 2).sum(axis=(0, 2)) / self._pose_weights.sum()
         return squares + COMPONENT_COST * bases.gain * 3 * coefficients.shape[1]

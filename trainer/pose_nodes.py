@@ -249,8 +249,8 @@ def add_range(graph: GraphBuilder, features: Features, trained_model: TrainedMod
     outside = graph.reshape(outside, [0, size], "outside_row")
     squared = graph.add("Mul", [outside, outside], "outside_squared")
     counts = np.zeros((size, len(training_range.counts)))
-    position = features.position[: len(training_range.width)]
-    scaled_counts = (training_range.counts / training_range.width.astype(np.float64) ** 2).T
+    position = features.position[: len(training_range.fade_width)]
+    scaled_counts = (training_range.counts / training_range.fade_width.astype(np.float64) ** 2).T
     counts[position[position >= 0]] = scaled_counts[position >= 0]
     terms = [squared, graph.floats("counts", counts), graph.floats("full_confidence", np.ones(1))]
     root = graph.add("Relu", [graph.add("Gemm", terms, "confidence_base", alpha=-1.0)], "confidence_root")

@@ -35,8 +35,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 2) // 2)))
 
 
-class Cancelled(Exception):  # noqa: N818 - no error
-    """The work was stopped on request."""
+class Cancelled(Exception):  # noqa: N818 - a request, not an error
+    """Raised when the work stops on request."""
 
 
 class StopRequest:

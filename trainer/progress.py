@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Sends the progress of the trainer: as JSON messages for the add-on, or as text for a person."""
+"""Output of the trainer's progress: JSON messages for the add-on, or text for a person."""
 
 import sys
 from typing import Protocol
@@ -17,7 +17,7 @@ LINES = {
     MessageType.CANCELLED: "Cancelled; nothing was written.",
 }
 LINE_INTERVAL = 0.1
-"""Part of the epochs between lines of progress where the output is no terminal."""
+"""Part of the epochs between two lines of progress where stdout is not a terminal."""
 BAR_WIDTH = 30
 """Characters of the progress bar."""
 
@@ -38,7 +38,7 @@ class JsonMessageSink:
 
 
 class TextMessageSink:
-    """Writes readable lines to stdout; a terminal shows progress on one line. Failures go to stderr elsewhere."""
+    """Writes text to stdout; on a terminal, progress stays on one line. `run_with_messages` prints failures."""
 
     def __init__(self):
         self.is_terminal = sys.stdout.isatty()

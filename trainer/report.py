@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report of a training: `report.json`, and the page that is made from it."""
+"""The report of a training: the content of `report.json`, and its page `report.html`."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ def make_report(
     model_name: str,
     analyses: Sequence[ErrorAnalysis],
 ) -> dict:
-    """Make the content of `report.json`; docs/formats.md describes the keys. Errors are in mm.
+    """Create the content of `report.json`; docs/formats.md describes the keys. Errors are in mm.
 
     Args:
-        recording, trained_model, exported, curves: of the training.
+        recording, trained_model, exported, curves: input and results of the training.
         on_training: errors on a sample of the training poses.
         surface: `normals` and `edges` of held-out poses.
         model_name: file name of the model.
@@ -115,11 +115,11 @@ def _histogram(errors: np.ndarray) -> list[int]:
 
 
 def write_html(report: dict, path: Path, pictures: Sequence[Path] = (), evaluation: dict | None = None) -> None:
-    """Write the page of a report. It may be written again with pictures and an evaluation.
+    """Write the page of a report, optionally with pictures and an evaluation.
 
     Args:
         report: content of `report.json`.
-        path: of the page.
+        path: path of the page.
         pictures: PNG or JPEG files to show.
         evaluation: content of the JSON that `evaluate` wrote; None without one.
 

@@ -26,10 +26,10 @@ def check_drawable(report: dict, path: Path) -> None:
 
     Args:
         report: as from `core.report.read_report`.
-        path: of the report.
+        path: path of the report, for the message.
 
     Raises:
-        TrainingError: they cannot.
+        TrainingError: the numbers cannot be drawn.
     """
     histogram = report["histogram"]
     edges, counts = histogram["edges"], (histogram["fdda"], histogram["linear"])

@@ -31,7 +31,7 @@ MAX_PRUNING_LOSS = 0.1
 """A weight is removed where the error grows by at most this part without it. Each joint that moves a partition is one
 more input of its network: docs/experiments.md, Fitted skin weights."""
 MIN_WEIGHT = 1e-3
-"""Smaller weights are removed in any case."""
+"""Smaller weights are always removed."""
 MIN_RIDGE_RATIO = 1e-12
 """Minimum ridge, as a part of the errors: less would be lost in the rounding of the products."""
 
@@ -40,7 +40,7 @@ class SkinSolver:
     """Fits the weights of a rig's vertices to poses."""
 
     def __init__(self, poses: FitPoses):
-        """Compute what all vertices share: products of all joints' skin matrices."""
+        """Compute the products of all joints' skin matrices, which all vertices share."""
         self._poses = poses
         rig = poses.rig
         self._pose_count, self._joint_count = len(poses.pose_matrices), len(rig.joints)

@@ -14,7 +14,7 @@ from .config import TrainingConfig
 
 MIN_POSES = 10
 BLOCK_FRAMES = 10
-"""Frames of animation that are split together: adjacent frames are nearly the same pose."""
+"""Frames of an animation that stay together in a split, because adjacent frames are nearly the same pose."""
 
 
 @dataclass(frozen=True)
@@ -68,13 +68,13 @@ def _split(items: np.ndarray, validation_fraction: float, seed: int, held_out_fr
 def split_recording(recording: Recording, config: TrainingConfig) -> Split:
     """Split the poses of a recording.
 
-    Random poses are split one by one, frames of animation in blocks: the error on a pose is no measure when adjacent
-    frames trained. Refined poses and poses of the margin all train: they are no sample of the range of motion. Held-out
-    poses stay held out when a recording is extended. Poses in which the target did not come to rest are left out,
-    unless the settings include them.
+    Random poses are split one by one. Frames of animation are split in blocks, because the error on a frame is too low
+    if adjacent frames are training poses. All refined poses and poses of the margin are training poses, because they do
+    not represent the range of motion. Held-out poses stay held out when a recording is extended. Poses in which the
+    target did not come to rest are left out, unless the settings include them.
 
     Raises:
-        TrainingError: there are too few poses beside the refined ones.
+        TrainingError: there are too few poses besides the refined ones.
     """
     sources = recording.info.sampling.sources
     always_trains = np.concatenate([np.full(s.poses, s.kind == REFINED) for s in sources])
@@ -134,7 +134,7 @@ def _poses_in_blocks(blocks: list[list[int]], selected: np.ndarray) -> np.ndarra
 def holdout_fingerprint(recording: Recording, split: Split) -> str:
     """Return a digest of 16 hexadecimal digits of the validation and held-out poses.
 
-    Where it is equal for two recordings and splits, no pose that one of them holds out can have trained the other.
+    If it is equal for two splits, no held-out pose of one is a training pose of the other.
     """
     arrays = (recording.pose_matrices, recording.controls) if recording.rig.controls else (recording.pose_matrices,)
     return Fingerprint.digest(

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Selects the vertices whose surface frames are inputs of the networks, and fits the frames to the recording.
 
-The selection does not read the modifiers: a rig may smooth with any modifier, or with nodes. It removes what linear
-regression on the nearby joints explains from the residuals, and compares the rest with the corners of the skinned
-surface at increasing amounts of smoothing. For a rig that smooths, one of these amounts explains the rest.
+The selection does not read the modifiers, because a rig may smooth with any modifier, or with nodes. It removes from
+the residuals the part that linear regression on the nearby joints explains. It compares the remainder with the corners
+of the skinned surface at increasing amounts of smoothing. For a rig that smooths, one of these amounts explains the
+remainder.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +31,7 @@ CORNER_COUNT_QUANTILE, MAX_CORNERS = 0.75, 16
 selected vertices are padded to the largest corner count."""
 SMOOTHING_ITERATIONS = (2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 28, 32, 40, 48, 56, 64)
 SMOOTHING_FACTOR = 0.5
-"""Of each iteration: one iteration at twice the factor smooths about as much as two."""
+"""Factor of each smoothing iteration. One iteration at twice the factor smooths about as much as two iterations."""
 MIN_EXPLAINED_VARIANCE, MIN_BEST_EXPLAINED_VARIANCE = 0.8, 0.95
 """Explained part of the squared residual that the joints leave: minimum of a selected vertex and of the median
 candidate, and minimum of the best candidate. Bulges that follow joint angles reach 0.94 by chance."""
@@ -38,9 +39,9 @@ EPSILON_RATIO = 0.01
 """`SurfaceFrameFeatures.epsilons` over the corner's longer tangent in the rest pose, for the normal over its square. A
 vector whose direction is mostly rounding fades out."""
 MAX_PROBED_CANDIDATES = 24
-"""Candidates that determine the number of smoothing iterations."""
+"""Maximum number of candidates that determine the number of smoothing iterations."""
 MIN_EXTENT = 1e-18
-"""Least epsilon, of corners without extent; mesh units."""
+"""Minimum epsilon, for corners without extent; mesh units."""
 RIDGE_RADIANS = 0.03
 """Ridge of the fit: tangents and normals, and sums of them, that rotate by less than this against the joints are
 suppressed. Their coefficients would be so large that rounding matters."""

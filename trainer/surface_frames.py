@@ -6,7 +6,7 @@ frame of the smoothed surface (Mancewicz and others, Delta Mush, 2014; Blender's
 folds, a small rotation of a joint flips that frame, and a network that takes only joints as inputs cannot follow.
 Smoothed linear skinning is linear in the pose matrices, so the frame of a few vertices is cheap to compute. Each
 surface frame is a weighted sum of tangents and normals of the face corners at a vertex; `surface_frame_fit` fits the
-weights to the recording. docs/experiments.md has the errors with and without.
+weights to the recording. docs/experiments.md compares the errors with and without them.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ FEATURES_PER_SURFACE_FRAME = 3
 MIN_SQUARED_LENGTH = 1e-18
 """Added to squared lengths before a division: a joint that is scaled to zero gives finite values."""
 MAX_JOINT_ENTRIES = 1 << 12
-"""Maximum of joints times surface frames: each frame of the animation reads one value of each joint per tangent."""
+"""Maximum of joints times surface frames. Each evaluation reads one value of each joint for each tangent."""
 
 
 @dataclass(frozen=True)

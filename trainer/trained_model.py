@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The result of a training: everything that is exported or evaluated."""
+"""The result of a training, which is exported and evaluated."""
 
 from dataclasses import dataclass
 
@@ -25,12 +25,12 @@ class TrainedModel:
 
     Attributes:
         rig: with J joints and V vertices.
-        partitions: P of them.
-        inputs: of the networks.
+        partitions: P partitions.
+        inputs: input features of the networks.
         prepared: data of each partition.
-        networks: of each partition.
-        training_range: of the training poses.
-        activation: of the networks.
+        networks: network of each partition.
+        training_range: range of the training poses.
+        activation: activation of the networks.
         sheared: whether the columns of some recorded pose matrix are not orthogonal.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One training, from the recording to the files that it writes."""
+"""One training: all steps from the recording to the written files."""
 
 import time
 from collections.abc import Callable

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reorders vertices from the order of the partitions to the order of the mesh, in blocks.
+"""Order of the vertices in the graph: conversion from the order of the partitions to the order of the mesh, in blocks.
 
 Gathering vertices one by one takes as long as all products of a large mesh. Most vertices have neighbors in index order
 of the same partition, so most of the mesh can be gathered in blocks. Blocks of several partitions are assembled first.

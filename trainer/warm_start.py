@@ -14,26 +14,26 @@ from fdda_addon.core.errors import TrainingError
 from fdda_addon.core.recording.reader import Recording
 from fdda_addon.core.report import checkpoint_path
 
-from .checkpoint import OTHER_PARTITIONS, Checkpoint, PartitionCheckpoint, read_checkpoint
+from .checkpoint import OTHER_PARTITIONS_SENTENCE, Checkpoint, PartitionCheckpoint, read_checkpoint
 from .config import TrainingConfig
 from .data import PreparedPartition
 from .networks import Network
 
 WARM_START_EPOCHS_RATIO, WARM_START_RATE_RATIO = 0.5, 0.3
-"""Parts of the epochs and of the learning rate that a warm start takes."""
+"""Epochs and learning rate of a warm start, as parts of the settings."""
 
 
 def read_initial_checkpoint(model_path: Path, recording: Recording, holdout: str, config: TrainingConfig) -> Checkpoint:
     """Read the checkpoint to start from, and check that it fits.
 
     Args:
-        model_path: of the model; the checkpoint is beside it.
-        recording: to train on.
+        model_path: path of the model; the checkpoint is beside it.
+        recording: recording to train on.
         holdout: fingerprint of its held-out and validation poses.
-        config: the settings.
+        config: settings of the training.
 
     Raises:
-        TrainingError: there is none, or it is of another rig, other controls, other networks or another split.
+        TrainingError: there is no checkpoint, or its rig, controls, networks or split differ.
     """
     path = checkpoint_path(model_path)
     checkpoint = read_checkpoint(path)
@@ -84,7 +84,7 @@ def initial_networks(
     """
     sizes = [3 * partition.vertex_count for partition in prepared]
     if sizes != [len(partition.basis_mean) for partition in checkpoint.partitions]:
-        raise TrainingError(OTHER_PARTITIONS)
+        raise TrainingError(OTHER_PARTITIONS_SENTENCE)
     return [_converted(*each) for each in zip(checkpoint.partitions, prepared, columns, strict=True)]
 
 

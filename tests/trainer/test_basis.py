@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bases: the number of components follows from the tolerance, with the Gram matrix and with the covariance."""
+"""Bases: the tolerance determines the number of components, with the Gram matrix and with the covariance matrix."""
 
 import numpy as np
 import pytest
@@ -84,7 +84,7 @@ def joint_error(errors: list[np.ndarray], vertices: list[int], counts: list[int]
 
 def test_shared_allocation_meets_the_tolerance_with_fewer_parameters():
     errors, vertices = spectra()
-    counts = allocate_components(errors, vertices, 0.06, units=65)
+    counts = allocate_components(errors, vertices, 0.06, parameters_per_component=65)
     alone = [int(np.argmax(by_count <= 0.06)) for by_count in errors]
     assert joint_error(errors, vertices, counts) <= 0.06
 
@@ -98,20 +98,20 @@ def test_shared_allocation_meets_the_tolerance_with_fewer_parameters():
 def test_a_single_partition_meets_the_tolerance_alone():
     errors, vertices = spectra()
     for by_count, size in zip(errors, vertices, strict=True):
-        (count,) = allocate_components([by_count], [size], 0.06, units=65)
+        (count,) = allocate_components([by_count], [size], 0.06, parameters_per_component=65)
         assert by_count[count] <= 0.06 < by_count[count - 1]
 
 
 def test_an_unreachable_tolerance_takes_all_components():
     errors, vertices = [np.array([1.0, 0.5]), np.array([1.0])], [10, 10]
-    assert allocate_components(errors, vertices, 1e-3, units=0) == [1, 0]
+    assert allocate_components(errors, vertices, 1e-3, parameters_per_component=0) == [1, 0]
 
 
 def test_truncated_bases_have_the_stated_error():
     values = residuals(60, 50, 12)
     basis = make_basis(values, 1e-5, np.random.default_rng(0))
     for count in range(len(basis.components) + 1):
-        fewer = basis.truncated(count)
+        fewer = basis.truncate(count)
         error = rms(values - fewer.residuals(fewer.coefficients(values)))
         assert fewer.truncation_rms == pytest.approx(error, rel=0.02, abs=1e-8)
 
