@@ -16,7 +16,7 @@ LIMIT = 0.9
 
 
 def rotation(axis: int, angle: float) -> np.ndarray:
-    """(4, 4) rotation about a coordinate axis, radians."""
+    """Return the (4, 4) rotation about a coordinate axis by an angle in radians."""
     matrix, (i, j) = np.eye(4), [(1, 2), (2, 0), (0, 1)][axis]
     matrix[i, i] = matrix[j, j] = np.cos(angle)
     matrix[j, i], matrix[i, j] = np.sin(angle), -np.sin(angle)
@@ -24,7 +24,7 @@ def rotation(axis: int, angle: float) -> np.ndarray:
 
 
 def chain_rig(joints: int = 3, vertices: int = 90, seed: int = 0) -> Rig:
-    """A tube of one meter along z, smoothly skinned to a chain of joints in an order unlike that of the vertices."""
+    """Create a tube of one meter along z, smoothly skinned to a chain of joints. Vertices are in random order."""
     rng = np.random.default_rng(seed)
     rest = np.stack([np.eye(4)] * joints)
     rest[:, 2, 3] = np.arange(joints) / joints
@@ -44,21 +44,21 @@ def chain_rig(joints: int = 3, vertices: int = 90, seed: int = 0) -> Rig:
 
 
 def chain_faces(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Starts and vertices of triangles, each of three vertices that follow one another along the tube."""
+    """Return starts and vertices of triangles, each of three consecutive vertices along the tube."""
     order = np.argsort(height)
     vertices = np.stack([order[:-2], order[1:-1], order[2:]], axis=1)
     return np.arange(0, vertices.size, 3, dtype=np.int32), vertices.astype(np.int32).ravel()
 
 
 def chain_angles(poses: int, joints: int, seed: int, reach: float = 1.0) -> np.ndarray:
-    """(poses, joints, 2) angles about x and z, uniform in `reach` times the range of motion; the root stays."""
+    """Draw (poses, joints, 2) angles about x and z, uniform in `reach` times the range of motion; the root is still."""
     angles = np.random.default_rng(seed).uniform(-LIMIT * reach, LIMIT * reach, (poses, joints, 2))
     angles[:, 0] = 0
     return angles
 
 
 def pose_chain(rig: Rig, angles: np.ndarray) -> np.ndarray:
-    """(N, J, 2) angles to (N, J, 4, 4) float32 pose matrices."""
+    """Convert (N, J, 2) angles to (N, J, 4, 4) float32 pose matrices."""
     rest = rig.rest_matrices.astype(np.float64)
     matrices = np.empty((len(angles), len(rig.joints), 4, 4))
     for pose, by_joint in enumerate(angles):
@@ -72,7 +72,7 @@ def pose_chain(rig: Rig, angles: np.ndarray) -> np.ndarray:
 
 
 def chain_residuals(rig: Rig, angles: np.ndarray) -> np.ndarray:
-    """(N, V, 3) float32 local residuals: bulges of some millimeters that grow with the bends beside a vertex."""
+    """Return (N, V, 3) float32 local residuals: bulges of some millimeters that grow with nearby bends."""
     position = rig.rest_positions[:, 2] * len(rig.joints)
     residuals = np.zeros((len(angles), rig.vertex_count, 3), np.float32)
     for joint in range(1, len(rig.joints)):
@@ -84,20 +84,20 @@ def chain_residuals(rig: Rig, angles: np.ndarray) -> np.ndarray:
 
 
 def write_chain(path: Path, poses: int = 120, complete: int | None = None, joints: int = 3, seed: int = 0) -> Rig:
-    """Write a recording of the chain; all poses are complete unless said otherwise. The last joint is locked."""
+    """Write a recording of the chain with its last joint locked; `complete` poses of it are written, None for all."""
     rig = chain_rig(joints)
     angles = chain_angles(poses, joints, seed)
     angles[:, joints - 1, 1] = 0
     influencing = {j: tuple(i for i in (j, j + 1) if 0 < i < joints) for j in range(joints)}
     info = chain_info(poses, seed)
-    chosen = angles[: poses if complete is None else complete]
+    written_angles = angles[: poses if complete is None else complete]
     with RecordingWriter(path, rig, make_partitions(rig, influencing), info) as writer:
-        writer.append(pose_chain(rig, chosen), chain_residuals(rig, chosen))
+        writer.append(pose_chain(rig, written_angles), chain_residuals(rig, written_angles))
     return rig
 
 
 def chain_info(poses: int, seed: int = 0) -> RecordingInfo:
-    """Make the index of a recording of random poses."""
+    """Create the index of a recording of random poses."""
     limits = (Channel("bone_1", "rotation", 0, -LIMIT, LIMIT),)
     sampling = Sampling(seed, 1.0, limits, (Source("random", poses),))
     return RecordingInfo(poses, 0, "chain.blend", "chain", "5.2.0", sampling)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from trainer.__main__ import main  # first of all: it says how threads wait, which torch reads when it loads
+from trainer.__main__ import main  # First, because it sets how threads wait, and torch reads that when it loads.
 
 from .chain import write_chain
 
@@ -32,7 +32,7 @@ def start_trainer(*arguments: str | Path, **options) -> subprocess.Popen:
 
 
 def run_page(chapter: str, folder: Path) -> str:
-    """Run the block of code in a chapter of docs/formats.md in a folder; returns what it prints."""
+    """Run the code block of a chapter of docs/formats.md in a folder, and return its output."""
     page = (REPOSITORY / "docs" / "formats.md").read_text("utf-8")
     text = page.partition(f"\n## {chapter}\n")[2].partition("\n## ")[0]
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Compares the optimizer with PyTorch's, in a process of its own: PyTorch's compiler crashes beside Blender."""
+"""Compares the optimizer with PyTorch's. It runs in a separate process, because PyTorch's compiler crashes Blender."""
 
 import itertools
 
@@ -12,7 +12,7 @@ WARM_UP_FRACTIONS = (0.15, 0.4)
 
 
 def compare(total_steps: int, warm_up_fraction: float) -> None:
-    """Assert that both move the same parameters by the same gradients to the same bits."""
+    """Assert that both optimizers compute bit-equal parameters from the same gradients."""
     generator = torch.Generator().manual_seed(0)
     start = [torch.randn(shape, generator=generator) for shape in ((4, 3, 5), (4, 1, 5))]
     ours, theirs = ([torch.nn.Parameter(values.clone()) for values in start] for _ in range(2))

@@ -9,7 +9,7 @@ from trainer.batch import check_batch
 from ..core.limb import record_limb
 
 
-def test_a_file_of_another_kind_stops_the_first_training_too(tmp_path):
+def test_a_file_of_another_kind_is_refused_before_the_first_training(tmp_path):
     recordings = [tmp_path / "r" / name for name in ("body", "sleeve")]
     for recording in recordings:
         record_limb(recording, 4)

@@ -20,7 +20,7 @@ CONFIG = TrainingConfig(epochs=30, hidden=(16, 16), batch_size=16, tolerance_mm=
 
 
 def partition(inputs: int, vertices: int, seed: int, poses: int = 150) -> PartitionData:
-    """Residuals of some millimeters that depend smoothly on the features."""
+    """Create a partition with residuals of some millimeters that depend smoothly on its features."""
     features = np.sin(chain_angles(poses, inputs + 1, seed)[:, 1:, 0]).astype(np.float32)
     rng = np.random.default_rng(seed)
     values = np.tanh(features @ rng.normal(size=(inputs, 4))) @ rng.normal(size=(4, 3 * vertices)) * 0.002
@@ -28,14 +28,14 @@ def partition(inputs: int, vertices: int, seed: int, poses: int = 150) -> Partit
     return PartitionData(f"p{inputs}", features, lambda: residuals, vertices)
 
 
-def learn(partitions, config=CONFIG, **options):
+def train_partitions(partitions, config=CONFIG, **options):
     split = split_poses(np.arange(len(partitions[0].features)), config.validation_fraction, config.seed)
     prepared = [prepare_partition(p, split, config.tolerance_mm, config.seed) for p in partitions]
     return prepared, train(prepared, split, config, torch.device("cpu"), **options)
 
 
 @pytest.mark.parametrize("activation", sorted(ACTIVATION_FUNCTIONS))
-def test_padding_changes_no_output(activation):
+def test_padding_does_not_change_outputs(activation):
     generator = torch.Generator().manual_seed(0)
     model = PartitionNetworks([3, 7], [5, 2], (8, 6), activation, 0.0, generator)
     inputs = torch.randn(2, 4, 7, generator=generator)
@@ -60,7 +60,7 @@ def test_dropout_drops_only_with_a_generator():
 
 
 def test_training_learns_every_partition():
-    prepared, trained = learn([partition(2, 12, 0), partition(5, 7, 1)])
+    prepared, trained = train_partitions([partition(2, 12, 0), partition(5, 7, 1)])
     for data, network, curve in zip(prepared, trained.networks, trained.curves, strict=True):
         assert min(curve.validation_mm) < 0.15 * data.residual_rms * 1000
         assert curve.validation_mm[curve.best_epoch - 1] == min(curve.validation_mm)
@@ -69,11 +69,11 @@ def test_training_learns_every_partition():
 
 
 def test_returned_weights_are_those_of_the_best_epoch():
-    """Of residuals that are random the networks learn only the training poses, and the last epoch is not the best."""
+    """The residuals are noisy, so the networks overfit the training poses, and the last epoch is not the best."""
     learned = partition(3, 10, 2, poses=40)
     rng = np.random.default_rng(3)
     noise = rng.normal(scale=0.02, size=learned.read_residuals().shape).astype(np.float32)
-    prepared, trained = learn([replace(learned, read_residuals=lambda: learned.read_residuals() + noise)])
+    prepared, trained = train_partitions([replace(learned, read_residuals=lambda: learned.read_residuals() + noise)])
     assert trained.curves[0].best_epoch < CONFIG.epochs
     split = split_poses(np.arange(40), CONFIG.validation_fraction, CONFIG.seed)
     coefficients = trained.networks[0].coefficients(prepared[0].inputs[split.validation], CONFIG.activation)
@@ -85,18 +85,22 @@ def test_returned_weights_are_those_of_the_best_epoch():
 def test_one_seed_gives_the_same_weights_and_another_does_not():
     partitions = [partition(3, 10, 2), partition(2, 5, 3)]
     config = TrainingConfig(epochs=3, hidden=(8,), batch_size=16, dropout=0.1)
-    first, second = (learn(partitions, config)[1].networks for _ in range(2))
-    for one, other in zip(first, second, strict=True):
-        for a, b in zip((*one.weights, *one.biases), (*other.weights, *other.biases), strict=True):
-            np.testing.assert_array_equal(a, b)
+    first, second = (train_partitions(partitions, config)[1].networks for _ in range(2))
+    for first_network, second_network in zip(first, second, strict=True):
+        for first_array, second_array in zip(
+            (*first_network.weights, *first_network.biases),
+            (*second_network.weights, *second_network.biases),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(first_array, second_array)
     reseeded = TrainingConfig(seed=1, epochs=3, hidden=(8,), batch_size=16, dropout=0.1)
-    assert not np.array_equal(learn(partitions, reseeded)[1].networks[0].weights[0], first[0].weights[0])
+    assert not np.array_equal(train_partitions(partitions, reseeded)[1].networks[0].weights[0], first[0].weights[0])
 
 
 def test_a_partition_without_inputs_keeps_its_mean():
-    still = PartitionData("still", np.zeros((150, 0), np.float32), partition(2, 6, 4).read_residuals, 6)
+    without_features = PartitionData("still", np.zeros((150, 0), np.float32), partition(2, 6, 4).read_residuals, 6)
     constant = PartitionData("constant", np.ones((150, 12), np.float32), partition(2, 6, 4).read_residuals, 6)
-    prepared, trained = learn([still, partition(2, 6, 5), constant])
+    prepared, trained = train_partitions([without_features, partition(2, 6, 5), constant])
     assert [len(p.basis.components) > 0 for p in prepared] == [False, True, False]
     assert trained.curves[0].validation_mm == []
     assert trained.networks[2].biases[-1].shape == (0,)
@@ -105,7 +109,7 @@ def test_a_partition_without_inputs_keeps_its_mean():
 def test_penalties_shrink_the_weights():
     def size(**penalty) -> float:
         config = TrainingConfig(epochs=10, hidden=(8,), batch_size=16, weight_decay=0, **penalty)
-        return float(np.abs(learn([partition(3, 5, 6)], config)[1].networks[0].weights[0]).sum())
+        return float(np.abs(train_partitions([partition(3, 5, 6)], config)[1].networks[0].weights[0]).sum())
 
     assert size(l1=1e-2) < 0.9 * size()
     assert size(l2=1e-2) < 0.9 * size()
@@ -118,7 +122,7 @@ def test_irrelevant_inputs_are_suppressed(monkeypatch):
     config = replace(CONFIG, validation_fraction=0.3, weight_decay=0.2)
 
     def error() -> float:
-        return min(learn([with_noise], config)[1].curves[0].validation_mm)
+        return min(train_partitions([with_noise], config)[1].curves[0].validation_mm)
 
     rescaled = error()
     monkeypatch.setattr("trainer.loop.RELEVANCE_EPOCH_FRACTIONS", ())
@@ -128,7 +132,7 @@ def test_irrelevant_inputs_are_suppressed(monkeypatch):
 def test_rescaling_inputs_keeps_the_best_outputs(monkeypatch):
     partitions = [partition(3, 10, 2), partition(5, 7, 1)]
     config = replace(CONFIG, epochs=3, averaging=0)
-    before = learn(partitions, config)[1]
+    before = train_partitions(partitions, config)[1]
     loop_run = _Loop.run
 
     def run_and_rescale(loop: _Loop, *arguments) -> None:
@@ -136,21 +140,21 @@ def test_rescaling_inputs_keeps_the_best_outputs(monkeypatch):
         loop.rescale_inputs_by_relevance()
 
     monkeypatch.setattr(_Loop, "run", run_and_rescale)
-    prepared, after = learn(partitions, config)
-    for data, one, other in zip(prepared, before.networks, after.networks, strict=True):
-        expected, actual = (network.coefficients(data.inputs, "silu") for network in (one, other))
+    prepared, after = train_partitions(partitions, config)
+    for data, first_network, second_network in zip(prepared, before.networks, after.networks, strict=True):
+        expected, actual = (network.coefficients(data.inputs, "silu") for network in (first_network, second_network))
         np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 
 def test_a_warm_start_keeps_the_outputs():
     partitions = [partition(3, 10, 2), partition(5, 7, 1)]
-    prepared, first = learn(partitions)
-    still = replace(CONFIG, epochs=10, learning_rate=1e-12, averaging=0)
-    again = learn(partitions, still, initial=first.networks)[1]
+    prepared, first = train_partitions(partitions)
+    paused_config = replace(CONFIG, epochs=10, learning_rate=1e-12, averaging=0)
+    again = train_partitions(partitions, paused_config, initial=first.networks)[1]
     for curve, first_curve in zip(again.curves, first.curves, strict=True):
         np.testing.assert_allclose(curve.validation_mm, min(first_curve.validation_mm), rtol=1e-3)
-    for data, one, other in zip(prepared, first.networks, again.networks, strict=True):
-        expected, actual = (network.coefficients(data.inputs, "silu") for network in (one, other))
+    for data, first_network, second_network in zip(prepared, first.networks, again.networks, strict=True):
+        expected, actual = (network.coefficients(data.inputs, "silu") for network in (first_network, second_network))
         np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 
@@ -163,17 +167,17 @@ def test_patience_stops_early():
         lambda: np.random.default_rng(1).normal(size=(60, 4, 3)).astype(np.float32),
         4,
     )
-    learn([noise], config, on_epoch=epochs.append)
+    train_partitions([noise], config, on_epoch=epochs.append)
     assert len(epochs) < 60
 
 
 def test_a_stop_request_cancels_the_training():
     calls = []
 
-    def stop() -> bool:
+    def should_stop_after_five_calls() -> bool:
         calls.append(True)
         return len(calls) > 5
 
     with pytest.raises(Cancelled):
-        learn([partition(2, 5, 7)], should_stop=stop)
+        train_partitions([partition(2, 5, 7)], should_stop=should_stop_after_five_calls)
     assert len(calls) == 6

@@ -35,7 +35,7 @@ PUFF = Control("armature_object", '["puff"]', -2, 2)
 LOCKED = Control("armature", '["locked"]', 0.5, 0.5)
 INFLUENCING = {0: (), 1: (1, 2), 2: (2,)}
 CONTROLLED = {0: (1,), 1: (0,), 2: (0,)}
-"""The first partition follows a control and no joint."""
+"""Controls that influence each partition. No joint influences the first partition."""
 
 
 def controlled_rig(*controls: Control) -> Rig:
@@ -43,13 +43,13 @@ def controlled_rig(*controls: Control) -> Rig:
 
 
 def controlled_poses(poses: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """(poses, 3, 2) angles and (poses, 3) values of the controls, in nine tenths of their ranges."""
+    """Draw (poses, 3, 2) angles, and (poses, 3) values of the controls in nine tenths of their ranges."""
     values = np.random.default_rng([seed, 1]).uniform(-1, 1, (poses, 3)) * [0.45, 1.8, 0] + [0.5, 0, 0.5]
     return chain_angles(poses, 3, seed), values.astype(np.float32)
 
 
 def controlled_residuals(rig: Rig, angles: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(N, V, 3): as the chain's above the first joint, and centimeters that depend on the controls."""
+    """Return (N, V, 3) residuals: of the chain except at its first joint, plus centimeters that depend on controls."""
     position = rig.rest_positions[:, 2] * 3
     residuals = chain_residuals(rig, angles)
     first = make_partitions(rig)[0].vertices
@@ -84,7 +84,7 @@ def network(model) -> Network:
     return Network(model)
 
 
-def test_the_error_is_small_with_the_controls_and_large_without(network, model):
+def test_the_model_needs_the_values_of_controls(network, model):
     rig, (angles, values) = controlled_rig(), controlled_poses(50, 9)
     poses, skinning = pose_chain(rig, angles), LinearSkinning(rig)
     truth = skinning.complex_positions(poses, controlled_residuals(rig, angles, values))
@@ -109,7 +109,7 @@ def test_the_graph_has_the_controls_input_only_with_controls(model, trained):
     assert read_model_info(trained / "model.onnx").controls == ()
 
 
-def test_metadata_has_the_ranges_that_the_training_poses_had(model, controlled):
+def test_metadata_has_the_ranges_of_the_training_poses(model, controlled):
     info, recording = read_model_info(model), read_recording(controlled)
     values = recording.controls[split_recording(recording, TrainingConfig()).training]
     assert [c.name for c in info.controls] == [c.name for c in (BULGE, PUFF, LOCKED)]
@@ -129,7 +129,7 @@ def test_the_report_names_controls(model):
 
 
 def confidence_of(network: Network, control: int, values: np.ndarray) -> np.ndarray:
-    """(N, 3) confidence in the rest pose as one control moves; the others stay at their centers."""
+    """Return the (N, 3) confidence in the rest pose for values of one control; the other controls are centered."""
     controls = np.tile(np.float32([0.5, 0, 0.5]), (len(values), 1))
     controls[:, control] = values
     return network.confidence(np.tile(network.info.rest_matrices, (len(values), 1, 1, 1)), controls)
@@ -178,7 +178,7 @@ def test_values_of_controls_must_be_given(network):
             call(rest, np.zeros(3, np.float32))
 
 
-def test_characters_of_a_crowd_have_their_own_values(network):
+def test_each_pose_of_a_batch_has_its_own_control_values(network):
     angles, values = controlled_poses(6, 4)
     poses = pose_chain(controlled_rig(), angles)
     together = network.positions(poses, values).copy()
@@ -188,7 +188,7 @@ def test_characters_of_a_crowd_have_their_own_values(network):
     assert np.abs(network.positions(poses, values[::-1]) - together).max() > 1e-3
 
 
-def test_the_code_of_the_page_on_models_plays_it(model):
+def test_the_code_in_the_model_format_page_runs(model):
     assert run_page("Model", model.parent).startswith("['bone_0', 'bone_1', 'bone_2'] (2, 90, 3) [1. ")
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The analysis of the largest errors finds the cause that the test makes."""
+"""The analysis of the largest errors finds the cause that each test creates."""
 
 import json
 from pathlib import Path
@@ -21,15 +21,15 @@ def train_chain(folder: Path, poses: int, *options: str) -> list[dict]:
     return report["partitions"]
 
 
-def test_too_few_components(tmp_path):
-    """With a tolerance of two millimeters nearly all of the error is what no component represents."""
+def test_too_few_components_are_the_cause(tmp_path):
+    """With a tolerance of two millimeters, components do not represent most of the error."""
     partitions = train_chain(tmp_path, 200, "--epochs", "60", "--tolerance-mm", "2")
     analyses = [p["largest_errors"] for p in partitions if p["held_out"]["max"] > 1]
     assert analyses and all(a["truncation"] > 0.8 and a["cause"] == COMPONENTS for a in analyses)
 
 
-def test_too_few_poses(tmp_path):
-    """Thirty poses and many epochs: training poses are right, the others are not."""
+def test_too_few_poses_are_the_cause(tmp_path):
+    """With thirty poses and many epochs, the training poses are accurate and the other poses are not."""
     partitions = train_chain(tmp_path, 30, "--epochs", "300", "--tolerance-mm", "0.001", "--held-out-fraction", "0.4")
     analysis = max(partitions, key=lambda p: p["held_out"]["max"])["largest_errors"]
     assert analysis["generalization"] > 1.5 and analysis["cause"] in (POSES, EXTREMES)
@@ -46,7 +46,7 @@ def test_too_few_poses(tmp_path):
         (0.4, 1.0, 1.0, NONE),
     ],
 )
-def test_causes(truncation, distance, generalization, cause):
+def test_cause_of_measured_ratios(truncation, distance, generalization, cause):
     assert _cause(truncation, distance, generalization) == cause and cause in CAUSES
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The graph: it agrees with PyTorch for all transforms of bones, and has few nodes and constants."""
+"""The graph agrees with PyTorch for all transforms of bones, and has few nodes and constants."""
 
 import json
 from dataclasses import replace
@@ -26,19 +26,23 @@ SHEAR = np.eye(4)
 SHEAR[0, 1] = 0.3
 
 
-def keep_trained_model(monkeypatch) -> list[TrainedModel]:
-    """Collect the models of all further trainings."""
-    made, make = [], trainer.training._trained_model
-    monkeypatch.setattr(trainer.training, "_trained_model", lambda *args: made.append(make(*args)) or made[-1])
-    return made
+def collect_trained_models(monkeypatch) -> list[TrainedModel]:
+    """Return a list to which every later training adds its model."""
+    trained_models, make_trained_model = [], trainer.training._trained_model
+    monkeypatch.setattr(
+        trainer.training,
+        "_trained_model",
+        lambda *args: trained_models.append(make_trained_model(*args)) or trained_models[-1],
+    )
+    return trained_models
 
 
 @pytest.fixture(scope="module")
 def trained_model(recording, tmp_path_factory) -> TrainedModel:
     with pytest.MonkeyPatch.context() as monkeypatch:
-        made = keep_trained_model(monkeypatch)
+        trained_models = collect_trained_models(monkeypatch)
         assert main([str(recording), str(tmp_path_factory.mktemp("graph") / "model.onnx"), *QUICK]) == 0
-    return made[0]
+    return trained_models[0]
 
 
 def run_graph(trained_model: TrainedModel, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -47,7 +51,7 @@ def run_graph(trained_model: TrainedModel, poses: np.ndarray) -> tuple[np.ndarra
 
 
 def check_agreement(trained_model: TrainedModel, poses: np.ndarray, tolerance: float = 2e-6) -> np.ndarray:
-    """Compare with PyTorch; returns the confidence."""
+    """Compare the graph with PyTorch, and return the confidence."""
     positions, confidence = run_graph(trained_model, poses)
     expected, expected_confidence = reference_positions(trained_model, poses, np.zeros((len(poses), 0), np.float32))
     np.testing.assert_allclose(positions, expected, atol=tolerance)
@@ -56,7 +60,7 @@ def check_agreement(trained_model: TrainedModel, poses: np.ndarray, tolerance: f
 
 
 @pytest.mark.parametrize("sheared", [False, True])
-def test_rigid_bones(trained_model, sheared):
+def test_the_graph_agrees_with_pytorch_for_rigid_bones(trained_model, sheared):
     angles = chain_angles(20, 3, 5)
     angles[:, 2, 1] = 0
     assert (check_agreement(replace(trained_model, sheared=sheared), pose_chain(trained_model.rig, angles)) == 1).all()
@@ -64,7 +68,7 @@ def test_rigid_bones(trained_model, sheared):
 
 @pytest.mark.parametrize("sheared", [False, True])
 @pytest.mark.parametrize("scale", [(2, 2, 2), (0.01, 0.01, 0.01), (1.1, 0.9, 1.05)])
-def test_scaled_bones(trained_model, sheared, scale):
+def test_the_graph_agrees_with_pytorch_for_scaled_bones(trained_model, sheared, scale):
     poses = pose_chain(trained_model.rig, chain_angles(20, 3, 5))
     poses[:, 1:] = poses[:, 1:] @ np.diag([*scale, 1]).astype(np.float32)
     check_agreement(replace(trained_model, sheared=sheared), poses)
@@ -83,11 +87,11 @@ def test_a_character_that_is_scaled_as_a_whole_keeps_its_residuals(trained_model
     assert np.abs(positions - LinearSkinning(trained_model.rig).positions(scaled))[:, last].max() > 1e-3
 
 
-def test_far_from_the_origin(trained_model):
+def test_the_graph_agrees_with_pytorch_far_from_the_origin(trained_model):
     poses = pose_chain(trained_model.rig, chain_angles(5, 3, 5))
-    away = np.eye(4)
-    away[:3, 3] = 60, -70, 40
-    check_agreement(trained_model, (away @ poses).astype(np.float32), tolerance=1e-4)
+    translation = np.eye(4)
+    translation[:3, 3] = 60, -70, 40
+    check_agreement(trained_model, (translation @ poses).astype(np.float32), tolerance=1e-4)
 
 
 def test_a_sheared_bone_gives_finite_positions(trained_model):
@@ -106,12 +110,12 @@ def test_scale_is_not_shear(recording):
     poses[299, 1] = poses[299, 1] @ SHEAR.astype(np.float32)
     assert is_sheared(poses)
     # As little shear as a stretching bone of a control rig has.
-    little = np.eye(4)
-    little[0, 1] = 3e-5
-    assert is_sheared((pose_chain(chain_rig(), chain_angles(20, 3, 0)) @ little).astype(np.float32))
+    small_shear = np.eye(4)
+    small_shear[0, 1] = 3e-5
+    assert is_sheared((pose_chain(chain_rig(), chain_angles(20, 3, 0)) @ small_shear).astype(np.float32))
 
 
-def test_a_recording_with_sheared_bones_plays_them(tmp_path, monkeypatch):
+def test_a_model_of_sheared_bones_agrees_with_pytorch(tmp_path, monkeypatch):
     rig, angles = chain_rig(), chain_angles(120, 3, 0)
     # A mesh object that is scaled along a slanted axis shears every matrix.
     squash = rotation(0, 0.7) @ np.diag([1, 1, 0.6, 1]) @ rotation(0, -0.7)
@@ -120,15 +124,15 @@ def test_a_recording_with_sheared_bones_plays_them(tmp_path, monkeypatch):
     influencing = {0: (1,), 1: (1, 2), 2: (2,)}
     with RecordingWriter(tmp_path / "recording", rig, make_partitions(rig, influencing), chain_info(120)) as writer:
         writer.append(poses, chain_residuals(chain_rig(), angles))
-    made = keep_trained_model(monkeypatch)
+    trained_models = collect_trained_models(monkeypatch)
     assert main([str(tmp_path / "recording"), str(tmp_path / "model.onnx"), *QUICK]) == 0
-    assert made[0].sheared and read_model_info(tmp_path / "model.onnx").parity_mm < 1e-2
+    assert trained_models[0].sheared and read_model_info(tmp_path / "model.onnx").parity_mm < 1e-2
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["fdda"]["held_out"]["mean"] < 0.1 * report["linear"]["held_out"]["mean"]
 
 
 def test_the_graph_has_few_nodes(trained):
-    """A node takes a third of a microsecond, and nearly one in a frame."""
+    """The time of a frame grows with the number of nodes."""
     info, graph = read_model_info(trained / "model.onnx"), onnx.load(trained / "model.onnx").graph
     assert len(graph.node) <= 50 + len(info.partitions)
 
@@ -177,7 +181,7 @@ def test_translations_are_packed_by_three():
 
 @pytest.mark.parametrize("joints", [(0, 1, 2), (0, 1), (2,)])
 def test_partial_slices_of_translations_agree_with_pytorch(trained_model, joints):
-    """With fewer fitted joints the slices of translations change."""
+    """Fewer fitted joints change the slices of translations."""
     poses = pose_chain(trained_model.rig, chain_angles(5, 3, 3))
     prepared = list(trained_model.prepared)
     for n in joints:
@@ -190,7 +194,7 @@ def test_partial_slices_of_translations_agree_with_pytorch(trained_model, joints
 
 @pytest.mark.parametrize("chunk_cost, split_cost", [(0, 0), (100, 0), (0, 10**9)])
 def test_networks_in_chunks_have_the_same_outputs(trained_model, monkeypatch, chunk_cost, split_cost):
-    """Chunks of one input and one component, of several, and one for each network."""
+    """Chunks have one input or component, several, or all of a network."""
     poses = pose_chain(trained_model.rig, chain_angles(5, 3, 3))
     expected, _ = run_graph(trained_model, poses)
     monkeypatch.setattr(network_nodes, "CHUNK_COST", chunk_cost)

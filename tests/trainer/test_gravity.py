@@ -19,58 +19,58 @@ POSES = 200
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
-def of_chain(follows: str, sag: float) -> Recording:
-    """A chain that bends and rotates as a whole, and whose surface sags by some meters."""
+def record_sagging_chain(follows: str, sag: float) -> Recording:
+    """Create a recording of a chain that bends and rotates, and whose surface sags by `sag` meters."""
     rig = chain_rig(joints=4)
     angles = np.random.default_rng(0).uniform(-LIMIT, LIMIT, (POSES, 4, 2))
     matrices = pose_chain(rig, angles)
     residuals = chain_residuals(rig, angles)
-    bare = make_partitions(rig, {joint: () for joint in range(4)})
-    for partition in bare:
+    bare_partitions = make_partitions(rig, {joint: () for joint in range(4)})
+    for partition in bare_partitions:
         rotations = matrices[:, partition.joint, :3, :3] @ rig.rest_matrices[partition.joint, :3, :3].T
         residuals[:, partition.vertices] += (sag * DOWN @ rotations).astype(np.float32)[:, None]
     info = RecordingInfo(
         POSES, POSES, "chain.blend", "chain", "5.2.0", Sampling(0, 1.0, (), (Source("random", POSES),)),
         target=RecordedTarget("flesh", follows, 0),
     )  # fmt: skip
-    partitions = assume_nearby_influences(rig, bare)
+    partitions = assume_nearby_influences(rig, bare_partitions)
     return Recording(Path(), info, rig, partitions, matrices, residuals, np.zeros((POSES, 0), np.float32))
 
 
-def split() -> Split:
+def make_split() -> Split:
     return Split(np.arange(0, 160), np.arange(160, 180), np.arange(180, POSES))
 
 
 @pytest.mark.parametrize("follows", [FRAMES, SIMULATION])
 def test_without_sag_the_gravity_input_is_dropped(follows):
-    found = drop_gravity_input(of_chain(follows, sag=0.0), split())
+    found = drop_gravity_input(record_sagging_chain(follows, sag=0.0), make_split())
     assert [partition.influencing for partition in found.partitions] == [(1,), (1, 2), (1, 2, 3), (1, 2, 3)]
 
 
 @pytest.mark.parametrize("follows", [FRAMES, SIMULATION])
 def test_with_sag_the_gravity_input_stays(follows):
-    recording = of_chain(follows, sag=0.01)
+    recording = record_sagging_chain(follows, sag=0.01)
     assert [partition.influencing for partition in recording.partitions] == [
         (0, 1),
         (0, 1, 2),
         (0, 1, 2, 3),
         (0, 1, 2, 3),
     ]
-    assert drop_gravity_input(recording, split()) is recording
+    assert drop_gravity_input(recording, make_split()) is recording
 
 
 def test_a_target_that_follows_the_pose_keeps_its_influences():
-    recording = of_chain(POSE, sag=0.0)
-    assert drop_gravity_input(recording, split()) is recording
+    recording = record_sagging_chain(POSE, sag=0.0)
+    assert drop_gravity_input(recording, make_split()) is recording
 
 
 def test_held_out_poses_are_not_used():
-    recording = of_chain(FRAMES, sag=0.0)
-    recording.residuals[split().held_out] = np.nan
-    assert drop_gravity_input(recording, split()) is not recording
+    recording = record_sagging_chain(FRAMES, sag=0.0)
+    recording.residuals[make_split().held_out] = np.nan
+    assert drop_gravity_input(recording, make_split()) is not recording
 
 
-def test_several_roots_stay():
+def test_joints_of_several_roots_keep_their_influences():
     rig = chain_rig(joints=2)
     apart = type(rig)(
         tuple(type(joint)(joint.name, -1) for joint in rig.joints), rig.rest_positions, rig.rest_matrices,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Half-rotation features: used where a rig blends rotations and nowhere else; the graph computes the same."""
+"""Half-rotation features are used only for rigs that blend rotations; the graph computes the same values."""
 
 import json
 import shutil
@@ -30,7 +30,7 @@ from trainer.trained_model import TrainedModel
 
 from .chain import chain_angles, chain_info, chain_rig, pose_chain, rotation, write_chain
 from .conftest import QUICK
-from .test_graph import check_agreement, constant_bytes, keep_trained_model
+from .test_graph import check_agreement, collect_trained_models, constant_bytes
 from .tube import write_tube
 
 POSES, REACH = 160, 1.8
@@ -38,24 +38,24 @@ INFLUENCING = {0: (1,), 1: (1, 2), 2: (1, 2)}
 
 
 def blend_rotations(rig: Rig, pose_matrices: np.ndarray) -> np.ndarray:
-    """(N, V, 3) positions skinned by dual quaternions, as an armature that preserves volume does it."""
+    """Return (N, V, 3) positions skinned with dual quaternions, as by an armature that preserves volume."""
     skin = skin_matrices(pose_matrices, rig.rest_matrices).astype(np.float64)
     real = Rotation.from_matrix(skin[:, :, :3, :3].reshape(-1, 3, 3)).as_quat(scalar_first=True)
     real = real.reshape(len(skin), -1, 4)
-    dual = 0.5 * product(np.pad(skin[:, :, :3, 3], ((0, 0), (0, 0), (1, 0))), real)
+    dual = 0.5 * multiply_quaternions(np.pad(skin[:, :, :3, 3], ((0, 0), (0, 0), (1, 0))), real)
     first = real[:, rig.skin_joints[:, :1]]
     real, dual = real[:, rig.skin_joints], dual[:, rig.skin_joints]
     weights = rig.skin_weights[None, :, :, None] * np.where((first * real).sum(axis=3, keepdims=True) < 0, -1, 1)
     real, dual = ((weights * each).sum(axis=2) for each in (real, dual))
     length = np.linalg.norm(real, axis=2, keepdims=True)
     real, dual = real / length, dual / length
-    moved = 2 * product(dual, real * [1, -1, -1, -1])[..., 1:]
-    turned = Rotation.from_quat(real.reshape(-1, 4), scalar_first=True)
+    moved = 2 * multiply_quaternions(dual, real * [1, -1, -1, -1])[..., 1:]
+    rotations = Rotation.from_quat(real.reshape(-1, 4), scalar_first=True)
     rest = np.broadcast_to(rig.rest_positions, moved.shape).reshape(-1, 3)
-    return turned.apply(rest).reshape(moved.shape) + moved
+    return rotations.apply(rest).reshape(moved.shape) + moved
 
 
-def product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def multiply_quaternions(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Multiply quaternions (..., 4), the scalar first."""
     scalar = first[..., 0] * second[..., 0] - (first[..., 1:] * second[..., 1:]).sum(axis=-1)
     vector = first[..., :1] * second[..., 1:] + second[..., :1] * first[..., 1:]
@@ -63,7 +63,7 @@ def product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def write_volume(path: Path, per_metre: float = 1.0, away: float = 0.0, squash: np.ndarray | None = None) -> Recording:
-    """A recording of the chain with an armature that preserves volume."""
+    """Write a recording of the chain with an armature that preserves volume."""
     plain, squash = chain_rig(), np.eye(4) if squash is None else squash
     poses = pose_chain(plain, chain_angles(POSES, 3, seed=2, reach=REACH))
     positions = blend_rotations(plain, poses)
@@ -91,20 +91,20 @@ def recording(tmp_path_factory) -> Recording:
 
 @pytest.fixture(scope="module")
 def trained(recording, tmp_path_factory) -> tuple:
-    """The trained model, and the path of its file."""
+    """The trained model and the path of its file."""
     path = tmp_path_factory.mktemp("models") / "volume.onnx"
     with pytest.MonkeyPatch.context() as monkeypatch:
-        made = keep_trained_model(monkeypatch)
+        trained_models = collect_trained_models(monkeypatch)
         assert main([str(recording.path), str(path), *QUICK]) == 0
-    return made[0], path
+    return trained_models[0], path
 
 
-def helpful(recording: Recording) -> bool:
+def half_rotations_are_selected(recording: Recording) -> bool:
     return half_rotations_help(recording, split_recording(recording, TrainingConfig()).training)
 
 
 def pose_second(rig: Rig, matrix: np.ndarray) -> np.ndarray:
-    """(1, J, 4, 4) pose matrices with a transform of the second joint relative to the first."""
+    """Return (1, J, 4, 4) pose matrices with a transform of the second joint relative to the first."""
     rest = rig.rest_matrices.astype(np.float64)
     poses = rest.copy()
     poses[0] = rotation(1, 0.4) @ rest[0]
@@ -131,22 +131,24 @@ def test_a_half_rotation_is_proportional_to_the_sine_of_half_the_angle(degrees):
 def test_half_rotations_rotate_with_the_character():
     rig = chain_rig()
     poses = pose_chain(rig, chain_angles(5, 3, seed=3)).astype(np.float64)
-    whole = rotation(0, 0.7) @ rotation(2, -1.9)
-    whole[:3, 3] = 30, -20, 10
-    moved = regression_matrices((whole @ poses).astype(np.float32), rig, use_half_rotations=True)[:, 3:]
-    expected = whole[:3, :3] @ regression_matrices(poses.astype(np.float32), rig, use_half_rotations=True)[:, 3:]
+    character_transform = rotation(0, 0.7) @ rotation(2, -1.9)
+    character_transform[:3, 3] = 30, -20, 10
+    moved = regression_matrices((character_transform @ poses).astype(np.float32), rig, use_half_rotations=True)[:, 3:]
+    expected = (
+        character_transform[:3, :3] @ regression_matrices(poses.astype(np.float32), rig, use_half_rotations=True)[:, 3:]
+    )
     np.testing.assert_allclose(moved, expected, atol=1e-5)
     assert not moved[..., 3].any() and np.abs(moved).max() > 0.1
 
 
 @pytest.mark.parametrize("matrix", [rotation(0, np.pi), np.diag([100, 100, 100, 1]), np.diag([-1, -1, -1, 1])])
 def test_half_rotations_are_bounded(matrix):
-    """180 degrees, a joint at a hundred times its size, and a mirrored one, whose divisor would be 0."""
+    """The cases are 180 degrees, a joint scaled by a hundred, and a mirrored joint, whose divisor would be 0."""
     rig = chain_rig()
     assert np.abs(half_rotation_matrices(pose_second(rig, matrix), rig)).max() < 1e-4
 
 
-def test_they_explain_most_of_the_residuals_of_preserved_volume(recording):
+def test_half_rotations_explain_most_residuals_of_preserved_volume(recording):
     split = split_recording(recording, TrainingConfig())
     for partition in recording.partitions:
         residuals, left = recording.residuals[:, partition.vertices], []
@@ -162,9 +164,9 @@ def test_they_explain_most_of_the_residuals_of_preserved_volume(recording):
 
 
 @pytest.mark.parametrize("per_metre, away", [(1000.0, 0.0), (1.0, 100.0), (1000.0, 100.0)])
-def test_units_and_place_change_nothing(tmp_path, recording, per_metre, away):
+def test_selection_does_not_depend_on_unit_and_position(tmp_path, recording, per_metre, away):
     other = write_volume(tmp_path / "volume", per_metre, away)
-    assert helpful(recording) and helpful(other)
+    assert half_rotations_are_selected(recording) and half_rotations_are_selected(other)
     joints = []
     for each in (recording, other):
         matrices = regression_matrices(each.pose_matrices, each.rig, use_half_rotations=True)
@@ -175,10 +177,12 @@ def test_units_and_place_change_nothing(tmp_path, recording, per_metre, away):
 
 
 def test_a_rig_that_blends_matrices_has_none(tmp_path):
-    """Bulges that grow with the bend, skinning alone, and delta mush, which has surface frames instead."""
+    """The cases are bulges that grow with the bend, skinning alone, and delta mush, which has surface frames."""
     write_chain(tmp_path / "chain")
     bulges = read_recording(tmp_path / "chain")
-    assert not helpful(bulges) and not helpful(replace(bulges, residuals=0 * bulges.residuals))
+    assert not half_rotations_are_selected(bulges) and not half_rotations_are_selected(
+        replace(bulges, residuals=0 * bulges.residuals)
+    )
     write_tube(tmp_path / "tube")
     assert main([str(tmp_path / "tube"), str(tmp_path / "tube.onnx"), *QUICK]) == 0
     names = {node.name for node in onnx.load(tmp_path / "tube.onnx").graph.node}
@@ -211,7 +215,7 @@ def test_a_warm_start_keeps_half_rotations(recording, trained, tmp_path, capsys)
     assert report["fdda"]["held_out"]["mean"] < 0.1 * report["linear"]["held_out"]["mean"]
 
 
-def test_they_cost_thirteen_nodes_and_three_parameters_per_vertex(trained, monkeypatch):
+def test_half_rotations_cost_thirteen_nodes_and_three_parameters_per_vertex(trained, monkeypatch):
     trained_model = trained[0]
     monkeypatch.setattr(skinning_nodes, "MAX_PADDING_ELEMENTS", 0)
     graph, plain = (build_graph(each) for each in (trained_model, without_half_rotations(trained_model)))
@@ -234,8 +238,8 @@ def test_the_graph_agrees_with_pytorch(trained, sheared):
 
 def test_sheared_bones_have_half_rotations(tmp_path, monkeypatch):
     squash = rotation(0, 0.7) @ np.diag([1, 1, 0.6, 1]) @ rotation(0, -0.7)
-    made = keep_trained_model(monkeypatch)
+    trained_models = collect_trained_models(monkeypatch)
     sheared = write_volume(tmp_path / "volume", squash=squash)
     assert main([str(sheared.path), str(tmp_path / "model.onnx"), *QUICK]) == 0
-    assert made[0].sheared and len(made[0].half_rotation_joints())
+    assert trained_models[0].sheared and len(trained_models[0].half_rotation_joints())
     assert read_model_info(tmp_path / "model.onnx").parity_mm < 1e-2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The model does not depend on the unit and the place of the character, within rounding."""
+"""The model does not depend on the unit and the position of the character, except for rounding."""
 
 import json
 from dataclasses import replace
@@ -23,20 +23,20 @@ from .chain import chain_angles, chain_info, chain_residuals, chain_rig, pose_ch
 from .conftest import QUICK
 
 JOINTS, POSES = 4, 160
-METRES = "meters"
-WAYS = {
-    METRES: (1.0, 0.0),
+METER = "meters"
+UNITS_AND_DISTANCES = {
+    METER: (1.0, 0.0),
     "centimeters": (100.0, 0.0),
     "millimeters": (1000.0, 0.0),
     "kilometers": (0.001, 0.0),
     "100 meters away": (1.0, 100.0),
     "millimeters, 100 meters away": (1000.0, 100.0),
 }
-OTHERS = [name for name in WAYS if name != METRES]
+OTHER_UNITS = [name for name in UNITS_AND_DISTANCES if name != METER]
 
 
-def write(path, per_metre: float, away: float) -> None:
-    """A recording of the chain in another unit, at a distance from the origin in meters."""
+def write_recording(path, per_metre: float, away: float) -> None:
+    """Write a recording of the chain in another unit, at a distance from the origin in meters."""
     rig = chain_rig(JOINTS)
     angles = chain_angles(POSES, JOINTS, seed=3)
     matrices, residuals = pose_chain(rig, angles).astype(np.float64), chain_residuals(rig, angles)
@@ -57,12 +57,12 @@ def write(path, per_metre: float, away: float) -> None:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> dict:
-    """Recording, report and model of each."""
+    """Recording, report and model metadata for each unit and distance."""
     folder, found = tmp_path_factory.mktemp("lengths"), {}
-    for name, way in WAYS.items():
+    for name, way in UNITS_AND_DISTANCES.items():
         path = folder / name
         path.mkdir()
-        write(path / "recording", *way)
+        write_recording(path / "recording", *way)
         model = path / "m.onnx"
         assert main([str(path / "recording"), str(model), *QUICK]) == 0, name
         report = json.loads(report_path(model).read_text())
@@ -78,37 +78,37 @@ def prepared(recording) -> list:
     return [prepare_partition(p, split, config.tolerance_mm, config.seed, rig.metres_per_unit) for p in partitions]
 
 
-@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize("name", OTHER_UNITS)
 def test_networks_have_the_same_inputs(trained, name):
-    """Rounding of constant features is no input; small features that vary are."""
-    for own, meters in zip(*(prepared(trained[n][0]) for n in (name, METRES)), strict=True):
+    """Constant features with rounding errors are not inputs; features that vary a little are."""
+    for own, meters in zip(*(prepared(trained[n][0]) for n in (name, METER)), strict=True):
         assert own.columns.tolist() == meters.columns.tolist()
         assert own.fit.joints.tolist() == meters.fit.joints.tolist()
         assert abs(len(own.basis.components) - len(meters.basis.components)) <= 1
 
 
-@pytest.mark.parametrize("name", OTHERS)
-def test_models_are_as_good(trained, name):
-    own, meters = (trained[n][1] for n in (name, METRES))
+@pytest.mark.parametrize("name", OTHER_UNITS)
+def test_models_have_the_same_errors(trained, name):
+    own, meters = (trained[n][1] for n in (name, METER))
     # One step of float32, mm: positions far from the origin are no more exact than that.
-    step = 1000 * float(np.spacing(np.float32(WAYS[name][1])))
+    step = 1000 * float(np.spacing(np.float32(UNITS_AND_DISTANCES[name][1])))
     for way in ("fdda", "linear"):
         for statistic, value in meters[way]["held_out"].items():
             assert own[way]["held_out"][statistic] == pytest.approx(value, rel=0.1, abs=step), (way, statistic)
 
 
-@pytest.mark.parametrize("name", OTHERS)
-def test_the_same_counts_as_locked(trained, name):
-    """What the confidence is taken for: ranges in true meters agree."""
-    (_, _, own), (_, _, meters) = trained[name], trained[METRES]
-    per_metre, _ = WAYS[name]
+@pytest.mark.parametrize("name", OTHER_UNITS)
+def test_training_ranges_agree_in_meters(trained, name):
+    """The bounds that determine the confidence are equal in meters."""
+    (_, _, own), (_, _, meters) = trained[name], trained[METER]
+    per_metre, _ = UNITS_AND_DISTANCES[name]
     for mine, theirs in ((own.feature_low, meters.feature_low), (own.feature_high, meters.feature_high)):
         mine = mine.copy()
         mine[:, 3::4] /= per_metre
         assert np.abs(mine - theirs)[1:].max() < 2e-4
 
 
-@pytest.mark.parametrize("name", WAYS)
-def test_nothing_is_suspicious(trained, name):
-    own, meters = ({warning.name for warning in check_recording(trained[n][0])} for n in (name, METRES))
+@pytest.mark.parametrize("name", UNITS_AND_DISTANCES)
+def test_recording_checks_give_the_same_warnings(trained, name):
+    own, meters = ({warning.name for warning in check_recording(trained[n][0])} for n in (name, METER))
     assert own == meters

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Low-rank factors of large partitions: fewer parameters, the same positions, at any place and in any unit."""
+"""Low-rank factors of large partitions: fewer parameters and the same positions, at any position and in any unit."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ from trainer.trained_model import TrainedModel
 
 from .chain import chain_angles, chain_info, chain_rig, pose_chain
 from .conftest import QUICK
-from .test_graph import check_agreement, keep_trained_model, run_graph
+from .test_graph import check_agreement, collect_trained_models, run_graph
 
 JOINTS, VERTICES, POSES = 3, 6_000, 120
 INFLUENCING = {0: (1,), 1: (1, 2), 2: (2,)}
@@ -30,8 +30,8 @@ TRAINING = np.arange(POSES)
 ONES = np.ones(POSES)
 
 
-def sliding(rig: Rig, angles: np.ndarray) -> np.ndarray:
-    """(N, V, 3) float32 local residuals, bulges that slide with the bends, which need many components."""
+def sliding_residuals(rig: Rig, angles: np.ndarray) -> np.ndarray:
+    """Return (N, V, 3) float32 local residuals: bulges that slide with the bends and so need many components."""
     place = rig.rest_positions[:, 2] * JOINTS
     residuals = np.zeros((len(angles), rig.vertex_count, 3))
     for joint in range(1, JOINTS):
@@ -43,19 +43,20 @@ def sliding(rig: Rig, angles: np.ndarray) -> np.ndarray:
 
 
 class Prepared:
-    """A partition of the tube, fitted, with its basis.
+    """A partition of the chain's tube with its fit and basis.
 
     Args:
-        away: how far the tube stands from the origin, meters.
-        per_metre: mesh units.
+        away: distance of the tube from the origin, meters.
+        per_metre: mesh units per meter.
+        without_residuals: whether all residuals are 0.
     """
 
-    def __init__(self, away: float = 0.0, per_metre: float = 1.0, still: bool = False):
+    def __init__(self, away: float = 0.0, per_metre: float = 1.0, without_residuals: bool = False):
         rig, angles = chain_rig(JOINTS, VERTICES), chain_angles(POSES, JOINTS, 0)
-        residuals = sliding(rig, angles) * (not still)
-        there = np.eye(4)
-        there[:3, 3] = away
-        self.rig, poses = moved(rig, there, per_metre), there @ pose_chain(rig, angles)
+        residuals = sliding_residuals(rig, angles) * (not without_residuals)
+        translation = np.eye(4)
+        translation[:3, 3] = away
+        self.rig, poses = moved(rig, translation, per_metre), translation @ pose_chain(rig, angles)
         poses[..., :3, 3] *= per_metre
         self.partition: Partition = make_partitions(self.rig, INFLUENCING)[1]
         self.skin = skin_matrices(poses, self.rig.rest_matrices)
@@ -72,16 +73,16 @@ class Prepared:
         return low_rank.factorize(*arguments)
 
     def offsets(self, of: "Prepared | LowRankFactors") -> np.ndarray:
-        """(N, Vp, 3) offsets from linear skinning as the main joint sees them, mesh units."""
+        """Return the (N, Vp, 3) offsets from linear skinning in the space of the main joint, mesh units."""
         turned = np.linalg.inv(self.skin[:, self.partition.joint, :3, :3].astype(np.float64))
         fitted = of.fit.offsets(self.skin) @ turned.transpose(0, 2, 1)
         return fitted + of.basis.residuals(of.coefficients).reshape(fitted.shape)
 
 
-def moved(rig: Rig, there: np.ndarray, per_metre: float) -> Rig:
-    rest = there @ rig.rest_matrices
+def moved(rig: Rig, translation: np.ndarray, per_metre: float) -> Rig:
+    rest = translation @ rig.rest_matrices
     rest[:, :3, 3] *= per_metre
-    positions = (rig.rest_positions + there[:3, 3]) * per_metre
+    positions = (rig.rest_positions + translation[:3, 3]) * per_metre
     return replace(
         rig,
         rest_positions=positions.astype(np.float32),
@@ -147,13 +148,16 @@ def test_a_lower_pose_weight_lowers_the_rank(prepared):
 
 
 def test_zero_residuals_have_rank_zero():
-    still = Prepared(still=True)
+    without_residuals = Prepared(without_residuals=True)
     # More joints than the residuals need.
-    factors = np.zeros((12, len(still.partition.vertices)), np.float32)
-    still.fit = JointFit(np.arange(3)[[1, 0, 2]], factors)
-    factors = still.factorize()
-    assert factors.vertex_factors.shape == (0, len(still.partition.vertices)) and len(factors.basis.components) == 0
-    assert not still.offsets(factors).any() and factors.coefficients.shape == (POSES, 0)
+    factors = np.zeros((12, len(without_residuals.partition.vertices)), np.float32)
+    without_residuals.fit = JointFit(np.arange(3)[[1, 0, 2]], factors)
+    factors = without_residuals.factorize()
+    assert (
+        factors.vertex_factors.shape == (0, len(without_residuals.partition.vertices))
+        and len(factors.basis.components) == 0
+    )
+    assert not without_residuals.offsets(factors).any() and factors.coefficients.shape == (POSES, 0)
 
 
 def test_small_partitions_are_not_factorized(prepared):
@@ -182,11 +186,11 @@ def trained(tmp_path_factory) -> TrainedModel:
     rig, angles = chain_rig(JOINTS, VERTICES), chain_angles(POSES, JOINTS, 0)
     path = tmp_path_factory.mktemp("low_rank")
     with RecordingWriter(path / "recording", rig, make_partitions(rig, INFLUENCING), chain_info(POSES)) as writer:
-        writer.append(pose_chain(rig, angles), sliding(rig, angles))
+        writer.append(pose_chain(rig, angles), sliding_residuals(rig, angles))
     with pytest.MonkeyPatch.context() as monkeypatch:
-        made = keep_trained_model(monkeypatch)
+        trained_models = collect_trained_models(monkeypatch)
         assert main([str(path / "recording"), str(path / "model.onnx"), *QUICK]) == 0
-    return made[0]
+    return trained_models[0]
 
 
 def test_the_graph_agrees_with_pytorch(trained):
@@ -203,9 +207,9 @@ def test_the_graph_agrees_with_pytorch(trained):
 
 def test_the_graph_agrees_far_away_and_beyond_the_range(trained):
     poses = pose_chain(trained.rig, chain_angles(20, JOINTS, 5, reach=1.2))
-    there = np.eye(4)
-    there[:3, 3] = 60, -70, 40
-    confidence = check_agreement(trained, (there @ poses).astype(np.float32), tolerance=1e-4)
+    translation = np.eye(4)
+    translation[:3, 3] = 60, -70, 40
+    confidence = check_agreement(trained, (translation @ poses).astype(np.float32), tolerance=1e-4)
     assert (confidence < 1).any()
     folded = pose_chain(trained.rig, np.full((1, JOINTS, 2), 3.0))
     positions, confidence = run_graph(trained, folded)

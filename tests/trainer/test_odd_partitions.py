@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Partitions that took in others, and vertices that follow no bone, train and play like any."""
+"""Merged partitions, and vertices without a bone, are trained and evaluated like all others."""
 
 import json
 from dataclasses import replace
@@ -24,12 +24,12 @@ from .conftest import QUICK, run_page
 
 POSES, JOINTS = 120, 4
 STATIC_JOINT_INDEX = JOINTS
-MERGED, TAKEN_IN_BY = 3, 2
-INFLUENCING = {0: (0, 1), 1: (0, 1, 2, 3), TAKEN_IN_BY: (2, 3), STATIC_JOINT_INDEX: (0, 1)}
+MERGED_JOINT, ABSORBING_JOINT = 3, 2
+INFLUENCING = {0: (0, 1), 1: (0, 1, 2, 3), ABSORBING_JOINT: (2, 3), STATIC_JOINT_INDEX: (0, 1)}
 
 
 def odd_rig() -> Rig:
-    """A chain of four joints whose first tenth follows no bone."""
+    """Create a chain of four joints; the vertices of its first tenth have no bone."""
     rig = chain_rig(JOINTS)
     skin_joints, skin_weights = rig.skin_joints.copy(), rig.skin_weights.copy()
     start = rig.rest_positions[:, 2] < 0.1
@@ -40,18 +40,18 @@ def odd_rig() -> Rig:
 
 
 def odd_partitions(rig: Rig) -> tuple[Partition, ...]:
-    return make_partitions(rig, INFLUENCING, merged={MERGED: TAKEN_IN_BY})
+    return make_partitions(rig, INFLUENCING, merged={MERGED_JOINT: ABSORBING_JOINT})
 
 
 def odd_poses(rig: Rig, poses: int, seed: int) -> np.ndarray:
     angles = np.concatenate([chain_angles(poses, JOINTS, seed), np.zeros((poses, 1, 2))], axis=1)
-    # The root turns: what follows no bone stays behind.
+    # The root rotates, and vertices without a bone do not move.
     angles[:, 0] = np.random.default_rng([seed, 1]).uniform(-0.5, 0.5, (poses, 2))
     return pose_chain(rig, angles)
 
 
 def smoothed(rig: Rig, poses: np.ndarray) -> np.ndarray:
-    """(N, V, 3): every vertex follows the joints of the chain beside it, more softly than its weights say."""
+    """Return (N, V, 3) positions where every vertex follows nearby joints with smoother weights than the rig's."""
     height = rig.rest_positions[:, 2, None] * JOINTS
     weights = np.exp(-(((height - np.arange(JOINTS) - 0.5) / 0.6) ** 2))
     weights = np.concatenate([weights, np.exp(-((height / 0.6) ** 2))], axis=1)
@@ -78,12 +78,12 @@ def test_every_partition_approximates_unseen_poses(model):
     for partition in partitions:
         assert error[:, partition.vertices].mean() < 0.1 * linear[:, partition.vertices].mean()
     main_joint = main_joints(rig.skin_joints, rig.skin_weights)
-    for joint in (MERGED, STATIC_JOINT_INDEX):
+    for joint in (MERGED_JOINT, STATIC_JOINT_INDEX):
         own = main_joint == joint
         assert own.sum() > 5 and error[:, own].mean() < 0.1 * linear[:, own].mean()
 
 
-def test_model_and_report_say_what_was_merged(model):
+def test_model_and_report_name_merged_joints(model):
     info, report = read_model_info(model), json.loads(model.with_name("report.json").read_text())
     assert [(p.joint, p.merged) for p in info.partitions] == [(0, ()), (1, ()), (2, (3,)), (4, ())]
     assert sum(p.vertices for p in info.partitions) == info.vertex_count
@@ -95,7 +95,7 @@ def test_model_and_report_say_what_was_merged(model):
     assert '<td title="with bone_3">bone_2</td>' in page and ">no bone</td>" in page
 
 
-def test_the_code_of_the_page_on_recordings_reads_it(model):
+def test_the_code_in_the_recording_format_page_runs(model):
     rig = odd_rig()
     pose = odd_poses(rig, POSES, 0)[:1]
     expected = distances(smoothed(rig, pose), LinearSkinning(rig).positions(pose)).mean() * 1000
@@ -107,13 +107,13 @@ def test_confidence_is_one_where_only_recorded_joints_move(model):
     assert (Network(model).confidence(odd_poses(odd_rig(), 10, 0)) == 1).all()
 
 
-def test_what_follows_no_bone_sees_the_joints_that_influence_it():
+def test_vertices_without_a_bone_have_inputs_of_influencing_joints():
     rig = odd_rig()
     partitions = odd_partitions(rig)
     inputs = inputs_of_rig(rig, partition_centers(rig, partitions), partitions)
-    seen = [(a, b) for a, b in zip(inputs.pair_references.tolist(), inputs.pair_points.tolist(), strict=True)]
-    assert (STATIC_JOINT_INDEX, 1) in seen, "two joints move the second bone against what follows none"
-    assert (1, STATIC_JOINT_INDEX) in seen and (2, STATIC_JOINT_INDEX) not in seen, (
+    pairs = [(a, b) for a, b in zip(inputs.pair_references.tolist(), inputs.pair_points.tolist(), strict=True)]
+    assert (STATIC_JOINT_INDEX, 1) in pairs, "two joints move the second bone against what follows none"
+    assert (1, STATIC_JOINT_INDEX) in pairs and (2, STATIC_JOINT_INDEX) not in pairs, (
         "the root does not influence the third"
     )
     skin = skin_matrices(odd_poses(rig, 3, 0), rig.rest_matrices)
@@ -122,7 +122,7 @@ def test_what_follows_no_bone_sees_the_joints_that_influence_it():
     assert joint_regression(rig, partitions[2], skin).joints.tolist() == [2, 1, 3]
 
 
-def test_between_two_roots_are_all_joints_up_to_both():
+def test_the_path_between_two_roots_has_all_joints_up_to_both():
     parents = np.array([-1, 0, 1, -1, 3])
     assert joints_on_path(parents, 2, 4) == joints_on_path(parents, 4, 2) == {0, 1, 2, 3, 4}
     assert joints_on_path(parents, 0, 3) == {0, 3} and joints_on_path(parents, 1, 3) == {0, 1, 3}

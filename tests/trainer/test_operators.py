@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the exporter writes is what the add-on takes: operators, sizes, and the checksum."""
+"""Exported models are accepted by the add-on: operators, sizes, and the checksum."""
 
 import json
 
@@ -20,29 +20,29 @@ from .chain import write_chain
 
 @pytest.fixture(scope="module")
 def models(recording, tmp_path_factory) -> list[bytes]:
-    """A model of each activation, of one and of many joints, deep, wide and without shapes."""
+    """Models with each activation, with one and many joints, with deep and wide networks, and without components."""
     folder = tmp_path_factory.mktemp("models")
     for joints in (1, 12):
         write_chain(folder / f"chain_{joints}", poses=60, joints=joints)
-    ways = [(recording, "--activation", name, "--hidden", "24", "24") for name in ACTIVATIONS]
-    ways += [(folder / f"chain_{joints}", "--hidden", "16") for joints in (1, 12)]
-    ways += [(recording, "--hidden", "300", "200", "100", "50"), (recording, "--tolerance-mm", "10000")]
+    trainings = [(recording, "--activation", name, "--hidden", "24", "24") for name in ACTIVATIONS]
+    trainings += [(folder / f"chain_{joints}", "--hidden", "16") for joints in (1, 12)]
+    trainings += [(recording, "--hidden", "300", "200", "100", "50"), (recording, "--tolerance-mm", "10000")]
     found = []
-    for number, (path, *options) in enumerate(ways):
+    for number, (path, *options) in enumerate(trainings):
         model = folder / f"{number}.onnx"
         assert main([str(path), str(model), "--epochs", "2", *options]) == 0
         found.append(model.read_bytes())
     return found
 
 
-def test_every_operator_that_is_written_is_taken(models):
-    written = {node.op_type for data in models for node in onnx.load_from_string(data).graph.node}
-    assert written <= set(OPERATORS)
-    assert {"MatMul", "Gather", "Erf", "Tanh", "Relu", "Sigmoid"} <= written
+def test_the_add_on_accepts_every_exported_operator(models):
+    exported_operators = {node.op_type for data in models for node in onnx.load_from_string(data).graph.node}
+    assert exported_operators <= set(OPERATORS)
+    assert {"MatMul", "Gather", "Erf", "Tanh", "Relu", "Sigmoid"} <= exported_operators
 
 
-def test_the_metadata_explains_the_size_with_room_to_spare(models):
-    """An exporter that comes near the bounds is to widen them, before a character fails on them."""
+def test_the_limits_of_the_add_on_leave_a_margin(models):
+    """If exported graphs come near the limits, the limits must be raised before they refuse a character."""
     for data in models:
         info, contents = check_model(data, "m.onnx"), read_onnx(data)
         budget, cost = info.budget(), compute_graph_cost(contents, 1)
@@ -52,7 +52,7 @@ def test_the_metadata_explains_the_size_with_room_to_spare(models):
         )
 
 
-def test_weights_that_were_changed_are_noticed(trained):
+def test_changed_weights_are_refused(trained):
     data = bytearray((trained / "model.onnx").read_bytes())
     largest = max(read_onnx(bytes(data)).constants.values(), key=lambda constant: len(constant.data)).data
     data[bytes(data).index(bytes(largest)) + len(largest) // 2] ^= 1
@@ -60,8 +60,8 @@ def test_weights_that_were_changed_are_noticed(trained):
         check_model(bytes(data), "m.onnx")
 
 
-def test_a_larger_character_is_explained_by_its_numbers(trained):
-    """The bounds come from the metadata: with fewer vertices in it the same graph is too large."""
+def test_a_graph_larger_than_its_metadata_explains_is_refused(trained):
+    """The limits come from the metadata: a graph with more constants than they explain is too large."""
     model = onnx.load_from_string((trained / "model.onnx").read_bytes())
     text = next(prop for prop in model.metadata_props if prop.key == METADATA_KEY)
     value = json.loads(text.value)

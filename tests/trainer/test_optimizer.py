@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The optimizer against PyTorch's own."""
+"""The optimizer computes the same parameters as PyTorch's optimizer."""
 
 import subprocess
 import sys
@@ -12,12 +12,12 @@ from .conftest import REPOSITORY
 
 
 def output_of(*arguments: object) -> list[str]:
-    """Run a Python of its own and return the lines that it prints."""
+    """Run a separate Python process and return the lines that it prints."""
     command = [sys.executable, *map(str, arguments)]
     return subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout.splitlines()
 
 
-def test_the_numbers_are_those_of_torch():
+def test_parameters_equal_those_of_torch():
     assert output_of("-m", "tests.trainer.optimizer_comparison") == ["equal"]
 
 

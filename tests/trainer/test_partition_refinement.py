@@ -29,8 +29,8 @@ from .conftest import QUICK
 from .tube import AROUND, INFLUENCING, JOINTS, RINGS, tube, write_tube
 
 POSES, WAVES = 200, 4
-ODD = np.arange(RINGS // JOINTS, RINGS // JOINTS + 3)
-"""Rings with weights on the middle joint whose residuals follow the first joint."""
+ODD_RINGS = np.arange(RINGS // JOINTS, RINGS // JOINTS + 3)
+"""Rings of vertices with weights on the middle joint, whose residuals depend on the first joint."""
 
 
 def write_odd(path: Path, per_metre: float = 1.0, away: float = 0.0) -> Recording:
@@ -38,7 +38,7 @@ def write_odd(path: Path, per_metre: float = 1.0, away: float = 0.0) -> Recordin
     plain, rig, angles = tube(), tube(per_metre, away), chain_angles(POSES, JOINTS, seed=3, reach=1.5)
     matrices, skinning = pose_chain(plain, angles), LinearSkinning(plain)
     ring = np.arange(plain.vertex_count) // AROUND
-    follows = np.where(np.isin(ring, ODD), 0, plain.skin_joints[:, 0])
+    follows = np.where(np.isin(ring, ODD_RINGS), 0, plain.skin_joints[:, 0])
     waves = np.random.default_rng(2).normal(size=(JOINTS, WAVES, plain.vertex_count, 3))
     residuals = np.zeros((POSES, plain.vertex_count, 3), np.float32)
     for joint in range(JOINTS):
@@ -46,8 +46,8 @@ def write_odd(path: Path, per_metre: float = 1.0, away: float = 0.0) -> Recordin
         sines = np.sin(bend[:, None] * np.arange(3, 3 + WAVES))
         own = follows == joint
         residuals[:, own] = 0.004 * np.einsum("nk,kva->nva", sines, waves[joint][:, own])
-    cut = reassign_vertices(make_partitions(plain), follows)
-    positions = LinearSkinning(plain, cut).complex_positions(matrices, residuals)
+    refined_partitions = reassign_vertices(make_partitions(plain), follows)
+    positions = LinearSkinning(plain, refined_partitions).complex_positions(matrices, residuals)
     matrices = matrices.astype(np.float64)
     matrices[:, :, :3, 3] = per_metre * (matrices[:, :, :3, 3] + away)
     residuals = per_metre * skinning.local_residuals(pose_chain(plain, angles), positions)
@@ -56,12 +56,12 @@ def write_odd(path: Path, per_metre: float = 1.0, away: float = 0.0) -> Recordin
     return read_recording(path)
 
 
-def moved(recording: Recording, tolerance_mm: float = 0.2) -> tuple[Partition, ...]:
+def refined(recording: Recording, tolerance_mm: float = 0.2) -> tuple[Partition, ...]:
     return refine_partitions(recording, split_recording(recording, TrainingConfig()), False, tolerance_mm, 24)
 
 
 def odd_vertices() -> np.ndarray:
-    return (AROUND * ODD[:, None] + np.arange(AROUND)).ravel()
+    return (AROUND * ODD_RINGS[:, None] + np.arange(AROUND)).ravel()
 
 
 @pytest.fixture(scope="module")
@@ -77,37 +77,40 @@ def trained(odd, tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize(("per_metre", "away"), [(1.0, 0.0), (1000.0, 0.0), (1.0, 100.0)])
-def test_vertices_change_over_to_what_they_follow(tmp_path, per_metre, away):
+def test_vertices_are_reassigned_to_the_partition_that_they_follow(tmp_path, per_metre, away):
     recording = write_odd(tmp_path / "tube", per_metre, away)
-    partitions = moved(recording)
+    partitions = refined(recording)
     assert np.array_equal(np.setdiff1d(partitions[0].vertices, recording.partitions[0].vertices), odd_vertices())
     assert np.array_equal(partitions[2].vertices, recording.partitions[2].vertices)
     assert [replace(p, vertices=None) for p in partitions] == [replace(p, vertices=None) for p in recording.partitions]
     assert np.array_equal(np.sort(np.concatenate([p.vertices for p in partitions])), np.arange(RINGS * AROUND))
 
 
-def test_where_weights_say_it_well_nothing_moves(tmp_path):
+def test_good_skin_weights_are_not_refined(tmp_path):
     recording = write_tube(tmp_path / "tube")
-    for partition, recorded in zip(moved(recording), recording.partitions, strict=True):
+    for partition, recorded in zip(refined(recording), recording.partitions, strict=True):
         assert np.array_equal(partition.vertices, recorded.vertices)
 
 
-def test_for_too_little_nothing_moves(odd, monkeypatch):
+def test_a_small_gain_is_not_refined(odd, monkeypatch):
     monkeypatch.setattr(partition_refinement, "MAX_SIZE_RATIO", 0.5)
-    assert moved(odd) is odd.partitions
+    assert refined(odd) is odd.partitions
 
 
-def test_without_faces_or_beside_nothing_that_learns_nothing_moves(odd):
+def test_a_mesh_without_faces_or_inputs_is_not_refined(odd):
     none = np.zeros(0, np.int32)
-    assert moved(replace(odd, rig=replace(odd.rig, face_starts=none, face_vertices=none))) is odd.partitions
-    deaf = tuple(replace(p, influencing=()) if p.joint == 1 else p for p in odd.partitions)
-    assert np.array_equal(partition_indices(moved(replace(odd, partitions=deaf))), partition_indices(odd.partitions))
+    assert refined(replace(odd, rig=replace(odd.rig, face_starts=none, face_vertices=none))) is odd.partitions
+    partitions_without_inputs = tuple(replace(p, influencing=()) if p.joint == 1 else p for p in odd.partitions)
+    assert np.array_equal(
+        partition_indices(refined(replace(odd, partitions=partitions_without_inputs))),
+        partition_indices(odd.partitions),
+    )
 
 
-@pytest.mark.parametrize(("limit", "most"), [("MAX_POSES", 8), ("MAX_ELEMENTS", 8 * 3 * RINGS * AROUND)])
-def test_few_poses_refine_nothing(odd, monkeypatch, limit, most):
-    monkeypatch.setattr(partition_refinement, limit, most)
-    assert np.array_equal(partition_indices(moved(odd)), partition_indices(odd.partitions))
+@pytest.mark.parametrize(("limit", "maximum"), [("MAX_POSES", 8), ("MAX_ELEMENTS", 8 * 3 * RINGS * AROUND)])
+def test_few_poses_refine_nothing(odd, monkeypatch, limit, maximum):
+    monkeypatch.setattr(partition_refinement, limit, maximum)
+    assert np.array_equal(partition_indices(refined(odd)), partition_indices(odd.partitions))
 
 
 def test_a_partition_keeps_some_vertices(odd):
@@ -123,30 +126,32 @@ def test_a_partition_keeps_some_vertices(odd):
         residuals=LinearSkinning(rig).local_residuals(odd.pose_matrices, positions),
     )
     assert len(small.partitions[1].vertices) == len(few)
-    assert np.array_equal(moved(small)[1].vertices, few)
+    assert np.array_equal(refined(small)[1].vertices, few)
 
 
-def test_residuals_are_seen_from_the_partition_that_they_count_to(odd):
-    cut = moved(odd)
+def test_residuals_are_in_the_space_of_their_new_partition(odd):
+    refined_partitions = refined(odd)
     poses = np.array([3, 50, 120])
     local = np.empty((len(poses), RINGS * AROUND, 3), np.float32)
-    for partition in cut:
+    for partition in refined_partitions:
         local[:, partition.vertices] = residuals_of(odd, partition, poses)
         assert np.array_equal(residuals_of(odd, partition)[poses], local[:, partition.vertices])
     matrices = odd.pose_matrices[poses]
     expected = LinearSkinning(odd.rig, odd.partitions).complex_positions(matrices, odd.residuals[poses])
-    assert np.abs(LinearSkinning(odd.rig, cut).complex_positions(matrices, local) - expected).max() < 2e-6
+    assert (
+        np.abs(LinearSkinning(odd.rig, refined_partitions).complex_positions(matrices, local) - expected).max() < 2e-6
+    )
 
 
-def test_a_model_says_whose_vertices_it_took(odd, trained):
+def test_the_model_has_the_reassigned_vertices(odd, trained):
     info = read_model_info(trained)
     assert [p.reassigned for p in info.partitions] == [tuple(odd_vertices().tolist()), (), ()]
     assert [len(p.vertices) for p in info.partitions_of(odd.rig)] == [p.vertices for p in info.partitions]
-    for ours, theirs in zip(info.partitions_of(odd.rig), moved(odd), strict=True):
+    for ours, theirs in zip(info.partitions_of(odd.rig), refined(odd), strict=True):
         assert np.array_equal(ours.vertices, theirs.vertices)
 
 
-def test_it_takes_fewer_numbers_for_no_larger_error(odd, trained, tmp_path, monkeypatch, capsys):
+def test_refinement_needs_fewer_parameters_for_no_larger_error(odd, trained, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(partition_refinement, "MAX_ROUNDS", 0)
     plain = tmp_path / "plain" / "tube.onnx"
     plain.parent.mkdir()
@@ -161,7 +166,7 @@ def test_it_takes_fewer_numbers_for_no_larger_error(odd, trained, tmp_path, monk
 
 def test_a_warm_start_keeps_the_partitions(odd, trained, tmp_path, monkeypatch, capsys):
     checkpoint = read_checkpoint(checkpoint_path(trained))
-    assert np.array_equal(checkpoint.partition_indices, partition_indices(moved(odd)))
+    assert np.array_equal(checkpoint.partition_indices, partition_indices(refined(odd)))
     before = json.loads((trained.parent / "report.json").read_text())["fdda"]["held_out"]["mean"]
     model = tmp_path / "tube.onnx"
     checkpoint_path(model).write_bytes(checkpoint_path(trained).read_bytes())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The report's page: whole, self-contained, and written again with pictures and an evaluation."""
+"""The report's page is complete and self-contained, and can be written again with pictures and an evaluation."""
 
 import base64
 import json
@@ -22,7 +22,7 @@ PNG = base64.b64decode(
 
 
 class Tags(HTMLParser):
-    """Collects tags; fails on one that is closed and was not open."""
+    """Collects tags, and fails on a closing tag without its opening tag."""
 
     VOID = ("meta", "img", "line", "rect", "polyline", "polygon")
 
@@ -41,7 +41,7 @@ class Tags(HTMLParser):
             assert self.open.pop() == tag
 
 
-def test_page_is_well_formed_and_asks_for_nothing(trained, report):
+def test_page_is_well_formed_and_loads_nothing(trained, report):
     text = (trained / "report.html").read_text(encoding="utf-8")
     tags = Tags(text)
     assert not tags.open
@@ -53,7 +53,7 @@ def test_page_is_well_formed_and_asks_for_nothing(trained, report):
         assert f"{partition['held_out']['max']:.4f}" in text
 
 
-def test_written_again_with_pictures_and_evaluation(trained, report, tmp_path):
+def test_page_is_written_again_with_pictures_and_evaluation(trained, report, tmp_path):
     (tmp_path / "report.json").write_text(json.dumps(report))
     pictures = tmp_path / "pictures"
     pictures.mkdir()
@@ -80,49 +80,57 @@ def test_names_from_the_rig_cannot_break_the_page(report, tmp_path):
     assert "</script>" not in text and "&lt;b&gt;&amp;bone" in text
 
 
-TAG = "<script>alert(1)</script>"
+SCRIPT_TAG = "<script>alert(1)</script>"
 
 
-def places(value, path=()):
-    """Where a value and those inside of it are."""
+def value_paths(value, path=()):
+    """Yield the path of a value and of all values in it."""
     yield path
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, inner in items:
-        # The first of a list stands for all.
+        # Only the first item of a list is changed.
         if not isinstance(key, int) or key == 0:
-            yield from places(inner, (*path, key))
+            yield from value_paths(inner, (*path, key))
 
 
-def put(value, path, new):
-    *way, last = path
-    for key in way:
+def set_value(value, path, new):
+    *parent_path, last_key = path
+    for key in parent_path:
         value = value[key]
-    value[last] = new
+    value[last_key] = new
 
 
-@pytest.mark.parametrize("new", [TAG, [TAG], {TAG: TAG}, None, float("nan"), 1e400, -5, 10**400, 1e300, 5e-324, True])
+@pytest.mark.parametrize(
+    "new",
+    [SCRIPT_TAG, [SCRIPT_TAG], {SCRIPT_TAG: SCRIPT_TAG}, None, float("nan"), 1e400, -5, 10**400, 1e300, 5e-324, True],
+)
 def test_a_hostile_report_breaks_no_page(report, tmp_path, capsys, new):
-    """Whatever stands wherever: a page without a tag of its own, or a sentence."""
+    """For any value at any key, the result is a page without script tags, or an error in one sentence."""
     written = 0
-    for path in list(places(report))[1:]:
+    for path in list(value_paths(report))[1:]:
         changed = json.loads(json.dumps(report))
-        put(changed, path, new)
+        set_value(changed, path, new)
         (tmp_path / "report.json").write_text(json.dumps(changed))
         (tmp_path / "report.html").unlink(missing_ok=True)
         status = main([str(tmp_path / "report.json")])
-        said = capsys.readouterr().err
+        error_text = capsys.readouterr().err
         if status:
-            assert status == 1 and said.endswith("; train again.\n") and said.count("\n") == 1 and len(said) < 1200
+            assert (
+                status == 1
+                and error_text.endswith("; train again.\n")
+                and error_text.count("\n") == 1
+                and len(error_text) < 1200
+            )
             continue
         written += 1
         tags = Tags((tmp_path / "report.html").read_text(encoding="utf-8"))
         assert "script" not in {tag for tag, _ in tags.seen}, path
         assert not tags.open
-    assert written or new != TAG
+    assert written or new != SCRIPT_TAG
 
 
 @pytest.mark.parametrize("key", ["poses", "fdda", "linear"])
-@pytest.mark.parametrize("new", [TAG, None, [], {"mean": TAG}])
+@pytest.mark.parametrize("new", [SCRIPT_TAG, None, [], {"mean": SCRIPT_TAG}])
 def test_a_hostile_evaluation_is_refused(report, tmp_path, capsys, key, new):
     (tmp_path / "report.json").write_text(json.dumps(report))
     statistics = {"mean": 0.125, "rms": 0.25, "p99": 0.5, "p999": 1.0, "max": 2.0}
@@ -134,7 +142,7 @@ def test_a_hostile_evaluation_is_refused(report, tmp_path, capsys, key, new):
 
 
 @systems.named_pipes
-def test_pipes_block_nobody(report, tmp_path, capsys):
+def test_named_pipes_are_refused(report, tmp_path, capsys):
     os.mkfifo(tmp_path / "pipe.png")
     for name in ("report.json", "pipe.png"):
         assert main([str(tmp_path / name)]) == 1
@@ -143,14 +151,14 @@ def test_pipes_block_nobody(report, tmp_path, capsys):
     assert "it is not a regular file" in capsys.readouterr().err
 
 
-def test_the_page_takes_no_other_file_s_place(report, tmp_path, capsys):
+def test_the_page_does_not_overwrite_its_report(report, tmp_path, capsys):
     (tmp_path / "report.html").write_text(json.dumps(report))
     assert main([str(tmp_path / "report.html")]) == 1
     assert "it is read for this" in capsys.readouterr().err
     assert json.loads((tmp_path / "report.html").read_text()) == report
 
 
-def test_what_is_no_report_is_refused(tmp_path, capsys):
+def test_a_file_that_is_not_a_report_is_refused(tmp_path, capsys):
     (tmp_path / "report.json").write_text("{}")
     assert main([str(tmp_path / "report.json")]) == 1
     assert "is not a training report" in capsys.readouterr().err

@@ -30,13 +30,13 @@ from .conftest import REPOSITORY
 JOINTS, VERTICES, POSES = 24, 300, 40
 
 
-class Silent:
+class SilentSink:
     def send(self, kind: MessageType, **values) -> None:
         pass
 
 
 def random_poses(rng: np.random.Generator, heads: np.ndarray, poses: int = POSES) -> np.ndarray:
-    """(poses, J, 4, 4) float32: each joint rotated and moved independently, and all of them far away."""
+    """Draw (poses, J, 4, 4) float32 matrices: each joint rotates and moves independently, and all move far together."""
     matrices = np.empty((poses, len(heads), 4, 4))
     for pose in matrices:
         root = rng.normal(0, 5, 3)
@@ -47,7 +47,7 @@ def random_poses(rng: np.random.Generator, heads: np.ndarray, poses: int = POSES
 
 
 def random_rig(influences: int, seed: int = 0, away: float = 0.0) -> Rig:
-    """A cloud of vertices, `away` from the origin, skinned to joints anywhere in it."""
+    """Create a cloud of vertices, `away` from the origin, skinned to joints at random positions in it."""
     rng = np.random.default_rng(seed)
     heads = rng.uniform(-1, 1, (JOINTS, 3)) + away
     rest = np.stack([np.eye(4)] * JOINTS)
@@ -63,7 +63,7 @@ def random_rig(influences: int, seed: int = 0, away: float = 0.0) -> Rig:
 
 
 def with_one_joint(rig: Rig, joints: np.ndarray) -> Rig:
-    """The rig with each vertex on one joint."""
+    """Return the rig with each vertex on one joint."""
     weights = np.zeros((rig.vertex_count, 4), np.float32)
     weights[:, 0] = 1
     places = np.zeros((rig.vertex_count, 4), np.int32)
@@ -71,8 +71,8 @@ def with_one_joint(rig: Rig, joints: np.ndarray) -> Rig:
     return replace(rig, skin_joints=places, skin_weights=weights)
 
 
-def posed(rig: Rig, seed: int = 1, noise: float = 0.0, poses: int = POSES) -> FitPoses:
-    """Poses of the rig; the weights that come with them are all on the first joint."""
+def make_fit_poses(rig: Rig, seed: int = 1, noise: float = 0.0, poses: int = POSES) -> FitPoses:
+    """Create poses of the rig; their rig has all weights on the first joint."""
     rng = np.random.default_rng(seed)
     matrices = random_poses(rng, rig.rest_matrices[:, :3, 3], poses)
     positions = LinearSkinning(rig).positions(matrices)
@@ -80,22 +80,22 @@ def posed(rig: Rig, seed: int = 1, noise: float = 0.0, poses: int = POSES) -> Fi
     return FitPoses(with_one_joint(rig, np.zeros(rig.vertex_count)), matrices, positions)
 
 
-def fitted(poses: FitPoses, kind: str) -> Rig:
-    """The rig with the fitted weights."""
+def fit_rig(poses: FitPoses, kind: str) -> Rig:
+    """Return the rig with the fitted weights."""
     joints, weights = np.zeros((VERTICES, 4), np.int32), np.zeros((VERTICES, 4), np.float32)
     for block, *found in SkinSolver(poses).fit(kind):
         joints[block], weights[block] = found
     return replace(poses.rig, skin_joints=joints, skin_weights=weights)
 
 
-def dense(rig: Rig) -> np.ndarray:
-    """(V, J) weights."""
+def dense_weights(rig: Rig) -> np.ndarray:
+    """Return the skin weights as a (V, J) array."""
     weights = np.zeros((rig.vertex_count, len(rig.joints)))
     np.add.at(weights, (np.arange(rig.vertex_count)[:, None], rig.skin_joints), rig.skin_weights)
     return weights
 
 
-def write(folder: Path, poses: FitPoses) -> Path:
+def write_fit_folder(folder: Path, poses: FitPoses) -> Path:
     with FitPosesWriter(folder, poses.rig, len(poses.positions)) as writer:
         for matrices, positions in zip(poses.pose_matrices, poses.positions, strict=True):
             writer.append(matrices, positions)
@@ -105,19 +105,19 @@ def write(folder: Path, poses: FitPoses) -> Path:
 @pytest.mark.parametrize(("influences", "away"), [(2, 0), (4, 0), (4, 1000)])
 def test_smooth_weights_are_recovered(influences, away):
     rig = random_rig(influences, away=away)
-    assert np.abs(dense(fitted(posed(rig), "smooth")) - dense(rig)).max() < 1e-3
+    assert np.abs(dense_weights(fit_rig(make_fit_poses(rig), "smooth")) - dense_weights(rig)).max() < 1e-3
 
 
 def test_rigid_weights_are_recovered():
     labels = np.random.default_rng(5).integers(0, JOINTS, VERTICES)
-    found = fitted(posed(with_one_joint(random_rig(1), labels), noise=0.01), "hard")
+    found = fit_rig(make_fit_poses(with_one_joint(random_rig(1), labels), noise=0.01), "hard")
     np.testing.assert_array_equal(found.skin_joints[:, 0], labels)
     assert (found.skin_weights == [1, 0, 0, 0]).all() and (found.skin_joints[:, 1:] == 0).all()
 
 
 @pytest.mark.parametrize("kind", ["hard", "smooth"])
 def test_constraints_hold_for_random_positions(kind):
-    rig = fitted(posed(random_rig(4), noise=0.3), kind)
+    rig = fit_rig(make_fit_poses(random_rig(4), noise=0.3), kind)
     assert (rig.skin_weights >= 0).all() and (rig.skin_weights > 0).sum(axis=1).max() <= (1 if kind == "hard" else 4)
     np.testing.assert_allclose(rig.skin_weights.sum(axis=1), 1, atol=1e-6)
     assert (np.diff(rig.skin_weights, axis=1) <= 0).all()
@@ -126,24 +126,24 @@ def test_constraints_hold_for_random_positions(kind):
 
 
 def test_noise_adds_no_joints():
-    """Each joint explains a little of any noise, but only the true one explains enough."""
+    """Each joint explains a little of any noise, but only the true joint explains enough."""
     labels = np.random.default_rng(5).integers(0, JOINTS, VERTICES)
-    found = fitted(posed(with_one_joint(random_rig(1), labels), noise=0.05), "smooth")
+    found = fit_rig(make_fit_poses(with_one_joint(random_rig(1), labels), noise=0.05), "smooth")
     assert (found.skin_weights > 0).sum(axis=1).mean() < 1.02
     np.testing.assert_array_equal(found.skin_joints[:, 0], labels)
 
 
 def test_five_joints_are_approximated_by_the_best_four():
-    """A fit with four joints is no worse than the best four of the five that made the poses."""
+    """The fit has a smaller error than the four heaviest of the five joints that moved each vertex."""
     rig = random_rig(4)
     rig = replace(
         rig,
         skin_joints=np.pad(rig.skin_joints, ((0, 0), (0, 1)), constant_values=JOINTS - 1),
         skin_weights=np.pad(rig.skin_weights * np.float32(0.9), ((0, 0), (0, 1)), constant_values=0.1),
     )
-    poses = posed(rig)
+    poses = make_fit_poses(rig)
     heaviest = replace(rig, skin_joints=rig.skin_joints[:, :4], skin_weights=rig.skin_weights[:, :4] / np.float32(0.9))
-    gain = measure(replace(poses, rig=heaviest), fitted(poses, "smooth"))
+    gain = measure(replace(poses, rig=heaviest), fit_rig(poses, "smooth"))
     assert gain.rms_mm["fitted"] < 0.8 * gain.rms_mm["rig"]
 
 
@@ -170,29 +170,29 @@ def test_ties_prefer_the_rig_s_joint_then_the_nearest(kind):
     rest = rig.rest_matrices.copy()
     rest[:6, :3, 3] = [[0, 0, 9], [0, 0, 8], [0, 0, 7], [0, 0, 0], [0, 9, 0], [0, 8, 0]]
     rig = replace(rig, rest_matrices=rest)
-    poses = posed(rig)
+    poses = make_fit_poses(rig)
     moved = poses.pose_matrices[:, 2] @ np.linalg.inv(rest[2])
     poses.pose_matrices[:, :6] = moved[:, None] @ rest[:6]
     own = np.where(np.arange(VERTICES) < VERTICES // 2, 4, JOINTS - 1)
-    found = fitted(replace(poses, rig=with_one_joint(rig, own)), kind)
+    found = fit_rig(replace(poses, rig=with_one_joint(rig, own)), kind)
     np.testing.assert_array_equal(found.skin_joints[:, 0], np.where(own == 4, 4, 3))
     np.testing.assert_allclose(found.skin_weights[:, 0], 1, atol=1e-4)
 
 
 def test_static_vertices_follow_the_static_joint():
-    poses = posed(random_rig(4))
+    poses = make_fit_poses(random_rig(4))
     rest = poses.rig.rest_matrices.copy()
     rest[7] = np.eye(4)
     poses.pose_matrices[:, 7] = np.eye(4)
     poses.positions[:, :50] = poses.rig.rest_positions[:50]
-    found = fitted(replace(poses, rig=replace(poses.rig, rest_matrices=rest)), "smooth")
+    found = fit_rig(replace(poses, rig=replace(poses.rig, rest_matrices=rest)), "smooth")
     assert (found.skin_joints[:50, 0] == 7).all() and (found.skin_weights[:50, 0] > 0.999).all()
 
 
 @pytest.mark.parametrize("kind", ["hard", "smooth"])
 def test_the_process_reports_the_errors(kind, tmp_path, capsys):
-    poses = posed(random_rig(2), noise=0.002)
-    assert main([str(write(tmp_path, poses)), kind]) == 0
+    poses = make_fit_poses(random_rig(2), noise=0.002)
+    assert main([str(write_fit_folder(tmp_path, poses)), kind]) == 0
     messages = [Message.decode(line) for line in capsys.readouterr().out.splitlines()]
     assert messages[-2].values == {"done": VERTICES, "total": VERTICES}
     fit = SkinFit.from_json(json.loads(json.dumps(messages[-1].values["fit"])))
@@ -203,25 +203,25 @@ def test_the_process_reports_the_errors(kind, tmp_path, capsys):
     found = LinearSkinning(replace(poses.rig, skin_joints=joints, skin_weights=weights))
     # Every other pose is held out.
     for gain, part in ((fit.held_out, slice(1, None, 2)), (fit.training, slice(0, None, 2))):
-        apart = np.linalg.norm(found.positions(poses.pose_matrices[part]) - poses.positions[part], axis=2)
-        np.testing.assert_allclose(gain.rms_mm["fitted"], 1000 * np.sqrt((apart**2).mean()), rtol=1e-4)
-        np.testing.assert_allclose(gain.max_mm["fitted"], 1000 * apart.max(), rtol=1e-4)
+        distances = np.linalg.norm(found.positions(poses.pose_matrices[part]) - poses.positions[part], axis=2)
+        np.testing.assert_allclose(gain.rms_mm["fitted"], 1000 * np.sqrt((distances**2).mean()), rtol=1e-4)
+        np.testing.assert_allclose(gain.max_mm["fitted"], 1000 * distances.max(), rtol=1e-4)
     if kind == "smooth":
         # The noise, √3 · 2 mm, remains; a little more on held-out poses.
         assert 3.3 < fit.training.rms_mm["fitted"] < fit.held_out.rms_mm["fitted"] < 4
 
 
 def test_a_stopped_fit_writes_nothing(tmp_path):
-    write(tmp_path, posed(random_rig(2)))
+    write_fit_folder(tmp_path, make_fit_poses(random_rig(2)))
     before = set(tmp_path.iterdir())
     with pytest.raises(Cancelled):
-        fit_folder(tmp_path, "smooth", Silent(), lambda: True)
+        fit_folder(tmp_path, "smooth", SilentSink(), lambda: True)
     assert set(tmp_path.iterdir()) == before
 
 
 def test_a_python_without_scipy(tmp_path):
     code = "import sys; sys.modules['scipy'] = None; from trainer.skin_fit import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, str(write(tmp_path, posed(random_rig(2)))), "smooth"]
+    command = [sys.executable, "-c", code, str(write_fit_folder(tmp_path, make_fit_poses(random_rig(2)))), "smooth"]
     process = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert process.returncode == 1
     message = Message.decode(process.stdout)
@@ -279,7 +279,7 @@ DAMAGE = {name: (break_it, words) for name, break_it, words in damage()}
 @pytest.mark.parametrize("name", DAMAGE)
 def test_a_damaged_folder_is_refused(name, tmp_path, capsys):
     break_it, words = DAMAGE[name]
-    break_it(write(tmp_path, posed(random_rig(2))))
+    break_it(write_fit_folder(tmp_path, make_fit_poses(random_rig(2))))
     assert main([str(tmp_path), "smooth"]) == 1
     output = capsys.readouterr()
     text = Message.decode(output.out.splitlines()[-1]).values["text"]
@@ -289,12 +289,12 @@ def test_a_damaged_folder_is_refused(name, tmp_path, capsys):
 
 def test_too_few_poses(tmp_path):
     with pytest.raises(RecordingError, match="they are 4, and a fit takes 10; record again"):
-        read_fit_poses(write(tmp_path, posed(random_rig(2), poses=4)))
+        read_fit_poses(write_fit_folder(tmp_path, make_fit_poses(random_rig(2), poses=4)))
 
 
 def test_fitted_weights_of_another_rig_are_refused(tmp_path):
     rig = random_rig(2)
-    fit_folder(write(tmp_path, posed(rig)), "hard", Silent(), lambda: False)
+    fit_folder(write_fit_folder(tmp_path, make_fit_poses(rig)), "hard", SilentSink(), lambda: False)
     with pytest.raises(RecordingError, match=r"the fitted weights have the shapes \(300, 4\) and \(300, 4\)"):
         read_fitted_weights(tmp_path, replace(rig, rest_positions=rig.rest_positions[1:]))
     np.save(tmp_path / "fitted_weights.npy", np.full((VERTICES, 4), -0.25, np.float32))

@@ -18,7 +18,7 @@ from trainer.splitting import BLOCK_FRAMES, Split, split_recording
 from .chain import write_chain
 
 CONFIG = TrainingConfig(seed=3)
-PARTS = ("training", "validation", "held_out")
+PART_NAMES = ("training", "validation", "held_out")
 
 
 @pytest.fixture(scope="module")
@@ -29,55 +29,55 @@ def source(tmp_path_factory) -> Recording:
 
 
 def split(source: Recording, *sources: Source, config: TrainingConfig = CONFIG) -> Split:
-    """Split a recording of some sources; each pose is in exactly one part."""
+    """Split a recording with some sources, and assert that each pose is in exactly one part."""
     sampling = replace(source.info.sampling, sources=sources)
-    found = split_recording(replace(source, info=replace(source.info, sampling=sampling)), config)
-    poses = np.concatenate([getattr(found, part) for part in PARTS])
+    result = split_recording(replace(source, info=replace(source.info, sampling=sampling)), config)
+    poses = np.concatenate([getattr(result, part) for part in PART_NAMES])
     assert np.array_equal(np.sort(poses), np.arange(sum(s.poses for s in sources)))
-    return found
+    return result
 
 
-def part_of(found: Split, poses: int) -> np.ndarray:
-    """Return (poses,) the index of the part of each pose."""
+def part_indices(result: Split, poses: int) -> np.ndarray:
+    """Return (poses,) int, index of the part of each pose."""
     parts = np.empty(poses, int)
-    for number, part in enumerate(PARTS):
-        parts[getattr(found, part)] = number
+    for number, part in enumerate(PART_NAMES):
+        parts[getattr(result, part)] = number
     return parts
 
 
 def test_random_poses_are_split_one_by_one(source):
-    found = split(source, Source(RANDOM, 200))
+    result = split(source, Source(RANDOM, 200))
     order = np.random.default_rng([3, 1]).permutation(200)
-    assert np.array_equal(found.held_out, np.sort(order[:20]))
-    assert np.array_equal(found.validation, np.sort(order[20:30]))
+    assert np.array_equal(result.held_out, np.sort(order[:20]))
+    assert np.array_equal(result.validation, np.sort(order[20:30]))
 
 
 def test_frames_are_split_in_blocks(source):
-    found = split(source, Source(ACTION, 400, "walk", (1, 1)))
-    blocks = part_of(found, 400).reshape(-1, BLOCK_FRAMES)
+    result = split(source, Source(ACTION, 400, "walk", (1, 1)))
+    blocks = part_indices(result, 400).reshape(-1, BLOCK_FRAMES)
     assert (blocks == blocks[:, :1]).all()
     assert [(blocks[:, 0] == number).sum() for number in range(3)] == [34, 2, 4]
     other = split(source, Source(ACTION, 400, "walk", (1, 1)), config=TrainingConfig(seed=4))
-    assert not np.array_equal(found.held_out, other.held_out)
+    assert not np.array_equal(result.held_out, other.held_out)
 
 
 def test_random_poses_beside_frames_are_split_as_alone(source):
-    alone = part_of(split(source, Source(RANDOM, 100)), 100)
-    found = part_of(split(source, Source(RANDOM, 100), Source(ACTION, 120, "walk", (1, 1))), 220)
-    assert np.array_equal(found[:100], alone)
-    assert set(found[100:]) == {0, 1, 2}
+    split_alone = part_indices(split(source, Source(RANDOM, 100)), 100)
+    result = part_indices(split(source, Source(RANDOM, 100), Source(ACTION, 120, "walk", (1, 1))), 220)
+    assert np.array_equal(result[:100], split_alone)
+    assert set(result[100:]) == {0, 1, 2}
 
 
 def test_a_frame_and_its_mirror_image_are_in_one_part(source):
     walk, run = Source(ACTION, 95, "walk", (1, 1)), Source(ACTION, 60, "run", (5, 1))
     sources = (walk, replace(walk, kind=MIRRORED), run, replace(run, kind=MIRRORED))
-    parts = part_of(split(source, *sources), 310)
+    parts = part_indices(split(source, *sources), 310)
     assert np.array_equal(parts[:95], parts[95:190]) and np.array_equal(parts[190:250], parts[250:])
     assert set(parts[:190]) | set(parts[190:]) == {0, 1, 2}
 
 
 def test_short_animations_have_shorter_blocks(source):
-    parts = part_of(split(source, Source(ACTION, 34, "nod", (1, 1))), 34)
+    parts = part_indices(split(source, Source(ACTION, 34, "nod", (1, 1))), 34)
     runs = np.split(parts, np.arange(3, 34, 3))
     assert all(len(set(run)) == 1 for run in runs) and set(parts) == {0, 1, 2}
 
@@ -93,13 +93,13 @@ def test_poses_of_the_margin_all_train(source):
     sampling = source.info.sampling
     with_margin = replace(sampling, margin=Margin(2.0, 50, sampling.channels))
     other = replace(source, info=replace(source.info, sampling=with_margin))
-    found = split(other, Source(RANDOM, 200), Source(ACTION, 100, "walk", (1, 1)))
-    assert np.array_equal(found.margin, np.arange(150, 200))
-    assert np.isin(found.margin, found.training).all()
-    alone = split(source, Source(RANDOM, 150))
-    assert np.array_equal(found.held_out[found.held_out < 200], alone.held_out)
-    weights = found.weights(0.1)
-    assert np.array_equal(found.training[weights == 0.1], found.margin) and set(weights) == {0.1, 1.0}
+    result = split(other, Source(RANDOM, 200), Source(ACTION, 100, "walk", (1, 1)))
+    assert np.array_equal(result.margin, np.arange(150, 200))
+    assert np.isin(result.margin, result.training).all()
+    split_alone = split(source, Source(RANDOM, 150))
+    assert np.array_equal(result.held_out[result.held_out < 200], split_alone.held_out)
+    weights = result.weights(0.1)
+    assert np.array_equal(result.training[weights == 0.1], result.margin) and set(weights) == {0.1, 1.0}
 
 
 def test_too_few_poses_are_refused(source):
@@ -110,11 +110,11 @@ def test_too_few_poses_are_refused(source):
 def test_unsettled_poses_are_left_out_unless_included(source):
     sampling = replace(source.info.sampling, sources=(Source(RANDOM, 30),))
     info = replace(source.info, sampling=sampling, unsettled=tuple(range(0, 30, 3)))
-    found = split_recording(replace(source, info=info), CONFIG)
-    poses = np.sort(np.concatenate([getattr(found, part) for part in PARTS]))
+    result = split_recording(replace(source, info=info), CONFIG)
+    poses = np.sort(np.concatenate([getattr(result, part) for part in PART_NAMES]))
     assert np.array_equal(poses, [pose for pose in range(30) if pose % 3])
     all_of_them = split_recording(replace(source, info=info), replace(CONFIG, include_unsettled=True))
-    assert sum(len(getattr(all_of_them, part)) for part in PARTS) == 30
+    assert sum(len(getattr(all_of_them, part)) for part in PART_NAMES) == 30
     with pytest.raises(TrainingError, match="Only 4 of the 30 poses of the recording came to rest and training takes"):
         split_recording(replace(source, info=replace(info, unsettled=tuple(range(26)))), CONFIG)
 

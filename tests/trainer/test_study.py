@@ -46,7 +46,7 @@ def held_out(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def studied(recording, held_out, tmp_path_factory):
-    """Folder of a finished study; what a test changes it must not leave changed."""
+    """Folder of a finished study; a test that changes a file must restore it."""
     out = tmp_path_factory.mktemp("study")
     study(recording, held_out, out, PLAN, NAMES)
     return out
@@ -137,7 +137,7 @@ def test_a_factor_is_the_ratio_of_what_differs_in_it_alone(result):
     assert row.split(" | ")[1] == "0.50 (0.50 to 0.50), less in 4 of 4"
 
 
-def test_it_goes_on_where_it_was_interrupted(studied, recording, held_out, capsys):
+def test_an_interrupted_study_resumes(studied, recording, held_out, capsys):
     before = sorted((studied / "trainings").iterdir())
     assert len(before) == 2 * TRAININGS
     gone = studied / "trainings" / "8x2-relu-0.001-seed0.json"
@@ -150,7 +150,7 @@ def test_it_goes_on_where_it_was_interrupted(studied, recording, held_out, capsy
     assert sorted((studied / "trainings").iterdir()) == before
 
 
-def test_other_settings_are_trained_anew(recording, held_out, tmp_path, capsys):
+def test_other_settings_train_again(recording, held_out, tmp_path, capsys):
     material = read_material(recording, held_out, NAMES)
     for epochs in (2, 3):
         trainings = Trainings(material, tmp_path, print)
@@ -159,23 +159,23 @@ def test_other_settings_are_trained_anew(recording, held_out, tmp_path, capsys):
         assert len(training["partitions"]["bone_1"]["curve"]["validation"]) == epochs
 
 
-def test_a_partition_that_is_not_there(recording, held_out, tmp_path):
+def test_a_missing_partition_is_refused(recording, held_out, tmp_path):
     with pytest.raises(RecordingError, match="has no partition 'shoulder'; it has bone_0, bone_1, bone_2"):
         study(recording, held_out, tmp_path, PLAN, ("shoulder",))
 
 
-def test_held_out_poses_that_are_the_training_poses(recording, tmp_path):
+def test_training_poses_as_held_out_poses_are_refused(recording, tmp_path):
     with pytest.raises(RecordingError, match=r"has seed 0, as .* its poses are no held-out ones"):
         study(recording, recording, tmp_path, PLAN, NAMES)
 
 
-def test_recordings_of_two_rigs(recording, tmp_path):
+def test_recordings_of_two_rigs_are_refused(recording, tmp_path):
     write_chain(tmp_path / "other", poses=20, joints=4, seed=3)
     with pytest.raises(RecordingError, match="is of another rig than"):
         study(recording, tmp_path / "other", tmp_path, PLAN, NAMES)
 
 
-def test_an_output_that_is_a_file(tmp_path, capsys):
+def test_an_output_that_is_a_file_is_refused(tmp_path, capsys):
     (tmp_path / "out").write_text("text")
     assert main([str(tmp_path / "out")]) == 1
     assert capsys.readouterr().err == (
@@ -183,7 +183,7 @@ def test_an_output_that_is_a_file(tmp_path, capsys):
     )
 
 
-def test_no_seeds(tmp_path, capsys):
+def test_zero_seeds_are_refused(tmp_path, capsys):
     with pytest.raises(SystemExit) as exit_:
         main([str(tmp_path), "--seeds", "0"])
     assert exit_.value.code == 2 and "--seeds and --poses must be 1 or more" in capsys.readouterr().err

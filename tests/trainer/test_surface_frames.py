@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Surface frames: selected where a rig smooths, with its smoothing, and nowhere else; the graph computes the same."""
+"""Surface frames are selected only for rigs that smooth, with the rig's smoothing; the graph computes the same."""
 
 import shutil
 from dataclasses import replace
@@ -64,40 +64,42 @@ def test_tangents_and_normals_are_those_of_the_smoothed_surface(recording, surfa
 
 
 def test_surface_frames_explain_what_joints_do_not(recording, surface_frames):
-    """On held-out poses, with linear functions of the joints as well."""
+    """The errors are measured on held-out poses, with linear functions of the joints as further regressors."""
     split = split_recording(recording, TrainingConfig())
-    seen = surface_frames.evaluate(recording.pose_matrices).reshape(POSES, -1, 3)
+    features = surface_frames.evaluate(recording.pose_matrices).reshape(POSES, -1, 3)
     rows = np.linalg.inv(recording.pose_matrices[:, 1, None]) @ recording.pose_matrices
     rows = np.append(rows[:, :, :3].reshape(POSES, -1), np.ones((POSES, 1)), axis=1)
     for number in np.flatnonzero(surface_frames.main_joints == 1):
-        wanted = recording.residuals[:, surface_frames.vertices[number]]
+        targets = recording.residuals[:, surface_frames.vertices[number]]
         errors = []
-        for inputs in (rows, np.append(rows, seen[:, number], axis=1)):
-            factors = np.linalg.lstsq(inputs[split.training], wanted[split.training], rcond=1e-6)[0]
-            errors.append(((inputs[split.held_out] @ factors - wanted[split.held_out]) ** 2).sum())
+        for inputs in (rows, np.append(rows, features[:, number], axis=1)):
+            factors = np.linalg.lstsq(inputs[split.training], targets[split.training], rcond=1e-6)[0]
+            errors.append(((inputs[split.held_out] @ factors - targets[split.held_out]) ** 2).sum())
         assert errors[1] < (1 - MIN_EXPLAINED_VARIANCE) * errors[0]
 
 
 @pytest.mark.parametrize("per_metre, away", [(1000.0, 0.0), (1.0, 100.0), (1000.0, 100.0)])
-def test_units_and_place_change_nothing(tmp_path, recording, surface_frames, per_metre, away):
+def test_selection_does_not_depend_on_unit_and_position(tmp_path, recording, surface_frames, per_metre, away):
     other = write_tube(tmp_path / "tube", per_metre, away)
     found = select(other)
     assert found.vertices.tolist() == surface_frames.vertices.tolist()
-    seen, meters = found.evaluate(other.pose_matrices) / per_metre, surface_frames.evaluate(recording.pose_matrices)
+    features, meters = found.evaluate(other.pose_matrices) / per_metre, surface_frames.evaluate(recording.pose_matrices)
     # 100 m away, positions have steps of 0.008 mm.
-    assert np.abs(seen - meters).max() < (0.02 if away else 1e-4) * np.abs(meters).max()
+    assert np.abs(features - meters).max() < (0.02 if away else 1e-4) * np.abs(meters).max()
 
 
 def test_a_character_that_is_scaled_and_turned_as_a_whole_has_the_same_surface_frames(recording, surface_frames):
     matrices = recording.pose_matrices[:20].astype(np.float64)
-    whole = rotation(0, 0.7) @ rotation(2, -1.9) @ np.diag([2.5, 2.5, 2.5, 1])
-    whole[:3, 3] = 3, -2, 1
-    seen = surface_frames.evaluate(matrices)
+    character_transform = rotation(0, 0.7) @ rotation(2, -1.9) @ np.diag([2.5, 2.5, 2.5, 1])
+    character_transform[:3, 3] = 3, -2, 1
+    features = surface_frames.evaluate(matrices)
     # Epsilons damp nearly degenerate corners, relative to their extent at rest.
-    assert np.abs(surface_frames.evaluate(whole @ matrices) - seen).max() < 1e-3 * np.abs(seen).max()
+    assert (
+        np.abs(surface_frames.evaluate(character_transform @ matrices) - features).max() < 1e-3 * np.abs(features).max()
+    )
 
 
-def test_a_rig_that_does_not_smooth_has_none(tmp_path):
+def test_a_rig_that_does_not_smooth_has_no_surface_frames(tmp_path):
     assert select(write_tube(tmp_path / "tube", smooths=False)) is NO_SURFACE_FRAMES
 
 
@@ -107,8 +109,8 @@ def test_chance_correlations_select_nothing(tmp_path):
     assert select(read_recording(tmp_path / "chain")) is NO_SURFACE_FRAMES
 
 
-def test_a_rig_that_smooths_in_part_has_none(tmp_path, recording):
-    """Surface frames of one partition cost as much, and gain less."""
+def test_a_rig_that_smooths_one_partition_has_no_surface_frames(tmp_path, recording):
+    """Surface frames for one partition cost as much as for all, and reduce the error less."""
     waves = write_tube(tmp_path / "tube", smooths=False)
     residuals = np.array(waves.residuals)
     smooth = recording.partitions[0].vertices
@@ -150,7 +152,7 @@ def test_vertices_without_faces_are_ignored(recording, surface_frames):
     assert found.vertices.tolist() == surface_frames.vertices.tolist()
 
 
-def test_without_faces_there_are_none(recording):
+def test_a_mesh_without_faces_has_no_surface_frames(recording):
     none = np.zeros(0, np.int32)
     assert (
         select(replace(recording, rig=replace(recording.rig, face_starts=none, face_vertices=none)))
@@ -158,7 +160,7 @@ def test_without_faces_there_are_none(recording):
     )
 
 
-def test_vertices_within_the_tolerance_need_none(recording):
+def test_vertices_within_the_tolerance_have_no_surface_frames(recording):
     split = split_recording(recording, TrainingConfig())
     assert select_surface_frames(recording, split, tolerance_mm=100.0) is NO_SURFACE_FRAMES
 

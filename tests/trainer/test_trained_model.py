@@ -32,28 +32,28 @@ def session(trained) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(str(trained / "model.onnx"), providers=["CPUExecutionProvider"])
 
 
-def play(session, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def run_model(session, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return tuple(session.run(["positions", "confidence"], {"pose_matrices": poses}))
 
 
-def test_approximates_unseen_poses(session, rig):
+def test_the_model_approximates_unseen_poses(session, rig):
     angles = chain_angles(50, 3, seed=99)
     angles[:, 2, 1] = 0
     poses = pose_chain(rig, angles)
     skinning = LinearSkinning(rig)
     truth = skinning.complex_positions(poses, chain_residuals(rig, angles))
-    error, linear = distances(play(session, poses)[0], truth), distances(skinning.positions(poses), truth)
+    error, linear = distances(run_model(session, poses)[0], truth), distances(skinning.positions(poses), truth)
     assert linear.mean() > 2e-3
     assert error.mean() < 0.08 * linear.mean()
 
 
 def test_number_of_poses_is_free_and_poses_do_not_mix(session, rig):
     poses = pose_chain(rig, chain_angles(7, 3, seed=5))
-    together, confidence = play(session, poses)
+    together, confidence = run_model(session, poses)
     assert together.shape == (7, rig.vertex_count, 3) and together.dtype == np.float32
     assert confidence.shape == (7, len(read_model_info_partitions(session)))
     for number in (0, 6):
-        alone = play(session, poses[number : number + 1])[0]
+        alone = run_model(session, poses[number : number + 1])[0]
         np.testing.assert_allclose(alone[0], together[number], atol=2e-6)
 
 
@@ -72,14 +72,14 @@ def test_moving_the_character_as_a_whole_moves_the_mesh(session, rig):
 
 
 def test_confidence_is_one_in_recorded_poses(session, recording):
-    confidence = play(session, np.array(read_recording(recording).pose_matrices))[1]
+    confidence = run_model(session, np.array(read_recording(recording).pose_matrices))[1]
     assert (confidence == 1).all()
 
 
 def test_confidence_fades_outside(session, rig):
     angles = np.zeros((40, 3, 2))
     angles[:, 1, 0] = np.linspace(LIMIT, LIMIT * 3, 40)
-    confidence = play(session, pose_chain(rig, angles))[1]
+    confidence = run_model(session, pose_chain(rig, angles))[1]
     assert confidence[0].min() == 1
     assert (np.diff(confidence, axis=0) <= 1e-6).all(), "confidence increases with the distance"
     assert 0 < confidence[-1, :2].max() < 0.99
@@ -89,13 +89,13 @@ def test_confidence_fades_outside(session, rig):
 def test_far_outside_only_linear_skinning_remains(session, rig, trained):
     poses = pose_chain(rig, np.zeros((3, 3, 2)))
     poses[:, 1:, :3, :3] *= np.float32([1, 5, 50])[:, None, None, None]
-    positions, confidence = play(session, poses)
+    positions, confidence = run_model(session, poses)
     assert (confidence[0] == 1).all() and (np.diff(confidence[:, :2], axis=0) <= 0).all()
-    gone = np.flatnonzero(confidence[2] == 0)
-    assert len(gone), "a joint fifty times its size still has full confidence"
+    zero_confidence_partitions = np.flatnonzero(confidence[2] == 0)
+    assert len(zero_confidence_partitions), "a joint fifty times its size still has full confidence"
     partitions = read_model_info(trained / "model.onnx").partitions_of(rig)
     linear = LinearSkinning(rig).positions(poses)
-    for number in gone:
+    for number in zero_confidence_partitions:
         vertices = partitions[number].vertices
         np.testing.assert_allclose(positions[2, vertices], linear[2, vertices], atol=1e-4)
 
@@ -103,7 +103,7 @@ def test_far_outside_only_linear_skinning_remains(session, rig, trained):
 def test_a_locked_axis_that_rotates_lowers_the_confidence(session, rig):
     angles = np.zeros((3, 3, 2))
     angles[1:, 2, 1] = 0.5, 1.5
-    confidence = play(session, pose_chain(rig, angles))[1]
+    confidence = run_model(session, pose_chain(rig, angles))[1]
     assert (confidence[0] == 1).all()
     assert 1 > confidence[1, 2] > confidence[2, 2], "the last joint never turned about z in the recording"
 
@@ -113,14 +113,14 @@ def test_beyond_the_range_it_is_never_worse_than_linear_skinning(session, rig, r
     angles = chain_angles(100, 3, seed=8, reach=reach)
     poses, skinning = pose_chain(rig, angles), LinearSkinning(rig)
     truth = skinning.complex_positions(poses, chain_residuals(rig, angles))
-    positions = play(session, poses)[0]
+    positions = run_model(session, poses)[0]
     assert distances(positions, truth).mean() <= distances(skinning.positions(poses), truth).mean()
 
 
 def test_a_joint_scaled_to_zero_gives_finite_positions(session, rig):
     poses = pose_chain(rig, chain_angles(2, 3, seed=1))
     poses[1, 1, :3, :3] = 0
-    positions, confidence = play(session, poses)
+    positions, confidence = run_model(session, poses)
     assert np.isfinite(positions).all() and np.isfinite(confidence).all()
     assert confidence[1].min() < 1
 
@@ -175,7 +175,7 @@ def test_a_rig_of_one_joint_is_exported(tmp_path):
     model = tmp_path / "m.onnx"
     assert main([str(tmp_path / "one"), str(model), "--epochs", "1"]) == 0
     session = onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
-    positions, confidence = play(session, rig.rest_matrices[None])
+    positions, confidence = run_model(session, rig.rest_matrices[None])
     np.testing.assert_allclose(positions[0], rig.rest_positions, atol=1e-5)
     assert confidence.tolist() == [[1.0]]
 
@@ -195,7 +195,7 @@ def test_the_report_has_the_surface_errors(report, recording, session, trained):
     for pose in split.held_out:
         matrices = np.array(source.pose_matrices[pose : pose + 1])
         truth = skinning.complex_positions(matrices, np.array(source.residuals[pose : pose + 1]))[0]
-        played = play(session, matrices)[0][0]
+        played = run_model(session, matrices)[0][0]
         lengths = [np.linalg.norm(np.subtract(*positions[pairs.T]), axis=1) for positions in (played, truth)]
         errors.append(np.abs(lengths[0] - lengths[1]) / rest)
     assert edges["fdda"]["across"] == pytest.approx(np.mean(errors, axis=0)[crossing].mean(), rel=1e-3)

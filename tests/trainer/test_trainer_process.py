@@ -70,7 +70,7 @@ def test_a_second_training_gives_the_same_model(recording, trained, tmp_path):
     assert reports[0] == reports[1]
 
 
-def failure(arguments, capsys) -> str:
+def run_failing_training(arguments, capsys) -> str:
     assert main([*map(str, arguments), "--messages", "--epochs", "2"]) == 1
     output = capsys.readouterr()
     messages = decode(output.out)
@@ -79,58 +79,60 @@ def failure(arguments, capsys) -> str:
     return output.err.strip()
 
 
-def copy(recording, tmp_path):
+def copy_recording(recording, tmp_path):
     return shutil.copytree(recording, tmp_path / "copy")
 
 
-def test_no_recording(tmp_path, capsys):
-    assert "is not a recording" in failure([tmp_path / "none", tmp_path / "m.onnx"], capsys)
+def test_a_missing_recording_is_refused(tmp_path, capsys):
+    assert "is not a recording" in run_failing_training([tmp_path / "none", tmp_path / "m.onnx"], capsys)
 
 
-def test_incomplete_recording(tmp_path, capsys):
+def test_an_incomplete_recording_is_refused(tmp_path, capsys):
     write_chain(tmp_path / "half", poses=40, complete=13)
-    text = failure([tmp_path / "half", tmp_path / "m.onnx"], capsys)
+    text = run_failing_training([tmp_path / "half", tmp_path / "m.onnx"], capsys)
     assert "is incomplete: 13 of 40 poses" in text and "--resume" in text
     assert not (tmp_path / "m.onnx").exists()
 
 
-def test_truncated_recording(recording, tmp_path, capsys):
-    path = copy(recording, tmp_path)
+def test_a_truncated_recording_is_refused(recording, tmp_path, capsys):
+    path = copy_recording(recording, tmp_path)
     content = (path / "residuals.npy").read_bytes()
     (path / "residuals.npy").write_bytes(content[:-100])
-    assert "residuals.npy' cannot be used: it is truncated" in failure([path, tmp_path / "m.onnx"], capsys)
+    assert "residuals.npy' cannot be used: it is truncated" in run_failing_training([path, tmp_path / "m.onnx"], capsys)
 
 
-def test_recording_with_nan(recording, tmp_path, capsys):
-    path = copy(recording, tmp_path)
+def test_a_recording_with_nan_is_refused(recording, tmp_path, capsys):
+    path = copy_recording(recording, tmp_path)
     residuals = np.load(path / "residuals.npy")
     residuals[17, 3, 1] = np.nan
     np.save(path / "residuals.npy", residuals)
-    assert "holds values that are not numbers (residuals" in failure([path, tmp_path / "m.onnx"], capsys)
+    assert "holds values that are not numbers (residuals" in run_failing_training([path, tmp_path / "m.onnx"], capsys)
 
 
-def test_too_few_poses(tmp_path, capsys):
+def test_too_few_poses_are_refused(tmp_path, capsys):
     write_chain(tmp_path / "few", poses=5)
-    assert "has 5 poses and training takes at least 10" in failure([tmp_path / "few", tmp_path / "m.onnx"], capsys)
+    assert "has 5 poses and training takes at least 10" in run_failing_training(
+        [tmp_path / "few", tmp_path / "m.onnx"], capsys
+    )
 
 
 def test_output_in_a_folder_that_is_not_there(recording, tmp_path, capsys):
-    text = failure([recording, tmp_path / "no" / "m.onnx"], capsys)
+    text = run_failing_training([recording, tmp_path / "no" / "m.onnx"], capsys)
     assert "does not exist; create it first" in text
 
 
 def test_output_that_is_a_folder(recording, tmp_path, capsys):
     (tmp_path / "m.onnx").mkdir()
-    assert "it is a folder" in failure([recording, tmp_path / "m.onnx"], capsys)
+    assert "it is a folder" in run_failing_training([recording, tmp_path / "m.onnx"], capsys)
 
 
-def test_impossible_setting(recording, tmp_path, capsys):
-    text = failure([recording, tmp_path / "m.onnx", "--learning-rate", "-1"], capsys)
+def test_an_impossible_setting_is_refused(recording, tmp_path, capsys):
+    text = run_failing_training([recording, tmp_path / "m.onnx", "--learning-rate", "-1"], capsys)
     assert "setting learning_rate cannot be -1.0" in text
 
 
 def test_settings_that_diverge_fail_in_a_sentence(recording, tmp_path, capsys):
-    text = failure([recording, tmp_path / "m.onnx", "--learning-rate", "1e30", "--averaging", "0"], capsys)
+    text = run_failing_training([recording, tmp_path / "m.onnx", "--learning-rate", "1e30", "--averaging", "0"], capsys)
     assert "diverged in epoch 1" in text and "smaller learning rate than 1e+30" in text
     assert list(tmp_path.iterdir()) == []
 
@@ -154,8 +156,8 @@ def test_a_full_disk_leaves_nothing(recording, trained, tmp_path, limit):
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    old = trained.joinpath("model.onnx").read_bytes()
-    (tmp_path / "m.onnx").write_bytes(old)
+    old_model = trained.joinpath("model.onnx").read_bytes()
+    (tmp_path / "m.onnx").write_bytes(old_model)
     process = start_trainer(recording, tmp_path / "m.onnx", "--epochs", "2", "--messages", preexec_fn=small_files)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 1
@@ -165,7 +167,7 @@ def test_a_full_disk_leaves_nothing(recording, trained, tmp_path, limit):
     )
     assert err.endswith("File too large; nothing was changed.\n")
     assert [p.name for p in tmp_path.iterdir()] == ["m.onnx"]
-    assert (tmp_path / "m.onnx").read_bytes() == old
+    assert (tmp_path / "m.onnx").read_bytes() == old_model
 
 
 @pytest.mark.parametrize(
@@ -200,13 +202,13 @@ def test_a_stop_request_before_the_start(recording, tmp_path, monkeypatch, capsy
     assert list(tmp_path.iterdir()) == []
 
 
-FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "x")
+FULL_DISK_ERROR = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "x")
 
 
 @pytest.mark.parametrize(
     ("error", "status", "text"),
     [
-        (FULL, 75, f"'x': {FULL.strerror}; make room, end other programs, or try again."),
+        (FULL_DISK_ERROR, 75, f"'x': {FULL_DISK_ERROR.strerror}; make room, end other programs, or try again."),
         (OSError(errno.EIO, "Input/output error"), 75, "Input/output error; make room, end other"),
         (OSError(errno.ENOMEM, "Cannot allocate memory"), 75, "The training lacks memory ("),
         (MemoryError(), 75, "The training lacks memory ("),

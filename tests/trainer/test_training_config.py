@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Settings: unknown names and impossible values are errors, options reach the training."""
+"""Training settings: unknown names and impossible values are errors, and every setting has an option."""
 
 import argparse
 

@@ -11,14 +11,14 @@ from trainer.graph_builder import GraphBuilder
 from trainer.vertex_order import VertexOrder, vertex_order
 
 
-def in_strips(vertices: int, strip: int, partitions: int) -> list[np.ndarray]:
-    """Assign strips of adjacent vertices to partitions in turn."""
+def assign_strips(vertices: int, strip: int, partitions: int) -> list[np.ndarray]:
+    """Assign strips of adjacent vertices to partitions in rotation."""
     owner = np.arange(vertices) // strip % partitions
     return [np.flatnonzero(owner == number) for number in range(partitions)]
 
 
-def played(order: VertexOrder, poses: int) -> np.ndarray:
-    """(poses, V, 3) the graph's output for positions that encode their vertex and pose."""
+def run_order_graph(order: VertexOrder, poses: int) -> np.ndarray:
+    """Return the (poses, V, 3) output of the graph for positions that encode their vertex and pose."""
     graph, columns = GraphBuilder(), np.concatenate(order.columns)
     order.add(graph, "joined", "positions")
     values = [helper.make_tensor_value_info("joined", TensorProto.FLOAT, ["N", len(columns), 3])]
@@ -36,23 +36,23 @@ def played(order: VertexOrder, poses: int) -> np.ndarray:
     [(5, 1, 2), (90, 7, 3), (9_960, 61, 22), (50_001, 500, 7), (40_000, 40_000, 1), (20_000, 1, 9), (32_768, 64, 4)],
 )
 def test_vertices_are_in_mesh_order(vertices, strip, partitions):
-    order = vertex_order(in_strips(vertices, strip, partitions))
+    order = vertex_order(assign_strips(vertices, strip, partitions))
     expected = np.arange(vertices)[:, None] + np.arange(3) * 0.25
-    for pose, positions in enumerate(played(order, 2)):
+    for pose, positions in enumerate(run_order_graph(order, 2)):
         np.testing.assert_array_equal(positions, (expected + 100_000 * pose).astype(np.float32))
 
 
 def test_every_vertex_has_one_column():
-    order = vertex_order(in_strips(50_001, 500, 7))
+    order = vertex_order(assign_strips(50_001, 500, 7))
     columns = np.concatenate(order.columns)
     np.testing.assert_array_equal(np.sort(columns[columns >= 0]), np.arange(50_001))
     assert (columns < 0).sum() < 7 * order.block_size
 
 
-@pytest.mark.parametrize(("strip", "blocks"), [(500, True), (1, False), (100_000, True)])
-def test_blocks_only_where_strips_are_long(strip, blocks):
-    assert (vertex_order(in_strips(50_000, strip, 5)).block_size > 1) == blocks
+@pytest.mark.parametrize(("strip", "uses_blocks"), [(500, True), (1, False), (100_000, True)])
+def test_blocks_only_where_strips_are_long(strip, uses_blocks):
+    assert (vertex_order(assign_strips(50_000, strip, 5)).block_size > 1) == uses_blocks
 
 
 def test_few_vertices_are_gathered_one_by_one():
-    assert vertex_order(in_strips(300, 30, 3)).block_size == 1
+    assert vertex_order(assign_strips(300, 30, 3)).block_size == 1

@@ -24,16 +24,16 @@ from .. import systems
 from .chain import chain_angles, chain_residuals, pose_chain, write_chain
 from .conftest import QUICK
 
-GROWN = 60
+ADDED_POSES = 60
 
 
 @pytest.fixture
-def grown(recording, tmp_path):
+def grown_recording(recording, tmp_path):
     """The recording with refined poses that reach the end of the range."""
     folder = tmp_path / "grown"
     shutil.copytree(recording, folder)
     read = read_recording(folder)
-    angles = chain_angles(GROWN, 3, seed=5)
+    angles = chain_angles(ADDED_POSES, 3, seed=5)
     angles[:, 2, 1] = 0
     with RecordingExtension(read, "model.onnx") as extension:
         extension.append(pose_chain(read.rig, angles), chain_residuals(read.rig, angles))
@@ -58,10 +58,10 @@ def prepared_of(path, config, checkpoint):
     return split, prepared, [c[p.columns] for c, p in zip(inputs.columns, prepared, strict=True)]
 
 
-def test_networks_start_with_nearly_their_former_outputs(recording, trained, grown):
+def test_networks_start_with_nearly_their_former_outputs(recording, trained, grown_recording):
     config = TrainingConfig(tolerance_mm=1e-4)
     checkpoint = read_checkpoint(checkpoint_path(trained / "model.onnx"))
-    _, prepared, columns = prepared_of(grown, config, checkpoint)
+    _, prepared, columns = prepared_of(grown_recording, config, checkpoint)
     networks = initial_networks(checkpoint, prepared, columns)
     compared = 0
     for before, now, network in zip(checkpoint.partitions, prepared, networks, strict=True):
@@ -69,65 +69,72 @@ def test_networks_start_with_nearly_their_former_outputs(recording, trained, gro
             continue
         features = now.inputs * now.feature_scale + now.feature_mean
         assert np.array_equal(before.columns, columns[compared]) or len(before.columns) == len(now.columns)
-        old = before.network.coefficients(
+        old_coefficients = before.network.coefficients(
             ((features - before.feature_mean) / before.feature_scale).astype(np.float32), checkpoint.activation
         )
-        expected = old @ before.basis_components + before.basis_mean
-        answered = now.basis.residuals(network.coefficients(now.inputs, checkpoint.activation))
+        expected = old_coefficients @ before.basis_components + before.basis_mean
+        residuals = now.basis.residuals(network.coefficients(now.inputs, checkpoint.activation))
         # Not exactly: the linear fit and the components are computed from other poses.
-        assert np.linalg.norm(answered - expected) < 0.05 * np.linalg.norm(expected)
+        assert np.linalg.norm(residuals - expected) < 0.05 * np.linalg.norm(expected)
         compared += 1
     assert compared >= 2
 
 
-def test_a_warm_start_continues_the_training(grown, model, trained):
+def test_a_warm_start_continues_the_training(grown_recording, model, trained):
     first = json.loads((trained / "report.json").read_text())["fdda"]["held_out"]["mean"]
-    assert main([str(grown), str(model), *QUICK, "--epochs", "12", "--warm-start"]) == 0
+    assert main([str(grown_recording), str(model), *QUICK, "--epochs", "12", "--warm-start"]) == 0
     report = json.loads((model.parent / "report.json").read_text())
     # Six epochs from random weights leave several times the error.
     assert report["fdda"]["held_out"]["mean"] < 1.5 * first
-    assert main([str(grown), str(model), *QUICK, "--epochs", "6"]) == 0
-    cold = json.loads((model.parent / "report.json").read_text())
-    assert cold["fdda"]["held_out"]["mean"] > 2 * report["fdda"]["held_out"]["mean"]
-    assert main([str(grown), str(model), *QUICK, "--epochs", "12", "--warm-start"]) == 0
-    assert report["training"]["warm_start"] and report["poses"] == 120 + GROWN
+    assert main([str(grown_recording), str(model), *QUICK, "--epochs", "6"]) == 0
+    cold_report = json.loads((model.parent / "report.json").read_text())
+    assert cold_report["fdda"]["held_out"]["mean"] > 2 * report["fdda"]["held_out"]["mean"]
+    assert main([str(grown_recording), str(model), *QUICK, "--epochs", "12", "--warm-start"]) == 0
+    assert report["training"]["warm_start"] and report["poses"] == 120 + ADDED_POSES
     history = read_checkpoint(checkpoint_path(model)).history
-    assert [entry["poses"] for entry in history] == [120 + GROWN] * 2
+    assert [entry["poses"] for entry in history] == [120 + ADDED_POSES] * 2
 
 
-def test_refined_poses_train_and_held_out_poses_stay(recording, grown):
+def test_refined_poses_train_and_held_out_poses_stay(recording, grown_recording):
     config = TrainingConfig()
-    before, after = split_recording(read_recording(recording), config), split_recording(read_recording(grown), config)
+    before, after = (
+        split_recording(read_recording(recording), config),
+        split_recording(read_recording(grown_recording), config),
+    )
     assert np.array_equal(before.held_out, after.held_out) and np.array_equal(before.validation, after.validation)
-    assert np.array_equal(after.training, [*before.training, *range(120, 120 + GROWN)])
+    assert np.array_equal(after.training, [*before.training, *range(120, 120 + ADDED_POSES)])
     parts = (before.training, before.validation, before.held_out)
     assert np.array_equal(np.sort(np.concatenate(parts)), np.arange(120)) and [len(p) for p in parts] == [102, 6, 12]
 
 
-def refused(capsys, *arguments) -> str:
+def refused_warm_start(capsys, *arguments) -> str:
     options = arguments[2:] or QUICK
     assert main([*map(str, arguments[:2]), *options, "--warm-start"]) == 1
     return capsys.readouterr().err
 
 
 def test_there_must_be_a_checkpoint(recording, tmp_path, capsys):
-    assert "There is no checkpoint" in refused(capsys, recording, tmp_path / "m.onnx")
+    assert "There is no checkpoint" in refused_warm_start(capsys, recording, tmp_path / "m.onnx")
 
 
 def test_a_checkpoint_of_other_network_or_rig_is_refused(recording, model, tmp_path, capsys):
-    assert "is of networks --hidden 24 24 --activation silu" in refused(capsys, recording, model, "--hidden", "8")
+    assert "is of networks --hidden 24 24 --activation silu" in refused_warm_start(
+        capsys, recording, model, "--hidden", "8"
+    )
     write_chain(tmp_path / "other", joints=4)
-    assert "is of another rig" in refused(capsys, tmp_path / "other", model)
+    assert "is of another rig" in refused_warm_start(capsys, tmp_path / "other", model)
 
 
 @pytest.mark.parametrize("options", [["--seed", "1"], ["--held-out-fraction", "0.2"], ["--validation-fraction", "0.2"]])
 def test_training_poses_never_become_held_out(recording, model, capsys, options):
-    assert "may have been trained on poses that are held out now" in refused(capsys, recording, model, *QUICK, *options)
+    assert "may have been trained on poses that are held out now" in refused_warm_start(
+        capsys, recording, model, *QUICK, *options
+    )
 
 
 def test_another_recording_of_the_rig_is_refused(model, tmp_path, capsys):
     write_chain(tmp_path / "other", seed=3)
-    assert "is of another recording or seed" in refused(capsys, tmp_path / "other", model)
+    assert "is of another recording or seed" in refused_warm_start(capsys, tmp_path / "other", model)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +169,7 @@ def test_a_damaged_checkpoint_is_refused(recording, model, capsys, damage):
         content["1/weight_1"] = changed[damage]
         np.savez(path, **content)
     before = model.read_bytes()
-    text = refused(capsys, recording, model)
+    text = refused_warm_start(capsys, recording, model)
     if damage == "pipe":
         assert "it is not a regular file" in text
     elif damage == "text":

@@ -15,7 +15,7 @@ from .conftest import QUICK
 
 
 @pytest.fixture(scope="module")
-def suspicious(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def suspicious_recording(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The chain's recording, with 30 repeated poses of 120, one of them with other residuals."""
     path = shutil.copytree(recording, tmp_path_factory.mktemp("suspicious") / "recording")
     for name in ("pose_matrices", "residuals"):
@@ -30,8 +30,8 @@ def suspicious(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 WARNINGS = ["duplicate-poses", "hidden-inputs"]
 
 
-def test_warnings_are_sent_before_the_training_and_reported(suspicious, tmp_path, capsys):
-    assert main([str(suspicious), str(tmp_path / "m.onnx"), "--messages", *QUICK[2:], "--epochs", "2"]) == 0
+def test_warnings_are_sent_before_the_training_and_reported(suspicious_recording, tmp_path, capsys):
+    assert main([str(suspicious_recording), str(tmp_path / "m.onnx"), "--messages", *QUICK[2:], "--epochs", "2"]) == 0
     messages = [Message.decode(line) for line in capsys.readouterr().out.splitlines()]
     kinds = [MessageType.STARTED, MessageType.LOG, *[MessageType.WARNING] * 2, MessageType.PREPARING]
     assert [m.type for m in messages[:5]] == kinds
@@ -45,19 +45,21 @@ def test_warnings_are_sent_before_the_training_and_reported(suspicious, tmp_path
 
 
 @pytest.mark.parametrize("messages", [[], ["--messages"]])
-def test_strict_ends_the_training_before_it_begins(suspicious, tmp_path, capsys, messages):
-    assert main([str(suspicious), str(tmp_path / "m.onnx"), "--strict", *messages, *QUICK]) == 1
+def test_strict_ends_the_training_before_it_begins(suspicious_recording, tmp_path, capsys, messages):
+    assert main([str(suspicious_recording), str(tmp_path / "m.onnx"), "--strict", *messages, *QUICK]) == 1
     output = capsys.readouterr()
     assert output.err.startswith("30 of 120 poses repeat an earlier one, such as pose 21 pose 20: ")
     assert output.err.endswith(" (duplicate-poses; 1 more: hidden-inputs).\n")
     assert output.err.count("\n") == 1
-    said = '{"type": "warning", "name": "hidden-inputs", "text": ' if messages else "Warning (hidden-inputs): "
-    assert said in output.out
+    expected_warning = (
+        '{"type": "warning", "name": "hidden-inputs", "text": ' if messages else "Warning (hidden-inputs): "
+    )
+    assert expected_warning in output.out
     assert ("epoch" in output.out, list(tmp_path.iterdir())) == (False, [])
 
 
-def test_the_text_for_a_person_has_the_warnings(report, suspicious, tmp_path, capsys):
-    assert main([str(suspicious), str(tmp_path / "m.onnx"), *QUICK[2:], "--epochs", "1"]) == 0
+def test_the_text_for_a_person_has_the_warnings(report, suspicious_recording, tmp_path, capsys):
+    assert main([str(suspicious_recording), str(tmp_path / "m.onnx"), *QUICK[2:], "--epochs", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines[2:4]] == [f"Warning ({name})" for name in WARNINGS]
     assert report["warnings"] == []

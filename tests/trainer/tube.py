@@ -16,7 +16,7 @@ ITERATIONS, FACTOR = 6, 0.5
 
 
 def tube(per_metre: float = 1.0, away: float = 0.0) -> Rig:
-    """A tube of one meter along z with bulges, of rings of quads, each ring on one joint."""
+    """Create a tube of one meter along z with bulges. It has rings of quads, and each ring is on one joint."""
     height, angle = np.meshgrid(np.linspace(0, 1, RINGS), np.arange(AROUND) * 2 * np.pi / AROUND, indexing="ij")
     radius = 0.08 + 0.015 * np.sin(9 * height) * np.cos(3 * angle)
     positions = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=2).reshape(-1, 3)
@@ -55,7 +55,7 @@ def smoothed(rig: Rig, positions: np.ndarray) -> np.ndarray:
 
 
 def corner_frames(rig: Rig, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(C, 3, 3) frames of the corners, in columns, and (C,) their weights, as Corrective Smooth has them."""
+    """Return (C, 3, 3) axes of the corners in columns, and (C,) their weights, as in Corrective Smooth."""
     faces = positions[rig.face_vertices.reshape(-1, 4)]
     before, after = (np.roll(faces, shift, axis=1) - faces for shift in (1, -1))
     before, after = (edge / np.linalg.norm(edge, axis=2, keepdims=True) for edge in (before, after))
@@ -67,7 +67,7 @@ def corner_frames(rig: Rig, positions: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def delta_mush(rig: Rig, skinned: np.ndarray) -> np.ndarray:
-    """(N, V, 3) positions with delta mush, from skinned ones."""
+    """Return (N, V, 3) positions with delta mush, computed from skinned positions."""
     rest = rig.rest_positions.astype(np.float64)
     frames, _ = corner_frames(rig, smoothed(rig, rest))
     deltas = np.einsum("cab,ca->cb", frames, (rest - smoothed(rig, rest))[rig.face_vertices])
@@ -88,7 +88,7 @@ INFLUENCING = {joint: tuple(i for i in (joint, joint + 1) if 0 < i < JOINTS) for
 def write_tube(
     path, per_metre: float = 1.0, away: float = 0.0, smooths: bool = True, sheared: bool = False, poses: int = POSES
 ) -> Recording:
-    """A recording of the tube with delta mush, or with bulges that follow the joints in another way."""
+    """Write a recording of the tube with delta mush, or with bulges that depend on the joints without smoothing."""
     plain, rig, angles = tube(), tube(per_metre, away), chain_angles(poses, JOINTS, seed=1, reach=1.5)
     matrices, skinning = pose_chain(plain, angles), LinearSkinning(plain)
     if sheared:
