@@ -22,7 +22,7 @@ REPEATABILITY_POSES = 10
 """Number of poses that a simulated target reaches a second time, from another direction."""
 
 TOLERANCE_MM = 0.04
-"""What the components may leave, over the whole mesh."""
+"""Rms distance over training poses and all vertices that the principal components may leave, mm."""
 EPOCHS = 200
 
 EVALUATION_POSES, SIDEBAR_EVALUATION_POSES = 200, 100

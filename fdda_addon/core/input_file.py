@@ -11,7 +11,7 @@ from .open_files import open_with_retry
 
 NOT_A_REGULAR_FILE = "it is not a regular file"
 IS_A_LINK = "it is a link to another place"
-# A pipe that replaces the file between check and open must not block. Windows has neither flags nor such pipes.
+# A pipe that replaces the file between check and open must not block. Windows has neither these flags nor such pipes.
 _NONBLOCK = getattr(os, "O_NONBLOCK", 0)
 _NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 

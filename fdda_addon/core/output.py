@@ -196,8 +196,9 @@ def _commit(temporaries: list[Path], paths: tuple[Path, ...], keep: bool) -> Non
         text = f"{_quoted(changed)} was replaced, and no other" if changed else "nothing was changed"
         if keep and not changed and (kept := _keep_beside(temporaries, paths)):
             rename = f"rename {'it' if len(kept) == 1 else 'them'}"
-            way = f"close what has '{refused.name}' open, and" if error.errno == errno.EBUSY else "then"
-            text += f", and what was made is kept as {_quoted(kept)}; {way} {rename}"
+            way = f"close the program that has '{refused.name}' open, and" if error.errno == errno.EBUSY else "then"
+            new_files = "the new file is" if len(kept) == 1 else "the new files are"
+            text += f", and {new_files} kept as {_quoted(kept)}; {way} {rename}"
         raise OutputError(f"Cannot write '{refused}': {os_error_text(error)}; {text}.") from error
     finally:
         for path, backup in backups.items():

@@ -102,7 +102,7 @@ def page_path(model: Path) -> Path:
 
 
 def checkpoint_path(model: Path) -> Path:
-    """Where the checkpoint of a model lies, which a training goes on from."""
+    """Return the path of a model's checkpoint, from which a training continues."""
     return model.with_suffix(CHECKPOINT_SUFFIX)
 
 

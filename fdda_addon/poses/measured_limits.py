@@ -41,7 +41,7 @@ class MeasuredLimit:
 
     Attributes:
         bone, kind, axis: as in `Channel`.
-        low, high: the range that was set, radians, metres or factors.
+        low, high: the range that was set, or the measured one if it was not; radians, metres or factors.
         reason_unset: why the range was not set; empty if it was.
         near_gimbal_lock: the bone rotates less far than its three Euler angles do (`MAX_WIDENING`).
     """
@@ -131,7 +131,7 @@ def _measured_limit(
 ) -> MeasuredLimit:
     """Compute the range to set for an axis, or the reason not to set it."""
     if not has_width(bounds):
-        return MeasuredLimit(bone.name, kind, axis, *bounds, "stands still away from rest, has no range")
+        return MeasuredLimit(bone.name, kind, axis, *bounds, "constant and not at rest, so it gets no range")
     low, high = bounds
     extra = (high - low) * margin
     # Positive scales stay positive, because a scale of zero has no inverse.

@@ -114,8 +114,8 @@ def set_rotation_range(bone: bpy.types.PoseBone, axis: int, low: float, high: fl
         setattr(bone, f"ik_max_{letter}", high)
     elif constraint is None and has_ik_limits:
         raise RigError(
-            f"'{bone.name}' states its range as IK limits, which hold the rest pose; begin at 0 or below and end at 0 "
-            "or above, or give the bone a Limit Rotation constraint in local space."
+            f"'{bone.name}' has IK limits, which must include the rest pose; begin at 0 or below and end at 0 or "
+            "above, or give the bone a Limit Rotation constraint in local space."
         )
     else:
         if constraint is None:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Turns poses of a rig into a recording: planned, influences found, evaluated, and extended where it is worst."""
+"""Records a rig: plans poses, detects influences, evaluates the poses, and adds poses where a model is worst."""

@@ -74,7 +74,7 @@ def _compare_surfaces(
     if largest_difference > max(INFLUENCE_TOLERANCE * mesh.rig.size, 4 * FLOAT32_ROUNDING_RATIO * extent):
         raise RigError(
             f"The surface of '{mesh.name}' differs by {largest_difference * mesh.rig.metres_per_unit * 1000:.2g} mm "
-            f"between frames {frames[0]} and {frames[1]} in the same pose, so it does not follow from the pose; look "
-            "for what reads the frame (keys, drivers, Geometry Nodes, what a constraint follows), and make it a "
-            "control or switch it off."
+            f"between frames {frames[0]} and {frames[1]} in the same pose, so it does not follow from the pose; find "
+            "the keys, drivers, Geometry Nodes or constraint targets that depend on the frame, and make them controls "
+            "or switch them off."
         )

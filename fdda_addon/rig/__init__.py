@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What of a scene is the rig: its joints, skin and controls, the modifiers it replaces, and what is refused."""
+"""Reads the rig of a scene: joints, skin, controls, replaced modifiers; refuses rigs that no model can represent."""

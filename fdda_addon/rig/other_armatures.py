@@ -15,7 +15,7 @@ from .sources import Sources, is_transform_channel, split_bone_path
 
 _COPY_CONSTRAINTS = {"COPY_LOCATION": LOCATION, "COPY_ROTATION": ROTATION, "COPY_SCALE": SCALE}
 _FOUR_COMPONENT_MODES = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
-_VERBS = {ROTATION: "turn", LOCATION: "move", SCALE: "scale"}
+_VERBS = {ROTATION: "rotate", LOCATION: "move", SCALE: "scale"}
 
 AxisRanges = dict[int, tuple[float, float] | None]
 """Ranges of free channels by axis; None for a channel without a range."""
@@ -64,14 +64,14 @@ def check_other_armatures(
         if free_kinds:
             raise RigError(
                 f"'{scene_rig.mesh_object.name}' follows the bone '{bone.name}' of a second armature, "
-                f"'{armature_object.name}', which can {' and '.join(_VERBS[kind] for kind in free_kinds)} without the "
-                f"model being told; {' and '.join(_remedies(bone, free_kinds))}, or join the armatures."
+                f"'{armature_object.name}', which can {' and '.join(_VERBS[kind] for kind in free_kinds)}, but is no "
+                f"input of the model; {' and '.join(_remedies(bone, free_kinds))}, or join the armatures."
             )
     for armature_object, _, path in _channels_read(scene_rig, sources):
         if fcurve_target(armature_object, path) not in inputs:
             raise RigError(
                 f"A driver of '{scene_rig.mesh_object.name}' reads '{path}' of a second armature, "
-                f"'{armature_object.name}', without the model being told; name it as a control with a range "
+                f"'{armature_object.name}', which is no input of the model; name it as a control with a range "
                 f"(--control '{OTHER_OBJECT}{armature_object.name}/{path}=LOW:HIGH'), or lock it."
             )
 

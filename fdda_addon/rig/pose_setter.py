@@ -334,15 +334,13 @@ def make_pose_setter(scene_rig: SceneRig, settings: TargetSettings, clips: Seque
     """
     if not settings.name:
         if settings.pre_roll or settings.max_settle_frames:
-            raise RigError(
-                "There is no target whose time a pre-roll or settling would change; give one, or none of both."
-            )
+            raise RigError("A pre-roll and settling need a target; name one, or leave both out.")
         return DIRECT_POSE_SETTER
     target = find_target(scene_rig, settings.name)
     if random and target.follows == FRAMES:
         raise RigError(
-            f"The target '{target.name}' shows frames ({target.caches[0].description}), and not random poses; record 0 "
-            "of them, and the action that it was made with."
+            f"The target '{target.name}' follows frames ({target.caches[0].description}), so it cannot show random "
+            "poses; record 0 random poses, and the action that it was made with."
         )
     if random and target.follows == SIMULATION and not settings.max_settle_frames:
         raise RigError(
@@ -369,4 +367,4 @@ def _reason_against_settling(target: Target) -> str:
     if target.follows == POSE:
         return "it follows the pose at once"
     cache = next(cache for cache in target.caches if not cache.is_simulation)
-    return f"{cache.description} has the frames that it has"
+    return f"{cache.description} has a fixed range of frames"

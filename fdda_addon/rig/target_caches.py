@@ -89,7 +89,7 @@ def _mesh_cache(modifier: bpy.types.MeshCacheModifier, description: str) -> Cach
     try:
         frames = read_frame_count(path)
     except PointCacheError as error:
-        raise RigError(f"{_capitalize(description)} plays what cannot be read. {error}") from error
+        raise RigError(f"{_capitalize(description)} plays a file that cannot be read. {error}") from error
     return Cache(description, modifier.frame_start, modifier.frame_start + (frames - 1) / modifier.frame_scale)
 
 

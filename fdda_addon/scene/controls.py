@@ -70,7 +70,7 @@ def make_control(
         )
     low, high = bounds or sampled_ranges.get(name) or _property_range(datablock, path)
     if not low < high or high - low > MAX_RANGE_WIDTH:
-        raise RigError(f"The control '{name}' states no range; give one: '{name}=LOW:HIGH'.")
+        raise RigError(f"The control '{name}' has no range; give one: '{name}=LOW:HIGH'.")
     return Control(owner, path, float(low), float(high))
 
 
@@ -96,7 +96,9 @@ def parse_controls(
             try:
                 bounds = float(match["low"]), float(match["high"])
             except ValueError as error:
-                raise RigError(f"'{text}' states no range; write it as NAME=LOW:HIGH, with two numbers.") from error
+                raise RigError(
+                    f"'{text}' has an invalid range; write it as NAME=LOW:HIGH, with two numbers."
+                ) from error
         for owner, path in _resolve_name(scene_rig, name):
             control = make_control(scene_rig, owner, path, bounds, sampled_ranges)
             controls[control.name] = control

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Knows the folders that the user trusts in the preferences: a .blend file may refer to models in these and in its own.
+"""Checks whether a path is in a folder that the user trusts in the preferences.
 
-So a file from somebody else can only make the add-on read a model, and only from folders that the user chose.
+A .blend file may load models from these folders and from its own folder. So a file from somebody else can only make the
+add-on read a model, and only from folders that the user chose.
 """
 
 from collections.abc import Callable

@@ -61,5 +61,5 @@ def test_what_is_no_number_is_refused(rig, armature_object, name):
 
 
 def test_a_number_without_a_range_is_refused(rig, armature_object):
-    with pytest.raises(RigError, match=r"states no range; give one: 'armature_object/location\[0\]=LOW:HIGH'"):
+    with pytest.raises(RigError, match=r"has no range; give one: 'armature_object/location\[0\]=LOW:HIGH'"):
         parse_controls(rig, ["armature_object/location[0]"])

@@ -251,4 +251,4 @@ def test_the_sidebar_fits_as_the_command_line_does(tmp_path):
     assert (same.state, same.sentence) == (FolderState.COMPLETE, "")
     assert same.measured_sentences[0].startswith("Linear skinning with fitted weights (hard), mm: ")
     other = read_folder(tmp_path / "recording", own, index["sampling"], "")
-    assert other.sentence == "It was recorded with other settings than those above: linear skinning."
+    assert other.sentence == "It was recorded with other settings than those above: base skinning."

@@ -235,7 +235,7 @@ class TestPoses:
         bpy.ops.fdda.set_limit(bone="upper", axis="Z", low=-1, high=0.5)
         assert self.ranges(saved)["upper Z"] == (-57, 29) and self.ranges(saved)["upper X"] == (-45, 45)
         assert bone.use_ik_limit_z and not bone.constraints
-        with pytest.raises(RuntimeError, match="IK limits, which hold the rest pose; begin at 0 or below"):
+        with pytest.raises(RuntimeError, match="IK limits, which must include the rest pose; begin at 0 or below"):
             bpy.ops.fdda.set_limit(bone="upper", axis="X", low=0.5, high=1)
         bpy.ops.fdda.clear_limit(bone="upper", axis="Z")
         assert self.ranges(saved)["upper Z"] == (-45, 45)

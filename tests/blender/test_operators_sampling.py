@@ -301,7 +301,7 @@ class TestControls:
         control = face.mesh_object.fdda.settings.controls[0]
         control.has_range, control.low, control.high = True, 1.0, 0.5
         (problem,) = checks.check_now(face).problems
-        assert problem.startswith("The control 'shape_keys/key_blocks[\"thin\"].value' states no range; give one")
+        assert problem.startswith("The control 'shape_keys/key_blocks[\"thin\"].value' has no range; give one")
 
     def test_those_that_drivers_read_are_found(self, tmp_path):
         controls.custom_property()

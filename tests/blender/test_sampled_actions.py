@@ -87,7 +87,7 @@ def test_what_stands_still_beside_the_rest_pose_stays_there(figure):
         key_channel(spine, frame, "location", (0, 0.5, 0))
     limits = set_limits_from_actions(figure, bpy.data.actions, 0.0)
     assert describe_limits(figure.armature_object, limits) == [
-        "spine: turns X 43.0 to 43.0° (stands still away from rest, has no range), turns Y -11.5 to 11.5°"
+        "spine: turns X 43.0 to 43.0° (constant and not at rest, so it gets no range), turns Y -11.5 to 11.5°"
     ]
     channels = sampled(figure)
     assert _format_channels(list(channels), True) == "locked  ±11°  locked"

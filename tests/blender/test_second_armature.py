@@ -22,28 +22,28 @@ from .scene_state import assert_same_state, drain, scene_state
 
 APART = 1e-3
 FOLLOWS = (
-    "'elbow' follows the bone '{}' of a second armature, 'muscle_rig', which can {} without the model being told; {}, "
+    "'elbow' follows the bone '{}' of a second armature, 'muscle_rig', which can {}, but is no input of the model; {}, "
     "or join the armatures."
 )
 EULER, LOCKED = "set its rotation mode to XYZ Euler", "lock its {} (or add {} in local space)"
 ALL = FOLLOWS.format(
     "muscle",
-    "turn and move and scale",
+    "rotate and move and scale",
     f"{EULER} and {LOCKED.format('location and scale', 'Limit Location and Limit Scale')}",
 )
 READS = 'pose.bones["muscle"].rotation_quaternion[1]'
 SENTENCES = {
-    second_armature.quaternion: FOLLOWS.format("muscle", "turn", EULER),
-    second_armature.axis_angle: FOLLOWS.format("muscle", "turn", EULER),
+    second_armature.quaternion: FOLLOWS.format("muscle", "rotate", EULER),
+    second_armature.axis_angle: FOLLOWS.format("muscle", "rotate", EULER),
     second_armature.free_location: FOLLOWS.format("muscle", "move", LOCKED.format("location", "Limit Location")),
     second_armature.free_scale: FOLLOWS.format("muscle", "scale", LOCKED.format("scale", "Limit Scale")),
-    second_armature.free_root: FOLLOWS.format("root", "turn", EULER),
+    second_armature.free_root: FOLLOWS.format("root", "rotate", EULER),
     second_armature.hook_on_a_bone: ALL,
     second_armature.hook_that_copies_a_bone: ALL,
     second_armature.lattice_on_a_bone: ALL,
     second_armature.driver_of_a_bone: ALL,
     second_armature.driver_of_a_channel: (
-        f"A driver of 'elbow' reads '{READS}' of a second armature, 'muscle_rig', without the model being told; name "
+        f"A driver of 'elbow' reads '{READS}' of a second armature, 'muscle_rig', which is no input of the model; name "
         f"it as a control with a range (--control 'object:muscle_rig/{READS}=LOW:HIGH'), or lock it."
     ),
 }  # fmt: skip
@@ -70,9 +70,9 @@ def test_what_a_model_is_not_told_is_named(build, loose_model, tmp_path):
         drain(record(rig, tmp_path / "recording", FEW_POSES))
     assert str(error.value) == SENTENCES[build]
     # This model is not told of Euler angles either.
-    with pytest.raises(RigError, match=r" of a second armature, 'muscle_rig', .*without the model being told; "):
+    with pytest.raises(RigError, match=r" of a second armature, 'muscle_rig', .*is no input of the model; "):
         drain(evaluate(rig, loose_model, EvaluationSettings(poses=2)))
-    with pytest.raises(RigError, match=r" of a second armature, 'muscle_rig', .*without the model being told; "):
+    with pytest.raises(RigError, match=r" of a second armature, 'muscle_rig', .*is no input of the model; "):
         bind(rig, loose_model)
     assert_same_state(before, scene_state(rig))
     still = evaluated(rig.mesh_object)

@@ -111,7 +111,9 @@ def test_a_file_that_is_damaged(refusal, tmp_path):
     rig = built(targets.target_mdd, tmp_path / "rig.blend")
     path = Path(bpy.data.objects["flesh"].modifiers["Cache"].filepath)
     path.write_bytes(path.read_bytes()[:-5])
-    assert refused(refusal, rig).startswith("The modifier 'Cache' of 'flesh' plays what cannot be read. The point")
+    assert refused(refusal, rig).startswith(
+        "The modifier 'Cache' of 'flesh' plays a file that cannot be read. The point"
+    )
 
 
 def test_the_mesh_itself(refusal, tmp_path):
@@ -161,8 +163,8 @@ def test_a_hidden_target(refusal, tmp_path):
 def test_random_poses_of_a_cache(refusal, tmp_path):
     rig = built(targets.target_pc2, tmp_path / "rig.blend")
     assert refused(refusal, rig, "--poses", 5) == (
-        "The target 'flesh' shows frames (the modifier 'Cache' of 'flesh'), and not random poses; record 0 of them, "
-        "and the action that it was made with."
+        "The target 'flesh' follows frames (the modifier 'Cache' of 'flesh'), so it cannot show random poses; record "
+        "0 random poses, and the action that it was made with."
     )
 
 
@@ -176,7 +178,7 @@ def test_mirrored_frames_of_a_cache(refusal, tmp_path):
 def test_settling_and_pre_roll_of_what_is_no_simulation(refusal, tmp_path):
     rig = built(targets.target_pc2, tmp_path / "rig.blend")
     assert refused(refusal, rig, "--poses", 0, "--max-settle-frames", 5) == (
-        "The target 'flesh' cannot settle: the modifier 'Cache' of 'flesh' has the frames that it has; leave settling "
+        "The target 'flesh' cannot settle: the modifier 'Cache' of 'flesh' has a fixed range of frames; leave settling "
         "out."
     )
     assert refused(refusal, rig, "--pre-roll", 5).startswith("The target 'flesh' is no simulation, so there is nothing")

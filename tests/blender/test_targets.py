@@ -154,7 +154,7 @@ def test_the_sidebar_records_and_evaluates_a_target(own, tmp_path):
     assert np.abs(complex_positions(recording) - complex_positions(own)).max() <= EXACT * own.rig.size
     assert recording.info.target.object_name == "flesh"
     settings.poses = 3
-    with pytest.raises(RuntimeError, match="The target 'flesh' shows frames"):
+    with pytest.raises(RuntimeError, match="The target 'flesh' follows frames"):
         bpy.ops.fdda.record(folder=str(tmp_path / "random"))
     model = tmp_path / "elbow.onnx"
     train(recording.path, model, "--epochs", 30)

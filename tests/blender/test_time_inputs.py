@@ -176,7 +176,7 @@ def test_a_target_that_moves_with_time_shows_frames(kind, tmp_path):
     rig, target = find_rig(ELBOW), TargetSettings("flesh")
     with pytest.raises(RigError) as error:
         drain(record(rig, tmp_path / "random", RecordingSettings(poses=4, target=target)))
-    assert str(error.value).startswith(f"The target 'flesh' shows frames ({words}), and not random poses;")
+    assert str(error.value).startswith(f"The target 'flesh' follows frames ({words}), so it cannot show random poses;")
     settings = RecordingSettings(poses=0, actions=("elbow_wave",), target=target)
     drain(record(rig, tmp_path / "frames", settings))
     assert read_recording(tmp_path / "frames").info.target.follows == "frames"

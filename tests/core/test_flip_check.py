@@ -40,8 +40,8 @@ def test_a_flipping_joint_is_reported(poses):
     text = single_warning_text(flipping_recording(poses, 1.1, 0.08), "flips")
     assert re.match(
         r"Vertices of '(upper|lower)' jump up to \d\d mm between similar poses, 'lower' on the two sides of 180 "
-        r"degrees \(\d+ pairs?, such as poses \d+ and \d+\); [12] more partitions? jumps? too, and no network follows "
-        "a jump: keep its rotation below 180 degrees",
+        r"degrees \(\d+ pairs?, such as poses \d+ and \d+\); [12] more partitions? jumps? too, and no network can "
+        "learn a jump: keep its rotation below 180 degrees",
         text,
     )
 

@@ -100,8 +100,9 @@ def test_a_file_that_stays_open_is_not_replaced_and_new_files_are_kept(tmp_path,
         for temporary in temporaries:
             temporary.write_text("new")
     assert str(error.value) == (
-        f"Cannot write '{paths[open_index]}': another program has it open; nothing was changed, and what was made is "
-        f"kept as 'new-a', 'new-b', 'new-c'; close what has '{paths[open_index].name}' open, and rename them."
+        f"Cannot write '{paths[open_index]}': another program has it open; nothing was changed, and the new files are "
+        f"kept as 'new-a', 'new-b', 'new-c'; close the program that has '{paths[open_index].name}' open, and rename "
+        "them."
     )
     assert exit_status(error.value) == TRY_AGAIN
     assert file_texts(tmp_path) == {"a": "old", "b": "old", "new-a": "new", "new-b": "new", "new-c": "new"}

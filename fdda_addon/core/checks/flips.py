@@ -75,7 +75,7 @@ def check_flips(recording: Recording, scan: ResidualScan) -> list[RecordingWarni
     text = (
         f"Vertices of '{joint_name(rig, recording.partitions[worst.partition].joint)}' jump up to {jump} "
         f"between similar poses{where} ({pairs}, such as poses {worst.poses[0]} and {worst.poses[1]}){too}, and "
-        f"no network follows a jump: {advice}, and record again."
+        f"no network can learn a jump: {advice}, and record again."
     )
     return [RecordingWarning("flips", text)]
 

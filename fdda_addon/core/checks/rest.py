@@ -24,7 +24,7 @@ def check_rest(rig: Rig) -> list[RecordingWarning]:
     if not MIN_SIZE_METRES <= rig.size * rig.metres_per_unit <= MAX_SIZE_METRES:
         text = (
             f"The mesh is {format_length(rig, rig.size)} large, so errors and tolerances in mm mean little: set the "
-            "unit scale of the scene to the unit that the character is built in (0.01 for centimetres), or scale it to "
+            "unit scale of the scene to the unit that the character is built in (0.01 for centimeters), or scale it to "
             "its true size, and record again."
         )
         return [RecordingWarning("units", text)]
@@ -107,7 +107,7 @@ def _rotation_label(rotation: np.ndarray) -> str:
     # A counter-clockwise rotation about Y moves Z towards X.
     positive = rotation[y, x] > 0 if fixed_axes[0] != 1 else rotation[x, y] > 0
     sign = "" if angle == 180 or positive else "-"
-    return f"a turn of {sign}{angle} degrees about {'XYZ'[fixed_axes[0]]}"
+    return f"a rotation of {sign}{angle} degrees about {'XYZ'[fixed_axes[0]]}"
 
 
 def _axis_label(offset: np.ndarray) -> str:

@@ -213,7 +213,7 @@ class RecordingWriter:
             pose_matrices: (n, J, 4, 4), mesh-object space, mesh units.
             residuals: (n, V, 3), local residuals, axes of the main joint, mesh units.
             controls: (n, C), where the rig has controls.
-            unsettled: indices of the poses in which the target did not come to rest.
+            unsettled: indices, among the poses appended here, of those in which the target did not come to rest.
 
         Raises:
             OutputError: the disk is full or was disconnected; earlier poses stay complete.
