@@ -167,7 +167,7 @@ def test_training_until_a_target_is_met(elbow, recording, tmp_path, capfd):
     ("options", "words"),
     [
         (["--refine", "RIG"], "give the goal with --goal-mm"),
-        (["--object", "elbow"], "give --refine RIG.blend with them"),
+        (["--object", "elbow"], "give --refine RIG.blend too"),
     ],
 )
 def test_options_of_the_target_that_make_no_sense(elbow, recording, tmp_path, capfd, options, words):
@@ -183,4 +183,4 @@ def test_options_of_the_target_that_make_no_sense(elbow, recording, tmp_path, ca
 def test_the_help_of_train_says_how_to_refine(capfd):
     assert run("train", "--help") == 0
     out = capfd.readouterr().out
-    assert "--goal-mm" in out and "--refine RIG.blend" in out and "poses to add each time" in out
+    assert "--goal-mm" in out and "--refine RIG.blend" in out and "poses to add in each" in out
