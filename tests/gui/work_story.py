@@ -195,7 +195,9 @@ def check_headings_of_the_manual(_folder: Path) -> Iterator[float]:
     page = extension_module("operators.help").manual_file().read_text(encoding="utf-8")
     headings = [getattr(bpy.types, f"FDDA_PT_{name}").bl_label for name in sidebar.SECTIONS]
     missing = [
-        heading for heading in headings if f'id="{extension_module("core.manual_page").anchor(heading)}"' not in page
+        heading
+        for heading in headings
+        if f'id="{extension_module("core.manual_page").heading_anchor(heading)}"' not in page
     ]
     require(not missing, f"the manual has no section {missing}")
     yield 0.1
