@@ -18,7 +18,7 @@ CLOTHES = {
 }
 """The bones that each piece covers."""
 THICKNESS = 0.012
-"""How far a piece lies over the body, metres."""
+"""How far a piece lies over the body, meters."""
 
 
 def main_bones(body: bpy.types.Object) -> list[str]:

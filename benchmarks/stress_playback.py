@@ -28,7 +28,7 @@ from fdda_addon.runtime.network import Network  # noqa: E402
 from fdda_addon.scene.scene_rig import SceneRig, armature_modifier  # noqa: E402
 
 MAX_DIFFERENCE_M = 1e-5
-"""Metres. What Blender shows may be so far from what the model says."""
+"""Meters. What Blender shows may be so far from what the model says."""
 BONES = ("upper", "lower")
 OPERATION_WEIGHTS = {
     "frame": 30, "subframe": 6, "pose": 30, "pose of several": 6, "undo": 5, "redo": 4, "render": 2, "mode": 6,
@@ -38,7 +38,7 @@ OPERATION_WEIGHTS = {
 
 @dataclass
 class Outcome:
-    """What happened: how often each operation, the largest difference in metres, memory in MB at its times."""
+    """What happened: how often each operation, the largest difference in meters, memory in MB at its times."""
 
     operations: Counter = field(default_factory=Counter)
     compared: int = 0

@@ -14,7 +14,7 @@ RIG_OBJECT = "elbow_rig"
 ACTION = "elbow_wave"
 FRAMES = 30
 
-# Metres along +X: the tube from its start to its end, the joint between the two bones, how far the weights blend.
+# Meters along +X: the tube from its start to its end, the joint between the two bones, how far the weights blend.
 START, JOINT, END = 0.0, 0.25, 0.50
 BLEND = 0.06
 _AROUND, _RINGS = 12, 24
@@ -25,7 +25,7 @@ UPPER_RANGE = ((-45.0, 45.0), (-45.0, 45.0), (-45.0, 45.0))
 
 
 def elbow_surface() -> tuple[np.ndarray, np.ndarray]:
-    """points (v, 3) float64, metres, and faces (f, 4) int32, outward: a tube that is thick above the joint, closed."""
+    """points (v, 3) float64, meters, and faces (f, 4) int32, outward: a tube that is thick above the joint, closed."""
     along = np.linspace(START, END, _RINGS + 1)
     radius = np.interp(along, (START, 0.10, 0.22, 0.27, 0.34, END), (0.047, 0.052, 0.041, 0.042, 0.046, 0.030))
     angle = np.arange(_AROUND) * (2 * np.pi / _AROUND) + np.pi / _AROUND

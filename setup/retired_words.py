@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`python setup/retired_words.py`: find words in code and docs that the field does not use, and name those it uses.
+"""`python setup/retired_words.py`: find retired words in code and documents, and print their replacements.
 
-Exit status: 0 none found, 1 some found, a line each.
+Retired words are words that the field does not use. Exit status: 0 if none is found, 1 if some are found.
 """
 
 import re
@@ -10,9 +10,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("fdda_addon", "trainer", "farm", "tests", "benchmarks", "blend_fixtures", "setup", "examples", "docs")
-SUFFIXES = {".py", ".md", ".toml", ".mjs", ".html"}
+SUFFIXES = {".py", ".md", ".toml", ".mjs", ".js", ".html", ".c", ""}
+"""Suffixes of the files that are searched; scripts have none."""
+PAGES = ("Makefile", "pyproject.toml", ".ci/run")
+"""Searched files outside `FOLDERS`."""
+GENERATED_FOLDERS = {"node_modules", "__pycache__", "dist"}
 
-RETIRED = {
+REPLACEMENTS = {
     r"linear[ _]layers?|LinearLayer": "linear skinning (a linear layer is torch.nn.Linear)",
     r"target[-_]mm": "goal-mm (a target is an object that is recorded)",
     r"last weights|LastWeights": "checkpoint",
@@ -27,33 +31,41 @@ RETIRED = {
     r"what is none|so many of": "the noun that is meant",
     r"colour|\bgrey|centre|neighbour|normalis|standardis|recognis|minimis|licence\b|labelled": "the US spelling",
     r"\blearnt\b": "learned",
+    r"\b(?-i:([Mm]illi|[Cc]enti|[Kk]ilo)?[Mm]etres?)\b(?!-per-unit)": "meter (not in metres_per_unit)",
+    r"(?<![\w\"`])(?-i:cancell(ed|ing))\b(?![\"`])": "canceled, canceling",
 }
-"""Regular expressions, without regard to case, and what to write."""
+"""Regular expressions of retired words, without regard to case, and their replacements."""
 
 
-def files() -> list[Path]:
-    """Return the files that people write, without this one."""
-    pages = [path for path in ROOT.glob("*.md")]
-    below = (path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*")))
-    found = (path for path in [*pages, *below] if path.suffix in SUFFIXES and path != Path(__file__).resolve())
-    return [path for path in found if "node_modules" not in path.parts]
+def list_files() -> list[Path]:
+    """List the files that people write, without this one."""
+    pages = [*ROOT.glob("*.md"), *(ROOT / name for name in PAGES)]
+    files = [*pages, *(path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*")))]
+    return [
+        path
+        for path in files
+        if path.suffix in SUFFIXES
+        and path.is_file()
+        and path != Path(__file__).resolve()
+        and not GENERATED_FOLDERS.intersection(path.parts)
+    ]
 
 
-def find(text: str) -> list[tuple[int, str, str]]:
-    """Return the retired words of a text: line, word, and what to write."""
-    found = []
-    for pattern, replacement in RETIRED.items():
+def find_retired_words(text: str) -> list[tuple[int, str, str]]:
+    """Return the line and the text of each retired word, and its replacement."""
+    matches = []
+    for pattern, replacement in REPLACEMENTS.items():
         for match in re.finditer(pattern, text, re.IGNORECASE):
-            found.append((text.count("\n", 0, match.start()) + 1, match[0], replacement))
-    return sorted(found)
+            matches.append((text.count("\n", 0, match.start()) + 1, match[0], replacement))
+    return sorted(matches)
 
 
 def main() -> int:
     """Print a line for each retired word."""
     lines = [
         f"{path.relative_to(ROOT)}:{line}: '{word}': write {replacement}"
-        for path in files()
-        for line, word, replacement in find(path.read_text(encoding="utf-8"))
+        for path in list_files()
+        for line, word, replacement in find_retired_words(path.read_text(encoding="utf-8", errors="replace"))
     ]
     print("\n".join(lines), end="\n" if lines else "")
     return 1 if lines else 0

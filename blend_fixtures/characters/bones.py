@@ -18,7 +18,7 @@ KINDS = {"LIMIT_ROTATION": "lock_rotation", "LIMIT_LOCATION": "lock_location", "
 
 @dataclass(frozen=True)
 class NewBone:
-    """A bone to be added; ends in armature space, metres."""
+    """A bone to be added; ends in armature space, meters."""
 
     name: str
     head: Point
@@ -53,7 +53,7 @@ def limit(bone: bpy.types.PoseBone, kind: str, ranges: dict[int, tuple[float, fl
     Args:
         bone: the pose bone.
         kind: of the constraint, one of `KINDS`.
-        ranges: by axis; degrees, metres or factors.
+        ranges: by axis; degrees, meters or factors.
     """
     constraint = bone.constraints.new(kind)
     constraint.owner_space = "LOCAL"
@@ -114,7 +114,7 @@ def add_smooth_weights(
     Args:
         mesh_object, armature_object: of a `limb`.
         most: bones a vertex.
-        width: metres over which weights fall off.
+        width: meters over which weights fall off.
     """
     along = np.array([vertex.co.x for vertex in mesh_object.data.vertices])
     bones = [bone for bone in armature_object.data.bones if bone.use_deform]

@@ -38,7 +38,7 @@ class Result:
         mesh: name of the mesh object.
         linear_mm, fdda_mm: mean error of linear skinning and of the model on held-out poses.
         moved_mm: how far the rig moves a vertex from its rest position in these poses, mean.
-        difference: the largest between the evaluated mesh and the model's output, in any coordinate; metres.
+        difference: the largest between the evaluated mesh and the model's output, in any coordinate; meters.
     """
 
     mesh: str
@@ -109,7 +109,7 @@ def _errors(row: Row, scene_rig: SceneRig, network: Network) -> tuple[float, flo
     held_out = evaluation.held_out
     rest = rest_positions(scene_rig.mesh_object.data)
     moved = distances(held_out.positions, rest, metres_per_unit(scene_rig.mesh_object))
-    return tuple(float(metres.mean()) * 1000 for metres in (held_out.linear, held_out.fdda, moved))
+    return tuple(float(meters.mean()) * 1000 for meters in (held_out.linear, held_out.fdda, moved))
 
 
 def _play(rigs: list[SceneRig], networks: list[Network], channels: tuple[Channel, ...]) -> list[float]:

@@ -21,7 +21,7 @@ from .controls import add_key
 MESH, ARMATURE, SPEECH = "face", "face_rig", "speech"
 FRAMES = 80
 RADII = np.array((0.078, 0.096, 0.118))
-"""Of the head, metres: it looks along -Y, its left is +X."""
+"""Of the head, meters: it looks along -Y, its left is +X."""
 RINGS, AROUND = 72, 72
 
 # Where parts of the face lie: degrees to the left, and upwards.
@@ -68,7 +68,7 @@ def _apart(points: np.ndarray, name: str) -> np.ndarray:
 
 
 def _bump(name: str, offset: tuple[float, float, float], size: float = 0.16) -> Callable[[np.ndarray], np.ndarray]:
-    """Moves what is near a place, by millimetres."""
+    """Moves what is near a place, by millimeters."""
 
     def move(points: np.ndarray) -> np.ndarray:
         return points + np.exp(-((_apart(points, name) / size) ** 2))[:, None] * np.array(offset) / 1000

@@ -33,10 +33,10 @@ class Body:
 
     Attributes:
         metarig: operator of `bpy.ops.object` that adds the metarig.
-        thickness: of the body around the bones of the metarig, metres, by the beginning of their names; the longest
+        thickness: of the body around the bones of the metarig, meters, by the beginning of their names; the longest
             that fits counts, bones of no entry get no flesh.
-        resolution: of the surface, metres.
-        moves: what an animator does with a control bone: how far it goes to both sides, in metres along the axes of the
+        resolution: of the surface, meters.
+        moves: what an animator does with a control bone: how far it goes to both sides, in meters along the axes of the
             armature, and how far it turns, in degrees about its own axes.
     """
 

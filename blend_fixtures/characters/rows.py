@@ -171,7 +171,7 @@ ROWS: tuple[Row, ...] = (
     _tube(MESHES, transforms.far_from_its_origin, "vertices 100 m from the origin of their object"),
     _tube(MESHES, transforms.scaled_armature, "an armature in centimeters, scaled by 0.01"),
     _tube(MESHES, transforms.scaled_character, "mesh and armature in centimeters, scaled by 0.01"),
-    _tube(MESHES, transforms.far_away, "hundreds of metres from the origin"),
+    _tube(MESHES, transforms.far_away, "hundreds of meters from the origin"),
     Row(
         "linked", MESHES, "a linked character, overridden twice in two poses", stacks.corrective_smooth, is_linked=True
     ),

@@ -193,7 +193,7 @@ STACKS: tuple[Callable[[], None], ...] = (
 
 
 def ripple_group() -> bpy.types.NodeTree:
-    """Moves each vertex by some millimetres, in a direction that depends on its place."""
+    """Moves each vertex by some millimeters, in a direction that depends on its place."""
     group = chain("Ripple", "GeometryNodeSetPosition")
     position, wave, scale = (
         group.nodes.new(kind) for kind in ("GeometryNodeInputPosition", *["ShaderNodeVectorMath"] * 2)

@@ -15,7 +15,7 @@ from blend_fixtures.elbow import build_elbow
 from .base import link
 
 CENTIMETRES, MILLIMETRES, KILOMETRES = 100.0, 1000.0, 0.001
-"""Blender units in a metre where a unit is a centimetre, a millimetre, a kilometre."""
+"""Blender units in a meter where a unit is a centimeter, a millimeter, a kilometer."""
 
 
 def moved() -> None:
@@ -61,22 +61,22 @@ def parented_to_bone() -> None:
 
 
 def in_centimetres() -> None:
-    """A scene whose unit is a centimetre: positions in tens, unit scale 0.01."""
+    """A scene whose unit is a centimeter: positions in tens, unit scale 0.01."""
     _in_unit(CENTIMETRES)
 
 
 def in_millimetres() -> None:
-    """A scene whose unit is a millimetre: positions in hundreds, unit scale 0.001."""
+    """A scene whose unit is a millimeter: positions in hundreds, unit scale 0.001."""
     _in_unit(MILLIMETRES)
 
 
 def in_kilometres() -> None:
-    """A scene whose unit is a kilometre: positions in ten-thousandths, unit scale 1000."""
+    """A scene whose unit is a kilometer: positions in ten-thousandths, unit scale 1000."""
     _in_unit(KILOMETRES)
 
 
 def far_from_its_origin() -> None:
-    """Mesh and bones 100 metres from the origins of their objects, which stand as far on the other side."""
+    """Mesh and bones 100 meters from the origins of their objects, which stand as far on the other side."""
     away = Vector((60.0, -80.0, 0.0))
     mesh_object, armature_object = build_elbow()
     for scene_object in (mesh_object, armature_object):
@@ -85,7 +85,7 @@ def far_from_its_origin() -> None:
 
 
 def scaled_armature() -> None:
-    """An armature as FBX brings it, in centimetres with an object scale of 0.01; the mesh is in metres, unparented."""
+    """An armature as FBX brings it, in centimeters with an object scale of 0.01; the mesh is in meters, unparented."""
     mesh_object, armature_object = build_elbow()
     mesh_object.parent = None
     _enlarge(armature_object)
@@ -94,7 +94,7 @@ def scaled_armature() -> None:
 
 
 def scaled_character() -> None:
-    """Mesh and armature as FBX brings them: both in centimetres, turned upright and scaled by 0.01."""
+    """Mesh and armature as FBX brings them: both in centimeters, turned upright and scaled by 0.01."""
     mesh_object, armature_object = build_elbow()
     for scene_object in (mesh_object, armature_object):
         _enlarge(scene_object)
@@ -102,7 +102,7 @@ def scaled_character() -> None:
 
 
 def far_away() -> None:
-    """A character in metres, some hundreds of metres from the world's origin."""
+    """A character in meters, some hundreds of meters from the world's origin."""
     _, armature_object = build_elbow()
     _place(armature_object, (300.0, -200.0, 50.0), (10, 20, 30), (1.0, 1.0, 1.0))
 

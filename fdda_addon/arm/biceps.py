@@ -3,7 +3,7 @@
 
 import numpy as np
 
-# Metres by density: how high the key stands over the relaxed arm. Corrective Smooth comes after it and takes its share,
+# Meters by density: how high the key stands over the relaxed arm. Corrective Smooth comes after it and takes its share,
 # the more the coarser the quads; about 17 mm are left at any density.
 PEAK = {1: 0.036, 2: 0.028, 3: 0.022}
 
@@ -15,9 +15,9 @@ def _bump(x: np.ndarray, top: float, rise: float, fall: float) -> np.ndarray:
 
 
 def biceps_offsets(points: np.ndarray, normals: np.ndarray, peak: float) -> np.ndarray:
-    """Compute (n, 3) offsets in metres from (n, 3) rest `points` with unit outward `normals`, in arm space.
+    """Compute (n, 3) offsets in meters from (n, 3) rest `points` with unit outward `normals`, in arm space.
 
-    The muscle shortens: it peaks past the middle of the upper arm, at `peak` metres, falls off steeply towards the
+    The muscle shortens: it peaks past the middle of the upper arm, at `peak` meters, falls off steeply towards the
     elbow into its tendon, thins out at both ends, and a furrow parts its two heads. The triceps opposite is drawn flat.
     """
     # Contiguous, or the last bit of an angle hangs on where memory lies: past a strided array's end NumPy may see

@@ -12,7 +12,7 @@ from .tube import Tube
 # is the end of the tube, or the thumb's root.
 _FINGER_RINGS = (0.33, 0.52, 0.71, 0.89, 1.12, 1.37, 1.64, 1.88, 2.13, 2.36, 2.60, 2.84, 3.04)
 _THUMB_RINGS = (0.60, 0.72, 0.83, 0.94, 1.12, 1.35, 1.60, 1.86, 2.12, 2.38, 2.66, 2.94)
-# How far from the axis the rings start, metres: outside the skin.
+# How far from the axis the rings start, meters: outside the skin.
 _FINGER_RADIUS, _THUMB_RADIUS = 0.0085, 0.0125
 # The thumb leaves the hand askew. Corners of its root, by (wrist, webs) and (back, palm): outside the skin, in the
 # folds where it parts from the hand. This part of its rings runs straight from there to its first joint.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Signed distance fields: lofts and ellipsoids, joined and subtracted with smooth blends.
 
-Every form answers `distance(points)`: (n, 3) float64 points in metres to (n,) float64 metres, negative inside. The
+Every form answers `distance(points)`: (n, 3) float64 points in meters to (n,) float64 meters, negative inside. The
 answers are first-order distances: exact in sign, and close to the truth near the surface, which is where they are read.
 """
 
@@ -55,7 +55,7 @@ def cubic_curve(at: np.ndarray, knots: np.ndarray, values: np.ndarray) -> np.nda
 
 
 class Ellipsoid:
-    """center (3,), radii (3,) along the rows of `axes` (3, 3), metres."""
+    """center (3,), radii (3,) along the rows of `axes` (3, 3), meters."""
 
     def __init__(self, center, radii, axes=None):
         self.center = np.asarray(center, float)
@@ -87,7 +87,7 @@ class Loft:
     """A limb: cross-sections along a straight axis, each with its own center and four half-widths.
 
     origin (3,): where station 0 is. frame: rows along, side, up. stations: (k, 7) float, columns
-    along, center side, center up, half-width to +side, -side, +up, -up; metres. caps: how far the rounded ends reach
+    along, center side, center up, half-width to +side, -side, +up, -up; meters. caps: how far the rounded ends reach
     in from the first and last station. power: 2 is an ellipse, more is boxier.
     """
 
@@ -127,7 +127,7 @@ class Loft:
 
 @dataclass(frozen=True)
 class Stroke:
-    """One solid that is added or subtracted, with a smooth blend of about `blend` metres."""
+    """One solid that is added or subtracted, with a smooth blend of about `blend` meters."""
 
     form: Solid
     blend: float
@@ -147,11 +147,11 @@ class Field:
         self.strokes = strokes
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Compute the (n,) float64 signed distances of (n, 3) points, metres."""
+        """Compute the (n,) float64 signed distances of (n, 3) points, meters."""
         return self._distance(points, self._points_near_strokes(points))
 
     def distance_and_gradient(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute (n,) distances in metres and (n, 3) gradients, from differences at a tetrahedron of 0.1 mm."""
+        """Compute (n,) distances in meters and (n, 3) gradients, from differences at a tetrahedron of 0.1 mm."""
         step, near = 1e-4, self._points_near_strokes(points)
         corners = np.array([[1.0, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]])
         values = np.array([self._distance(points + corner * step, near) for corner in corners])

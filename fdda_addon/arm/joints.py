@@ -2,7 +2,7 @@
 """The joints of the arm: names, parents, rest pose and range of motion, without bpy.
 
 A left arm in a T-pose: shoulder at the origin, arm along +X, palm down (-Z), thumb and elbow crease to the front (-Y),
-the forearm half way between pronation and supination. Lengths in metres, angles in degrees.
+the forearm half way between pronation and supination. Lengths in meters, angles in degrees.
 
 Every bone runs along its local Y; its local Z points to where it bends (the elbow crease, the palm, the pad of the
 thumb), so that a positive rotation about local X is flexion everywhere.
@@ -35,7 +35,7 @@ Range = tuple[float, float]
 class Joint(NamedTuple):
     """One bone in the rest pose.
 
-    head, tail: metres, armature space. bend: unit vector, armature space, the bone's local Z.
+    head, tail: meters, armature space. bend: unit vector, armature space, the bone's local Z.
     limits: degrees about local X (flexion), Y (twist) and Z (sideways: positive towards the thumb, and for the thumb
     itself away from the back of the hand); `LOCKED` for an axis that does not turn.
     """
@@ -49,7 +49,7 @@ class Joint(NamedTuple):
 
 
 class Finger(NamedTuple):
-    """Measures of one finger: joint positions in metres, the heading in degrees (positive: towards the thumb).
+    """Measures of one finger: joint positions in meters, the heading in degrees (positive: towards the thumb).
 
     bends: the slight flexion that the finger rests in, at its three free joints.
     tip: how far the flesh reaches beyond the last bone's tail.

@@ -46,7 +46,7 @@ class SheetPosition:
 class Grid:
     """Unsculpted quads.
 
-    points: (n, 3) float64, metres, arm space. faces: (f, 4) int32, outward.
+    points: (n, 3) float64, meters, arm space. faces: (f, 4) int32, outward.
     digit: (n,) int, -1 for arm and palm, else 0 for the thumb, 1..4 from index to little finger.
     column: (n,) int, in the palm the finger 1..4 in whose columns a vertex runs.
     plane_point, plane_normal (n, 3), plane_hold (n,) 0..1: the plane of a vertex's ring, and how firmly it keeps to it.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The shape of the arm as strokes of a field: muscles, bones under the skin, palm and fingers; metres.
+"""The shape of the arm as strokes of a field: muscles, bones under the skin, palm and fingers; meters.
 
 Arm space (see `joints`): +X along the arm, +Z the back of the hand, -Y the elbow crease and the thumb.
 """
@@ -158,7 +158,7 @@ def _finger_form(name: str) -> list[Stroke]:
     def at(i: int, part: float) -> tuple[float, float]:
         return along[i] + (along[i + 1] - along[i]) * part, up[i] + (up[i + 1] - up[i]) * part
 
-    # place, half-width, half-thickness of the back, of the palm side; millimetres
+    # place, half-width, half-thickness of the back, of the palm side; millimeters
     profile = [
         (at(0, -0.25), 8.6, 8.5, 8.6),
         (at(0, 0.25), 8.8, 8.9, 9.4),

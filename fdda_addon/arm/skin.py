@@ -16,7 +16,7 @@ def _past_joint_plane(points: np.ndarray, before: str, after: str) -> np.ndarray
 
 
 def _distance_to_bone(points: np.ndarray, name: str, start: float = 0.0) -> np.ndarray:
-    """Compute (n,) distances in metres to a bone's segment without its first part `start` (0..1)."""
+    """Compute (n,) distances in meters to a bone's segment without its first part `start` (0..1)."""
     head, tail = np.array(joint(name).head), np.array(joint(name).tail)
     head = head + (tail - head) * start
     axis = tail - head
@@ -25,7 +25,7 @@ def _distance_to_bone(points: np.ndarray, name: str, start: float = 0.0) -> np.n
 
 
 def main_joints(points: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return the (n,) int32 index into `JOINTS` of (n, 3) rest points, metres.
+    """Return the (n,) int32 index into `JOINTS` of (n, 3) rest points, meters.
 
     Fingers are cut at their joints, by chain: no vertex of a finger follows another one. The palm goes to the
     metacarpals by column, the ball of the thumb to the thumb's.

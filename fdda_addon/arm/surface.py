@@ -22,10 +22,10 @@ class Surface:
     """The surface of the arm.
 
     Attributes:
-        points: (v, 3) float64, metres, arm space.
+        points: (v, 3) float64, meters, arm space.
         faces: (f, 4) int32, outward.
         joints: (v,) int32 into `JOINTS`.
-        biceps: (v, 3) float64, offsets at full contraction, metres.
+        biceps: (v, 3) float64, offsets at full contraction, meters.
         nails: (f,) bool, the faces of the nails.
     """
 

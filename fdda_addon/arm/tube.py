@@ -14,7 +14,7 @@ from .field import cubic_curve
 from .joints import FINGERS, HAND, UPPER_ARM_LENGTH, WRIST_X, joint
 from .quads import DIVISIONS, Divisions, GridBuilder, SheetPosition
 
-# x and the spacing of rings wanted there, metres: close at the elbow, the wrist and in the hand.
+# x and the spacing of rings wanted there, meters: close at the elbow, the wrist and in the hand.
 _SPACING = np.array(
     [
         (-0.030, 0.017),
@@ -141,7 +141,7 @@ def _hand_x(ring: float, x: float, y: np.ndarray) -> np.ndarray:
 
 
 def _outlines(tube: Tube) -> tuple[np.ndarray, np.ndarray]:
-    """(around, 2) places y, z of the addresses: around a circle of radius 1, and in the hand, metres."""
+    """(around, 2) places y, z of the addresses: around a circle of radius 1, and in the hand, meters."""
     d, columns = tube.divisions, _hand_columns(tube)
     corner = np.pi * 0.22
     angle, hand = np.zeros(tube.around), np.zeros((tube.around, 2))

@@ -17,7 +17,7 @@ MIN_PARTITION_VERTICES = 8
 REFINEMENT_POSES = 250
 """Number of poses that are added where a model is worst."""
 REST_THRESHOLD_MM = 0.1
-"""Millimetres per frame. A target is at rest when no vertex moves by more between two frames."""
+"""Millimeters per frame. A target is at rest when no vertex moves by more between two frames."""
 REPEATABILITY_POSES = 10
 """Number of poses that a simulated target reaches a second time, from another direction."""
 

@@ -2,7 +2,7 @@
 """Errors with a message for the user.
 
 Each message is one sentence: what is wrong, with names and numbers, and what to do. The command line prints it and
-exits with status 1, or with `TRY_AGAIN` where the machine caused the error; an operator reports it and is cancelled.
+exits with status 1, or with `TRY_AGAIN` where the machine caused the error; an operator reports it and is canceled.
 Any other exception is a bug and propagates.
 """
 

@@ -45,7 +45,7 @@ def float32_rounding(pose_matrices: np.ndarray) -> float:
 
 
 def joint_features_in_metres(pose_matrices: np.ndarray, rig: Rig) -> np.ndarray:
-    """Compute `joint_features` with translations in metres.
+    """Compute `joint_features` with translations in meters.
 
     A translation that differs by no more than `float32_rounding` is set to its mean.
 

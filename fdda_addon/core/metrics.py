@@ -8,13 +8,13 @@ import numpy as np
 NO_ERROR_METRES = 1e-6
 """Below this error the heat map is green."""
 HEAT_MAP_STOPS = ((NO_ERROR_METRES, (0.10, 0.25, 0.95)), (0.005, (0.60, 0.10, 0.80)), (0.01, (0.95, 0.05, 0.05)))
-"""Error in metres and sRGB color: blue just above no error, violet at 0.5 cm, red at 1 cm and above."""
+"""Error in meters and sRGB color: blue just above no error, violet at 0.5 cm, red at 1 cm and above."""
 NO_ERROR_COLOR = (0.10, 0.70, 0.20)
 
 
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Statistics of distances over vertices and poses, in millimetres."""
+    """Statistics of distances over vertices and poses, in millimeters."""
 
     mean: float
     rms: float
@@ -34,7 +34,7 @@ def distances(first: np.ndarray, second: np.ndarray, metres_per_unit: float = 1.
         metres_per_unit: length of a mesh unit.
 
     Returns:
-        (N, V) float32, metres.
+        (N, V) float32, meters.
     """
     return np.linalg.norm(first - second, axis=-1) * metres_per_unit
 
@@ -43,7 +43,7 @@ def error_statistics(errors: np.ndarray) -> ErrorStatistics:
     """Compute statistics of errors.
 
     Args:
-        errors: distances in metres, any shape, not empty.
+        errors: distances in meters, any shape, not empty.
     """
     mm = np.asarray(errors, np.float64).ravel() * 1000
     p99, p999 = np.percentile(mm, (99, 99.9))
@@ -54,8 +54,8 @@ def heat_colors(errors: np.ndarray, max_error: float = HEAT_MAP_STOPS[-1][0]) ->
     """Compute the heat map colors of errors.
 
     Args:
-        errors: (V,) metres.
-        max_error: metres; this error and larger ones are red.
+        errors: (V,) meters.
+        max_error: meters; this error and larger ones are red.
 
     Returns:
         (V, 3) float32 sRGB, 0 to 1: green below 1e-4 cm, then from blue through violet (half of `max_error`) to red.
@@ -71,7 +71,7 @@ def worst_poses(errors: np.ndarray, count: int, min_index_distance: int) -> list
     """Find the poses with the largest error of a vertex, the worst first.
 
     Args:
-        errors: (N, V) metres.
+        errors: (N, V) meters.
         count: most poses to return.
         min_index_distance: smallest difference of two indices, so that one movement is not reported several times.
 

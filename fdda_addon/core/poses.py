@@ -22,7 +22,7 @@ MAX_MARGIN = 4.0
 LOCKED_AXIS_ANGLE = np.pi / 4
 """Rotation of a locked axis in the margin, radians per unit of the margin's factor above 1."""
 RANGE_TOLERANCE = 1e-4
-"""Radians or metres. Largest difference of two equal ranges, which Blender stores as float32."""
+"""Radians or meters. Largest difference of two equal ranges, which Blender stores as float32."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Channel:
     Attributes:
         name: of the bone, or of the control (`Control.name`).
         kind: `ROTATION` (Euler angle, radians), `ROTATION_VECTOR` (one of three components of axis times angle,
-            radians), `LOCATION` (metres) or `SCALE` (factor) of a bone, relative to the rest pose, or `CONTROL` (the
+            radians), `LOCATION` (meters) or `SCALE` (factor) of a bone, relative to the rest pose, or `CONTROL` (the
             unit of its property).
         axis: 0, 1 or 2; 0 for a control.
         low, high: the range of motion.
@@ -93,7 +93,7 @@ def sample_pose(channels: tuple[Channel, ...], seed: int, index: int, spread: fl
         spread: standard deviation as a ratio of half the range; larger values are closer to uniform.
 
     Returns:
-        (C,) float64, radians or metres, as the channels say.
+        (C,) float64, radians or meters, as the channels say.
     """
     rng = np.random.default_rng([seed, index])
     low, high = np.array([(channel.low, channel.high) for channel in channels]).T

@@ -20,8 +20,8 @@ class Probes:
     """M poses in which a model was compared with its rig.
 
     Attributes:
-        values: (M, C) float64, of the channels, radians or metres.
-        errors: (M, P) largest error of each partition, metres.
+        values: (M, C) float64, of the channels, radians or meters.
+        errors: (M, P) largest error of each partition, meters.
         distances: (M, P) distance to the nearest recorded pose, of the joints that influence each partition, no unit.
     """
 

@@ -18,7 +18,7 @@ STATIC_JOINT_LABEL = "no bone"
 
 MAX_HASH_LENGTH = 128
 REST_MATRIX_TOLERANCE = 1e-4
-"""Largest difference of two equal rest matrices in one element; metres for translations, no unit for rotations.
+"""Largest difference of two equal rest matrices in one element; meters for translations, no unit for rotations.
 
 Versions of Blender compute a bone's matrix with different rounding, so the comparison cannot be exact."""
 
@@ -112,7 +112,7 @@ class Rig:
         face_starts: (F,) int32, first corner of each face in `face_vertices`; empty where faces are unknown.
         face_vertices: (C,) int32, vertex indices of the corners, face by face.
         controls: the inputs beside the joints.
-        metres_per_unit: length in metres of a unit of mesh-object space (a mesh unit).
+        metres_per_unit: length in meters of a unit of mesh-object space (a mesh unit).
     """
 
     joints: tuple[Joint, ...]

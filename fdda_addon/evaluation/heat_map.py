@@ -112,7 +112,7 @@ def colors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
 
 
 def errors_of(mesh_object: bpy.types.Object) -> np.ndarray | None:
-    """Return the errors that the view settings select, (V,) metres; None if there are none at the current frame."""
+    """Return the errors that the view settings select, (V,) meters; None if there are none at the current frame."""
     last, view = last_evaluation.get(mesh_object), bpy.context.window_manager.fdda_view
     if last is None:
         return None

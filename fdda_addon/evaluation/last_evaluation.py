@@ -50,7 +50,7 @@ class LastEvaluation:
         model: file name of the model.
         first_frame: first frame of the action; 0 for random poses.
         seed: seed of the random poses.
-        errors: (N, V) float32, metres, for each of `METHODS`.
+        errors: (N, V) float32, meters, for each of `METHODS`.
         total: statistics of the errors of all vertices, mm, for each of `METHODS`.
         partitions: errors of the partitions, in descending order of the largest error of the model.
         channels: channels of the random poses.
@@ -90,7 +90,7 @@ class LastEvaluation:
             pose: index of this pose.
 
         Returns:
-            (V,) float32, metres; None if there is no such pose.
+            (V,) float32, meters; None if there is no such pose.
         """
         errors = self.errors[method]
         if statistic == "pose":

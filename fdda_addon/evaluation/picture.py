@@ -173,8 +173,8 @@ class _Picture:
         strip_colors = heat_colors(np.linspace(HEAT_MAP_STOPS[0][0], HEAT_MAP_STOPS[-1][0], 64))
         self._add_strip((left, y - box_size), (width, box_size), strip_colors)
         max_metres = HEAT_MAP_STOPS[-1][0]
-        for metres, text in ((0.0, "error 0 cm"), (0.005, "0.5 cm"), (max_metres, "1 cm and above")):
-            label_position = (left + width * metres / max_metres - 0.6 * text_size, y - box_size - 1.2 * text_size)
+        for meters, text in ((0.0, "error 0 cm"), (0.005, "0.5 cm"), (max_metres, "1 cm and above")):
+            label_position = (left + width * meters / max_metres - 0.6 * text_size, y - box_size - 1.2 * text_size)
             self._add_text(text, label_position, 0.9 * text_size)
 
     def _add_strip(self, position: tuple[float, float], size: tuple[float, float], colors: np.ndarray) -> None:

@@ -89,7 +89,7 @@ class PoseErrors:
         pose_matrices: (N, J, 4, 4) float32, mesh-object space, mesh units.
         positions: (N, V, 3) float32, positions of the rig, mesh-object space, mesh units.
         controls: (N, C) float32, values of the controls.
-        fdda, linear: (N, V) float32, distances of the model and of linear skinning from the rig, metres.
+        fdda, linear: (N, V) float32, distances of the model and of linear skinning from the rig, meters.
         fdda_surface, linear_surface: errors of normals and edges; None for a mesh without faces, or if the surface was
             not compared.
     """

@@ -80,7 +80,7 @@ def measured_ranges(armature_object: bpy.types.Object, actions: Iterable[bpy.typ
 
     Returns:
         Ranges of the channels that the actions key and change, relative to the rest pose: `ROTATION` in radians,
-        `LOCATION` in metres, `SCALE` as factors. Rotations are Euler angles as `armature.Poser` sets them: in the
+        `LOCATION` in meters, `SCALE` as factors. Rotations are Euler angles as `armature.Poser` sets them: in the
         rotation order of the bone (XYZ for quaternions and axis angles), continuous beyond half a turn.
     """
     return moving_ranges(keyed_ranges(armature_object, actions))

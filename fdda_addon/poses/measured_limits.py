@@ -41,7 +41,7 @@ class MeasuredLimit:
 
     Attributes:
         bone, kind, axis: as in `Channel`.
-        low, high: the range that was set, or the measured one if it was not; radians, metres or factors.
+        low, high: the range that was set, or the measured one if it was not; radians, meters or factors.
         reason_unset: why the range was not set; empty if it was.
         near_gimbal_lock: the bone rotates less far than its three Euler angles do (`MAX_WIDENING`).
     """
@@ -167,7 +167,7 @@ def _set_range_constraint(bone: bpy.types.PoseBone, kind: str, limits: list[Meas
 
 
 def describe_limits(armature_object: bpy.types.Object, limits: Iterable[MeasuredLimit]) -> list[str]:
-    """Describe the limits in a line for each bone, in degrees and millimetres."""
+    """Describe the limits in a line for each bone, in degrees and millimeters."""
     factors = {ROTATION: 180 / math.pi, LOCATION: 1000 * metres_per_unit(armature_object), SCALE: 1.0}
     limits, by_bone = list(limits), dict[str, list[str]]()
     for limit in limits:

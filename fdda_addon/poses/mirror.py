@@ -13,7 +13,7 @@ from ..scene.temporary_state import set_value
 from ..scene.unit import metres_per_unit
 
 MIN_DISTANCE_TOLERANCE, RELATIVE_DISTANCE_TOLERANCE = 1e-3, 1e-3
-"""Largest distance between an end of a bone and its mirror image: in metres, or relative to the armature's size."""
+"""Largest distance between an end of a bone and its mirror image: in meters, or relative to the armature's size."""
 AXIS_TOLERANCE = 1e-2
 """Largest angle between an axis of a bone and that of its mirror image, radians."""
 
@@ -90,10 +90,10 @@ def _check_symmetric(armature_object: bpy.types.Object, partners: np.ndarray) ->
     flip = np.diag([-1.0, 1.0, 1.0, 1.0])
     images = flip @ matrices[partners] @ flip
     ends = np.concatenate([matrices[:, :3, 3], tails])
-    metres = metres_per_unit(armature_object)
-    size = metres * float(np.ptp(ends, axis=0).max())
+    meters = metres_per_unit(armature_object)
+    size = meters * float(np.ptp(ends, axis=0).max())
     tolerance = max(MIN_DISTANCE_TOLERANCE, RELATIVE_DISTANCE_TOLERANCE * size)
-    distances = metres * np.maximum(
+    distances = meters * np.maximum(
         np.linalg.norm(images[:, :3, 3] - matrices[:, :3, 3], axis=1),
         np.linalg.norm(tails[partners] * [-1, 1, 1] - tails, axis=1),
     )

@@ -61,7 +61,7 @@ def _rotation_range(bone: bpy.types.PoseBone, constraint: bpy.types.Constraint |
 
 
 def location_ranges(bone: bpy.types.PoseBone) -> dict[int, tuple[float, float]]:
-    """Return the ranges, in metres, of the axes that a Limit Location constraint limits on both sides."""
+    """Return the ranges, in meters, of the axes that a Limit Location constraint limits on both sides."""
     return _limited(find_local_limit(bone, "LIMIT_LOCATION"))
 
 
@@ -168,7 +168,7 @@ def ensure_range_constraint(bone: bpy.types.PoseBone, constraint_type: str) -> b
 
 
 def set_constraint_limit(constraint: bpy.types.Constraint, axis: int, low: float, high: float) -> None:
-    """Set the limits of one axis of a Limit constraint, in radians, metres or factors."""
+    """Set the limits of one axis of a Limit constraint, in radians, meters or factors."""
     letter = AXES[axis]
     for name in (f"use_limit_{letter}", f"use_min_{letter}", f"use_max_{letter}"):
         if hasattr(constraint, name):

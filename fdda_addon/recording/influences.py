@@ -29,7 +29,7 @@ from ..scene.scene_rig import SceneRig
 from .joint_override import JointOverride, override_joints
 
 MIN_TRANSFORM_CHANGE = 1e-5
-"""Smallest change of a joint's relative transform between poses that counts as motion (no unit, or metres)."""
+"""Smallest change of a joint's relative transform between poses that counts as motion (no unit, or meters)."""
 MAX_BATCH_MOVES, BATCH_BYTES = 50, 6 << 20
 """Limits of a batch of moves whose residuals are computed together."""
 

@@ -6,12 +6,12 @@ import numpy as np
 
 
 def metres_per_unit(scene_object: bpy.types.Object) -> float:
-    """Compute the length of a unit of an object's space, in metres, with the current scales of scene and object.
+    """Compute the length of a unit of an object's space, in meters, with the current scales of scene and object.
 
     For an object with different scales along its axes, it uses their geometric mean.
 
     Returns:
-        The length, rounded to six digits, which is Blender's single precision, so that a metre is exactly 1.
+        The length, rounded to six digits, which is Blender's single precision, so that a meter is exactly 1.
     """
     settings = bpy.context.scene.unit_settings
     scale = settings.scale_length if settings.system != "NONE" else 1.0

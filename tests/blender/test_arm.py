@@ -49,7 +49,7 @@ def arm(animated) -> tuple[bpy.types.Object, bpy.types.Object]:
 
 
 def evaluated(mesh_object: bpy.types.Object) -> np.ndarray:
-    """(v, 3) float64 metres: the mesh after all its modifiers."""
+    """(v, 3) float64 meters: the mesh after all its modifiers."""
     bpy.context.view_layer.update()
     mesh = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
     positions = np.empty(len(mesh.vertices) * 3)
@@ -104,7 +104,7 @@ def test_no_face_is_folded(surface):
 
 
 def test_it_measures_like_an_arm(surface):
-    """Metres from the shoulder joint to the tip of the middle finger, and the order of the finger tips."""
+    """Meters from the shoulder joint to the tip of the middle finger, and the order of the finger tips."""
     _, arm = surface
     tips = {name: arm.points[arm.joints == JOINT_INDEX[f"{name}_3"], 0].max() for name in FINGERS}
     assert tips["middle"] == pytest.approx(0.30 + 0.26 + 0.19, abs=0.01)
@@ -211,9 +211,9 @@ def test_biceps_bulges_on_the_front_of_the_upper_arm(arm):
 
 
 @pytest.mark.parametrize(
-    ("name", "angle", "millimetres"), [("wrist", 60, 6.0), ("index_1", 70, 5.0), ("elbow", 90, 8.0)]
+    ("name", "angle", "millimeters"), [("wrist", 60, 6.0), ("index_1", 70, 5.0), ("elbow", 90, 8.0)]
 )
-def test_smoothing_changes_the_bent_joint(arm, name, angle, millimetres):
+def test_smoothing_changes_the_bent_joint(arm, name, angle, millimeters):
     mesh_object, rig = arm
     smooth = mesh_object.modifiers["CorrectiveSmooth"]
     assert (smooth.rest_source, smooth.iterations) == ("ORCO", 10)
@@ -221,7 +221,7 @@ def test_smoothing_changes_the_bent_joint(arm, name, angle, millimetres):
     smoothed = evaluated(mesh_object)
     smooth.show_viewport = False
     change = np.linalg.norm(smoothed - evaluated(mesh_object), axis=1)
-    assert change.max() > millimetres * 1e-3
+    assert change.max() > millimeters * 1e-3
     assert np.linalg.norm(rest(mesh_object)[change.argmax()] - joint(name).head) < 0.06
 
 

@@ -20,14 +20,14 @@ class Work:
     """Steps that wait for `go`, one after the other, and end when `cancel` is called."""
 
     def __init__(self, error: BaseException | None = None):
-        self.go, self.cancelled, self.threads, self.error = threading.Event(), threading.Event(), set(), error
+        self.go, self.canceled, self.threads, self.error = threading.Event(), threading.Event(), set(), error
 
     def steps(self) -> Iterator[object]:
         self.threads.add(threading.current_thread())
         yield Progress("waiting", 0, 2)
         while not self.go.wait(0.005):
-            if self.cancelled.is_set():
-                raise FDDAError("It was cancelled; nothing is left of it.")
+            if self.canceled.is_set():
+                raise FDDAError("It was canceled; nothing is left of it.")
         if self.error:
             raise self.error
         yield Progress("going", 1, 2)
@@ -35,7 +35,7 @@ class Work:
 
     def begin(self) -> JobRunner:
         state = JobState("fetch", "Fetching", works_on=ENVIRONMENT)
-        steps = iterate_in_thread(self.steps(), state, self.cancelled.set)
+        steps = iterate_in_thread(self.steps(), state, self.canceled.set)
         return JobRunner(state, steps, lambda result: f"Fetched: {result}.", lambda: "Cancelled.", ends_itself=True)
 
 
@@ -43,7 +43,7 @@ class Work:
 def work() -> Iterator[Work]:
     work = Work()
     yield work
-    work.cancelled.set()
+    work.canceled.set()
 
 
 def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
@@ -85,7 +85,7 @@ def test_cancelled_it_says_so_itself(work):
     assert not run.state.cancel_requested, "that was about the other job"
     request_cancel(ENVIRONMENT)
     until(lambda: run.work(0.01))
-    assert (run.state.outcome, run.state.outcome_level) == ("It was cancelled; nothing is left of it.", "WARNING")
+    assert (run.state.outcome, run.state.outcome_level) == ("It was canceled; nothing is left of it.", "WARNING")
 
 
 def test_an_error_is_its_outcome_and_a_bug_is_raised():
@@ -118,6 +118,6 @@ def test_it_ends_with_the_addon(work):
     run_in_background(run)
     assert not run.work(0)
     fdda_addon.unregister()
-    assert work.cancelled.is_set() and not next(iter(work.threads)).is_alive()
+    assert work.canceled.is_set() and not next(iter(work.threads)).is_alive()
     assert run.state.outcome == "Fetching ended because the add-on was disabled."
     assert not bpy.app.timers.is_registered(background._tick)

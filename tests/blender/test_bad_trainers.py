@@ -186,7 +186,7 @@ def test_a_trainer_that_does_not_stop_is_stopped(tmp_path, monkeypatch):
 
 
 def test_nobody_waits_for_a_trainer_that_is_silent(tmp_path, monkeypatch):
-    """As a window has it: a poll is answered at once, and a cancelled trainer ends without an error."""
+    """As a window has it: a poll is answered at once, and a canceled trainer ends without an error."""
     from fdda_addon.training import process
 
     stand_in_trainer(tmp_path, monkeypatch, STARTED, "time.sleep(3600)")

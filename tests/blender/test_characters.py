@@ -21,7 +21,7 @@ from .conftest import train
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "characters.md"
 PLAYED = 1e-5
-"""Metres: the evaluated mesh is the model's output within this."""
+"""Meters: the evaluated mesh is the model's output within this."""
 NOTHING_MM = 0.01
 """Errors below this are none."""
 MOVED_MM = 10.0

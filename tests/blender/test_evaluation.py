@@ -70,7 +70,7 @@ def test_the_model_is_nearer_than_linear_skinning(report):
 
 
 def by_hand(rig, elbow, channels, seed: int, indices) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (N, V) of model and linear skinning, computed without the evaluation: metres."""
+    """Errors (N, V) of model and linear skinning, computed without the evaluation: meters."""
     arrays = read_rig(rig)
     skinning, network = LinearSkinning(arrays), Network(elbow.model)
     bones, errors = rig.armature_object.pose.bones, ([], [])
@@ -176,7 +176,7 @@ def test_heat_map(elbow, tmp_path):
     assert path.read_bytes().startswith(b"\x89PNG")
     picture = pixels(path)[..., :3]
     assert min(picture.shape[:2]) > 300
-    # Green where there is no error, and colors of the scale that are not: linear skinning is off by millimetres.
+    # Green where there is no error, and colors of the scale that are not: linear skinning is off by millimeters.
     green = (picture[..., 1] > 1.5 * picture[..., 0]) & (picture[..., 1] > 1.5 * picture[..., 2])
     blue = picture[..., 2] > 1.3 * picture[..., 1]
     assert green.mean() > 0.02 and blue.mean() > 0.02

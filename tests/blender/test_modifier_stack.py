@@ -21,7 +21,7 @@ from .modifiers import FEW_POSES, add_modifier_at, add_nodes_at, build_rig
 from .scene_state import assert_same_state, drain, scene_state
 
 MOVES = 0.001
-"""Metres by which a stack moves some vertex, at the least, from where linear skinning has it."""
+"""Meters by which a stack moves some vertex, at the least, from where linear skinning has it."""
 
 
 def residuals(rig: SceneRig, folder: Path) -> np.ndarray:

@@ -59,7 +59,7 @@ class FDDA_OT_count(JobOperator, bpy.types.Operator):  # noqa: N801 - Blender wa
         return f"Counted to {result}."
 
     def cancel_message(self, _context: bpy.types.Context) -> str:
-        return f"Counting cancelled at {self.state.done}."
+        return f"Counting canceled at {self.state.done}."
 
 
 @pytest.fixture(autouse=True)
@@ -104,7 +104,7 @@ def test_a_cancelled_job_gives_back_and_says_how_far_it_came():
     assert bpy.ops.fdda.count(at=2, what="cancel") == {"CANCELLED"}
     assert events == ["given back"]
     state = job.state_of("count")
-    assert (state.outcome, state.outcome_level) == ("Counting cancelled at 2.", "WARNING")
+    assert (state.outcome, state.outcome_level) == ("Counting canceled at 2.", "WARNING")
 
 
 def test_a_bug_propagates_and_does_not_block_the_next_job():

@@ -15,7 +15,7 @@ from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
 
 
 def refused(call, *words: str) -> None:
-    """The operator is cancelled with a report that holds the words."""
+    """The operator is canceled with a report that holds the words."""
     with pytest.raises(RuntimeError) as error:
         call()
     for word in words:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From the sample arm to a model with operators alone, without a window: values, sentences, cancelling and undo."""
+"""From the sample arm to a model with operators alone, without a window: values, sentences, canceling and undo."""
 
 import json
 import math

@@ -40,7 +40,7 @@ def lower(fresh) -> bpy.types.PoseBone:
 
 
 def ranges(rig: SceneRig, bone: str = "lower", kind: str = "rotation") -> dict[int, tuple[float, float]]:
-    """Range by axis of the channels of a bone, in degrees or metres."""
+    """Range by axis of the channels of a bone, in degrees or meters."""
     scale = 180 / math.pi if kind == "rotation" else 1
     return {
         c.axis: (round(c.low * scale, 3), round(c.high * scale, 3))

@@ -12,7 +12,7 @@ from .test_evaluations import handler, keyed
 from .test_renders import FRAME, animation, set_camera, still
 
 OBJ_DIGITS = 2e-6
-"""Metres: an OBJ file has six digits."""
+"""Meters: an OBJ file has six digits."""
 
 
 @pytest.fixture(params=[False, True], ids=["rig in renders", "model in renders"])

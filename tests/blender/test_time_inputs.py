@@ -23,7 +23,7 @@ from .modifiers import FEW_POSES, assert_refused, build_rig
 from .scene_state import assert_same_state, drain, scene_state
 
 APART = 1e-4
-"""Metres by which a surface differs between two frames, at the least, so that a case is one."""
+"""Meters by which a surface differs between two frames, at the least, so that a case is one."""
 
 
 SURFACE = "The surface of 'elbow' changes with time through {}, so it does not follow from the pose; {}."

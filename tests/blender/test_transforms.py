@@ -46,7 +46,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, P
 
 @pytest.fixture(params=TRANSFORMS, ids=lambda build: build.__name__)
 def character(request, trained) -> tuple[bpy.types.Object, Path, float]:
-    """The mesh object with its model bound, the model, and how many units of the mesh make a metre."""
+    """The mesh object with its model bound, the model, and how many units of the mesh make a meter."""
     build: Callable[[], None] = request.param
     rig, model = trained[build.__name__]
     bpy.ops.wm.open_mainfile(filepath=str(rig))

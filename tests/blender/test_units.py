@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Millimetres are millimetres: whatever unit the elbow is built in, and wherever it lies, it gives the same figures."""
+"""Millimeters are millimeters: whatever unit the elbow is built in, and wherever it lies, it gives the same figures."""
 
 import json
 from collections.abc import Callable
@@ -32,8 +32,8 @@ from .conftest import ELBOW, run, train
 
 pytestmark = pytest.mark.one_blender_version
 
-IN_METRES, IN_CENTIMETRES, FROM_FBX = "metres", "centimetres", "FBX"
-IN_MILLIMETRES, IN_KILOMETRES, FAR_AWAY = "millimetres", "kilometres", "100 metres from its origin"
+IN_METRES, IN_CENTIMETRES, FROM_FBX = "meters", "centimeters", "FBX"
+IN_MILLIMETRES, IN_KILOMETRES, FAR_AWAY = "millimeters", "kilometers", "100 meters from its origin"
 BUILDERS: dict[str, Callable[[], object]] = {
     IN_METRES: build_elbow,
     IN_CENTIMETRES: in_centimetres,
@@ -45,7 +45,7 @@ BUILDERS: dict[str, Callable[[], object]] = {
 OTHERS = (IN_CENTIMETRES, FROM_FBX, IN_MILLIMETRES, IN_KILOMETRES, FAR_AWAY)
 METRES_PER_UNIT = {IN_CENTIMETRES: 0.01, FROM_FBX: 0.01, IN_MILLIMETRES: 0.001, IN_KILOMETRES: 1000.0, FAR_AWAY: 1.0}
 STEP = 0.01
-"""Millimetres; what rounding makes 100 metres from the origin."""
+"""Millimeters; what rounding makes 100 meters from the origin."""
 AGREE = 0.2
 """Relative difference of figures: rounding differs with the unit, and a training makes more of it."""
 
@@ -89,36 +89,36 @@ def characters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Character]
     }
 
 
-def assert_agree(own: dict, metres: dict) -> None:
+def assert_agree(own: dict, meters: dict) -> None:
     """Statistics of two evaluations or reports agree."""
     for way in ("fdda", "linear"):
-        for name, value in metres[way].items():
+        for name, value in meters[way].items():
             assert own[way][name] == pytest.approx(value, rel=AGREE, abs=STEP)
 
 
 def test_linear_skinning_of_the_elbow_is_off_by_millimetres(characters):
-    """The elbow is half a metre long."""
+    """The elbow is half a meter long."""
     assert 0.5 < characters[IN_METRES].evaluation["linear"]["mean"] < 10
 
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_evaluations_agree(characters, name):
-    own, metres = characters[name].evaluation, characters[IN_METRES].evaluation
-    assert_agree(own, metres)
-    for partition, expected in zip(own["partitions"], metres["partitions"], strict=True):
+    own, meters = characters[name].evaluation, characters[IN_METRES].evaluation
+    assert_agree(own, meters)
+    for partition, expected in zip(own["partitions"], meters["partitions"], strict=True):
         assert_agree(partition, expected)
     # Of the same poses: nothing but rounding is between them.
     step = STEP if name == FAR_AWAY else 0
-    assert own["linear"]["mean"] == pytest.approx(metres["linear"]["mean"], rel=1e-3, abs=step)
+    assert own["linear"]["mean"] == pytest.approx(meters["linear"]["mean"], rel=1e-3, abs=step)
 
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_trainings_agree(characters, name):
     """Held-out errors, curves and parity, and as many shapes with the default tolerance."""
-    own, metres = characters[name].report, characters[IN_METRES].report
-    assert_agree(*({way: report[way]["held_out"] for way in ("fdda", "linear")} for report in (own, metres)))
+    own, meters = characters[name].report, characters[IN_METRES].report
+    assert_agree(*({way: report[way]["held_out"] for way in ("fdda", "linear")} for report in (own, meters)))
     assert own["parity"] < (10 * STEP if name == FAR_AWAY else 0.01)
-    for partition, expected in zip(own["partitions"], metres["partitions"], strict=True):
+    for partition, expected in zip(own["partitions"], meters["partitions"], strict=True):
         assert abs(partition["basis"] - expected["basis"]) <= 2
         assert partition["truncation"] == pytest.approx(expected["truncation"], rel=AGREE)
         for curve in ("training", "validation"):
@@ -127,13 +127,13 @@ def test_trainings_agree(characters, name):
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_files_say_their_unit_and_hold_units(characters, name):
-    own, metres = (read_recording(characters[n].recording) for n in (name, IN_METRES))
+    own, meters = (read_recording(characters[n].recording) for n in (name, IN_METRES))
     unit = METRES_PER_UNIT[name]
     assert own.rig.metres_per_unit == read_model_info(characters[name].model).metres_per_unit
     assert own.rig.metres_per_unit == pytest.approx(unit, rel=1e-6)
     if name != FAR_AWAY:
-        np.testing.assert_allclose(unit * own.rig.rest_positions, metres.rig.rest_positions, rtol=1e-5, atol=1e-7)
-    np.testing.assert_allclose(unit * own.residuals, metres.residuals, atol=1e-4)
+        np.testing.assert_allclose(unit * own.rig.rest_positions, meters.rig.rest_positions, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(unit * own.residuals, meters.residuals, atol=1e-4)
 
 
 def test_files_of_a_character_in_metres_say_nothing(characters):
@@ -172,7 +172,7 @@ def test_the_heat_map_shows_millimetres(characters, name):
 
 
 @pytest.mark.parametrize(
-    ("system", "unit_scale", "scale", "metres"),
+    ("system", "unit_scale", "scale", "meters"),
     [
         ("METRIC", 1.0, (1.0, 1.0, 1.0), 1.0),
         ("METRIC", 0.01, (1.0, 1.0, 1.0), 0.01),
@@ -184,14 +184,14 @@ def test_the_heat_map_shows_millimetres(characters, name):
         ("METRIC", 1.0, (2.0, 4.0, 8.0), 4.0),
     ],
 )
-def test_the_unit_is_that_of_scene_and_object(system, unit_scale, scale, metres):
+def test_the_unit_is_that_of_scene_and_object(system, unit_scale, scale, meters):
     build_elbow()
     settings, mesh_object = bpy.context.scene.unit_settings, bpy.data.objects[ELBOW]
     settings.system, settings.scale_length = system, unit_scale
     # Of its parent's too, and however it is turned.
     mesh_object.parent.scale, mesh_object.parent.rotation_euler = scale, (1.0, 0.5, -2.0)
     bpy.context.view_layer.update()
-    assert metres_per_unit(mesh_object) == metres
+    assert metres_per_unit(mesh_object) == meters
 
 
 def test_a_copy_that_is_scaled_up_has_the_figures_of_its_model(characters):

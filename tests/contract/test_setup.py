@@ -30,6 +30,7 @@ def load_script(name: str) -> ModuleType:
 
 environment = load_script("environment")
 package = load_script("package")
+retired_words = load_script("retired_words")
 posix_only = pytest.mark.skipif(WINDOWS, reason="setup/environment is a POSIX shell script.")
 
 
@@ -303,3 +304,17 @@ def test_a_package_that_is_too_large_is_refused(tmp_path: Path):
         file.truncate(61_000_000)
     with pytest.raises(package.PackageError, match=r"large\.zip has 61 MB and may have 60; look for"):
         package.check_size(zip_path)
+
+
+def test_retired_words_are_found_in_prose_only():
+    # The words are composed, because the search for retired words reads this file too.
+    length, state = "met" + "res", "cancel" + "led"
+    text = f"100 {length}, {length}_per_unit, --{length}-per-unit\n{state}, '{state.upper()}', \"{state}\", is_{state}"
+    assert [match[:2] for match in retired_words.find_retired_words(text)] == [(1, length), (2, state)]
+
+
+def test_retired_words_are_searched_in_scripts_and_settings():
+    names = {path.relative_to(ROOT).as_posix() for path in retired_words.list_files()}
+    assert names >= {"Makefile", "pyproject.toml", ".ci/run", "setup/environment", "setup/windows/launcher.c"}
+    assert names >= {"examples/web/src/main.js", "farm/flamenco_job/fdda_characters.js", "README.md"}
+    assert not any("__pycache__" in name or "node_modules" in name for name in names)

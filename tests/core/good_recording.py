@@ -17,7 +17,7 @@ from fdda_addon.core.skinning import LinearSkinning
 
 JOINTS = (Joint("root", -1), Joint("upper", 0), Joint("lower", 1), Joint("hand", 2))
 BONE_LENGTH, RADIUS = 0.25, 0.05
-"""Sizes of the tube, metres."""
+"""Sizes of the tube, meters."""
 CONTROLS = (Control("shape_keys", 'key_blocks["Bulge"].value', 0.0, 1.0),)
 ROTATION_LIMIT = 0.8
 """Each joint rotates about X between minus and plus this angle, radians."""

@@ -241,9 +241,9 @@ def test_texts_of_warnings_and_lists():
 
 def test_lengths_are_formatted_in_meters_for_any_unit(clean_recording):
     texts = ["0.04 mm", "87 mm", "250 mm", "1.23 m"]
-    for metres in (1.0, 0.01):
-        rig = with_rig(clean_recording, metres_per_unit=metres).rig
-        assert [format_length(rig, m / metres) for m in (0.00004, 0.0871, 0.25, 1.234)] == texts
+    for meters in (1.0, 0.01):
+        rig = with_rig(clean_recording, metres_per_unit=meters).rig
+        assert [format_length(rig, m / meters) for m in (0.00004, 0.0871, 0.25, 1.234)] == texts
 
 
 def test_every_warning_is_documented():

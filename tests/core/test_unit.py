@@ -31,12 +31,12 @@ def record_in_unit(path, metres_per_unit: float, complete: int = 6, resume: bool
 
 
 def test_a_recording_stores_its_unit(tmp_path):
-    centimetres = read_recording(record_in_unit(tmp_path / "centimetres", 0.01))
-    assert centimetres.rig.metres_per_unit == 0.01
-    metres = read_recording(record_in_unit(tmp_path / "metres", 1.0))
-    assert metres.rig.metres_per_unit == 1.0
+    centimeters = read_recording(record_in_unit(tmp_path / "centimeters", 0.01))
+    assert centimeters.rig.metres_per_unit == 0.01
+    meters = read_recording(record_in_unit(tmp_path / "meters", 1.0))
+    assert meters.rig.metres_per_unit == 1.0
     for name in ("pose_matrices", "residuals"):
-        assert np.array_equal(getattr(centimetres, name), getattr(metres, name))
+        assert np.array_equal(getattr(centimeters, name), getattr(meters, name))
 
 
 @pytest.mark.parametrize("metres_per_unit", [1.0, 1 + 5e-7, 1 - 5e-7])

@@ -93,7 +93,7 @@ def blender_pose(info: dict, turns: Turns) -> np.ndarray:
 
 
 def expected_positions(model: Path, turns: Turns, controls: tuple[float, ...] = ()) -> np.ndarray:
-    """(V, 3), what the add-on's runtime says of a pose, metres."""
+    """(V, 3), what the add-on's runtime says of a pose, meters."""
     from fdda_addon.runtime.network import Network
 
     network = Network(model)

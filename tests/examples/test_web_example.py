@@ -38,7 +38,7 @@ class Shown:
 
     Attributes:
         state, status: "ready" or "failed", and the sentence.
-        positions: (V, 3) float32, metres; empty before the first.
+        positions: (V, 3) float32, meters; empty before the first.
         joints: names to choose from.
         sliders: how many there are.
         requests: addresses that were fetched.

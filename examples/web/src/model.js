@@ -22,7 +22,7 @@ export class Model {
    * Deform the mesh.
    *
    * @param {Pose} pose
-   * @returns `positions`, Float32Array of V times x, y, z in mesh-object space, metres, and `confidence`, the lowest of the
+   * @returns `positions`, Float32Array of V times x, y, z in mesh-object space, meters, and `confidence`, the lowest of the
    *     partitions, 0 to 1
    */
   async run(pose) {

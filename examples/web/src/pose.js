@@ -25,7 +25,7 @@ export class Pose {
     this.values = this.controls.map(atRest);
   }
 
-  /** Pose matrices of the joints, mesh-object space, metres; every parent stands before its children. */
+  /** Pose matrices of the joints, mesh-object space, meters; every parent stands before its children. */
   matrices() {
     const posed = [];
     this.joints.forEach(({ parent }, joint) => {

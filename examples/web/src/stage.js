@@ -35,7 +35,7 @@ export class Stage {
   /**
    * @param {HTMLCanvasElement} canvas fills its parent
    * @param {Uint32Array} triangles three vertices each
-   * @param {Float32Array} positions the rest pose, metres
+   * @param {Float32Array} positions the rest pose, meters
    */
   constructor(canvas, triangles, positions) {
     this.renderer = new WebGLRenderer({ canvas, antialias: true });
@@ -79,7 +79,7 @@ export class Stage {
     attribute.array.set(positions);
     attribute.needsUpdate = true;
     this.geometry.computeVertexNormals();
-    // The joint may be scaled, as in a rig that was built in centimetres; its axes keep their length.
+    // The joint may be scaled, as in a rig that was built in centimeters; its axes keep their length.
     const columns = [new Vector3(), new Vector3(), new Vector3()];
     joint.extractBasis(...columns);
     this.axes.matrix.makeBasis(...columns.map((column) => column.normalize())).copyPosition(joint);

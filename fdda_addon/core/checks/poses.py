@@ -13,7 +13,7 @@ from .warning import RecordingWarning, format_length, format_with_noun
 _SOURCE_LABELS = {ACTION: "the action", STRIP: "the strip", MIRRORED: "the mirrored"}
 """Labels of the sources of frames in messages."""
 POSE_TOLERANCE = 1e-5
-"""Poses are equal when their elements (metres, no unit, or a control's unit) round to the same multiple of this."""
+"""Poses are equal when their elements (meters, no unit, or a control's unit) round to the same multiple of this."""
 MAX_REPEATED_RATIO = 0.05
 """Ratio of the poses that may repeat others, because the last frame of a loop equals its first."""
 MAX_COMPARED_PAIRS = 200

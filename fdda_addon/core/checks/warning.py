@@ -65,7 +65,7 @@ def joint_name(rig: Rig, joint: int) -> str:
 
 def format_length(rig: Rig, units: float) -> str:
     """Format a length in mesh units: "0.04 mm", "87 mm", "1.2 m"."""
-    metres = units * rig.metres_per_unit
-    if metres < 1:
-        return f"{metres * 1000:.2g} mm" if metres < 0.1 else f"{metres * 1000:.0f} mm"
-    return f"{metres:.3g} m"
+    meters = units * rig.metres_per_unit
+    if meters < 1:
+        return f"{meters * 1000:.2g} mm" if meters < 0.1 else f"{meters * 1000:.0f} mm"
+    return f"{meters:.3g} m"
