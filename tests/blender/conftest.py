@@ -154,6 +154,15 @@ def refusal_on_a_full_disk(tmp_path: Path, capsys: pytest.CaptureFixture):
 
 
 @pytest.fixture
+def preferences() -> Iterator[bpy.types.AddonPreferences]:
+    """The preferences of the add-on. Without installation, tests add them."""
+    addon = bpy.context.preferences.addons.new()
+    addon.module = "fdda_addon"
+    yield addon.preferences
+    bpy.context.preferences.addons.remove(addon)
+
+
+@pytest.fixture
 def loose_model(elbow: ElbowFiles) -> Path:
     """Return a copy of the elbow's model that plays with any modifiers."""
     return without_deformation(elbow.model)
@@ -164,6 +173,14 @@ def rig(elbow: ElbowFiles) -> SceneRig:
     """Open the elbow's file, and return its rig."""
     bpy.ops.wm.open_mainfile(filepath=str(elbow.rig))
     return find_rig()
+
+
+@pytest.fixture
+def saved(rig: SceneRig, tmp_path: Path) -> SceneRig:
+    """The elbow, active, in a .blend file of its own."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elbow.blend"))
+    bpy.context.view_layer.objects.active = rig.mesh_object
+    return rig
 
 
 @pytest.fixture

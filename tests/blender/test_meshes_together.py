@@ -60,8 +60,7 @@ def test_one_button_records_trains_and_binds(two):
     assert two[0].fdda.packed.session_uid != before
 
 
-@pytest.mark.slow
-def test_one_button_for_all_meshes(two):
+def test_one_button_records_trains_and_binds_all_meshes(two):
     assert bpy.ops.fdda.build_model(all_meshes=True) == {"FINISHED"}
     assert all(mesh_object.fdda.mode == "FDDA" for mesh_object in two)
 

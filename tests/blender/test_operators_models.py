@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The operators of the section Model Library: several models of a mesh, packed and checked."""
+"""The operators of the section Model Library: several models of a mesh, and changes of the rig since their training."""
 
 import shutil
 from pathlib import Path
@@ -8,9 +8,7 @@ import bpy
 import numpy as np
 import pytest
 
-from fdda_addon.core.errors import ModelError
 from fdda_addon.models.entries import bound_entry, format_file_size
-from fdda_addon.runtime import packed_model
 from fdda_addon.runtime.binding import bind
 from fdda_addon.timing import frame_times
 
@@ -23,14 +21,6 @@ from .test_operators_playback import refused
 def second(elbow, tmp_path):
     """Another model of the elbow: the same, under another name, outside the folder of its file."""
     return Path(shutil.copy(elbow.model, tmp_path / "second.onnx"))
-
-
-@pytest.fixture
-def packed_elbow(bound, elbow):
-    """The bound elbow with its model packed, in a file of its own."""
-    bpy.context.view_layer.objects.active = bound
-    bpy.ops.fdda.pack_model()
-    return bound
 
 
 def test_switching_between_models(rig, elbow, second):
@@ -73,126 +63,6 @@ def test_a_model_of_another_rig_is_not_added(rig, elbow):
 def test_an_index_that_is_none(bound):
     bpy.context.view_layer.objects.active = bound
     refused(lambda: bpy.ops.fdda.check_model(index=3), "has 1 models and none with index 3")
-
-
-def test_packed_model_plays_without_its_file(packed_elbow, elbow, tmp_path):
-    entry = packed_elbow.fdda.models[0]
-    assert entry.packed_bytes == elbow.model.stat().st_size and not entry.packed.use_fake_user
-    pose(angle=0.9)
-    assert_plays(packed_elbow, elbow.model)
-    refused(bpy.ops.fdda.pack_model, "is already packed")
-    path = tmp_path / "alone.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    bpy.ops.wm.open_mainfile(filepath=str(path))
-    mesh_object = bpy.data.objects[ELBOW]
-    pose(angle=1.4)
-    assert_plays(mesh_object, elbow.model)
-    assert bytes(packed_model.read(mesh_object.fdda.packed)) == elbow.model.read_bytes()
-
-
-def test_a_refused_find_model_changes_nothing(packed_elbow, elbow, tmp_path):
-    """The model of another rig, and a file that is none."""
-    other = tmp_path / "other.onnx"
-    shutil.copy(elbow.model, other)
-    (tmp_path / "none.onnx").write_bytes(b"no model")
-    entry = packed_elbow.fdda.models[0]
-    before = entry.name, entry.path, entry.packed, entry.packed_bytes, packed_elbow.fdda.model_index
-    paint_weight()
-    for name, words in (("other.onnx", "the skin weights differ"), ("none.onnx", "is not a model")):
-        refused(lambda name=name: bpy.ops.fdda.relink(filepath=str(tmp_path / name)), words)
-        (entry,) = packed_elbow.fdda.models
-        assert before == (entry.name, entry.path, entry.packed, entry.packed_bytes, packed_elbow.fdda.model_index)
-        assert packed_elbow.fdda.packed == entry.packed and packed_elbow.fdda.is_bound
-    # Of a model that is in no list, none is made.
-    packed_elbow.fdda.models.clear()
-    refused(lambda: bpy.ops.fdda.relink(filepath=str(other)), "the skin weights differ")
-    assert not packed_elbow.fdda.models and packed_elbow.fdda.is_bound
-
-
-def test_undo_with_a_packed_model(packed_elbow, elbow):
-    bpy.ops.ed.undo_push(message="packed")
-    pose(angle=0.9)
-    bpy.ops.ed.undo_push(message="posed")
-    bpy.ops.ed.undo()
-    pose(angle=1.3)
-    assert_plays(bpy.data.objects[ELBOW], elbow.model)
-    assert bpy.data.objects[ELBOW].fdda.packed is not None
-
-
-def test_unbinding_and_binding_a_packed_model(packed_elbow, elbow):
-    bpy.ops.fdda.unbind()
-    assert len(bpy.data.texts) == 1
-    bpy.ops.fdda.bind()
-    pose(angle=1.0)
-    assert_plays(packed_elbow, elbow.model)
-    assert packed_elbow.fdda.packed is not None
-    bpy.ops.fdda.measure_model(frames=5)
-    assert packed_elbow.fdda.packed is not None and packed_elbow.fdda.is_bound
-
-
-def test_borrowing_gives_a_packed_model_back(packed_elbow, elbow, second):
-    from pathlib import Path
-
-    from fdda_addon.runtime.binding import temporary_binding
-    from fdda_addon.scene.scene_rig import find_rig
-
-    before = packed_elbow.fdda.model
-    with temporary_binding(find_rig(), Path(second)):
-        assert packed_elbow.fdda.packed is None
-    assert packed_elbow.fdda.packed is not None and packed_elbow.fdda.model == before
-    assert bound_entry(packed_elbow) is not None
-
-
-def test_unpack_writes_what_was_packed_and_removes_it(packed_elbow, elbow, tmp_path):
-    path = tmp_path / "out.onnx"
-    path.write_bytes(b"another")
-    refused(lambda: bpy.ops.fdda.unpack_model(filepath=str(path)), "There is another file", "choose another name")
-    path.unlink()
-    bpy.ops.fdda.unpack_model(filepath=str(path))
-    assert path.read_bytes() == elbow.model.read_bytes()
-    assert not bpy.data.texts and packed_elbow.fdda.packed is None
-    pose(angle=1.1)
-    assert_plays(packed_elbow, path)
-    refused(bpy.ops.fdda.unpack_model, "is not packed")
-
-
-def test_unpack_beside_the_file_where_the_same_model_lies(packed_elbow, elbow):
-    bpy.ops.fdda.unpack_model()
-    assert packed_elbow.fdda.model == "//elbow.onnx"
-    pose(angle=1.1)
-    assert_plays(packed_elbow, elbow.model)
-
-
-def test_removing_a_packed_model_deletes_it(packed_elbow):
-    bpy.ops.fdda.remove_model()
-    assert not bpy.data.texts
-
-
-def test_a_packed_model_passes_the_same_checks(packed_elbow, elbow):
-    packed_elbow.fdda.packed[packed_model.PACKED_MODEL_KEY] = b"\x08\x08" + elbow.model.read_bytes()[:100]
-    path = elbow.bound.with_name("damaged.blend")
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    bpy.ops.wm.open_mainfile(filepath=str(path))
-    mesh_object = bpy.data.objects[ELBOW]
-    bpy.context.view_layer.update()
-    assert "is not a model" in mesh_object.fdda.status and mesh_object.fdda.mode == "RIG"
-    del mesh_object.fdda.packed[packed_model.PACKED_MODEL_KEY]
-    with pytest.raises(ModelError, match="does not hold a model any more"):
-        packed_model.read(mesh_object.fdda.packed)
-    with pytest.raises(ModelError, match="is not a model"):
-        packed_model.pack("text", b"no model")
-
-
-def test_a_packed_model_is_appended_with_its_object(packed_elbow, elbow, tmp_path):
-    path = tmp_path / "library.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    with bpy.data.libraries.load(str(path)) as (_, wanted):
-        wanted.objects = [ELBOW, ELBOW_RIG]
-    for appended in wanted.objects:
-        bpy.context.scene.collection.objects.link(appended)
-    pose(angle=1.2)
-    assert_plays(wanted.objects[0], elbow.model)
 
 
 def move_vertex() -> None:

@@ -151,7 +151,7 @@ def test_a_model_that_was_moved_is_found_again(elbow, tmp_path):
     assert_plays(mesh_object, tmp_path / "moved.onnx")
 
 
-def test_trust_is_what_the_model_says_and_asked_once_a_pose(bound, elbow, monkeypatch):
+def test_confidence_is_the_model_s_and_computed_once_per_pose(bound, elbow, monkeypatch):
     pose(angle=0.3)
     inside = confidence.partition_confidence(bound)
     assert sorted(name for name, _ in inside) == ["lower", "upper"]

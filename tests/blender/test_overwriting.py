@@ -86,14 +86,14 @@ def test_a_verb_refuses(place, capfd, monkeypatch, line, path, kind):
     assert Refusal(place, capfd)(*line.split()) == f"Cannot write '{Path(path)}': {words}"
 
 
-def test_a_point_cache_beside_is_looked_at_too(place, capfd, monkeypatch):
+def test_the_point_cache_beside_a_baked_file_is_checked_too(place, capfd, monkeypatch):
     monkeypatch.chdir(place)
     (place / "out.pc2").write_text("mine")
     text = Refusal(place, capfd)("bake", "rig.blend", "m.onnx", "out.blend")
     assert text == f"Cannot write 'out.pc2': {IS_OTHER.format('a point cache')}"
 
 
-def test_the_report_and_the_weights_are_looked_at_too(place, capfd, monkeypatch):
+def test_report_and_checkpoint_are_checked_too(place, capfd, monkeypatch):
     monkeypatch.chdir(place)
     for name, kind in (
         ("report.json", "a training report"),
@@ -141,12 +141,11 @@ def done(line: str) -> bool:
     return run(*line.split()) == 0
 
 
-@pytest.mark.slow
-def test_what_a_verb_wrote_before_it_writes_again(place, monkeypatch):
+def test_verbs_overwrite_what_they_wrote_before(place, monkeypatch):
     monkeypatch.chdir(place)
     verbs = (
         "check-recording recording --json w.json",
-        "train recording new.onnx --epochs 2",
+        "train recording new.onnx --epochs 1",
         "bind rig.blend m.onnx bound.blend",
         "evaluate rig.blend m.onnx --json e.json --poses 2 --heatmap e.png",
         "benchmark rig.blend m.onnx --json b.json --frames 2",
@@ -159,8 +158,7 @@ def test_what_a_verb_wrote_before_it_writes_again(place, monkeypatch):
     assert left == []
 
 
-@pytest.mark.slow
-def test_a_verb_that_is_told_to_overwrites(place, monkeypatch):
+def test_verbs_overwrite_files_of_another_kind_with_overwrite(place, monkeypatch):
     monkeypatch.chdir(place)
     assert done("evaluate rig.blend m.onnx --json notes.txt --poses 2 --overwrite")
     assert json.loads((place / "notes.txt").read_text())["unit"] == "mm"

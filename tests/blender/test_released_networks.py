@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Files that are opened one after the other leave no network behind: each has some twenty format_file_size."""
+"""Files that are opened one after the other release their networks, about 20 MB each."""
 
 import gc
 import shutil
@@ -14,8 +14,6 @@ from fdda_addon.runtime.model_files import network_of
 from fdda_addon.scene.blend_file import save_copy
 
 from .conftest import ELBOW, assert_plays
-
-pytestmark = pytest.mark.one_blender_version
 
 
 def opened(path) -> weakref.ref:

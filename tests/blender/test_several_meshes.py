@@ -26,8 +26,6 @@ from .command_output import CommandOutput, output_of
 from .conftest import assert_plays, pose, run
 from .refusals import Refusal, file_contents
 
-pytestmark = pytest.mark.one_blender_version
-
 BODY, SLEEVE = "elbow", "sleeve"
 POSES = 60
 

@@ -28,6 +28,7 @@ from .test_targets import built, complex_positions, of_flesh, recorded
 
 SIMULATIONS = (targets.target_soft_body, targets.target_cloth, targets.target_geometry_nodes)
 ROOT = Path(__file__).resolve().parents[2]
+SLOW_SIMULATIONS = [pytest.param(build, marks=pytest.mark.slow) for build in SIMULATIONS[:2]]
 SETTLED = ("--target", "flesh", "--max-settle-frames", 80)
 
 
@@ -125,8 +126,7 @@ def test_a_simulation_that_does_not_move(refusal, tmp_path):
     assert refused(refusal, rig).startswith("The target 'flesh' does not move while 'elbow' does, by ")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("build", SIMULATIONS)
+@pytest.mark.parametrize("build", [*SLOW_SIMULATIONS, targets.target_geometry_nodes])
 def test_a_settled_pose_depends_on_the_pose_alone(build, tmp_path):
     rig = built(build, tmp_path / "rig.blend")
     recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 6)
@@ -200,9 +200,18 @@ def test_a_settled_model_is_evaluated_against_settled_poses(tmp_path, capfd):
     assert run("evaluate", rig, model, *options) == 0
     found = json.loads(errors.read_text())
     assert found["fdda"]["mean"] < found["linear"]["mean"]
+
+
+def test_the_training_report_has_the_repeatability_of_settled_poses(tmp_path):
+    rig = built(targets.target_geometry_nodes, tmp_path / "rig.blend")
+    recording = recorded(rig, tmp_path / "recording", *SETTLED, "--poses", 12, "--repeatability-poses", 2)
+    model, errors = tmp_path / "elbow.onnx", tmp_path / "errors.json"
+    train(recording.path, model, "--epochs", 2, "--hidden", 8)
     report = json.loads((tmp_path / "report.json").read_text())
-    assert report["repeatability"] == repeatability.to_json()
+    assert report["repeatability"] == recording.info.repeatability.to_json()
     assert "two ways to the same pose" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert run("evaluate", rig, model, "--object", "elbow", *SETTLED, "--poses", 2, "--json", errors) == 0
+    assert json.loads(errors.read_text())["fdda"]["mean"] > 0
 
 
 @pytest.mark.slow
@@ -215,7 +224,7 @@ def test_cloth_that_folds_one_way_or_the_other_is_named(tmp_path, capfd):
     assert "hysteresis" in out and "mm from itself when the same pose is reached from another direction" in out
 
 
-def test_repeats_are_measured_once_and_again_where_they_are_missing(tmp_path):
+def test_repeatability_is_measured_once_and_only_where_it_is_missing(tmp_path):
     rig = built(targets.target_geometry_nodes, tmp_path / "rig.blend")
     options = ["--object", "elbow", *SETTLED, "--poses", 6]
     assert run("record", rig, tmp_path / "recording", *options, "--repeatability-poses", 0) == 0

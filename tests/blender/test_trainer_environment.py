@@ -23,8 +23,6 @@ from .conftest import run
 from .stand_ins import write_program
 from .tiny_wheels import pinned_version, write_wheel, write_wheels
 
-pytestmark = pytest.mark.one_blender_version
-
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -59,15 +57,6 @@ def own(made: Path, user: Path) -> Path:
     return folder.environment_folder()
 
 
-@pytest.fixture
-def preferences():
-    """The preferences, as an installed extension has them."""
-    addon = bpy.context.preferences.addons.new()
-    addon.module = "fdda_addon"
-    yield addon.preferences
-    bpy.context.preferences.addons.remove(addon)
-
-
 def create(**options: str) -> set[str]:
     return bpy.ops.fdda.create_trainer_environment(python=sys.executable, **options)
 
@@ -95,8 +84,9 @@ def test_it_is_created_from_a_folder_of_wheels(user: Path, wheels: Path):
     assert not (folder.environment_folder() / "temporary").exists()
 
 
-@pytest.mark.slow
-def test_the_other_pythons_come_first(own: Path, preferences, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_preferences_and_variable_come_before_the_own_environment(
+    own: Path, preferences, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     assert choice.select_python() == (str(folder.interpreter_path(own)), Origin.OWN)
     monkeypatch.setenv(choice.PYTHON_VARIABLE, "/of/the/variable")
     assert choice.select_python() == ("/of/the/variable", Origin.VARIABLE)
@@ -152,6 +142,7 @@ def test_packages_that_do_not_work_are_no_environment(user: Path, wheels: Path, 
     assert session.environment_state() is FolderState.MISSING
 
 
+@pytest.mark.one_blender_version
 def test_a_folder_without_wheels_leaves_what_is_there(own: Path, tmp_path: Path):
     assert refused(create, wheels=str(tmp_path)).startswith(f"The folder '{tmp_path}' lacks the packages ")
     missing = tmp_path / "none"
@@ -169,6 +160,7 @@ def test_offline_it_asks_for_wheels(user: Path, preferences, tmp_path: Path):
     assert "lacks the packages matplotlib" in refused(create)
 
 
+@pytest.mark.one_blender_version
 def test_a_full_disk_is_noticed_before(user: Path, own: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(creation, "MIN_FREE_GB", 10**9)
     with pytest.raises(TrainerEnvironmentError, match=r"needs 1000000000 GB and '.*' has [\d.]+ GB left; make room"):
@@ -194,6 +186,7 @@ def test_a_python_that_cannot_make_one(user: Path, wheels: Path, tmp_path: Path)
     )
 
 
+@pytest.mark.one_blender_version
 def test_a_second_blender_waits(user: Path, own: Path):
     code = "import sys; from pathlib import Path; from fdda_addon.training.environment.folder import creation_lock\n"
     code += "with creation_lock(Path(sys.argv[1])): print('mine', flush=True); sys.stdin.read()"
@@ -238,6 +231,7 @@ def test_cancelled_it_ends_at_once_and_leaves_nothing(user: Path, wheels: Path):
     assert not bpy.ops.fdda.cancel_trainer_environment.poll()
 
 
+@pytest.mark.one_blender_version
 def test_cancelled_before_it_begins_it_leaves_what_is_there(own: Path, wheels: Path):
     job = EnvironmentCreation(own, folder.log_path(), wheels, sys.executable)
     job.cancel()
@@ -284,6 +278,7 @@ def test_an_environment_whose_torch_is_gone(own: Path):
     assert session.check_result.level == "ERROR" and "torch is missing" in session.check_result.details
 
 
+@pytest.mark.one_blender_version
 def test_an_environment_of_other_versions_still_trains(own: Path):
     (own / folder.COMPLETION_MARKER).write_text("of another time\n")
     assert session.environment_state() is FolderState.OUTDATED
@@ -292,6 +287,7 @@ def test_an_environment_of_other_versions_still_trains(own: Path):
     assert folder.folder_state(own) is FolderState.INCOMPLETE
 
 
+@pytest.mark.one_blender_version
 def test_an_environment_that_cannot_be_removed_is_incomplete(own: Path, monkeypatch: pytest.MonkeyPatch):
     def rmtree(path: object, ignore_errors: bool = False) -> None:
         if not ignore_errors:

@@ -22,8 +22,6 @@ from .conftest import run
 from .stand_ins import write_program
 from .tiny_wheels import TORCH
 
-pytestmark = pytest.mark.one_blender_version
-
 ROOT = Path(__file__).resolve().parents[2]
 ADVICE = "do this"
 
@@ -221,6 +219,7 @@ def windows_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.one_blender_version
 def test_pythons_of_windows_are_looked_for(windows_folders: Path):
     """Of python.org for one and for all, the launcher, uv and pyenv-win; never the Store's, which opens the shop."""
     found = [
@@ -256,6 +255,7 @@ def test_a_python_of_the_registry_is_found(tmp_path: Path):
             winreg.DeleteKey(winreg.HKEY_CURRENT_USER, name)
 
 
+@pytest.mark.one_blender_version
 def test_paths_that_are_too_long_for_windows_are_noticed_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     extension = r"AppData\Roaming\Blender Foundation\Blender\5.2\extensions\.user\user_default\fdda\trainer"
     temporary = r"AppData\Local\Temp\fdda-12345678"
@@ -271,6 +271,7 @@ def test_paths_that_are_too_long_for_windows_are_noticed_before(tmp_path: Path, 
     assert not (tmp_path / "trainer").exists()
 
 
+@pytest.mark.one_blender_version
 def test_the_packages_are_what_the_trainer_asks_for():
     groups = tomllib.loads((ROOT / "pyproject.toml").read_text())["dependency-groups"]
     assert sorted(folder.PACKAGES) == sorted(requirement.partition("==")[0] for requirement in groups["trainer"])

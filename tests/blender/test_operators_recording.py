@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The operators that record and delete a recording, without a window: settings, cancellation and refusals."""
+
+import json
+import os
+import socket
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from fdda_addon.core.recording.index import read_index
+from fdda_addon.core.recording.lock import LOCK_NAME
+from fdda_addon.core.recording.lock import _lock as lock_file
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.jobs import job
+from fdda_addon.scene.scene_rig import SceneRig
+
+from .scene_state import assert_same_state, scene_state
+
+
+def recorded_folder(tmp_path: Path) -> Path:
+    return tmp_path / "elbow_recording"
+
+
+def record(rig: SceneRig, poses: int = 20, **options) -> set[str]:
+    rig.mesh_object.fdda.settings.poses = poses
+    return bpy.ops.fdda.record(**options)
+
+
+def test_what_the_settings_say_is_recorded_beside_the_file(saved, tmp_path):
+    settings = saved.mesh_object.fdda.settings
+    settings.seed, settings.spread = 5, 0.75
+    bpy.data.actions["elbow_wave"].fdda.record = True
+    bpy.data.actions.new("of something else").fdda.record = True
+    before = scene_state(saved)
+    assert record(saved) == {"FINISHED"}
+    assert_same_state(before, scene_state(saved))
+    sampling = read_recording(recorded_folder(tmp_path)).info.sampling
+    assert (sampling.seed, sampling.spread) == (5, 0.75)
+    assert [(s.kind, s.poses, s.name) for s in sampling.sources] == [
+        ("random", 20, ""),
+        ("action", 30, "elbow_wave"),
+    ]
+    assert job.state_of("record").outcome == "Recorded 50 poses into 'elbow_recording'."
+
+
+def test_an_unsaved_file_has_no_place_for_it():
+    bpy.ops.fdda.add_sample_arm(density="1")
+    with pytest.raises(
+        RuntimeError, match=r"Save the \.blend file first \(recordings are stored next to it\), or choose a Folder"
+    ):
+        bpy.ops.fdda.record()
+
+
+def test_a_folder_that_is_named(saved, tmp_path):
+    saved.mesh_object.fdda.settings.recording = "//deep/down"
+    assert record(saved) == {"FINISHED"}
+    assert read_index(tmp_path / "deep" / "down")["complete"] == 20
+    assert record(saved, folder=str(tmp_path / "other")) == {"FINISHED"}
+    assert read_index(tmp_path / "other")["complete"] == 20
+
+
+def test_cancelled_and_resumed(saved, tmp_path, monkeypatch):
+    show = job.JobState.show
+
+    def cancel(state, progress):
+        show(state, progress)
+        if progress.stage == "poses" and progress.done == 8:
+            bpy.ops.fdda.cancel()
+
+    before = scene_state(saved)
+    with monkeypatch.context() as patch:
+        patch.setattr(job.JobState, "show", cancel)
+        assert record(saved) == {"CANCELLED"}
+    assert_same_state(before, scene_state(saved))
+    outcome = job.state_of("record").outcome
+    complete = read_index(recorded_folder(tmp_path))["complete"]
+    assert complete >= 8 and f"{complete} of 20 poses are kept" in outcome
+    with pytest.raises(RuntimeError, match="holds a recording already"):
+        record(saved)
+    assert record(saved, resume=True) == {"FINISHED"}
+    assert len(read_recording(recorded_folder(tmp_path)).residuals) == 20
+
+
+def test_another_blender_is_recording_there(saved, tmp_path):
+    recorded_folder(tmp_path).mkdir()
+    lock = recorded_folder(tmp_path) / LOCK_NAME
+    lock.write_text(json.dumps({"pid": os.getppid(), "host": socket.gethostname()}))
+    with lock.open("r+b") as held:
+        # The system's lock is of the open file, so this is another's also in one process.
+        assert lock_file(held.fileno())
+        with pytest.raises(RuntimeError, match=rf"Another Blender \(process {os.getppid()}\) is recording into"):
+            record(saved)
+    assert lock.exists()
+
+
+def test_removing_a_recording(saved, tmp_path):
+    with pytest.raises(RuntimeError, match="holds no recording; there is nothing to remove"):
+        bpy.ops.fdda.delete_recording()
+    record(saved)
+    (recorded_folder(tmp_path) / "notes.txt").write_text("mine")
+    assert bpy.ops.fdda.delete_recording() == {"FINISHED"}
+    assert [path.name for path in recorded_folder(tmp_path).iterdir()] == ["notes.txt"]
+
+
+def test_a_bound_rig_is_recorded_as_the_true_rig(bound, elbow, tmp_path):
+    bpy.context.view_layer.objects.active = bound
+    assert bound.fdda.is_playing
+    bound.fdda.settings.poses = 5
+    assert bpy.ops.fdda.record(folder=str(tmp_path / "r")) == {"FINISHED"}
+    first, again = (read_recording(path).residuals[:5] for path in (elbow.recording, tmp_path / "r"))
+    np.testing.assert_allclose(again, first, atol=1e-6)
+    assert bound.fdda.is_playing

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The operators that train and refine, without a window: settings, learning curves, cancellation and refusals."""
+
+import json
+from pathlib import Path
+
+import bpy
+import pytest
+
+from fdda_addon.core.model import read_model_info
+from fdda_addon.core.recording.lock import LOCK_NAME
+from fdda_addon.core.recording.reader import read_recording
+from fdda_addon.jobs import job
+from fdda_addon.properties.character import model_file
+from fdda_addon.scene.scene_rig import SceneRig
+
+from .scene_state import assert_same_state, scene_state
+
+
+def recorded_folder(tmp_path: Path) -> Path:
+    return tmp_path / "elbow_recording"
+
+
+def train(rig: SceneRig, elbow, **options) -> set[str]:
+    settings = rig.mesh_object.fdda.settings
+    settings.epochs, settings.tolerance_mm, settings.training_seed = 6, 0.2, 3
+    return bpy.ops.fdda.train(recording=str(elbow.recording), **options)
+
+
+def test_a_model_with_these_settings_and_its_curves(saved, elbow, tmp_path):
+    saved.mesh_object.fdda.settings.model = "//models/a.onnx"
+    assert train(saved, elbow) == {"FINISHED"}
+    model = tmp_path / "models" / "a.onnx"
+    training = read_model_info(model).training
+    assert (training["epochs"], training["tolerance_mm"], training["seed"]) == (6, 0.2, 3)
+    state = job.state_of("train")
+    assert (state.done, state.total) == (6, 6) and state.outcome.startswith("Trained 'a.onnx' in ")
+    assert [len(state.curves[name]) for name in ("training", "validation")] == [6, 6]
+    assert state.curves["validation"][-1] < state.curves["validation"][0]
+
+
+def test_cancelled(saved, elbow, tmp_path, monkeypatch):
+    show = job.JobState.show
+
+    def cancel(state, progress):
+        show(state, progress)
+        if progress.done == 2:
+            bpy.ops.fdda.cancel()
+
+    monkeypatch.setattr(job.JobState, "show", cancel)
+    saved.mesh_object.fdda.settings.epochs = 10_000
+    options = {"recording": str(elbow.recording), "model": str(tmp_path / "m.onnx")}
+    assert bpy.ops.fdda.train(**options) == {"CANCELLED"}
+    assert job.state_of("train").outcome == "Training canceled; no model was written."
+    assert not (tmp_path / "m.onnx").exists()
+
+
+def test_more_poses_where_the_model_is_worst_and_training_on(saved, elbow, tmp_path):
+    settings = saved.mesh_object.fdda.settings
+    settings.poses, settings.epochs, settings.use_goal, settings.goal_mm = 20, 2, True, 0.001
+    assert bpy.ops.fdda.record() == {"FINISHED"}
+    with pytest.raises(RuntimeError, match="There is no checkpoint"):
+        bpy.ops.fdda.train(warm_start=True)
+    assert bpy.ops.fdda.train() == {"FINISHED"}
+    before = scene_state(saved)
+    assert bpy.ops.fdda.refine(poses=6) == {"FINISHED"}
+    assert job.state_of("refine").outcome == "Added 6 poses to 'elbow_recording'; press Continue Training."
+    assert_same_state(before, scene_state(saved))
+    assert [s.kind for s in read_recording(recorded_folder(tmp_path)).info.sampling.sources] == [
+        "random",
+        "refined",
+    ]
+    assert not (recorded_folder(tmp_path) / LOCK_NAME).exists()
+    assert bpy.ops.fdda.train(warm_start=True) == {"FINISHED"}
+    model = model_file(saved.mesh_object)
+    assert read_model_info(model).training["warm_start"]
+    report = json.loads((model.parent / "report.json").read_text())
+    assert report["poses"] == 26 and report["goal"]["verdict"] == "missed"
+
+
+def test_there_must_be_a_model_to_refine(saved):
+    saved.mesh_object.fdda.settings.poses = 12
+    bpy.ops.fdda.record()
+    with pytest.raises(RuntimeError, match="train it first"):
+        bpy.ops.fdda.refine()
+
+
+def test_no_recording_and_one_that_is_not_finished(saved, tmp_path):
+    with pytest.raises(RuntimeError, match="is not a recording: it has no recording"):
+        bpy.ops.fdda.train()
+    saved.mesh_object.fdda.settings.poses = 4
+    bpy.ops.fdda.record()
+    index = recorded_folder(tmp_path) / "recording.json"
+    index.write_text(index.read_text().replace('"complete": 4', '"complete": 3'))
+    with pytest.raises(RuntimeError, match="The recording 'elbow_recording' has 3 of 4 poses; resume it first"):
+        bpy.ops.fdda.train()
+
+
+def test_a_python_that_is_not_there(saved, elbow, tmp_path, monkeypatch):
+    monkeypatch.setenv("FDDA_TRAINER_PYTHON", "/none/python")
+    with pytest.raises(RuntimeError, match="The trainer's Python '/none/python' cannot be started"):
+        train(saved, elbow)
+    assert job.current() is None
