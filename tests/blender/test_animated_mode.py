@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Mode and strength that are set, keyed and driven."""
+"""Mode and strength set by hand, by keyframes and by drivers."""
 
 import bpy
 import numpy as np
@@ -16,12 +16,12 @@ def key_mode(mesh_object: bpy.types.Object, modes: dict[int, str]) -> None:
         mesh_object.keyframe_insert("fdda.mode", frame=frame)
 
 
-def test_a_mode_that_is_keyed(bound, elbow):
+def test_keyed_modes_show_like_modes_set_by_hand(bound, elbow):
     key_mode(bound, {1: "FDDA", 8: "LINEAR", 12: "RIG", 16: "FDDA", 20: "RIG", 24: "LINEAR"})
     shown = {}
     for frame in (3, 9, 13, 17, 21, 25, 13, 3):
         bpy.context.scene.frame_set(frame)
-        # What is drawn, without another evaluation.
+        # The viewport draws these positions without another evaluation.
         shown[frame] = shown_in(bpy.context.view_layer.depsgraph, bound)
         assert np.array_equal(evaluated(bound), shown[frame])
         if bound.fdda.mode == "FDDA":
@@ -35,32 +35,32 @@ def test_a_mode_that_is_keyed(bound, elbow):
     assert not bound.fdda.status
 
 
-def test_a_mode_that_is_set_shows_at_once(bound, elbow):
+def test_a_mode_set_by_hand_shows_at_once(bound, elbow):
     pose(angle=1.1)
     graph = bpy.context.view_layer.depsgraph
     for mode in ("RIG", "FDDA", "LINEAR", "RIG", "LINEAR", "FDDA"):
         bound.fdda.mode = mode
         bpy.context.view_layer.update()
-        drawn = shown_in(graph, bound)
-        assert np.array_equal(drawn, evaluated(bound)), mode
+        drawn_positions = shown_in(graph, bound)
+        assert np.array_equal(drawn_positions, evaluated(bound)), mode
     assert_plays(bound, elbow.model)
 
 
-def test_renders_of_a_mode_that_is_keyed(bound, elbow, tmp_path):
+def test_renders_follow_a_keyed_mode(bound, elbow, tmp_path):
     bound.fdda.use_in_render = True
     set_camera()
     bound.fdda.mode = "RIG"
-    rig = animation(tmp_path / "rig")
+    rig_images = animation(tmp_path / "rig")
     bound.fdda.mode = "FDDA"
-    model = animation(tmp_path / "model")
+    model_images = animation(tmp_path / "model")
     key_mode(bound, {FRAME - 1: "FDDA", FRAME: "RIG", FRAME + 1: "FDDA"})
     for curve in curves(bound):
         for point in curve.keyframe_points:
             point.interpolation = "CONSTANT"
-    mixed = animation(tmp_path / "mixed")
-    for frame, source in ((FRAME - 1, model), (FRAME, rig), (FRAME + 1, model)):
-        assert np.array_equal(mixed[frame], source[frame]), frame
-    assert not np.array_equal(rig[FRAME - 1], model[FRAME - 1])
+    images = animation(tmp_path / "keyed")
+    for frame, expected in ((FRAME - 1, model_images), (FRAME, rig_images), (FRAME + 1, model_images)):
+        assert np.array_equal(images[frame], expected[frame]), frame
+    assert not np.array_equal(rig_images[FRAME - 1], model_images[FRAME - 1])
 
 
 def curves(mesh_object: bpy.types.Object) -> list[bpy.types.FCurve]:
@@ -70,7 +70,7 @@ def curves(mesh_object: bpy.types.Object) -> list[bpy.types.FCurve]:
 
 
 @pytest.mark.parametrize("is_driven", [False, True], ids=["keyed", "driven"])
-def test_a_strength_that_is_animated(bound, elbow, is_driven):
+def test_an_animated_strength_blends_linear_skinning_with_the_model(bound, elbow, is_driven):
     if is_driven:
         curve = bound.driver_add("fdda.strength")
         curve.driver.expression = "min(1, frame / 20)"
@@ -78,8 +78,8 @@ def test_a_strength_that_is_animated(bound, elbow, is_driven):
         for frame, strength in ((0, 0.0), (20, 1.0)):
             bound.fdda.strength = strength
             bound.keyframe_insert("fdda.strength", frame=frame)
-        for found in curves(bound):
-            for point in found.keyframe_points:
+        for curve in curves(bound):
+            for point in curve.keyframe_points:
                 point.interpolation = "LINEAR"
     shown = {}
     for frame in (5, 10, 20):
@@ -90,7 +90,8 @@ def test_a_strength_that_is_animated(bound, elbow, is_driven):
     for frame, positions in shown.items():
         bpy.context.scene.frame_set(frame)
         bound.fdda.strength = 1
-        playing = assert_plays(bound, elbow.model)
+        model_positions = assert_plays(bound, elbow.model)
         bound.fdda.strength = 0
-        linear, strength = evaluated(bound), min(1, frame / 20)
-        assert np.abs(positions - (linear + strength * (playing - linear))).max() < 1e-6
+        linear_positions, strength = evaluated(bound), min(1, frame / 20)
+        expected = linear_positions + strength * (model_positions - linear_positions)
+        assert np.abs(positions - expected).max() < 1e-6

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Poses from animation: actions and strips, mirrored, of all datablocks of a rig; recorded, resumed, evaluated."""
+"""Recording and evaluation of actions and NLA strips, also mirrored, and of shape keys that actions animate."""
 
 import json
 
@@ -30,49 +30,49 @@ def figure() -> SceneRig:
     return rig
 
 
-def recorded(rig: SceneRig, path, **settings) -> Recording:
-    """A recording without random poses unless said otherwise."""
+def record_and_read(rig: SceneRig, path, **settings) -> Recording:
+    """Record a rig and read the recording; it has no random poses unless the settings ask for them."""
     drain(record(rig, path, RecordingSettings(**{"poses": 0, "influence_poses": 2, **settings})))
     return read_recording(path)
 
 
-def positions(recording: Recording) -> np.ndarray:
-    """(N, V, 3) what Blender evaluated."""
+def positions_of(recording: Recording) -> np.ndarray:
+    """Return the recorded positions (N, V, 3): linear skinning plus residuals."""
     matrices = np.array(recording.pose_matrices)
     skinning = LinearSkinning(recording.rig, recording.partitions)
     return skinning.complex_positions(matrices, np.array(recording.residuals))
 
 
 def evaluated(rig: SceneRig) -> np.ndarray:
-    """(V, 3) what Blender shows now."""
+    """Return the positions (V, 3) of the evaluated mesh."""
     mesh_object = rig.mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get())
     return np.array([vertex.co[:] for vertex in mesh_object.data.vertices], np.float32)
 
 
-def played(rig: SceneRig, frames) -> np.ndarray:
-    """(F, V, 3) what the rig shows when its own animation plays."""
-    found = []
+def positions_in_frames(rig: SceneRig, frames) -> np.ndarray:
+    """Return the positions (F, V, 3) of the rig in frames of its own animation."""
+    positions_by_frame = []
     for frame in frames:
         bpy.context.scene.frame_set(frame)
-        found.append(evaluated(rig))
-    return np.array(found)
+        positions_by_frame.append(evaluated(rig))
+    return np.array(positions_by_frame)
 
 
-def other_side(rig: SceneRig, points: np.ndarray) -> np.ndarray:
-    """Positions mirrored: each vertex takes the place of the one on the other side."""
+def mirrored(rig: SceneRig, points: np.ndarray) -> np.ndarray:
+    """Mirror positions (F, V, 3) across X; each vertex gets the position of the vertex on the other side."""
     rest = np.array([vertex.co[:] for vertex in rig.mesh_object.data.vertices])
-    apart = np.linalg.norm(rest[:, None] * [-1, 1, 1] - rest[None], axis=-1)
-    assert apart.min(axis=1).max() < 1e-6
-    return points[:, apart.argmin(axis=1)] * [-1, 1, 1]
+    distances = np.linalg.norm(rest[:, None] * [-1, 1, 1] - rest[None], axis=-1)
+    assert distances.min(axis=1).max() < 1e-6
+    return points[:, distances.argmin(axis=1)] * [-1, 1, 1]
 
 
-def strip_of(rig: SceneRig, action: bpy.types.Action, start: int = 40, name: str = "swing") -> bpy.types.NlaStrip:
-    """Put an action into the NLA, with one below it that turns the spine."""
+def add_strips(rig: SceneRig, action: bpy.types.Action, start: int = 40, name: str = "swing") -> bpy.types.NlaStrip:
+    """Add an NLA strip with an action, above a strip that rotates the spine."""
     animation = rig.armature_object.animation_data
-    animation.action = lean = bpy.data.actions.new("lean")
+    animation.action = lean_action = bpy.data.actions.new("lean")
     key_channel(rig.armature_object.pose.bones["spine"], 1, "rotation_euler", (0, 0, 0.3))
     below = animation.nla_tracks.new()
-    below.strips.new("lean", 1, lean).frame_end = 200
+    below.strips.new("lean", 1, lean_action).frame_end = 200
     above = animation.nla_tracks.new()
     above.name = "above"
     strip = above.strips.new("swing", start, action)
@@ -81,60 +81,60 @@ def strip_of(rig: SceneRig, action: bpy.types.Action, start: int = 40, name: str
     return strip
 
 
-def test_the_frames_of_a_strip_are_those_of_the_whole_nla(figure, tmp_path):
-    strip_of(figure, bpy.data.actions[WAVE])
-    shown = played(figure, range(40, 40 + FRAMES))
-    other = bpy.data.actions.new("other")
-    figure.armature_object.animation_data.action = other
+def test_a_recorded_strip_includes_the_tracks_below_it(figure, tmp_path):
+    add_strips(figure, bpy.data.actions[WAVE])
+    shown = positions_in_frames(figure, range(40, 40 + FRAMES))
+    other_action = bpy.data.actions.new("other")
+    figure.armature_object.animation_data.action = other_action
     key_channel(figure.armature_object.pose.bones["arm.R"], 1, "rotation_quaternion", (0.5, 0.5, 0.5, 0.5))
     before = scene_state(figure)
-    recording = recorded(figure, tmp_path / "recording", strips=("swing",))
+    recording = record_and_read(figure, tmp_path / "recording", strips=("swing",))
     assert_same_state(before, scene_state(figure))
     (source,) = recording.info.sampling.sources
     assert (source.kind, source.poses, source.name, source.frames) == ("strip", FRAMES, "swing", (40, 1))
-    np.testing.assert_allclose(positions(recording), shown, atol=1e-5)
-    alone = recorded(figure, tmp_path / "alone", actions=(WAVE,))
-    assert np.abs(positions(alone) - shown).max() > 0.05, "the track below plays along"
+    np.testing.assert_allclose(positions_of(recording), shown, atol=1e-5)
+    action_recording = record_and_read(figure, tmp_path / "action", actions=(WAVE,))
+    assert np.abs(positions_of(action_recording) - shown).max() > 0.05, "the strip includes the track below"
 
 
 def test_mirrored_frames_are_the_mirror_images(figure, tmp_path):
-    shown = played(figure, range(1, FRAMES + 1))
+    shown = positions_in_frames(figure, range(1, FRAMES + 1))
     before = scene_state(figure)
-    recording = recorded(figure, tmp_path / "recording", actions=(WAVE,), mirror=True)
+    recording = record_and_read(figure, tmp_path / "recording", actions=(WAVE,), mirror=True)
     assert_same_state(before, scene_state(figure))
     assert [(s.kind, s.poses, s.name, s.frames) for s in recording.info.sampling.sources] == [
         ("action", FRAMES, WAVE, (1, 1)),
         ("mirrored", FRAMES, WAVE, (1, 1)),
     ]
-    found = positions(recording)
-    np.testing.assert_allclose(found[:FRAMES], shown, atol=1e-5)
-    np.testing.assert_allclose(found[FRAMES:], other_side(figure, shown), atol=1e-5)
-    assert np.abs(found[FRAMES:] - found[:FRAMES]).max() > 0.1
+    recorded_positions = positions_of(recording)
+    np.testing.assert_allclose(recorded_positions[:FRAMES], shown, atol=1e-5)
+    np.testing.assert_allclose(recorded_positions[FRAMES:], mirrored(figure, shown), atol=1e-5)
+    assert np.abs(recorded_positions[FRAMES:] - recorded_positions[:FRAMES]).max() > 0.1
 
 
-def test_mirrored_strips(figure, tmp_path):
-    strip_of(figure, bpy.data.actions[WAVE])
-    shown = played(figure, range(40, 40 + FRAMES))
-    recording = recorded(figure, tmp_path / "recording", strips=("swing",), mirror=True)
-    np.testing.assert_allclose(positions(recording)[FRAMES:], other_side(figure, shown), atol=1e-5)
+def test_mirrored_strips_are_the_mirror_images(figure, tmp_path):
+    add_strips(figure, bpy.data.actions[WAVE])
+    shown = positions_in_frames(figure, range(40, 40 + FRAMES))
+    recording = record_and_read(figure, tmp_path / "recording", strips=("swing",), mirror=True)
+    np.testing.assert_allclose(positions_of(recording)[FRAMES:], mirrored(figure, shown), atol=1e-5)
 
 
-def test_numbers_with_a_left_and_a_right_are_exchanged(figure, tmp_path):
-    """A fist that is keyed, one that is not; what they drive follows."""
+def test_mirroring_exchanges_controls_of_left_and_right_bones(figure, tmp_path):
+    """The left control is keyed, and the right control is constant."""
     figure.armature_object.pose.bones["arm.R"]["fist"] = 0.25
     names = [f'armature_object/pose.bones["arm.{side}"]["fist"]=0:1' for side in "LR"]
     before = scene_state(figure)
-    recording = recorded(figure, tmp_path / "recording", actions=(WAVE,), mirror=True, controls=tuple(names))
+    recording = record_and_read(figure, tmp_path / "recording", actions=(WAVE,), mirror=True, controls=tuple(names))
     assert_same_state(before, scene_state(figure))
     controls = np.array(recording.controls)
     assert np.ptp(controls[:FRAMES, 0]) > 0.9 and (controls[:FRAMES, 1] == 0.25).all()
     np.testing.assert_array_equal(controls[FRAMES:], controls[:FRAMES, ::-1])
 
 
-def test_rigs_that_are_not_the_same_on_both_sides_are_refused(figure, tmp_path):
+def test_mirroring_refuses_asymmetric_rigs(figure, tmp_path):
     def refusal() -> str:
         with pytest.raises(RigError) as error:
-            recorded(figure, tmp_path / "recording", actions=(WAVE,), mirror=True)
+            record_and_read(figure, tmp_path / "recording", actions=(WAVE,), mirror=True)
         assert not (tmp_path / "recording").exists()
         return str(error.value)
 
@@ -153,25 +153,25 @@ def test_rigs_that_are_not_the_same_on_both_sides_are_refused(figure, tmp_path):
     assert "the bone 'spine' differs from its mirror image by 200.0 mm; bring it into the middle" in refusal()
 
 
-def test_mirroring_needs_animation(figure, tmp_path):
+def test_mirroring_without_animation_is_refused(figure, tmp_path):
     with pytest.raises(RecordingError, match="nothing to mirror: no action and no strip; give --action or --strip"):
-        recorded(figure, tmp_path / "recording", poses=3, mirror=True)
+        record_and_read(figure, tmp_path / "recording", poses=3, mirror=True)
 
 
 def test_strips_that_are_missing_or_muted_are_refused(figure, tmp_path):
-    strip = strip_of(figure, bpy.data.actions[WAVE])
+    strip = add_strips(figure, bpy.data.actions[WAVE])
     with pytest.raises(RigError, match=r"NLA of 'figure_rig' has no strip 'jump'; its strips: 'lean', 'swing'\."):
-        recorded(figure, tmp_path / "recording", strips=("jump",))
+        record_and_read(figure, tmp_path / "recording", strips=("jump",))
     strip.mute = True
     with pytest.raises(RigError, match="'swing' of 'figure_rig' is muted and shows nothing; unmute it and its track"):
-        recorded(figure, tmp_path / "recording", strips=("swing",))
+        record_and_read(figure, tmp_path / "recording", strips=("swing",))
 
 
 @needs_slots
-def test_an_action_moves_the_shape_keys_that_it_has_curves_for(figure, tmp_path):
+def test_an_action_with_curves_for_shape_keys_moves_them(figure, tmp_path):
     wave, keys = bpy.data.actions[WAVE], figure.mesh_object.data.shape_keys
     add_smile(figure, wave)
-    keys.animation_data.action = own = bpy.data.actions.new("own")
+    keys.animation_data.action = own_action = bpy.data.actions.new("own")
     keys.key_blocks["Smile"].value = 0.9
     keys.keyframe_insert(SMILE, frame=1)
     bpy.context.view_layer.update()
@@ -179,69 +179,68 @@ def test_an_action_moves_the_shape_keys_that_it_has_curves_for(figure, tmp_path)
     slot = keys.animation_data.action_slot.identifier
     before = scene_state(figure)
     for controls in ((), ("Smile",)):
-        recording = recorded(figure, tmp_path / f"recording{len(controls)}", actions=(WAVE,), controls=controls)
-        found = positions(recording)
-        still = recorded(figure, tmp_path / f"still{len(controls)}", actions=("own",))
-        assert (keys.animation_data.action, keys.animation_data.action_slot.identifier) == (own, slot)
+        recording = record_and_read(figure, tmp_path / f"recording{len(controls)}", actions=(WAVE,), controls=controls)
+        still_recording = record_and_read(figure, tmp_path / f"still{len(controls)}", actions=("own",))
+        assert (keys.animation_data.action, keys.animation_data.action_slot.identifier) == (own_action, slot)
         assert keys.key_blocks["Smile"].value == pytest.approx(0.3)
-        middle = FRAMES // 2 - 1
-        raised = np.linalg.norm(found - positions(still)[0], axis=-1)
-        assert raised[middle].max() > 0.02
+        middle_index = FRAMES // 2 - 1
+        offsets = np.linalg.norm(positions_of(recording) - positions_of(still_recording)[0], axis=-1)
+        assert offsets[middle_index].max() > 0.02
         if controls:
             values = np.array(recording.controls)[:, 0]
-            assert values[0] == 0 and values[middle] == pytest.approx(0.8) and values[-1] == 0
+            assert values[0] == 0 and values[middle_index] == pytest.approx(0.8) and values[-1] == 0
     assert_same_state({**before, "positions": ()}, {**scene_state(figure), "positions": ()})
 
 
 @needs_slots
-def test_actions_made_for_another_character_and_slots_of_others(figure, tmp_path):
-    """The slot that is named like the datablock counts; a figure of another name takes the one that moves bones."""
+def test_a_renamed_character_uses_the_slot_that_moves_bones(figure, tmp_path):
+    """No slot has the name of the armature, so the slot with curves of bones is used, not an empty slot."""
     wave = bpy.data.actions[WAVE]
-    expected = positions(recorded(figure, tmp_path / "own", actions=(WAVE,)))
+    expected = positions_of(record_and_read(figure, tmp_path / "own", actions=(WAVE,)))
     figure.armature_object.name = "someone"
     wave.slots.new(id_type="OBJECT", name="table")
-    np.testing.assert_array_equal(positions(recorded(figure, tmp_path / "other", actions=(WAVE,))), expected)
+    np.testing.assert_array_equal(positions_of(record_and_read(figure, tmp_path / "other", actions=(WAVE,))), expected)
 
 
-def test_what_random_poses_set_does_not_show_in_actions(figure, tmp_path):
-    """So that a recording that is resumed in an action has the same bytes."""
+def test_random_controls_are_reset_before_actions(figure, tmp_path):
+    """Otherwise a recording that is resumed in an action would differ from an uninterrupted one."""
     name = 'armature_object/pose.bones["arm.R"]["fist"]'
     figure.armature_object.pose.bones["arm.R"]["fist"] = 0.5
-    recording = recorded(figure, tmp_path / "recording", poses=5, actions=(WAVE,), controls=(f"{name}=0:1",))
+    recording = record_and_read(figure, tmp_path / "recording", poses=5, actions=(WAVE,), controls=(f"{name}=0:1",))
     values = np.array(recording.controls)[:, [c.name for c in recording.rig.controls].index(name)]
     assert np.ptp(values[:5]) > 0 and (values[5:] == 0.5).all()
 
 
-@pytest.mark.parametrize("stop", [8, 30, 55])
-def test_resumed_recordings_have_the_same_bytes(figure, tmp_path, stop):
-    """Stopped among the random poses, in the action, in its mirror image."""
-    strip_of(figure, bpy.data.actions[WAVE])
+@pytest.mark.parametrize("stop_pose", [8, 30, 55])
+def test_resumed_recordings_have_the_same_bytes(figure, tmp_path, stop_pose):
+    """Recording stops during the random poses, the action, and the mirrored action."""
+    add_strips(figure, bpy.data.actions[WAVE])
     name = 'armature_object/pose.bones["arm.R"]["fist"]=0:1'
     settings = {"poses": 10, "actions": (WAVE,), "strips": ("swing",), "mirror": True, "influence_poses": 1}
     settings = RecordingSettings(**settings, controls=(name,))
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
     drain(record(figure, whole, settings))
-    steps = record(figure, parts, settings)
+    steps = record(figure, resumed, settings)
     for step in steps:
-        if step.stage == "poses" and step.done == stop:
+        if step.stage == "poses" and step.done == stop_pose:
             steps.close()
-    index = json.loads((parts / "recording.json").read_text())
-    assert stop <= index["complete"] < index["poses"] == 10 + 4 * FRAMES
-    drain(record(figure, parts, RecordingSettings(**{**settings.__dict__, "resume": True})))
+    index = json.loads((resumed / "recording.json").read_text())
+    assert stop_pose <= index["complete"] < index["poses"] == 10 + 4 * FRAMES
+    drain(record(figure, resumed, RecordingSettings(**{**settings.__dict__, "resume": True})))
     for file in whole.iterdir():
-        assert file.read_bytes() == (parts / file.name).read_bytes(), file.name
+        assert file.read_bytes() == (resumed / file.name).read_bytes(), file.name
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A figure, and a model of it that was trained on its action alone."""
+def trained_folder(tmp_path_factory):
+    """Return a folder with a figure and a model that was trained on its action alone."""
     import fdda_addon
 
     folder = tmp_path_factory.mktemp("figure")
     fdda_addon.register()
     rig = build_figure()
     add_wave(rig)
-    strip_of(rig, bpy.data.actions[WAVE])
+    add_strips(rig, bpy.data.actions[WAVE])
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "figure.blend"))
     options = ("--poses", 0, "--action", WAVE, "--mirror")
     assert run("record", folder / "figure.blend", folder / "recording", *options) == 0
@@ -249,28 +248,30 @@ def trained(tmp_path_factory):
     return folder
 
 
-def test_the_first_action_stands_in_place_of_held_out_poses(trained, tmp_path, capsys):
-    files = (trained / "figure.blend", trained / "figure.onnx", "--json", tmp_path / "errors.json")
+def test_with_0_poses_the_report_shows_the_errors_of_the_first_action(trained_folder, tmp_path, capsys):
+    files = (trained_folder / "figure.blend", trained_folder / "figure.onnx", "--json", tmp_path / "errors.json")
     assert run("evaluate", *files, "--poses", 0, "--action", WAVE, "--strip", "swing") == 0
     report, table = json.loads((tmp_path / "errors.json").read_text()), capsys.readouterr().out
     assert report["poses"] == FRAMES and [a["name"] for a in report["actions"]] == [WAVE, "swing"]
     assert report["fdda"] == report["actions"][0]["fdda"] and report["fdda"]["mean"] < report["linear"]["mean"] / 2
     assert report["actions"][1]["poses"] == FRAMES and report["actions"][1]["linear"] != report["linear"]
     assert table.count(f"{WAVE}, {FRAMES} poses") == 1 and "swing" in table
-    for wrong in ((), ("--action", WAVE, "--range-scale", 2)):
-        assert run("evaluate", *files, "--poses", 0, *wrong) == 2
+    for options in ((), ("--action", WAVE, "--range-scale", 2)):
+        assert run("evaluate", *files, "--poses", 0, *options) == 2
         assert "With --poses 0 only actions and strips are compared; give --action" in capsys.readouterr().err
 
 
-def test_evaluation_without_poses_needs_no_range_of_motion(trained):
-    bpy.ops.wm.open_mainfile(filepath=str(trained / "figure.blend"))
+def test_evaluation_of_an_action_needs_no_range_of_motion(trained_folder):
+    bpy.ops.wm.open_mainfile(filepath=str(trained_folder / "figure.blend"))
     rig = SceneRig(bpy.data.objects["body"], bpy.data.objects["figure_rig"])
     for bone in rig.armature_object.pose.bones:
         bone.lock_rotation = (True, True, True)
-    *_, found = evaluate(rig, trained / "figure.onnx", EvaluationSettings(0, actions=(WAVE,), surface=False))
-    assert found.held_out is found.actions[0] and found.held_out.name == WAVE
+    *_, evaluation = evaluate(
+        rig, trained_folder / "figure.onnx", EvaluationSettings(0, actions=(WAVE,), surface=False)
+    )
+    assert evaluation.held_out is evaluation.actions[0] and evaluation.held_out.name == WAVE
     with pytest.raises(RigError, match="nothing to evaluate: 0 poses and no action; give --poses or --action"):
-        drain(evaluate(rig, trained / "figure.onnx", EvaluationSettings(0)))
+        drain(evaluate(rig, trained_folder / "figure.onnx", EvaluationSettings(0)))
 
 
 def test_sidebar_records_mirrored_frames(figure, tmp_path):

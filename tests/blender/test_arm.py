@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The arm and the elbow: their meshes, rigs, layers of deformation and actions; and the fixtures built from them."""
+"""Mesh, rig, modifiers and action of the arm; the saved fixtures of arm and elbow match the code that builds them."""
 
 import math
 from pathlib import Path
@@ -15,7 +15,7 @@ from fdda_addon.arm.sculpt import arm_field
 from fdda_addon.arm.surface import Surface, sculpt_arm
 
 FIXTURES = Path(__file__).resolve().parents[2] / "blend_fixtures"
-VERTICES = {1: 1450, 2: 10_000, 3: 50_000}
+VERTEX_COUNTS = {1: 1450, 2: 10_000, 3: 50_000}
 FINGERS = ("index", "middle", "ring", "pinky")
 
 
@@ -26,7 +26,7 @@ def surface(request) -> tuple[int, Surface]:
 
 @pytest.fixture(scope="module")
 def arm_file(tmp_path_factory) -> Path:
-    """The default arm, built once and saved."""
+    """Build and save the default arm once."""
     file = tmp_path_factory.mktemp("arm") / "arm.blend"
     bpy.ops.wm.read_factory_settings(use_empty=True)
     build_arm()
@@ -36,20 +36,20 @@ def arm_file(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def animated(arm_file) -> tuple[bpy.types.Object, bpy.types.Object]:
-    """The default arm, its file opened."""
+    """Open the default arm; return its mesh object and its armature object."""
     bpy.ops.wm.open_mainfile(filepath=str(arm_file))
     return bpy.data.objects["arm"], bpy.data.objects["arm_rig"]
 
 
 @pytest.fixture
 def arm(animated) -> tuple[bpy.types.Object, bpy.types.Object]:
-    """The default arm, its action taken off so that tests can pose it."""
+    """Open the default arm and remove its action, so that tests can pose the bones."""
     animated[1].animation_data.action = None
     return animated
 
 
 def evaluated(mesh_object: bpy.types.Object) -> np.ndarray:
-    """(v, 3) float64 meters: the mesh after all its modifiers."""
+    """Return the positions (V, 3) of the mesh after all modifiers, float64, in meters."""
     bpy.context.view_layer.update()
     mesh = mesh_object.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
     positions = np.empty(len(mesh.vertices) * 3)
@@ -57,7 +57,7 @@ def evaluated(mesh_object: bpy.types.Object) -> np.ndarray:
     return positions.reshape(-1, 3)
 
 
-def rest(mesh_object: bpy.types.Object) -> np.ndarray:
+def rest_positions(mesh_object: bpy.types.Object) -> np.ndarray:
     positions = np.empty(len(mesh_object.data.vertices) * 3)
     mesh_object.data.vertices.foreach_get("co", positions)
     return positions.reshape(-1, 3)
@@ -68,7 +68,7 @@ def bend(rig: bpy.types.Object, name: str, x: float = 0.0, y: float = 0.0, z: fl
 
 
 def assert_closed(points: np.ndarray, faces: np.ndarray):
-    """Every edge between exactly two faces that run it in opposite directions, one sphere, outward."""
+    """Assert that quads form one closed surface of the topology of a sphere, with normals that point outward."""
     directed = np.concatenate([faces[:, [i, (i + 1) % 4]] for i in range(4)])
     assert len(np.unique(directed, axis=0)) == len(directed)
     edges, uses = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
@@ -81,7 +81,7 @@ def assert_closed(points: np.ndarray, faces: np.ndarray):
 
 def test_density_sets_the_number_of_vertices(surface):
     density, arm = surface
-    assert abs(len(arm.points) / VERTICES[density] - 1) < 0.06
+    assert abs(len(arm.points) / VERTEX_COUNTS[density] - 1) < 0.06
 
 
 def test_mesh_is_closed_and_faces_outward(surface):
@@ -91,20 +91,20 @@ def test_mesh_is_closed_and_faces_outward(surface):
     assert_closed(arm.points, arm.faces)
 
 
-def test_no_face_is_folded(surface):
-    """Both halves of every quad look the way the sculpted surface does."""
+def test_face_normals_point_along_the_gradient(surface):
+    """The normal of every quad points in the direction in which the distance to the sculpted surface grows."""
     _, arm = surface
     distance, outward = arm_field().distance_and_gradient(arm.points)
     assert np.abs(distance).max() < 1e-4
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    corners, wanted = arm.points[arm.faces], outward[arm.faces].mean(axis=1)
-    across = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    assert np.einsum("ij,ij->i", across, wanted).min() > 0.2
+    corners, expected_normals = arm.points[arm.faces], outward[arm.faces].mean(axis=1)
+    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    assert np.einsum("ij,ij->i", normals, expected_normals).min() > 0.2
 
 
-def test_it_measures_like_an_arm(surface):
-    """Meters from the shoulder joint to the tip of the middle finger, and the order of the finger tips."""
+def test_the_mesh_has_the_lengths_of_an_arm(surface):
+    """Check the distance from shoulder to fingertip in meters, and which fingers are longest."""
     _, arm = surface
     tips = {name: arm.points[arm.joints == JOINT_INDEX[f"{name}_3"], 0].max() for name in FINGERS}
     assert tips["middle"] == pytest.approx(0.30 + 0.26 + 0.19, abs=0.01)
@@ -147,8 +147,8 @@ def test_joints_have_their_names_and_parents(arm):
     assert [o.name for o in arm] == ["arm", "arm_rig"]
 
 
-def test_every_bone_bends_about_its_x(arm):
-    """A positive turn about local X moves the tail the way the joint table says it bends."""
+def test_a_positive_rotation_about_x_bends_the_joint(arm):
+    """A positive rotation about local X moves the tail in the direction that the table of joints defines."""
     _, rig = arm
     for entry in JOINTS:
         matrix = rig.data.bones[entry.name].matrix_local
@@ -161,13 +161,13 @@ def test_every_bone_bends_about_its_x(arm):
     assert np.allclose(moved, (-0.26, -0.26, 0.0), atol=1e-5)
 
 
-def test_skinning_is_hard(arm):
+def test_each_vertex_follows_one_bone(arm):
     mesh_object, rig = arm
     groups = np.array([[(g.group, g.weight) for g in vertex.groups] for vertex in mesh_object.data.vertices])
     assert groups.shape[1] == 1 and (groups[..., 1] == 1.0).all()
-    owned = np.bincount(groups[:, 0, 0].astype(int), minlength=22)
+    vertex_counts = np.bincount(groups[:, 0, 0].astype(int), minlength=22)
     assert [group.name for group in mesh_object.vertex_groups] == list(JOINT_NAMES)
-    assert owned.min() >= 20
+    assert vertex_counts.min() >= 20
     assert [(m.name, m.type) for m in mesh_object.modifiers] == [
         ("Armature", "ARMATURE"),
         ("CorrectiveSmooth", "CORRECTIVE_SMOOTH"),
@@ -176,12 +176,12 @@ def test_skinning_is_hard(arm):
     assert skin.object == rig and not skin.use_deform_preserve_volume and not skin.use_bone_envelopes
 
 
-def test_rest_pose_is_the_rest_shape(arm):
+def test_the_rest_pose_shows_the_undeformed_mesh(arm):
     mesh_object, _ = arm
-    assert np.abs(evaluated(mesh_object) - rest(mesh_object)).max() < 1e-6
+    assert np.abs(evaluated(mesh_object) - rest_positions(mesh_object)).max() < 1e-6
 
 
-def test_biceps_rises_with_the_elbow(arm):
+def test_the_elbow_drives_the_biceps_shape_key(arm):
     mesh_object, rig = arm
     keys = mesh_object.data.shape_keys
     driver = keys.animation_data.drivers[0].driver
@@ -196,36 +196,36 @@ def test_biceps_rises_with_the_elbow(arm):
 
 
 def test_biceps_bulges_on_the_front_of_the_upper_arm(arm):
-    """What the key adds to the bent arm after the smoothing: about 17 mm, half way down, on the crease's side."""
+    """The shape key moves the bent arm by about 17 mm, in the middle of the upper arm, on the inner side."""
     mesh_object, rig = arm
     key = mesh_object.data.shape_keys.key_blocks["biceps"]
     bend(rig, "elbow", x=140)
     contracted = evaluated(mesh_object)
     key.mute = True
-    rise = np.linalg.norm(contracted - evaluated(mesh_object), axis=1)
-    assert 0.014 < rise.max() < 0.020
-    x, y, _ = rest(mesh_object)[rise.argmax()]
+    offsets = np.linalg.norm(contracted - evaluated(mesh_object), axis=1)
+    assert 0.014 < offsets.max() < 0.020
+    x, y, _ = rest_positions(mesh_object)[offsets.argmax()]
     assert 0.12 < x < 0.22 and y < -0.02
     owners = [JOINT_NAMES[vertex.groups[0].group] for vertex in mesh_object.data.vertices]
-    assert rise[[owner not in ("shoulder", "elbow") for owner in owners]].max() < 1e-6
+    assert offsets[[owner not in ("shoulder", "elbow") for owner in owners]].max() < 1e-6
 
 
 @pytest.mark.parametrize(
     ("name", "angle", "millimeters"), [("wrist", 60, 6.0), ("index_1", 70, 5.0), ("elbow", 90, 8.0)]
 )
-def test_smoothing_changes_the_bent_joint(arm, name, angle, millimeters):
+def test_corrective_smooth_moves_a_bent_joint(arm, name, angle, millimeters):
     mesh_object, rig = arm
     smooth = mesh_object.modifiers["CorrectiveSmooth"]
     assert (smooth.rest_source, smooth.iterations) == ("ORCO", 10)
     bend(rig, name, x=angle)
     smoothed = evaluated(mesh_object)
     smooth.show_viewport = False
-    change = np.linalg.norm(smoothed - evaluated(mesh_object), axis=1)
-    assert change.max() > millimeters * 1e-3
-    assert np.linalg.norm(rest(mesh_object)[change.argmax()] - joint(name).head) < 0.06
+    offsets = np.linalg.norm(smoothed - evaluated(mesh_object), axis=1)
+    assert offsets.max() > millimeters * 1e-3
+    assert np.linalg.norm(rest_positions(mesh_object)[offsets.argmax()] - joint(name).head) < 0.06
 
 
-def test_range_of_motion_is_in_the_bones(arm):
+def test_ik_limits_and_locks_define_the_range_of_motion(arm):
     _, rig = arm
     for entry in JOINTS:
         bone = rig.pose.bones[entry.name]
@@ -241,8 +241,8 @@ def test_range_of_motion_is_in_the_bones(arm):
     assert all(joint(f"{name}_0").limits == ((-20, 20),) * 3 for name in FINGERS)
 
 
-def outside(rig: bpy.types.Object) -> float:
-    """How far, in degrees, the pose is outside the range of motion."""
+def degrees_outside_range(rig: bpy.types.Object) -> float:
+    """Return the largest angle by which the pose exceeds the range of motion, in degrees."""
     angles = np.degrees([rig.pose.bones[entry.name].rotation_euler for entry in JOINTS])
     limits = np.array([entry.limits for entry in JOINTS])
     return float(np.maximum(limits[..., 0] - angles, angles - limits[..., 1]).max())
@@ -256,8 +256,8 @@ def test_action_stays_inside_the_range_until_the_last_twenty_frames(animated):
     poses = set()
     for frame in range(1, 251):
         scene.frame_set(frame)
-        assert (outside(rig) > 0.5) == (frame > 230), frame
-        assert frame > 230 or outside(rig) < 1e-3, frame
+        assert (degrees_outside_range(rig) > 0.5) == (frame > 230), frame
+        assert frame > 230 or degrees_outside_range(rig) < 1e-3, frame
         poses.add(tuple(round(angle, 4) for bone in rig.pose.bones for angle in bone.rotation_euler))
     assert len(poses) > 200
     scene.frame_set(240)
@@ -265,7 +265,7 @@ def test_action_stays_inside_the_range_until_the_last_twenty_frames(animated):
     assert abs(math.degrees(rig.pose.bones["elbow"].rotation_euler.z)) > 40
 
 
-def test_building_leaves_the_preferences_alone():
+def test_building_restores_the_preferences():
     edit = bpy.context.preferences.edit
     edit.keyframe_new_interpolation_type = "CONSTANT"
     try:
@@ -276,17 +276,20 @@ def test_building_leaves_the_preferences_alone():
 
 
 @pytest.mark.parametrize(("name", "build"), [("arm", build_arm), ("elbow", build_elbow)])
-def test_fixture_is_what_the_script_builds_now(name, build):
+def test_the_saved_fixture_equals_a_newly_built_one(name, build):
     bpy.ops.wm.open_mainfile(filepath=str(FIXTURES / f"{name}.blend"))
-    kept = bpy.data.objects[name]
-    points, weights = rest(kept), [[(g.group, g.weight) for g in vertex.groups] for vertex in kept.data.vertices]
-    faces = [tuple(polygon.vertices) for polygon in kept.data.polygons]
+    saved = bpy.data.objects[name]
+    points, weights = (
+        rest_positions(saved),
+        [[(g.group, g.weight) for g in vertex.groups] for vertex in saved.data.vertices],
+    )
+    faces = [tuple(polygon.vertices) for polygon in saved.data.polygons]
     bpy.context.scene.frame_set(10)
-    posed = evaluated(kept)
+    posed_points = evaluated(saved)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     fresh, _ = build()
-    assert points == pytest.approx(rest(fresh), abs=1e-6)
+    assert points == pytest.approx(rest_positions(fresh), abs=1e-6)
     assert faces == [tuple(polygon.vertices) for polygon in fresh.data.polygons]
     assert weights == [[(g.group, g.weight) for g in vertex.groups] for vertex in fresh.data.vertices]
     bpy.context.scene.frame_set(10)
-    assert posed == pytest.approx(evaluated(fresh), abs=1e-5)
+    assert posed_points == pytest.approx(evaluated(fresh), abs=1e-5)

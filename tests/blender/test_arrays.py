@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The border between arrays and RNA: what is declared is what Blender keeps, and what does not fit is named."""
+"""Reading and writing arrays of RNA properties: declared types match Blender's, and errors name the array."""
 
 import bpy
 import bpy.utils.previews
@@ -18,7 +18,7 @@ from fdda_addon.scene.arrays import (
 )
 from fdda_addon.scene.mesh import mesh_positions, set_mesh_positions
 
-OWNERS = {
+ELEMENTS_BY_OWNER = {
     "MeshVertex": (COORDINATE_ELEMENT,),
     "ShapeKeyPoint": (COORDINATE_ELEMENT,),
     "FloatVectorAttributeValue": (VECTOR_ELEMENT,),
@@ -32,21 +32,22 @@ OWNERS = {
     "Bone": (arrays.REST_MATRIX,),
     "Keyframe": arrays.KEYFRAME_ELEMENTS,
 }
-"""Whose elements have them."""
-KINDS = {"FLOAT": np.float32, "INT": np.int32, "ENUM": np.int32, "BOOLEAN": np.bool_}
+"""Declared elements by the RNA type that has them."""
+DTYPES = {"FLOAT": np.float32, "INT": np.int32, "ENUM": np.int32, "BOOLEAN": np.bool_}
 
 
-@pytest.mark.parametrize("owner", OWNERS)
-def test_blender_keeps_what_is_declared(owner):
-    for element in OWNERS[owner]:
+@pytest.mark.parametrize("owner", ELEMENTS_BY_OWNER)
+def test_declared_types_are_those_of_blender(owner):
+    for element in ELEMENTS_BY_OWNER[owner]:
         rna = getattr(bpy.types, owner).bl_rna.properties[element.name]
         shape = tuple(size for size in getattr(rna, "array_dimensions", ()) if size)
-        assert (KINDS[rna.type], shape) == (element.dtype, element.shape), element.name
+        assert (DTYPES[rna.type], shape) == (element.dtype, element.shape), element.name
 
 
-def test_every_declaration_is_held_against_blender():
-    stated = [v if isinstance(v, tuple) else (v,) for k, v in vars(arrays).items() if k.isupper()]
-    assert {element for elements in stated for element in elements} == {e for own in OWNERS.values() for e in own}
+def test_every_declared_element_is_compared():
+    declared = [v if isinstance(v, tuple) else (v,) for k, v in vars(arrays).items() if k.isupper()]
+    compared = [element for elements in ELEMENTS_BY_OWNER.values() for element in elements]
+    assert {element for elements in declared for element in elements} == set(compared)
 
 
 @pytest.fixture
@@ -56,18 +57,18 @@ def mesh() -> bpy.types.Mesh:
     return mesh
 
 
-def test_what_is_written_is_read(mesh):
+def test_written_arrays_are_read_back(mesh):
     positions = np.arange(9, dtype=np.float32).reshape(3, 3)
     arrays.write(mesh.vertices, COORDINATE_ELEMENT, positions)
-    for found in (arrays.read(mesh.vertices, COORDINATE_ELEMENT), mesh_positions(mesh)):
-        assert found.dtype == np.float32 and np.array_equal(found, positions)
+    for read_positions in (arrays.read(mesh.vertices, COORDINATE_ELEMENT), mesh_positions(mesh)):
+        assert read_positions.dtype == np.float32 and np.array_equal(read_positions, positions)
     set_mesh_positions(mesh, -positions)
     assert [tuple(vertex.co) for vertex in mesh.vertices] == [tuple(row) for row in (-positions).tolist()]
     assert arrays.read(mesh.polygons, LOOP_START).shape == (0,)
 
 
 @pytest.mark.parametrize(
-    ("values", "named"),
+    ("values", "shape"),
     [
         (np.zeros((2, 3), np.float32), r"\(2, 3\) float32"),
         (np.zeros((4, 3), np.float32), r"\(4, 3\) float32"),
@@ -76,14 +77,14 @@ def test_what_is_written_is_read(mesh):
         (np.zeros((3, 3), np.float32).T, r"\(3, 3\) float32, not contiguous"),
     ],
 )
-def test_what_does_not_fit_is_named_and_not_written(mesh, values, named):
+def test_an_array_of_the_wrong_type_is_named_and_not_written(mesh, values, shape):
     arrays.write(mesh.vertices, COORDINATE_ELEMENT, np.ones((3, 3), np.float32))
-    with pytest.raises(ValueError, match=rf"'co' of .*\[3\], MeshVertices.* is \(3,\) float32 each, .* is {named}"):
+    with pytest.raises(ValueError, match=rf"'co' of .*\[3\], MeshVertices.* is \(3,\) float32 each, .* is {shape}"):
         arrays.write(mesh.vertices, COORDINATE_ELEMENT, values)
     assert (mesh_positions(mesh) == 1).all()
 
 
-def test_a_reader_reads_into_its_memory_and_refuses_another(mesh):
+def test_a_reader_refuses_data_of_another_size(mesh):
     reader = Reader(VECTOR_ELEMENT, np.empty((3, 3), np.float32))
     set_mesh_positions(mesh, np.full((3, 3), 2, np.float32))
     reader.read(mesh.attributes["position"].data)
@@ -95,12 +96,12 @@ def test_a_reader_reads_into_its_memory_and_refuses_another(mesh):
         Reader(VECTOR_ELEMENT, np.empty((3, 3)))
 
 
-def test_a_property_that_is_not_there_is_a_bug(mesh):
+def test_a_missing_property_raises_attribute_error(mesh):
     with pytest.raises(AttributeError, match="nope"):
         arrays.read(mesh.vertices, Element("nope", np.float32))
 
 
-def test_pixels_have_the_size_of_their_picture():
+def test_written_pixels_must_have_the_size_of_the_picture():
     previews = bpy.utils.previews.new()
     try:
         preview = previews.new("picture")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Models of another rig, and files that are no models, on the command line: one sentence each."""
+"""Verbs that refuse models of another rig and damaged model files with one error message."""
 
 import json
 
@@ -21,16 +21,16 @@ from .refusals import save_elbow
 
 @pytest.fixture(params=["bind", "evaluate", "benchmark"])
 def verb(request, tmp_path):
-    """Arguments of each verb that takes a model, given rig and model."""
-    after = {
+    """Return, for each verb that reads a model, a function from the paths of rig and model to its arguments."""
+    more_arguments = {
         "bind": [tmp_path / "bound.blend"],
         "evaluate": ["--json", tmp_path / "e.json", "--poses", "2"],
         "benchmark": ["--json", tmp_path / "b.json", "--frames", "5"],
     }[request.param]
-    return lambda rig, model: [request.param, rig, model, *after]
+    return lambda rig, model: [request.param, rig, model, *more_arguments]
 
 
-def subdivide(rig) -> None:
+def subdivide_mesh(rig) -> None:
     bpy.context.view_layer.objects.active = rig.mesh_object
     bpy.ops.object.mode_set(mode="EDIT")
     bpy.ops.mesh.select_all(action="SELECT")
@@ -38,7 +38,7 @@ def subdivide(rig) -> None:
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def edit_bones(change):
+def bone_editor(change):
     def edit(rig):
         bpy.context.view_layer.objects.active = rig.armature_object
         bpy.ops.object.mode_set(mode="EDIT")
@@ -48,15 +48,15 @@ def edit_bones(change):
     return edit
 
 
-def rename(bones) -> None:
+def rename_bone(bones) -> None:
     bones["lower"].name = "forearm"
 
 
-def move(bones) -> None:
+def move_tail(bones) -> None:
     bones["lower"].tail.z += 0.1
 
 
-def unparent(bones) -> None:
+def unparent_bone(bones) -> None:
     bones["lower"].parent = None
 
 
@@ -64,24 +64,24 @@ def move_vertex(rig) -> None:
     rig.mesh_object.data.vertices[5].co.x += 0.001
 
 
-def reweight(rig) -> None:
+def change_weight(rig) -> None:
     rig.mesh_object.vertex_groups["lower"].add([0], 0.2, "REPLACE")
 
 
-def flip(rig) -> None:
+def flip_face(rig) -> None:
     rig.mesh_object.data.polygons[3].flip()
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (subdivide, "it has 300 vertices, the mesh has "),
-        (edit_bones(rename), "the armature lacks the joint 'lower'; it does not know the joint 'forearm'"),
-        (edit_bones(move), "the rest pose of the armature differs"),
-        (edit_bones(unparent), "its joints have other parents"),
+        (subdivide_mesh, "it has 300 vertices, the mesh has "),
+        (bone_editor(rename_bone), "the armature lacks the joint 'lower'; it does not know the joint 'forearm'"),
+        (bone_editor(move_tail), "the rest pose of the armature differs"),
+        (bone_editor(unparent_bone), "its joints have other parents"),
         (move_vertex, "the rest pose of the mesh differs"),
-        (reweight, "the skin weights differ"),
-        (flip, "the topology of the mesh differs"),
+        (change_weight, "the skin weights differ"),
+        (flip_face, "the topology of the mesh differs"),
     ],
     ids=["vertex count", "joints", "rest pose", "parents", "rest positions", "weights", "topology"],
 )
@@ -92,14 +92,14 @@ def test_a_model_of_another_rig(refusal, verb, elbow, tmp_path, change, words):
     assert text.endswith(". Record and train this rig.")
 
 
-def test_no_model(refusal, verb, elbow, tmp_path):
+def test_a_missing_model(refusal, verb, elbow, tmp_path):
     path = tmp_path / "none.onnx"
     text = refusal(*verb(elbow.rig, path))
     assert text.startswith(f"The model '{path}' cannot be read: {systems.NOT_FOUND}; ")
 
 
 @pytest.mark.parametrize("content", [b"", b"text, not a model\n" * 50, bytes(5000)])
-def test_a_file_that_is_no_model(refusal, verb, elbow, tmp_path, content):
+def test_a_file_that_is_not_an_onnx_file(refusal, verb, elbow, tmp_path, content):
     path = tmp_path / "m.onnx"
     path.write_bytes(content)
     assert refusal(*verb(elbow.rig, path)) == (
@@ -107,10 +107,10 @@ def test_a_file_that_is_no_model(refusal, verb, elbow, tmp_path, content):
     )
 
 
-@pytest.mark.parametrize("part", [0.1, 0.5, 0.999])
-def test_a_truncated_model(refusal, verb, elbow, tmp_path, part):
+@pytest.mark.parametrize("kept_ratio", [0.1, 0.5, 0.999])
+def test_a_truncated_model(refusal, verb, elbow, tmp_path, kept_ratio):
     path, data = tmp_path / "m.onnx", elbow.model.read_bytes()
-    path.write_bytes(data[: int(len(data) * part)])
+    path.write_bytes(data[: int(len(data) * kept_ratio)])
     assert f"'{path}' is not a model" in refusal(*verb(elbow.rig, path))
 
 
@@ -141,7 +141,7 @@ def remove_metadata(model) -> None:
     del model.metadata_props[:]
 
 
-def of_version_2(model) -> None:
+def set_version_2(model) -> None:
     (prop,) = (prop for prop in model.metadata_props if prop.key == METADATA_KEY)
     prop.value = json.dumps({**json.loads(prop.value), "version": 2})
 
@@ -154,65 +154,65 @@ def of_version_2(model) -> None:
         (add_hidden_operator, "uses custom operators (com.example::Run), which is refused; give a model"),
         (keep_data_outside, "keeps data in other files, which is refused; give a model that train made"),
         (remove_metadata, "is an ONNX file but not a model of this add-on; give one that train made"),
-        (of_version_2, "cannot be used: it is of version 2 and this add-on reads version 1; train it again"),
+        (set_version_2, "cannot be used: it is of version 2 and this add-on reads version 1; train it again"),
     ],
 )
-def test_onnx_files_that_are_refused_unopened(refusal, verb, elbow, tmp_path, change, words):
+def test_onnx_files_that_are_not_models_of_the_add_on(refusal, verb, elbow, tmp_path, change, words):
     path = write_edited(elbow.model, tmp_path / "m.onnx", change)
     text = refusal(*verb(elbow.rig, path))
     assert str(path) in text and words in text
 
 
-def of_an_unknown_operator(model) -> None:
+def use_unknown_operator(model) -> None:
     model.graph.node[0].op_type = "NoSuchOperator"
 
 
-def with_a_loop(model) -> None:
+def create_loop(model) -> None:
     model.graph.node[0].input[0] = model.graph.node[-1].output[0]
 
 
-def of_doubles(model) -> None:
+def use_double_input(model) -> None:
     model.graph.input[0].type.tensor_type.elem_type = TensorProto.DOUBLE
 
 
-@pytest.mark.parametrize("change", [of_an_unknown_operator, with_a_loop])
-def test_graphs_that_are_refused_before_onnx_runtime_sees_them(refusal, verb, elbow, tmp_path, change):
+@pytest.mark.parametrize("change", [use_unknown_operator, create_loop])
+def test_graphs_that_are_refused_before_onnx_runtime_loads_them(refusal, verb, elbow, tmp_path, change):
     path = write_edited(elbow.model, tmp_path / "m.onnx", change)
     text = refusal(*verb(elbow.rig, path))
     assert text.startswith(f"The model '{path}' is refused: ") and text.endswith("; give one that train made.")
 
 
-def test_what_onnx_runtime_refuses(refusal, verb, elbow, tmp_path):
-    path = write_edited(elbow.model, tmp_path / "m.onnx", of_doubles)
+def test_a_graph_that_onnx_runtime_refuses(refusal, verb, elbow, tmp_path):
+    path = write_edited(elbow.model, tmp_path / "m.onnx", use_double_input)
     text = refusal(*verb(elbow.rig, path))
     assert text.startswith(f"ONNX Runtime refuses the model '{path}' (") and text.endswith("); train it again.")
 
 
-def test_weights_that_were_damaged_on_the_way(refusal, verb, elbow, tmp_path):
+def test_weights_that_do_not_match_the_checksum(refusal, verb, elbow, tmp_path):
     data = bytearray(elbow.model.read_bytes())
-    place = max(read_onnx(bytes(data)).constants.values(), key=lambda constant: len(constant.data)).data
-    data[bytes(data).index(bytes(place)) + len(place) // 2] ^= 0x40
+    weights = max(read_onnx(bytes(data)).constants.values(), key=lambda constant: len(constant.data)).data
+    data[bytes(data).index(bytes(weights)) + len(weights) // 2] ^= 0x40
     path = tmp_path / "m.onnx"
     path.write_bytes(data)
     assert "is damaged: its checksum is not that of its weights" in refusal(*verb(elbow.rig, path))
 
 
-def answer_nan(model) -> None:
-    """The positions are multiplied by NaN on their way out."""
+def output_nan(model) -> None:
+    """Multiply the output positions by NaN."""
     last = next(node for node in model.graph.node if "positions" in node.output)
     last.output[list(last.output).index("positions")] = "good"
     model.graph.initializer.append(numpy_helper.from_array(np.float32([np.nan]), "nan"))
     model.graph.node.append(helper.make_node("Mul", ["good", "nan"], ["positions"]))
 
 
-def test_a_model_that_answers_no_numbers(refusal, elbow, tmp_path):
-    path = write_edited(elbow.model, tmp_path / "m.onnx", answer_nan)
+def test_evaluating_a_model_that_returns_nan(refusal, elbow, tmp_path):
+    path = write_edited(elbow.model, tmp_path / "m.onnx", output_nan)
     text = refusal("evaluate", elbow.rig, path, "--json", tmp_path / "e.json", "--poses", 2)
     assert f"The model '{path}' gives positions that are not numbers (held-out poses, pose 0)" in text
 
 
-def answer_nan_when_straight(model) -> None:
-    """0 / 0 is added where an element of the lower joint's matrix, 1.0 in the straight arm, is above 0.85."""
+def output_nan_when_straight(model) -> None:
+    """Add 0 / 0 to the positions if an element of the lower joint's matrix is above 0.85, as in a straight arm."""
     last = next(node for node in model.graph.node if "positions" in node.output)
     last.output[list(last.output).index("positions")] = "good"
     for name, value in (("from", [1, 0, 1]), ("to", [2, 1, 2]), ("axes", [1, 2, 3]), ("one", [-1, 1, 1])):
@@ -231,21 +231,24 @@ def answer_nan_when_straight(model) -> None:
         model.graph.node.append(helper.make_node(*node))
 
 
-@pytest.mark.parametrize("change", [answer_nan, answer_nan_when_straight])
-def test_a_model_that_plays_no_numbers_says_so(bound, elbow, tmp_path, change, capsys):
+@pytest.mark.parametrize("change", [output_nan, output_nan_when_straight])
+def test_playing_a_model_that_returns_nan_shows_an_error(bound, elbow, tmp_path, change, capsys):
     armature = bpy.data.objects["elbow_rig"]
     armature.animation_data_clear()
     bind(find_rig(), write_edited(elbow.model, tmp_path / "m.onnx", change))
-    said = []
+    is_error_shown = []
     for angle in (0.8, -0.8, 0.8):
         armature.pose.bones["lower"].rotation_euler[0] = angle
         bpy.context.view_layer.update()
-        said.append("gives positions that are not numbers; train it again." in bound.fdda.status)
-    assert said == [True, True, True] if change is answer_nan else sorted(set(said)) == [False, True]
+        is_error_shown.append("gives positions that are not numbers; train it again." in bound.fdda.status)
+    if change is output_nan:
+        assert is_error_shown == [True, True, True]
+    else:
+        assert sorted(set(is_error_shown)) == [False, True]
     assert bound.fdda.mode == "FDDA"
 
 
-def answer_fewer(model) -> None:
+def output_fewer_vertices(model) -> None:
     last = next(node for node in model.graph.node if "positions" in node.output)
     last.output[list(last.output).index("positions")] = "all"
     for name, value in (("from", [0]), ("to", [7]), ("axis", [1])):
@@ -253,14 +256,14 @@ def answer_fewer(model) -> None:
     model.graph.node.append(helper.make_node("Slice", ["all", "from", "to", "axis"], ["positions"]))
 
 
-def test_a_model_that_answers_another_shape(refusal, verb, elbow, tmp_path):
-    path = write_edited(elbow.model, tmp_path / "m.onnx", answer_fewer)
+def test_a_model_whose_output_has_another_shape(refusal, verb, elbow, tmp_path):
+    path = write_edited(elbow.model, tmp_path / "m.onnx", output_fewer_vertices)
     assert "is refused: its output 'positions' comes out as (1, 7, 3), not as (1, 300, 3)" in refusal(
         *verb(elbow.rig, path)
     )
 
 
-def test_a_refused_model_leaves_a_bound_object_as_it_is(bound, elbow, tmp_path):
+def test_a_refused_model_does_not_change_a_bound_object(bound, elbow, tmp_path):
     path = write_edited(elbow.model, tmp_path / "m.onnx", add_custom_operator)
     with pytest.raises(FDDAError, match="custom operators"):
         bind(find_rig(), path)
@@ -268,6 +271,6 @@ def test_a_refused_model_leaves_a_bound_object_as_it_is(bound, elbow, tmp_path):
     assert [m.show_viewport for m in bound.modifiers] == [False, False, True]
 
 
-def test_the_good_model_is_taken(verb, elbow):
-    """Else all refusals above could have another reason."""
+def test_the_unchanged_model_is_accepted(verb, elbow):
+    """This shows that the changes above are the reason for the errors."""
     assert run(*verb(elbow.rig, elbow.model)) == 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A trainer that is not there, lacks torch, or dies: `train` says so and leaves no model."""
+"""Trainers that are missing, lack a package, fail or die: `train` prints an error message and writes no model."""
 
 import os
 import re
@@ -24,8 +24,8 @@ pytestmark = pytest.mark.one_blender_version
 
 
 @pytest.fixture
-def train(refusal, elbow, tmp_path):
-    """Run `train` on the elbow's recording and return the sentence."""
+def train_refusal(refusal, elbow, tmp_path):
+    """Return a function that runs `train` on the elbow's recording, and returns its error message."""
 
     def run_train(*options: object, status: int = 1) -> str:
         return refusal("train", elbow.recording, tmp_path / "m.onnx", *options, status=status)
@@ -34,22 +34,22 @@ def train(refusal, elbow, tmp_path):
 
 
 STARTED = print_message_code(MessageType.STARTED, partitions=1, poses=1, vertices=1, device="cpu")
-PROGRESS = print_message_code(MessageType.PROGRESS, epoch=1, epochs=2, validation_mm=0.5)
+PROGRESSED = print_message_code(MessageType.PROGRESS, epoch=1, epochs=2, validation_mm=0.5)
 
 
-def test_a_python_without_torch(train, tmp_path, monkeypatch):
+def test_a_python_without_torch(train_refusal, tmp_path, monkeypatch):
     packages = tmp_path / "packages"
     packages.mkdir()
     (packages / "sitecustomize.py").write_text("import sys\nsys.modules['torch'] = None\n")
     monkeypatch.setenv("PYTHONPATH", str(packages))
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
-    text = train()
+    text = train_refusal()
     python = os.environ.get(PYTHON_VARIABLE) or sys.executable
     assert text.startswith(f"Training needs the Python package 'torch', which {python} does not have; install torch")
     assert PYTHON_VARIABLE in text
 
 
-def test_a_python_that_finds_no_trainer(train, tmp_path, monkeypatch):
+def test_a_python_that_cannot_import_the_trainer(train_refusal, tmp_path, monkeypatch):
     stand_in_trainer(
         tmp_path,
         monkeypatch,
@@ -57,7 +57,7 @@ def test_a_python_that_finds_no_trainer(train, tmp_path, monkeypatch):
         "status = subprocess.call([sys.executable, '-I', '-S', *sys.orig_argv[1:]])",
     )
     assert re.match(
-        r"The trainer ended with status 1 before it was done \(.*trainer.*\); no model was written", train()
+        r"The trainer ended with status 1 before it was done \(.*trainer.*\); no model was written", train_refusal()
     )
 
 
@@ -70,42 +70,42 @@ def test_a_trainer_in_the_current_folder_is_not_run(tmp_path):
     assert result.returncode == 0 and "usage: " in result.stdout, result.stderr
 
 
-def test_a_python_that_is_not_there(train, monkeypatch):
+def test_a_missing_python(train_refusal, monkeypatch):
     monkeypatch.setenv(PYTHON_VARIABLE, "/none/python")
     assert re.fullmatch(
         r"The trainer's Python '/none/python' cannot be started \(No such file or directory.*\); set "
         "FDDA_TRAINER_PYTHON to a Python that has torch.",
-        train(),
+        train_refusal(),
     )
 
 
-def test_a_python_that_is_no_program(train, tmp_path, monkeypatch):
+def test_a_python_that_is_not_executable(train_refusal, tmp_path, monkeypatch):
     path = tmp_path / "python"
     path.write_text("")
     monkeypatch.setenv(PYTHON_VARIABLE, str(path))
-    assert "cannot be started (" in train()
+    assert "cannot be started (" in train_refusal()
 
 
-def test_a_trainer_that_ends_without_a_word(train, tmp_path, monkeypatch):
+def test_a_trainer_that_fails_without_output(train_refusal, tmp_path, monkeypatch):
     stand_in_trainer(tmp_path, monkeypatch, status=3)
-    assert train() == "The trainer ended with status 3 before it was done; no model was written, train again."
+    assert train_refusal() == "The trainer ended with status 3 before it was done; no model was written, train again."
 
 
-def test_a_trainer_that_ends_well_without_a_word(train, tmp_path, monkeypatch):
+def test_a_trainer_that_exits_with_0_before_it_is_done(train_refusal, tmp_path, monkeypatch):
     stand_in_trainer(tmp_path, monkeypatch, STARTED)
-    assert "The trainer ended with status 0 before it was done;" in train()
+    assert "The trainer ended with status 0 before it was done;" in train_refusal()
 
 
-def test_a_trainer_that_complains_and_ends(train, tmp_path, monkeypatch):
+def test_a_trainer_that_writes_an_error_and_exits(train_refusal, tmp_path, monkeypatch):
     stand_in_trainer(tmp_path, monkeypatch, "sys.stderr.write('first\\nImportError: Jürgen 李\\n')", status=1)
-    assert train() == (
+    assert train_refusal() == (
         "The trainer ended with status 1 before it was done (ImportError: Jürgen 李); no model was written, train "
         "again."
     )
 
 
 @pytest.mark.parametrize("verb", ["train", "record"])
-def test_no_temporary_folder_takes_a_file(refusal, elbow, tmp_path, monkeypatch, verb):
+def test_no_temporary_folder_is_writable(refusal, elbow, tmp_path, monkeypatch, verb):
     arguments = {
         "train": ["train", elbow.recording, tmp_path / "m.onnx"],
         "record": ["record", elbow.rig, tmp_path / "r", "--poses", 20, "--fit-linear", "hard"],
@@ -118,63 +118,65 @@ def test_no_temporary_folder_takes_a_file(refusal, elbow, tmp_path, monkeypatch,
     assert text.endswith("); make room there, or name another folder in TMPDIR.")
 
 
-def test_a_trainer_that_lacks_a_library(train, tmp_path, monkeypatch):
+def test_a_trainer_that_lacks_a_library(train_refusal, tmp_path, monkeypatch):
     error = "ImportError: DLL load failed while importing _C: Das angegebene Modul wurde nicht gefunden."
     stand_in_trainer(tmp_path, monkeypatch, f"sys.stderr.write({error!r})", status=1)
-    text = train()
+    text = train_refusal()
     assert f"({error}); install Microsoft's Visual C++ runtime from https://aka.ms/vs/17/release/vc_redist." in text
 
 
-def test_a_trainer_that_is_killed(train, tmp_path, monkeypatch):
-    """On Windows the Task Manager gives a process status 1, and nothing else says that it was killed."""
+def test_a_trainer_that_is_killed(train_refusal, tmp_path, monkeypatch):
+    """On Windows, a process that the Task Manager kills has exit status 1, like a process that fails."""
     kill = "os.kill(os.getpid(), getattr(signal, 'SIGKILL', 15))"
-    stand_in_trainer(tmp_path, monkeypatch, STARTED, PROGRESS, kill)
-    how = "was ended from outside" if os.name == "nt" else "was ended by signal 9"
-    assert train(status=TRY_AGAIN) == f"The trainer {how} before it was done; no model was written, train again."
+    stand_in_trainer(tmp_path, monkeypatch, STARTED, PROGRESSED, kill)
+    cause = "was ended from outside" if os.name == "nt" else "was ended by signal 9"
+    assert (
+        train_refusal(status=TRY_AGAIN) == f"The trainer {cause} before it was done; no model was written, train again."
+    )
 
 
-def test_a_trainer_that_crashes(train, tmp_path, monkeypatch):
+def test_a_trainer_that_crashes(train_refusal, tmp_path, monkeypatch):
     stand_in_trainer(tmp_path, monkeypatch, STARTED, "import faulthandler", "faulthandler._read_null()")
-    how = "crashed: access violation, status 0xC0000005" if os.name == "nt" else "was ended by signal 11"
-    assert train(status=TRY_AGAIN).startswith(f"The trainer {how}")
+    cause = "crashed: access violation, status 0xC0000005" if os.name == "nt" else "was ended by signal 11"
+    assert train_refusal(status=TRY_AGAIN).startswith(f"The trainer {cause}")
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="/dev/full is Linux's")
 @pytest.mark.parametrize("is_silent", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_a_trainer_whose_disk_is_full(elbow, train, tmp_path, monkeypatch, is_silent):
-    """It cannot say a word, or only on stderr."""
+def test_a_trainer_whose_disk_is_full(elbow, train_refusal, tmp_path, monkeypatch, is_silent):
+    """The trainer cannot write to stdout, and in one case not to stderr."""
     lines = ["os.dup2(os.open('/dev/full', os.O_WRONLY), 1)", *(["os.dup2(1, 2)"] if is_silent else [])]
     packages = tmp_path / "packages"
     packages.mkdir()
     code = "\n".join(["import os, sys", "if 'trainer' in sys.orig_argv:", *(f"    {line}" for line in lines), ""])
     (packages / "sitecustomize.py").write_text(code)
     monkeypatch.setenv("PYTHONPATH", str(packages))
-    text = train("--epochs", 1, status=TRY_AGAIN)
+    text = train_refusal("--epochs", 1, status=TRY_AGAIN)
     assert is_silent or "No space left on device; make room, end other programs, or try again." in text
 
 
-def test_a_trainer_that_fails_in_a_sentence(train, tmp_path, monkeypatch):
+def test_an_error_message_of_the_trainer_is_shown(train_refusal, tmp_path, monkeypatch):
     stand_in_trainer(
         tmp_path, monkeypatch, STARTED, print_message_code(MessageType.FAILED, text="The sky fell; wait."), status=1
     )
-    assert train() == "The sky fell; wait."
+    assert train_refusal() == "The sky fell; wait."
 
 
-def test_lines_that_are_no_messages_are_passed_over(train, tmp_path, monkeypatch):
+def test_lines_that_are_not_messages_are_ignored(train_refusal, tmp_path, monkeypatch):
     noise = ["print('a warning')", "print('{}')", "sys.stdout.buffer.write(b'\\xfc\\n')", STARTED, "print()"]
     stand_in_trainer(tmp_path, monkeypatch, *noise, print_message_code(MessageType.FAILED, text="Enough."))
-    assert train() == "Enough."
+    assert train_refusal() == "Enough."
 
 
 @pytest.mark.parametrize("lines", [(STARTED, print_message_code(MessageType.CANCELLED)), ()])
-def test_a_trainer_that_is_cancelled_by_someone_else(elbow, tmp_path, monkeypatch, lines):
+def test_a_trainer_that_another_program_cancels(elbow, tmp_path, monkeypatch, lines):
     stand_in_trainer(tmp_path, monkeypatch, *lines, status=130)
     assert run("train", elbow.recording, tmp_path / "m.onnx") == 130
     assert not (tmp_path / "m.onnx").exists()
 
 
-def test_a_trainer_that_does_not_stop_is_stopped(tmp_path, monkeypatch):
-    """Leaving the block ends the process, also one that would go on for an hour and heeds nothing."""
+def test_a_trainer_that_ignores_the_stop_request_is_killed(tmp_path, monkeypatch):
+    """Leaving the `with` block ends a process that would run for an hour and ignores requests."""
     from fdda_addon.training import process
 
     monkeypatch.setattr(process, "KILL_AFTER_SECONDS", 0.5)
@@ -185,15 +187,15 @@ def test_a_trainer_that_does_not_stop_is_stopped(tmp_path, monkeypatch):
     assert popen.returncode not in (None, 0) and not training._stop_file.exists()
 
 
-def test_nobody_waits_for_a_trainer_that_is_silent(tmp_path, monkeypatch):
-    """As a window has it: a poll is answered at once, and a canceled trainer ends without an error."""
+def test_polling_a_silent_trainer_does_not_block(tmp_path, monkeypatch):
+    """A modal operator polls for messages. A poll returns at once, and a canceled trainer ends without an error."""
     from fdda_addon.training import process
 
     stand_in_trainer(tmp_path, monkeypatch, STARTED, "time.sleep(3600)")
     with process.Training([]) as training:
         messages = training.messages(wait=False)
-        seen = first_of(messages)
-        assert seen.type is MessageType.STARTED
+        message = next_message(messages)
+        assert message.type is MessageType.STARTED
         seconds = []
         for _ in range(100):
             start = time.monotonic()
@@ -203,15 +205,15 @@ def test_nobody_waits_for_a_trainer_that_is_silent(tmp_path, monkeypatch):
         assert max(seconds) < 1
         monkeypatch.setattr(process, "KILL_AFTER_SECONDS", 0.5)
         training.cancel()
-        assert first_of(messages) is None
+        assert next_message(messages) is None
 
 
-def first_of(messages: Iterator[Message | None], seconds: float = 20) -> Message | None:
-    """The next message of a training that is polled; None when it has ended."""
-    until = time.monotonic() + seconds
+def next_message(messages: Iterator[Message | None], seconds: float = 20) -> Message | None:
+    """Poll until a training has a message and return the message, or None if the training ends."""
+    deadline = time.monotonic() + seconds
     for message in messages:
         if message is not None:
             return message
-        assert time.monotonic() < until, "neither a message nor an end"
+        assert time.monotonic() < deadline, "neither a message nor an end"
         time.sleep(0.01)
     return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Baked files play what the model says in a Blender that has never heard of the add-on."""
+"""Baked files show the model's positions in a Blender without the add-on."""
 
 import shutil
 from pathlib import Path
@@ -24,13 +24,14 @@ from .scene_state import fresh_elbow
 
 
 @pytest.fixture(scope="module")
-def wave(elbow) -> np.ndarray:
+def wave_positions(elbow) -> np.ndarray:
+    """Return the model's positions (F, V, 3) in all frames of the elbow's action."""
     return predicted_wave(elbow)
 
 
 @pytest.fixture(scope="module")
-def baked(elbow, tmp_path_factory) -> Path:
-    """A folder with a bake of each kind."""
+def baked_folder(elbow, tmp_path_factory) -> Path:
+    """Bake the elbow as a point cache, as a file with a cache, and as a file with shape keys; return the folder."""
     folder = tmp_path_factory.mktemp("baked")
     for options in (["walk.pc2"], ["cache.blend"], ["keys.blend", "--shape-keys"]):
         arguments = ["--action", "elbow_wave", *options[1:]]
@@ -39,18 +40,18 @@ def baked(elbow, tmp_path_factory) -> Path:
 
 
 class TestFiles:
-    def test_a_point_cache_holds_what_the_model_says(self, baked, wave):
-        start, rate, positions = read_pc2(baked / "walk.pc2")
-        assert (start, rate) == (1, 1) and positions.shape == wave.shape
-        assert np.abs(positions - wave).max() < 1e-6 < np.abs(np.diff(wave, axis=0)).max()
+    def test_a_point_cache_contains_the_model_s_positions(self, baked_folder, wave_positions):
+        start, rate, positions = read_pc2(baked_folder / "walk.pc2")
+        assert (start, rate) == (1, 1) and positions.shape == wave_positions.shape
+        assert np.abs(positions - wave_positions).max() < 1e-6 < np.abs(np.diff(wave_positions, axis=0)).max()
 
-    def test_only_these_files_are_written(self, baked):
-        assert sorted(file_contents(baked)) == ["cache.blend", "cache.pc2", "keys.blend", "walk.pc2"]
-        assert (baked / "cache.pc2").read_bytes() == (baked / "walk.pc2").read_bytes()
+    def test_baking_writes_no_other_files(self, baked_folder):
+        assert sorted(file_contents(baked_folder)) == ["cache.blend", "cache.pc2", "keys.blend", "walk.pc2"]
+        assert (baked_folder / "cache.pc2").read_bytes() == (baked_folder / "walk.pc2").read_bytes()
 
     @pytest.mark.parametrize("name", ["cache.blend", "keys.blend"])
-    def test_the_rig_no_longer_deforms(self, baked, name):
-        bpy.ops.wm.open_mainfile(filepath=str(baked / name))
+    def test_a_baked_file_has_no_armature_modifier(self, baked_folder, name):
+        bpy.ops.wm.open_mainfile(filepath=str(baked_folder / name))
         mesh_object = bpy.data.objects[ELBOW]
         assert [m.type for m in mesh_object.modifiers] == (["MESH_CACHE"] if name == "cache.blend" else [])
         assert len(bpy.data.objects) == 2 and mesh_object.parent == bpy.data.objects[ELBOW_RIG]
@@ -58,30 +59,33 @@ class TestFiles:
 
 
 class TestWithoutTheAddOn:
-    def test_files_play_what_the_model_says(self, baked, wave, tmp_path):
-        """Every frame, between frames, before the first and after the last; also from another folder."""
-        moved = shutil.copytree(baked, tmp_path / "moved")
+    def test_baked_files_show_the_model_s_positions(self, baked_folder, wave_positions, tmp_path):
+        """Check all frames, a subframe, and frames outside the range; also after the folder was moved."""
+        moved = shutil.copytree(baked_folder, tmp_path / "moved")
         (moved / "walk.pc2").unlink()
-        inside, between = list(map(float, WAVE_FRAMES)), 8.25
-        times = [*inside, between, -5.0, 99.0]
-        jobs = [(folder / name, times) for name in ("cache.blend", "keys.blend") for folder in (baked, moved)]
+        frames, subframe = list(map(float, WAVE_FRAMES)), 8.25
+        times = [*frames, subframe, -5.0, 99.0]
+        jobs = [(folder / name, times) for name in ("cache.blend", "keys.blend") for folder in (baked_folder, moved)]
         shown = shown_without_add_on(tmp_path, *jobs)
         for path, _ in jobs:
-            frames = np.array([shown[path, time] for time in inside])
-            assert np.abs(frames - wave).max() < POSITION_TOLERANCE
-            assert np.abs(shown[path, between] - (0.75 * wave[7] + 0.25 * wave[8])).max() < POSITION_TOLERANCE
-            assert np.abs(shown[path, -5.0] - wave[0]).max() < POSITION_TOLERANCE
-            assert np.abs(shown[path, 99.0] - wave[-1]).max() < POSITION_TOLERANCE
+            positions = np.array([shown[path, time] for time in frames])
+            assert np.abs(positions - wave_positions).max() < POSITION_TOLERANCE
+            assert (
+                np.abs(shown[path, subframe] - (0.75 * wave_positions[7] + 0.25 * wave_positions[8])).max()
+                < POSITION_TOLERANCE
+            )
+            assert np.abs(shown[path, -5.0] - wave_positions[0]).max() < POSITION_TOLERANCE
+            assert np.abs(shown[path, 99.0] - wave_positions[-1]).max() < POSITION_TOLERANCE
 
-    def test_the_cache_that_moved_along_is_the_one_that_plays(self, baked, tmp_path):
-        moved = shutil.copytree(baked, tmp_path / "moved")
+    def test_a_moved_file_plays_the_cache_in_its_own_folder(self, baked_folder, tmp_path):
+        moved = shutil.copytree(baked_folder, tmp_path / "moved")
         data = bytearray((moved / "cache.pc2").read_bytes())
         data[32:] = np.ones((len(data) - 32) // 4, "<f4").tobytes()
         (moved / "cache.pc2").write_bytes(data)
         path = moved / "cache.blend"
         assert (shown_without_add_on(tmp_path, (path, [4.0]))[path, 4.0] == 1).all()
 
-    def test_an_output_in_another_folder_than_the_rig(self, elbow, wave, tmp_path, monkeypatch):
+    def test_baking_into_another_folder_than_the_rig_s(self, elbow, wave_positions, tmp_path, monkeypatch):
         (tmp_path / "in").mkdir()
         (tmp_path / "out").mkdir()
         rig = shutil.copy(elbow.rig, tmp_path / "in" / "rig.blend")
@@ -89,12 +93,12 @@ class TestWithoutTheAddOn:
         assert run("bake", rig, elbow.model, "out/a.blend") == 0
         bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "a.blend"))
         assert bpy.data.objects[ELBOW].modifiers[0].filepath == "//a.pc2"
-        assert np.abs(evaluated(bpy.data.objects[ELBOW]) - wave[0]).max() < POSITION_TOLERANCE
+        assert np.abs(evaluated(bpy.data.objects[ELBOW]) - wave_positions[0]).max() < POSITION_TOLERANCE
 
-    def test_a_subdivision_above_stays_live(self, elbow, wave, tmp_path):
+    def test_a_subdivision_after_the_baked_modifiers_is_kept(self, elbow, wave_positions, tmp_path):
         def subdivide(rig):
-            finer = rig.mesh_object.modifiers.new("Finer", "SUBSURF")
-            finer.levels, finer.use_pin_to_last = 1, True
+            modifier = rig.mesh_object.modifiers.new("Finer", "SUBSURF")
+            modifier.levels, modifier.use_pin_to_last = 1, True
 
         rig = save_elbow(tmp_path / "rig.blend", subdivide)
         outs = [tmp_path / "cache.blend", tmp_path / "keys.blend"]
@@ -105,17 +109,17 @@ class TestWithoutTheAddOn:
         shown = shown_without_add_on(tmp_path, *((out, [10.0]) for out in outs))
         mesh_object = fresh_elbow().mesh_object
         mesh_object.modifiers.clear()
-        mesh_object.data.attributes["position"].data.foreach_set("vector", wave[9].reshape(-1))
+        mesh_object.data.attributes["position"].data.foreach_set("vector", wave_positions[9].reshape(-1))
         mesh_object.modifiers.new("Finer", "SUBSURF").levels = 1
         expected = evaluated(mesh_object)
-        assert len(expected) > 3 * len(wave[9])
+        assert len(expected) > 3 * len(wave_positions[9])
         for out in outs:
             assert np.abs(shown[out, 10.0] - expected).max() < POSITION_TOLERANCE
 
-    def test_keys_of_the_mesh_and_a_parent_that_deforms_do_not_show(self, elbow, wave, tmp_path):
-        """The mesh that another object shares keeps its own keys."""
+    def test_shape_keys_and_an_armature_parent_do_not_change_a_bake(self, elbow, wave_positions, tmp_path):
+        """The mesh keeps its shape keys for another object that uses it."""
 
-        def change(rig):
+        def add_keys_and_parent(rig):
             mesh_object = rig.mesh_object
             twin = bpy.data.objects.new("twin", mesh_object.data)
             bpy.context.scene.collection.objects.link(twin)
@@ -126,14 +130,14 @@ class TestWithoutTheAddOn:
             mesh_object.parent_type = "ARMATURE"
             mesh_object.show_only_shape_key, mesh_object.active_shape_key_index = True, 0
 
-        rig = save_elbow(tmp_path / "rig.blend", change)
+        rig = save_elbow(tmp_path / "rig.blend", add_keys_and_parent)
         outs = [tmp_path / "cache.blend", tmp_path / "keys.blend"]
         for out, options in zip(outs, ([], ["--shape-keys"]), strict=True):
             assert run("bake", rig, elbow.model, out, "--action", "elbow_wave", *options) == 0
         shown = shown_without_add_on(tmp_path, *((out, [1.0, 10.0]) for out in outs))
         for out in outs:
-            assert np.abs(shown[out, 10.0] - wave[9]).max() < POSITION_TOLERANCE
-            assert np.abs(shown[out, 1.0] - wave[0]).max() < POSITION_TOLERANCE
+            assert np.abs(shown[out, 10.0] - wave_positions[9]).max() < POSITION_TOLERANCE
+            assert np.abs(shown[out, 1.0] - wave_positions[0]).max() < POSITION_TOLERANCE
         bpy.ops.wm.open_mainfile(filepath=str(outs[1]))
         assert [key.name for key in bpy.data.objects["twin"].data.shape_keys.key_blocks] == ["Basis", "Fat"]
         keys = bpy.data.objects[ELBOW].data.shape_keys.key_blocks
@@ -143,9 +147,9 @@ class TestWithoutTheAddOn:
 class TestLinked:
     @pytest.fixture
     def shot(self, elbow, tmp_path) -> Path:
-        """A file that links the elbow, with a library override when asked."""
+        """Return a function that saves a file with a linked elbow, or with a library override of it."""
 
-        def make(override: bool) -> Path:
+        def make_shot(is_overridden: bool) -> Path:
             bpy.ops.wm.read_factory_settings(use_empty=True)
             path = tmp_path / "shot.blend"
             save_copy(path)
@@ -154,32 +158,32 @@ class TestLinked:
                 into.objects = [ELBOW, ELBOW_RIG]
             for linked in list(into.objects):
                 bpy.context.scene.collection.objects.link(linked)
-            if override:
+            if is_overridden:
                 for linked in list(into.objects):
                     linked.override_create(remap_local_usages=True)
             save_copy(path)
             return path
 
-        return make
+        return make_shot
 
-    def test_a_linked_character(self, shot, elbow, wave, tmp_path, capfd):
-        path = shot(override=False)
+    def test_a_linked_character_is_baked_into_a_point_cache_only(self, shot, elbow, wave_positions, tmp_path, capfd):
+        path = shot(is_overridden=False)
         assert run("bake", path, elbow.model, tmp_path / "a.pc2", "--frames", 1, 30) == 0
-        assert np.abs(read_pc2(tmp_path / "a.pc2")[2] - wave).max() < 1e-6
+        assert np.abs(read_pc2(tmp_path / "a.pc2")[2] - wave_positions).max() < 1e-6
         assert run("bake", path, elbow.model, tmp_path / "a.blend") == 1
         assert "so its modifiers cannot be replaced here; bake it in that file" in capfd.readouterr().err
 
     @pytest.mark.parametrize("options", [[], ["--shape-keys"]], ids=["cache", "keys"])
-    def test_a_library_override(self, shot, elbow, wave, tmp_path, options):
-        path = shot(override=True)
+    def test_a_library_override_is_baked(self, shot, elbow, wave_positions, tmp_path, options):
+        path = shot(is_overridden=True)
         out = tmp_path / "a.blend"
         assert run("bake", path, elbow.model, out, "--frames", 1, 30, *options) == 0
         shown = shown_without_add_on(tmp_path, (out, [9.0]))
-        assert np.abs(shown[out, 9.0] - wave[8]).max() < POSITION_TOLERANCE
+        assert np.abs(shown[out, 9.0] - wave_positions[8]).max() < POSITION_TOLERANCE
 
 
-def test_controls_are_baked_along(tmp_path):
-    """A key that no bone moves is an input of the model; its animation is in the bake, and it is gone itself."""
+def test_a_bake_includes_animated_controls(tmp_path):
+    """An animated shape key is an input of the model. The bake includes its effect, but not the shape key."""
 
     def add_key(rig):
         rig.mesh_object.shape_key_add(name="Basis")
@@ -200,7 +204,7 @@ def test_controls_are_baked_along(tmp_path):
     keys = bpy.data.objects[ELBOW].data.shape_keys
     keys.animation_data_clear()
     keys.key_blocks["Fat"].value = 0.0
-    assert np.abs(predicted_in_frames([20], model)[0] - expected[19]).max() > 0.01, "the key matters"
+    assert np.abs(predicted_in_frames([20], model)[0] - expected[19]).max() > 0.01, "the shape key moves vertices"
     assert np.abs(read_pc2(tmp_path / "a.pc2")[2] - expected).max() < 1e-6
     shown = shown_without_add_on(tmp_path, (out, [20.0]))
     assert np.abs(shown[out, 20.0] - expected[19]).max() < POSITION_TOLERANCE

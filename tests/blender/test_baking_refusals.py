@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bakes that are refused: one sentence each, and nothing half written."""
+"""Bakes that fail with one error message and leave no incomplete file."""
 
 import re
 import shutil
@@ -13,20 +13,20 @@ from .refusals import file_contents, limited_file_size, save_elbow
 
 
 class TestRefusals:
-    def test_no_such_action(self, refusal, elbow, tmp_path):
+    def test_a_missing_action(self, refusal, elbow, tmp_path):
         text = refusal("bake", elbow.rig, elbow.model, tmp_path / "a.pc2", "--action", "jump")
         assert text == "The file has no action 'jump'; its actions: 'elbow_wave'."
 
     def test_a_model_of_another_rig(self, refusal, elbow, tmp_path):
-        def move(rig):
+        def move_vertex(rig):
             rig.mesh_object.data.vertices[0].co.x += 0.01
 
-        rig = save_elbow(tmp_path / "rig.blend", move)
+        rig = save_elbow(tmp_path / "rig.blend", move_vertex)
         assert f"The model '{elbow.model}' was trained for another rig: " in refusal(
             "bake", rig, elbow.model, tmp_path / "a.pc2"
         )
 
-    def test_no_model(self, refusal, elbow, tmp_path):
+    def test_a_missing_model(self, refusal, elbow, tmp_path):
         assert "none.onnx' cannot be read" in refusal("bake", elbow.rig, tmp_path / "none.onnx", tmp_path / "a.pc2")
 
     @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ class TestRefusals:
         assert words in captured.err and captured.err.count("\n") == 1 and not captured.out
         assert file_contents(tmp_path) == {}
 
-    def test_the_file_of_the_rig(self, refusal, elbow, tmp_path):
+    def test_an_output_that_is_the_rig_s_file(self, refusal, elbow, tmp_path):
         rig = shutil.copy(elbow.rig, tmp_path / "rig.blend")
         text = refusal("bake", rig, elbow.model, rig)
         assert text == f"Cannot write '{rig}': it is read for this; give another name, or --overwrite."
@@ -55,39 +55,37 @@ class TestRefusals:
         text = refusal("bake", elbow.rig, elbow.model, tmp_path / "a.blend")
         assert text == f"Cannot write '{tmp_path / 'a.pc2'}': it is a folder; give the name of a file."
 
-    def test_a_folder_that_is_not_there(self, refusal, elbow, tmp_path):
+    def test_a_missing_folder(self, refusal, elbow, tmp_path):
         assert "does not exist; create it first." in refusal("bake", elbow.rig, elbow.model, tmp_path / "b" / "a.pc2")
 
     @pytest.mark.parametrize(("out", "options"), [("a.pc2", []), ("a.blend", []), ("a.blend", ["--shape-keys"])])
     @pytest.mark.parametrize("limit", [100, 60_000, 150_000])
-    def test_a_disk_that_fills_up_leaves_the_old_files(
-        self, refusal_on_a_full_disk, elbow, tmp_path, out, options, limit
-    ):
-        """At once, in the middle of the positions, and after them, in the .blend file."""
+    def test_a_full_disk_leaves_the_old_files(self, refusal_on_a_full_disk, elbow, tmp_path, out, options, limit):
+        """The limit is reached at once, while positions are written, or in the .blend file."""
         if limit > 100_000 and out == "a.pc2":
-            pytest.skip("has nothing but positions")
+            pytest.skip("this file contains only positions")
 
-        def fatten(_rig):
-            # Larger than the limit also when it is compressed.
+        def add_random_data(_rig):
+            # Random data exceeds the limit even in a compressed file.
             bpy.context.scene["noise"] = np.random.default_rng(0).bytes(200_000).hex()
 
-        rig = save_elbow(tmp_path / "rig.blend", fatten)
+        rig = save_elbow(tmp_path / "rig.blend", add_random_data)
         for name in ("a.pc2", "a.blend"):
             (tmp_path / name).write_text("old")
         with limited_file_size(limit):
             text = refusal_on_a_full_disk("bake", rig, elbow.model, tmp_path / out, *options)
         assert re.match(f"Cannot write '{tmp_path / 'a'}.", text)
 
-    def test_a_modifier_that_changes_the_topology_below(self, refusal, elbow, tmp_path):
-        def add(rig):
+    def test_a_modifier_that_changes_the_topology_before_the_armature(self, refusal, elbow, tmp_path):
+        def add_subdivision(rig):
             rig.mesh_object.modifiers.new("Changes", "SUBSURF")
             rig.mesh_object.modifiers.move(2, 0)
 
-        rig = save_elbow(tmp_path / "rig.blend", add)
+        rig = save_elbow(tmp_path / "rig.blend", add_subdivision)
         assert "Modifier 'Changes' of 'elbow' changes the topology of the mesh before" in refusal(
             "bake", rig, elbow.model, tmp_path / "a.blend"
         )
 
-    def test_an_armature_at_rest(self, refusal, elbow, tmp_path):
+    def test_an_armature_in_rest_position(self, refusal, elbow, tmp_path):
         rig = save_elbow(tmp_path / "rig.blend", lambda rig: setattr(rig.armature_object.data, "pose_position", "REST"))
         assert "shows its rest position; set it to pose." in refusal("bake", rig, elbow.model, tmp_path / "a.pc2")

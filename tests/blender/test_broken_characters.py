@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A character that cannot play any more: it shows its rig and says why, and the others play on."""
+"""A character that can no longer play shows its rig and an error message; other characters keep playing."""
 
 import json
 import os
@@ -35,8 +35,8 @@ def delete_vertices(mesh_object: bpy.types.Object) -> None:
     edit_mesh(mesh_object, lambda: bpy.ops.mesh.delete(type="VERT"))
 
 
-@pytest.mark.parametrize("count", [3, 5], ids=["each by itself", "a crowd"])
-def test_a_mesh_without_vertices(bound, elbow, count):
+@pytest.mark.parametrize("count", [3, 5], ids=["single", "batched"])
+def test_a_character_without_vertices_shows_an_error(bound, elbow, count):
     crowd = crowd_of(bound, count)
     for frame in (1, 2, 3):
         bpy.context.scene.frame_set(frame)
@@ -50,28 +50,28 @@ def test_a_mesh_without_vertices(bound, elbow, count):
     assert crowd[1].fdda.mode == "RIG" and "has 0 vertices and its model was trained for" in crowd[1].fdda.status
 
 
-STEPS = {
-    "when it is found": (Player, "__init__"),
-    "when it has changed": (Player, "fits_object"),
-    "when its rig is checked": (Player, "check_rig"),
-    "when its mask is read": (Player, "update_mask"),
+FAILING_METHODS = {
+    "created": (Player, "__init__"),
+    "object changed": (Player, "fits_object"),
+    "rig checked": (Player, "check_rig"),
+    "mask read": (Player, "update_mask"),
 }
 
 
-@pytest.mark.parametrize("where", STEPS)
-def test_what_nobody_expected_harms_one_character(bound, elbow, monkeypatch, where):
+@pytest.mark.parametrize("event", FAILING_METHODS)
+def test_an_unexpected_error_stops_one_character_only(bound, elbow, monkeypatch, event):
     crowd = crowd_of(bound, 3)
     bpy.context.view_layer.update()
-    owner, name = STEPS[where]
-    real, broken = getattr(owner, name), crowd[1].session_uid
+    owner, name = FAILING_METHODS[event]
+    method, failing_uid = getattr(owner, name), crowd[1].session_uid
 
-    def fail(player: Player, *arguments: object, **named: object) -> object:
-        if broken in (getattr(player, "object_uid", 0), getattr(arguments[0], "session_uid", 0)):
+    def fail(player: Player, *arguments: object, **keywords: object) -> object:
+        if failing_uid in (getattr(player, "object_uid", 0), getattr(arguments[0], "session_uid", 0)):
             raise KeyError("position")
-        return real(player, *arguments, **named)
+        return method(player, *arguments, **keywords)
 
     monkeypatch.setattr(owner, name, fail)
-    if where == "when it is found":
+    if event == "created":
         registry.reset_players()
     for mesh_object in crowd:
         mesh_object.data.update()
@@ -83,8 +83,8 @@ def test_what_nobody_expected_harms_one_character(bound, elbow, monkeypatch, whe
     assert crowd[1].fdda.mode == "RIG" and "cannot be played (KeyError('position'))" in crowd[1].fdda.status
 
 
-def with_control(model: Path, owner: str, path: str) -> Path:
-    """A model beside another that has a control, which moves nothing."""
+def add_control_to_model(model: Path, owner: str, path: str) -> Path:
+    """Write a copy of a model with a control that has no effect, in the same folder."""
 
     def add_control(proto: onnx.ModelProto) -> None:
         proto.graph.input.append(helper.make_tensor_value_info(CONTROLS_INPUT, TensorProto.FLOAT, ["N", 1]))
@@ -100,13 +100,17 @@ def armature_object() -> bpy.types.Object:
     return bpy.data.objects[ELBOW_RIG]
 
 
-def keys() -> bpy.types.Key:
+def shape_keys() -> bpy.types.Key:
     return bpy.data.objects[ELBOW].data.shape_keys
+
+
+def remove_shape_key() -> None:
+    bpy.data.objects[ELBOW].shape_key_remove(shape_keys().key_blocks["smile"])
 
 
 def delete_property() -> None:
     del armature_object()["dial"]
-    # As the interface does: until then Blender goes on with the value that it had.
+    # Like the user interface; without the tag, Blender keeps using the old value.
     armature_object().update_tag()
 
 
@@ -120,24 +124,24 @@ def rename_object() -> None:
     registry.reset_players()
 
 
-KEY = ("shape_keys", 'key_blocks["smile"].value')
-BONE = ("armature_object", 'pose.bones["dial"]["fist"]')
-OBJECT = ("object:dials", "location[2]")
-GONE = {
+SHAPE_KEY_CONTROL = ("shape_keys", 'key_blocks["smile"].value')
+BONE_CONTROL = ("armature_object", 'pose.bones["dial"]["fist"]')
+OBJECT_CONTROL = ("object:dials", "location[2]")
+CONTROL_REMOVALS = {
     "a property is deleted": (("armature_object", '["dial"]'), delete_property),
     "a property is renamed": (("armature_object", '["dial"]'), rename_property),
-    "a shape key is removed": (KEY, lambda: bpy.data.objects[ELBOW].shape_key_remove(keys().key_blocks["smile"])),
-    "all shape keys are": (KEY, lambda: bpy.data.objects[ELBOW].shape_key_clear()),
-    "a shape key is renamed": (KEY, lambda: setattr(keys().key_blocks["smile"], "name", "grin")),
-    "a bone is renamed": (BONE, lambda: setattr(armature_object().data.bones["dial"], "name", "knob")),
-    "an object is removed": (OBJECT, lambda: bpy.data.objects.remove(bpy.data.objects["dials"])),
-    "an object is renamed": (OBJECT, rename_object),
+    "a shape key is removed": (SHAPE_KEY_CONTROL, remove_shape_key),
+    "all shape keys are removed": (SHAPE_KEY_CONTROL, lambda: bpy.data.objects[ELBOW].shape_key_clear()),
+    "a shape key is renamed": (SHAPE_KEY_CONTROL, lambda: setattr(shape_keys().key_blocks["smile"], "name", "grin")),
+    "a bone is renamed": (BONE_CONTROL, lambda: setattr(armature_object().data.bones["dial"], "name", "knob")),
+    "an object is removed": (OBJECT_CONTROL, lambda: bpy.data.objects.remove(bpy.data.objects["dials"])),
+    "an object is renamed": (OBJECT_CONTROL, rename_object),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("when", ["pose", "frame"])
-@pytest.mark.parametrize("what", GONE)
-def test_a_control_that_is_gone(rig, elbow, what, when):
+@pytest.mark.parametrize("update", ["pose", "frame"])
+@pytest.mark.parametrize("removal", CONTROL_REMOVALS)
+def test_a_character_that_lacks_a_control_shows_its_rig(rig, elbow, removal, update):
     mesh_object = rig.mesh_object
     armature_object()["dial"] = 0.5
     mesh_object.shape_key_add(name="Basis")
@@ -150,12 +154,12 @@ def test_a_control_that_is_gone(rig, elbow, what, when):
     bone.head, bone.tail, bone.use_deform = (1, 0, 0), (1, 0, 0.2), False
     bpy.ops.object.mode_set(mode="OBJECT")
     armature_object().pose.bones["dial"]["fist"] = 0.5
-    (owner, path), change = GONE[what]
-    bind(find_rig(), with_control(elbow.model, owner, path))
+    (owner, path), change = CONTROL_REMOVALS[removal]
+    bind(find_rig(), add_control_to_model(elbow.model, owner, path))
     pose(angle=1.0)
     assert mesh_object.fdda.mode == "FDDA" and not mesh_object.fdda.status
     change()
-    if when == "pose":
+    if update == "pose":
         pose(angle=0.6)
     else:
         bpy.context.scene.frame_set(11)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The example of docs/simulations.md, as a user runs it: a cache is made, its stack thrown away, the cache learned."""
+"""The example of docs/simulations.md: a model learns a cached deformation after the rig has lost its modifier."""
 
 import json
 import os
@@ -19,7 +19,8 @@ ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "cache" / "learn_from_cache.py"
 
 
-def make_cache(path: Path, mesh_object: bpy.types.Object) -> None:
+def export_cache(path: Path, mesh_object: bpy.types.Object) -> None:
+    """Export the animated mesh as Alembic or .pc2, by the suffix of the path."""
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, FRAMES
     for scene_object in scene.objects:
@@ -37,17 +38,17 @@ def make_cache(path: Path, mesh_object: bpy.types.Object) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["abc", pytest.param("pc2", marks=pytest.mark.slow)])
-def test_a_cache_is_learned_from_files_alone(suffix, tmp_path):
+def test_the_example_trains_a_model_of_a_cache(suffix, tmp_path):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh_object, _ = build_elbow()
     cache, rig, out = tmp_path / f"elbow.{suffix}", tmp_path / "rig.blend", tmp_path / "out"
-    make_cache(cache, mesh_object)
+    export_cache(cache, mesh_object)
     mesh_object.modifiers.remove(mesh_object.modifiers["CorrectiveSmooth"])
     save_copy(rig)
     command = [sys.executable, EXAMPLE, rig, cache, out, "--object", "elbow", "--action", ACTION]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
     errors = json.loads((out / "errors.json").read_text(encoding="utf-8"))
     assert errors["poses"] == FRAMES
     assert errors["fdda"]["mean"] < 0.15 * errors["linear"]["mean"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A rig that is changed while a model plays on it: the model goes on where it may, else the rig is back, with why."""
+"""Changes of a rig while its model plays: the model keeps playing if it still fits; otherwise the rig shows."""
 
 import bpy
 import numpy as np
@@ -24,12 +24,12 @@ from .rig_changes import (
     move_reference_key,
     vertex_groups,
 )
-from .test_evaluations import keyed
+from .test_evaluations import add_shape_key
 from .test_player_batch import crowd_of
 
 
-def assert_given_back(mesh_object: bpy.types.Object, clause: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """The rig shows, as it does where nothing was ever bound, and it was said why, once."""
+def assert_rig_shown(mesh_object: bpy.types.Object, clause: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Assert that the evaluated mesh is the rig's, and that one message gave the reason."""
     assert mesh_object.fdda.mode == "RIG" and clause in mesh_object.fdda.status
     assert mesh_object.fdda.status.endswith("undo the change, or record and train again.")
     assert all(m.show_viewport for m in mesh_object.modifiers if m.name != "FDDA")
@@ -40,44 +40,44 @@ def assert_given_back(mesh_object: bpy.types.Object, clause: str, capsys: pytest
     assert np.array_equal(evaluated(mesh_object), shown)
 
 
-def look(when: str) -> None:
-    if when == "frame":
+def trigger_check(update: str) -> None:
+    if update == "frame":
         bpy.context.scene.frame_set(7)
     else:
         bpy.context.view_layer.update()
 
 
-@pytest.mark.parametrize("when", ["update", "frame"])
-@pytest.mark.parametrize("what", EDIT_MODE_CHANGES)
-def test_an_edit_gives_the_rig_back(bound, what, when, capsys):
-    name, change, clause = EDIT_MODE_CHANGES[what]
+@pytest.mark.parametrize("update", ["view layer", "frame"])
+@pytest.mark.parametrize("change_name", EDIT_MODE_CHANGES)
+def test_a_change_in_edit_mode_shows_the_rig(bound, change_name, update, capsys):
+    name, change, clause = EDIT_MODE_CHANGES[change_name]
     pose(angle=1.0)
     change_in_edit_mode(bpy.data.objects[name], change)
-    look(when)
-    assert_given_back(bound, clause, capsys)
+    trigger_check(update)
+    assert_rig_shown(bound, clause, capsys)
 
 
-@pytest.mark.parametrize("when", ["update", "frame"])
-@pytest.mark.parametrize("what", SCRIPT_CHANGES)
-def test_a_script_gives_the_rig_back(bound, what, when, capsys):
-    change, clause = SCRIPT_CHANGES[what]
+@pytest.mark.parametrize("update", ["view layer", "frame"])
+@pytest.mark.parametrize("change_name", SCRIPT_CHANGES)
+def test_a_change_by_a_script_shows_the_rig(bound, change_name, update, capsys):
+    change, clause = SCRIPT_CHANGES[change_name]
     pose(angle=1.0)
     change()
-    look(when)
-    assert_given_back(bound, clause, capsys)
+    trigger_check(update)
+    assert_rig_shown(bound, clause, capsys)
 
 
-def test_the_reference_key_gives_the_rig_back(bound, capsys):
-    keyed(bound)
+def test_a_change_of_the_reference_key_shows_the_rig(bound, capsys):
+    add_shape_key(bound)
     pose(angle=1.0)
     assert not bound.fdda.status
     move_reference_key()
-    look("update")
-    assert_given_back(bound, f"{REST_POSE_OF} mesh differs", capsys)
+    trigger_check("view layer")
+    assert_rig_shown(bound, f"{REST_POSE_OF} mesh differs", capsys)
 
 
-def test_data_of_another_object_give_the_rig_back(bound, capsys):
-    """The armature is edited, and the mesh is, through an object that has nothing to do with the character."""
+def test_a_change_through_another_object_shows_the_rig(bound, capsys):
+    """Armature and mesh are edited through another object that shares their data."""
     for scene_object, change, clause in (
         (bpy.data.objects[ELBOW_RIG], change_bone_roll, f"{REST_POSE_OF} armature differs"),
         (bound, flip_faces, "the topology of the mesh differs"),
@@ -86,53 +86,53 @@ def test_data_of_another_object_give_the_rig_back(bound, capsys):
         bpy.context.scene.collection.objects.link(other)
         pose(angle=1.0)
         change_in_edit_mode(other, change)
-        look("update")
-        assert_given_back(bound, clause, capsys)
+        trigger_check("view layer")
+        assert_rig_shown(bound, clause, capsys)
         if scene_object.type == "ARMATURE":
             change_in_edit_mode(other, lambda: setattr(edit_bones()["lower"], "roll", edit_bones()["lower"].roll - 0.4))
             bound.fdda.mode = "FDDA"
-            look("update")
+            trigger_check("view layer")
             assert not bound.fdda.status
             assert bound.fdda.mode == "FDDA"
 
 
-@pytest.mark.parametrize("when", ["update", "frame"])
-def test_bones_that_are_no_joints_may_come_go_and_change_places(bound, elbow, when):
-    """The order of the bones is another, that of the joints is not."""
+@pytest.mark.parametrize("update", ["view layer", "frame"])
+def test_changes_of_bones_that_are_not_joints_keep_the_model_playing(bound, elbow, update):
+    """The order of the bones changes, but the order of the joints does not."""
     rig = bpy.data.objects[ELBOW_RIG]
 
     def names():
         return [bone.name for bone in rig.data.bones]
 
     change_in_edit_mode(rig, lambda: (add_bone("a"), add_bone("b"), add_bone("c", "upper")))
-    look(when)
+    trigger_check(update)
     pose(angle=0.7)
     assert_plays(bound, elbow.model)
-    seen = {names().index("lower")}
+    lower_indices = {names().index("lower")}
     for bone, parent in (("upper", "a"), ("a", "b"), ("upper", ""), ("b", "upper"), ("c", "a"), ("c", "")):
         change_in_edit_mode(rig, lambda b=bone, p=parent: setattr(edit_bones()[b], "parent", edit_bones().get(p)))
-        seen.add(names().index("lower"))
-        look(when)
+        lower_indices.add(names().index("lower"))
+        trigger_check(update)
         pose(angle=0.9)
         assert_plays(bound, elbow.model)
-    assert len(seen) > 1
+    assert len(lower_indices) > 1
     change_in_edit_mode(rig, lambda: edit_bones().remove(edit_bones()["a"]))
-    look(when)
+    trigger_check(update)
     assert_plays(bound, elbow.model)
     assert bound.fdda.mode == "FDDA"
 
 
-def test_an_edit_that_changes_nothing_of_the_rig(bound, elbow):
+def test_changes_unrelated_to_the_rig_keep_the_model_playing(bound, elbow):
     change_in_edit_mode(bound, lambda: bpy.ops.mesh.select_all(action="SELECT"))
     bound.vertex_groups.new(name="no bone").add([0, 5], 0.5, "REPLACE")
     bound.data.attributes.new("color", "FLOAT_COLOR", "POINT")
-    look("update")
+    trigger_check("view layer")
     pose(angle=1.1)
     assert_plays(bound, elbow.model)
 
 
-def test_objects_that_move_on_their_own_play_on(bound, elbow):
-    """The relation of mesh and armature is no part of the rig: animation moves both."""
+def test_a_moved_armature_object_keeps_the_model_playing(bound, elbow):
+    """The transform between mesh and armature may be animated, so it is not part of the rig."""
     bpy.data.objects[ELBOW_RIG].location = (0.3, 0.1, 0)
     bpy.data.objects[ELBOW_RIG].rotation_euler = (0.2, 0.1, 0.4)
     bpy.context.view_layer.update()
@@ -142,15 +142,15 @@ def test_objects_that_move_on_their_own_play_on(bound, elbow):
     assert_plays(bound, elbow.model)
 
 
-def test_a_change_while_no_model_played(bound, capsys):
+def test_a_change_in_mode_rig_is_found_when_the_mode_changes(bound, capsys):
     bound.fdda.mode = "RIG"
     change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_bone_roll)
     bound.fdda.mode = "FDDA"
-    look("update")
-    assert_given_back(bound, f"{REST_POSE_OF} armature differs", capsys)
+    trigger_check("view layer")
+    assert_rig_shown(bound, f"{REST_POSE_OF} armature differs", capsys)
 
 
-def test_undone_it_plays_again(bound, elbow):
+def test_the_model_plays_again_after_undo(bound, elbow):
     bpy.ops.ed.undo_push(message="start")
     change_in_edit_mode(bpy.data.objects[ELBOW_RIG], change_bone_roll)
     bpy.context.view_layer.update()
@@ -165,8 +165,8 @@ def test_undone_it_plays_again(bound, elbow):
     assert "rest pose" in bpy.data.objects[ELBOW].fdda.status
 
 
-def test_weights_that_an_undo_brings_back(bound):
-    """What is written without an evaluation is found by the undo that reads it."""
+def test_weights_restored_by_undo_show_the_rig(bound):
+    """The weights change without an evaluation. The check after undo finds them."""
     bound.fdda.mode = "RIG"
     vertex_groups()["lower"].add([0], 0.3, "ADD")
     bpy.context.view_layer.update()
@@ -181,7 +181,7 @@ def test_weights_that_an_undo_brings_back(bound):
     assert WEIGHTS_DIFFER in bpy.data.objects[ELBOW].fdda.status
 
 
-def test_a_file_in_which_the_rig_was_changed_without_the_addon(bound, tmp_path, capsys):
+def test_a_rig_changed_without_the_add_on_shows_after_loading(bound, tmp_path, capsys):
     import fdda_addon
 
     path = bpy.data.filepath.replace("bound.blend", "changed.blend")
@@ -192,11 +192,11 @@ def test_a_file_in_which_the_rig_was_changed_without_the_addon(bound, tmp_path, 
     capsys.readouterr()
     bpy.ops.wm.open_mainfile(filepath=path)
     bpy.context.view_layer.update()
-    assert_given_back(bpy.data.objects[ELBOW], f"{REST_POSE_OF} armature differs", capsys)
+    assert_rig_shown(bpy.data.objects[ELBOW], f"{REST_POSE_OF} armature differs", capsys)
 
 
 @pytest.mark.parametrize("is_reloaded", [False, True], ids=["opened", "reloaded"])
-def test_a_linked_rig_that_its_own_file_changed(library, pair, is_reloaded):
+def test_a_linked_rig_that_changed_in_its_library_shows(library, pair, is_reloaded):
     shot = str(library.path.with_name("shot.blend"))
     bpy.context.view_layer.update()
     assert not any(o.fdda.status for o in pair)
@@ -217,6 +217,7 @@ def test_a_linked_rig_that_its_own_file_changed(library, pair, is_reloaded):
 
 
 def change_in_another_process(path) -> None:
+    """Change the roll of a bone in a file, in another process."""
     import subprocess
     import sys
 
@@ -232,7 +233,7 @@ def change_in_another_process(path) -> None:
     subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True, capture_output=True, timeout=120)
 
 
-def test_one_of_a_crowd(bound, elbow):
+def test_a_change_of_one_character_leaves_the_others_playing(bound, elbow):
     crowd = crowd_of(bound, 5)
     for frame in (1, 2, 3):
         bpy.context.scene.frame_set(frame)
@@ -245,8 +246,8 @@ def test_one_of_a_crowd(bound, elbow):
         assert_plays(mesh_object, elbow.model)
 
 
-def test_the_mode_of_the_mesh_holds_the_check_back(bound, capsys):
-    """Where it is left, the rig is looked at."""
+def test_weight_paint_mode_delays_the_check(bound, capsys):
+    """The rig is checked after the mesh has left the mode."""
     pose(angle=1.0)
     bpy.context.view_layer.objects.active = bound
     bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
@@ -255,12 +256,12 @@ def test_the_mode_of_the_mesh_holds_the_check_back(bound, capsys):
     assert bound.fdda.mode == "FDDA" and not bound.fdda.status
     bpy.ops.object.mode_set(mode="OBJECT")
     bpy.context.view_layer.update()
-    assert_given_back(bound, WEIGHTS_DIFFER, capsys)
+    assert_rig_shown(bound, WEIGHTS_DIFFER, capsys)
 
 
-def test_playback_and_posing_read_no_rig(bound, elbow, monkeypatch):
-    """Neither frames nor poses by hand, nor shape keys that bones drive, have the rig read again."""
-    keyed(bound)
+def test_playback_and_posing_do_not_check_the_rig(bound, elbow, monkeypatch):
+    """Frame changes, posing and driven shape keys do not read the rig again."""
+    add_shape_key(bound)
     key = bound.data.shape_keys.key_blocks["bulge"]
     driver = key.driver_add("value").driver
     variable = driver.variables.new()
@@ -271,13 +272,13 @@ def test_playback_and_posing_read_no_rig(bound, elbow, monkeypatch):
     pose(angle=0.3)
     monkeypatch.setattr(rig_signature, "read_model_rig", None)
     monkeypatch.setattr(rig_signature, "rest_digest", None)
-    for step in range(5):
-        bpy.context.scene.frame_set(step)
-        pose(angle=0.1 * step)
+    for frame in range(5):
+        bpy.context.scene.frame_set(frame)
+        pose(angle=0.1 * frame)
     assert_plays(bound, elbow.model)
 
 
-def test_the_joints_of_a_model_keep_their_order(bound):
+def test_added_bones_do_not_change_the_order_of_joints(bound):
     rig = bpy.data.objects[ELBOW_RIG]
     change_in_edit_mode(rig, lambda: (add_bone("a", "upper"), add_bone("b", "a")))
     info = network_of(bound).info

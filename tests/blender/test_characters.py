@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Many kinds of characters: recorded, trained briefly, bound, and compared with their rigs and their models.
+"""Many kinds of characters: recorded, trained briefly, bound, and compared with their rigs and models.
 
-docs/characters.md has the figures, which `make characters` writes; the same rows are held to their bars here.
+`make characters` writes the results of the same rows into docs/characters.md.
 """
 
 import ast
@@ -20,92 +20,98 @@ from .conftest import train
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "characters.md"
-PLAYED = 1e-5
-"""Meters: the evaluated mesh is the model's output within this."""
-NOTHING_MM = 0.01
-"""Errors below this are none."""
-MOVED_MM = 10.0
-"""The poses move the vertices by more, on average."""
-QUICK = {
+MAX_PLAYBACK_DIFFERENCE = 1e-5
+"""Largest distance between the evaluated mesh and the model's output, in meters."""
+NEGLIGIBLE_ERROR_MM = 0.01
+"""Smaller errors count as zero."""
+MIN_MOVEMENT_MM = 10.0
+"""Smallest mean distance by which the poses must move the vertices."""
+QUICK_ROWS = {
     "smooth_weights", "preserve_volume", "b_bones", "corrective_smooth", "geometry_nodes", "ik_fk", "custom_property",
-    "body_and_sleeve", "parented_to_bone", "far_away", "in_millimetres", "target_alembic",
+    "body_and_sleeve", "parented_to_bone", "far_away", "in_millimeters", "target_alembic",
 }  # fmt: skip
 """Rows that `make test` trains, at least one of each topic; `make test-slow` trains the others."""
 
 
-def parameter(row: Row) -> object:
-    return pytest.param(row, id=row.name, marks=() if row.name in QUICK else pytest.mark.slow)
+def row_parameter(row: Row) -> object:
+    return pytest.param(row, id=row.name, marks=() if row.name in QUICK_ROWS else pytest.mark.slow)
 
 
-@pytest.mark.parametrize("row", map(parameter, ROWS))
-def test_a_character_is_learned_and_played(row: Row, tmp_path: Path):
+@pytest.mark.parametrize("row", [row_parameter(row) for row in ROWS])
+def test_a_character_is_recorded_trained_and_played(row: Row, tmp_path: Path):
     for recording, model in record_row(row, tmp_path):
         train(recording, model, "--epochs", row.epochs, *SMALL)
     results = compare_row(row, tmp_path)
     assert tuple(result.mesh for result in results) == row.meshes
     for result in results:
-        assert result.moved_mm > MOVED_MM
-        assert result.difference <= PLAYED
+        assert result.moved_mm > MIN_MOVEMENT_MM
+        assert result.difference <= MAX_PLAYBACK_DIFFERENCE
         if row.is_linear:
-            assert max(result.linear_mm, result.fdda_mm) < NOTHING_MM
+            assert max(result.linear_mm, result.fdda_mm) < NEGLIGIBLE_ERROR_MM
         else:
-            assert result.linear_mm > NOTHING_MM
+            assert result.linear_mm > NEGLIGIBLE_ERROR_MM
             assert result.fdda_mm < result.linear_mm
 
 
 @pytest.mark.one_blender_version
-def test_every_character_of_the_folder_has_a_row():
-    built = {row.build for row in ROWS}
-    assert built >= {*skinning.SKINNINGS, *stacks.STACKS, *controls.CONTROLS, *transforms.TRANSFORMS, *targets.TARGETS}
-    assert {row.name for row in ROWS} > QUICK
-    assert {row.topic for row in ROWS if row.name in QUICK} == {row.topic for row in ROWS}
+def test_every_built_character_has_a_row():
+    build_functions = {row.build for row in ROWS}
+    assert build_functions >= {
+        *skinning.SKINNINGS,
+        *stacks.STACKS,
+        *controls.CONTROLS,
+        *transforms.TRANSFORMS,
+        *targets.TARGETS,
+    }
+    assert {row.name for row in ROWS} > QUICK_ROWS
+    assert {row.topic for row in ROWS if row.name in QUICK_ROWS} == {row.topic for row in ROWS}
     assert len({row.name for row in ROWS}) == len({row.text for row in ROWS}) == len(ROWS)
 
 
-def results_of(page: str) -> dict[str, list[str]]:
-    """The cells after the first of every row of the table that is made, by the first."""
-    made = page.partition(START)[2].partition(END)[0]
-    rows = [line.strip("| ").split(" | ") for line in made.splitlines() if line.startswith("| ")]
+def results_by_row(page: str) -> dict[str, list[str]]:
+    """Return the other cells of each row of the generated table, by the first cell of the row."""
+    table_text = page.partition(START)[2].partition(END)[0]
+    rows = [line.strip("| ").split(" | ") for line in table_text.splitlines() if line.startswith("| ")]
     return {cells[0]: cells[1:] for cells in rows}
 
 
 @pytest.mark.one_blender_version
-def test_the_page_has_every_row_and_each_meets_its_bars():
-    found = results_of(PAGE.read_text(encoding="utf-8"))
+def test_the_page_contains_every_row_with_small_errors():
+    results = results_by_row(PAGE.read_text(encoding="utf-8"))
     for row in ROWS:
         for mesh in row.meshes:
-            *errors, played = found[row.text + (f": `{mesh}`" if len(row.meshes) > 1 else "")]
-            assert len(errors) == 4 and float(played) <= PLAYED
+            *errors, difference = results[row.text + (f": `{mesh}`" if len(row.meshes) > 1 else "")]
+            assert len(errors) == 4 and float(difference) <= MAX_PLAYBACK_DIFFERENCE
             for pair in errors[::2]:
                 linear, fdda = map(float, pair.split(" / "))
-                assert max(linear, fdda) < NOTHING_MM if row.is_linear else fdda < linear
+                assert max(linear, fdda) < NEGLIGIBLE_ERROR_MM if row.is_linear else fdda < linear
 
 
 @pytest.mark.one_blender_version
-def test_the_table_has_a_cell_for_every_line():
+def test_the_table_has_cells_for_every_blender_version():
     result = {"linear_mm": 2.0, "fdda_mm": 0.5, "moved_mm": 100.0, "difference": 2e-8}
     results = [{"row": row.name, "mesh": mesh, **result} for row in ROWS for mesh in row.meshes]
     line = {"blender": "5.2.3", "date": "2026-01-01", "results": results}
-    rows = results_of(f"{START}\n{table({'4.5': line, '5.2': line})}\n{END}")
+    rows = results_by_row(f"{START}\n{table({'4.5': line, '5.2': line})}\n{END}")
     assert rows["Preserve Volume"] == ["2.000 / 0.500", "25.0 %", "2.000 / 0.500", "25.0 %", "2e-08"]
 
 
-def sentences() -> set[str]:
-    """Every text of the add-on, with … for what is filled in."""
-    found = set()
+def texts_of_the_add_on() -> set[str]:
+    """Return every string in the code of the add-on, with … in place of inserted values."""
+    texts = set()
     for file in (ROOT / "fdda_addon").rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.JoinedStr):
-                found.add("".join(p.value if isinstance(p, ast.Constant) else "…" for p in node.values))
+                texts.add("".join(p.value if isinstance(p, ast.Constant) else "…" for p in node.values))
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                found.add(node.value)
-    return found
+                texts.add(node.value)
+    return texts
 
 
 @pytest.mark.one_blender_version
-def test_the_page_quotes_refusals_as_they_are():
+def test_the_page_quotes_error_messages_literally():
     refusals = PAGE.read_text(encoding="utf-8").partition("## What is refused")[2]
     quoted = re.findall(r"\| \*(.+?)\* \|", refusals)
-    texts = sentences()
+    texts = texts_of_the_add_on()
     assert len(quoted) > 10
     assert [quote for quote in quoted if not any(quote in text for text in texts)] == []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What is copied to the clipboard, or written to a library, is the true rig; pasted it plays."""
+"""Characters copied to the clipboard or written to a library contain the rig; pasted characters play."""
 
 from pathlib import Path
 
@@ -15,31 +15,31 @@ from .conftest import ELBOW, ELBOW_RIG, assert_plays, evaluated, pose
 
 @pytest.fixture(autouse=True)
 def _clipboard(tmp_path, monkeypatch):
-    """The clipboard is a file in the folder of the test."""
+    """Put Blender's clipboard, which is a file, into the folder of the test."""
     monkeypatch.setattr(bpy.context.preferences.filepaths, "temporary_directory", str(tmp_path))
 
 
-def to_clipboard(_: bpy.types.Object, folder: Path) -> Path:
+def copy_to_clipboard(_: bpy.types.Object, folder: Path) -> Path:
     bpy.ops.object.select_all(action="SELECT")
     assert bpy.ops.fdda.copy_objects() == {"FINISHED"}
     (path,) = folder.rglob("copybuffer*.blend")
     return path
 
 
-def to_library(mesh_object: bpy.types.Object, folder: Path) -> Path:
+def write_library(mesh_object: bpy.types.Object, folder: Path) -> Path:
     with playback.suspended_playback():
         bpy.data.libraries.write(str(folder / "library.blend"), {mesh_object})
     return folder / "library.blend"
 
 
-@pytest.mark.parametrize("write", [to_clipboard, to_library])
+@pytest.mark.parametrize("write", [copy_to_clipboard, write_library])
 @pytest.mark.parametrize("use_in_render", [False, True])
-def test_it_is_the_true_rig(bound, elbow, tmp_path, write, use_in_render):
+def test_a_copied_character_shows_its_rig_without_the_add_on(bound, elbow, tmp_path, write, use_in_render):
     bound.fdda.use_in_render = use_in_render
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     pose(angle=1.2)
     bound.fdda.mode = "RIG"
-    rig = evaluated(bound)
+    rig_shape = evaluated(bound)
     bound.fdda.mode = "FDDA"
     bpy.context.view_layer.update()
     path = write(bound, tmp_path)
@@ -47,19 +47,19 @@ def test_it_is_the_true_rig(bound, elbow, tmp_path, write, use_in_render):
     assert_plays(bound, elbow.model)
     fdda_addon.unregister()
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    with bpy.data.libraries.load(str(path)) as (found, wanted):
-        assert sorted(found.objects) == [ELBOW, ELBOW_RIG] and found.meshes == [ELBOW]
-        wanted.objects = list(found.objects)
-    for pasted in wanted.objects:
+    with bpy.data.libraries.load(str(path)) as (available, appended):
+        assert sorted(available.objects) == [ELBOW, ELBOW_RIG] and available.meshes == [ELBOW]
+        appended.objects = list(available.objects)
+    for pasted in appended.objects:
         bpy.context.scene.collection.objects.link(pasted)
     bpy.context.view_layer.update()
     shown = {m.name: (m.show_viewport, m.show_render) for m in bpy.data.objects[ELBOW].modifiers}
     assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
-    assert np.array_equal(evaluated(bpy.data.objects[ELBOW]), rig)
+    assert np.array_equal(evaluated(bpy.data.objects[ELBOW]), rig_shape)
 
 
-def test_pasted_it_plays(bound, elbow, tmp_path):
-    to_clipboard(bound, tmp_path)
+def test_a_pasted_character_plays(bound, elbow, tmp_path):
+    copy_to_clipboard(bound, tmp_path)
     assert bpy.ops.view3d.pastebuffer() == {"FINISHED"}
     bpy.context.view_layer.update()
     pasted = bpy.data.objects[f"{ELBOW}.001"]
@@ -69,8 +69,8 @@ def test_pasted_it_plays(bound, elbow, tmp_path):
     assert_plays(bound, elbow.model)
 
 
-def test_what_blenders_own_operator_copied_plays_too(bound, elbow):
-    """It is called from the menu, and by scripts; the rig is off in what it writes, and back with mode RIG."""
+def test_a_character_copied_by_blender_s_operator_plays(bound, elbow):
+    """Menus and scripts call Blender's operator. It saves the modifiers disabled; mode RIG enables them."""
     bpy.ops.object.select_all(action="SELECT")
     bpy.ops.view3d.copybuffer()
     bpy.ops.view3d.pastebuffer()
@@ -81,7 +81,7 @@ def test_what_blenders_own_operator_copied_plays_too(bound, elbow):
     assert [m.show_viewport for m in pasted.modifiers] == [True, True, False]
 
 
-def test_in_another_mode_it_says_why_not(bound):
+def test_copying_in_edit_mode_shows_an_error(bound):
     bpy.context.view_layer.objects.active = bound
     bpy.ops.object.mode_set(mode="EDIT")
     with pytest.raises(RuntimeError, match="Objects can only be copied in Object Mode"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line: statuses, options, what each verb prints, and the files that it makes."""
+"""Exit statuses, options, output and files of the command line."""
 
 import errno
 import io
@@ -25,7 +25,7 @@ from .refusals import file_contents, save_elbow
 
 
 @pytest.mark.parametrize("arguments", [["--help"], *([verb, "--help"] for verb in VERBS)], ids=" ".join)
-def test_help(arguments, capfd):
+def test_help_prints_the_usage(arguments, capfd):
     assert run(*arguments) == 0
     captured = capfd.readouterr()
     assert captured.out.startswith("usage: ") and not captured.err
@@ -74,8 +74,8 @@ def test_wrong_usage(arguments, capfd, tmp_path, monkeypatch):
     assert file_contents(tmp_path) == {}
 
 
-def test_a_full_disk_is_no_fault_of_the_user(tmp_path, monkeypatch, capfd):
-    """A farm tries again what ends with this status."""
+def test_a_full_disk_ends_with_the_status_for_another_try(tmp_path, monkeypatch, capfd):
+    """Render farms repeat jobs that end with this status."""
 
     def fail(_options: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -85,7 +85,7 @@ def test_a_full_disk_is_no_fault_of_the_user(tmp_path, monkeypatch, capfd):
     assert capfd.readouterr().err.startswith("Error: No space left on device")
 
 
-def test_train_passes_its_options_on(elbow, tmp_path, capfd):
+def test_train_passes_its_options_to_the_trainer(elbow, tmp_path, capfd):
     model = tmp_path / "m.onnx"
     options = ["--epochs", 3, "--hidden", 8, 16, "--activation", "tanh", "--seed", 9, "--learning-rate", "0.002"]
     assert run("train", elbow.recording, model, *options) == 0
@@ -100,18 +100,18 @@ def test_train_passes_its_options_on(elbow, tmp_path, capfd):
     assert sorted(file_contents(tmp_path)) == ["m.checkpoint.npz", "m.onnx", "report.html", "report.json"]
 
 
-def test_an_impossible_setting_fails(elbow, tmp_path, capfd):
+def test_a_negative_learning_rate_fails(elbow, tmp_path, capfd):
     assert run("train", elbow.recording, tmp_path / "m.onnx", "--learning-rate", -1) == 1
     assert "learning_rate cannot be -1.0" in capfd.readouterr().err
     assert file_contents(tmp_path) == {}
 
 
-def test_record_prints_lines_where_there_is_no_terminal(elbow, tmp_path, capfd):
+def test_record_prints_plain_lines_without_a_terminal(elbow, tmp_path, capfd):
     assert run("record", elbow.rig, tmp_path / "r", "--poses", 20, "--seed", 4, "--action", "elbow_wave") == 0
     captured = capfd.readouterr()
-    estimate, done = captured.out.splitlines()
+    estimate, summary = captured.out.splitlines()
     assert estimate.startswith("50 poses of 300 vertices: less than 1 MB on the disk, about ")
-    assert done.startswith(f"{tmp_path / 'r'}: 50 poses in ")
+    assert summary.startswith(f"{tmp_path / 'r'}: 50 poses in ")
     lines = captured.err.splitlines()
     assert lines[0].startswith("influences: 1 of 30, ") and lines[10].startswith("influences: 30 of 30, ")
     assert lines[11].startswith("poses: 0 of 50, ") and lines[-1].startswith("poses: 50 of 50, ")
@@ -126,11 +126,11 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_bar_on_a_terminal():
+def test_a_terminal_shows_a_progress_bar():
     stream = Terminal()
     with ProgressPrinter(stream) as progress:
-        for done in range(5):
-            progress.show("poses", done, 4, "fine")
+        for done_count in range(5):
+            progress.show("poses", done_count, 4, "fine")
         progress.say("hello")
         progress.show("more", 1, 2)
     lines = stream.getvalue().split("\n")
@@ -139,11 +139,11 @@ def test_a_bar_on_a_terminal():
     assert "1/2" in lines[2] and "█" * 15 + "░" * 15 in lines[2] and lines[3] == ""
 
 
-def test_plain_lines_come_ten_times_a_stage():
+def test_a_stage_prints_about_ten_plain_lines():
     stream = io.StringIO()
     with ProgressPrinter(stream) as progress:
-        for done in range(1001):
-            progress.show("poses", done, 1000)
+        for done_count in range(1001):
+            progress.show("poses", done_count, 1000)
         progress.show("next", 0, 0)
     lines = stream.getvalue().splitlines()
     assert (
@@ -151,7 +151,7 @@ def test_plain_lines_come_ten_times_a_stage():
     )
 
 
-def test_a_name_chooses_the_object(elbow, tmp_path, capfd):
+def test_the_option_object_selects_a_mesh(elbow, tmp_path, capfd):
     def add_second(rig):
         second = rig.mesh_object.copy()
         second.data = second.data.copy()
@@ -166,8 +166,8 @@ def test_a_name_chooses_the_object(elbow, tmp_path, capfd):
     assert "'elbow' is hidden" in capfd.readouterr().err
 
 
-def opened(path) -> bpy.types.Object:
-    """The elbow of a file, opened as a user would who never chose a model in this session."""
+def open_in_new_session(path) -> bpy.types.Object:
+    """Open a file without the models that a user has selected in this session, and return its elbow."""
     registry.reset_players()
     model_files._chosen_paths.clear()
     bpy.ops.wm.open_mainfile(filepath=str(path))
@@ -175,21 +175,20 @@ def opened(path) -> bpy.types.Object:
 
 
 def test_a_bound_file_plays_when_it_is_opened(elbow, tmp_path, capfd):
-    """Rig, model and bound file each in a folder of its own: the model is brought beside the bound file."""
+    """Rig, model and bound file are in different folders, so the model is copied into the bound file's folder."""
     model, out = tmp_path / "models" / "m.onnx", tmp_path / "out" / "bound.blend"
     for path in (model, out):
         path.parent.mkdir()
     shutil.copy(elbow.model, model)
     assert run("bind", elbow.rig, model, out) == 0
-    printed = capfd.readouterr().out.splitlines()
-    assert printed == [
+    assert capfd.readouterr().out.splitlines() == [
         f"{out.parent / 'm.onnx'}: a copy of {model}, beside the file that plays it",
         f"{out}: 'elbow' plays m.onnx",
     ]
     assert (out.parent / "m.onnx").read_bytes() == elbow.model.read_bytes()
     shutil.rmtree(model.parent)
     moved = out.parent.rename(tmp_path / "elsewhere")
-    mesh_object = opened(moved / "bound.blend")
+    mesh_object = open_in_new_session(moved / "bound.blend")
     assert mesh_object.fdda.model == "//m.onnx" and not mesh_object.fdda.use_in_render
     pose(angle=0.3)
     first = assert_plays(mesh_object, elbow.model)
@@ -197,7 +196,7 @@ def test_a_bound_file_plays_when_it_is_opened(elbow, tmp_path, capfd):
     assert abs(assert_plays(mesh_object, elbow.model) - first).max() > 0.01
 
 
-def test_folders_of_meshes_differ_in_more_than_letter_case(tmp_path):
+def test_folders_that_differ_only_in_letter_case_are_refused(tmp_path):
     rigs = [SceneRig(bpy.data.objects.new(name, bpy.data.meshes.new(name)), None) for name in ("Arm", "arm.", "ARM")]
     assert [path.name for _, path in mesh_folders(rigs[:2], tmp_path)] == ["Arm", "arm_"]
     with pytest.raises(OutputError, match="'Arm' and 'ARM' would both be recorded into"):
@@ -213,19 +212,19 @@ def test_a_bound_file_that_cannot_be_saved_leaves_no_copy_of_the_model(elbow, tm
     assert file_contents(tmp_path) == {}
 
 
-def test_a_model_in_the_folder_or_below_stays_where_it_is(elbow, tmp_path, monkeypatch):
+def test_a_model_below_the_folder_is_not_copied(elbow, tmp_path, monkeypatch):
     (tmp_path / "models").mkdir()
     shutil.copy(elbow.model, tmp_path / "models" / "m.onnx")
     monkeypatch.chdir(tmp_path)
     assert run("bind", elbow.rig, "models/m.onnx", "bound.blend") == 0
     assert sorted(file_contents(tmp_path)) == ["bound.blend", "models", "models/m.onnx"]
-    mesh_object = opened(tmp_path / "bound.blend")
+    mesh_object = open_in_new_session(tmp_path / "bound.blend")
     assert mesh_object.fdda.model == "//models/m.onnx"
     pose(angle=1.0)
     assert_plays(mesh_object, elbow.model)
 
 
-def test_the_same_model_beside_the_file_is_left_alone(elbow, tmp_path):
+def test_an_identical_model_in_the_folder_is_not_written_again(elbow, tmp_path):
     shutil.copy2(elbow.model, tmp_path / elbow.model.name)
     before = (tmp_path / elbow.model.name).stat()
     assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend") == 0
@@ -233,39 +232,39 @@ def test_the_same_model_beside_the_file_is_left_alone(elbow, tmp_path):
     assert (before.st_mtime_ns, before.st_ino) == (after.st_mtime_ns, after.st_ino)
 
 
-def test_binding_leaves_rig_and_model_alone(elbow, tmp_path):
+def test_binding_does_not_change_rig_and_model(elbow, tmp_path):
     before = elbow.rig.read_bytes(), elbow.model.read_bytes()
     assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend") == 0
     assert (elbow.rig.read_bytes(), elbow.model.read_bytes()) == before
 
 
-def test_a_bound_file_in_place_of_the_rig(elbow, tmp_path):
+def test_binding_can_overwrite_the_rig_s_file(elbow, tmp_path):
     rig = shutil.copy(elbow.rig, tmp_path / "rig.blend")
     assert run("bind", rig, elbow.model, rig, "--overwrite") == 0
-    assert_plays(opened(rig), elbow.model)
+    assert_plays(open_in_new_session(rig), elbow.model)
 
 
 def test_binding_a_bound_file_again(elbow, tmp_path):
     assert run("bind", elbow.bound, elbow.model, tmp_path / "b.blend") == 0
-    mesh_object = opened(tmp_path / "b.blend")
+    mesh_object = open_in_new_session(tmp_path / "b.blend")
     assert sum(m.type == "NODES" for m in mesh_object.modifiers) == 1
     pose(angle=1.3)
     assert_plays(mesh_object, elbow.model)
 
 
-def test_use_in_render(elbow, tmp_path):
+def test_bind_sets_use_in_render(elbow, tmp_path):
     assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend", "--use-in-render") == 0
-    mesh_object = opened(tmp_path / "b.blend")
+    mesh_object = open_in_new_session(tmp_path / "b.blend")
     assert mesh_object.fdda.use_in_render
     assert [m.show_render for m in mesh_object.modifiers] == [False, False, True]
 
 
 def test_a_bound_file_shows_the_rig_without_the_add_on(elbow, tmp_path):
     assert run("bind", elbow.rig, elbow.model, tmp_path / "b.blend") == 0
-    playing, true = (evaluated(opened(path)) for path in (tmp_path / "b.blend", elbow.rig))
+    model_shape, rig_shape = (evaluated(open_in_new_session(path)) for path in (tmp_path / "b.blend", elbow.rig))
     fdda_addon.unregister()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "b.blend"))
-    assert abs(evaluated(bpy.data.objects["elbow"]) - true).max() < 1e-6 < abs(playing - true).max()
+    assert abs(evaluated(bpy.data.objects["elbow"]) - rig_shape).max() < 1e-6 < abs(model_shape - rig_shape).max()
 
 
 def test_recording_a_bound_file_records_the_rig(elbow, tmp_path):
@@ -275,7 +274,7 @@ def test_recording_a_bound_file_records_the_rig(elbow, tmp_path):
     assert first["residuals.npy"] == second["residuals.npy"]
 
 
-def test_the_add_on_stays_as_it_was_registered(elbow, tmp_path):
+def test_verbs_restore_whether_the_add_on_is_registered(elbow, tmp_path):
     assert run("record", elbow.rig, tmp_path / "a", "--poses", 1) == 0
     assert fdda_addon.is_registered()
     fdda_addon.unregister()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""`python -m fdda_addon` as a process: exit statuses, Ctrl-C, and a recording that continues after it."""
+"""`python -m fdda_addon` as a process: exit statuses, stop signals, and recordings that continue afterwards."""
 
 import os
 import signal
@@ -20,9 +20,9 @@ from .refusals import file_contents
 ROOT = Path(__file__).resolve().parents[2]
 POSES = 8 * BATCH_POSES
 
-INTERRUPT = "CTRL_BREAK_EVENT" if os.name == "nt" else "SIGINT"
-REQUESTS = ("CTRL_BREAK_EVENT",) if os.name == "nt" else ("SIGINT", "SIGTERM", "SIGHUP")
-HOOK = """
+INTERRUPT_SIGNAL = "CTRL_BREAK_EVENT" if os.name == "nt" else "SIGINT"
+STOP_SIGNALS = ("CTRL_BREAK_EVENT",) if os.name == "nt" else ("SIGINT", "SIGTERM", "SIGHUP")
+IMPORT_HOOK = """
 import signal, sys
 def hook(event, arguments):
     global done
@@ -44,9 +44,9 @@ if "fdda_addon" in sys.orig_argv:
 """
 
 
-def start(*arguments: object, **environment: str) -> subprocess.Popen:
+def start_verb(*arguments: object, **environment: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "fdda_addon", *map(str, arguments)]
-    own = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP} if os.name == "nt" else {}
+    options = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP} if os.name == "nt" else {}
     return subprocess.Popen(
         command,
         cwd=ROOT,
@@ -55,28 +55,28 @@ def start(*arguments: object, **environment: str) -> subprocess.Popen:
         text=True,
         errors="replace",
         env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
-        **own,
+        **options,
     )
 
 
-def finish(*arguments: object, **environment: str) -> tuple[int, str, str]:
-    process = start(*arguments, **environment)
+def run_to_end(*arguments: object, **environment: str) -> tuple[int, str, str]:
+    process = start_verb(*arguments, **environment)
     out, err = process.communicate(timeout=120)
     return process.returncode, out, err
 
 
-def test_done(elbow, tmp_path):
-    status, out, err = finish("record", elbow.rig, tmp_path / "r", "--poses", 4)
+def test_a_successful_verb(elbow, tmp_path):
+    status, out, err = run_to_end("record", elbow.rig, tmp_path / "r", "--poses", 4)
     assert status == 0, err
     estimate, recorded = out.splitlines()
-    assert estimate.startswith("4 poses of 300 vertices: "), "Blender's lines are kept away"
+    assert estimate.startswith("4 poses of 300 vertices: "), "Blender's output is hidden"
     assert recorded.startswith(f"{tmp_path / 'r'}: 4 poses in ")
     assert err.splitlines()[-1].startswith("poses: 4 of 4, ")
 
 
-def test_failed(tmp_path):
+def test_a_failed_verb(tmp_path):
     path = tmp_path / "none.blend"
-    assert finish("record", path, tmp_path / "r") == (
+    assert run_to_end("record", path, tmp_path / "r") == (
         1,
         "",
         f"Error: There is no file '{path}'; give the path of a .blend file.\n",
@@ -84,14 +84,14 @@ def test_failed(tmp_path):
 
 
 def test_wrong_usage():
-    status, out, err = finish("record", "--poses", "many")
+    status, out, err = run_to_end("record", "--poses", "many")
     assert (status, out) == (2, "")
     assert err.startswith("usage: python -m fdda_addon record")
 
 
-def test_a_blender_file_that_is_none_prints_one_line(tmp_path):
+def test_a_file_that_is_not_a_blend_file_prints_one_line(tmp_path):
     (tmp_path / "text.blend").write_text("text")
-    status, out, err = finish("record", tmp_path / "text.blend", tmp_path / "r")
+    status, out, err = run_to_end("record", tmp_path / "text.blend", tmp_path / "r")
     assert (status, out) == (1, "") and err.count("\n") == 1 and err.startswith("Error: Blender cannot open '")
 
 
@@ -103,7 +103,7 @@ def wait_for(condition, process: subprocess.Popen) -> None:
         time.sleep(0.005)
 
 
-def complete(path: Path) -> int:
+def recorded_pose_count(path: Path) -> int:
     try:
         return read_index(path)["complete"]
     except RecordingError:
@@ -111,17 +111,16 @@ def complete(path: Path) -> int:
 
 
 def test_an_interrupted_recording_resumes(elbow, tmp_path):
-    """Stopped by Ctrl-C in the middle and continued, it is the recording that was never stopped, byte for byte."""
+    """A recording that Ctrl-C stops and `--resume` continues has the same bytes as an uninterrupted one."""
     options = ["--poses", POSES, "--seed", 5]
     path = tmp_path / "interrupted"
-    process = start("record", elbow.rig, path, *options)
-    wait_for(lambda: complete(path) > 0, process)
-    process.send_signal(getattr(signal, INTERRUPT))
+    process = start_verb("record", elbow.rig, path, *options)
+    wait_for(lambda: recorded_pose_count(path) > 0, process)
+    process.send_signal(getattr(signal, INTERRUPT_SIGNAL))
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert out.count("\n") == 1 and err.splitlines()[-1] == "Interrupted." and "Traceback" not in err
-    done = complete(path)
-    assert 0 < done < POSES
+    assert 0 < recorded_pose_count(path) < POSES
     assert run("record", elbow.rig, path, *options, "--resume") == 0
     assert run("record", elbow.rig, tmp_path / "whole", *options) == 0
     assert file_contents(path) == file_contents(tmp_path / "whole")
@@ -129,27 +128,27 @@ def test_an_interrupted_recording_resumes(elbow, tmp_path):
 
 def test_a_recording_that_is_killed_resumes(elbow, tmp_path):
     path = tmp_path / "killed"
-    process = start("record", elbow.rig, path, "--poses", POSES)
-    wait_for(lambda: complete(path) > 0, process)
+    process = start_verb("record", elbow.rig, path, "--poses", POSES)
+    wait_for(lambda: recorded_pose_count(path) > 0, process)
     process.kill()
     process.communicate(timeout=60)
     assert process.returncode == (1 if os.name == "nt" else -signal.SIGKILL)
-    assert 0 < complete(path) < POSES
+    assert 0 < recorded_pose_count(path) < POSES
     assert run("record", elbow.rig, path, "--poses", POSES, "--resume") == 0
     assert run("record", elbow.rig, tmp_path / "whole", "--poses", POSES) == 0
     assert file_contents(path) == file_contents(tmp_path / "whole")
 
 
 @pytest.mark.parametrize(
-    "request_", [REQUESTS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in REQUESTS[1:])]
+    "signal_name", [STOP_SIGNALS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in STOP_SIGNALS[1:])]
 )
-def test_an_interrupted_training_leaves_neither_model_nor_trainer(elbow, tmp_path, request_):
-    """Also where the request reaches the verb alone, as that of a batch system does."""
-    process = start("train", elbow.recording, tmp_path / "m.onnx", "--epochs", 1_000_000)
+def test_an_interrupted_training_leaves_neither_model_nor_trainer(elbow, tmp_path, signal_name):
+    """Only the process of the verb gets the signal, as from a batch system."""
+    process = start_verb("train", elbow.recording, tmp_path / "m.onnx", "--epochs", 1_000_000)
     for line in process.stderr:
         if line.startswith("training: "):
             break
-    process.send_signal(getattr(signal, request_))
+    process.send_signal(getattr(signal, signal_name))
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert "Traceback" not in err and out == ""
@@ -159,31 +158,31 @@ def test_an_interrupted_training_leaves_neither_model_nor_trainer(elbow, tmp_pat
 
 
 @pytest.mark.parametrize(("module", "error"), [("argparse", ""), ("numpy", "Interrupted.\n")])
-def test_ctrl_c_while_modules_are_imported(tmp_path, module, error):
-    (tmp_path / "sitecustomize.py").write_text(HOOK.format(module=module))
+def test_ctrl_c_during_imports(tmp_path, module, error):
+    (tmp_path / "sitecustomize.py").write_text(IMPORT_HOOK.format(module=module))
     verb = ("record", tmp_path / "none.blend", tmp_path / "r")
-    assert finish(*verb, PYTHONPATH=str(tmp_path)) == (130, "", error)
+    assert run_to_end(*verb, PYTHONPATH=str(tmp_path)) == (130, "", error)
 
 
-def test_ctrl_c_while_classes_are_registered(elbow, tmp_path):
-    """Blender asks for the annotations of a class, and only prints what goes wrong there."""
+def test_ctrl_c_during_registration(elbow, tmp_path):
+    """Blender prints exceptions that are raised while it reads the annotations of a class, and continues."""
     (tmp_path / "sitecustomize.py").write_text(REGISTRATION_HOOK)
-    status, out, err = finish("record", elbow.rig, tmp_path / "r", "--poses", 10_000, PYTHONPATH=str(tmp_path))
+    status, out, err = run_to_end("record", elbow.rig, tmp_path / "r", "--poses", 10_000, PYTHONPATH=str(tmp_path))
     assert (status, out, err) == (130, "", "Interrupted.\n")
     assert file_contents(tmp_path / "r") == {}
 
 
-def test_names_on_a_console_of_another_country(tmp_path):
-    """What the code page lacks is written out."""
+def test_names_that_the_console_s_encoding_lacks(tmp_path):
+    """Characters that the code page lacks are printed as escape sequences."""
     path = tmp_path / "Jürgen Müller 李.blend"
     for encoding in ("cp1252", "cp850"):
-        status, out, err = finish("record", path, tmp_path / "r", PYTHONIOENCODING=encoding, PYTHONUTF8="0")
+        status, out, err = run_to_end("record", path, tmp_path / "r", PYTHONIOENCODING=encoding, PYTHONUTF8="0")
         assert (status, out, "Traceback" in err) == (1, "", False)
         assert r"\u674e.blend" in err
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"]])
-def test_without_a_verb(arguments):
-    status, out, err = finish(*arguments)
+def test_usage_without_a_verb(arguments):
+    status, out, err = run_to_end(*arguments)
     assert status == (0 if arguments else 2)
     assert (out or err).startswith("usage: python -m fdda_addon")

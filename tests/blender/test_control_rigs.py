@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rigify's control rigs: sampled on their control bones, learned from their deforming ones, played by an action."""
+"""Rigify's control rigs: poses are sampled on control bones, and the model reads the deforming bones."""
 
 import json
 import subprocess
@@ -17,13 +17,13 @@ from fdda_addon.core.recording.reader import read_recording
 from .conftest import assert_plays, run, train
 
 ROOT = Path(__file__).resolve().parents[2]
-MOST = 0.1
-"""Part of linear skinning's error that may be left on an action that training has not seen."""
+MAX_ERROR_RATIO = 0.1
+"""Limit for the model's error, as a ratio of linear skinning's error, on an action outside the training data."""
 
 
 @dataclass(frozen=True)
 class Character:
-    """The files of a character."""
+    """Paths of a character's files."""
 
     rig: Path
     recording: Path
@@ -32,6 +32,7 @@ class Character:
 
 @pytest.fixture(scope="module", params=["BASIC_HUMAN", pytest.param("HORSE", marks=pytest.mark.slow)])
 def character(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Character:
+    """Build a Rigify rig in another process, record it and train a model."""
     folder = tmp_path_factory.mktemp(request.param.lower())
     files = Character(folder / "rig.blend", folder / "recording", folder / "model.onnx")
     command = [sys.executable, "-m", rigify.__name__, request.param, files.rig]
@@ -42,36 +43,37 @@ def character(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
     return files
 
 
-def test_the_model_sees_deforming_bones_alone(character: Character):
+def test_only_deforming_bones_are_joints(character: Character):
     recording = read_recording(character.recording)
     names = recording.rig.joint_names
     assert names and all(name.startswith("DEF-") for name in names)
     sampled = {channel.name for channel in recording.info.sampling.channels}
     assert {"torso", "chest", "head"} <= sampled and not sampled & set(names)
-    # What lies in the place of an original bone is a child of the deforming bone in that place.
+    # Every deforming bone but the root has a deforming bone as its parent.
     parents = {
         name: names[joint.parent] for name, joint in zip(names, recording.rig.joints, strict=True) if joint.parent >= 0
     }
     assert len(parents) == len(names) - 1
 
 
-def test_influences_are_near(character: Character):
-    """A limb depends on its own joints, not on those of the other end of the body."""
+def test_only_near_joints_influence_a_foot(character: Character):
+    """No joint of head or hands influences a foot."""
     recording = read_recording(character.recording)
     names = recording.rig.joint_names
     for partition in recording.partitions:
-        around = {names[joint] for joint in partition.influencing}
+        influencing_names = {names[joint] for joint in partition.influencing}
         if "foot" in names[partition.joint] and "fore" not in names[partition.joint]:
-            assert around and not any(part in name for name in around for part in ("head", "neck", "forearm", "hand"))
+            assert influencing_names
+            assert not any(part in name for name in influencing_names for part in ("head", "neck", "forearm", "hand"))
 
 
-def test_an_action_that_training_has_not_seen(character: Character, tmp_path: Path):
+def test_an_action_outside_the_training_data_has_small_errors(character: Character, tmp_path: Path):
     report = tmp_path / "errors.json"
     action = ("--action", rigify.PERFORMANCE)
     assert run("evaluate", character.rig, character.model, "--json", report, "--poses", 0, *action) == 0
     (errors,) = json.loads(report.read_text())["actions"]
     assert errors["linear"]["mean"] > 1.0
-    assert errors["fdda"]["mean"] < MOST * errors["linear"]["mean"]
+    assert errors["fdda"]["mean"] < MAX_ERROR_RATIO * errors["linear"]["mean"]
 
 
 def test_the_bound_character_plays_the_action(character: Character, tmp_path: Path):
@@ -80,8 +82,8 @@ def test_the_bound_character_plays_the_action(character: Character, tmp_path: Pa
     bpy.ops.wm.open_mainfile(filepath=str(bound))
     mesh_object, armature_object = bpy.data.objects["body"], bpy.data.objects["rig"]
     armature_object.animation_data.action = bpy.data.actions[rigify.PERFORMANCE]
-    seen = []
+    shapes = []
     for frame in (1, 30, 61):
         bpy.context.scene.frame_set(frame)
-        seen.append(assert_plays(mesh_object, tmp_path / character.model.name))
-    assert np.abs(seen[0] - seen[1]).max() > 0.01
+        shapes.append(assert_plays(mesh_object, tmp_path / character.model.name))
+    assert np.abs(shapes[0] - shapes[1]).max() > 0.01

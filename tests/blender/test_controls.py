@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Controls are read and set by their paths, whatever kind of property they are."""
+"""Controls: properties of every type are read and set by their RNA paths."""
 
 import bpy
 import pytest
@@ -13,16 +13,17 @@ from .conftest import ELBOW_RIG
 
 @pytest.fixture
 def armature_object(rig) -> bpy.types.Object:
-    """The elbow's armature object with custom properties of every kind."""
-    found = bpy.data.objects[ELBOW_RIG]
-    found["dial"], found["count"], found["is_on"], found["odd [name]"] = 0.5, 3, True, 0.1
-    found["many"] = [0.1, 0.2, 0.3]
+    """Return the elbow's armature object with custom properties of every type."""
+    armature_object = bpy.data.objects[ELBOW_RIG]
+    armature_object["dial"], armature_object["count"] = 0.5, 3
+    armature_object["is_on"], armature_object["odd [name]"] = True, 0.1
+    armature_object["many"] = [0.1, 0.2, 0.3]
     for name in ("dial", "count", "odd [name]", "many"):
-        found.id_properties_ui(name).update(min=-2, max=4, soft_min=-1, soft_max=2)
-    found.pose.bones["lower"]["fist"] = 0.25
-    found.pose.bones["lower"].id_properties_ui("fist").update(min=0, max=1)
+        armature_object.id_properties_ui(name).update(min=-2, max=4, soft_min=-1, soft_max=2)
+    armature_object.pose.bones["lower"]["fist"] = 0.25
+    armature_object.pose.bones["lower"].id_properties_ui("fist").update(min=0, max=1)
     bpy.context.view_layer.update()
-    return found
+    return armature_object
 
 
 @pytest.mark.parametrize(
@@ -55,7 +56,7 @@ def test_only_the_named_element_is_set(rig, armature_object):
 
 
 @pytest.mark.parametrize("name", ['armature_object/["none"]', 'armature_object/["many"]', "elsewhere/location[0]", "x"])
-def test_what_is_no_number_is_refused(rig, armature_object, name):
+def test_a_path_without_a_number_is_refused(rig, armature_object, name):
     with pytest.raises(RigError, match=r"'elbow' has no control '.*'; give the name of a shape key, or OWNER/PATH"):
         parse_controls(rig, [name])
 

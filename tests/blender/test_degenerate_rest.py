@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rest poses that no model can be learned of are refused before any work, with what to do about them."""
+"""Rest poses that cannot be trained are refused before recording, with an error message that tells what to do."""
 
 import math
 
@@ -24,37 +24,37 @@ def move_vertices(rig: SceneRig, change: object) -> None:
     mesh.update()
 
 
-def not_a_number(rig: SceneRig) -> None:
+def set_vertex_to_nan(rig: SceneRig) -> None:
     move_vertices(rig, lambda points: points.__setitem__((3, 1), math.nan))
 
 
-def infinite(rig: SceneRig) -> None:
+def set_vertices_to_infinity(rig: SceneRig) -> None:
     move_vertices(rig, lambda points: points.__setitem__(slice(5, 7), math.inf))
 
 
-def one_point(rig: SceneRig) -> None:
+def collapse_mesh(rig: SceneRig) -> None:
     move_vertices(rig, lambda points: points.fill(1000.1))
 
 
-def empty_basis(rig: SceneRig) -> None:
+def collapse_basis_key(rig: SceneRig) -> None:
     rig.mesh_object.shape_key_add(name="Basis")
     for point in rig.mesh_object.data.shape_keys.reference_key.data:
         point.co = (0, 0, 0)
 
 
-def one_vertex(rig: SceneRig) -> None:
+def keep_one_vertex(rig: SceneRig) -> None:
     rig.mesh_object.data.clear_geometry()
     rig.mesh_object.data.vertices.add(1)
 
 
-def lost_bone(rig: SceneRig) -> None:
+def set_bone_tail_to_nan(rig: SceneRig) -> None:
     bpy.context.view_layer.objects.active = rig.armature_object
     bpy.ops.object.mode_set(mode="EDIT")
     rig.armature_object.data.edit_bones["lower"].tail = (math.nan, 0, 0)
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def lost_armature(rig: SceneRig) -> None:
+def set_armature_location_to_nan(rig: SceneRig) -> None:
     rig.armature_object.location.x = math.nan
     bpy.context.view_layer.update()
 
@@ -63,18 +63,30 @@ def lost_armature(rig: SceneRig) -> None:
     ("change", "words"),
     [
         (
-            not_a_number,
+            set_vertex_to_nan,
             "1 of 300 vertices of 'elbow' have coordinates that are not finite, the first is vertex 3;",
         ),
-        (infinite, "2 of 300 vertices of 'elbow' have coordinates that are not finite, the first is vertex 5; delete"),
-        (one_point, "All 300 vertices of 'elbow' lie at one point in the rest pose, so the mesh has no size; give the"),
-        (empty_basis, "All 300 vertices of 'elbow' lie at one point in the rest pose"),
-        (one_vertex, "The mesh of 'elbow' has one vertex, and no surface to learn; choose another object."),
-        (lost_bone, "The bone 'lower' has no length or no finite place in the rest pose; give its head and its tail"),
-        (lost_armature, "'elbow_rig' is at no finite place; clear the location, rotation and scale of it and of its"),
+        (
+            set_vertices_to_infinity,
+            "2 of 300 vertices of 'elbow' have coordinates that are not finite, the first is vertex 5; delete",
+        ),
+        (
+            collapse_mesh,
+            "All 300 vertices of 'elbow' lie at one point in the rest pose, so the mesh has no size; give the",
+        ),
+        (collapse_basis_key, "All 300 vertices of 'elbow' lie at one point in the rest pose"),
+        (keep_one_vertex, "The mesh of 'elbow' has one vertex, and no surface to learn; choose another object."),
+        (
+            set_bone_tail_to_nan,
+            "The bone 'lower' has no length or no finite place in the rest pose; give its head and its tail",
+        ),
+        (
+            set_armature_location_to_nan,
+            "'elbow_rig' is at no finite place; clear the location, rotation and scale of it and of its",
+        ),
     ],
 )
-def test_a_rest_pose_without_size_or_place_is_refused(change, words, tmp_path):
+def test_a_rest_pose_without_size_or_finite_location_is_refused(change, words, tmp_path):
     rig = fresh_elbow()
     change(rig)
     (problem,) = check_recordable_rig(rig).problems

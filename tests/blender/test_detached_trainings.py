@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A training goes on when the Blender that started it is closed, and whoever opens the character follows it."""
+"""Detached trainings continue after the Blender that started them is closed; another Blender can attach to them."""
 
 import subprocess
 import sys
@@ -16,7 +16,7 @@ from fdda_addon.training import detached_process
 
 pytestmark = pytest.mark.one_blender_version
 
-LEAVING = """
+DETACHING_CODE = """
 import sys
 sys.path.insert(0, {root!r})
 from pathlib import Path
@@ -30,44 +30,44 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(autouse=True)
-def _user(tmp_path, monkeypatch):
+def _temporary_user_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(detached_process, "user_folder", lambda: tmp_path / "user")
 
 
-def leave_in_another_process(elbow, model: Path, epochs: int) -> None:
-    """Start a training in a process of its own that ends while it goes on."""
+def detach_in_another_process(elbow, model: Path, epochs: int) -> None:
+    """Start a training and detach from it in another process, which then ends."""
     user = model.parent / "user"
-    code = LEAVING.format(
+    code = DETACHING_CODE.format(
         root=str(ROOT), user=str(user), recording=str(elbow.recording), model=str(model), epochs=epochs
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
-def test_it_goes_on_when_its_blender_is_closed_and_is_followed_from_the_start(elbow, tmp_path):
+def test_a_detached_training_continues_and_is_read_from_its_start(elbow, tmp_path):
     model = tmp_path / "m.onnx"
-    leave_in_another_process(elbow, model, 30)
+    detach_in_another_process(elbow, model, 30)
     assert detached_process.is_detached(model) and not model.exists()
     with detached_process.AttachedTraining(model) as training:
-        kinds = [message.type for message in training.messages()]
-    assert kinds[0] is MessageType.STARTED and kinds.count(MessageType.PROGRESS) == 30
-    assert kinds[-1] is MessageType.FINISHED
+        message_types = [message.type for message in training.messages()]
+    assert message_types[0] is MessageType.STARTED and message_types.count(MessageType.PROGRESS) == 30
+    assert message_types[-1] is MessageType.FINISHED
     assert read_model_info(model).training["epochs"] == 30
     assert not detached_process.is_detached(model)
 
 
-def test_one_that_ended_meanwhile_is_followed_too(elbow, tmp_path):
+def test_attaching_to_a_training_that_has_ended(elbow, tmp_path):
     model = tmp_path / "m.onnx"
-    leave_in_another_process(elbow, model, 3)
-    end = time.monotonic() + 60
-    while detached_process._ProcessFiles(model).is_running() and time.monotonic() < end:
+    detach_in_another_process(elbow, model, 3)
+    deadline = time.monotonic() + 60
+    while detached_process._ProcessFiles(model).is_running() and time.monotonic() < deadline:
         time.sleep(0.1)
     with detached_process.AttachedTraining(model) as training:
         assert [message.type for message in training.messages()][-1] is MessageType.FINISHED
 
 
-def test_one_that_was_killed_says_so(elbow, tmp_path):
+def test_attaching_to_a_killed_training_raises_an_error(elbow, tmp_path):
     model = tmp_path / "m.onnx"
-    leave_in_another_process(elbow, model, 100_000)
+    detach_in_another_process(elbow, model, 100_000)
     with detached_process.AttachedTraining(model) as training:
         training._process.kill()
         with pytest.raises(TrainingError, match="before it was done; no model was written, train again"):
@@ -75,9 +75,9 @@ def test_one_that_was_killed_says_so(elbow, tmp_path):
     assert not detached_process.is_detached(model)
 
 
-def test_one_that_is_followed_can_be_cancelled(elbow, tmp_path):
+def test_an_attached_training_can_be_canceled(elbow, tmp_path):
     model = tmp_path / "m.onnx"
-    leave_in_another_process(elbow, model, 100_000)
+    detach_in_another_process(elbow, model, 100_000)
     with detached_process.AttachedTraining(model) as training:
         messages = training.messages()
         next(messages)
@@ -87,7 +87,7 @@ def test_one_that_is_followed_can_be_cancelled(elbow, tmp_path):
     assert list((tmp_path / "user" / "trainings").iterdir()) == []
 
 
-def test_one_that_died_says_why_to_another_blender(tmp_path):
+def test_attaching_to_a_failed_training_shows_its_error(tmp_path):
     files = detached_process._ProcessFiles(tmp_path / "m.onnx")
     with files.new_messages(), files.new_errors() as errors:
         errors.write("Traceback\nImportError: Jürgen 李\n")
@@ -102,7 +102,7 @@ def test_one_that_died_says_why_to_another_blender(tmp_path):
     assert not detached_process.is_detached(tmp_path / "m.onnx")
 
 
-def test_one_that_is_not_left_ends_with_its_block(elbow, tmp_path):
+def test_a_training_that_is_not_detached_ends_with_its_block(elbow, tmp_path):
     model = tmp_path / "m.onnx"
     with detached_process.DetachedTraining([str(elbow.recording), str(model), "--epochs", "100000"], model) as training:
         next(training.messages())
@@ -110,22 +110,22 @@ def test_one_that_is_not_left_ends_with_its_block(elbow, tmp_path):
     assert process.poll() is not None and not detached_process.is_detached(model)
 
 
-def test_a_number_of_another_process_is_never_ended(tmp_path):
-    """A machine that was switched off has given the number to somebody else."""
+def test_another_process_with_the_same_id_is_not_killed(tmp_path):
+    """After a restart, the system may have given the process ID to another process."""
     model = tmp_path / "m.onnx"
-    bystander = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    other_process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     try:
         files = detached_process._ProcessFiles(model)
         files.new_messages().close()
-        files.write_process_id(bystander.pid)
+        files.write_process_id(other_process.pid)
         with detached_process.AttachedTraining(model) as training:
             training.cancel()
             training._process.kill()
             list(training.messages())
-        assert bystander.poll() is None
+        assert other_process.poll() is None
     finally:
-        bystander.kill()
-        bystander.wait()
+        other_process.kill()
+        other_process.wait()
 
 
 def test_an_attached_training_ends_when_another_blender_has_removed_its_files(tmp_path):
@@ -138,7 +138,7 @@ def test_an_attached_training_ends_when_another_blender_has_removed_its_files(tm
             assert not training._reader.is_alive() and training._lines.get_nowait() is None
 
 
-def test_what_is_no_record_is_none(tmp_path):
+def test_an_invalid_process_file_is_ignored(tmp_path):
     files = detached_process._ProcessFiles(tmp_path / "m.onnx")
     files.new_messages().close()
     for text in ("", "[]", '{"process": "x"}', '{"process": null}'):
@@ -146,8 +146,8 @@ def test_what_is_no_record_is_none(tmp_path):
         assert not detached_process.is_detached(tmp_path / "m.onnx")
 
 
-def test_adjust_last_operation_is_not_offered_for_any_job():
-    """It would do the work again at every change, in the foreground."""
+def test_no_job_supports_adjust_last_operation():
+    """Adjust Last Operation would repeat the whole job at every change of an option."""
     from importlib import import_module
 
     from fdda_addon import operators
@@ -158,7 +158,7 @@ def test_adjust_last_operation_is_not_offered_for_any_job():
     assert len(jobs) > 5 and [c.bl_idname for c in jobs if "UNDO" in c.bl_options] == []
 
 
-def test_another_file_knows_nothing_of_a_job_that_ended(rig):
+def test_opening_a_file_clears_ended_jobs(rig):
     from fdda_addon.jobs import job
 
     bpy.ops.fdda.measure()

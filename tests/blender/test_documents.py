@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The page on the file formats: its code runs on what the verbs write, and its tables name every key."""
+"""Example code of the documentation runs on files that the verbs write; docs/formats.md names every key."""
 
 import json
 import os
@@ -24,18 +24,18 @@ pytestmark = pytest.mark.one_blender_version
 ROOT = Path(__file__).resolve().parents[2]
 
 
-FORMATS = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
-DEVELOPMENT = (ROOT / "docs" / "development.md").read_text(encoding="utf-8")
+FORMATS_PAGE = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+DEVELOPMENT_PAGE = (ROOT / "docs" / "development.md").read_text(encoding="utf-8")
 
 
 def chapter(name: str) -> str:
-    """The text of a chapter of docs/formats.md."""
-    assert f"\n## {name}\n" in FORMATS
-    return FORMATS.partition(f"\n## {name}\n")[2].partition("\n## ")[0]
+    """Return the text of a chapter of docs/formats.md."""
+    assert f"\n## {name}\n" in FORMATS_PAGE
+    return FORMATS_PAGE.partition(f"\n## {name}\n")[2].partition("\n## ")[0]
 
 
 def run_code(text: str, folder: Path, python: str = sys.executable, arguments: tuple[object, ...] = ()) -> str:
-    """Run the only block of code of a text in a folder; returns what it prints."""
+    """Run the only code block of a text in a folder, and return its output."""
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     code = textwrap.dedent(code)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -53,7 +53,7 @@ def run_code(text: str, folder: Path, python: str = sys.executable, arguments: t
 
 @pytest.fixture(scope="module")
 def folder(elbow, tmp_path_factory) -> Path:
-    """The files of the elbow under the names that the page uses."""
+    """Make a folder with the elbow's files under the names that the page uses."""
     folder = tmp_path_factory.mktemp("documents")
     shutil.copytree(elbow.recording, folder / "recording")
     (folder / "model.onnx").write_bytes(elbow.model.read_bytes())
@@ -64,7 +64,7 @@ def folder(elbow, tmp_path_factory) -> Path:
 
 
 def test_recording_code(folder):
-    """Mean residual of the recording's first pose, as the core computes it."""
+    """The code prints the same mean residual of the first pose as `fdda_addon.core`."""
     from fdda_addon.core.metrics import distances
     from fdda_addon.core.recording.reader import read_recording
     from fdda_addon.core.skinning import LinearSkinning
@@ -97,22 +97,24 @@ def test_messages_code(folder, tmp_path):
 
 
 def test_development_code(elbow, tmp_path):
-    """What plays is what the model says, the model is near the rig, and linear skinning is farther."""
-    text = run_code(DEVELOPMENT, tmp_path, arguments=(elbow.bound, "elbow", 12))
-    playback, model, linear = (float(far) for far in re.findall(r"^\w.*: ([\d.]+) at vertex", text, re.MULTILINE))
+    """Playback equals the model's output, and the model is nearer to the rig than linear skinning."""
+    text = run_code(DEVELOPMENT_PAGE, tmp_path, arguments=(elbow.bound, "elbow", 12))
+    playback, model, linear = (
+        float(distance) for distance in re.findall(r"^\w.*: ([\d.]+) at vertex", text, re.MULTILINE)
+    )
     assert playback < 1e-5 and playback < model < 0.002 < linear
 
 
-def dotted(value: dict, prefix: str = "") -> set[str]:
-    """Names of all keys, `a.b` for those inside."""
-    found = set()
+def dotted_keys(value: dict, prefix: str = "") -> set[str]:
+    """Return the names of all keys; a nested key has the form `a.b`."""
+    keys = set()
     for key, inner in value.items():
-        found |= dotted(inner, f"{prefix}{key}.") if isinstance(inner, dict) else {prefix + key}
-    return found
+        keys |= dotted_keys(inner, f"{prefix}{key}.") if isinstance(inner, dict) else {prefix + key}
+    return keys
 
 
-def named(text: str, key: str) -> bool:
-    """Whether a page has a key in code: its whole dotted name, or its first and last part."""
+def is_key_documented(text: str, key: str) -> bool:
+    """Return whether inline code of a page contains a key: its dotted name, or its first and last part."""
     parts = key.split(".")
     text = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
     words = set(re.findall(r"[a-z_0-9]+(?:\.[a-z_0-9]+)*", " ".join(re.findall(r"`([^`]+)`", text))))
@@ -122,9 +124,9 @@ def named(text: str, key: str) -> bool:
 def test_recording_chapter_names_every_key_and_array(folder):
     text = chapter("Recording")
     index = json.loads((folder / "recording" / "recording.json").read_text())
-    keys = dotted(index) | {key for name in ("joints", "partitions") for key in index[name][0]}
+    keys = dotted_keys(index) | {key for name in ("joints", "partitions") for key in index[name][0]}
     keys |= {key for name in ("limits", "sources") for key in index["sampling"][name][0]}
-    assert [key for key in sorted(keys) if not named(text, key)] == []
+    assert [key for key in sorted(keys) if not is_key_documented(text, key)] == []
     assert [name for name in array_shapes(1, 1, 1, 1, 1, 3) if f"`{name}.npy`" not in text] == []
 
 
@@ -134,7 +136,7 @@ def test_model_chapter_names_every_key(folder):
     value = json.loads(read_model_info(folder / "model.onnx").to_json())
     keys = set(value) | {key for name in ("joints", "partitions") for key in value[name][0]}
     keys |= set(value["fingerprint"]) | set(value["held_out_mm"]) | set(value["training_ranges"])
-    assert [key for key in sorted(keys) if not named(chapter("Model"), key)] == []
+    assert [key for key in sorted(keys) if not is_key_documented(chapter("Model"), key)] == []
 
 
 def test_metadata_table_names_every_key_of_a_partition():
@@ -149,7 +151,7 @@ def test_metadata_table_names_every_key_of_a_partition():
 def test_evaluation_chapter_names_every_key(folder, name):
     value = json.loads((folder / f"{name}.json").read_text())
     keys = set(value) | {key for inner in value.values() if isinstance(inner, dict) for key in inner}
-    assert [key for key in sorted(keys) if not named(chapter(name.capitalize()), key)] == []
+    assert [key for key in sorted(keys) if not is_key_documented(chapter(name.capitalize()), key)] == []
 
 
 def test_messages_chapter_names_every_type_and_its_keys():

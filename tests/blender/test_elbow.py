@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The elbow, the smallest of the rigs that tests use."""
+"""Mesh, constraints and action of the elbow, the smallest rig of the tests."""
 
 import math
 
@@ -9,16 +9,16 @@ import pytest
 
 from blend_fixtures.elbow import LOWER_RANGE, UPPER_RANGE, build_elbow, elbow_surface
 
-from .test_arm import assert_closed, evaluated, rest
+from .test_arm import assert_closed, evaluated, rest_positions
 
 
-def test_elbow_is_a_small_closed_tube():
+def test_the_elbow_is_a_small_closed_tube():
     points, faces = elbow_surface()
     assert 250 <= len(points) <= 400
     assert_closed(points, faces)
 
 
-def test_elbow_keeps_its_range_in_constraints():
+def test_constraints_define_the_range_of_motion_of_the_elbow():
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh_object, rig = build_elbow()
     assert (mesh_object.name, rig.name) == ("elbow", "elbow_rig")
@@ -35,13 +35,13 @@ def test_elbow_keeps_its_range_in_constraints():
     assert sum(len(vertex.groups) == 2 for vertex in mesh_object.data.vertices) >= 24
 
 
-def test_elbow_waves():
+def test_the_action_moves_the_tip_of_the_elbow():
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh_object, rig = build_elbow()
     assert rig.animation_data.action.name == "elbow_wave"
     scene = bpy.context.scene
     assert (scene.frame_start, scene.frame_end) == (1, 30)
-    still = evaluated(mesh_object)
+    first_positions = evaluated(mesh_object)
     scene.frame_set(10)
-    tip = rest(mesh_object)[:, 0].argmax()
-    assert np.linalg.norm(evaluated(mesh_object)[tip] - still[tip]) > 0.2
+    tip = rest_positions(mesh_object)[:, 0].argmax()
+    assert np.linalg.norm(evaluated(mesh_object)[tip] - first_positions[tip]) > 0.2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Names that are not ASCII, where the terminal shows nothing else."""
+"""Names with characters outside ASCII, on terminals that support only ASCII."""
 
 import json
 import os
@@ -15,44 +15,44 @@ from .refusals import save_elbow
 pytestmark = pytest.mark.one_blender_version
 
 ROOT = Path(__file__).resolve().parents[2]
-ASCII = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
+ASCII_ENVIRONMENT = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
 
 
-def rename(rig) -> None:
+def rename_with_unicode(rig) -> None:
     rig.mesh_object.name = "Ärmel"
     rig.armature_object.data.bones["lower"].name = "前腕"
 
 
 @pytest.fixture
-def named(tmp_path):
-    return save_elbow(tmp_path / "ellbögen.blend", rename)
+def unicode_rig(tmp_path):
+    return save_elbow(tmp_path / "ellbögen.blend", rename_with_unicode)
 
 
-def verb(*arguments, **environment) -> subprocess.CompletedProcess:
+def run_verb(*arguments, **environment) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", "fdda_addon", *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, env=ASCII | environment, capture_output=True, check=False)
+    return subprocess.run(command, cwd=ROOT, env=ASCII_ENVIRONMENT | environment, capture_output=True, check=False)
 
 
-def test_verbs_on_a_terminal_that_knows_ascii_only(named, tmp_path):
+def test_verbs_on_an_ascii_terminal(unicode_rig, tmp_path):
     assert "Ärmel" in bpy.data.objects
     recording = tmp_path / "Aufnahme ß"
-    for arguments in (("record", named, recording, "--poses", 12), ("check-recording", recording)):
-        done = verb(*arguments)
-        assert done.returncode == 0, done.stderr
-        assert b"Aufnahme \\xdf" in done.stdout and b"Traceback" not in done.stderr
+    for arguments in (("record", unicode_rig, recording, "--poses", 12), ("check-recording", recording)):
+        result = run_verb(*arguments)
+        assert result.returncode == 0, result.stderr
+        assert b"Aufnahme \\xdf" in result.stdout and b"Traceback" not in result.stderr
 
 
-def test_refusals_on_a_terminal_that_knows_ascii_only(named):
-    done = verb("record", named, named.parent / "r", "--object", "Handschuh ü")
-    assert done.returncode == 1
-    assert b"no mesh object 'Handschuh" in done.stderr and b"'\\xc4rmel'" in done.stderr
-    assert done.stderr.count(b"\n") == 1
+def test_error_messages_on_an_ascii_terminal(unicode_rig):
+    result = run_verb("record", unicode_rig, unicode_rig.parent / "r", "--object", "Handschuh ü")
+    assert result.returncode == 1
+    assert b"no mesh object 'Handschuh" in result.stderr and b"'\\xc4rmel'" in result.stderr
+    assert result.stderr.count(b"\n") == 1
 
 
-def test_names_where_python_takes_them_for_ascii(named, tmp_path):
-    """UTF-8 mode off: what is typed reaches Python as bytes that it cannot read."""
+def test_arguments_without_utf_8_mode(unicode_rig, tmp_path):
+    """Without UTF-8 mode, Python cannot decode the bytes of the arguments."""
     recording = tmp_path / "Aufnahme ß"
-    arguments = ("record", named, recording, "--poses", 12, "--object", "Ärmel")
-    done = verb(*arguments, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
-    assert done.returncode == 0 and b"Traceback" not in done.stderr, done.stderr
+    arguments = ("record", unicode_rig, recording, "--poses", 12, "--object", "Ärmel")
+    result = run_verb(*arguments, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
+    assert result.returncode == 0 and b"Traceback" not in result.stderr, result.stderr
     assert json.loads((recording / "recording.json").read_text(encoding="utf-8"))["rig"]["object"] == "Ärmel"

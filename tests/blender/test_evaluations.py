@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Whatever evaluates shows the model's output: subframes, exports, motion blur, view layers, scenes, foreign code."""
+"""Every evaluation shows the model's output: subframes, exports, motion blur, view layers, scenes, other add-ons."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,7 +23,7 @@ FRAMES = (4, 11, 20)
 
 @contextmanager
 def handler(name: str, function) -> Iterator[None]:
-    """A handler of another add-on."""
+    """Register a handler, as another add-on does, while the `with` block runs."""
     handlers = getattr(bpy.app.handlers, name)
     handlers.append(function)
     try:
@@ -38,15 +38,15 @@ def shown_in(graph: bpy.types.Depsgraph, mesh_object: bpy.types.Object) -> np.nd
 
 
 @pytest.mark.parametrize("subframe", [0.25, 0.5, 0.999])
-def test_subframes(bound, elbow, subframe):
+def test_subframes_show_the_model(bound, elbow, subframe):
     bpy.context.scene.frame_set(10)
-    whole = assert_plays(bound, elbow.model)
+    frame_positions = assert_plays(bound, elbow.model)
     bpy.context.scene.frame_set(10, subframe=subframe)
-    assert np.abs(assert_plays(bound, elbow.model) - whole).max() > 1e-4
+    assert np.abs(assert_plays(bound, elbow.model) - frame_positions).max() > 1e-4
 
 
-def keyed(bound: bpy.types.Object) -> bpy.types.Object:
-    """The bound elbow with a shape key that the rig shows and the model has not learned."""
+def add_shape_key(bound: bpy.types.Object) -> bpy.types.Object:
+    """Add a shape key that the model was not trained with to the bound elbow, and return the elbow."""
     bind(SceneRig(bound, armature_of(bound)), without_deformation(model_path(bound)))
     bound.fdda.mode = "RIG"
     bound.shape_key_add(name="Basis")
@@ -73,45 +73,46 @@ def export_usd(path: Path, mode: str) -> None:
     )
 
 
-def read_back(path: Path) -> dict[int, np.ndarray]:
-    """Positions of the exported mesh at frames."""
+def positions_in_file(path: Path) -> dict[int, np.ndarray]:
+    """Import an exported file, and return the positions (V, 3) of its mesh by frame."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     if path.suffix == ".abc":
         bpy.ops.wm.alembic_import(filepath=str(path), as_background_job=False)
     else:
         bpy.ops.wm.usd_import(filepath=str(path))
     mesh_object = max((o for o in bpy.data.objects if o.type == "MESH"), key=lambda o: len(o.data.vertices))
-    found = {}
+    positions = {}
     for frame in FRAMES:
         bpy.context.scene.frame_set(frame)
-        found[frame] = evaluated(mesh_object)
-    return found
+        positions[frame] = evaluated(mesh_object)
+    return positions
 
 
 @pytest.mark.parametrize("suffix", [".abc", ".usdc"])
 @pytest.mark.parametrize("mode", ["VIEWPORT", "RENDER"])
 @pytest.mark.parametrize("use_in_render", [False, True])
-def test_exports(bound, elbow, tmp_path, suffix, mode, use_in_render):
-    """What is evaluated for renders is the rig, with its shape keys, unless renders use the model."""
-    keyed(bound).fdda.use_in_render = use_in_render
+def test_exports_contain_the_model_or_the_rig(bound, elbow, tmp_path, suffix, mode, use_in_render):
+    """Exports for renders contain the rig with its shape keys, unless Use in Render is set."""
+    add_shape_key(bound).fdda.use_in_render = use_in_render
     shows_model = use_in_render or mode == "VIEWPORT"
     expected, other = {}, {}
     for frame in FRAMES:
         bpy.context.scene.frame_set(frame)
-        model = assert_plays(bound, elbow.model)
+        model_positions = assert_plays(bound, elbow.model)
         bound.fdda.mode = "RIG"
-        rig = evaluated(bound)
+        rig_shape = evaluated(bound)
         bound.fdda.mode = "FDDA"
-        expected[frame], other[frame] = (model, rig) if shows_model else (rig, model)
+        both = (model_positions, rig_shape) if shows_model else (rig_shape, model_positions)
+        expected[frame], other[frame] = both
     path = tmp_path / f"elbow{suffix}"
     {".abc": export_alembic, ".usdc": export_usd}[suffix](path, mode)
-    for frame, positions in read_back(path).items():
+    for frame, positions in positions_in_file(path).items():
         assert np.abs(positions - expected[frame]).max() < 1e-5
         assert np.abs(positions - other[frame]).max() > 1e-3
 
 
-def test_motion_blur_is_that_of_a_mesh_cache(bound, elbow, tmp_path):
-    """Cycles evaluates between frames; a mesh that an Alembic file moves is the measure."""
+def test_motion_blur_equals_that_of_an_alembic_cache(bound, elbow, tmp_path):
+    """Cycles evaluates subframes. The expected image shows the same mesh from an Alembic file."""
     scene = bpy.context.scene
     bound.fdda.use_in_render = True
     set_camera()
@@ -123,33 +124,34 @@ def test_motion_blur_is_that_of_a_mesh_cache(bound, elbow, tmp_path):
     light.rotation_euler[0] = 0.9
     scene.collection.objects.link(light)
     scene.frame_set(11)
-    model = still(tmp_path / "model.png")
-    assert not np.array_equal(model, rig_pixels(bound, tmp_path))
+    model_image = still(tmp_path / "model.png")
+    assert not np.array_equal(model_image, rig_pixels(bound, tmp_path))
     bpy.ops.wm.alembic_export(
         filepath=str(tmp_path / "e.abc"), start=10, end=13, gsamples=2, xsamples=2, as_background_job=False
     )
     bound.hide_render = True
     bpy.ops.wm.alembic_import(filepath=str(tmp_path / "e.abc"), set_frame_range=False, as_background_job=False)
     scene.frame_set(11)
-    baked = still(tmp_path / "baked.png")
-    assert np.abs(model - baked).mean() < 2e-3
+    cache_image = still(tmp_path / "cache.png")
+    assert np.abs(model_image - cache_image).mean() < 2e-3
     scene.render.use_motion_blur = False
-    assert np.abs(still(tmp_path / "sharp.png") - model).mean() > 4 * np.abs(model - baked).mean()
+    sharp_image = still(tmp_path / "sharp.png")
+    assert np.abs(sharp_image - model_image).mean() > 4 * np.abs(model_image - cache_image).mean()
 
 
-def test_two_view_layers(bound, elbow):
+def test_two_view_layers_show_the_model(bound, elbow):
     scene = bpy.context.scene
-    second = scene.view_layers.new("second")
+    second_layer = scene.view_layers.new("second")
     for angle in (0.4, 1.5):
         bpy.data.objects[ELBOW_RIG].animation_data_clear()
         pose(angle=angle)
-        second.update()
+        second_layer.update()
         expected = assert_plays(bound, elbow.model)
-        assert np.abs(shown_in(second.depsgraph, bound) - expected).max() < 1e-5
+        assert np.abs(shown_in(second_layer.depsgraph, bound) - expected).max() < 1e-5
 
 
-def test_two_scenes(bound, elbow):
-    """Linked to another scene, at another frame."""
+def test_two_scenes_show_the_model_at_different_frames(bound, elbow):
+    """The character is linked to a second scene with another current frame."""
     first, second = bpy.context.scene, bpy.data.scenes.new("second")
     for name in (ELBOW, ELBOW_RIG):
         second.collection.objects.link(bpy.data.objects[name])
@@ -163,20 +165,20 @@ def test_two_scenes(bound, elbow):
     assert np.abs(shown_in(graph, bound) - assert_plays(bound, elbow.model)).max() < 1e-5
 
 
-def test_a_foreign_handler_that_evaluates(bound, elbow):
-    seen = []
+def test_a_handler_of_another_add_on_evaluates_the_model(bound, elbow):
+    handler_positions = []
 
     def evaluate(*_):
-        seen.append(evaluated(bound))
+        handler_positions.append(evaluated(bound))
 
     with handler("frame_change_post", evaluate):
         for frame in FRAMES:
             bpy.context.scene.frame_set(frame)
-            assert np.abs(seen[-1] - assert_plays(bound, elbow.model)).max() < 1e-5
-    assert len(seen) == len(FRAMES)
+            assert np.abs(handler_positions[-1] - assert_plays(bound, elbow.model)).max() < 1e-5
+    assert len(handler_positions) == len(FRAMES)
 
 
-def test_another_add_on_that_poses_after_a_frame(bound, elbow):
+def test_another_add_on_may_set_the_pose_after_a_frame_change(bound, elbow):
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
 
     def set_pose(scene, _graph):
@@ -187,22 +189,22 @@ def test_another_add_on_that_poses_after_a_frame(bound, elbow):
     assert np.abs(shown[0] - shown[2]).max() > 1e-2
 
 
-def test_python_drivers_elsewhere(bound, elbow, monkeypatch):
-    """Their expressions take Python's lock, on the threads that evaluate."""
+def test_python_drivers_of_other_objects_do_not_block_playback(bound, elbow, monkeypatch):
+    """The expressions of these drivers take the global interpreter lock on threads that evaluate."""
     monkeypatch.setattr(bpy.context.preferences.filepaths, "use_scripts_auto_execute", True)
-    for number in range(20):
-        empty = bpy.data.objects.new(f"empty {number}", None)
+    for index in range(20):
+        empty = bpy.data.objects.new(f"empty {index}", None)
         bpy.context.scene.collection.objects.link(empty)
         curve = empty.driver_add("location", 0)
-        curve.driver.expression = f"len([i for i in range({number} + int(frame))])"
+        curve.driver.expression = f"len([i for i in range({index} + int(frame))])"
     for frame in FRAMES:
         bpy.context.scene.frame_set(frame)
         assert_plays(bound, elbow.model)
         assert bpy.data.objects["empty 3"].matrix_world.translation.x == 3 + frame
 
 
-def test_a_driver_that_reads_another_pose(bound, elbow):
-    """The bend follows an empty that the frame moves."""
+def test_a_bone_driven_by_another_object_is_played(bound, elbow):
+    """The location of an animated empty drives the rotation of the bone."""
     armature_object = bpy.data.objects[ELBOW_RIG]
     armature_object.animation_data_clear()
     empty = bpy.data.objects.new("slider", None)
@@ -219,58 +221,58 @@ def test_a_driver_that_reads_another_pose(bound, elbow):
     assert np.abs(shown[0] - shown[2]).max() > 1e-2
 
 
-def test_a_character_that_stands_still_is_not_evaluated(bound, monkeypatch):
+def test_an_unchanged_character_is_not_evaluated(bound, monkeypatch):
     from fdda_addon.runtime.player import Player
 
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     bpy.context.view_layer.update()
-    calls, real = [], Player.play
-    monkeypatch.setattr(Player, "play", lambda self, buffer: calls.append(buffer) or real(self, buffer))
+    calls, play = [], Player.play
+    monkeypatch.setattr(Player, "play", lambda self, buffer: calls.append(buffer) or play(self, buffer))
     bpy.context.scene.frame_set(7)
     assert calls == []
     pose(angle=0.7)
     assert len(calls) == 1
 
 
-def test_a_render_of_the_rig_executes_no_model(bound, tmp_path, monkeypatch):
+def test_a_render_of_the_rig_does_not_run_the_model(bound, tmp_path, monkeypatch):
     from fdda_addon.runtime.network import Execution
 
     set_camera()
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     bpy.context.view_layer.update()
-    calls, real = [], Execution.run
-    monkeypatch.setattr(Execution, "run", lambda self: calls.append(self) or real(self))
+    calls, run = [], Execution.run
+    monkeypatch.setattr(Execution, "run", lambda self: calls.append(self) or run(self))
     still(tmp_path / "still.png")
     assert calls == []
 
 
-def test_another_armature(bound, elbow):
-    other = bpy.data.objects[ELBOW_RIG].copy()
-    other.animation_data_clear()
-    bpy.context.scene.collection.objects.link(other)
-    other.pose.bones["lower"].rotation_euler[0] = 1.4
-    bound.modifiers["Armature"].object = bound.parent = other
+def test_a_character_follows_another_armature(bound, elbow):
+    other_armature = bpy.data.objects[ELBOW_RIG].copy()
+    other_armature.animation_data_clear()
+    bpy.context.scene.collection.objects.link(other_armature)
+    other_armature.pose.bones["lower"].rotation_euler[0] = 1.4
+    bound.modifiers["Armature"].object = bound.parent = other_armature
     bpy.context.view_layer.update()
     first = assert_plays(bound, elbow.model)
-    pose(other.name, angle=0.2)
+    pose(other_armature.name, angle=0.2)
     assert np.abs(assert_plays(bound, elbow.model) - first).max() > 1e-2
     assert np.abs(evaluated(bound) - predicted(bound, elbow.model)).max() < 1e-5
 
 
-def test_graphs_are_known_by_what_they_are_of(bound, tmp_path):
-    """Blender gives the address of a graph that is gone to another one."""
-    keyed(bound)
+def test_depsgraphs_are_identified_by_mode_scene_and_view_layer(bound, tmp_path):
+    """A new dependency graph may get the address of a deleted one."""
+    add_shape_key(bound)
     set_camera()
-    seen = []
+    seen_graphs = []
 
-    def look(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-        seen.append((depsgraph.mode, VIEWPORT_KEY in bound.evaluated_get(depsgraph)))
+    def record_graph(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+        seen_graphs.append((depsgraph.mode, VIEWPORT_KEY in bound.evaluated_get(depsgraph)))
 
-    with handler("frame_change_post", look):
-        for number in range(3):
+    with handler("frame_change_post", record_graph):
+        for frame in range(3):
             still(tmp_path / "still.png")
-            bpy.context.scene.frame_set(number)
-    assert set(seen) == {("RENDER", False), ("VIEWPORT", True)}
+            bpy.context.scene.frame_set(frame)
+    assert set(seen_graphs) == {("RENDER", False), ("VIEWPORT", True)}
     (player,) = registry.players.values()
     uid, name = bpy.context.scene.session_uid, bpy.context.view_layer.name
     assert player.depsgraph_keys == {("RENDER", uid, name), ("VIEWPORT", uid, name)}

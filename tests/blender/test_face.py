@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A face of bones, shape keys and correctives: learned from its controls, and played by an action it has not seen."""
+"""A face with bones, shape keys and correctives, trained with its controls and evaluated on another action."""
 
 import json
 from pathlib import Path
@@ -15,13 +15,13 @@ from fdda_addon.scene.mesh import evaluated_positions
 
 from .conftest import assert_plays, run, train
 
-MOST = 0.5
-"""Part of linear skinning's mean error that a short training may leave; docs/characters.md has a long one's."""
+MAX_ERROR_RATIO = 0.5
+"""Limit for the model's mean error after a short training, as a ratio of linear skinning's mean error."""
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the rig, a recording and a model."""
+def face_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build, record and train the face; return the folder of its files."""
     folder = tmp_path_factory.mktemp("face")
     bpy.ops.wm.read_factory_settings(use_empty=True)
     face.face()
@@ -34,61 +34,67 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def opened(files: Path) -> bpy.types.Object:
-    bpy.ops.wm.open_mainfile(filepath=str(files / "face.blend"))
+def face_object(face_folder: Path) -> bpy.types.Object:
+    """Open the file of the face, and return its mesh object."""
+    bpy.ops.wm.open_mainfile(filepath=str(face_folder / "face.blend"))
     return bpy.data.objects[face.MESH]
 
 
-def test_half_of_its_controls_are_shape_keys(opened, files):
-    keys = opened.data.shape_keys
-    driven = {curve.data_path for curve in keys.animation_data.drivers}
-    free = [block.name for block in keys.key_blocks[1:] if f'key_blocks["{block.name}"].value' not in driven]
+def test_half_of_the_controls_are_shape_keys(face_object, face_folder):
+    keys = face_object.data.shape_keys
+    driven_paths = {curve.data_path for curve in keys.animation_data.drivers}
+    undriven_names = [
+        block.name for block in keys.key_blocks[1:] if f'key_blocks["{block.name}"].value' not in driven_paths
+    ]
     bones = bpy.data.objects[face.ARMATURE].pose.bones
-    assert len(opened.data.vertices) >= 5000
-    assert (len(free), len(bones), len(driven)) == (22, 22, 12)
-    recording = read_recording(files / "recording")
+    assert len(face_object.data.vertices) >= 5000
+    assert (len(undriven_names), len(bones), len(driven_paths)) == (22, 22, 12)
+    recording = read_recording(face_folder / "recording")
     controls = {control.name for control in recording.rig.controls}
-    assert controls == {f'shape_keys/key_blocks["{name}"].value' for name in free}
+    assert controls == {f'shape_keys/key_blocks["{name}"].value' for name in undriven_names}
 
 
 @pytest.mark.parametrize(("first", "second"), face._correctives(), ids="-".join)
-def test_correctives_come_with_both(opened, first, second):
-    """A corrective moves the mesh where both are there, and neither alone."""
-    blocks, jaw = opened.data.shape_keys.key_blocks, bpy.data.objects[face.ARMATURE].pose.bones["jaw"]
+def test_a_corrective_needs_both_of_its_controls(face_object, first, second):
+    """The value of a corrective is 0 if one of its two controls is 0, and grows with both."""
+    blocks, jaw = face_object.data.shape_keys.key_blocks, bpy.data.objects[face.ARMATURE].pose.bones["jaw"]
     corrective = blocks[f"{first}_{second}"]
 
-    def set_to(one: float, other: float) -> float:
-        blocks[first].value = one
+    def corrective_value(first_value: float, second_value: float) -> float:
+        blocks[first].value = first_value
         if second == "jaw":
-            jaw.rotation_euler[0] = -other * face.JAW_OPENS
+            jaw.rotation_euler[0] = -second_value * face.JAW_OPENS
         else:
-            blocks[second].value = other
+            blocks[second].value = second_value
         bpy.context.view_layer.update()
         graph = bpy.context.evaluated_depsgraph_get()
-        evaluated_positions(opened, graph)
-        return opened.evaluated_get(graph).data.shape_keys.key_blocks[corrective.name].value
+        evaluated_positions(face_object, graph)
+        return face_object.evaluated_get(graph).data.shape_keys.key_blocks[corrective.name].value
 
-    assert [round(set_to(*values), 3) for values in ((0, 1), (1, 0), (1, 0.5), (1, 1))] == [0, 0, 0.5, 1]
+    assert [round(corrective_value(*values), 3) for values in ((0, 1), (1, 0), (1, 0.5), (1, 1))] == [0, 0, 0.5, 1]
 
 
-def test_an_action_that_training_has_not_seen(files, tmp_path):
+def test_an_action_outside_the_training_data_has_small_errors(face_folder, tmp_path):
     report, speech = tmp_path / "errors.json", ("--action", face.SPEECH)
-    assert run("evaluate", files / "face.blend", files / "face.onnx", "--json", report, "--poses", 0, *speech) == 0
+    assert (
+        run("evaluate", face_folder / "face.blend", face_folder / "face.onnx", "--json", report, "--poses", 0, *speech)
+        == 0
+    )
     (errors,) = json.loads(report.read_text())["actions"]
     assert errors["linear"]["max"] > 5
-    assert errors["fdda"]["mean"] < MOST * errors["linear"]["mean"]
+    assert errors["fdda"]["mean"] < MAX_ERROR_RATIO * errors["linear"]["mean"]
 
 
-def test_the_bound_face_speaks(files, tmp_path):
+def test_the_bound_face_plays_the_action_and_a_shape_key(face_folder, tmp_path):
     bound = tmp_path / "bound.blend"
-    assert run("bind", files / "face.blend", files / "face.onnx", bound) == 0
+    assert run("bind", face_folder / "face.blend", face_folder / "face.onnx", bound) == 0
     bpy.ops.wm.open_mainfile(filepath=str(bound))
     mesh_object, armature_object = bpy.data.objects[face.MESH], bpy.data.objects[face.ARMATURE]
     armature_object.animation_data.action = bpy.data.actions[face.SPEECH]
-    keys, seen = mesh_object.data.shape_keys, []
+    keys, shapes = mesh_object.data.shape_keys, []
     for frame, smile in ((1, 0.0), (30, 0.7), (61, 1.0)):
         bpy.context.scene.frame_set(frame)
         keys.key_blocks["smile.L"].value = smile
         bpy.context.view_layer.update()
-        seen.append(assert_plays(mesh_object, files / "face.onnx"))
-    assert np.abs(seen[0] - seen[1]).max() > 0.003
+        shapes.append(assert_plays(mesh_object, face_folder / "face.onnx"))
+    assert np.abs(shapes[0] - shapes[1]).max() > 0.003

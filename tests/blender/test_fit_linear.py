@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Linear skinning with fitted weights: recorded, trained, bound and compared; resumed, and refused."""
+"""Recordings with fitted skin weights: training, playback, resuming, and errors."""
 
 import dataclasses
 import json
@@ -32,20 +32,20 @@ from .conftest import ELBOW, assert_plays, evaluated, pose, run, train
 from .refusals import save_elbow
 from .scene_state import assert_same_state, drain, fresh_elbow, scene_state
 
-SMOOTH = RecordingSettings(poses=60, influence_poses=2, fit_linear="smooth")
+SMOOTH_SETTINGS = RecordingSettings(poses=60, influence_poses=2, fit_linear="smooth")
 
 
-def rigid_elbow() -> None:
-    """An elbow that is skinned to one bone a vertex; what makes it smooth is delta mush."""
+def build_rigid_elbow() -> None:
+    """Build an elbow with one bone per vertex, smoothed by Corrective Smooth (delta mush)."""
     mesh_object, _ = build_elbow()
     lower = lower_weights(np.array([vertex.co for vertex in mesh_object.data.vertices])) >= 0.5
-    for name, own in (("upper", ~lower), ("lower", lower)):
-        mesh_object.vertex_groups[name].remove(range(len(own)))
-        mesh_object.vertex_groups[name].add(np.flatnonzero(own).tolist(), 1.0, "REPLACE")
+    for name, is_member in (("upper", ~lower), ("lower", lower)):
+        mesh_object.vertex_groups[name].remove(range(len(is_member)))
+        mesh_object.vertex_groups[name].add(np.flatnonzero(is_member).tolist(), 1.0, "REPLACE")
 
 
-def cloth() -> SceneRig:
-    """A mesh without weights that sticks to a skinned body."""
+def build_cloth() -> SceneRig:
+    """Build a mesh without weights that a Surface Deform modifier attaches to a skinned body."""
     mesh_object, armature_object = tube()
     mesh_object.modifiers.clear()
     mesh_object.vertex_groups.clear()
@@ -60,8 +60,8 @@ def cloth() -> SceneRig:
 
 
 @dataclasses.dataclass(frozen=True)
-class Fitted:
-    """The files of a character with fitted linear skinning, and what `record` printed."""
+class FittedCharacter:
+    """Paths of a character with fitted linear skinning, and the output of `record`."""
 
     rig: Path
     recording: Path
@@ -74,12 +74,12 @@ class Fitted:
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable], Fitted]:
-    """Makes a character once: records it with fitted linear skinning, and trains."""
-    made: dict[str, Fitted] = {}
+def make_fitted_character(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable], FittedCharacter]:
+    """Return a function that records a character with fitted weights and trains a model, once for each kind."""
+    characters: dict[str, FittedCharacter] = {}
 
-    def make(kind: str, build: Callable[[], object], capfd: pytest.CaptureFixture) -> Fitted:
-        if kind not in made:
+    def make(kind: str, build: Callable[[], object], capfd: pytest.CaptureFixture) -> FittedCharacter:
+        if kind not in characters:
             folder = tmp_path_factory.mktemp("fitted")
             files = [folder / name for name in ("rig.blend", "recording", "model.onnx")]
             bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -90,25 +90,25 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable]
             assert run("record", *files[:2], *options) == 0
             printed = capfd.readouterr().out
             train(*files[1:], "--epochs", 25)
-            made[kind] = Fitted(*files, printed)
-        return made[kind]
+            characters[kind] = FittedCharacter(*files, printed)
+        return characters[kind]
 
     return make
 
 
-CHARACTERS = [("hard", cloth), ("smooth", rigid_elbow)]
+KINDS_AND_BUILDERS = [("hard", build_cloth), ("smooth", build_rigid_elbow)]
 
 
 def pose_matrices(rig: SceneRig, recorded: Rig) -> np.ndarray:
-    """(J, 4, 4), the pose that Blender has evaluated, of the joints of a recording."""
+    """Return the evaluated pose matrices (J, 4, 4) of the joints of a recording."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     reader = PoseReader(rig, recorded.joint_names, recorded.rest_matrices)
     return reader.read(*(o.evaluated_get(depsgraph) for o in (rig.mesh_object, rig.armature_object)))
 
 
-@pytest.mark.parametrize(("kind", "build"), CHARACTERS)
-def test_from_the_fit_to_playback(kind, build, fitted, capfd):
-    files = fitted(kind, build, capfd)
+@pytest.mark.parametrize(("kind", "build"), KINDS_AND_BUILDERS)
+def test_fitted_weights_reduce_errors_and_are_in_the_model(kind, build, make_fitted_character, capfd):
+    files = make_fitted_character(kind, build, capfd)
     recording, info = read_recording(files.recording), read_model_info(files.model)
     fit = recording.info.fit
     assert fit.sentence() in files.printed and (fit.kind, fit.poses) == (kind, 120)
@@ -116,42 +116,42 @@ def test_from_the_fit_to_playback(kind, build, fitted, capfd):
         assert gain.rms_mm["fitted"] < 0.8 * gain.rms_mm["rig"]
 
     rig = files.open()
-    own = read_rig(rig)
-    # The fingerprint is that of the rig: it does not matter to it which linear skinning a model has.
-    assert recording.rig.fingerprint == own.fingerprint == info.fingerprint
-    assert [own.joint_names[p.joint] for p in info.partitions] == ["upper", "lower"]
+    rig_data = read_rig(rig)
+    # The fingerprint describes the rig, and does not include fitted weights.
+    assert recording.rig.fingerprint == rig_data.fingerprint == info.fingerprint
+    assert [rig_data.joint_names[p.joint] for p in info.partitions] == ["upper", "lower"]
     assert (recording.rig.skin_weights > 0).sum(axis=1).max() == (1 if kind == "hard" else 2)
-    assert (own.skin_weights > 0).sum(axis=1).max() == 1
+    assert (rig_data.skin_weights > 0).sum(axis=1).max() == 1
 
     evaluation = drain(evaluate(rig, files.model, EvaluationSettings(30)))
     assert evaluation.fdda.rms < 0.5 * evaluation.linear.rms
-    # On other poses: those of the fit are 120, and every other one of them.
+    # The evaluation uses other poses than the fit.
     assert evaluation.linear.rms == pytest.approx(fit.held_out.rms_mm["fitted"], rel=0.3)
     assert [p.joint for p in evaluation.partitions] == [p.joint for p in info.partitions]
     assert [len(p.vertices) for p in evaluation.partitions] == [p.vertices for p in info.partitions]
 
 
-@pytest.mark.parametrize(("kind", "build"), CHARACTERS)
-def test_the_fitted_linear_skinning_is_what_plays(kind, build, fitted, capfd):
-    files = fitted(kind, build, capfd)
+@pytest.mark.parametrize(("kind", "build"), KINDS_AND_BUILDERS)
+def test_playback_uses_the_fitted_weights(kind, build, make_fitted_character, capfd):
+    files = make_fitted_character(kind, build, capfd)
     rig = files.open()
     pose(angle=1.2)
-    true = evaluated(rig.mesh_object)
+    rig_shape = evaluated(rig.mesh_object)
     bind(rig, files.model)
-    shown = assert_plays(rig.mesh_object, files.model)
+    model_positions = assert_plays(rig.mesh_object, files.model)
     heat_map.paint_partitions(rig)
     assert len(np.unique(heat_map.colors_of(rig.mesh_object), axis=0)) == 2
     rig.mesh_object.fdda.mode = "LINEAR"
-    linear = evaluated(rig.mesh_object)
+    linear_positions = evaluated(rig.mesh_object)
     recording = read_recording(files.recording)
     matrices = pose_matrices(rig, recording.rig)
-    np.testing.assert_allclose(linear, LinearSkinning(recording.rig).positions(matrices[None])[0], atol=1e-5)
-    errors = [np.linalg.norm(positions - true, axis=1).mean() for positions in (shown, linear)]
+    np.testing.assert_allclose(linear_positions, LinearSkinning(recording.rig).positions(matrices[None])[0], atol=1e-5)
+    errors = [np.linalg.norm(positions - rig_shape, axis=1).mean() for positions in (model_positions, linear_positions)]
     assert errors[0] < errors[1] < 0.01
 
 
 def test_a_mesh_without_weights_is_refused_unless_they_are_fitted(refusal, tmp_path):
-    cloth()
+    build_cloth()
     save_copy(tmp_path / "cloth.blend")
     assert refusal("record", tmp_path / "cloth.blend", tmp_path / "recording", "--object", ELBOW) == (
         "The vertices of 'elbow' have no weights on deforming bones of 'elbow_rig', so there is no linear skinning to "
@@ -159,7 +159,7 @@ def test_a_mesh_without_weights_is_refused_unless_they_are_fitted(refusal, tmp_p
     )
 
 
-def test_too_few_poses_to_fit(refusal, tmp_path):
+def test_fitting_to_too_few_poses_is_refused(refusal, tmp_path):
     path = save_elbow(tmp_path / "elbow.blend")
     assert refusal("record", path, tmp_path / "recording", "--poses", 9, "--fit-linear", "hard") == (
         "Skin weights are fitted to at least 10 poses, and these are 9; record more, or leave --fit-linear out."
@@ -177,7 +177,7 @@ def test_a_python_without_scipy_leaves_no_recording(refusal, tmp_path, monkeypat
     assert text.startswith("Fitting skin weights needs the Python package 'scipy', which ")
 
 
-def test_a_fit_that_dies_is_reported(refusal, tmp_path, monkeypatch):
+def test_a_fit_whose_process_dies_prints_an_error(refusal, tmp_path, monkeypatch):
     path = save_elbow(tmp_path / "elbow.blend")
     (tmp_path / "sitecustomize.py").write_text("import os\nos._exit(3)\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
@@ -187,7 +187,7 @@ def test_a_fit_that_dies_is_reported(refusal, tmp_path, monkeypatch):
     )
 
 
-def test_refined_poses_take_linear_skinning_of_the_recording(tmp_path, refusal):
+def test_refining_poses_cannot_fit_weights_again(tmp_path, refusal):
     assert run("record", save_elbow(tmp_path / "elbow.blend"), tmp_path / "recording", "--poses", 3) == 0
     status = run(
         "record", tmp_path / "elbow.blend", tmp_path / "recording", "--refine", "m.onnx", "--fit-linear", "hard"
@@ -198,20 +198,20 @@ def test_refined_poses_take_linear_skinning_of_the_recording(tmp_path, refusal):
 def test_a_resumed_recording_keeps_its_weights(tmp_path, monkeypatch):
     rig = fresh_elbow()
     before = scene_state(rig)
-    drain(record(rig, tmp_path / "whole", SMOOTH))
+    drain(record(rig, tmp_path / "whole", SMOOTH_SETTINGS))
     assert_same_state(before, scene_state(rig))
-    steps = record(rig, tmp_path / "broken", SMOOTH)
+    steps = record(rig, tmp_path / "broken", SMOOTH_SETTINGS)
     for step in steps:
         if step.stage == "poses" and step.done == 30:
             break
     steps.close()
     assert read_folder(tmp_path / "broken").complete == 30
-    # No trainer is asked: the weights are there.
+    # Resuming starts no trainer, because the recording contains the weights.
     monkeypatch.setenv(PYTHON_VARIABLE, "/none/python")
-    resumed = dataclasses.replace(SMOOTH, resume=True)
-    for other in ("", "hard"):
+    resumed = dataclasses.replace(SMOOTH_SETTINGS, resume=True)
+    for other_kind in ("", "hard"):
         with pytest.raises(RecordingError) as error:
-            drain(record(rig, tmp_path / "broken", dataclasses.replace(resumed, fit_linear=other)))
+            drain(record(rig, tmp_path / "broken", dataclasses.replace(resumed, fit_linear=other_kind)))
         assert str(error.value) == (
             f"Cannot resume '{tmp_path / 'broken'}': it was recorded with --fit-linear smooth; give that, or record "
             "into another folder."
@@ -225,30 +225,30 @@ def test_a_recording_of_the_rigs_own_weights_is_not_resumed_with_others(tmp_path
     rig = fresh_elbow()
     drain(record(rig, tmp_path / "own", RecordingSettings(poses=4, influence_poses=1)))
     with pytest.raises(RecordingError, match="it was recorded with the rig's own weights; give that"):
-        drain(record(rig, tmp_path / "own", dataclasses.replace(SMOOTH, poses=4, resume=True)))
+        drain(record(rig, tmp_path / "own", dataclasses.replace(SMOOTH_SETTINGS, poses=4, resume=True)))
 
 
-def test_a_fit_that_is_cancelled_leaves_nothing(tmp_path):
+def test_a_canceled_fit_leaves_no_files(tmp_path):
     rig = fresh_elbow()
     before = scene_state(rig)
     for stage in ("poses to fit", "fit"):
-        steps = record(rig, tmp_path / "recording", SMOOTH)
+        steps = record(rig, tmp_path / "recording", SMOOTH_SETTINGS)
         assert any(step.stage == stage for step in steps)
         steps.close()
     assert_same_state(before, scene_state(rig))
     assert not (tmp_path / "recording").exists()
 
 
-def test_the_sidebar_fits_as_the_command_line_does(tmp_path):
+def test_the_sidebar_records_with_fitted_weights(tmp_path):
     rig = fresh_elbow()
     settings = rig.mesh_object.fdda.settings
     settings.poses, settings.fit_linear = 12, "HARD"
     assert bpy.ops.fdda.record(object=ELBOW, folder=str(tmp_path / "recording")) == {"FINISHED"}
     index = json.loads((tmp_path / "recording" / "recording.json").read_text())
     assert (index["fit"]["kind"], index["fit"]["poses"]) == ("hard", 12)
-    own = read_rig(rig)
-    same = read_folder(tmp_path / "recording", own, index["sampling"], "hard")
-    assert (same.state, same.sentence) == (FolderState.COMPLETE, "")
-    assert same.measured_sentences[0].startswith("Linear skinning with fitted weights (hard), mm: ")
-    other = read_folder(tmp_path / "recording", own, index["sampling"], "")
-    assert other.sentence == "It was recorded with other settings than those above: base skinning."
+    rig_data = read_rig(rig)
+    same_settings = read_folder(tmp_path / "recording", rig_data, index["sampling"], "hard")
+    assert (same_settings.state, same_settings.sentence) == (FolderState.COMPLETE, "")
+    assert same_settings.measured_sentences[0].startswith("Linear skinning with fitted weights (hard), mm: ")
+    other_settings = read_folder(tmp_path / "recording", rig_data, index["sampling"], "")
+    assert other_settings.sentence == "It was recorded with other settings than those above: base skinning."

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The one table of handlers: all of the add-on's are in it, once each, and it is all that is removed."""
+"""The add-on's table of handlers lists every handler once; unregistering removes these handlers and no others."""
 
 import sys
 
@@ -11,49 +11,49 @@ from fdda_addon.cli.registered import registered
 from fdda_addon.registration import handler_table
 
 
-def ours() -> list[tuple[str, object]]:
-    """Handlers of the add-on that Blender calls now."""
+def add_on_handlers() -> list[tuple[str, object]]:
+    """Return the registered handlers of the add-on, with the names of their lists."""
     lists = {name: getattr(bpy.app.handlers, name) for name in dir(bpy.app.handlers) if not name.startswith("_")}
-    found = [(name, handler) for name, listed in lists.items() if isinstance(listed, list) for handler in listed]
-    return [entry for entry in found if getattr(entry[1], "__module__", "").startswith("fdda_addon.")]
+    handlers = [(name, handler) for name, listed in lists.items() if isinstance(listed, list) for handler in listed]
+    return [entry for entry in handlers if getattr(entry[1], "__module__", "").startswith("fdda_addon.")]
 
 
-def declared() -> set[object]:
-    """Functions of the loaded modules of the add-on that are marked to outlive a file."""
+def persistent_functions() -> set[object]:
+    """Return the functions of the add-on's loaded modules that are marked as persistent."""
     modules = [module for name, module in sys.modules.items() if name.startswith("fdda_addon.")]
     functions = {value for module in modules for value in vars(module).values() if callable(value)}
     return {f for f in functions if "_bpy_persistent" in getattr(f, "__dict__", {}) or hasattr(f, "_bpy_persistent")}
 
 
-def test_all_are_registered_once_however_often_it_is_done():
+def test_registering_twice_adds_each_handler_once():
     expected = sorted(handler_table(), key=str)
-    assert expected and sorted(ours(), key=str) == expected
+    assert expected and sorted(add_on_handlers(), key=str) == expected
     fdda_addon.register()
-    assert sorted(ours(), key=str) == expected
+    assert sorted(add_on_handlers(), key=str) == expected
 
 
-def test_exactly_the_table_is_removed():
-    def of_another(*_: object) -> None:
-        """Another add-on's."""
+def test_unregistering_removes_only_handlers_of_the_add_on():
+    def other_handler(*_: object) -> None:
+        """Do nothing, as a handler of another add-on."""
 
-    bpy.app.handlers.load_post.append(of_another)
+    bpy.app.handlers.load_post.append(other_handler)
     try:
         fdda_addon.unregister()
-        assert ours() == [] and of_another in bpy.app.handlers.load_post
+        assert add_on_handlers() == [] and other_handler in bpy.app.handlers.load_post
     finally:
-        bpy.app.handlers.load_post.remove(of_another)
+        bpy.app.handlers.load_post.remove(other_handler)
         fdda_addon.register()
 
 
-def test_all_outlive_a_file_and_are_in_the_table():
-    before = ours()
+def test_all_handlers_are_persistent_and_in_the_table():
+    before = add_on_handlers()
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    assert ours() == before
-    assert declared() == {handler for _, handler in handler_table()}
+    assert add_on_handlers() == before
+    assert persistent_functions() == {handler for _, handler in handler_table()}
 
 
-def test_ctrl_c_waits_in_all_of_them():
-    """Blender prints what leaves a handler and goes on: a Ctrl-C that is raised there is lost."""
+def test_ctrl_c_is_delayed_in_all_modules_with_handlers():
+    """Blender prints exceptions of handlers and continues, so a KeyboardInterrupt in a handler would be lost."""
     with registered():
         assert {handler.__module__ for _, handler in handler_table()} <= interruption._callback_modules
         assert all(name in sys.modules for name in interruption._callback_modules)

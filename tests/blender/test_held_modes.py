@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A mode that is keyed or driven, and the eye of the FDDA modifier: work on the rig has the rig, and shows say why."""
+"""Animated modes and the visibility of the FDDA modifier: jobs still read the rig, and messages give reasons."""
 
 import json
 
@@ -15,38 +15,38 @@ from .test_evaluations import handler
 from .test_renders import FRAME, animation, rig_pixels, set_camera, still
 
 
-def key(mesh_object: bpy.types.Object) -> None:
+def key_mode(mesh_object: bpy.types.Object) -> None:
     mesh_object.fdda.keyframe_insert("mode", frame=1)
 
 
-def drive(mesh_object: bpy.types.Object) -> None:
+def drive_mode(mesh_object: bpy.types.Object) -> None:
     mesh_object.fdda.driver_add("mode").driver.expression = "2"
 
 
-def key_in_strip(mesh_object: bpy.types.Object) -> None:
-    key(mesh_object)
+def key_mode_in_strip(mesh_object: bpy.types.Object) -> None:
+    key_mode(mesh_object)
     animation_data = mesh_object.animation_data
     track = animation_data.nla_tracks.new()
     strip = track.strips.new("mode", 1, animation_data.action)
     strip.extrapolation, animation_data.action = "HOLD", None
 
 
-ANIMATED = {"keyed": key, "driven": drive, "in a strip": key_in_strip}
+MODE_ANIMATIONS = {"keyed": key_mode, "driven": drive_mode, "in a strip": key_mode_in_strip}
 
 
-@pytest.mark.parametrize("how", ANIMATED)
-def test_the_rig_is_held_while_it_is_borrowed(bound, elbow, how):
+@pytest.mark.parametrize("animation_name", MODE_ANIMATIONS)
+def test_an_animated_mode_shows_the_rig_while_the_model_is_disabled(bound, elbow, animation_name):
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     pose(angle=1.0)
     expected = rig_positions(bound)
-    ANIMATED[how](bound)
+    MODE_ANIMATIONS[animation_name](bound)
     pose(angle=1.0)
     assert_plays(bound, elbow.model)
     with model_disabled(bound):
         for _ in range(3):
             pose(angle=1.0)
             assert np.array_equal(evaluated(bound), expected)
-        # As a job is in a window, beside a user.
+        # While a job runs modally, a user can change the mode and the frame.
         bound.fdda.mode = "FDDA"
         bpy.context.scene.frame_set(7)
         pose(angle=1.0)
@@ -55,29 +55,29 @@ def test_the_rig_is_held_while_it_is_borrowed(bound, elbow, how):
     assert_plays(bound, elbow.model)
 
 
-def test_an_evaluation_compares_with_the_rig(bound, elbow, tmp_path):
-    path, figures = tmp_path / "bound.blend", {}
-    for name, animate in (("plain", lambda _: None), ("driven", drive)):
+def test_an_evaluation_with_a_driven_mode_compares_with_the_rig(bound, elbow, tmp_path):
+    path, reports = tmp_path / "bound.blend", {}
+    for name, animate in (("plain", lambda _: None), ("driven", drive_mode)):
         animate(bound)
         bpy.context.view_layer.update()
         save_copy(path)
         report = tmp_path / f"{name}.json"
         assert run("evaluate", path, elbow.model, "--poses", 3, "--json", report) == 0
-        figures[name] = json.loads(report.read_text())
+        reports[name] = json.loads(report.read_text())
         bpy.ops.wm.open_mainfile(filepath=str(elbow.bound))
         bound = bpy.data.objects["elbow"]
-    assert figures["driven"]["fdda"] == figures["plain"]["fdda"]
+    assert reports["driven"]["fdda"] == reports["plain"]["fdda"]
 
 
-def hide(mesh_object: bpy.types.Object) -> None:
+def disable_modifier(mesh_object: bpy.types.Object) -> None:
     mesh_object.modifiers["FDDA"].show_viewport = False
 
 
-def test_the_eye_of_the_modifier_is_the_switch(bound, elbow):
+def test_disabling_the_modifier_sets_mode_rig(bound, elbow):
     pose(angle=1.0)
     expected = rig_positions(bound)
     bpy.context.view_layer.update()
-    hide(bound)
+    disable_modifier(bound)
     bpy.context.view_layer.update()
     assert np.array_equal(evaluated(bound), expected)
     assert bound.fdda.mode == "RIG" and "The modifier 'FDDA' of 'elbow' was switched off" in bound.fdda.status
@@ -85,8 +85,8 @@ def test_the_eye_of_the_modifier_is_the_switch(bound, elbow):
     bpy.context.view_layer.update()
     pose(angle=0.7)
     assert_plays(bound, elbow.model)
-    # Also with a frame, and where no evaluation was in between.
-    hide(bound)
+    # This also works with a frame change, without an evaluation in between.
+    disable_modifier(bound)
     bpy.context.scene.frame_set(9)
     expected = evaluated(bound)
     assert bound.fdda.mode == "RIG"
@@ -95,16 +95,16 @@ def test_the_eye_of_the_modifier_is_the_switch(bound, elbow):
     assert np.abs(rig_positions(bound) - expected).max() < 1e-6
 
 
-def test_the_eye_goes_with_a_mode_that_is_driven(bound, elbow):
-    drive(bound)
+def test_a_driven_mode_enables_a_disabled_modifier(bound, elbow):
+    drive_mode(bound)
     pose(angle=1.0)
-    hide(bound)
+    disable_modifier(bound)
     bpy.context.view_layer.update()
     assert_plays(bound, elbow.model)
 
 
 @pytest.mark.parametrize("is_keyed", [False, True], ids=["driven", "keyed"])
-def test_an_eye_that_is_animated_is_followed(bound, elbow, is_keyed):
+def test_an_animated_visibility_of_the_modifier_is_followed(bound, elbow, is_keyed):
     modifier = bound.modifiers["FDDA"]
     if is_keyed:
         for frame, value in ((1, True), (10, False), (20, True)):
@@ -121,7 +121,7 @@ def test_an_eye_that_is_animated_is_followed(bound, elbow, is_keyed):
                 assert np.array_equal(evaluated(bound), shown), frame
         else:
             assert_plays(bound, elbow.model)
-    # With the rig chosen, one that is shown changes nothing.
+    # In mode RIG, the visibility of the modifier has no effect.
     bound.fdda.mode = "RIG"
     bpy.context.scene.frame_set(22)
     shown = evaluated(bound)
@@ -131,40 +131,40 @@ def test_an_eye_that_is_animated_is_followed(bound, elbow, is_keyed):
     assert np.array_equal(evaluated(bound), shown)
 
 
-def test_the_eye_in_renders_is_that_of_use_in_render(bound, tmp_path):
+def test_disabling_the_modifier_in_renders_clears_use_in_render(bound, tmp_path):
     set_camera()
     bound.fdda.use_in_render = True
     bpy.context.view_layer.update()
-    model = still(tmp_path / "model.png")
+    model_image = still(tmp_path / "model.png")
     bound.modifiers["FDDA"].show_render = False
     bpy.context.view_layer.update()
     assert not bound.fdda.use_in_render
-    rig = still(tmp_path / "rig.png")
-    assert np.array_equal(rig, rig_pixels(bound, tmp_path)) and not np.array_equal(rig, model)
+    rig_image = still(tmp_path / "rig.png")
+    assert np.array_equal(rig_image, rig_pixels(bound, tmp_path)) and not np.array_equal(rig_image, model_image)
 
 
-@pytest.mark.parametrize("place", [0, None], ids=["before ours", "after ours"])
-def test_a_handler_that_lets_the_model_play_in_a_render(bound, tmp_path, place):
+@pytest.mark.parametrize("index", [0, None], ids=["before the add-on's", "after the add-on's"])
+def test_a_handler_of_another_add_on_can_set_the_mode_in_renders(bound, tmp_path, index):
     bound.fdda.use_in_render = True
     set_camera()
-    model = animation(tmp_path / "model")
+    model_images = animation(tmp_path / "model")
 
-    def play(scene: bpy.types.Scene, _: bpy.types.Depsgraph) -> None:
+    def set_mode(scene: bpy.types.Scene, _: bpy.types.Depsgraph) -> None:
         bound.fdda.mode = "RIG" if scene.frame_current < FRAME else "FDDA"
 
     bound.fdda.mode = "RIG"
     bpy.context.view_layer.update()
-    rig = animation(tmp_path / "rig")
+    rig_images = animation(tmp_path / "rig")
     handlers = bpy.app.handlers.frame_change_post
-    with handler("frame_change_post", play):
-        if place is not None:
+    with handler("frame_change_post", set_mode):
+        if index is not None:
             handlers.insert(0, handlers.pop())
-        mixed = animation(tmp_path / "mixed")
-    for frame, pixels in mixed.items():
-        assert np.array_equal(pixels, (rig if frame < FRAME else model)[frame]), frame
+        images = animation(tmp_path / "mixed")
+    for frame, pixels in images.items():
+        assert np.array_equal(pixels, (rig_images if frame < FRAME else model_images)[frame]), frame
 
 
-def test_only_what_is_followed_can_be_animated(bound):
+def test_only_mode_and_strength_can_be_animated(bound):
     from fdda_addon.properties.character import FDDA_PG_character
 
     groups = {"fdda": bound.fdda, "fdda.settings": bound.fdda.settings}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Linked characters play: with library overrides in poses of their own, without, as instances, duplicated, rendered."""
+"""Playback of linked characters: with and without library overrides, as instances, duplicated and rendered."""
 
 import bpy
 import numpy as np
@@ -25,17 +25,17 @@ from .linked import (
 )
 from .test_renders import render_positions, rig_pixels, set_camera, still
 
-CROWD = 20
+CROWD_SIZE = 20
 
 
-def test_overrides_play_their_own_poses(pair, library):
+def test_each_override_plays_its_own_pose(pair, library):
     assert_overrides_play(library)
     bend_elbow(pair[0], 0.8)
     assert_overrides_play(library, (0.8, 1.4))
 
 
 @pytest.mark.parametrize("is_editable", [True, False], ids=["editable", "system override"])
-def test_overrides_play_when_the_shot_is_opened_elsewhere(library, tmp_path, is_editable):
+def test_overrides_play_when_another_process_opens_the_shot(library, tmp_path, is_editable):
     collection = link_character(library.path)
     for angle in ANGLES:
         override_character(collection, angle, is_editable)
@@ -55,12 +55,13 @@ def test_overrides_follow_their_actions(library, tmp_path):
         bend_elbow(second, angle)
         armature_object.pose.bones["lower"].keyframe_insert("rotation_euler", index=0, frame=frame)
     save_and_reopen_shot(tmp_path)
-    seen = []
+    positions_by_frame = []
     for frame in (2, 15, 27):
         bpy.context.scene.frame_set(frame)
-        seen.append([assert_plays(mesh_object, library.model) for mesh_object in overridden_meshes()])
-        assert np.abs(seen[-1][0] - seen[-1][1]).max() > 1e-3
-    assert np.abs(seen[0][1] - seen[2][1]).max() > 1e-2
+        positions_by_frame.append([assert_plays(mesh_object, library.model) for mesh_object in overridden_meshes()])
+        first_positions, second_positions = positions_by_frame[-1]
+        assert np.abs(first_positions - second_positions).max() > 1e-3
+    assert np.abs(positions_by_frame[0][1] - positions_by_frame[2][1]).max() > 1e-2
 
 
 def test_overrides_after_undo_and_redo(pair, library):
@@ -93,10 +94,10 @@ def test_renders_of_overrides(pair, library, tmp_path, use_in_render):
     first.fdda.use_in_render = use_in_render
     bpy.context.view_layer.update()
     rendered = still(tmp_path / "still.png")
-    model = render_positions(first, predicted(first, library.model), tmp_path / "plain.png")
-    rig = rig_pixels(first, tmp_path)
-    assert not np.array_equal(model, rig)
-    assert np.array_equal(rendered, model if use_in_render else rig)
+    model_image = render_positions(first, predicted(first, library.model), tmp_path / "plain.png")
+    rig_image = rig_pixels(first, tmp_path)
+    assert not np.array_equal(model_image, rig_image)
+    assert np.array_equal(rendered, model_image if use_in_render else rig_image)
     assert_overrides_play(library)
 
 
@@ -114,8 +115,8 @@ def test_a_linked_character_without_override_plays_its_action(library, tmp_path)
     assert_plays(next(o for o in bpy.context.scene.objects if o.type == "MESH"), library.model)
 
 
-def test_an_override_of_what_plays_already(library, tmp_path):
-    """As users do it: link with an instance, then make an override of what it shows."""
+def test_an_override_of_a_playing_instance(library, tmp_path):
+    """Users link a character as an instance, and then make a library override of the instance."""
     empty = bpy.data.objects.new("instance", None)
     empty.instance_type, empty.instance_collection = "COLLECTION", link_character(library.path)
     bpy.context.scene.collection.objects.link(empty)
@@ -140,21 +141,21 @@ def test_instances_of_a_collection_show_one_pose(library, is_linked):
         bpy.ops.wm.open_mainfile(filepath=str(library.path))
         collection = bpy.data.collections[COLLECTION]
         bpy.context.scene.collection.children.unlink(collection)
-    for place in range(2):
-        empty = bpy.data.objects.new(f"instance {place}", None)
-        empty.instance_type, empty.instance_collection, empty.location.x = "COLLECTION", collection, place
+    for index in range(2):
+        empty = bpy.data.objects.new(f"instance {index}", None)
+        empty.instance_type, empty.instance_collection, empty.location.x = "COLLECTION", collection, index
         bpy.context.scene.collection.objects.link(empty)
     mesh_object = next(o for o in collection.all_objects if o.type == "MESH")
     for frame in (4, 21):
         bpy.context.scene.frame_set(frame)
         expected = predicted(mesh_object, library.model)
-        places = []
+        x_locations = []
         for instance in bpy.context.evaluated_depsgraph_get().object_instances:
             if instance.object.type == "MESH":
-                places.append(instance.matrix_world.translation.x)
+                x_locations.append(instance.matrix_world.translation.x)
                 positions = np.array([vertex.co[:] for vertex in instance.object.data.vertices])
                 assert np.abs(positions - expected).max() < 1e-5
-        assert places == [0, 1]
+        assert x_locations == [0, 1]
         assert not mesh_object.fdda.status
 
 
@@ -172,14 +173,14 @@ def test_a_duplicated_override_has_its_own_positions(pair, library, tmp_path):
     assert_overrides_play(library, (*ANGLES, 0.7))
 
 
-def test_a_crowd_of_overrides_is_one_call(library, monkeypatch):
+def test_many_overrides_play_in_one_batch(library, monkeypatch):
     collection = link_character(library.path)
-    crowd = [override_character(collection, 1.2 * number / CROWD) for number in range(CROWD)]
+    crowd = [override_character(collection, 1.2 * index / CROWD_SIZE) for index in range(CROWD_SIZE)]
     crowd_tests.animate(crowd)
     calls = crowd_tests.count_calls(monkeypatch)
     for frame in (1, 2, 3, 4):
         bpy.context.scene.frame_set(frame)
-    assert calls[-1] == CROWD
+    assert calls[-1] == CROWD_SIZE
     for mesh_object in crowd:
         assert_plays(mesh_object, library.model)
-    assert len({buffer_name(mesh_object) for mesh_object in crowd}) == CROWD
+    assert len({buffer_name(mesh_object) for mesh_object in crowd}) == CROWD_SIZE

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What shots save of linked characters, where their models are found, and what a changed library brings."""
+"""Saved shots with linked characters: stored overrides, paths of models, and changes of the library."""
 
 from pathlib import Path
 
@@ -26,39 +26,41 @@ from .linked import (
     shot_path,
 )
 
-OWN = {"parent", 'modifiers["Armature"].object', 'modifiers["FDDA"].properties.inputs.Socket_1.value'}
-"""What an override of the elbow's mesh differs in anyway: it follows its own armature and has its own positions."""
+EXPECTED_OVERRIDES = {"parent", 'modifiers["Armature"].object', 'modifiers["FDDA"].properties.inputs.Socket_1.value'}
+"""Properties that every override of the elbow's mesh changes: its armature and the object with its positions."""
 
 
 def test_overrides_keep_mode_strength_and_use_in_render(pair, library, tmp_path):
     first, second = pair
     first.fdda.mode, second.fdda.strength, second.fdda.use_in_render = "RIG", 0.25, True
     bpy.context.view_layer.update()
-    before = evaluated(first), evaluated(second)
+    saved_positions = evaluated(first), evaluated(second)
     save_and_reopen_shot(tmp_path)
     first, second = overridden_meshes()
     assert (first.fdda.mode, first.fdda.is_playing) == ("RIG", False)
     assert (second.fdda.mode, second.fdda.strength, second.fdda.use_in_render) == ("FDDA", 0.25, True)
-    for mesh_object, positions in zip((first, second), before, strict=True):
+    for mesh_object, positions in zip((first, second), saved_positions, strict=True):
         assert np.abs(evaluated(mesh_object) - positions).max() < 1e-6
 
 
-def show_all(mesh_objects: list[bpy.types.Object], mode: str) -> list[np.ndarray]:
+def positions_in_mode(mesh_objects: list[bpy.types.Object], mode: str) -> list[np.ndarray]:
+    """Set the mode of characters, and return the evaluated positions (V, 3) of each."""
     for mesh_object in mesh_objects:
         mesh_object.fdda.mode = mode
     bpy.context.view_layer.update()
     return [evaluated(mesh_object) for mesh_object in mesh_objects]
 
 
-def test_saved_overrides_hold_the_true_rig(pair, library, tmp_path):
+def test_saved_overrides_show_their_rig_without_the_add_on(pair, library, tmp_path):
     pair[0].fdda.use_in_render = True
-    true, shown = (show_all(pair, mode) for mode in ("RIG", "FDDA"))
-    assert all(np.abs(a - b).max() > 1e-5 for a, b in zip(true, shown, strict=True)), "rig and model differ"
+    rig_shapes, model_shapes = (positions_in_mode(pair, mode) for mode in ("RIG", "FDDA"))
+    for rig_shape, model_shape in zip(rig_shapes, model_shapes, strict=True):
+        assert np.abs(rig_shape - model_shape).max() > 1e-5, "rig and model differ"
     bpy.ops.ed.undo_push(message="playing")
     bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(tmp_path)))
     fdda_addon.unregister()
     bpy.ops.wm.open_mainfile(filepath=str(shot_path(tmp_path)))
-    for mesh_object, positions in zip(overridden_meshes(), true, strict=True):
+    for mesh_object, positions in zip(overridden_meshes(), rig_shapes, strict=True):
         assert not hasattr(mesh_object, "fdda")
         shown = {m.name: (m.show_viewport, m.show_render) for m in mesh_object.modifiers}
         assert shown == {"Armature": (True, True), "CorrectiveSmooth": (True, True), "FDDA": (False, False)}
@@ -66,30 +68,30 @@ def test_saved_overrides_hold_the_true_rig(pair, library, tmp_path):
 
 
 def overridden_paths(mesh_object: bpy.types.Object) -> set[str]:
-    """What an override differs in from its library; spelled as in 5.2."""
-    paths = {found.rna_path for found in mesh_object.override_library.properties}
+    """Return the paths of the properties that an override changes, as Blender 5.2 spells them."""
+    paths = {entry.rna_path for entry in mesh_object.override_library.properties}
     return {path.replace('["Socket_1"]', ".properties.inputs.Socket_1.value") for path in paths}
 
 
-def test_a_saved_shot_holds_what_was_changed_and_no_more(pair, library, tmp_path):
+def test_a_saved_shot_contains_only_changed_properties(pair, library, tmp_path):
     pair[0].fdda.strength = 0.5
     bpy.context.view_layer.update()
     bpy.ops.ed.undo_push(message="playing")
     save_and_reopen_shot(tmp_path)
     bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(tmp_path)))
-    # Blender has just looked for what differs.
-    assert overridden_paths(overridden_meshes()[0]) - OWN == {"fdda.strength"}
-    assert overridden_paths(overridden_meshes()[1]) - OWN == set()
+    # Saving updates the list of changed properties.
+    assert overridden_paths(overridden_meshes()[0]) - EXPECTED_OVERRIDES == {"fdda.strength"}
+    assert overridden_paths(overridden_meshes()[1]) - EXPECTED_OVERRIDES == set()
     fdda_addon.unregister()
     bpy.ops.wm.open_mainfile(filepath=str(shot_path(tmp_path)))
     first, second = overridden_meshes()
-    # No positions have a place in the shot.
+    # The shot contains no objects with positions.
     assert [o for o in bpy.data.objects if o.library is None and o.type == "MESH"] == [first, second]
     assert {mesh.library is None for mesh in bpy.data.meshes} == {False}
 
 
-def test_a_shot_that_was_saved_by_itself(library, tmp_path):
-    """An auto-save calls no handler: the override of a character that is saved with its rig is caught playing."""
+def test_an_auto_saved_shot_plays(library, tmp_path):
+    """Auto Save calls no handler, so it saves an override while its model plays, unlike its library."""
     run_in_another_process(f"pack_model({str(library.path)!r})")
     mesh_object = override_character(link_character(library.path), 0.6)
     mesh_object.fdda.mode = "FDDA"
@@ -125,10 +127,10 @@ def test_a_packed_model_is_found_in_the_library(library, tmp_path):
     assert_plays(overridden_meshes()[0].override_library.reference, moved)
 
 
-def test_a_path_out_of_the_folder_of_the_library_is_not_followed(library, tmp_path):
+def test_a_model_outside_the_library_s_folder_is_not_loaded(library, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(library.path))
-    outside = library.model.rename(tmp_path / "shots" / "elbow.onnx")
-    bpy.data.objects[ELBOW].fdda.model = f"//../shots/{outside.name}"
+    outside_path = library.model.rename(tmp_path / "shots" / "elbow.onnx")
+    bpy.data.objects[ELBOW].fdda.model = f"//../shots/{outside_path.name}"
     bpy.ops.wm.save_as_mainfile(filepath=str(library.path))
     model_files._chosen_paths.clear()
     save_new_shot(tmp_path)
@@ -138,16 +140,16 @@ def test_a_path_out_of_the_folder_of_the_library_is_not_followed(library, tmp_pa
     assert (mesh_object.fdda.mode, mesh_object.modifiers["Armature"].show_viewport) == ("RIG", True)
 
 
-def change_library(library: Library, change, folder: Path) -> None:
-    """Change the library's file; the shot, saved before, is open again."""
+def change_library(library: Library, edit, folder: Path) -> None:
+    """Save the shot, then open the library's file, edit it and save it."""
     bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(folder)))
     bpy.ops.wm.open_mainfile(filepath=str(library.path))
-    change()
+    edit()
     bpy.ops.wm.save_as_mainfile(filepath=str(library.path))
 
 
-def add_a_hat() -> None:
-    """Something new in the character, so that its overrides have to be made anew."""
+def add_hat_and_modifiers() -> None:
+    """Add an object and modifiers to the library, so that overrides must be resynchronized."""
     hat = bpy.data.objects.new("hat", bpy.data.meshes.new("hat"))
     hat.parent = bpy.data.objects[ELBOW_RIG]
     bpy.data.collections[COLLECTION].objects.link(hat)
@@ -155,9 +157,9 @@ def add_a_hat() -> None:
     bpy.data.objects[ELBOW].modifiers.new("Subdivision", "SUBSURF").show_viewport = False
 
 
-def test_a_resynced_override_plays_on(pair, library, tmp_path):
+def test_a_resynchronized_override_plays(pair, library, tmp_path):
     assert_overrides_play(library)
-    change_library(library, add_a_hat, tmp_path)
+    change_library(library, add_hat_and_modifiers, tmp_path)
     bpy.ops.wm.open_mainfile(filepath=str(shot_path(tmp_path)))
     assert sum("hat" in o.name and o.library is None for o in bpy.data.objects) == 2
     pair = [o for o in overridden_meshes() if o.fdda.is_bound]
@@ -170,7 +172,7 @@ def test_a_resynced_override_plays_on(pair, library, tmp_path):
         assert_plays(mesh_object, library.model)
 
 
-def test_a_reloaded_library_plays_on(pair, library, tmp_path):
+def test_overrides_play_after_the_library_is_reloaded(pair, library, tmp_path):
     bpy.context.scene.collection.children.link(pair[0].override_library.reference.users_collection[0])
     assert_overrides_play(library)
     bpy.data.libraries[0].reload()
@@ -182,8 +184,8 @@ def test_a_reloaded_library_plays_on(pair, library, tmp_path):
     assert_overrides_play(library, (0.6, 1.4))
 
 
-def test_a_reloaded_library_brings_its_new_model(pair, library, tmp_path, elbow):
-    """Reloaded while the shot is open; another process has saved the library with its model packed and mode RIG."""
+def test_overrides_play_the_new_model_of_a_reloaded_library(pair, library, tmp_path, elbow):
+    """While the shot is open, another process packs the model, sets mode RIG and saves the library."""
     bpy.ops.wm.save_as_mainfile(filepath=str(shot_path(tmp_path)), copy=True)
     pair[1].fdda.mode = "LINEAR"
     bpy.context.view_layer.update()
@@ -192,7 +194,7 @@ def test_a_reloaded_library_brings_its_new_model(pair, library, tmp_path, elbow)
     bpy.data.libraries[0].reload()
     bpy.context.view_layer.update()
     first, second = overridden_meshes()
-    # The first has the mode of its library, the second its own.
+    # The first override has the mode of its library. The second override has a mode of its own.
     assert [(o.fdda.mode, o.fdda.is_playing) for o in (first, second)] == [("RIG", False), ("LINEAR", True)]
     assert first.modifiers["Armature"].show_viewport and not second.modifiers["Armature"].show_viewport
     first.fdda.mode = second.fdda.mode = "FDDA"
@@ -202,8 +204,8 @@ def test_a_reloaded_library_brings_its_new_model(pair, library, tmp_path, elbow)
         assert_plays(mesh_object, elbow.model)
 
 
-def test_an_override_of_an_override(library, tmp_path):
-    """The shot links a set that holds an override of the character: two libraries away, the model is found."""
+def test_an_override_of_an_override_plays(library, tmp_path):
+    """The shot links a set which contains an override of the character, so the model is two libraries away."""
     mesh_object = override_character(link_character(library.path), 0.2)
     collection = mesh_object.users_collection[0]
     collection.name = COLLECTION

@@ -5,11 +5,11 @@ import bpy
 import numpy as np
 
 from .conftest import assert_plays, evaluated, pose, rig_positions
-from .test_evaluations import keyed
+from .test_evaluations import add_shape_key
 
 
 def test_shape_keys_are_back_with_the_rig(bound, elbow):
-    keyed(bound)
+    add_shape_key(bound)
     pose(angle=1.1)
     assert_plays(bound, elbow.model)
     shown = rig_positions(bound)
@@ -21,7 +21,7 @@ def test_shape_keys_are_back_with_the_rig(bound, elbow):
 
 
 def test_shape_keys_are_not_mixed_while_a_model_plays(bound):
-    keyed(bound)
+    add_shape_key(bound)
     bulge = bound.data.shape_keys.key_blocks["bulge"]
 
     def muted() -> list[bool]:
@@ -56,7 +56,7 @@ def test_shape_keys_that_come_while_a_model_plays(bound, elbow):
 
 def test_shape_keys_of_two_objects(bound, elbow):
     """One plays, the other shows the rig of the same mesh."""
-    keyed(bound)
+    add_shape_key(bound)
     pose(angle=0.9)
     expected = rig_positions(bound)
     other = bound.copy()

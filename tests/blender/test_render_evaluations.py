@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from .conftest import ELBOW_RIG, assert_plays, evaluated, pose
-from .test_evaluations import handler, keyed
+from .test_evaluations import add_shape_key, handler
 from .test_renders import FRAME, animation, set_camera, still
 
 OBJ_DIGITS = 2e-6
@@ -18,7 +18,7 @@ OBJ_DIGITS = 2e-6
 @pytest.fixture(params=[False, True], ids=["rig in renders", "model in renders"])
 def character(request, bound, elbow) -> tuple[bpy.types.Object, np.ndarray, np.ndarray]:
     """The elbow with a shape key, posed; what renders show of it and what they do not."""
-    keyed(bound).fdda.use_in_render = request.param
+    add_shape_key(bound).fdda.use_in_render = request.param
     bpy.data.objects[ELBOW_RIG].animation_data_clear()
     pose(angle=1.1)
     model = assert_plays(bound, elbow.model)
